@@ -1,0 +1,30 @@
+"""Simulated AMiRos, arenas and scanline sensors in MuJoCo-MJX."""
+
+import contextlib
+import io
+
+with contextlib.redirect_stdout(io.StringIO()):
+    # On import, MJX prints that NVIDIA Warp, which nothing here uses, is not installed.
+    import mujoco.mjx as _  # noqa: F401
+
+from jaxsense.sim.arena import Arena as Arena
+from jaxsense.sim.arena import Layout as Layout
+from jaxsense.sim.arena import build as build
+from jaxsense.sim.arena import drive as drive
+from jaxsense.sim.arena import make_layout as make_layout
+from jaxsense.sim.arena import place as place
+from jaxsense.sim.arena import random_layout as random_layout
+from jaxsense.sim.arena import robot_poses as robot_poses
+from jaxsense.sim.raycast import CrossSection as CrossSection
+from jaxsense.sim.raycast import Hit as Hit
+from jaxsense.sim.raycast import cast as cast
+from jaxsense.sim.raycast import cross_section as cross_section
+from jaxsense.sim.sensors import Light as Light
+from jaxsense.sim.sensors import Sensor as Sensor
+from jaxsense.sim.sensors import random_light as random_light
+from jaxsense.sim.sensors import scan as scan
+from jaxsense.sim.world import Scene as Scene
+from jaxsense.sim.world import World as World
+from jaxsense.sim.world import look as look
+from jaxsense.sim.world import make_world as make_world
+from jaxsense.sim.world import random_scene as random_scene

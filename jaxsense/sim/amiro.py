@@ -1,0 +1,106 @@
+"""The AMiRo mini robot: its sizes and its MJCF.
+
+Numbers are those of the robot's published URDF (`amiro_description`). The robot moves in the plane:
+two slides and a hinge, so `qpos` and `qvel` of one robot are x [m], y [m] and yaw [rad]. Its wheels
+are velocity servos that push the body at the two points where the wheels stand; a third, passive
+actuator holds it against sliding sideways. There is no other coupling, so a wheel that cannot reach
+its speed slips, within the servo's force.
+"""
+
+from jaxsense.config import ROBOT_RADIUS
+
+BODY_RADIUS = ROBOT_RADIUS
+BODY_HEIGHT = 0.084  # m
+GROUND_CLEARANCE = 0.010  # m
+BODY_MASS = 0.4  # kg
+WHEEL_RADIUS = 0.05571 / 2  # m
+WHEEL_WIDTH = 0.006  # m
+WHEEL_MASS = 0.02  # kg
+WHEEL_SEPARATION = 0.069  # m
+CASTER_RADIUS = 0.0025  # m
+CASTER_OFFSET = 0.036  # m, fore and aft
+CAMERA_HEIGHT = 0.042  # m, above the floor
+LIDAR_HEIGHT = 0.152  # m, of the beams above the floor
+LIDAR_HALF_WIDTH = 0.025  # m, the URG-04LX is 50 mm x 50 mm x 70 mm
+LIDAR_TOP = 0.164  # m
+
+MAX_SPEED = 0.2  # m/s
+MAX_TURN_RATE = 1.0  # rad/s
+MAX_ACCELERATION = 2.5  # m/s^2
+MAX_TURN_ACCELERATION = 3.2  # rad/s^2
+
+_MASS = BODY_MASS + 2 * WHEEL_MASS
+# The servo reaches a commanded wheel speed with this time constant; two physics steps or more keep
+# the integration stable and well damped.
+_TIME_CONSTANT = 0.02  # s
+_WHEEL_GAIN = _MASS * WHEEL_RADIUS**2 / (2 * _TIME_CONSTANT)  # N m s / rad
+_WHEEL_TORQUE = _MASS * MAX_ACCELERATION * WHEEL_RADIUS / 2  # N m
+_SLIP_GAIN = _MASS / _TIME_CONSTANT  # N s / m
+_SLIP_FORCE = 0.8 * _MASS * 9.81  # N, friction coefficient of rubber on a smooth floor
+
+MAX_WHEEL_SPEED = (MAX_SPEED + MAX_TURN_RATE * WHEEL_SEPARATION / 2) / WHEEL_RADIUS  # rad/s
+
+
+def wheel_speeds(forward: float, turn: float) -> tuple[float, float]:
+    """Left and right wheel speeds [rad/s] for a forward speed [m/s] and a turn rate [rad/s]."""
+    half = WHEEL_SEPARATION / 2
+    return (forward - turn * half) / WHEEL_RADIUS, (forward + turn * half) / WHEEL_RADIUS
+
+
+def body(name: str, has_lidar: bool, reach: float) -> str:
+    """MJCF of one robot's body.
+
+    Args:
+      name: prefix of the names of its parts.
+      has_lidar: whether it carries a laser scanner on top; else only the camera in its body.
+      reach: how far the robot's centre may go from the origin along x and along y, in metres.
+
+    Returns:
+      An MJCF `<body>` element. Only the sphere in its middle collides: seen from above it is the
+      robot's disc, and it meets upright cylinders, boxes and other robots where the disc does.
+    """
+    middle = GROUND_CLEARANCE + BODY_HEIGHT / 2
+    tower = (LIDAR_TOP - GROUND_CLEARANCE - BODY_HEIGHT) / 2
+    lidar = (
+        f'<geom name="{name}_lidar" type="box" pos="0 0 {LIDAR_TOP - tower}" mass="0" '
+        f'size="{LIDAR_HALF_WIDTH} {LIDAR_HALF_WIDTH} {tower}" rgba=".15 .15 .15 1"/>'
+    )
+    wheels = "".join(
+        f'<geom name="{name}_{side}_wheel" type="cylinder" mass="{WHEEL_MASS}" group="1" '
+        f'size="{WHEEL_RADIUS} {WHEEL_WIDTH / 2}" euler="90 0 0" '
+        f'pos="0 {sign * WHEEL_SEPARATION / 2} {WHEEL_RADIUS}" rgba=".1 .1 .1 1"/>'
+        f'<site name="{name}_{side}" pos="0 {sign * WHEEL_SEPARATION / 2} 0"/>'
+        for side, sign in (("left", 1), ("right", -1))
+    )
+    casters = "".join(
+        f'<geom name="{name}_{end}_caster" type="sphere" mass="0" size="{CASTER_RADIUS}" group="1" '
+        f'pos="{sign * CASTER_OFFSET} 0 {CASTER_RADIUS}" rgba=".5 .5 .5 1"/>'
+        for end, sign in (("front", 1), ("rear", -1))
+    )
+    return f"""
+    <body name="{name}">
+      <joint name="{name}_x" type="slide" axis="1 0 0" range="{-reach} {reach}"/>
+      <joint name="{name}_y" type="slide" axis="0 1 0" range="{-reach} {reach}"/>
+      <joint name="{name}_yaw" type="hinge" axis="0 0 1" limited="false"/>
+      <geom name="{name}_body" type="cylinder" size="{BODY_RADIUS} {BODY_HEIGHT / 2}"
+            pos="0 0 {middle}" mass="{BODY_MASS}" rgba=".25 .25 .3 1"/>
+      <geom name="{name}_collider" type="sphere" size="{BODY_RADIUS}" pos="0 0 {middle}" mass="0"
+            class="collider"/>
+      {wheels}{casters}<site name="{name}_axle"/>
+      {lidar if has_lidar else ""}
+    </body>"""
+
+
+def actuators(name: str) -> str:
+    """MJCF of one robot's three actuators: left wheel, right wheel, and sideways grip."""
+    wheels = "".join(
+        f'<velocity name="{name}_{side}" site="{name}_{side}" gear="{1 / WHEEL_RADIUS} 0 0 0 0 0" '
+        f'kv="{_WHEEL_GAIN}" ctrlrange="{-MAX_WHEEL_SPEED} {MAX_WHEEL_SPEED}" '
+        f'forcerange="{-_WHEEL_TORQUE} {_WHEEL_TORQUE}"/>'
+        for side in ("left", "right")
+    )
+    return wheels + (
+        f'<general name="{name}_grip" site="{name}_axle" gear="0 1 0 0 0 0" gaintype="fixed" '
+        f'gainprm="0" biastype="affine" biasprm="0 0 {-_SLIP_GAIN}" '
+        f'forcerange="{-_SLIP_FORCE} {_SLIP_FORCE}"/>'
+    )

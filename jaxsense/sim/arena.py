@@ -1,0 +1,240 @@
+"""The arena in MuJoCo-MJX: walls, robots, and points of interest whose kind is data.
+
+A PoI slot owns one upright cylinder and one cube, each a mocap body; the one that the slot does not
+show waits below the floor. Its pose and shape are therefore entries of the MJX state, its colour an
+entry of the layout, and a new layout or class never recompiles anything.
+"""
+
+import dataclasses
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from mujoco import mjx
+
+from jaxsense.config import COLOURS, SHAPES, ArenaConfig
+from jaxsense.sim import amiro
+from jaxsense.types import Key
+
+WALL_HEIGHT = 0.3  # m
+WALL_THICKNESS = 0.05  # m
+TIMESTEP = 0.01  # s
+_STORE = -2.0  # m, height at which the shapes that are not shown wait below the floor
+_WALL_COLOUR = (0.6, 0.6, 0.6)
+
+
+@struct.dataclass
+class Layout:
+    """What stands where in one arena; all of it data, so that nothing recompiles.
+
+    Attributes:
+      position: `[N, 2]` float32 centres of the PoIs, in metres from the arena's centre.
+      yaw: `[N]` float32, in radians.
+      shape: `[N]` int32 index into `config.SHAPES`.
+      colour: `[N, 3]` float32 albedo, linear RGB in [0, 1].
+    """
+
+    position: jax.Array
+    yaw: jax.Array
+    shape: jax.Array
+    colour: jax.Array
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Arena:
+    """A compiled arena: what is the same for all its layouts. Static under `jit`.
+
+    Attributes:
+      config: the settings it was built from.
+      mj_model: the model for C MuJoCo.
+      model: the same for MJX.
+      data: an MJX state of it, to be filled by `place`.
+      num_robots: robots, named robot0, robot1 and so on.
+    """
+
+    config: ArenaConfig
+    mj_model: mujoco.MjModel  # pyright: ignore[reportAttributeAccessIssue]
+    model: mjx.Model
+    data: mjx.Data
+    num_robots: int
+
+    @functools.cached_property
+    def robot_of_geom(self) -> np.ndarray:
+        """`[G]` int32, the robot that each geom belongs to, or -1."""
+        bodies = [self.mj_model.body(f"robot{r}").id for r in range(self.num_robots)]
+        return np.array(
+            [bodies.index(b) if b in bodies else -1 for b in self.mj_model.geom_bodyid], np.int32
+        )
+
+    @functools.cached_property
+    def poi_of_geom(self) -> np.ndarray:
+        """`[G]` int32, the PoI slot that each geom belongs to, or -1."""
+        names = [self.mj_model.geom(g).name for g in range(self.mj_model.ngeom)]
+        return np.array(
+            [int(n.split("_")[0][3:]) if n.startswith("poi") else -1 for n in names], np.int32
+        )
+
+
+def build(config: ArenaConfig, lidar_robots: tuple[bool, ...], *, contacts: bool = False) -> Arena:
+    """Compiles an arena.
+
+    Args:
+      config: sizes and number of PoIs.
+      lidar_robots: for each robot, whether it carries a laser scanner.
+      contacts: whether robots collide with PoIs, with each other and with the walls.
+
+    Returns:
+      The arena; its `data` holds every robot and PoI at the origin.
+    """
+    reach = config.side / 2 - amiro.BODY_RADIUS
+    robots = [f"robot{r}" for r in range(len(lidar_robots))]
+    size = f"{config.poi_radius} {config.poi_radius} {config.poi_height / 2}"
+    pois = "".join(
+        f'<body name="poi{n}_{shape}" mocap="true">'
+        f'<geom name="poi{n}_{shape}" type="{kind}" size="{size}" class="obstacle"/></body>'
+        for n in range(config.num_pois)
+        for shape, kind in zip(SHAPES, ("cylinder", "box"), strict=True)
+    )
+    offset = (config.side + WALL_THICKNESS) / 2
+    half = (WALL_THICKNESS / 2, config.side / 2 + WALL_THICKNESS)
+    walls = "".join(
+        f'<geom name="wall{w}" type="box" pos="{x} {y} {WALL_HEIGHT / 2}" '
+        f'size="{half[abs(y) > 0]} {half[abs(x) > 0]} {WALL_HEIGHT / 2}" '
+        f'rgba="{" ".join(map(str, _WALL_COLOUR))} 1"/>'
+        for w, (x, y) in enumerate(((offset, 0), (0, offset), (-offset, 0), (0, -offset)))
+    )
+    bits = (1, 2) if contacts else (0, 0)
+    # Euler, because MJX's implicitfast leaves out that a servo's force is limited, and accelerates
+    # a third less than C MuJoCo. The servos' time constant of two steps keeps it stable.
+    mj_model = mujoco.MjModel.from_xml_string(  # pyright: ignore[reportAttributeAccessIssue]
+        f"""
+    <mujoco model="jaxsense">
+      <compiler angle="degree" autolimits="true"/>
+      <option timestep="{TIMESTEP}" integrator="Euler" iterations="1" ls_iterations="4">
+        <flag eulerdamp="disable" {"" if contacts else 'contact="disable" limit="disable"'}/>
+      </option>
+      <default>
+        <geom contype="0" conaffinity="0"/>
+        <default class="collider">
+          <geom contype="{bits[0]}" conaffinity="{bits[0] | bits[1]}" condim="1" group="3"/>
+        </default>
+        <default class="obstacle">
+          <geom contype="{bits[1]}" conaffinity="0" condim="1"/>
+        </default>
+      </default>
+      <worldbody>
+        {walls}{pois}
+        {"".join(amiro.body(n, h, reach) for n, h in zip(robots, lidar_robots, strict=True))}
+      </worldbody>
+      <actuator>{"".join(map(amiro.actuators, robots))}</actuator>
+    </mujoco>"""
+    )
+    model = mjx.put_model(mj_model, impl="jax")
+    return Arena(config, mj_model, model, mjx.make_data(model), len(robots))
+
+
+def make_layout(
+    config: ArenaConfig, position: jax.Array, yaw: jax.Array, classes: jax.Array
+) -> Layout:
+    """The layout in which PoI n is of class `classes[n]`, an `[N]` index into `config.classes`."""
+    chex.assert_shape(position, (config.num_pois, 2), custom_message="position")
+    chex.assert_shape([yaw, classes], (config.num_pois,), custom_message="yaw, classes")
+    words = [name.split(" ") for name in config.classes]
+    shapes = jnp.array([SHAPES.index(shape) for _, shape in words])
+    colours = jnp.array([COLOURS[colour] for colour, _ in words])
+    return Layout(position, yaw, shapes[classes], colours[classes])
+
+
+def random_layout(key: Key, config: ArenaConfig, classes: jax.Array) -> Layout:
+    """Puts PoIs of the given classes at random places that keep `poi_gap` between them.
+
+    The arena is cut into square cells, about twice as many as there are PoIs; each PoI gets a cell
+    of its own and a place in it that leaves half the gap free on every side.
+
+    Args:
+      key: random key.
+      config: the arena.
+      classes: `[N]` int32 index into `config.classes`.
+
+    Returns:
+      The layout, with random yaws.
+    """
+    chex.assert_shape(classes, (config.num_pois,), custom_message="classes")
+    per_side = min(
+        int(np.ceil(np.sqrt(2 * config.num_pois))), int(np.floor(config.side / config.poi_pitch))
+    )
+    cell_side = config.side / per_side
+    draws = jax.random.uniform(key, (per_side**2 + 3 * config.num_pois,))
+    cell = jnp.argsort(draws[: per_side**2])[: config.num_pois]
+    x, y, turn = draws[per_side**2 :].reshape(3, config.num_pois)
+    corner = jnp.stack([cell // per_side, cell % per_side], axis=-1) * cell_side - config.side / 2
+    play = (cell_side - config.poi_pitch) / 2
+    place = play * (2 * jnp.stack([x, y], axis=-1) - 1)
+    yaw = jnp.pi * (2 * turn - 1)
+    return make_layout(config, corner + cell_side / 2 + place, yaw, classes)
+
+
+def place(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
+    """The MJX state with PoIs and robots at rest where they are told to be.
+
+    Args:
+      arena: the arena.
+      layout: where the PoIs stand.
+      poses: `[R, 3]` x [m], y [m] and yaw [rad] of each robot.
+
+    Returns:
+      The state after MJX's kinematics, which fill `geom_xpos` and `geom_xmat`.
+    """
+    chex.assert_shape(poses, (arena.num_robots, 3), custom_message="poses")
+    check_layout(arena.config, layout)
+    shown = layout.shape[:, None] == jnp.arange(len(SHAPES))[None]
+    height = jnp.where(shown, arena.config.poi_height / 2, _STORE)
+    position = jnp.concatenate(
+        [jnp.broadcast_to(layout.position[:, None], (*height.shape, 2)), height[..., None]], axis=-1
+    )
+    zero = jnp.zeros_like(layout.yaw)
+    turn = jnp.stack([jnp.cos(layout.yaw / 2), zero, zero, jnp.sin(layout.yaw / 2)], axis=-1)
+    data = arena.data.replace(
+        mocap_pos=position.reshape(-1, 3),
+        mocap_quat=jnp.repeat(turn, len(SHAPES), axis=0),
+        qpos=poses.reshape(-1),
+    )
+    return mjx.kinematics(arena.model, data)
+
+
+def check_layout(config: ArenaConfig, layout: Layout) -> None:
+    """Raises an `AssertionError` that names the part of a layout which does not fit the arena."""
+    shapes = {"position": (2,), "yaw": (), "shape": (), "colour": (3,)}
+    for name, shape in shapes.items():
+        chex.assert_shape(
+            getattr(layout, name), (config.num_pois, *shape), custom_message=f"layout.{name}"
+        )
+
+
+def robot_poses(data: mjx.Data) -> jax.Array:
+    """`[R, 3]` x [m], y [m] and yaw [rad] of each robot."""
+    return data.qpos.reshape(-1, 3)
+
+
+def drive(arena: Arena, data: mjx.Data, wheel_speeds: jax.Array) -> mjx.Data:
+    """One physics step of `TIMESTEP` seconds under commanded wheel speeds.
+
+    Args:
+      arena: the arena.
+      data: the MJX state.
+      wheel_speeds: `[R, 2]` left and right wheel speed of each robot, in rad/s.
+
+    Returns:
+      The next MJX state.
+    """
+    chex.assert_shape(wheel_speeds, (arena.num_robots, 2), custom_message="wheel_speeds")
+    return mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds)))
+
+
+def as_control(wheel_speeds: jax.Array) -> jax.Array:
+    """MuJoCo's control vector for `[R, 2]` wheel speeds; the sideways grips take no command."""
+    return jnp.pad(wheel_speeds, ((0, 0), (0, 1))).reshape(-1)

@@ -1,0 +1,212 @@
+"""An exact ray-caster for horizontal rays over the MJX state.
+
+Everything in the arena that a sensor can see is upright: cylinders, boxes turned about the
+vertical, and spheres. At the height of a sensor the scene is therefore a set of circles and
+rectangles, and a ray meets them in closed form.
+"""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from mujoco import mjx
+
+from jaxsense.sim.arena import Arena
+
+_VISIBLE_GROUP = 0
+
+
+@struct.dataclass
+class CrossSection:
+    """The scene cut at one height: O outlines, first all circles, then all rectangles.
+
+    Attributes:
+      centre: `[O, 2]` in metres.
+      axis: `[O, 2]` unit vector along the first side.
+      half: `[O, 2]` half the sides, for a circle its radius twice, in metres; 0 where the plane
+        does not cut the geom.
+      geom: for each outline, the MuJoCo geom id.
+      num_circles: how many of the outlines are circles.
+    """
+
+    centre: jax.Array
+    axis: jax.Array
+    half: jax.Array
+    geom: tuple[int, ...] = struct.field(pytree_node=False)
+    num_circles: int = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class Hit:
+    """What a ray met first.
+
+    Attributes:
+      distance: `[...]` float32, in metres; infinite where nothing was met.
+      geom: `[...]` int32 MuJoCo geom id; -1 where nothing was met.
+      normal: x and y part, `[...]` float32 each, of the surface's outward unit normal; 0 where
+        nothing was met.
+    """
+
+    distance: jax.Array
+    geom: jax.Array
+    normal: tuple[jax.Array, jax.Array]
+
+
+def cross_section(arena: Arena, data: mjx.Data, height: float, robot: int) -> CrossSection:
+    """Cuts the scene at `height` [m] above the floor, without the robot that is looking.
+
+    Args:
+      arena: the arena.
+      data: its MJX state, with current `geom_xpos` and `geom_xmat`.
+      height: of the plane, in metres.
+      robot: index of the robot whose own geoms are left out, or -1 for none.
+
+    Returns:
+      The cross-section. Wheels and casters are not in it: they do not reach beyond the body's
+      cylinder at any height above the ground clearance, where the sensors are.
+
+    Raises:
+      ValueError: if there is no such robot.
+    """
+    if not -1 <= robot < arena.num_robots:
+        raise ValueError(f"robot = {robot}: must be -1 or one of the {arena.num_robots} robots")
+    kinds = arena.mj_model.geom_type
+    seen = [
+        g
+        for g in range(arena.mj_model.ngeom)
+        if arena.mj_model.geom_group[g] == _VISIBLE_GROUP
+        and (robot < 0 or arena.robot_of_geom[g] != robot)
+    ]
+    cylinders = tuple(g for g in seen if kinds[g] == mjx.GeomType.CYLINDER)
+    boxes = tuple(g for g in seen if kinds[g] == mjx.GeomType.BOX)
+    geoms = cylinders + boxes
+    ids = jnp.array(geoms, jnp.int32)
+    position, size = data.geom_xpos[ids], arena.model.geom_size[ids]
+    is_circle = jnp.arange(len(geoms)) < len(cylinders)
+    half_height = jnp.where(is_circle, size[:, 1], size[:, 2])
+    half = jnp.where(is_circle[:, None], size[:, :1], size[:, :2])
+    is_cut = jnp.abs(position[:, 2] - height) <= half_height
+    return CrossSection(
+        centre=position[:, :2],
+        axis=data.geom_xmat[ids, :2, 0],
+        half=jnp.where(is_cut[:, None], half, 0.0),
+        geom=geoms,
+        num_circles=len(cylinders),
+    )
+
+
+def cast(section: CrossSection, origin: jax.Array, angle: jax.Array) -> Hit:
+    """Casts one ray; `vmap` over `angle` for a scan.
+
+    A ray that starts inside a geom meets it where it leaves, as in MuJoCo's `mj_ray`.
+
+    Args:
+      section: the scene.
+      origin: `[2]` start, in metres.
+      angle: `[]` direction in the world, in radians.
+
+    Returns:
+      The nearest hit.
+    """
+    chex.assert_shape(origin, (2,), custom_message="origin")
+    chex.assert_rank(angle, 0, custom_message="angle")
+    distance = functools.reduce(jnp.minimum, _distances(section, origin, angle))
+    # One loop with several results is not vectorised on CPU, so the nearest outline is found by a
+    # loop of its own, from inputs that the compiler does not recognise as the same.
+    outline = _nearest_outline(*jax.lax.optimization_barrier((section, origin, angle)))
+    is_hit = outline < len(section.geom)
+    geom = jnp.where(is_hit, choose(jnp.array(section.geom), outline), -1)
+    normal_x, normal_y = _normal(section, outline, origin, angle, distance)
+    normal = jnp.where(is_hit, normal_x, 0.0), jnp.where(is_hit, normal_y, 0.0)
+    return Hit(distance, geom, normal)
+
+
+def choose(table: jax.Array, index: jax.Array) -> jax.Array:
+    """`table[index]` along the first axis, as a chain of selects.
+
+    For a few rows and many indices under `vmap` this is ten times faster on CPU than a gather. An
+    index outside the table gives the first row.
+    """
+    return functools.reduce(
+        lambda chosen, i: jnp.where(index == i, table[i], chosen), range(len(table)), table[0]
+    )
+
+
+def _distances(section: CrossSection, origin: jax.Array, angle: jax.Array) -> list[jax.Array]:
+    """The distance to each outline; infinite where it is not met."""
+    direction = jnp.cos(angle), jnp.sin(angle)
+    return [
+        (_to_circle if i < section.num_circles else _to_rectangle)(section, i, origin, direction)
+        for i in range(len(section.geom))
+    ]
+
+
+def _to_circle(section: CrossSection, i: int, origin, direction) -> jax.Array:
+    radius = section.half[i, 0]
+    to_x = section.centre[i, 0] - origin[0]
+    to_y = section.centre[i, 1] - origin[1]
+    along = to_x * direction[0] + to_y * direction[1]
+    # From the distance of the centre to the ray: the textbook discriminant loses digits far away.
+    across = to_x * direction[1] - to_y * direction[0]
+    half_chord_squared = radius**2 - across**2
+    half_chord = jnp.sqrt(jnp.maximum(half_chord_squared, 0.0))
+    distance = jnp.where(along >= half_chord, along - half_chord, along + half_chord)
+    return jnp.where((half_chord_squared > 0) & (distance >= 0), distance, jnp.inf)
+
+
+def _to_rectangle(section: CrossSection, i: int, origin, direction) -> jax.Array:
+    cos, sin = section.axis[i, 0], section.axis[i, 1]
+    from_x = origin[0] - section.centre[i, 0]
+    from_y = origin[1] - section.centre[i, 1]
+
+    def slab(position, speed, half):
+        speed = jnp.where(jnp.abs(speed) < 1e-12, 1e-12, speed)
+        one, other = (-half - position) / speed, (half - position) / speed
+        return jnp.minimum(one, other), jnp.maximum(one, other)
+
+    u_speed = cos * direction[0] + sin * direction[1]
+    v_speed = cos * direction[1] - sin * direction[0]
+    u_in, u_out = slab(cos * from_x + sin * from_y, u_speed, section.half[i, 0])
+    v_in, v_out = slab(cos * from_y - sin * from_x, v_speed, section.half[i, 1])
+    enter, leave = jnp.maximum(u_in, v_in), jnp.minimum(u_out, v_out)
+    is_met = (section.half[i, 0] > 0) & (enter <= leave) & (leave >= 0)
+    return jnp.where(is_met, jnp.where(enter >= 0, enter, leave), jnp.inf)
+
+
+def _nearest_outline(section: CrossSection, origin: jax.Array, angle: jax.Array) -> jax.Array:
+    """`[]` float32 index of the outline that a ray meets first; their number if it meets none."""
+    distances = _distances(section, origin, angle)
+    nearest = functools.reduce(jnp.minimum, distances)
+    squared_index = functools.reduce(
+        lambda chosen, i: jnp.where((distances[i] <= nearest) & (nearest < jnp.inf), i**2, chosen),
+        range(len(distances)),
+        jnp.float32(len(distances) ** 2),
+    )
+    # A square root is an operation that XLA computes once and keeps. Without one it repeats the
+    # whole chain wherever the index is used, hundreds of times slower.
+    return jnp.round(jnp.sqrt(squared_index))
+
+
+def _normal(
+    section: CrossSection, outline: jax.Array, origin: jax.Array, angle: jax.Array, distance
+) -> tuple[jax.Array, jax.Array]:
+    """Both parts of the outward unit normal where a ray meets an outline."""
+    centre_x, centre_y, half_u, half_v, cos, sin = (
+        choose(table[:, i], outline)
+        for table in (section.centre, section.half, section.axis)
+        for i in range(2)
+    )
+    offset_x = origin[0] + distance * jnp.cos(angle) - centre_x
+    offset_y = origin[1] + distance * jnp.sin(angle) - centre_y
+    along_u = offset_x * cos + offset_y * sin
+    along_v = offset_y * cos - offset_x * sin
+    on_u_side = jnp.abs(along_u) * half_v > jnp.abs(along_v) * half_u
+    is_circle = outline < section.num_circles
+    radius = jnp.maximum(half_u, 1e-9)
+    box_x = jnp.where(on_u_side, jnp.sign(along_u) * cos, -jnp.sign(along_v) * sin)
+    box_y = jnp.where(on_u_side, jnp.sign(along_u) * sin, jnp.sign(along_v) * cos)
+    normal_x = jnp.where(is_circle, offset_x / radius, box_x)
+    normal_y = jnp.where(is_circle, offset_y / radius, box_y)
+    return normal_x, normal_y

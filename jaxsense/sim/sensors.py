@@ -1,0 +1,198 @@
+"""LiDAR scans and camera scanlines: thin layers over the ray-caster.
+
+A sensor is a value: its rays, its height and how it turns hits into readings. Adding one means
+adding an entry to `make`; nothing else in the package names a sensor.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from mujoco import mjx
+
+from jaxsense.config import CameraConfig, Config, LidarConfig
+from jaxsense.sim import amiro, raycast
+from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
+from jaxsense.types import Key
+
+_BACKGROUND = (0.5, 0.6, 0.7)  # colour where a ray leaves the arena
+
+
+@struct.dataclass
+class Light:
+    """One distant light and the light from all around.
+
+    Attributes:
+      direction: `[3]` unit vector towards the light.
+      diffuse: `[]` strength of the distant light.
+      ambient: `[]` strength of the light from all around.
+    """
+
+    direction: jax.Array
+    diffuse: jax.Array
+    ambient: jax.Array
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sensor:
+    """A scanline sensor on a robot.
+
+    Attributes:
+      name: of the modality.
+      height: of its rays above the floor, in metres.
+      angles: `[B]` of its rays in the robot's frame, in radians, in the order of the readings.
+      window: number of rays that the detector reads.
+      channels: numbers in the reading of one ray.
+      stride: from each ray that the detector reads to the next.
+      centre: index, as a real number, of the ray that points along a bearing in radians.
+      read: `(key, hits of B rays, [G, 3] albedo of each geom, light) -> [B, ...] readings`.
+      window_limit: highest reading that the detector is shown.
+    """
+
+    name: str
+    height: float
+    angles: np.ndarray
+    window: int
+    channels: int
+    stride: int
+    centre: Callable[[jax.Array], jax.Array]
+    read: Callable[[Key, raycast.Hit, jax.Array, Light], jax.Array]
+    window_limit: float
+
+
+def random_light(key: Key) -> Light:
+    """A light from any side, 20 to 70 degrees high, of random strength."""
+    side, height, diffuse, ambient = jax.random.uniform(key, (4,))
+    side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)
+    flat = jnp.cos(height)
+    direction = jnp.stack([flat * jnp.cos(side), flat * jnp.sin(side), jnp.sin(height)])
+    return Light(direction, diffuse=0.2 + 0.6 * diffuse, ambient=0.3 + 0.3 * ambient)
+
+
+def lidar(config: LidarConfig) -> Sensor:
+    """The laser scanner: one distance in metres for each beam, from right to left."""
+    half = np.radians(config.field_of_view) / 2
+    angles = np.linspace(-half, half, config.num_beams, dtype=np.float32)
+    step = 2 * half / max(config.num_beams - 1, 1)
+
+    def read(key, hits, albedo, light):
+        del albedo, light
+        noise = config.range_noise * jax.random.normal(key, hits.distance.shape)
+        measured = jnp.clip(hits.distance + noise, config.min_range, config.max_range)
+        return jnp.where(hits.distance <= config.max_range, measured, config.max_range)
+
+    return Sensor(
+        name="lidar",
+        height=amiro.LIDAR_HEIGHT,
+        angles=angles,
+        window=config.window,
+        channels=1,
+        stride=config.stride,
+        centre=lambda bearing: (bearing + half) / step,
+        read=read,
+        window_limit=config.window_range,
+    )
+
+
+def camera(config: CameraConfig) -> Sensor:
+    """The camera's scanline: linear RGB in [0, 1] for each pixel, from left to right."""
+    middle = (config.num_pixels - 1) / 2
+    focal_length = (config.num_pixels / 2) / np.tan(np.radians(config.field_of_view) / 2)
+    columns = np.arange(config.num_pixels)
+    angles = np.arctan((middle - columns) / focal_length).astype(np.float32)
+
+    def read(key, hits, albedo, light):
+        normal_x, normal_y = hits.normal
+        facing = normal_x * light.direction[0] + normal_y * light.direction[1]
+        shade = light.ambient + light.diffuse * jnp.maximum(facing, 0.0)
+
+        def channel(of_geom, of_background):
+            lit = shade * raycast.choose(of_geom, hits.geom)
+            return jnp.where(hits.geom >= 0, lit, of_background)
+
+        # A loop over the channels makes the compiler finish the hits before it shades them; fused
+        # with the ray-caster, each channel would cast the rays many times over.
+        seen = jax.lax.map(lambda c: channel(*c), (albedo.T, jnp.array(_BACKGROUND))).T
+        noise = config.pixel_noise * jax.random.normal(key, seen.shape)
+        return jnp.clip(seen + noise, 0.0, 1.0)
+
+    return Sensor(
+        name="camera",
+        height=amiro.CAMERA_HEIGHT,
+        angles=angles,
+        window=config.window,
+        channels=3,
+        stride=config.stride,
+        centre=lambda bearing: middle - focal_length * jnp.tan(bearing),
+        read=read,
+        window_limit=1.0,
+    )
+
+
+def make(config: Config) -> tuple[Sensor, ...]:
+    """The sensor of each modality, in the order of `config.modalities`."""
+    known = {"camera": lambda: camera(config.camera), "lidar": lambda: lidar(config.lidar)}
+    return tuple(known[modality]() for modality in config.modalities)
+
+
+def palette(arena: Arena, layout: Layout) -> jax.Array:
+    """`[G, 3]` albedo of every geom: the PoIs' from the layout, the others' from the model."""
+    poi = jnp.array(arena.poi_of_geom)
+    return jnp.where((poi >= 0)[:, None], layout.colour[poi], arena.model.geom_rgba[:, :3])
+
+
+def scan(
+    key: Key,
+    sensor: Sensor,
+    arena: Arena,
+    data: mjx.Data,
+    layout: Layout,
+    light: Light,
+    robot: int,
+    angles: jax.Array,
+) -> jax.Array:
+    """Readings of one robot's sensor along some of its rays.
+
+    Args:
+      key: random key of the noise.
+      sensor: the sensor.
+      arena: the arena.
+      data: its MJX state, after kinematics.
+      layout: the PoIs, for their colours.
+      light: the light.
+      robot: index of the robot that carries the sensor; its own parts are not seen.
+      angles: `[B]` in the robot's frame, in radians; `sensor.angles` for a full scan.
+
+    Returns:
+      `[B, ...]` readings.
+    """
+    chex.assert_rank(angles, 1, custom_message="angles")
+    chex.assert_shape(light.direction, (3,), custom_message="light.direction")
+    check_layout(arena.config, layout)
+    pose = robot_poses(data)[robot]
+    section = raycast.cross_section(arena, data, sensor.height, robot)
+    hits = jax.vmap(raycast.cast, in_axes=(None, None, 0))(section, pose[:2], pose[2] + angles)
+    return sensor.read(key, hits, palette(arena, layout), light)
+
+
+def window_rays(sensor: Sensor, bearing: jax.Array) -> jax.Array:
+    """`[window]` int32 indices of the rays that the detector reads of a scan.
+
+    They lie around a bearing [rad] in the robot's frame; near the edge of the field of view they
+    stop at its last ray.
+    """
+    chex.assert_rank(bearing, 0, custom_message="bearing")
+    span = (sensor.window - 1) * sensor.stride
+    start = jnp.round(sensor.centre(bearing) - span / 2).astype(jnp.int32)
+    start = jnp.clip(start, 0, len(sensor.angles) - 1 - span)
+    return start + sensor.stride * jnp.arange(sensor.window)
+
+
+def as_window(sensor: Sensor, readings: jax.Array) -> jax.Array:
+    """`[F]` the detector's input from the `[window, ...]` readings of the rays it reads."""
+    chex.assert_axis_dimension(readings, 0, sensor.window, custom_message="readings")
+    return jnp.minimum(readings, sensor.window_limit).reshape(-1)

@@ -1,0 +1,106 @@
+"""Places from which a sensor faces a point of interest, in range and free of collision."""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxsense.config import ArenaConfig, ViewpointConfig
+from jaxsense.sim import amiro
+from jaxsense.sim.arena import Layout
+from jaxsense.types import Key
+
+NUM_CANDIDATES = 16
+
+
+def random_viewpoint(
+    key: Key,
+    config: ViewpointConfig,
+    arena: ArenaConfig,
+    layout: Layout,
+    others: jax.Array,
+    poi: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Draws a pose from which a robot looks at a PoI.
+
+    Candidates are uniform in distance and direction. The first is taken that stands free and sees
+    the PoI past the other PoIs and robots; where none does, the one that is closest to that.
+
+    Args:
+      key: random key.
+      config: distances, bearings and clearance.
+      arena: sizes of arena and PoIs.
+      layout: where the PoIs stand.
+      others: `[K, 2]` positions of the other robots, in metres.
+      poi: `[]` int32 index of the PoI to look at.
+
+    Returns:
+      `[3]` pose x [m], y [m], yaw [rad], and `[]` the bearing of the PoI in the robot's frame as
+      the robot believes it, in radians.
+    """
+    chex.assert_shape(others, (None, 2), custom_message="others")
+    chex.assert_rank(poi, 0, custom_message="poi")
+    # One draw for everything: every use of the random generator takes long to compile.
+    draws = jax.random.uniform(key, (2 * NUM_CANDIDATES + 2,))
+    near, far = config.min_distance, config.max_distance
+    distance = near + (far - near) * draws[:NUM_CANDIDATES]
+    side = jnp.pi * (2 * draws[NUM_CANDIDATES:-2] - 1)
+    target = layout.position[poi]
+    position = target[0] + distance * jnp.cos(side), target[1] + distance * jnp.sin(side)
+    room = free_room(*position, config, arena, layout, others, poi)
+    first_free = jnp.argmax(room > 0)
+    chosen = jnp.where(jnp.any(room > 0), first_free, jnp.argmax(room))
+
+    bearing = jnp.radians(config.max_bearing) * (2 * draws[-2] - 1)
+    believed = bearing + jnp.radians(config.bearing_error) * (2 * draws[-1] - 1)
+    yaw = side[chosen] + jnp.pi - bearing
+    return jnp.stack([position[0][chosen], position[1][chosen], yaw]), believed
+
+
+def free_room(
+    x: jax.Array,
+    y: jax.Array,
+    config: ViewpointConfig,
+    arena: ArenaConfig,
+    layout: Layout,
+    others: jax.Array,
+    poi: jax.Array,
+) -> jax.Array:
+    """How much room is left around viewpoints and in the view from them.
+
+    Args:
+      x: `[C]` of the candidates, in metres.
+      y: `[C]` of the candidates, in metres.
+      config: the clearance around a robot.
+      arena: sizes of arena and PoIs.
+      layout: where the PoIs stand.
+      others: `[K, 2]` positions of the other robots, in metres.
+      poi: `[]` int32 index of the PoI to look at.
+
+    Returns:
+      `[C]` metres, the smallest over walls, robots and PoIs; 0 or less where a robot would stand
+      too close to something, or something covers part of the view of the PoI.
+    """
+    chex.assert_equal_shape([x, y], custom_message="x, y")
+    reach = amiro.BODY_RADIUS + config.clearance
+    to_wall = arena.side / 2 - jnp.maximum(jnp.abs(x), jnp.abs(y)) - reach
+    target = layout.position[poi]
+    view_x, view_y = target[0] - x, target[1] - y
+    view_length = jnp.hypot(view_x, view_y)
+
+    def around(centre: jax.Array, radius: float) -> jax.Array:
+        to_x, to_y = centre[0] - x, centre[1] - y
+        standing = jnp.hypot(to_x, to_y) - radius - reach
+        # The view is the cone from the sensor to the outline of the PoI.
+        along = jnp.clip((to_x * view_x + to_y * view_y) / view_length, 0.0, view_length)
+        share = along / view_length
+        across = jnp.hypot(to_x - share * view_x, to_y - share * view_y)
+        return jnp.minimum(standing, across - share * arena.poi_extent - radius)
+
+    room = to_wall
+    for n in range(arena.num_pois):
+        is_target = poi == n
+        around_poi = around(layout.position[n], arena.poi_extent)
+        room = jnp.minimum(room, jnp.where(is_target, jnp.inf, around_poi))
+    for robot in others:
+        room = jnp.minimum(room, around(robot, amiro.BODY_RADIUS))
+    return room

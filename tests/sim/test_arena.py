@@ -1,0 +1,301 @@
+import chex
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from jaxsense import sim
+from jaxsense.config import ArenaConfig
+
+CLASSES = jnp.array([0, 1, 2])
+STEPS = 200
+TIMESTEP = 0.01  # s
+FREE_TOLERANCE = 2e-5  # m, rad, m/s and rad/s, over 2 s of float32 against float64
+# MJX finds the contact of a sphere and a cylinder by iteration, C MuJoCo in closed form: they may
+# differ by one step of 0.01 s at 0.22 m/s in when they meet.
+CONTACT_TOLERANCE = 3e-3  # m, rad
+
+
+def driver(arena):
+    def run(layout, poses, wheel_speeds):
+        def step(data, speeds):
+            data = sim.drive(arena, data, speeds)
+            return data, (data.qpos, data.qvel, data.geom_xpos, data.geom_xmat)
+
+        start = sim.place(arena, layout, poses)
+        return start, jax.lax.scan(step, start, wheel_speeds)[1]
+
+    jitted = jax.jit(run)
+
+    def drive(*args):
+        # MJX's own step promotes ranks.
+        with jax.numpy_rank_promotion("allow"):
+            return jax.tree.map(np.array, jitted(*args))
+
+    return drive
+
+
+def native_trajectory(arena, start, wheel_speeds):
+    mj_data = mujoco.MjData(arena.mj_model)
+    mj_data.mocap_pos[:], mj_data.mocap_quat[:] = start.mocap_pos, start.mocap_quat
+    mj_data.qpos[:] = start.qpos
+    states = []
+    for speeds in wheel_speeds:
+        # Left wheel, right wheel and the passive grip, for each robot.
+        mj_data.ctrl[:] = np.concatenate([[*pair, 0.0] for pair in speeds])
+        mujoco.mj_step(arena.mj_model, mj_data)
+        xmat = mj_data.geom_xmat.reshape(-1, 3, 3)
+        states.append([mj_data.qpos, mj_data.qvel, mj_data.geom_xpos, xmat])
+        states[-1] = [x.copy() for x in states[-1]]
+    return [np.stack(x) for x in zip(*states, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def drive_freely(arena):
+    return driver(arena)
+
+
+@pytest.fixture(scope="module")
+def contact_arena():
+    return sim.build(ArenaConfig(), (False, True), contacts=True)
+
+
+@pytest.fixture(scope="module")
+def contact_run(contact_arena):
+    """Robot 0 drives along x against a PoI that starts 0.35 m ahead, robot 1 against the wall."""
+    drive = driver(contact_arena)
+
+    def run(kind):
+        position = jnp.array([[0.5, 0.0], [-0.8, -0.8], [0.8, -0.8]])
+        layout = sim.make_layout(ArenaConfig(), position, jnp.zeros(3), jnp.array([kind, 0, 2]))
+        poses = jnp.array([[0.05, 0.0, 0.0], [0.2, 1.2, np.pi / 2]])
+        speeds = np.full((STEPS, 2, 2), 8.0, np.float32)
+        start, states = drive(layout, poses, speeds)
+        return states, native_trajectory(contact_arena, start, speeds)
+
+    return run
+
+
+def test_kinematics_agree_with_c_mujoco(place, set_native):
+    layouts = jax.jit(lambda key, c: sim.random_layout(key, ArenaConfig(), c))
+    rng = np.random.default_rng(0)
+    for seed in range(5):
+        layout = layouts(jax.random.key(seed), jnp.array(rng.integers(0, 3, 3)))
+        data = place(layout, jnp.array(rng.uniform(-1.4, 1.4, (2, 3)), jnp.float32))
+        mj_data = set_native(data)
+        for field in ("xpos", "xquat", "xmat", "geom_xpos", "geom_xmat", "site_xpos"):
+            expected = getattr(mj_data, field)
+            ours = np.array(getattr(data, field)).reshape(expected.shape)
+            np.testing.assert_allclose(ours, expected, atol=1e-6, err_msg=field)
+
+
+def test_place_shows_each_poi_once_in_its_shape_and_turns_it(arena, place):
+    layout = sim.make_layout(
+        ArenaConfig(),
+        jnp.array([[0.5, -0.2], [-1.0, 0.3], [0.9, 1.1]]),
+        jnp.array([0.0, 0.5, -1.2]),
+        jnp.array([2, 0, 1]),  # red cube, green cylinder, red cylinder
+    )
+    data = place(layout, jnp.array([[0.1, -0.3, 0.7], [1.0, -1.0, -2.0]]))
+    shown = {
+        arena.mj_model.geom(g).name: np.array(data.geom_xpos[g])
+        for g in range(arena.mj_model.ngeom)
+        if arena.poi_of_geom[g] >= 0 and data.geom_xpos[g, 2] > 0
+    }
+    # A PoI is 0.2 high and stands on the floor.
+    assert shown.keys() == {"poi0_cube", "poi1_cylinder", "poi2_cylinder"}
+    np.testing.assert_allclose(shown["poi0_cube"], [0.5, -0.2, 0.1], atol=1e-6)
+    np.testing.assert_allclose(shown["poi2_cylinder"], [0.9, 1.1, 0.1], atol=1e-6)
+    first_side = data.geom_xmat[arena.mj_model.geom("poi1_cylinder").id][:, 0]
+    np.testing.assert_allclose(first_side, [np.cos(0.5), np.sin(0.5), 0.0], atol=1e-6)
+    np.testing.assert_allclose(sim.robot_poses(data)[1], [1.0, -1.0, -2.0])
+    # The LiDAR's box is 0.094 to 0.164 m above the floor: its beams at 0.152 leave from within.
+    lidar = data.geom_xpos[arena.mj_model.geom("robot1_lidar").id]
+    np.testing.assert_allclose(lidar, [1.0, -1.0, 0.129], atol=1e-6)
+
+
+def test_one_step_lasts_ten_milliseconds(arena):
+    assert arena.mj_model.opt.timestep == pytest.approx(TIMESTEP)
+    assert float(arena.model.opt.timestep) == pytest.approx(TIMESTEP)
+
+
+def test_robot_has_the_urdf_sizes_and_mass(arena):
+    body = arena.mj_model.geom("robot0_body")
+    np.testing.assert_allclose(body.size[:2], [0.099 / 2, 0.084 / 2])
+    np.testing.assert_allclose(body.pos, [0, 0, 0.010 + 0.084 / 2])
+    left, right = (arena.mj_model.geom(f"robot0_{side}_wheel") for side in ("left", "right"))
+    np.testing.assert_allclose(left.size[:2], [0.05571 / 2, 0.006 / 2])
+    np.testing.assert_allclose(left.pos - right.pos, [0, 0.069, 0], atol=1e-9)
+    assert arena.mj_model.body("robot0").mass == pytest.approx(0.4 + 2 * 0.02)
+
+
+@pytest.mark.parametrize("contacts", [False, True])
+def test_only_an_arena_with_contacts_collides(arena, contact_arena, contacts):
+    mj_model = (contact_arena if contacts else arena).mj_model
+    mj_data = mujoco.MjData(mj_model)
+    mujoco.mj_forward(mj_model, mj_data)  # every robot and PoI at the origin
+    assert (mj_data.ncon > 0) == contacts
+
+
+def test_free_trajectory_agrees_with_c_mujoco(arena, drive_freely, known_layout):
+    rng = np.random.default_rng(0)
+    # Full range, ten different commands: the servos saturate after each change.
+    speeds = np.repeat(rng.uniform(-8, 8, (10, 2, 2)), STEPS // 10, axis=0).astype(np.float32)
+    poses = jnp.array([[-0.5, 0.1, 0.3], [0.5, -0.4, -2.0]])
+    start, states = drive_freely(known_layout, poses, speeds)
+    expected = native_trajectory(arena, start, speeds)
+    for name, ours, theirs in zip(("qpos", "qvel", "xpos", "xmat"), states, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=FREE_TOLERANCE, err_msg=name)
+    assert np.abs(expected[1]).max(axis=0).min() > 0.1  # they did move
+
+
+@pytest.mark.parametrize("kind", [0, 2], ids=["cylinder", "cube"])
+def test_contact_trajectory_agrees_with_c_mujoco(contact_run, kind):
+    (qpos, qvel, *_), (expected_qpos, expected_qvel, *_) = contact_run(kind)
+    np.testing.assert_allclose(qpos, expected_qpos, rtol=0, atol=CONTACT_TOLERANCE)
+    # Touching begins after (0.5 - 0.1 - 0.0495 - 0.05) m / 0.223 m/s = 1.35 s, not before.
+    np.testing.assert_allclose(qvel[:120, :3], expected_qvel[:120, :3], rtol=0, atol=FREE_TOLERANCE)
+    np.testing.assert_allclose(qvel[-1], expected_qvel[-1], rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("kind", [0, 2], ids=["cylinder", "cube"])
+def test_robots_stop_at_a_poi_and_at_a_wall(contact_run, kind):
+    (qpos, qvel, *_), _ = contact_run(kind)
+    # A PoI of 0.1 at x = 0.5 stops a robot of 0.0495 at x = 0.3505, the wall at y = 1.5 another at
+    # 1.4505; soft contacts give way by some millimetres.
+    assert 0.345 < qpos[-1, 0] < 0.3505 + 0.005
+    assert 1.445 < qpos[-1, 4] < 1.4505 + 0.005
+    assert np.abs(qvel[-1, [0, 4]]).max() < 0.01
+
+
+@pytest.fixture(scope="module")
+def ahead_and_turning(drive_freely, known_layout):
+    """Robot 0 is told to drive straight at 5 rad/s, robot 1 to turn on the spot at 2 rad/s."""
+    speeds = np.tile(np.float32([[5.0, 5.0], [-2.0, 2.0]]), (STEPS, 1, 1))
+    poses = jnp.array([[-1.0, -0.8, np.pi / 6], [0.5, 0.5, 0.0]])
+    _, (qpos, qvel, *_) = drive_freely(known_layout, poses, speeds)
+    return qpos, qvel
+
+
+def test_equal_wheel_speeds_drive_straight_ahead(ahead_and_turning):
+    qpos, qvel = ahead_and_turning
+    # 0.05571 m / 2 * 5 rad/s = 0.139275 m/s along 30 degrees.
+    expected = 0.139275 * np.array([np.cos(np.pi / 6), 0.5])
+    np.testing.assert_allclose(qvel[-1, :2], expected, atol=1e-5)
+    np.testing.assert_allclose(qvel[:, 2], 0.0, atol=1e-5)
+    moved = qpos[:, :2] - [-1.0, -0.8]
+    sideways = moved @ [-0.5, np.cos(np.pi / 6)]
+    np.testing.assert_allclose(sideways, 0.0, atol=1e-5)
+
+
+def test_opposite_wheel_speeds_turn_on_the_spot(ahead_and_turning):
+    qpos, qvel = ahead_and_turning
+    # 0.05571 m / 2 * (2 - -2) rad/s / 0.069 m = 1.614783 rad/s, to the left.
+    assert qvel[-1, 5] == pytest.approx(1.614783, abs=1e-4)
+    np.testing.assert_allclose(qpos[:, 3:5], 0.5, atol=1e-5)
+
+
+def test_acceleration_reaches_its_limit_and_no_more(ahead_and_turning):
+    _, qvel = ahead_and_turning
+    speed = np.concatenate([[0.0], qvel[:, :2] @ [np.cos(np.pi / 6), 0.5]])
+    acceleration = np.diff(speed) / TIMESTEP
+    assert acceleration.max() == pytest.approx(2.5, rel=0.02)
+    # 0.139 m/s take 0.056 s at 2.5 m/s^2; the last part is slower, five time constants of 0.02 s.
+    assert speed[16] > 0.99 * 0.139275
+    assert speed.max() <= 0.139275 + 1e-5
+
+
+def test_a_curve_is_a_circle_of_the_commanded_radius(drive_freely, known_layout):
+    # (4 + 6) / 2 * 0.027855 = 0.139275 m/s and (6 - 4) * 0.027855 / 0.069 = 0.807391 rad/s: after
+    # 2 s, 1.61 rad of a circle of 0.1725 m. Starting up takes it a little longer, and it drifts
+    # outwards at 0.139 * 0.807 m/s^2 for the grip's time constant of 0.02 s: 0.0022 m/s.
+    speeds = np.tile(np.float32([[4.0, 6.0], [6.0, 4.0]]), (STEPS, 1, 1))
+    _, (qpos, qvel, *_) = drive_freely(known_layout, jnp.zeros((2, 3)), speeds)
+    yaw, velocity = qpos[:, 2], qvel[:, :2]
+    forward = velocity[:, 0] * np.cos(yaw) + velocity[:, 1] * np.sin(yaw)
+    sideways = velocity[:, 1] * np.cos(yaw) - velocity[:, 0] * np.sin(yaw)
+    assert forward[-1] == pytest.approx(0.139275, abs=5e-4)
+    assert qvel[-1, 2] == pytest.approx(0.807391, abs=2e-3)
+    assert sideways[-1] == pytest.approx(-0.00225, abs=3e-4)
+    # Left and right are mirror images.
+    np.testing.assert_allclose(qpos[:, :3], qpos[:, 3:] * [1, -1, -1], atol=1e-5)
+
+
+def test_random_layout_keeps_the_gaps():
+    for num_pois, seeds in ((3, 300), (8, 200)):
+        config = ArenaConfig(num_pois=num_pois)
+        classes = jnp.zeros(num_pois, jnp.int32)
+        layouts = jax.jit(jax.vmap(lambda k, c=config, z=classes: sim.random_layout(k, c, z)))(
+            jax.random.split(jax.random.key(num_pois), seeds)
+        )
+        position = np.array(layouts.position)
+        between = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
+        between[:, range(num_pois), range(num_pois)] = np.inf
+        # A cube of half side 0.1 reaches 0.141421 from its centre: 0.3 m are free beyond that
+        # between two PoIs, and half of it to a wall at 1.5.
+        assert between.min() >= 2 * 0.141421 + 0.3 - 1e-5
+        assert np.abs(position).max() <= 1.5 - 0.141421 - 0.15 + 1e-5
+        # Everything that may be used is used: every quadrant by every slot, every direction.
+        quadrant = (position[..., 0] > 0) * 2 + (position[..., 1] > 0)
+        assert all(set(quadrant[:, n]) == {0, 1, 2, 3} for n in range(num_pois))
+        yaw = np.sort(np.array(layouts.yaw).ravel())
+        assert yaw[0] < -3.0
+        assert yaw[-1] > 3.0
+
+
+def test_as_many_pois_as_the_config_accepts_can_be_placed():
+    # A pitch of 2 * 0.070711 + 0.058579 = 0.2 m: 5 * 5 PoIs, to the last bit, fit a side of 1 m.
+    config = ArenaConfig(side=1.0, num_pois=25, poi_radius=0.05, poi_gap=0.05857864376269048)
+    classes = jnp.zeros(25, jnp.int32)
+    layout = jax.eval_shape(lambda: sim.random_layout(jax.random.key(0), config, classes))
+    assert layout.position.shape == (25, 2)
+
+
+def test_colours_and_shapes_follow_the_classes():
+    config = ArenaConfig(num_pois=4, classes=("blue cube", "red cylinder", "green cube"))
+    classes = jnp.array([1, 0, 2, 1])
+    layout = sim.random_layout(jax.random.key(0), config, classes)
+    np.testing.assert_array_equal(layout.shape, [0, 1, 1, 0])
+    red, blue, green = (0.8, 0.1, 0.1), (0.1, 0.2, 0.8), (0.1, 0.7, 0.1)
+    np.testing.assert_allclose(layout.colour, [red, blue, green, red])
+
+
+def test_new_layouts_and_classes_do_not_retrace(arena):
+    chex.clear_trace_counter()
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def look_around(key, classes, poses):
+        data = sim.place(arena, sim.random_layout(key, ArenaConfig(), classes), poses)
+        section = sim.cross_section(arena, data, 0.1, 0)
+        angles = jnp.linspace(-3.0, 3.0, 16)
+        return jax.vmap(sim.cast, in_axes=(None, None, 0))(section, poses[0, :2], angles).distance
+
+    seen = [
+        look_around(jax.random.key(seed), jnp.array(classes), jnp.full((2, 3), 0.1 * seed))
+        for seed, classes in enumerate([(0, 1, 2), (2, 2, 2), (0, 0, 1)])
+    ]
+    assert look_around._cache_size() == 1
+    assert not np.allclose(seen[0], seen[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("position", lambda c, n: sim.make_layout(c, jnp.zeros((n, 2)), jnp.zeros(3), CLASSES)),
+        ("yaw", lambda c, n: sim.make_layout(c, jnp.zeros((3, 2)), jnp.zeros(n), CLASSES)),
+        ("classes", lambda c, n: sim.random_layout(jax.random.key(0), c, jnp.zeros(n, jnp.int32))),
+    ],
+)
+def test_wrong_shapes_of_a_layout_are_named_while_tracing(name, call):
+    jax.eval_shape(lambda: call(ArenaConfig(), 3))
+    with pytest.raises(AssertionError, match=name):
+        jax.eval_shape(lambda: call(ArenaConfig(), 4))
+
+
+def test_wrong_shapes_of_poses_and_speeds_are_named_while_tracing(arena, known_layout):
+    with pytest.raises(AssertionError, match="poses"):
+        jax.eval_shape(lambda poses: sim.place(arena, known_layout, poses), jnp.zeros((3, 3)))
+    with pytest.raises(AssertionError, match="wheel_speeds"):
+        jax.eval_shape(lambda speeds: sim.drive(arena, arena.data, speeds), jnp.zeros((2, 3)))

@@ -1,0 +1,297 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import sim
+from jaxsense.config import CameraConfig, Config, LidarConfig
+from jaxsense.sim import sensors
+from jaxsense.sim.raycast import Hit
+
+# Towards +x and up by an elevation whose cosine is 0.8.
+LIGHT = sim.Light(jnp.array([0.8, 0.0, 0.6]), diffuse=jnp.float32(0.5), ambient=jnp.float32(0.25))
+# Robots 0 and 1 look at the cylinder in the origin from 0.5 m before and behind it.
+FACE_TO_FACE = jnp.array([[-0.5, 0.0, 0.0], [0.5, 0.0, np.pi]])
+GREEN = np.array([0.1, 0.7, 0.1])
+RED = np.array([0.8, 0.1, 0.1])
+WALL = np.array([0.6, 0.6, 0.6])
+
+
+def hits_at(distance):
+    distance = jnp.asarray(distance, jnp.float32)
+    return Hit(distance, jnp.where(distance < jnp.inf, 0, -1), (0 * distance, 0 * distance))
+
+
+@pytest.fixture(scope="module")
+def noiseless():
+    return sensors.make(
+        Config(camera=CameraConfig(pixel_noise=0.0), lidar=LidarConfig(range_noise=0.0))
+    )
+
+
+@pytest.fixture(scope="module")
+def scan(arena, noiseless):
+    """Full noiseless scans of robot 0's camera and robot 1's LiDAR."""
+
+    def scan(layout, poses):
+        data = sim.place(arena, layout, poses)
+        key = jax.random.key(0)
+        return tuple(
+            sim.scan(key, sensor, arena, data, layout, LIGHT, robot, jnp.array(sensor.angles))
+            for robot, sensor in enumerate(noiseless)
+        )
+
+    return scan
+
+
+@pytest.fixture(scope="module")
+def scans(scan):
+    jitted = jax.jit(scan)
+    return lambda *args: jax.device_get(jitted(*args))
+
+
+@pytest.fixture(scope="module")
+def view(scans, known_layout):
+    return scans(known_layout, FACE_TO_FACE)
+
+
+def test_lidar_rays():
+    angles = np.degrees(sensors.lidar(LidarConfig()).angles)
+    assert angles.shape == (683,)
+    np.testing.assert_allclose(angles[[0, 341, 682]], [-120, 0, 120], atol=1e-4)
+    np.testing.assert_allclose(np.diff(angles), 240 / 682, atol=1e-3)
+
+
+def test_camera_rays_are_those_of_a_pinhole_from_left_to_right():
+    angles = sensors.camera(CameraConfig()).angles
+    assert angles.shape == (640,)
+    assert np.all(np.diff(angles) < 0)
+    np.testing.assert_allclose(angles, -angles[::-1], atol=1e-6)
+    # The edges of 640 pixels are at +-40 degrees, so the first one's middle is 319.5 of 320 there.
+    assert np.tan(angles[0]) == pytest.approx(np.tan(np.radians(40)) * 319.5 / 320, rel=1e-5)
+    # On a pinhole's plane the pixels are equally far apart.
+    np.testing.assert_allclose(
+        np.diff(np.tan(angles)), -2 * np.tan(np.radians(40)) / 640, rtol=1e-2
+    )
+
+
+def test_227_beams_are_inside_the_cameras_view():
+    lidar = sensors.lidar(LidarConfig()).angles
+    assert (np.abs(np.degrees(lidar)) <= 40.0).sum() == 227  # as published for the AMiRo
+
+
+@pytest.mark.parametrize("name", ["camera", "lidar"])
+@pytest.mark.parametrize("bearing", [-0.4, -0.11, 0.0, 0.25])
+def test_centre_is_the_ray_along_a_bearing(noiseless, name, bearing):
+    sensor = {s.name: s for s in noiseless}[name]
+    index = np.interp(
+        bearing, *zip(*sorted(zip(sensor.angles, range(9999), strict=False)), strict=True)
+    )
+    assert float(sensor.centre(jnp.float32(bearing))) == pytest.approx(index, abs=0.02)
+
+
+def test_noise_has_the_configured_standard_deviation():
+    lidar = sensors.lidar(LidarConfig(range_noise=0.02))
+    camera = sensors.camera(CameraConfig(pixel_noise=0.05))
+    many = hits_at(jnp.full(20_000, 2.0))
+    ranges = np.array(lidar.read(jax.random.key(0), many, jnp.zeros((1, 3)), LIGHT))
+    # Standard error of a standard deviation: 0.02 / sqrt(2 * 20000) = 0.0001.
+    assert ranges.std() == pytest.approx(0.02, abs=4e-4)
+    assert ranges.mean() == pytest.approx(2.0, abs=6e-4)
+    pixels = np.array(camera.read(jax.random.key(1), many, jnp.ones((1, 3)), LIGHT))
+    # The normal is zero, so all light is ambient: 0.25, five deviations from being clipped.
+    np.testing.assert_allclose(pixels.std(axis=0), 0.05, atol=1e-3)
+    np.testing.assert_allclose(pixels.mean(axis=0), 0.25, atol=1.5e-3)
+    np.testing.assert_allclose(np.corrcoef(pixels.T), np.eye(3), atol=0.03)
+
+
+def test_default_noise_is_the_urdfs():
+    assert CameraConfig().pixel_noise == 0.007
+    assert LidarConfig().range_noise == 0.01
+
+
+def test_ranges_stop_at_the_shortest_and_the_longest():
+    exact = sensors.lidar(LidarConfig(range_noise=0.0))
+    key, albedo = jax.random.key(0), jnp.zeros((1, 3))
+    ranges = exact.read(key, hits_at([0.02, 0.08, 1.0, 4.99, 5.01, 7.0, jnp.inf]), albedo, LIGHT)
+    np.testing.assert_allclose(ranges, [0.08, 0.08, 1.0, 4.99, 5.0, 5.0, 5.0], rtol=1e-6)
+
+
+def test_noise_leaves_no_range_outside_the_limits():
+    noisy = sensors.lidar(LidarConfig(range_noise=0.1))
+    distance = jnp.concatenate([jnp.full(500, 0.1), jnp.full(500, 4.95), jnp.full(500, jnp.inf)])
+    ranges = np.array(noisy.read(jax.random.key(0), hits_at(distance), jnp.zeros((1, 3)), LIGHT))
+    assert ranges.min() >= np.float32(0.08)
+    assert ranges.max() <= 5.0
+    assert len(np.unique(ranges[:1000])) > 100
+
+
+def test_pixels_stay_within_full_scale():
+    camera = sensors.camera(CameraConfig(pixel_noise=0.5))
+    many = hits_at(jnp.full(20_000, 2.0))
+    pixels = np.array(camera.read(jax.random.key(0), many, jnp.ones((1, 3)), LIGHT))
+    assert pixels.min() == 0.0
+    assert pixels.max() == 1.0
+
+
+def test_hand_worked_colours_of_a_lambert_surface(view, scans, known_layout, noiseless):
+    pixels, _ = view
+    # The cylinder's near side faces -x, away from the light: ambient alone, 0.25 of green.
+    np.testing.assert_allclose(pixels[[319, 320]], np.tile(0.25 * GREEN, (2, 1)), atol=1e-6)
+    # From the other side its normal is +x: 0.25 + 0.5 * 0.8 = 0.65 of green. The pixel beside
+    # the middle meets it at a normal that is turned by less than 0.01 rad, of cosine 1.
+    turned, _ = scans(known_layout, jnp.array([[0.5, 0.0, np.pi], [-1.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(turned[[319, 320]], np.tile(0.65 * GREEN, (2, 1)), atol=1e-4)
+    # A wall at x = 1.5 faces -x: 0.25 of 0.6. The one at x = -1.5 faces +x: 0.65 of 0.6.
+    dark, _ = scans(known_layout, jnp.array([[1.0, 0.2, 0.0], [-1.0, 0.0, 0.0]]))
+    lit, _ = scans(known_layout, jnp.array([[-1.0, 0.2, np.pi], [-0.5, -0.5, 0.0]]))
+    np.testing.assert_allclose(dark[320], 0.15 * WALL / 0.6, atol=1e-6)
+    np.testing.assert_allclose(lit[320], 0.39 * WALL / 0.6, atol=1e-6)
+    # The cube at (0, 1) is turned by 30 degrees: from +x one sees the side whose normal is
+    # (cos 30, sin 30): 0.25 + 0.5 * 0.8 * 0.866025 = 0.596410 of red.
+    cube, _ = scans(known_layout, jnp.array([[0.5, 1.0, np.pi], [-1.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(cube[320], 0.596410 * RED, atol=1e-5)
+
+
+def test_camera_sees_a_red_poi_on_its_left_on_the_left(scans, known_layout):
+    # From (0, 0.4) along x turned by 60 degrees, the cube at (0, 1) is at a bearing of +30 degrees.
+    pixels, _ = scans(known_layout, jnp.array([[0.0, 0.4, np.radians(60)], [-1.0, -1.0, 0.0]]))
+    is_red = (pixels[:, 0] > 4 * pixels[:, 1]) & (pixels[:, 0] > 4 * pixels[:, 2])
+    # tan 30 / tan 40 = 0.688 of the half line left of the middle, 320: column 99.8.
+    assert is_red[100]
+    # It is 0.2 to 0.283 m wide at 0.6 m, and 143 to 202 pixels at least; none of them on the right.
+    assert 120 < is_red.sum() < 260
+    assert not is_red[320:].any()
+
+
+def test_light_comes_from_its_side_only():
+    camera = sensors.camera(CameraConfig(pixel_noise=0.0))
+    side = jnp.linspace(-np.pi, np.pi, 9)  # of the surface's normal, in steps of 45 degrees
+    hits = Hit(jnp.ones(9), jnp.zeros(9, jnp.int32), (jnp.cos(side), jnp.sin(side)))
+    seen = camera.read(jax.random.key(0), hits, jnp.ones((1, 3)), LIGHT)
+    # 0.25 + 0.5 * 0.8 * cos: 0.65 facing it, 0.532843 at 45 degrees, 0.25 from 90 degrees on.
+    expected = [0.25, 0.25, 0.25, 0.532843, 0.65, 0.532843, 0.25, 0.25, 0.25]
+    np.testing.assert_allclose(seen[:, 0], expected, atol=1e-6)
+
+
+def test_random_light_is_a_unit_vector_from_20_to_70_degrees():
+    light = jax.jit(jax.vmap(sim.random_light))(jax.random.split(jax.random.key(0), 500))
+    np.testing.assert_allclose(np.linalg.norm(light.direction, axis=-1), 1.0, atol=1e-6)
+    height = np.degrees(np.arcsin(light.direction[:, 2]))
+    assert 20 <= height.min() < 22
+    assert 68 < height.max() <= 70.001
+    for quarter in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        assert (np.sign(light.direction[:, :2]) == quarter).all(axis=-1).mean() > 0.15
+
+
+def test_lidar_ranges_in_a_known_scene(view):
+    _, ranges = view
+    # Straight ahead 0.5 - 0.1 m to the cylinder; to the left, 90 degrees is 90 / (240 / 682) =
+    # 255.75 beams from the middle beam 341, at 89.74 degrees it is 1.5 m / cos 0.26 to the wall.
+    assert ranges[341] == pytest.approx(0.4, abs=1e-5)
+    assert ranges[341 + 255] == pytest.approx(1.5, abs=1e-4)
+    assert ranges[341 - 255] == pytest.approx(1.5, abs=1e-4)
+    # The cylinder covers asin(0.1 / 0.5) = 11.54 degrees to either side: 32.8 beams.
+    np.testing.assert_array_equal(np.flatnonzero(ranges[220:463] < 0.6) + 220, range(309, 374))
+
+
+def test_first_beam_is_on_the_right(scans, known_layout):
+    # At (-0.5, -1) facing +x, the wall on the right is 0.5 m away, that on the left 2.5 m.
+    _, ranges = scans(known_layout, jnp.array([[1.2, 1.2, 0.0], [-0.5, -1.0, 0.0]]))
+    assert ranges[341 - 255] == pytest.approx(0.5, abs=1e-4)
+    assert ranges[341 + 255] == pytest.approx(2.5, abs=1e-3)
+
+
+def test_rays_of_a_window_read_what_they_do_in_a_full_scan(
+    arena, place, noiseless, view, known_layout
+):
+    data = place(known_layout, FACE_TO_FACE)
+
+    def windows(data, bearing):
+        for robot, sensor in enumerate(noiseless):
+            rays = sensors.window_rays(sensor, bearing)
+            angles = jnp.array(sensor.angles)[rays]
+            key = jax.random.key(3)
+            yield rays, sim.scan(key, sensor, arena, data, known_layout, LIGHT, robot, angles)
+
+    windows_at = jax.jit(lambda *args: tuple(windows(*args)))
+    for bearing in (-0.3, 0.05):
+        for (rays, readings), full in zip(
+            windows_at(data, jnp.float32(bearing)), view, strict=True
+        ):
+            np.testing.assert_allclose(readings, full[np.array(rays)], atol=1e-5)
+
+
+def test_windows_are_centred_on_the_bearing(noiseless):
+    for sensor in noiseless:
+        rays = sensors.window_rays(sensor, jnp.float32(0.2))
+        assert rays.shape == (sensor.window,)
+        np.testing.assert_array_equal(np.diff(rays), sensor.stride)
+        # Between the two rays in its middle, 0.2 rad, to within half a ray.
+        middle = sensor.angles[np.array(rays)[[0, -1]]]
+        middle = np.arctan(np.tan(middle).mean()) if sensor.name == "camera" else middle.mean()
+        assert middle == pytest.approx(0.2, abs=0.004)
+
+
+def test_windows_stop_at_the_edges(noiseless):
+    camera, lidar = noiseless
+    # Far left is the camera's first pixel and the LiDAR's last beam. 80 pixels, every 4th, span
+    # 79 * 4 = 316; 128 beams span 127.
+    np.testing.assert_array_equal(sensors.window_rays(camera, jnp.float32(0.69))[0], 0)
+    np.testing.assert_array_equal(sensors.window_rays(camera, jnp.float32(-0.69))[0], 639 - 316)
+    np.testing.assert_array_equal(sensors.window_rays(lidar, jnp.float32(2.0))[0], 682 - 127)
+    np.testing.assert_array_equal(sensors.window_rays(lidar, jnp.float32(-2.0))[0], 0)
+
+
+def test_detector_input_is_flat_and_cut_off(noiseless):
+    camera, lidar = noiseless
+    ranges = jnp.linspace(0.0, 3.0, 128)
+    np.testing.assert_allclose(sensors.as_window(lidar, ranges), np.minimum(ranges, 1.5))
+    assert sensors.as_window(camera, jnp.zeros((80, 3))).shape == (240,)
+
+
+def test_batch_of_scans_equals_a_loop_of_singles(scan, scans, known_layout):
+    x = jnp.linspace(-1.0, 0.6, 3)
+    poses = jnp.stack([jnp.stack([x, x - 0.3, x], -1), jnp.stack([x - 0.2, x, 2 * x], -1)], 1)
+    batches = jax.jit(jax.vmap(scan, in_axes=(None, 0)))(known_layout, poses)
+    for b in range(3):
+        for batch, single in zip(batches, scans(known_layout, poses[b]), strict=True):
+            np.testing.assert_allclose(batch[b], single, atol=1e-4)
+
+
+def test_a_robot_does_not_see_itself_but_sees_the_other(scans, known_layout):
+    # Robot 0's camera looks at robot 1, 0.4 m ahead; robot 1's LiDAR looks over robot 0, which
+    # has no tower, at the wall 1 m behind it.
+    pixels, ranges = scans(known_layout, jnp.array([[-0.5, -0.5, np.pi], [-0.9, -0.5, 0.0]]))
+    # Its body's colour is (0.25, 0.25, 0.3), and it faces +x: 0.65 of that.
+    np.testing.assert_allclose(pixels[320], 0.65 * np.array([0.25, 0.25, 0.3]), atol=1e-4)
+    assert ranges[341] == pytest.approx(1.5 + 0.9, abs=1e-4)
+
+
+def test_make_follows_the_order_of_the_modalities():
+    config = dataclasses.replace(Config(), modalities=("lidar", "camera"))
+    assert [s.name for s in sensors.make(config)] == ["lidar", "camera"]
+    assert [s.height for s in sensors.make(config)] == [0.152, 0.042]
+
+
+def test_wrong_shapes_are_named_while_tracing(arena, noiseless, known_layout):
+    def scan(angles):
+        key = jax.random.key(0)
+        return sim.scan(key, noiseless[0], arena, arena.data, known_layout, LIGHT, 0, angles)
+
+    with pytest.raises(AssertionError, match="angles"):
+        jax.eval_shape(scan, jnp.zeros((2, 3)))
+    with pytest.raises(AssertionError, match="bearing"):
+        jax.eval_shape(lambda b: sensors.window_rays(noiseless[0], b), jnp.zeros(2))
+    with pytest.raises(AssertionError, match="readings"):
+        jax.eval_shape(lambda r: sensors.as_window(noiseless[0], r), jnp.zeros((79, 3)))
+
+
+def test_palette_colours_pois_from_the_layout_and_the_rest_from_the_model(arena, known_layout):
+    palette = np.array(sensors.palette(arena, known_layout))
+    colour = {arena.mj_model.geom(g).name: palette[g] for g in range(arena.mj_model.ngeom)}
+    np.testing.assert_allclose(colour["poi0_cylinder"], GREEN)
+    np.testing.assert_allclose(colour["poi2_cube"], RED)
+    np.testing.assert_allclose(colour["wall0"], WALL)
