@@ -1,0 +1,116 @@
+"""The scanline detectors f_x and f_w: what a sensor alone can tell of a point of interest."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from jaxsense import training
+from jaxsense.config import DetectorConfig
+from jaxsense.networks import MLP
+from jaxsense.training import FitState, Params
+from jaxsense.types import Key
+
+
+@struct.dataclass
+class Detector:
+    """A trained detector.
+
+    Attributes:
+      params: of its network.
+      offset: `[F]` mean of the windows it was trained on.
+      scale: `[]` their standard deviation over everything.
+      hidden: sizes of the hidden layers.
+      num_labels: number of labels it tells apart, D_m.
+    """
+
+    params: Params
+    offset: jax.Array
+    scale: jax.Array
+    hidden: tuple[int, ...] = struct.field(pytree_node=False)
+    num_labels: int = struct.field(pytree_node=False)
+
+
+def init(key: Key, windows: jax.Array, num_labels: int, config: DetectorConfig) -> Detector:
+    """An untrained detector, standardised to the `[S, F]` windows that it will be trained on."""
+    chex.assert_rank(windows, 2, custom_message="windows")
+    params = MLP(config.hidden, num_labels).init(key, windows[0])
+    offset = jnp.mean(windows, axis=0)
+    scale = jnp.std(windows - offset[None]) + 1e-6
+    return Detector(params, offset, scale, config.hidden, num_labels)
+
+
+def logits(detector: Detector, window: jax.Array) -> jax.Array:
+    """`[D_m]` unnormalised log-probabilities of the labels, from one `[F]` window."""
+    chex.assert_shape(window, detector.offset.shape, custom_message="window")
+    standard = (window - detector.offset) / detector.scale
+    return MLP(detector.hidden, detector.num_labels).apply(detector.params, standard)  # pyright: ignore
+
+
+def detect(detector: Detector, window: jax.Array) -> jax.Array:
+    """The features of one look.
+
+    Args:
+      detector: a trained detector.
+      window: `[F]` readings around the PoI's bearing, see `sim.sensors.scan_window`.
+
+    Returns:
+      `[D_m]` probabilities of the labels, for example (red, green).
+    """
+    return jax.nn.softmax(logits(detector, window))
+
+
+def start(detector: Detector, config: DetectorConfig) -> FitState:
+    """The state before the first gradient step."""
+    return training.start(detector.params, _optimiser(config))
+
+
+def train(
+    key: Key,
+    state: FitState,
+    detector: Detector,
+    windows: jax.Array,
+    labels: jax.Array,
+    config: DetectorConfig,
+    steps: int,
+) -> tuple[FitState, jax.Array]:
+    """Some gradient steps on the cross-entropy of a detector's labels.
+
+    Args:
+      key: random key.
+      state: from `start`, or from the steps before.
+      detector: from `init`.
+      windows: `[S, F]` simulated looks.
+      labels: `[S]` int32.
+      config: batch, learning rate, and the number of steps of the whole training.
+      steps: how many of them to make.
+
+    Returns:
+      The next state, whose parameters are the detector's, and the `[steps]` losses.
+    """
+    chex.assert_equal_shape_prefix([windows, labels], 1)
+
+    def draw_batch(key: Key):
+        rows = jax.random.randint(key, (config.batch,), 0, windows.shape[0])
+        return windows[rows], labels[rows]
+
+    def loss(key: Key, params: Params, batch, step) -> jax.Array:
+        del key, step
+        new = dataclasses.replace(detector, params=params)
+        predicted = jax.vmap(lambda window: logits(new, window))(batch[0])
+        return optax.softmax_cross_entropy_with_integer_labels(predicted, batch[1]).mean()
+
+    return training.fit(key, state, loss, draw_batch, _optimiser(config), steps)
+
+
+def _optimiser(config: DetectorConfig) -> optax.GradientTransformation:
+    return training.adam(config.learning_rate, config.steps)
+
+
+def accuracy(detector: Detector, windows: jax.Array, labels: jax.Array) -> jax.Array:
+    """`[]` share of `[S, F]` windows whose most probable label is that of `[S]` labels."""
+    features = jax.vmap(lambda window: detect(detector, window))(windows)
+    return jnp.mean(jnp.argmax(features, axis=-1) == labels)

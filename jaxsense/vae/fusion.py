@@ -1,0 +1,68 @@
+"""Writing a detection into the map: first looks, and fusion in place (the paper's Fig. 3)."""
+
+import itertools
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxsense.training import Params
+from jaxsense.types import Belief
+from jaxsense.vae import jmvae
+from jaxsense.vae.jmvae import Jmvae
+
+
+def write(
+    params: Params,
+    model: Jmvae,
+    belief: Belief,
+    seen: jax.Array,
+    features: jax.Array,
+    modality: int,
+) -> Belief:
+    """The map's entry of a PoI after a look at it.
+
+    The first look gives `q(z|x)`. If other modalities have seen the PoI, their features are no
+    longer there: they are decoded from the entry's mean and encoded together with the new ones.
+
+    Args:
+      params: of the JMVAE.
+      model: its shape.
+      belief: `[D]` the present entry.
+      seen: `[M]` bool, which modalities have seen the PoI.
+      features: `[D_m]` what the look has detected.
+      modality: index of the sensor that looked; static.
+
+    Returns:
+      The new entry. The old one does not enter it but through the decoder.
+
+    Raises:
+      ValueError: if there is no such modality.
+    """
+    if not 0 <= modality < len(model.modalities):
+        raise ValueError(f"modality = {modality}: must be an index of {model.modalities}")
+    chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
+    chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
+    chex.assert_shape(seen, (len(model.modalities),), custom_message="seen")
+    generated = jmvae.decode(params, model, belief.mean)
+    others = [m for m in range(len(model.modalities)) if m != modality]
+    entry = belief
+    # One encoder for each set of modalities that may have looked before; `seen` picks among them.
+    for size in range(len(others) + 1):
+        for subset in itertools.combinations(others, size):
+            inputs = tuple(
+                features if m == modality else generated[m] if m in subset else None
+                for m in range(len(model.modalities))
+            )
+            candidate = jmvae.posterior(params, model, inputs)
+            is_subset = jnp.array([m in subset for m in others], bool)
+            applies = jnp.all(seen[jnp.array(others, int)] == is_subset)
+            entry = jax.tree.map(lambda new, old: jnp.where(applies, new, old), candidate, entry)  # noqa: B023
+    return entry
+
+
+def unseen(model: Jmvae, variance: float) -> Belief:
+    """The entry of a PoI that nobody has seen: mean 0 and the given variance in each dimension."""
+    return Belief(
+        jnp.zeros(model.latent_size), jnp.full(model.latent_size, jnp.sqrt(jnp.float32(variance)))
+    )

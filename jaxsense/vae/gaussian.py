@@ -1,0 +1,58 @@
+"""Diagonal Gaussians: divergence, sampling and moment matching."""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxsense.types import Key
+
+
+def kl_divergence(
+    mean_p: jax.Array, log_var_p: jax.Array, mean_q: jax.Array, log_var_q: jax.Array
+) -> jax.Array:
+    """`KL(p || q)` of two diagonal Gaussians.
+
+    Args:
+      mean_p: `[D]`.
+      log_var_p: `[D]` logarithm of the variances.
+      mean_q: `[D]`.
+      log_var_q: `[D]`.
+
+    Returns:
+      `[]` in nats.
+    """
+    chex.assert_equal_shape([mean_p, log_var_p, mean_q, log_var_q])
+    chex.assert_rank(mean_p, 1)
+    ratio = jnp.exp(log_var_p - log_var_q)
+    distance = (mean_p - mean_q) ** 2 * jnp.exp(-log_var_q)
+    return 0.5 * jnp.sum(ratio + distance - 1.0 - log_var_p + log_var_q)
+
+
+def kl_to_standard_normal(mean: jax.Array, log_var: jax.Array) -> jax.Array:
+    """`KL(N(mean, exp(log_var)) || N(0, I))`, `[]` in nats, of `[D]` inputs."""
+    return kl_divergence(mean, log_var, jnp.zeros_like(mean), jnp.zeros_like(log_var))
+
+
+def sample(key: Key, mean: jax.Array, log_var: jax.Array) -> jax.Array:
+    """A draw of shape `[D]`, differentiable in `mean` and `log_var` (reparameterised)."""
+    chex.assert_equal_shape([mean, log_var])
+    return mean + jnp.exp(0.5 * log_var) * jax.random.normal(key, mean.shape)
+
+
+def moment_match(mean: jax.Array, std: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The Gaussian with the mean and variance of an equal mixture of diagonal Gaussians.
+
+    It minimises `E KL(component || q)` over diagonal Gaussians q, which is what the uni-modal
+    encoders of a JMVAE are trained to do.
+
+    Args:
+      mean: `[K, D]` of the components.
+      std: `[K, D]` of the components.
+
+    Returns:
+      `[D]` mean and `[D]` standard deviation, with variance `E[std^2] + Var[mean]`.
+    """
+    chex.assert_equal_shape([mean, std])
+    chex.assert_rank(mean, 2)
+    variance = jnp.mean(std**2, axis=0) + jnp.var(mean, axis=0)
+    return jnp.mean(mean, axis=0), jnp.sqrt(variance)

@@ -1,0 +1,261 @@
+"""The joint multi-modal VAE (JMVAE) for any tuple of modalities.
+
+Suzuki, Nakayama and Matsuo 2017, as used in Korthals et al. 2018, Sec. II. There is an encoder for
+every non-empty subset of the modalities: the one of all of them is the joint encoder, and each of
+the others is drawn to it by a Kullback-Leibler divergence. For two modalities these are the joint
+and the two uni-modal encoders of the paper.
+"""
+
+import dataclasses
+import itertools
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxsense import training
+from jaxsense.config import JmvaeConfig
+from jaxsense.networks import MLP
+from jaxsense.training import FitState, Params
+from jaxsense.types import Belief, Key
+from jaxsense.vae import gaussian
+
+Features = tuple[jax.Array | None, ...]
+"""For each modality its `[D_m]` features, or None where it is missing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Jmvae:
+    """The shape of a JMVAE; hashable, static under `jit`.
+
+    Attributes:
+      modalities: names, in the order in which features are given.
+      feature_sizes: D_m of each modality.
+      latent_size: D.
+      hidden: sizes of the hidden layers of every encoder and decoder.
+    """
+
+    modalities: tuple[str, ...]
+    feature_sizes: tuple[int, ...]
+    latent_size: int
+    hidden: tuple[int, ...]
+
+    def __post_init__(self):
+        if not self.modalities:
+            raise ValueError("modalities = (): must name one or more modalities")
+        if len(self.feature_sizes) != len(self.modalities):
+            raise ValueError(
+                f"feature_sizes = {self.feature_sizes}: must hold one size for each of "
+                f"{self.modalities}"
+            )
+
+    @property
+    def subsets(self) -> tuple[tuple[int, ...], ...]:
+        """Every non-empty subset of the modalities, the one of all of them last."""
+        indices = range(len(self.modalities))
+        sizes = range(1, len(self.modalities) + 1)
+        return tuple(s for size in sizes for s in itertools.combinations(indices, size))
+
+    def encoder_name(self, subset: tuple[int, ...]) -> str:
+        """Name of a subset's encoder, for example "camera+lidar"."""
+        return "+".join(self.modalities[m] for m in subset)
+
+
+def init(key: Key, model: Jmvae) -> Params:
+    """Random parameters: `{"encoders": {NAME: ...}, "decoders": {NAME: ...}}`."""
+    encoder_key, decoder_key = jax.random.split(key)
+    encoder_keys = jax.random.split(encoder_key, len(model.subsets))
+    decoder_keys = jax.random.split(decoder_key, len(model.modalities))
+    encoders = {
+        model.encoder_name(subset): MLP(model.hidden, 2 * model.latent_size).init(
+            k, jnp.zeros(sum(model.feature_sizes[m] for m in subset))
+        )
+        for k, subset in zip(encoder_keys, model.subsets, strict=True)
+    }
+    decoders = {
+        name: MLP(model.hidden, size).init(k, jnp.zeros(model.latent_size))
+        for k, name, size in zip(decoder_keys, model.modalities, model.feature_sizes, strict=True)
+    }
+    return {"encoders": encoders, "decoders": decoders}
+
+
+def encode(params: Params, model: Jmvae, features: Features) -> tuple[jax.Array, jax.Array]:
+    """The posterior `q(z | the features that are there)`.
+
+    Args:
+      params: from `init` or `train`.
+      model: the shape.
+      features: for each modality `[D_m]`, or None where it is missing.
+
+    Returns:
+      `[D]` mean and `[D]` log-variance.
+
+    Raises:
+      ValueError: if `features` has not one entry for each modality, or none of them is there.
+    """
+    if len(features) != len(model.modalities):
+        raise ValueError(
+            f"features has {len(features)} entries: must be {len(model.modalities)}, one for each "
+            f"of {model.modalities}"
+        )
+    subset = tuple(m for m, feature in enumerate(features) if feature is not None)
+    if not subset:
+        raise ValueError(f"features = {features}: must hold one modality or more")
+    for m in subset:
+        chex.assert_shape(
+            features[m],
+            (model.feature_sizes[m],),
+            custom_message=f"features of {model.modalities[m]}",
+        )
+    joined = jnp.concatenate([f for f in features if f is not None])
+    network = MLP(model.hidden, 2 * model.latent_size)
+    output = network.apply(params["encoders"][model.encoder_name(subset)], joined)
+    mean, log_var = jnp.split(jnp.asarray(output), 2)
+    return mean, log_var
+
+
+def decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]:
+    """The mean of `p(features | z)` of every modality, `[D_m]` each, from `[D]` latents."""
+    chex.assert_shape(z, (model.latent_size,), custom_message="z")
+    return tuple(
+        jnp.asarray(MLP(model.hidden, size).apply(params["decoders"][name], z))
+        for name, size in zip(model.modalities, model.feature_sizes, strict=True)
+    )
+
+
+def posterior(params: Params, model: Jmvae, features: Features) -> Belief:
+    """`encode` as a belief."""
+    mean, log_var = encode(params, model, features)
+    return Belief(mean, jnp.exp(0.5 * log_var))
+
+
+def loss(
+    key: Key,
+    params: Params,
+    model: Jmvae,
+    features: tuple[jax.Array, ...],
+    *,
+    alpha: float | jax.Array,
+    beta: float | jax.Array,
+    reconstruction_weights: tuple[float, ...],
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """The JMVAE-kl objective for one example (Suzuki et al. 2017, Sec. 3.3), to be minimised.
+
+    `-E[sum_m w_m log p(x_m|z)] + beta KL(q(z|all) || N(0, I)) + alpha sum_s KL(q(z|all) || q(z|s))`
+    with z one reparameterised draw from `q(z|all)`, Gaussian p of unit variance without its
+    constant, and s every proper subset of the modalities.
+
+    Args:
+      key: random key of the draw.
+      params: from `init`.
+      model: the shape.
+      features: `[D_m]` of every modality.
+      alpha: weight of the divergences to the encoders of the subsets.
+      beta: weight of the divergence to the prior.
+      reconstruction_weights: w_m.
+
+    Returns:
+      `[]` loss, and its parts before weighting: `reconstruction`, `prior` and `subsets`.
+    """
+    if len(reconstruction_weights) != len(model.modalities):
+        raise ValueError(
+            f"reconstruction_weights = {reconstruction_weights}: must hold one weight for each of "
+            f"{model.modalities}"
+        )
+    mean, log_var = encode(params, model, features)
+    decoded = decode(params, model, gaussian.sample(key, mean, log_var))
+    reconstruction = sum(
+        weight * 0.5 * jnp.sum((x - x_decoded) ** 2)
+        for weight, x, x_decoded in zip(reconstruction_weights, features, decoded, strict=True)
+    )
+    prior = gaussian.kl_to_standard_normal(mean, log_var)
+    divergences = [
+        gaussian.kl_divergence(
+            mean,
+            log_var,
+            *encode(
+                params, model, tuple(x if m in subset else None for m, x in enumerate(features))
+            ),
+        )
+        for subset in model.subsets[:-1]
+    ]
+    subsets = jnp.sum(jnp.array(divergences))
+    parts = {"reconstruction": jnp.asarray(reconstruction), "prior": prior, "subsets": subsets}
+    return parts["reconstruction"] + beta * prior + alpha * subsets, parts
+
+
+def start(params: Params, config: JmvaeConfig) -> FitState:
+    """The state before the first gradient step."""
+    return training.start(params, _optimiser(config))
+
+
+def train(
+    key: Key,
+    state: FitState,
+    model: Jmvae,
+    bank: tuple[jax.Array, ...],
+    config: JmvaeConfig,
+    steps: int,
+) -> tuple[FitState, jax.Array]:
+    """Some gradient steps of a JMVAE on detections.
+
+    Args:
+      key: random key.
+      state: from `start`, or from the steps before.
+      model: the shape.
+      bank: for each modality `[C, S, D_m]` detections of every class. A training example is one
+        detection of each modality, of the same class and otherwise independent.
+      config: weights, batch, learning rate, and the number of steps of the whole training.
+      steps: how many of them to make.
+
+    Returns:
+      The next state and the `[steps]` losses.
+    """
+    chex.assert_rank(bank, 3)
+    num_classes, num_samples = bank[0].shape[:2]
+
+    def draw_batch(key: Key):
+        class_key, *row_keys = jax.random.split(key, 1 + len(bank))
+        classes = jax.random.randint(class_key, (config.batch,), 0, num_classes)
+        return tuple(
+            x[classes, jax.random.randint(k, (config.batch,), 0, num_samples)]
+            for x, k in zip(bank, row_keys, strict=True)
+        )
+
+    def batch_loss(key: Key, params: Params, batch, step: jax.Array) -> jax.Array:
+        beta = annealed_beta(step, config)
+
+        def example_loss(key: Key, *features: jax.Array) -> jax.Array:
+            weights = config.reconstruction_weights
+            return loss(
+                key,
+                params,
+                model,
+                features,
+                alpha=config.alpha,
+                beta=beta,
+                reconstruction_weights=weights,
+            )[0]
+
+        return jnp.mean(jax.vmap(example_loss)(jax.random.split(key, config.batch), *batch))
+
+    return training.fit(key, state, batch_loss, draw_batch, _optimiser(config), steps)
+
+
+def annealed_beta(step: jax.Array, config: JmvaeConfig) -> jax.Array:
+    """`[]` beta at a gradient step: from `initial_beta` to `beta` by equal factors, then constant.
+
+    From far above its last value, beta lets one latent dimension after the other come into use, as
+    soon as it explains enough of the features. Started low, all classes may end up on one line, a
+    local optimum that leaves the other dimensions empty.
+    """
+    annealing_steps = config.annealing * config.steps
+    if annealing_steps == 0:
+        return jnp.float32(config.beta)
+    remaining = jnp.maximum(1.0 - step / annealing_steps, 0.0)
+    return config.beta * (config.initial_beta / config.beta) ** remaining
+
+
+def _optimiser(config: JmvaeConfig) -> optax.GradientTransformation:
+    return training.adam(config.learning_rate, config.steps)

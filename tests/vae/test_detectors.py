@@ -1,0 +1,92 @@
+"""Detectors on synthetic windows."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense.config import DetectorConfig
+from jaxsense.vae import detectors
+
+CONFIG = DetectorConfig(hidden=(16,), steps=200, batch=64, learning_rate=1e-2)
+
+
+def synthetic_windows(key, number):
+    """Windows of 6 readings around 5: the label says whether the middle two stand out."""
+    label_key, noise_key = jax.random.split(key)
+    labels = jax.random.randint(label_key, (number,), 0, 2)
+    bump = jnp.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+    noise = 0.2 * jax.random.normal(noise_key, (number, 6))
+    return 5.0 + labels[:, None] * bump[None] + noise, labels
+
+
+@pytest.fixture(scope="module")
+def trained():
+    windows, labels = synthetic_windows(jax.random.key(0), 1000)
+    detector = detectors.init(jax.random.key(1), windows, 2, CONFIG)
+    state, losses = jax.jit(detectors.train, static_argnames=("config", "steps"))(
+        jax.random.key(2),
+        detectors.start(detector, CONFIG),
+        detector,
+        windows,
+        labels,
+        config=CONFIG,
+        steps=CONFIG.steps,
+    )
+    return detector, replace(detector, params=state.params), losses
+
+
+def test_training_learns_a_separable_set(trained):
+    untrained, detector, losses = trained
+    windows, labels = synthetic_windows(jax.random.key(3), 1000)
+    assert detectors.accuracy(detector, windows, labels) >= 0.99
+    assert detectors.accuracy(untrained, windows, labels) < 0.9
+    assert losses.shape == (200,)
+    assert losses[-20:].mean() < 0.1 * losses[:5].mean()
+
+
+def test_detect_gives_probabilities_of_the_labels_in_order(trained):
+    _, detector, _ = trained
+    windows, labels = synthetic_windows(jax.random.key(4), 50)
+    features = jax.vmap(detectors.detect, in_axes=(None, 0))(detector, windows)
+    assert features.shape == (50, 2)
+    np.testing.assert_allclose(features.sum(axis=-1), 1.0, rtol=1e-6)
+    np.testing.assert_array_equal(features[:, 1] > 0.5, labels == 1)
+
+
+def test_accuracy_is_the_share_of_right_labels(trained):
+    _, detector, _ = trained
+    windows, labels = synthetic_windows(jax.random.key(5), 40)
+    wrong = jnp.where(jnp.arange(40) < 10, 1 - labels, labels)  # 10 of 40 turned over
+    assert detectors.accuracy(detector, windows, wrong) == 0.75
+
+
+def test_init_standardises_the_readings():
+    windows = jnp.array([[1.0, 10.0], [3.0, 14.0]])
+    detector = detectors.init(jax.random.key(0), windows, 2, CONFIG)
+    np.testing.assert_allclose(detector.offset, [2.0, 12.0])  # the mean of each reading
+    # Deviations -1, 1, -2, 2: one scale for all of them, sqrt((1 + 1 + 4 + 4) / 4) = 1.581139.
+    np.testing.assert_allclose(detector.scale, 1.581139, rtol=1e-5)
+
+
+def test_logits_do_not_depend_on_the_unit_of_the_readings():
+    windows, _ = synthetic_windows(jax.random.key(0), 100)
+    key = jax.random.key(1)
+    in_metres = detectors.init(key, windows, 2, CONFIG)
+    in_millimetres = detectors.init(key, 1000.0 * windows + 300.0, 2, CONFIG)
+    for window in windows[:3]:
+        np.testing.assert_allclose(
+            detectors.logits(in_metres, window),
+            detectors.logits(in_millimetres, 1000.0 * window + 300.0),
+            atol=1e-3,
+        )
+
+
+def test_a_window_of_the_wrong_shape_raises_an_error_that_names_it(trained):
+    _, detector, _ = trained
+    with pytest.raises(AssertionError, match="window"):
+        detectors.detect(detector, jnp.zeros(5))
+    with pytest.raises(AssertionError, match="windows"):
+        detectors.init(jax.random.key(0), jnp.zeros(5), 2, CONFIG)

@@ -1,0 +1,311 @@
+"""The JMVAE's encoders, decoders, loss and training."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from jaxsense.config import JmvaeConfig
+from jaxsense.types import Belief
+from jaxsense.vae import fusion, gaussian, jmvae, metrics
+from jaxsense.vae.jmvae import Jmvae
+
+TWO = Jmvae(("camera", "lidar"), (2, 2), latent_size=2, hidden=(8,))
+THREE = Jmvae(("camera", "lidar", "sonar"), (2, 3, 1), latent_size=4, hidden=(8,))
+
+
+def some_features(model, seed=0):
+    keys = jax.random.split(jax.random.key(seed), len(model.modalities))
+    return tuple(
+        jax.random.uniform(k, (n,)) for k, n in zip(keys, model.feature_sizes, strict=True)
+    )
+
+
+def keep(features, subset):
+    return tuple(f if m in subset else None for m, f in enumerate(features))
+
+
+def zero_parameters(model):
+    return jax.tree.map(jnp.zeros_like, jmvae.init(jax.random.key(0), model))
+
+
+def with_output(params, part, name, output):
+    """Parameters with the bias of one network's last layer replaced."""
+    network = {"params": dict(params[part][name]["params"])}
+    network["params"]["Dense_1"] = {**network["params"]["Dense_1"], "bias": jnp.array(output)}
+    return {**params, part: {**params[part], name: network}}
+
+
+def test_subsets_are_all_non_empty_ones_with_the_joint_one_last():
+    assert TWO.subsets == ((0,), (1,), (0, 1))
+    assert set(THREE.subsets) == {(0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)}
+    assert len(THREE.subsets) == 7
+    assert THREE.subsets[-1] == (0, 1, 2)
+
+
+@pytest.mark.parametrize("model", [TWO, THREE])
+def test_every_subset_has_an_encoder_of_its_own(model):
+    params, features = jmvae.init(jax.random.key(0), model), some_features(model)
+    before = {s: jmvae.encode(params, model, keep(features, s)) for s in model.subsets}
+    for mean, log_var in before.values():
+        assert mean.shape == log_var.shape == (model.latent_size,)
+    means = [tuple(mean.tolist()) for mean, _ in before.values()]
+    assert len(set(means)) == len(model.subsets)
+    for changed in model.subsets:
+        name = "+".join(model.modalities[m] for m in changed)
+        other = with_output(params, "encoders", name, jnp.full(2 * model.latent_size, 9.0))
+        for subset in model.subsets:
+            mean, _ = jmvae.encode(other, model, keep(features, subset))
+            assert np.array_equal(mean, before[subset][0]) == (subset != changed)
+
+
+def test_first_half_of_an_encoders_output_is_the_mean_and_the_second_the_log_variance():
+    params = with_output(zero_parameters(TWO), "encoders", "lidar", [1.0, 2.0, jnp.log(4.0), 0.0])
+    features = keep(some_features(TWO), (1,))
+    mean, log_var = jmvae.encode(params, TWO, features)
+    np.testing.assert_allclose(mean, [1.0, 2.0])
+    np.testing.assert_allclose(log_var, [1.386294, 0.0], rtol=1e-5)
+    belief = jmvae.posterior(params, TWO, features)
+    np.testing.assert_allclose(belief.mean, [1.0, 2.0])
+    np.testing.assert_allclose(belief.std, [2.0, 1.0], rtol=1e-6)  # exp(ln(4) / 2) = 2
+
+
+def test_decode_gives_the_features_of_every_modality():
+    params = jmvae.init(jax.random.key(0), THREE)
+    z = jnp.array([0.3, -0.2, 1.0, 0.5])
+    before = jmvae.decode(params, THREE, z)
+    assert [x.shape for x in before] == [(2,), (3,), (1,)]
+    after = jmvae.decode(with_output(params, "decoders", "lidar", [9.0, 9.0, 9.0]), THREE, z)
+    changed = [not np.array_equal(x, y) for x, y in zip(before, after, strict=True)]
+    assert changed == [False, True, False]
+
+
+def test_encode_takes_batches_by_vmap_as_a_loop_of_singles():
+    params = jmvae.init(jax.random.key(0), TWO)
+    camera, lidar = jax.random.uniform(jax.random.key(1), (2, 5, 2))
+    batch, _ = jax.vmap(lambda x, w: jmvae.encode(params, TWO, (x, w)))(camera, lidar)
+    for mean, x, w in zip(batch, camera, lidar, strict=True):
+        np.testing.assert_allclose(mean, jmvae.encode(params, TWO, (x, w))[0], rtol=1e-5)
+
+
+def test_bad_input_raises_an_error_that_names_it():
+    params, (x, w) = zero_parameters(TWO), some_features(TWO)
+    with pytest.raises(ValueError, match="features"):
+        jmvae.encode(params, TWO, (None, None))
+    with pytest.raises(ValueError, match=r"features has 3 entries: must be 2"):
+        jmvae.encode(params, TWO, (x, w, w))
+    with pytest.raises(AssertionError, match="features of lidar"):
+        jmvae.encode(params, TWO, (x, w[:1]))
+    with pytest.raises(AssertionError, match="features of camera"):
+        jmvae.encode(params, TWO, (x[None], w))
+    with pytest.raises(AssertionError, match="z"):
+        jmvae.decode(params, TWO, jnp.zeros(3))
+    with pytest.raises(ValueError, match="reconstruction_weights"):
+        jmvae.loss(
+            jax.random.key(0), params, TWO, (x, w), alpha=1, beta=1, reconstruction_weights=(1.0,)
+        )
+    with pytest.raises(ValueError, match="modalities"):
+        Jmvae((), (), 2, (8,))
+    with pytest.raises(ValueError, match="feature_sizes"):
+        Jmvae(("camera", "lidar"), (2,), 2, (8,))
+
+
+def test_loss_as_worked_by_hand():
+    # Joint posterior N((1, 0), I), camera N(0, I), LiDAR N((1, 2), I); the decoders always give
+    # (1, 0) and (0, 0), so that the draw does not matter.
+    params = zero_parameters(TWO)
+    params = with_output(params, "encoders", "camera+lidar", [1.0, 0.0, 0.0, 0.0])
+    params = with_output(params, "encoders", "lidar", [1.0, 2.0, 0.0, 0.0])
+    params = with_output(params, "decoders", "camera", [1.0, 0.0])
+    total, parts = jmvae.loss(
+        jax.random.key(0),
+        params,
+        TWO,
+        (jnp.array([0.0, 0.0]), jnp.array([0.0, 2.0])),
+        alpha=0.1,
+        beta=0.2,
+        reconstruction_weights=(10.0, 3.0),
+    )
+    # 10 (1^2 / 2) + 3 (2^2 / 2) = 11; KL to the prior 1^2 / 2; KL to camera 1^2 / 2, LiDAR 2^2 / 2.
+    np.testing.assert_allclose(parts["reconstruction"], 11.0, rtol=1e-6)
+    np.testing.assert_allclose(parts["prior"], 0.5, rtol=1e-6)
+    np.testing.assert_allclose(parts["subsets"], 2.5, rtol=1e-6)
+    np.testing.assert_allclose(total, 11 + 0.2 * 0.5 + 0.1 * 2.5, rtol=1e-6)
+
+
+def test_loss_of_three_modalities_follows_from_encode_and_decode():
+    params, features = jmvae.init(jax.random.key(0), THREE), some_features(THREE, seed=1)
+    weights, alpha, beta = (2.0, 0.5, 3.0), 0.7, 0.3
+    keys = jax.random.split(jax.random.key(2), 4000)
+    options = {"alpha": alpha, "beta": beta, "reconstruction_weights": weights}
+    losses, _ = jax.vmap(lambda k: jmvae.loss(k, params, THREE, features, **options))(keys)
+
+    def kl(p, q):
+        (m, v), (n, w) = (p[0], np.exp(p[1])), (q[0], np.exp(q[1]))
+        return 0.5 * np.sum(v / w + (n - m) ** 2 / w - 1 + np.log(w / v))
+
+    def encode(subset):
+        belief = jmvae.encode(params, THREE, keep(features, subset))
+        return [np.asarray(x, np.float64) for x in belief]
+
+    joint = encode((0, 1, 2))
+    others = [s for size in (1, 2) for s in itertools.combinations(range(3), size)]
+    divergence = alpha * sum(kl(joint, encode(s)) for s in others)
+    divergence += beta * kl(joint, [np.zeros(4), np.zeros(4)])
+    # The expected reconstruction by draws of our own: only the means over many draws agree.
+    noise = np.random.default_rng(0).standard_normal((4000, 4))
+    z = jnp.array(joint[0] + np.exp(0.5 * joint[1]) * noise, jnp.float32)
+    decoded = jax.vmap(lambda z: jmvae.decode(params, THREE, z))(z)
+    reconstruction = np.sum(
+        [
+            weight * 0.5 * np.sum((np.asarray(d) - np.asarray(x)) ** 2, axis=1)
+            for weight, d, x in zip(weights, decoded, features, strict=True)
+        ],
+        axis=0,
+    )
+    standard_error = reconstruction.std() * np.sqrt(2 / 4000)
+    expected = reconstruction.mean() + divergence
+    np.testing.assert_allclose(losses.mean(), expected, atol=4 * standard_error)
+    np.testing.assert_allclose(losses.std(), reconstruction.std(), rtol=0.1)
+    # The smallest loss has a small reconstruction error, and holds the divergences in full.
+    assert losses.min() > divergence
+
+
+def test_gradient_of_the_loss_agrees_with_finite_differences():
+    with jax.enable_x64(True):
+        model = Jmvae(("camera", "lidar"), (2, 2), 2, (4,))
+        params = jmvae.init(jax.random.key(0), model)
+        flat, unravel = ravel_pytree(params)
+        flat = flat.astype(jnp.float64)
+        features = tuple(x.astype(jnp.float64) for x in some_features(model))
+
+        @jax.jit
+        def loss(flat):
+            options = {"alpha": 0.5, "beta": 0.2, "reconstruction_weights": (3.0, 1.0)}
+            params = jax.tree.map(lambda x: x.astype(jnp.float64), unravel(flat))
+            return jmvae.loss(jax.random.key(1), params, model, features, **options)[0]
+
+        gradient, h = jax.jit(jax.grad(loss))(flat), 1e-6
+        rows = np.flatnonzero(np.abs(np.asarray(gradient)) > 1e-3)[::7]
+        assert len(rows) >= 5
+        for i in rows:
+            step = jnp.zeros_like(flat).at[i].set(h)
+            slope = (loss(flat + step) - loss(flat - step)) / (2 * h)
+            np.testing.assert_allclose(gradient[i], slope, rtol=1e-5)
+
+
+def test_beta_falls_by_equal_factors_to_its_last_value():
+    config = JmvaeConfig(steps=100, annealing=0.5, initial_beta=1.0, beta=0.01)
+    betas = [float(jmvae.annealed_beta(jnp.int32(s), config)) for s in (0, 25, 50, 99)]
+    # Half way through the 50 steps of annealing, sqrt(1 x .01) = .1.
+    np.testing.assert_allclose(betas, [1.0, 0.1, 0.01, 0.01], rtol=1e-5)
+
+
+# A trained one, on features as the detectors give them.
+
+CONFIG = JmvaeConfig(
+    hidden=(64, 64),
+    alpha=0.1,
+    beta=0.003,
+    initial_beta=0.5,
+    annealing=0.5,
+    reconstruction_weights=(10.0, 10.0),
+    steps=1500,
+    batch=128,
+    learning_rate=2e-3,
+)
+MODEL = Jmvae(("camera", "lidar"), (2, 2), CONFIG.latent_size, CONFIG.hidden)
+LABELS = ((1, 0, 0), (0, 0, 1))  # green cylinder, red cylinder, red cube: colour and shape
+
+
+def two_hot_bank(key, per_class):
+    """`[C, S, 2]` probabilities per modality: .9 or more for the right label."""
+
+    def features(key, labels):
+        doubt = 0.1 * jax.random.uniform(key, (len(labels), per_class))
+        is_second = jnp.array(labels)[:, None] == 1
+        second = jnp.where(is_second, 1 - doubt, doubt)
+        return jnp.stack([1 - second, second], axis=-1)
+
+    keys = jax.random.split(key, len(LABELS))
+    return tuple(features(k, labels) for k, labels in zip(keys, LABELS, strict=True))
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """Losses, and beliefs of new detections: joint and one per modality, `[C, S, D]`."""
+    state = jmvae.start(jmvae.init(jax.random.key(0), MODEL), CONFIG)
+    train = jax.jit(jmvae.train, static_argnames=("model", "config", "steps"))
+    bank = two_hot_bank(jax.random.key(1), 500)
+    key = jax.random.key(2)
+    state, losses = train(key, state, model=MODEL, bank=bank, config=CONFIG, steps=CONFIG.steps)
+    params, bank = state.params, two_hot_bank(jax.random.key(3), 50)
+
+    @jax.jit
+    def examine(camera, lidar):
+        both = jax.vmap(jax.vmap(lambda x, w: jmvae.posterior(params, MODEL, (x, w))))
+        return {
+            "joint": both(camera, lidar),
+            "camera": jax.vmap(jax.vmap(lambda x: jmvae.posterior(params, MODEL, (x, None))))(
+                camera
+            ),
+            "lidar": jax.vmap(jax.vmap(lambda w: jmvae.posterior(params, MODEL, (None, w))))(lidar),
+        }
+
+    return params, losses, bank, examine(*bank)
+
+
+def test_training_lowers_the_loss(trained):
+    _, losses, _, _ = trained
+    assert losses.shape == (CONFIG.steps,)
+    assert np.all(np.isfinite(losses))
+    assert losses[-50:].mean() < 0.5 * losses[:50].mean()
+
+
+def test_trained_posteriors_reproduce_table_1(trained):
+    beliefs = trained[3]
+    class_means = beliefs["joint"].mean.mean(axis=1)
+    decide = jax.vmap(jax.vmap(metrics.unambiguous, in_axes=(0, None, None)), in_axes=(0, None, 0))
+    shares = {n: decide(b, class_means, jnp.arange(3)).mean(axis=1) for n, b in beliefs.items()}
+    np.testing.assert_array_equal(shares["joint"] > 0.9, [True, True, True])
+    np.testing.assert_array_equal(shares["camera"] > 0.9, [True, False, False])
+    np.testing.assert_array_equal(shares["lidar"] > 0.9, [False, False, True])
+
+
+def test_trained_posteriors_are_wider_where_a_detection_is_ambiguous(trained):
+    sigma = {n: metrics.sigma_norm(b.std).mean(axis=1) for n, b in trained[3].items()}
+    assert np.min(sigma["camera"][1:]) > 1.5 * np.max([*sigma["joint"], sigma["camera"][0]])
+    assert np.min(sigma["lidar"][:2]) > 1.5 * np.max([*sigma["joint"], sigma["lidar"][2]])
+
+
+def test_trained_unimodal_posteriors_match_the_moments_of_the_joint_ones(trained):
+    beliefs = trained[3]
+    for name, classes in (("camera", (1, 2)), ("lidar", (0, 1))):
+        members = jax.tree.map(lambda x: x[np.array(classes)].reshape(-1, 2), beliefs["joint"])  # noqa: B023
+        alone = jax.tree.map(lambda x: x[classes[0]], beliefs[name])  # noqa: B023
+        error = jax.vmap(metrics.moment_matching_error, in_axes=(0, None))(alone, members)
+        assert error.mean() < 0.3
+    mean, std = gaussian.moment_match(members.mean, members.std)
+    other = Belief(mean + std, std)  # the bound tells a shift by one deviation
+    assert metrics.moment_matching_error(other, members) > 0.3
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_trained_model_fuses_a_second_look_into_the_right_class(trained, first):
+    params, _, bank, beliefs = trained
+    class_means = beliefs["joint"].mean.mean(axis=1)
+    seen = jnp.arange(2) == first
+    old = beliefs[MODEL.modalities[first]]
+
+    @jax.jit
+    @jax.vmap
+    @jax.vmap
+    def fuse(old, features):
+        belief = fusion.write(params, MODEL, old, seen, features, 1 - first)
+        return metrics.nearest_class(belief, class_means)
+
+    is_right = np.asarray(fuse(old, bank[1 - first])) == np.arange(3)[:, None]
+    assert is_right.mean() > 0.95
