@@ -1,0 +1,209 @@
+"""The shared map as a Markov decision process (Korthals et al. 2018, Sec. III and IV).
+
+The map holds a Gaussian belief for each of N points of interest. Action n < N looks at PoI n with
+the agent's own sensor and writes what it sees into the map; action N is no operation (NOP), and
+ends the episode. What a look sees, and how it is written, are functions that the caller gives.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxsense.config import MdpConfig
+from jaxsense.types import Belief, Key
+
+Scene = Any
+"""A pytree that `observe` looks at; the MDP only carries it."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapMdp:
+    """The MDP of one team.
+
+    Attributes:
+      config: rewards and episode length.
+      num_pois: N.
+      num_classes: classes that a PoI can have.
+      num_modalities: M.
+      unseen: `[D]` the entry of a PoI that nobody has seen.
+      new_scene: `(key, classes [N]) -> scene`.
+      observe: `(key, scene, poi, modality) -> (features [D_m], scene)`.
+      write: `(belief [D], seen [M], features [D_m], modality) -> belief [D]`.
+    """
+
+    config: MdpConfig
+    num_pois: int
+    num_classes: int
+    num_modalities: int
+    unseen: Belief
+    new_scene: Callable[[Key, jax.Array], Scene]
+    observe: Callable[[Key, Scene, jax.Array, int], tuple[jax.Array, Scene]]
+    write: Callable[[Belief, jax.Array, jax.Array, int], Belief]
+
+
+@struct.dataclass
+class MapState:
+    """The map, and what it is a map of.
+
+    Attributes:
+      belief: `[N, D]` the map.
+      seen: `[N, M]` bool, which modalities have seen which PoI; hidden from the policies.
+      classes: `[N]` int32 true classes; hidden from the policies.
+      scene: what `observe` looks at; hidden from the policies.
+      steps: `[]` int32 actions so far.
+    """
+
+    belief: Belief
+    seen: jax.Array
+    classes: jax.Array
+    scene: Scene
+    steps: jax.Array
+
+
+@struct.dataclass
+class Outcome:
+    """What an action led to.
+
+    Attributes:
+      reward: `[]` float32.
+      is_over: `[]` bool, the episode has ended by NOP.
+      is_cut: `[]` bool, the episode has ended because it was too long.
+    """
+
+    reward: jax.Array
+    is_over: jax.Array
+    is_cut: jax.Array
+
+
+def information(std: jax.Array) -> jax.Array:
+    """Information of a belief, `I = 1 / ||std||_2` (Korthals et al. 2018, Sec. IV).
+
+    Args:
+      std: `[..., D]` positive standard deviations.
+
+    Returns:
+      `[...]` information in inverse latent units; grows without bound as `std` -> 0.
+    """
+    return 1.0 / jnp.linalg.norm(std, axis=-1)
+
+
+def as_state(belief: Belief) -> jax.Array:
+    """`[N * 2D]` the map as a Q-network sees it: mean and standard deviation of each PoI."""
+    chex.assert_rank([belief.mean, belief.std], 2, custom_message="belief")
+    return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)
+
+
+def random_start(key: Key, mdp: MapMdp) -> tuple[jax.Array, jax.Array]:
+    """`[N]` int32 classes, drawn independently, and `[N, M]` bool, which looks have been taken."""
+    class_key, seen_key = jax.random.split(key)
+    classes = jax.random.randint(class_key, (mdp.num_pois,), 0, mdp.num_classes)
+    shape = (mdp.num_pois, mdp.num_modalities)
+    return classes, _random_seen(seen_key, shape, mdp.config.partly_seen_starts)
+
+
+def reset(
+    key: Key, mdp: MapMdp, classes: jax.Array | None = None, seen: jax.Array | None = None
+) -> MapState:
+    """The start of an episode: some modalities have seen some of the PoIs.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      classes: `[N]` int32 true classes; drawn independently for each PoI if not given.
+      seen: `[N, M]` bool, who has seen what; random if not given.
+
+    Returns:
+      The state. What has been seen was really looked at: the map holds real detections. Each PoI
+      has its looks written in the order of the modalities, from a random one on.
+    """
+    start_key, scene_key, order_key, look_key = jax.random.split(key, 4)
+    shape = (mdp.num_pois, mdp.num_modalities)
+    random_classes, random_seen = random_start(start_key, mdp)
+    classes = random_classes if classes is None else classes
+    seen = random_seen if seen is None else seen
+    chex.assert_shape(classes, (mdp.num_pois,), custom_message="classes")
+    chex.assert_shape(seen, shape, custom_message="seen")
+    scene = mdp.new_scene(scene_key, classes)
+    first = jax.random.randint(order_key, (mdp.num_pois,), 0, mdp.num_modalities)
+    look_keys = jax.random.split(look_key, shape)
+    pois = jnp.arange(mdp.num_pois)
+    entries = jax.vmap(lambda *poi: _looked_at(mdp, scene, *poi))(look_keys, pois, seen, first)
+    return MapState(entries, seen, classes, scene, jnp.int32(0))
+
+
+def step(
+    key: Key, mdp: MapMdp, state: MapState, action: jax.Array, modality: int
+) -> tuple[MapState, Outcome]:
+    """Looks at a PoI with one modality's sensor, or ends the episode.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      state: the present state.
+      action: `[]` int32, a PoI or N for NOP.
+      modality: index of the agent's own sensor; static.
+
+    Returns:
+      The next state and the outcome. The reward is the gain of information; -1 if that is not above
+      `min_increase`; 0 for NOP.
+
+    Raises:
+      ValueError: if there is no such modality.
+    """
+    if not 0 <= modality < mdp.num_modalities:
+        raise ValueError(f"modality = {modality}: must be below {mdp.num_modalities}, not negative")
+    chex.assert_rank(action, 0, custom_message="action")
+    shape = (mdp.num_pois, *mdp.unseen.mean.shape)
+    for part in (state.belief.mean, state.belief.std):
+        chex.assert_shape(part, shape, custom_message="state.belief")
+    is_nop = action == mdp.num_pois
+    poi = jnp.minimum(action, mdp.num_pois - 1)
+    features, scene = mdp.observe(key, state.scene, poi, modality)
+    old = jax.tree.map(lambda x: x[poi], state.belief)
+    new = mdp.write(old, state.seen[poi], features, modality)
+    gain = information(new.std) - information(old.std)
+    reward = jnp.where(gain > mdp.config.min_increase, gain, -1.0)
+
+    looked = dataclasses.replace(
+        state,
+        belief=jax.tree.map(lambda x, y: x.at[poi].set(y), state.belief, new),
+        seen=state.seen.at[poi, modality].set(True),
+        scene=scene,
+    )
+    after = jax.tree.map(lambda x, y: jnp.where(is_nop, x, y), state, looked)
+    after = dataclasses.replace(after, steps=state.steps + 1)
+    outcome = Outcome(
+        reward=jnp.where(is_nop, 0.0, reward),
+        is_over=is_nop,
+        is_cut=~is_nop & (after.steps >= mdp.config.max_steps),
+    )
+    return after, outcome
+
+
+def _random_seen(key: Key, shape: tuple[int, int], is_partial: bool) -> jax.Array:
+    """Fair coins; with `is_partial`, given that they do not all fall the same way."""
+    if not is_partial:
+        return jax.random.bernoulli(key, 0.5, shape)
+    num_bits = shape[0] * shape[1]
+    code = jax.random.randint(key, (), 1, 2**num_bits - 1)
+    return (code >> jnp.arange(num_bits) & 1).astype(bool).reshape(shape)
+
+
+def _looked_at(mdp: MapMdp, scene: Scene, keys, poi, seen, first) -> Belief:
+    """The entry of one PoI after the looks that `seen` [M] tells of, in rotated order."""
+    looks = [mdp.observe(keys[m], scene, poi, m)[0] for m in range(mdp.num_modalities)]
+    entry = mdp.unseen
+    for start in range(mdp.num_modalities):
+        order = [(start + i) % mdp.num_modalities for i in range(mdp.num_modalities)]
+        written, seen_so_far = mdp.unseen, jnp.zeros(mdp.num_modalities, bool)
+        for m in order:
+            new = mdp.write(written, seen_so_far, looks[m], m)
+            written = jax.tree.map(lambda n, o: jnp.where(seen[m], n, o), new, written)  # noqa: B023
+            seen_so_far = seen_so_far.at[m].set(seen[m])
+        entry = jax.tree.map(lambda n, o: jnp.where(first == start, n, o), written, entry)  # noqa: B023
+    return entry

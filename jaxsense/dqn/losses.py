@@ -1,0 +1,34 @@
+"""The temporal-difference loss of a Q-network, for one transition."""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+def td_error(
+    q_tm1: jax.Array,
+    a_tm1: jax.Array,
+    r_t: jax.Array,
+    discount_t: jax.Array,
+    q_t: jax.Array,
+) -> jax.Array:
+    """One-step Q-learning error (Mnih et al. 2015, Eq. 2).
+
+    Args:
+      q_tm1: `[A]` values before the action.
+      a_tm1: `[]` int32 action.
+      r_t: `[]` reward.
+      discount_t: `[]` discount factor, 0 where the episode ended.
+      q_t: `[A]` the target network's values after the action; no gradient flows into them.
+
+    Returns:
+      `[]` target minus value.
+    """
+    chex.assert_rank([q_tm1, a_tm1, r_t, discount_t, q_t], [1, 0, 0, 0, 1])
+    target = r_t + discount_t * jnp.max(q_t)
+    return jax.lax.stop_gradient(target) - q_tm1[a_tm1]
+
+
+def pseudo_huber(error: jax.Array) -> jax.Array:
+    """`sqrt(1 + e^2) - 1`: quadratic near zero, linear far away, smooth everywhere."""
+    return jnp.sqrt(1.0 + error**2) - 1.0

@@ -1,0 +1,110 @@
+"""Policies: the DQN's, and those to compare it with. Each is `(key, state) -> action`."""
+
+from collections.abc import Callable
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxsense.dqn import belief_mdp
+from jaxsense.dqn.belief_mdp import MapMdp, MapState
+from jaxsense.networks import MLP
+from jaxsense.training import Params
+from jaxsense.types import Key
+
+Policy = Callable[[Key, MapState], jax.Array]
+
+
+def q_network(mdp: MapMdp, hidden: tuple[int, ...]) -> MLP:
+    """The Q-network: `[N * 2D]` map to `[N + 1]` values, the last that of NOP."""
+    return MLP(hidden, mdp.num_pois + 1)
+
+
+def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
+    """The action of highest value in a Q-network."""
+
+    def act(key: Key, state: MapState) -> jax.Array:
+        del key
+        values = q_network(mdp, hidden).apply(params, belief_mdp.as_state(state.belief))
+        return jnp.argmax(jnp.asarray(values))
+
+    return act
+
+
+def uniform(mdp: MapMdp) -> Policy:
+    """Every action with equal chance."""
+    return lambda key, state: jax.random.randint(key, (), 0, mdp.num_pois + 1)
+
+
+def naive(mdp: MapMdp, modality: int) -> Policy:
+    """Naive exploration: the first PoI that the own sensor has not seen, NOP when all are."""
+
+    def act(key: Key, state: MapState) -> jax.Array:
+        del key
+        own = state.seen[:, modality]
+        return jnp.where(jnp.all(own), mdp.num_pois, jnp.argmin(own))
+
+    return act
+
+
+def expected_rewards(key: Key, mdp: MapMdp, modality: int, num_draws: int) -> jax.Array:
+    """Expected reward of a look, by what it is a look at.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      modality: index of the agent's own sensor; static.
+      num_draws: simulated looks for each entry of the table.
+
+    Returns:
+      `[2^M, C]` mean reward of looking at a PoI of class c after the looks that the bits of the
+      first index tell of, modality m being bit m.
+    """
+
+    def reward(key: Key, code: jax.Array, poi_class: jax.Array) -> jax.Array:
+        reset_key, look_key = jax.random.split(key)
+        bits = (code >> jnp.arange(mdp.num_modalities) & 1).astype(bool)
+        seen = jnp.broadcast_to(bits, (mdp.num_pois, mdp.num_modalities))
+        classes = jnp.full(mdp.num_pois, poi_class)
+        state = belief_mdp.reset(reset_key, mdp, classes, seen)
+        return belief_mdp.step(look_key, mdp, state, jnp.int32(0), modality)[1].reward
+
+    of_draws = jax.vmap(reward, in_axes=(0, None, None))
+    of_classes = jax.vmap(of_draws, in_axes=(0, None, 0))
+    of_codes = jax.vmap(of_classes, in_axes=(0, 0, None))
+    shape = (2**mdp.num_modalities, mdp.num_classes)
+    keys = jax.random.split(key, (*shape, num_draws))
+    return of_codes(keys, jnp.arange(shape[0]), jnp.arange(shape[1])).mean(axis=-1)
+
+
+def optimal(mdp: MapMdp, rewards: jax.Array, label_of_class: jax.Array) -> Policy:
+    """Greedy on the true expected reward, given what the looks so far can have told.
+
+    Optimal for the total reward, because PoIs are independent: every look that pays is worth taking
+    and the order is free. It knows which looks have been taken and what they should have told, not
+    the noise of single detections.
+
+    Args:
+      mdp: the MDP.
+      rewards: `[2^M, C]` from `expected_rewards`, for the agent's own modality.
+      label_of_class: `[M, C]` int32, what each modality detects of each class. Classes that every
+        modality that has looked detects as it does the true one are equally likely.
+
+    Returns:
+      The policy; it uses the hidden parts of the state.
+    """
+    shape = (mdp.num_modalities, mdp.num_classes)
+    chex.assert_shape(label_of_class, shape, custom_message="label_of_class")
+    chex.assert_shape(rewards, (2 ** shape[0], shape[1]), custom_message="rewards")
+
+    def of_poi(seen: jax.Array, poi_class: jax.Array) -> jax.Array:
+        is_same = label_of_class == label_of_class[:, poi_class][:, None]
+        is_open = jnp.all(is_same | ~seen[:, None], axis=0)
+        code = jnp.sum(seen << jnp.arange(mdp.num_modalities))
+        return jnp.sum(rewards[code] * is_open) / jnp.sum(is_open)
+
+    def act(key: Key, state: MapState) -> jax.Array:
+        del key
+        return jnp.argmax(jnp.append(jax.vmap(of_poi)(state.seen, state.classes), 0.0))
+
+    return act

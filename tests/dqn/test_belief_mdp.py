@@ -1,0 +1,249 @@
+"""The map MDP on looks without networks, whose rewards are worked by hand."""
+
+import itertools
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import classes_mdp, noisy_mdp
+
+from jaxsense.dqn import belief_mdp
+from jaxsense.types import Belief
+
+NOP = 3
+MDP = classes_mdp()
+UNSEEN_STD = 4.472136  # sqrt(20)
+UNSEEN_INFORMATION = 0.158114  # 1 / sqrt(20 + 20)
+CLASSES = jnp.array([0, 1, 2])
+SEEN = jnp.array([[False, False], [True, False], [True, True]])
+
+
+@jax.jit
+def reset(key, classes, seen):
+    return belief_mdp.reset(key, MDP, classes, seen)
+
+
+@jax.jit
+def camera_step(state, action):
+    return belief_mdp.step(jax.random.key(0), MDP, state, action, 0)
+
+
+@jax.jit
+def lidar_step(state, action):
+    return belief_mdp.step(jax.random.key(0), MDP, state, action, 1)
+
+
+def start(seen=SEEN):
+    return reset(jax.random.key(0), CLASSES, seen)
+
+
+def test_information_is_the_inverse_norm_of_the_deviations():
+    # 1 / sqrt(9 + 16) = .2 and 1 / sqrt(.36 + .64) = 1.
+    np.testing.assert_allclose(
+        belief_mdp.information(jnp.array([[3.0, 4.0], [0.6, 0.8]])), [0.2, 1.0], rtol=1e-6
+    )
+
+
+def test_state_is_mean_and_deviation_of_one_poi_after_the_other():
+    belief = Belief(jnp.array([[1.0, 2.0], [5.0, 6.0]]), jnp.array([[3.0, 4.0], [7.0, 8.0]]))
+    np.testing.assert_array_equal(belief_mdp.as_state(belief), [1, 2, 3, 4, 5, 6, 7, 8])
+    with pytest.raises(AssertionError, match="belief"):
+        belief_mdp.as_state(Belief(jnp.zeros(2), jnp.ones(2)))
+
+
+def test_reset_writes_what_has_been_seen_and_nothing_else():
+    state = start()
+    np.testing.assert_array_equal(state.seen, SEEN)
+    np.testing.assert_array_equal(state.classes, CLASSES)
+    np.testing.assert_allclose(
+        state.belief.std, [[UNSEEN_STD, UNSEEN_STD], [3.0, 4.0], [0.6, 0.8]], rtol=1e-6
+    )
+    # The mean is (class, last modality): PoI 1 was seen by modality 0, PoI 2 by both.
+    np.testing.assert_array_equal(state.belief.mean[:2], [[0.0, 0.0], [1.0, 0.0]])
+    assert state.belief.mean[2, 0] == 2.0
+    assert state.steps == 0
+
+
+def test_reset_writes_the_modalities_in_random_order():
+    seen = jnp.ones((3, 2), bool)
+    states = jax.vmap(reset, in_axes=(0, None, None))(
+        jax.random.split(jax.random.key(0), 400), CLASSES, seen
+    )
+    last = np.asarray(states.belief.mean[:, :, 1])
+    # A fair coin for each PoI: 1/2 +- 4 sqrt(.25 / 400) = +- .1; two agree half of the time.
+    np.testing.assert_allclose(last.mean(axis=0), 0.5, atol=0.1)
+    np.testing.assert_allclose(np.mean(last[:, 0] == last[:, 1]), 0.5, atol=0.1)
+
+
+def test_a_first_look_pays_its_gain_of_information():
+    after, outcome = lidar_step(start(), jnp.int32(0))
+    np.testing.assert_allclose(outcome.reward, 0.2 - UNSEEN_INFORMATION, rtol=1e-4)
+    assert not outcome.is_over
+    assert not outcome.is_cut
+    np.testing.assert_allclose(after.belief.mean[0], [0.0, 1.0])  # class 0 by modality 1
+    np.testing.assert_allclose(after.belief.std[0], [3.0, 4.0])
+    assert after.steps == 1
+
+
+def test_a_look_at_what_the_other_has_seen_pays_more():
+    after, outcome = lidar_step(start(), jnp.int32(1))
+    np.testing.assert_allclose(outcome.reward, 1.0 - 0.2, rtol=1e-5)
+    np.testing.assert_array_equal(after.seen[1], [True, True])
+
+
+@pytest.mark.parametrize("step", [camera_step, lidar_step])
+def test_a_second_look_with_the_same_sensor_costs_one(step):
+    _, outcome = step(start(), jnp.int32(2))  # seen by both: no gain
+    assert outcome.reward == -1.0
+    _, outcome = camera_step(start(), jnp.int32(1))
+    assert outcome.reward == -1.0
+
+
+@pytest.mark.parametrize(("min_increase", "pays"), [(0.75, True), (0.85, False)])
+def test_a_gain_below_the_threshold_costs_one(min_increase, pays):
+    mdp = classes_mdp(min_increase=min_increase)  # against a gain of 1 - .2 = .8
+    _, outcome = belief_mdp.step(jax.random.key(0), mdp, start(), jnp.int32(1), 1)
+    np.testing.assert_allclose(outcome.reward, 0.8 if pays else -1.0, rtol=1e-5)
+
+
+def test_a_look_changes_the_entry_and_the_seen_bit_of_its_poi_alone():
+    before = start(seen=jnp.zeros((3, 2), bool))
+    for poi in range(3):
+        after, _ = lidar_step(before, jnp.int32(poi))
+        expected = np.zeros((3, 2), bool)
+        expected[poi, 1] = True
+        np.testing.assert_array_equal(after.seen, expected)
+        others = np.arange(3) != poi
+        np.testing.assert_array_equal(after.belief.mean[others], before.belief.mean[others])
+        np.testing.assert_array_equal(after.belief.std[others], before.belief.std[others])
+        assert after.belief.std[poi, 0] == 3.0
+
+
+def test_nop_gives_nothing_ends_the_episode_and_leaves_the_map():
+    before = start()
+    after, outcome = lidar_step(before, jnp.int32(NOP))
+    assert outcome.reward == 0.0
+    assert outcome.is_over
+    assert not outcome.is_cut
+    for name in ("belief", "seen", "classes", "scene"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(after, name), getattr(before, name))
+
+
+def test_an_episode_is_cut_after_max_steps():
+    mdp, state, cut = classes_mdp(max_steps=3), start(), []
+    for _ in range(3):
+        state, outcome = belief_mdp.step(jax.random.key(0), mdp, state, jnp.int32(0), 0)
+        cut.append(bool(outcome.is_cut))
+        assert not outcome.is_over
+    assert cut == [False, False, True]
+    # An episode that NOP ends is not cut as well.
+    late = replace(state, steps=jnp.int32(2))
+    _, outcome = belief_mdp.step(jax.random.key(0), mdp, late, jnp.int32(NOP), 0)
+    assert outcome.is_over
+    assert not outcome.is_cut
+
+
+def permute(state, order):
+    return replace(
+        state,
+        belief=jax.tree.map(lambda x: x[order], state.belief),
+        seen=state.seen[order],
+        classes=state.classes[order],
+        scene=state.scene[order],
+    )
+
+
+ORDERS = jnp.array(list(itertools.permutations(range(3))))
+
+
+@pytest.mark.parametrize("mdp", [MDP, noisy_mdp()], ids=["classes", "noisy"])
+@pytest.mark.parametrize("modality", [0, 1])
+def test_permuting_pois_permutes_what_a_step_does(mdp, modality):
+    state = belief_mdp.reset(jax.random.key(0), mdp, jnp.array([2, 0, 1]), SEEN)
+
+    def both_ways(order, action):
+        # PoI n of the permuted state is PoI order[n] of the other.
+        action_there = jnp.append(order, NOP)[action]
+        key = jax.random.key(1)
+        here, outcome = belief_mdp.step(key, mdp, permute(state, order), action, modality)
+        there, outcome_there = belief_mdp.step(key, mdp, state, action_there, modality)
+        return (here, outcome), (permute(there, order), outcome_there)
+
+    pairs = jax.vmap(jax.vmap(both_ways, in_axes=(None, 0)), in_axes=(0, None))
+    here, there = jax.jit(pairs)(ORDERS, jnp.arange(4))
+    jax.tree.map(np.testing.assert_array_equal, here, there)
+    assert len(np.unique(here[1].reward)) > 2  # the actions differ
+
+
+def test_permuting_pois_permutes_what_a_reset_does():
+    key = jax.random.key(0)
+    state = reset(key, CLASSES, SEEN)
+    for order in ORDERS:
+        permuted = reset(key, CLASSES[order], SEEN[order])
+        expected = permute(state, order)
+        np.testing.assert_array_equal(permuted.belief.std, expected.belief.std)
+        np.testing.assert_array_equal(permuted.belief.mean[:, 0], expected.belief.mean[:, 0])
+        np.testing.assert_array_equal(permuted.classes, expected.classes)
+
+
+@pytest.fixture(scope="module")
+def many_starts():
+    keys = jax.random.split(jax.random.key(0), 12_400)
+    classes, seen = jax.jit(jax.vmap(lambda key: belief_mdp.random_start(key, MDP)))(keys)
+    return np.asarray(classes), np.asarray(seen)
+
+
+def test_slots_draw_their_classes_independently(many_starts):
+    classes, _ = many_starts
+    _, counts = np.unique(classes @ [9, 3, 1], return_counts=True)
+    # All 27 combinations, 12400 / 27 = 459 of each: chi-square of 26 degrees of freedom, p = 1e-4.
+    assert len(counts) == 27
+    assert np.sum((counts - 12_400 / 27) ** 2 / (12_400 / 27)) < 61.7
+    # The same class in two slots: 1/3 +- 4 sqrt(1/3 x 2/3 / 12400) = +- .017.
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        np.testing.assert_allclose(np.mean(classes[:, i] == classes[:, j]), 1 / 3, atol=0.017)
+
+
+def test_partly_seen_starts_are_uniform_over_all_but_all_and_nothing(many_starts):
+    _, seen = many_starts
+    codes = seen.reshape(-1, 6) @ (1 << np.arange(6))
+    counts = np.bincount(codes, minlength=64)
+    assert counts[0] == 0
+    assert counts[63] == 0
+    # 62 codes, 200 of each: chi-square of 61 degrees of freedom, p = 1e-4.
+    assert np.sum((counts[1:63] - 200) ** 2 / 200) < 110.0
+
+
+def test_starts_may_hold_all_and_nothing_if_not_partly_seen():
+    mdp = classes_mdp(num_pois=1, partly_seen_starts=False)
+    keys = jax.random.split(jax.random.key(0), 1000)
+    _, seen = jax.vmap(lambda key: belief_mdp.random_start(key, mdp))(keys)
+    counts = np.bincount(np.asarray(seen).reshape(-1, 2) @ [1, 2], minlength=4)
+    # Two fair coins: 250 of each +- 4 sqrt(1000 x 3/16) = +- 55.
+    np.testing.assert_allclose(counts, 250, atol=55)
+
+
+def test_classes_and_looks_of_a_start_are_unrelated(many_starts):
+    classes, seen = many_starts
+    columns = np.concatenate([classes, seen.reshape(-1, 6)], axis=1).T
+    cross = np.corrcoef(columns)[:3, 3:]
+    assert np.max(np.abs(cross)) < 4 / np.sqrt(12_400)  # four standard errors
+
+
+def test_three_modalities_need_nothing_new():
+    mdp = classes_mdp(num_modalities=3)
+    seen = jnp.array([[True, True, False], [False, False, True], [False, False, False]])
+    state = belief_mdp.reset(jax.random.key(0), mdp, CLASSES, seen)
+    _, outcome = belief_mdp.step(jax.random.key(0), mdp, state, jnp.int32(0), 2)
+    np.testing.assert_allclose(outcome.reward, 2.0 - 1.0, rtol=1e-5)  # (.6, .8) to (.3, .4)
+
+
+def test_wrong_shapes_raise_errors_that_name_the_argument():
+    with pytest.raises(AssertionError, match="classes"):
+        belief_mdp.reset(jax.random.key(0), MDP, classes=jnp.zeros(2, int))
+    with pytest.raises(AssertionError, match="seen"):
+        belief_mdp.reset(jax.random.key(0), MDP, seen=jnp.zeros((2, 3), bool))
+    with pytest.raises(AssertionError, match="action"):
+        belief_mdp.step(jax.random.key(0), MDP, start(), jnp.zeros(3, int), 0)

@@ -1,0 +1,201 @@
+"""Deep Q-learning on a probe whose values are known, and the bookkeeping around it."""
+
+from dataclasses import replace
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import paying_once_mdp
+
+from jaxsense.config import DqnConfig
+from jaxsense.dqn import belief_mdp, policies, training
+
+# Every episode is cut after one action: no value could be learnt beyond it, were a cut an end.
+MDP = paying_once_mdp(num_pois=2, max_steps=1)
+FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
+PROBE = DqnConfig(
+    num_envs=32,
+    epochs=800,
+    chunk=800,
+    updates=2,
+    batch=64,
+    replay_capacity=4096,
+    discount=0.5,
+    learning_rate=1e-2,
+    final_learning_rate=1e-4,
+    epsilon_min=0.5,
+    target_period=20,
+    num_starts=256,
+)
+SEEN = jnp.array([[[0], [0]], [[1], [0]], [[0], [1]], [[1], [1]]], bool)
+# A first look gains .8 and a second costs 1; with gamma = .5, for look 0, look 1 and NOP:
+Q = np.array(
+    [
+        [1.2, 1.2, 0.0],  # .8 + .5 x .8
+        [-0.6, 0.8, 0.0],  # -1 + .5 x .8; .8 + .5 x 0
+        [0.8, -0.6, 0.0],
+        [-1.0, -1.0, 0.0],  # -1 + .5 x 0
+    ]
+)
+SMALL = DqnConfig(
+    hidden=(8,),
+    num_envs=8,
+    epochs=12,
+    chunk=1,
+    updates=1,
+    batch=8,
+    replay_capacity=64,
+    epsilon_decay=0.5,
+    epsilon_min=0.1,
+    target_period=3,
+    num_starts=16,
+)
+
+
+def states():
+    classes = jnp.zeros(2, int)
+    return jax.vmap(lambda seen: belief_mdp.reset(jax.random.key(0), MDP, classes, seen))(SEEN)
+
+
+@pytest.fixture(scope="module")
+def probe():
+    """Two seeds of the probe."""
+    train = jax.jit(
+        jax.vmap(lambda key: training.train(key, MDP, 0, PROBE)), compiler_options=FAST_TO_COMPILE
+    )
+    return train(jax.random.split(jax.random.key(0), 2))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_values_are_those_worked_by_hand(probe, seed):
+    params = jax.tree.map(lambda x: x[seed], probe[0].params)
+    inputs = jax.vmap(belief_mdp.as_state)(states().belief)
+    values = policies.q_network(MDP, PROBE.hidden).apply(params, inputs)
+    np.testing.assert_allclose(np.asarray(values), Q, atol=0.05)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_greedy_policy_is_optimal_after_training(probe, seed):
+    params = jax.tree.map(lambda x: x[seed], probe[0].params)
+    act = policies.greedy(MDP, params, PROBE.hidden)
+    actions = jax.vmap(act, in_axes=(None, 0))(jax.random.key(0), states())
+    assert actions[0] in (0, 1)
+    assert tuple(actions[1:]) == (1, 0, 2)
+
+
+def test_loss_falls_and_info_is_per_epoch(probe):
+    state, info = probe
+    assert info.loss.shape == info.episode_return.shape == (2, PROBE.epochs)
+    assert np.all(info.loss[:, -50:].mean(axis=1) < 0.1 * info.loss[:, :50].mean(axis=1))
+    assert np.all(state.epoch == PROBE.epochs)
+    np.testing.assert_array_equal(info.episodes, PROBE.num_envs)  # all are cut after one action
+    np.testing.assert_array_equal(state.replay.count, PROBE.epochs * PROBE.num_envs)
+
+
+def test_returns_of_exploring_and_learnt_behaviour(probe):
+    _, info = probe
+    # At random: .5 x .8 - .5 x 1 for a look and 0 for NOP, so -.1 x 2/3 = -.067. The best takes
+    # .8 in 3 of 4 starts: .6; with epsilon = .5 it is (.6 - .067) / 2 = .267.
+    np.testing.assert_allclose(info.episode_return[:, :5].mean(), -0.067, atol=0.15)
+    np.testing.assert_allclose(info.episode_return[:, -400:].mean(), 0.267, atol=0.05)
+
+
+@pytest.fixture(scope="module")
+def chunks():
+    """States of a small training after every epoch, and the infos, stepped from the host."""
+    config = SMALL
+
+    @chex.assert_max_traces(n=1)  # a second chunk must not be traced again
+    def chunk(key, state):
+        return training.train_chunk(key, MDP, 0, config, state)
+
+    chunk = jax.jit(chunk, compiler_options=FAST_TO_COMPILE)
+    init_key, chunk_key = jax.random.split(jax.random.key(0))
+    all_states, infos = [training.init(init_key, MDP, config)], []
+    for key in jax.random.split(chunk_key, config.epochs):
+        state, info = chunk(key, all_states[-1])
+        all_states.append(state)
+        infos.append(info)
+    return all_states, jax.tree.map(lambda *x: jnp.concatenate(x), *infos)
+
+
+def test_epsilon_falls_by_its_factor_every_epoch_down_to_the_floor(chunks):
+    np.testing.assert_allclose(chunks[1].epsilon[:6], [1.0, 0.5, 0.25, 0.125, 0.1, 0.1])
+
+
+def test_target_is_a_copy_from_the_last_multiple_of_its_period(chunks):
+    all_states, _ = chunks
+    for epoch, state in enumerate(all_states):
+        copied_at = epoch // SMALL.target_period * SMALL.target_period
+        source = all_states[copied_at].params
+        jax.tree.map(np.testing.assert_array_equal, state.target, source)
+        if epoch:
+            before = jax.tree.leaves(all_states[epoch - 1].params)
+            leaves = jax.tree.leaves(state.params)
+            assert not all(np.array_equal(x, y) for x, y in zip(leaves, before, strict=True))
+
+
+def train_small_once(key):
+    return training.train(key, MDP, 0, SMALL)
+
+
+@pytest.fixture(scope="module")
+def train_small():
+    return jax.jit(lambda key: training.train(key, MDP, 0, SMALL), compiler_options=FAST_TO_COMPILE)
+
+
+def test_training_in_one_call_equals_chunks_with_the_same_keys(chunks, train_small):
+    all_states, infos = chunks
+    state, info = train_small(jax.random.key(0))
+    chex.assert_trees_all_close((state, info), (all_states[-1], infos), rtol=1e-5, atol=1e-6)
+
+
+def test_training_over_seeds_equals_single_trainings(train_small):
+    keys = jax.random.split(jax.random.key(1), 3)
+    train_together = jax.jit(jax.vmap(train_small_once), compiler_options=FAST_TO_COMPILE)
+    together, info = train_together(keys)
+    for i, key in enumerate(keys):
+        alone, info_alone = train_small(key)
+        here = jax.tree.map(lambda x: x[i], (together.params, info))  # noqa: B023
+        chex.assert_trees_all_close(here, (alone.params, info_alone), rtol=1e-4, atol=1e-5)
+    assert len(np.unique(info.loss[:, 0])) == 3
+
+
+def test_an_episode_goes_on_until_nop_or_the_cut():
+    mdp = paying_once_mdp(num_pois=1, max_steps=3)
+    # A tall bias makes the network look for ever; epsilon is 0.
+    config = DqnConfig(
+        hidden=(4,),
+        num_envs=4,
+        epochs=7,
+        chunk=7,
+        updates=1,
+        batch=4,
+        replay_capacity=64,
+        learning_rate=1e-9,
+        final_learning_rate=0.0,
+        epsilon_start=0.0,
+        epsilon_min=0.0,
+        num_starts=8,
+    )
+    state = training.init(jax.random.key(0), mdp, config)
+    layers = state.params["params"]
+    layers = {**layers, "Dense_1": {**layers["Dense_1"], "bias": jnp.array([1e3, -1e3])}}
+    state = replace(state, params={"params": layers})
+    chunk = jax.jit(
+        lambda state: training.train_chunk(jax.random.key(1), mdp, 0, config, state),
+        compiler_options=FAST_TO_COMPILE,
+    )
+    state, info = chunk(state)
+    np.testing.assert_array_equal(info.episodes, [0, 0, 4, 0, 0, 4, 0])
+    # Three looks at one PoI: .8 - 1 - 1 if it had not been seen, else -3.
+    ended = np.asarray(info.episode_return)[[2, 5]]
+    seen_before = np.round((-1.2 - ended) / 1.8 * 4)  # of 4 episodes
+    np.testing.assert_allclose(ended, -1.2 - 1.8 * seen_before / 4, atol=1e-5)
+    np.testing.assert_array_equal(np.asarray(info.episode_return)[[0, 1, 3, 4, 6]], 0.0)
+    np.testing.assert_array_equal(state.needs_start, False)
+    np.testing.assert_array_equal(state.envs.steps, 1)
+    # The replay tells what is left of an episode that was cut, so the discount is never 0 here.
+    np.testing.assert_array_equal(state.replay.items.discount_t[:28], 1.0)

@@ -1,0 +1,102 @@
+"""Whole episodes with known totals, and the count of the map's states."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import classes_mdp, noisy_mdp
+
+from jaxsense.dqn import belief_mdp, evaluation, policies
+
+MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
+
+
+def scripted(*actions):
+    """A policy that takes the given actions one after the other."""
+    table = jnp.array(actions)
+    return lambda key, state: table[state.steps]
+
+
+def play(mdp, policy, seen, modality=0):
+    state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.array(seen, bool))
+    return evaluation.play(KEY, mdp, policy, state, modality)
+
+
+def test_every_state_of_the_paper_is_there_once():
+    classes, seen = evaluation.every_state(MDP)
+    assert classes.shape == (384, 3)  # 3! x 2^6
+    assert seen.shape == (384, 3, 2)
+    rows = np.concatenate([classes, seen.reshape(-1, 6)], axis=1)
+    assert len(np.unique(rows, axis=0)) == 384
+    np.testing.assert_array_equal(np.sort(classes, axis=1), np.tile([0, 1, 2], (384, 1)))
+
+
+@pytest.mark.parametrize(("num_pois", "expected"), [(1, 3 * 4), (2, 6 * 16), (4, 4096)])
+def test_every_state_of_other_maps(num_pois, expected):
+    classes, seen = evaluation.every_state(classes_mdp(num_pois=num_pois))
+    assert seen.shape == (expected, num_pois, 2)
+    rows = np.concatenate([classes, seen.reshape(expected, -1)], axis=1)
+    assert len(np.unique(rows, axis=0)) == expected
+
+
+def test_of_very_many_states_an_even_sample_is_taken():
+    classes, seen = evaluation.every_state(classes_mdp(num_pois=8))  # of 3^8 x 2^16
+    assert classes.shape == (4096, 8)
+    rows = np.concatenate([classes, seen.reshape(4096, -1)], axis=1)
+    assert len(np.unique(rows, axis=0)) == 4096
+    shares = np.stack([np.mean(classes == c, axis=0) for c in range(3)])
+    np.testing.assert_allclose(shares, 1 / 3, atol=0.05)
+    np.testing.assert_allclose(seen.mean(axis=0), 0.5, atol=0.05)
+
+
+def test_naive_play_has_the_total_worked_by_hand():
+    # PoI 0 unseen: .2 - .158114; PoI 1 seen by the LiDAR: 1 - .2; PoI 2 seen by both: no look.
+    total, first = play(MDP, policies.naive(MDP, 0), [[0, 0], [0, 1], [1, 1]])
+    np.testing.assert_allclose(total, 0.041886 + 0.8, rtol=1e-4)
+    np.testing.assert_allclose(first, 0.041886, rtol=1e-3)
+
+
+def test_play_with_the_other_modality():
+    total, first = play(MDP, scripted(1, NOP), [[0, 0], [1, 0], [1, 1]], modality=1)
+    np.testing.assert_allclose([total, first], 0.8, rtol=1e-5)
+    total, first = play(MDP, scripted(1, NOP), [[0, 0], [1, 0], [1, 1]], modality=0)
+    np.testing.assert_allclose([total, first], -1.0)
+
+
+def test_first_reward_is_that_of_the_first_action_alone():
+    total, first = play(MDP, scripted(2, 1, 2, NOP), [[0, 0], [0, 1], [1, 1]])
+    np.testing.assert_allclose(first, -1.0)
+    np.testing.assert_allclose(total, -1.0 + 0.8 - 1.0, rtol=1e-5)
+    total, first = play(MDP, scripted(NOP, 1), [[0, 0], [0, 1], [1, 1]])
+    assert (total, first) == (0.0, 0.0)
+
+
+def test_play_is_cut_after_max_steps():
+    mdp = classes_mdp(max_steps=4)
+    total, _ = play(mdp, lambda key, state: jnp.int32(0), np.ones((3, 2)))
+    np.testing.assert_allclose(total, -4.0)
+
+
+def test_the_kth_look_at_a_poi_sees_the_same_in_any_order():
+    mdp, seen = noisy_mdp(), np.zeros((3, 2))  # what a look adds depends on its key alone
+    total, first = play(mdp, scripted(0, 1, 0, 2, NOP), seen)
+    others = [play(mdp, scripted(*a, NOP), seen) for a in ((2, 0, 0, 1), (1, 2, 0, 0))]
+    np.testing.assert_allclose([t for t, _ in others], total, rtol=1e-5)
+    # Looks at different PoIs see different things, and so do two looks at one.
+    firsts = [first, *(f for _, f in others)]
+    assert len(np.unique(np.round(firsts, 4))) == 3
+    twice, once = play(mdp, scripted(0, 0, NOP), seen)
+    assert not np.isclose(twice, 2 * once)
+
+
+def test_policies_draw_anew_at_every_step():
+    def coin(key, state):  # ends the episode with a chance of one half at every step
+        return jnp.where(jax.random.bernoulli(key), NOP, 0)
+
+    mdp = classes_mdp(max_steps=20)
+    state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.ones((3, 2), bool))
+    keys = jax.random.split(KEY, 400)
+    totals, _ = jax.vmap(lambda key: evaluation.play(key, mdp, coin, state, 0))(keys)
+    # Looks in vain until the first NOP: geometric, mean 1, variance 2; +- 4 sqrt(2 / 400).
+    np.testing.assert_allclose(-totals.mean(), 1.0, atol=0.29)
+    assert len(np.unique(totals)) >= 5
