@@ -1,0 +1,29 @@
+"""Coordinated multi-modal robot perception in JAX.
+
+Robots with different sensors look at points of interest, write what they see into one shared map of
+latent Gaussians, and a policy for each sensor decides where looking next buys the most information.
+After Korthals, Leitner and Rueckert, "Coordinated Heterogeneous Distributed Perception based on
+Latent Space Representation", 2018.
+
+The parts are `jaxsense.sim` (arena, ray-caster, sensors), `jaxsense.vae` (detectors, JMVAE, fusion)
+and `jaxsense.dqn` (map MDP, Q-learning); `jaxsense.observe` joins them, and `jaxsense.pipeline`
+trains them one after the other. Every function is pure, takes its random key first, and works on
+one example: `vmap` and `jit` are yours.
+"""
+
+from jaxsense import dqn as dqn
+from jaxsense import sim as sim
+from jaxsense import vae as vae
+from jaxsense.config import PRESETS as PRESETS
+from jaxsense.config import Config as Config
+from jaxsense.config import ConfigError as ConfigError
+from jaxsense.observe import bank_mdp as bank_mdp
+from jaxsense.observe import live_mdp as live_mdp
+from jaxsense.pipeline import Models as Models
+from jaxsense.pipeline import jmvae_shape as jmvae_shape
+from jaxsense.pipeline import untrained as untrained
+from jaxsense.rundir import load as load
+from jaxsense.types import Belief as Belief
+from jaxsense.types import Transition as Transition
+
+__version__ = "0.1.0"

@@ -1,0 +1,150 @@
+"""The two ways of looking, and that they see the same."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import observe
+from jaxsense.config import MODALITIES, PRESETS
+from jaxsense.dqn import belief_mdp
+from jaxsense.sim import world as worlds
+from jaxsense.vae import detectors, jmvae
+from jaxsense.vae.jmvae import Jmvae
+
+CONFIG = PRESETS["smoke"]
+MODEL = Jmvae(CONFIG.modalities, (2, 2), 2, (8,))
+NUM_LOOKS = 2048
+FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
+
+
+def numbered_bank():
+    """Detections that tell where they come from: (class + row / 10, modality)."""
+    classes, rows = jnp.meshgrid(jnp.arange(3.0), jnp.arange(5.0), indexing="ij")
+    place = classes + rows / 10
+    return tuple(jnp.stack([place, jnp.full_like(place, m)], axis=-1) for m in range(2))
+
+
+@pytest.mark.parametrize("modality", [0, 1])
+def test_bank_draws_every_detection_of_the_true_class_and_no_other(modality):
+    mdp = observe.bank_mdp(CONFIG, numbered_bank(), {}, MODEL)
+    classes = jnp.array([2, 0, 1])
+    scene = mdp.new_scene(jax.random.key(0), classes)
+    keys = jax.random.split(jax.random.key(1), 200)
+    for poi in range(3):
+        look = jax.vmap(lambda key: mdp.observe(key, scene, jnp.int32(poi), modality)[0])  # noqa: B023
+        features = look(keys)
+        expected = [int(classes[poi]) + row / 10 for row in range(5)]
+        np.testing.assert_allclose(np.unique(features[:, 0]), expected, rtol=1e-6)
+        np.testing.assert_array_equal(features[:, 1], modality)
+
+
+def test_bank_mdp_writes_by_the_jmvae():
+    params = jmvae.init(jax.random.key(0), MODEL)
+    mdp = observe.bank_mdp(CONFIG, numbered_bank(), params, MODEL)
+    assert (mdp.num_pois, mdp.num_classes, mdp.num_modalities) == (3, 3, 2)
+    seen = jnp.array([[0, 0], [0, 1], [1, 0]], bool)
+    reset = jax.jit(lambda key, *start: belief_mdp.reset(key, mdp, *start))
+    state = reset(jax.random.key(1), jnp.array([2, 0, 1]), seen)
+    np.testing.assert_allclose(state.belief.std[0], np.sqrt(20.0), rtol=1e-6)
+    # PoI 1 is of class 0 and was seen by the LiDAR: one of five entries.
+    encode = jax.vmap(lambda x: jmvae.encode(params, MODEL, (None, x))[0])
+    distances = np.abs(np.asarray(encode(numbered_bank()[1][0])) - state.belief.mean[1][None])
+    assert np.min(np.max(distances, axis=1)) < 1e-5
+
+
+@pytest.fixture(scope="module")
+def world():
+    return worlds.make_world(CONFIG)
+
+
+@pytest.fixture(scope="module", params=[0, 1], ids=CONFIG.modalities)
+def looks(request, world):
+    """A modality, a detector of a short training, its training windows and new ones."""
+    modality = request.param
+    first_looks = jax.jit(
+        lambda key: observe.first_looks(key, world, modality, 500 + NUM_LOOKS, chunk=1274),
+        compiler_options=FAST_TO_COMPILE,
+    )
+    windows, new = jnp.split(first_looks(jax.random.key(0)), [500], axis=1)
+    labels = jnp.array(CONFIG.arena.label_of_class(MODALITIES[CONFIG.modalities[modality]]))
+    config, flat = CONFIG.detector, windows.reshape(-1, windows.shape[-1])
+    detector = detectors.init(jax.random.key(1), flat, 2, config)
+    train = jax.jit(detectors.train, static_argnames=("config", "steps"))
+    inputs = detectors.start(detector, config), detector, flat, jnp.repeat(labels, 500)
+    state, _ = train(jax.random.key(2), *inputs, config=config, steps=200)
+    return modality, replace(detector, params=state.params), windows, new
+
+
+@pytest.fixture(scope="module")
+def features(looks, world):
+    """A modality, and features `[C, S, 2]` from the bank and, live, with their `[S]` classes."""
+    modality, detector, _, new = looks
+    bank = jax.jit(jax.vmap(jax.vmap(detectors.detect, in_axes=(None, 0)), in_axes=(None, 0)))
+    mdp = observe.live_mdp(CONFIG, world, (detector, detector), {}, MODEL)
+
+    def look_thrice(key):
+        class_key, poi_key, scene_key, look_key = jax.random.split(key, 4)
+        classes = jax.random.randint(class_key, (3,), 0, 3)
+        pois = jax.random.randint(poi_key, (3,), 0, 3)
+
+        def look(scene, inputs):
+            key, poi = inputs
+            seen, scene = mdp.observe(key, scene, poi, modality)
+            return scene, (classes[poi], seen)
+
+        scene = mdp.new_scene(scene_key, classes)
+        _, seen = jax.lax.scan(look, scene, (jax.random.split(look_key, 3), pois))
+        return jax.tree.map(lambda x: x[-1], seen)  # the last look of an episode
+
+    keys = jax.random.split(jax.random.key(3), NUM_LOOKS)
+    live = jax.jit(jax.vmap(look_thrice), compiler_options=FAST_TO_COMPILE)(keys)
+    return modality, np.asarray(bank(detector, new)), jax.tree.map(np.asarray, live)
+
+
+def test_first_looks_come_in_the_order_of_the_classes(looks):
+    modality, _, windows, _ = looks
+    sensor = (CONFIG.camera, CONFIG.lidar)[modality]
+    values = 3 if modality == 0 else 1  # red, green and blue
+    assert windows.shape == (3, 500, sensor.window * values)
+    middle = windows.reshape(3, 500, sensor.window, values)[:, :, sensor.window // 2]
+    if modality == 0:
+        # Green cylinder, red cylinder, red cube: the PoI is in the middle of its window.
+        is_green = np.asarray(middle[..., 1] > middle[..., 0])
+        assert np.all(is_green.mean(axis=1)[1:] < 0.02)
+        assert is_green.mean(axis=1)[0] > 0.98
+    else:
+        # A PoI's surface is .07 to .14 m nearer than its centre, which is .3 to 1.2 m away.
+        assert np.mean((middle > 0.1) & (middle < 1.2)) > 0.98
+
+
+def test_first_looks_are_all_different(looks):
+    windows = np.asarray(looks[2])
+    assert len(np.unique(windows.reshape(1500, -1), axis=0)) == 1500
+
+
+def test_a_short_training_tells_most_looks_apart(features):
+    modality, bank, (classes, live) = features
+    labels = np.array(CONFIG.arena.label_of_class(MODALITIES[CONFIG.modalities[modality]]))
+    of_bank = np.mean(bank.argmax(axis=-1) == labels[:, None])
+    of_live = np.mean(live.argmax(axis=-1) == labels[classes])
+    assert of_bank > 0.9
+    # Four standard errors of a share at worst .9, of 3 x 2048 and of 2048 looks.
+    error = np.sqrt(0.9 * 0.1 * (1 / bank[..., 0].size + 1 / len(live)))
+    np.testing.assert_allclose(of_live, of_bank, atol=4 * error)
+
+
+def test_live_and_bank_features_have_the_same_distribution(features):
+    _, bank, (classes, live) = features
+    for c in range(3):
+        here, there = live[classes == c, 0], bank[c, :, 0]
+        # Kolmogorov-Smirnov: the largest gap of the distribution functions; 1.95 is p = .001.
+        values = np.concatenate([here, there])
+        gaps = [np.searchsorted(np.sort(x), values, side="right") / len(x) for x in (here, there)]
+        scale = np.sqrt(1 / len(here) + 1 / len(there))
+        assert np.max(np.abs(gaps[0] - gaps[1])) < 1.95 * scale
+        # And the means, within four standard errors.
+        spread = np.std(values) + 1e-6
+        np.testing.assert_allclose(here.mean(), there.mean(), atol=4 * spread * scale)

@@ -1,0 +1,96 @@
+"""What the presets must reach, trained as a whole. Slow: run `pytest -m slow` before a release."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxsense import train
+
+pytestmark = pytest.mark.slow
+
+TABLE_1 = {
+    "joint": [True, True, True],
+    "camera": [True, False, False],
+    "lidar": [False, False, True],
+}
+
+
+@pytest.fixture(scope="module", params=[0, 1, 2])
+def seed(request):
+    return request.param
+
+
+def summary_of(preset: str, seed: int, path: Path, *options: str) -> dict:
+    train.main(["--preset", preset, "--seed", str(seed), "--out", str(path), *options])
+    return json.loads((path / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def default(seed, tmp_path_factory):
+    return summary_of("default", seed, tmp_path_factory.mktemp("runs") / "default")
+
+
+@pytest.fixture(scope="module")
+def paper(seed, tmp_path_factory):
+    return summary_of("paper", seed, tmp_path_factory.mktemp("runs") / "paper")
+
+
+def sigma_norms(summary: dict) -> tuple[list[float], list[float]]:
+    """Norms of sigma of the unambiguous cells of Table I, and of the ambiguous ones."""
+    norms = summary["jmvae"]["sigma_norm"]
+    cells = [(norms[m][c], clear) for m, row in TABLE_1.items() for c, clear in enumerate(row)]
+    return [norm for norm, clear in cells if clear], [norm for norm, clear in cells if not clear]
+
+
+def check_common(summary: dict) -> None:
+    assert all(block["accuracy"] >= 0.99 for block in summary["detectors"].values())
+    assert summary["jmvae"]["unambiguous"] == TABLE_1
+    assert summary["jmvae"]["moment_matching_error"] <= 0.10
+    assert all(block["num_states"] == 384 for block in summary["dqn"].values())
+
+
+def test_default_preset(default):
+    check_common(default)
+    latent = default["jmvae"]
+    clear, ambiguous = sigma_norms(default)
+    assert latent["active_units"] == 2
+    assert min(ambiguous) / max(clear) >= 2.0
+    assert latent["fusion"]["accuracy"] >= 0.99
+    assert latent["fusion"]["mean_error"] <= 0.5
+    for block in default["dqn"].values():
+        assert block["fraction_of_optimal"] >= 0.99
+        assert block["optimal_states"] >= 380
+        assert block["one_step"]["policy"] / block["one_step"]["optimal"] >= 0.98
+    assert default["timing"]["total_s"] <= 180
+
+
+def test_paper_preset(paper):
+    check_common(paper)
+    clear, ambiguous = sigma_norms(paper)
+    assert min(clear) >= 1.00
+    assert max(ambiguous) <= 1.30
+    assert max(clear) < min(ambiguous)
+    assert paper["jmvae"]["fusion"]["accuracy"] >= 0.97
+    for block in paper["dqn"].values():
+        assert block["fraction_of_optimal"] >= 0.97
+        assert block["one_step"]["policy"] / block["one_step"]["optimal"] >= 0.95
+    assert paper["timing"]["total_s"] <= 300
+
+
+def test_live_and_bank_train_equally_good_policies(default, seed, tmp_path):
+    # The same seed trains the same detectors and the same JMVAE, so that rewards are comparable.
+    bank = summary_of("default", seed, tmp_path / "bank", "--dqn.observe", "bank")
+    assert bank["jmvae"] == default["jmvae"]
+    for modality, block in bank["dqn"].items():
+        assert block["return"] == pytest.approx(default["dqn"][modality]["return"], rel=0.01)
+
+
+def test_memory_stays_below_four_gibibytes(default):
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit <= 4 * 2**30
+    assert np.isfinite(default["timing"]["total_s"])

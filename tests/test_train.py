@@ -1,0 +1,199 @@
+"""The command line, run as a user runs it: in-process, with the smoke preset."""
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsense
+from jaxsense import train
+from jaxsense.config import PRESETS, Config
+
+SMOKE = ["--preset", "smoke", "--seed", "3"]
+
+
+@pytest.fixture(scope="module")
+def cached_compilation(tmp_path_factory):
+    """Compiles each program once for all runs of this module."""
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("cache")))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    yield
+    jax.config.update("jax_compilation_cache_dir", None)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, cached_compilation) -> Path:
+    path = tmp_path_factory.mktemp("runs") / "first"
+    train.main([*SMOKE, "--out", str(path)])
+    return path
+
+
+def without_times(summary: dict) -> dict:
+    summary = {key: value for key, value in summary.items() if key != "timing"}
+    for block in summary["dqn"].values():
+        del block["env_steps_per_s"]
+    return summary
+
+
+def test_run_directory_holds_everything(run):
+    names = {path.name for path in run.iterdir()}
+    plots = {"latent_space.png", "reward.png", "scanlines.png"}
+    assert names == {"config.json", "metrics.jsonl", "summary.json", "checkpoints"} | plots
+    for plot in plots:
+        assert (run / plot).read_bytes()[:4] == b"\x89PNG"
+    stages = {json.loads(line)["stage"] for line in (run / "metrics.jsonl").open()}
+    assert {"detector_camera", "detector_lidar", "jmvae", "dqn_camera", "dqn_lidar"} <= stages
+
+
+def test_summary_keeps_its_contract(run):
+    summary = json.loads((run / "summary.json").read_text())
+    assert set(summary) == {
+        "preset", "seed", "versions", "devices", "timing", "detectors", "jmvae", "dqn"
+    }  # fmt: skip
+    assert summary["preset"] == "smoke"
+    assert summary["seed"] == 3
+    assert set(summary["timing"]) == {"total_s", "stages"}
+    for stage in summary["timing"]["stages"].values():
+        assert set(stage) == {"compile_s", "run_s"}
+    assert set(summary["detectors"]) == {"camera", "lidar"}
+    assert set(summary["detectors"]["camera"]) == {"accuracy"}
+    latent = summary["jmvae"]
+    assert set(latent) == {
+        "active_units", "sigma_norm", "unambiguous", "moment_matching_error", "fusion"
+    }  # fmt: skip
+    for block, kind in (("sigma_norm", float), ("unambiguous", bool)):
+        assert set(latent[block]) == {"joint", "camera", "lidar"}
+        for values in latent[block].values():
+            assert [type(value) for value in values] == [kind] * 3
+    assert set(latent["fusion"]) == {"accuracy", "mean_error"}
+    for block in summary["dqn"].values():
+        assert set(block) == {
+            "return", "optimal", "naive", "random", "fraction_of_optimal", "one_step",
+            "optimal_states", "num_states", "env_steps", "env_steps_per_s",
+        }  # fmt: skip
+        assert set(block["one_step"]) == {"policy", "optimal", "random"}
+        assert block["num_states"] == 384
+        assert block["env_steps"] == 60 * 32  # epochs x environments of the smoke preset
+        assert block["fraction_of_optimal"] == pytest.approx(block["return"] / block["optimal"])
+
+
+def test_same_seed_gives_the_same_summary(run, tmp_path):
+    train.main([*SMOKE, "--out", str(tmp_path / "second")])
+    first, second = (
+        without_times(json.loads((path / "summary.json").read_text()))
+        for path in (run, tmp_path / "second")
+    )
+    assert first == second
+
+
+def test_a_finished_run_is_loaded_with_its_settings(run):
+    config, models = jaxsense.load(run)
+    assert config == PRESETS["smoke"]
+    untrained = jaxsense.untrained(jax.random.key(0), config)
+    assert jax.tree.structure(models) == jax.tree.structure(untrained)
+    kernel = models.jmvae["encoders"]["camera"]["params"]["Dense_0"]["kernel"]
+    assert np.isfinite(kernel).all()
+    assert not np.array_equal(
+        kernel, untrained.jmvae["encoders"]["camera"]["params"]["Dense_0"]["kernel"]
+    )
+
+
+def test_another_run_is_never_overwritten(run, capsys):
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    line = error_line([*SMOKE, "--out", str(run)], capsys)
+    assert f"out = {str(run)!r}: is not empty; must be a new directory" in line
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
+    cached_compilation, tmp_path, capsys
+):
+    out = tmp_path / "broken"
+    line = error_line([*SMOKE, "--jmvae.learning-rate", "1e30", "--out", str(out)], capsys)
+    assert "jmvae: loss = nan at step" in line or "jmvae: loss = inf at step" in line
+    assert str(out) in line
+    assert (out / "checkpoints" / "detectors").is_dir()
+    assert (out / "config.json").exists()
+    assert not (out / "summary.json").exists()
+
+
+def error_line(argv: list[str], capsys) -> str:
+    """Runs the program, which must end with status 2 and one line of error."""
+    with pytest.raises(SystemExit) as stop:
+        train.main(argv)
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1, error
+    assert "Traceback" not in error
+    return error
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (["--preset", "best"], "preset = 'best': must be one of default, paper, smoke"),
+        (["--colour", "red"], "--colour"),
+        (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
+        (["--seed", "one"], "--seed: invalid literal for int() with base 10: 'one'"),
+        (["--dqn.num-envs", "-4"], "dqn.num_envs = -4: must be a number greater than 0"),
+        (["--dqn.observe", "ideal"], "'ideal'"),
+        (["--jmvae.hidden", "64", "0"], "jmvae.hidden = (64, 0): must be one or more layer sizes"),
+        (["--jmvae.beta", "nan"], "jmvae.beta = nan: must be a number greater than 0"),
+        (["--modalities"], "modalities = (): must name one or more of camera, lidar"),
+        (["--modalities", "sonar"], "modalities = ('sonar',): must be some of camera, lidar"),
+        (["--arena.num-pois", "50"], "arena.num_pois = 50: at most"),
+        (["--arena.classes", "pink cube"], "'pink cube' must be"),
+        (["--dqn.replay-capacity", "1000"], "dqn.replay_capacity = 1000: must be a multiple of"),
+        (["--lidar.window", "700"], "lidar.window = 700: at most 683 of 683 rays fit"),
+    ],
+)
+def test_bad_options_are_named_in_one_line(argv, expected, capsys, tmp_path):
+    out = tmp_path / "out"
+    assert expected in error_line([*argv, "--out", str(out)], capsys)
+    assert not out.exists()
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.write_text("kept")
+    line = error_line(["--preset", "smoke", "--out", str(file / "run")], capsys)
+    assert f"out = {str(file / 'run')!r}: cannot be written" in line
+    assert file.read_text() == "kept"
+
+
+def test_help_explains_every_field(capsys):
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--help"])
+    assert stop.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for option in ("--preset", "--seed", "--out", "--arena.side", "--dqn.epsilon-decay"):
+        assert option in text
+    assert "in metres" in text
+
+
+def test_every_setting_has_a_sentence_of_help():
+    import ast
+    import inspect
+
+    from jaxsense import config
+
+    for node in ast.parse(inspect.getsource(config)).body:
+        if (
+            isinstance(node, ast.ClassDef)
+            and node.name.endswith("Config")
+            and node.name != "Config"
+        ):
+            for field, following in zip(node.body, node.body[1:], strict=False):
+                if isinstance(field, ast.AnnAssign):
+                    assert isinstance(following, ast.Expr), f"{node.name}.{ast.unparse(field)}"
+
+
+def test_presets_are_configurations():
+    assert set(PRESETS) == {"default", "paper", "smoke"}
+    assert all(isinstance(preset, Config) for preset in PRESETS.values())
+    assert PRESETS["default"].dqn.observe == "live"
+    assert PRESETS["paper"].dqn.observe == "bank"
+    assert (PRESETS["paper"].jmvae.alpha, PRESETS["paper"].jmvae.beta) == (1.0, 0.1)
+    assert (PRESETS["paper"].dqn.epochs, PRESETS["paper"].dqn.num_envs) == (2000, 512)
