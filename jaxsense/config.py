@@ -176,6 +176,9 @@ class LidarConfig:
         _require_not_negative(self, "range_noise")
         _require(self.field_of_view <= 360.0, self, "field_of_view", "must be at most 360 degrees")
         _require(self.max_range > self.min_range, self, "max_range", "must be above min_range")
+        _require(
+            self.window_range > self.min_range, self, "window_range", "must be above min_range"
+        )
         _require_window(self, self.num_beams)
 
 
@@ -288,10 +291,10 @@ class JmvaeConfig:
         _require_not_negative(self, "alpha")
         _require(0 <= self.annealing <= 1, self, "annealing", "must be within 0 and 1")
         _require(
-            all(weight >= 0 for weight in self.reconstruction_weights),
+            all(math.isfinite(w) and w >= 0 for w in self.reconstruction_weights),
             self,
             "reconstruction_weights",
-            "must not be negative",
+            "must be numbers that are not negative",
         )
 
 
@@ -417,7 +420,7 @@ class Config:
             raise ConfigError(
                 "jmvae.reconstruction_weights",
                 weights,
-                f"must hold one weight for each of the {len(self.modalities)} modalities",
+                f"must hold one weight for each of modalities = {self.modalities}",
             )
         nearest = self.arena.poi_extent + ROBOT_RADIUS + self.viewpoint.clearance
         if self.viewpoint.min_distance < nearest:

@@ -42,8 +42,15 @@ class Monitor:
         return run
 
     def run(self, stage: str, function: Callable[..., Any], *args: Any) -> Any:
-        """Compiles a function and runs it once."""
-        return self.compile(stage, function, *args)(*args)
+        """Compiles a function and runs it once; reports the stage as done."""
+        output = self.compile(stage, function, *args)(*args)
+        self._listener(stage, 1, 1, {})
+        return output
+
+    def check_finite(self, stage: str, params: Any) -> None:
+        """Raises a `StageError` if a trained parameter is not finite."""
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params)):
+            raise StageError(f"{stage}: parameters are not finite after the last step")
 
     def report(
         self, stage: str, done: int, total: int, losses: np.ndarray, **figures: float

@@ -40,11 +40,13 @@ class Models:
     Attributes:
       detectors: one for each modality.
       jmvae: parameters of the JMVAE.
+      class_means: `[C, D]` mean joint posterior of each class, by which the map is read.
       q_networks: parameters of one Q-network for each modality.
     """
 
     detectors: tuple[Detector, ...]
     jmvae: Params
+    class_means: jax.Array
     q_networks: tuple[Params, ...]
 
 
@@ -67,15 +69,14 @@ class RunResult:
 
     Attributes:
       models: the trained networks.
-      banks: the detections.
       windows: for each modality `[C, 1, F]` one look at each class.
       posteriors: for each set of modalities, `[C, S', D]` beliefs of held-out detections.
-      rewards: for each modality `[epochs]` mean total reward of the episodes that ended.
+      rewards: for each modality `[epochs]` mean total reward of the episodes that ended; NaN where
+        none did.
       summary: the blocks `detectors`, `jmvae` and `dqn` of `summary.json`.
     """
 
     models: Models
-    banks: Banks
     windows: dict[str, np.ndarray]
     posteriors: dict[str, Belief]
     rewards: dict[str, np.ndarray]
@@ -103,6 +104,7 @@ def untrained(key: Key, config: Config) -> Models:
     return Models(
         detectors=trained,
         jmvae=jmvae.init(jmvae_key, jmvae_shape(config)),
+        class_means=jnp.zeros((len(config.arena.classes), config.jmvae.latent_size)),
         q_networks=tuple(q_network.init(k, state) for k in dqn_keys),
     )
 
@@ -135,6 +137,8 @@ def run(
     params = train_jmvae(jmvae_key, banks.train, config, monitor)
     keep("jmvae", params)
     posteriors, jmvae_figures = examine_jmvae(params, banks.held_out, config, monitor)
+    class_means = jnp.mean(posteriors["joint"].mean, axis=1)
+    keep("class_means", class_means)
 
     q_networks, rewards, dqn_figures = [], {}, {}
     for m, (name, dqn_key) in enumerate(zip(config.modalities, dqn_keys, strict=True)):
@@ -148,8 +152,7 @@ def run(
         dqn_figures[name] = {**figures, **speed}
 
     return RunResult(
-        models=Models(trained, params, tuple(q_networks)),
-        banks=banks,
+        models=Models(trained, params, class_means, tuple(q_networks)),
         windows=windows,
         posteriors=posteriors,
         rewards=rewards,
@@ -217,8 +220,12 @@ def _train_detector(key: Key, modality: int, world: World, monitor: Monitor):
         monitor.report(stage, (i + 1) * steps, settings.steps, np.asarray(losses))
     detector = dataclasses.replace(detector, params=state.params)
 
+    monitor.check_finite(stage, detector.params)
+
     detect = jax.vmap(jax.vmap(detectors.detect, in_axes=(None, 0)), in_axes=(None, 0))
-    bank, held_out_bank = (monitor.run(stage, detect, detector, x) for x in (for_bank, held_out))
+    looks = jnp.concatenate([for_bank, held_out], axis=1)
+    features = monitor.run(f"detect_{name}", detect, detector, looks)
+    bank, held_out_bank = jnp.split(features, [num_bank], axis=1)
     is_right = jnp.argmax(held_out_bank, axis=-1) == labels[:, None]
     return detector, bank, held_out_bank, np.asarray(windows[:, :1]), float(is_right.mean())
 
@@ -246,7 +253,9 @@ def train_jmvae(key: Key, bank: Bank, config: Config, monitor: Monitor) -> Param
         worst = np.asarray(losses.max(axis=0))
         monitor.report("jmvae", (i + 1) * steps, settings.steps, worst)
     best = jnp.argmin(losses.mean(axis=1))
-    return jax.tree.map(lambda x: x[best], states.params)
+    params = jax.tree.map(lambda x: x[best], states.params)
+    monitor.check_finite("jmvae", params)
+    return params
 
 
 def examine_jmvae(
@@ -267,7 +276,10 @@ def examine_jmvae(
     model = jmvae_shape(config)
     labels = [config.arena.label_of_class(MODALITIES[m]) for m in config.modalities]
     posteriors, figures = monitor.run(
-        "jmvae", lambda params, bank: _latent_figures(params, model, bank, labels), params, bank
+        "evaluate_jmvae",
+        lambda params, bank: _latent_figures(params, model, bank, labels),
+        params,
+        bank,
     )
     lists = jax.tree.map(lambda x: x.tolist(), figures)
     lists["unambiguous"] = {
@@ -344,8 +356,8 @@ def train_dqn(
     """Trains the Q-network of one modality.
 
     Returns:
-      Its parameters, the `[epochs]` mean total reward of the episodes that ended, and the figures
-      `env_steps` and `env_steps_per_s`.
+      Its parameters, the `[epochs]` mean total reward of the episodes that ended, NaN where none
+      did, and the figures `env_steps` and `env_steps_per_s`.
     """
     config = world.config
     settings, model = config.dqn, jmvae_shape(config)
@@ -367,15 +379,17 @@ def train_dqn(
     before = monitor.seconds[stage]["run_s"]
     for i, chunk_key in enumerate(chunk_keys):
         state, info = train(chunk_key, state, *models)
-        rewards.append(np.asarray(info.episode_return))
+        episodes, ended = np.asarray(info.episodes), np.asarray(info.episode_return)
+        rewards.append(np.where(episodes > 0, ended, np.nan))
         monitor.report(
             stage,
             (i + 1) * settings.chunk,
             settings.epochs,
             np.asarray(info.loss),
-            reward=float(rewards[-1].mean()),
+            reward=float(np.average(ended, weights=np.maximum(episodes, 1e-9))),
             epsilon=float(info.epsilon[-1]),
         )
+    monitor.check_finite(stage, state.params)
     env_steps = settings.epochs * settings.num_envs
     seconds = monitor.seconds[stage]["run_s"] - before
     speed = {"env_steps": env_steps, "env_steps_per_s": env_steps / seconds}

@@ -103,7 +103,10 @@ def rewards(per_epoch: dict[str, np.ndarray], figures: dict[str, Any]) -> Figure
     axes = figure.subplots(1, len(per_epoch), squeeze=False)
     for ax, (name, reward) in zip(axes[0], per_epoch.items(), strict=True):
         window = min(_SMOOTHING, len(reward))
-        smooth = np.convolve(reward, np.ones(window) / window, mode="valid")
+        # An epoch in which no episode ended has no reward.
+        number = np.convolve(np.isfinite(reward), np.ones(window), mode="valid")
+        total = np.convolve(np.nan_to_num(reward), np.ones(window), mode="valid")
+        smooth = np.where(number > 0, total / np.maximum(number, 1), np.nan)
         ax.plot(reward, color="C0", alpha=0.25, linewidth=0.8)
         ax.plot(np.arange(window - 1, len(reward)), smooth, color="C0", label="DQN, exploring")
         lines = {"return": "DQN, greedy", "optimal": "optimal", "naive": "naive exploration"}

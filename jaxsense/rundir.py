@@ -83,6 +83,7 @@ def load(path: Path | str) -> tuple[Config, Models]:
             return config, Models(
                 detectors=restore("detectors", shapes.detectors),
                 jmvae=restore("jmvae", shapes.jmvae),
+                class_means=restore("class_means", shapes.class_means),
                 q_networks=q_networks,
             )
     except (OSError, KeyError, ValueError, TypeError) as error:

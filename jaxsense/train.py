@@ -61,6 +61,7 @@ def main(argv: list[str] | None = None) -> None:
             )
         except StageError as error:
             _exit(f"{error}; must be finite. What was written before is in {run.path}")
+    report.write_plots(run.path, arguments.config, result)
     summary = {
         "preset": arguments.preset,
         "seed": arguments.seed,
@@ -73,7 +74,6 @@ def main(argv: list[str] | None = None) -> None:
         **result.summary,
     }
     run.write_json("summary.json", summary)
-    report.write_plots(run.path, arguments.config, result)
     _print_summary(console, summary)
     console.print(f"Everything is in {run.path}; look at {run.path / 'latent_space.png'} first.")
 
@@ -113,9 +113,14 @@ def _preset_of(argv: list[str]) -> str:
 
 def _one_line(message: str) -> str:
     """What tyro says in a box, as one line without the box and without the help text."""
-    flat = " ".join(re.sub(r"[╭╮╰╯│─]|-{4,}", " ", message).split())
-    flat = re.split(r" (?:For full helptext|Argument helptext|Perhaps you meant)", flat)[0]
-    return re.sub(r"^.*?Error parsing (?:config\S* )?", "", flat)
+    _, *lines = message.splitlines()  # the first is the title of the box
+    flat = " ".join(re.sub(r"[╰╯│─]|-{4,}", " ", " ".join(lines)).split())
+    error = re.split(r" (?:For full helptext|Argument helptext|Perhaps you meant)", flat)[0]
+    error = re.sub(r"^.*?Error parsing (?:config\S* )?", "", error)
+    error = re.sub(r"invalid literal for int.*?: (.*)", r"\1 must be a whole number", error)
+    error = re.sub(r"could not convert string to float: (.*)", r"\1 must be a number", error)
+    similar = re.search(r"Perhaps you meant: (--\S+)", flat)
+    return f"{error}; perhaps {similar[1]}" if similar else error
 
 
 def _exit(message: str) -> NoReturn:
@@ -184,6 +189,7 @@ class Display:
             rate = done / (now - self._first[stage])
             left = (total - done) / rate
             progress = f"{done} of {total}, {rate:.0f}/s, {left:.0f} s left"
+            progress = "done" if total == 1 else progress
             print(f"{clock}: {progress}  {text}", flush=True)
 
 

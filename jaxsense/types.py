@@ -6,6 +6,9 @@ from flax import struct
 Key = jax.Array
 """A typed or legacy JAX random key; consumed exactly once by the function that takes it."""
 
+Features = tuple[jax.Array | None, ...]
+"""For each modality its `[D_m]` features, or None where it is missing."""
+
 
 @struct.dataclass
 class Belief:

@@ -134,9 +134,11 @@ def error_line(argv: list[str], capsys) -> str:
     ("argv", "expected"),
     [
         (["--preset", "best"], "preset = 'best': must be one of default, paper, smoke"),
-        (["--colour", "red"], "--colour"),
+        (["--colour", "red"], "train: Unrecognized options: --colour, red (--help"),
+        (["--jmvae.hiden", "3"], "--jmvae.hiden, 3; perhaps --jmvae.hidden (--help"),
+        (["--arena.side", "x"], "--arena.side: 'x' must be a number"),
         (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
-        (["--seed", "one"], "--seed: invalid literal for int() with base 10: 'one'"),
+        (["--seed", "one"], "--seed: 'one' must be a whole number"),
         (["--dqn.num-envs", "-4"], "dqn.num_envs = -4: must be a number greater than 0"),
         (["--dqn.observe", "ideal"], "'ideal'"),
         (["--jmvae.hidden", "64", "0"], "jmvae.hidden = (64, 0): must be one or more layer sizes"),

@@ -89,12 +89,14 @@ def information(std: jax.Array) -> jax.Array:
     Returns:
       `[...]` information in inverse latent units; grows without bound as `std` -> 0.
     """
+    chex.assert_shape(std, (..., None), custom_message="std")
     return 1.0 / jnp.linalg.norm(std, axis=-1)
 
 
 def as_state(belief: Belief) -> jax.Array:
     """`[N * 2D]` the map as a Q-network sees it: mean and standard deviation of each PoI."""
-    chex.assert_rank([belief.mean, belief.std], 2, custom_message="belief")
+    chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
+    chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
     return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)
 
 

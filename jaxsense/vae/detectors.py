@@ -108,9 +108,3 @@ def train(
 
 def _optimiser(config: DetectorConfig) -> optax.GradientTransformation:
     return training.adam(config.learning_rate, config.steps)
-
-
-def accuracy(detector: Detector, windows: jax.Array, labels: jax.Array) -> jax.Array:
-    """`[]` share of `[S, F]` windows whose most probable label is that of `[S]` labels."""
-    features = jax.vmap(lambda window: detect(detector, window))(windows)
-    return jnp.mean(jnp.argmax(features, axis=-1) == labels)

@@ -21,8 +21,10 @@ def kl_divergence(
     Returns:
       `[]` in nats.
     """
-    chex.assert_equal_shape([mean_p, log_var_p, mean_q, log_var_q])
-    chex.assert_rank(mean_p, 1)
+    chex.assert_rank(mean_p, 1, custom_message="mean_p")
+    chex.assert_shape(log_var_p, mean_p.shape, custom_message="log_var_p")
+    chex.assert_shape(mean_q, mean_p.shape, custom_message="mean_q")
+    chex.assert_shape(log_var_q, mean_p.shape, custom_message="log_var_q")
     ratio = jnp.exp(log_var_p - log_var_q)
     distance = (mean_p - mean_q) ** 2 * jnp.exp(-log_var_q)
     return 0.5 * jnp.sum(ratio + distance - 1.0 - log_var_p + log_var_q)
@@ -35,7 +37,7 @@ def kl_to_standard_normal(mean: jax.Array, log_var: jax.Array) -> jax.Array:
 
 def sample(key: Key, mean: jax.Array, log_var: jax.Array) -> jax.Array:
     """A draw of shape `[D]`, differentiable in `mean` and `log_var` (reparameterised)."""
-    chex.assert_equal_shape([mean, log_var])
+    chex.assert_shape(log_var, mean.shape, custom_message="log_var")
     return mean + jnp.exp(0.5 * log_var) * jax.random.normal(key, mean.shape)
 
 
@@ -52,7 +54,7 @@ def moment_match(mean: jax.Array, std: jax.Array) -> tuple[jax.Array, jax.Array]
     Returns:
       `[D]` mean and `[D]` standard deviation, with variance `E[std^2] + Var[mean]`.
     """
-    chex.assert_equal_shape([mean, std])
-    chex.assert_rank(mean, 2)
+    chex.assert_rank(mean, 2, custom_message="mean")
+    chex.assert_shape(std, mean.shape, custom_message="std")
     variance = jnp.mean(std**2, axis=0) + jnp.var(mean, axis=0)
     return jnp.mean(mean, axis=0), jnp.sqrt(variance)

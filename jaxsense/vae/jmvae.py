@@ -18,11 +18,8 @@ from jaxsense import training
 from jaxsense.config import JmvaeConfig
 from jaxsense.networks import MLP
 from jaxsense.training import FitState, Params
-from jaxsense.types import Belief, Key
+from jaxsense.types import Belief, Features, Key
 from jaxsense.vae import gaussian
-
-Features = tuple[jax.Array | None, ...]
-"""For each modality its `[D_m]` features, or None where it is missing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,7 +154,12 @@ def loss(
 
     Returns:
       `[]` loss, and its parts before weighting: `reconstruction`, `prior` and `subsets`.
+
+    Raises:
+      ValueError: if a modality's features or its weight is missing.
     """
+    if any(x is None for x in features):
+        raise ValueError(f"features = {features}: must hold every one of {model.modalities}")
     if len(reconstruction_weights) != len(model.modalities):
         raise ValueError(
             f"reconstruction_weights = {reconstruction_weights}: must hold one weight for each of "
@@ -212,14 +214,15 @@ def train(
     Returns:
       The next state and the `[steps]` losses.
     """
-    chex.assert_rank(bank, 3)
-    num_classes, num_samples = bank[0].shape[:2]
+    for features, size in zip(bank, model.feature_sizes, strict=True):
+        chex.assert_shape(features, (bank[0].shape[0], None, size), custom_message="bank")
+    num_classes = bank[0].shape[0]
 
     def draw_batch(key: Key):
         class_key, *row_keys = jax.random.split(key, 1 + len(bank))
         classes = jax.random.randint(class_key, (config.batch,), 0, num_classes)
         return tuple(
-            x[classes, jax.random.randint(k, (config.batch,), 0, num_samples)]
+            x[classes, jax.random.randint(k, (config.batch,), 0, x.shape[1])]
             for x, k in zip(bank, row_keys, strict=True)
         )
 

@@ -14,6 +14,7 @@ PLAUSIBLE_DISTANCE = 2.0
 
 def sigma_norm(std: jax.Array) -> jax.Array:
     """`||sigma||_2` of `[..., D]` standard deviations: what the paper's Fig. 4 shows as colour."""
+    chex.assert_shape(std, (..., None), custom_message="std")
     return jnp.linalg.norm(std, axis=-1)
 
 
@@ -23,7 +24,7 @@ def active_units(mean: jax.Array) -> jax.Array:
     A dimension counts when the variance of the means over the data exceeds 0.01 (Burda, Grosse and
     Salakhutdinov 2016, Sec. 5.2).
     """
-    chex.assert_rank(mean, 2)
+    chex.assert_rank(mean, 2, custom_message="mean")
     return jnp.sum(jnp.var(mean, axis=0) > ACTIVE_VARIANCE)
 
 
@@ -38,15 +39,21 @@ def plausible_classes(belief: Belief, class_means: jax.Array) -> jax.Array:
       `[C]` bool: the class's mean is at most two standard deviations away. The nearest is always
       one of them, so that a belief between everything still names a class.
     """
-    chex.assert_rank([belief.mean, class_means], [1, 2])
+    _check_belief(belief, class_means)
     distance = jnp.linalg.norm((class_means - belief.mean[None]) / belief.std[None], axis=-1)
     return (distance <= PLAUSIBLE_DISTANCE) | (distance <= jnp.min(distance))
 
 
 def nearest_class(belief: Belief, class_means: jax.Array) -> jax.Array:
     """`[]` int32, the class whose joint mean is nearest to a belief's mean."""
-    chex.assert_rank([belief.mean, class_means], [1, 2])
+    _check_belief(belief, class_means)
     return jnp.argmin(jnp.linalg.norm(class_means - belief.mean[None], axis=-1))
+
+
+def _check_belief(belief: Belief, class_means: jax.Array) -> None:
+    chex.assert_rank(belief.mean, 1, custom_message="belief.mean")
+    chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
+    chex.assert_shape(class_means, (None, *belief.mean.shape), custom_message="class_means")
 
 
 def unambiguous(belief: Belief, class_means: jax.Array, true_class: jax.Array) -> jax.Array:

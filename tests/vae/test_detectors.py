@@ -22,6 +22,11 @@ def synthetic_windows(key, number):
     return 5.0 + labels[:, None] * bump[None] + noise, labels
 
 
+def accuracy(detector, windows, labels):
+    features = jax.vmap(detectors.detect, in_axes=(None, 0))(detector, windows)
+    return np.mean(features.argmax(axis=-1) == labels)
+
+
 @pytest.fixture(scope="module")
 def trained():
     windows, labels = synthetic_windows(jax.random.key(0), 1000)
@@ -41,8 +46,8 @@ def trained():
 def test_training_learns_a_separable_set(trained):
     untrained, detector, losses = trained
     windows, labels = synthetic_windows(jax.random.key(3), 1000)
-    assert detectors.accuracy(detector, windows, labels) >= 0.99
-    assert detectors.accuracy(untrained, windows, labels) < 0.9
+    assert accuracy(detector, windows, labels) >= 0.99
+    assert accuracy(untrained, windows, labels) < 0.9
     assert losses.shape == (200,)
     assert losses[-20:].mean() < 0.1 * losses[:5].mean()
 
@@ -54,13 +59,6 @@ def test_detect_gives_probabilities_of_the_labels_in_order(trained):
     assert features.shape == (50, 2)
     np.testing.assert_allclose(features.sum(axis=-1), 1.0, rtol=1e-6)
     np.testing.assert_array_equal(features[:, 1] > 0.5, labels == 1)
-
-
-def test_accuracy_is_the_share_of_right_labels(trained):
-    _, detector, _ = trained
-    windows, labels = synthetic_windows(jax.random.key(5), 40)
-    wrong = jnp.where(jnp.arange(40) < 10, 1 - labels, labels)  # 10 of 40 turned over
-    assert detectors.accuracy(detector, windows, wrong) == 0.75
 
 
 def test_init_standardises_the_readings():

@@ -1,0 +1,77 @@
+"""Wrong shapes given to functions of `vae` and `dqn`: errors while tracing that name the argument.
+
+Those of `sim` are tested beside the functions.
+"""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxsense
+from jaxsense import dqn, vae
+from jaxsense.types import Belief
+from jaxsense.vae import jmvae, metrics
+
+CONFIG = jaxsense.PRESETS["smoke"]
+MODEL = jaxsense.jmvae_shape(CONFIG)
+KEY = jax.random.key(0)
+
+
+def zeros(*shape):
+    return jnp.zeros(shape)
+
+
+def belief(*shape):
+    return Belief(jnp.zeros(shape), jnp.ones(shape))
+
+
+def train_on(*bank):
+    params = jmvae.init(KEY, MODEL)
+    return jmvae.train(KEY, jmvae.start(params, CONFIG.jmvae), MODEL, bank, CONFIG.jmvae, 1)
+
+
+def encode(*features):
+    return vae.encode(jmvae.init(KEY, MODEL), MODEL, features)
+
+
+def write(old, seen, features):
+    return vae.write(jmvae.init(KEY, MODEL), MODEL, old, seen, features, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("mean_p", lambda: vae.kl_divergence(*[zeros(3, 2)] * 4)),
+        ("log_var_p", lambda: vae.kl_divergence(zeros(2), zeros(1), zeros(2), zeros(2))),
+        ("mean_q", lambda: vae.kl_divergence(zeros(2), zeros(2), zeros(1), zeros(2))),
+        ("log_var_q", lambda: vae.kl_divergence(zeros(2), zeros(2), zeros(2), zeros(3))),
+        ("mean", lambda: vae.moment_match(zeros(2), zeros(2))),
+        ("std", lambda: vae.moment_match(zeros(4, 2), zeros(4, 3))),
+        ("belief.mean", lambda: vae.plausible_classes(belief(4, 2), zeros(3, 2))),
+        ("belief.std", lambda: vae.plausible_classes(Belief(zeros(2), zeros(3)), zeros(3, 2))),
+        ("class_means", lambda: metrics.nearest_class(belief(2), zeros(3, 4))),
+        ("std", lambda: vae.sigma_norm(jnp.float32(1))),
+        ("std", lambda: dqn.information(jnp.float32(1))),
+        ("belief.mean", lambda: dqn.as_state(belief(2))),
+        ("belief.std", lambda: dqn.as_state(Belief(zeros(3, 2), zeros(3, 1)))),
+        ("bank", lambda: train_on(zeros(3, 8, 2), zeros(3, 8, 4))),
+        ("bank", lambda: train_on(zeros(3, 8, 2), zeros(2, 8, 2))),
+        ("features of lidar", lambda: encode(zeros(2), zeros(3))),
+        ("z", lambda: vae.decode(jmvae.init(KEY, MODEL), MODEL, zeros(3))),
+        ("seen", lambda: write(belief(2), zeros(3), zeros(2))),
+        ("belief.std", lambda: write(belief(3), zeros(2), zeros(2))),
+        ("features of camera", lambda: write(belief(2), zeros(2), zeros(5))),
+    ],
+)
+def test_argument_is_named(name, call):
+    with pytest.raises(AssertionError, match=rf"(^|\W){name}\W"):
+        jax.eval_shape(call)
+
+
+def test_missing_features_are_named():
+    params = jmvae.init(KEY, MODEL)
+    weights = CONFIG.jmvae.reconstruction_weights
+    with pytest.raises(ValueError, match="features"):
+        vae.loss(
+            KEY, params, MODEL, (zeros(2), None), alpha=1, beta=1, reconstruction_weights=weights
+        )
