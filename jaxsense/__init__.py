@@ -17,11 +17,11 @@ from jaxsense import vae as vae
 from jaxsense.config import PRESETS as PRESETS
 from jaxsense.config import Config as Config
 from jaxsense.config import ConfigError as ConfigError
+from jaxsense.models import Models as Models
+from jaxsense.models import jmvae_shape as jmvae_shape
+from jaxsense.models import untrained as untrained
 from jaxsense.observe import bank_mdp as bank_mdp
 from jaxsense.observe import live_mdp as live_mdp
-from jaxsense.pipeline import Models as Models
-from jaxsense.pipeline import jmvae_shape as jmvae_shape
-from jaxsense.pipeline import untrained as untrained
 from jaxsense.rundir import load as load
 from jaxsense.types import Belief as Belief
 from jaxsense.types import Transition as Transition

@@ -335,7 +335,7 @@ class DqnConfig:
     """Transitions of one gradient step."""
     replay_capacity: int = 512000
     """Transitions that the replay holds; a multiple of num_envs."""
-    discount: float = 0.95
+    discount: float = 0.5
     """Discount factor, gamma."""
     learning_rate: float = 1e-3
     """Learning rate of Adam."""
@@ -391,6 +391,75 @@ class EvaluationConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class NavigationConfig:
+    """How a robot finds its way: the paper's move_base, with the AMiRo's numbers."""
+
+    horizon: float = 2.0
+    """How far ahead a trajectory is rolled out, in seconds."""
+    speed_samples: int = 6
+    """Forward speeds that are tried, one of them backwards."""
+    turn_samples: int = 21
+    """Turn rates that are tried."""
+    robot_radius: float = 0.1
+    """Radius that a robot is given in planning, in metres; it measures 0.05."""
+    inflation: float = 0.1
+    """Distance to obstacles below which a way is held to be worse, in metres."""
+    goal_distance: float = 0.2
+    """How near a viewpoint counts as reached if the PoI is in view, in metres."""
+    goal_angle: float = 6.0
+    """Largest angle to the PoI at which a robot scans it, in degrees."""
+    view_distances: tuple[float, ...] = (0.5, 0.9)
+    """Distances of viewpoints from a PoI's centre, in metres."""
+    view_sides: int = 16
+    """Directions of viewpoints around a PoI."""
+    stuck_time: float = 3.0
+    """Seconds without progress after which a robot backs off and tries another viewpoint."""
+    recovery_time: float = 1.0
+    """Seconds for which a robot backs off."""
+
+    def __post_init__(self):
+        _require_positive(self, "horizon", "robot_radius", "goal_distance", "goal_angle")
+        _require_positive(self, "view_sides", "stuck_time", "recovery_time")
+        _require_not_negative(self, "inflation")
+        _require(self.speed_samples >= 3, self, "speed_samples", "must be at least 3")
+        odd = self.turn_samples >= 3 and self.turn_samples % 2 == 1
+        _require(odd, self, "turn_samples", "must be odd and at least 3, so that one goes straight")
+        _require(
+            self.robot_radius > ROBOT_RADIUS, self, "robot_radius", f"must be above {ROBOT_RADIUS}"
+        )
+        _require(self.goal_angle <= 10, self, "goal_angle", "must be at most 10 degrees")
+        _require(
+            len(self.view_distances) > 0 and all(d > 0 for d in self.view_distances),
+            self,
+            "view_distances",
+            "must be one or more distances, each greater than 0",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class MissionConfig:
+    """The closed loop of all robots in one arena."""
+
+    episodes: int = 256
+    """Episodes that are played with each policy at the end of a run."""
+    time_limit: float = 120.0
+    """Seconds after which a mission ends in any case."""
+    control_period: float = 0.1
+    """Seconds between two decisions of a robot; also between two scans."""
+    equal_values: float = 0.1
+    """Actions whose values differ by less than this from the best count as equally good, in inverse
+    latent units; the robot takes the PoI that no other robot is heading for, and of these the
+    nearest."""
+    attempts: int = 3
+    """Looks that detect nothing, or goals that are not reached, after which a robot gives a PoI
+    up."""
+
+    def __post_init__(self):
+        _require_positive(self, "episodes", "time_limit", "control_period", "attempts")
+        _require_not_negative(self, "equal_values")
+
+
+@dataclasses.dataclass(frozen=True)
 class Config:
     """All settings of a run but its seed."""
 
@@ -405,6 +474,8 @@ class Config:
     mdp: MdpConfig = MdpConfig()
     dqn: DqnConfig = DqnConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+    navigation: NavigationConfig = NavigationConfig()
+    mission: MissionConfig = MissionConfig()
 
     def __post_init__(self):
         known = ", ".join(MODALITIES)
@@ -435,6 +506,17 @@ class Config:
                 self.viewpoint.max_distance,
                 f"must be at most half the arena's side, {self.arena.side / 2} m",
             )
+        nearest = max(
+            self.arena.poi_extent + self.navigation.robot_radius, self.viewpoint.min_distance
+        )
+        distances = self.navigation.view_distances
+        if not nearest <= min(distances) <= max(distances) <= self.viewpoint.max_distance:
+            raise ConfigError(
+                "navigation.view_distances",
+                distances,
+                f"must lie between {nearest:.3f} m and {self.viewpoint.max_distance} m, where the "
+                "robot is clear of the PoI and its detector works",
+            )
         looks = self.arena.num_pois * len(self.modalities)
         if self.mdp.partly_seen_starts and not 2 <= looks <= 30:
             raise ConfigError(
@@ -455,6 +537,7 @@ _PAPER = Config(
     mdp=MdpConfig(min_increase=0.01, partly_seen_starts=True),
     dqn=DqnConfig(
         observe="bank",
+        discount=0.95,
         epochs=2000,
         updates=16,
         replay_capacity=1024000,

@@ -18,10 +18,9 @@ from jaxsense.config import MODALITIES, Config
 from jaxsense.dqn import evaluation, policies
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.belief_mdp import MapMdp, random_start, reset
+from jaxsense.models import Models, jmvae_shape
 from jaxsense.monitor import Monitor
-from jaxsense.networks import MLP
 from jaxsense.observe import Bank
-from jaxsense.sim import sensors
 from jaxsense.sim.world import World, make_world
 from jaxsense.training import Params
 from jaxsense.types import Belief, Key
@@ -31,23 +30,6 @@ from jaxsense.vae.jmvae import Jmvae
 
 _MOST_CHUNKS = 20
 _EXPECTATION_DRAWS = 1024
-
-
-@struct.dataclass
-class Models:
-    """Everything that a run trains.
-
-    Attributes:
-      detectors: one for each modality.
-      jmvae: parameters of the JMVAE.
-      class_means: `[C, D]` mean joint posterior of each class, by which the map is read.
-      q_networks: parameters of one Q-network for each modality.
-    """
-
-    detectors: tuple[Detector, ...]
-    jmvae: Params
-    class_means: jax.Array
-    q_networks: tuple[Params, ...]
 
 
 @struct.dataclass
@@ -83,32 +65,6 @@ class RunResult:
     summary: dict[str, Any]
 
 
-def jmvae_shape(config: Config) -> Jmvae:
-    """The JMVAE that fits the modalities and classes of a configuration."""
-    sizes = tuple(len(config.arena.labels(MODALITIES[m])) for m in config.modalities)
-    return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
-
-
-def untrained(key: Key, config: Config) -> Models:
-    """Models of the right shapes with random parameters, for a first look at the functions."""
-    detector_key, jmvae_key, dqn_key = jax.random.split(key, 3)
-    num_labels = jmvae_shape(config).feature_sizes
-    keys = jax.random.split(detector_key, len(config.modalities))
-    trained = tuple(
-        detectors.init(k, jnp.zeros((2, s.window * s.channels)), size, config.detector)
-        for k, s, size in zip(keys, sensors.make(config), num_labels, strict=True)
-    )
-    state = jnp.zeros(2 * config.jmvae.latent_size * config.arena.num_pois)
-    q_network = MLP(config.dqn.hidden, config.arena.num_pois + 1)
-    dqn_keys = jax.random.split(dqn_key, len(config.modalities))
-    return Models(
-        detectors=trained,
-        jmvae=jmvae.init(jmvae_key, jmvae_shape(config)),
-        class_means=jnp.zeros((len(config.arena.classes), config.jmvae.latent_size)),
-        q_networks=tuple(q_network.init(k, state) for k in dqn_keys),
-    )
-
-
 def run(
     key: Key,
     config: Config,
@@ -137,8 +93,8 @@ def run(
     params = train_jmvae(jmvae_key, banks.train, config, monitor)
     keep("jmvae", params)
     posteriors, jmvae_figures = examine_jmvae(params, banks.held_out, config, monitor)
-    class_means = jnp.mean(posteriors["joint"].mean, axis=1)
-    keep("class_means", class_means)
+    class_beliefs = jax.tree.map(lambda x: jnp.mean(x, axis=1), posteriors["joint"])
+    keep("class_beliefs", class_beliefs)
 
     q_networks, rewards, dqn_figures = [], {}, {}
     for m, (name, dqn_key) in enumerate(zip(config.modalities, dqn_keys, strict=True)):
@@ -152,7 +108,7 @@ def run(
         dqn_figures[name] = {**figures, **speed}
 
     return RunResult(
-        models=Models(trained, params, class_means, tuple(q_networks)),
+        models=Models(trained, params, class_beliefs, tuple(q_networks)),
         windows=windows,
         posteriors=posteriors,
         rewards=rewards,

@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
-from jaxsense import pipeline
+from jaxsense import models
 from jaxsense.config import Config, ConfigError
-from jaxsense.pipeline import Models
+from jaxsense.models import Models
 
 
 class RunDirectory:
@@ -70,7 +70,7 @@ def load(path: Path | str) -> tuple[Config, Models]:
     try:
         settings = json.loads((path / "config.json").read_text())["config"]
         config = _config_of(settings)
-        shapes = jax.eval_shape(lambda: pipeline.untrained(jax.random.key(0), config))
+        shapes = jax.eval_shape(lambda: models.untrained(jax.random.key(0), config))
         with ocp.StandardCheckpointer() as checkpointer:
 
             def restore(name: str, shape: Any) -> Any:
@@ -83,7 +83,7 @@ def load(path: Path | str) -> tuple[Config, Models]:
             return config, Models(
                 detectors=restore("detectors", shapes.detectors),
                 jmvae=restore("jmvae", shapes.jmvae),
-                class_means=restore("class_means", shapes.class_means),
+                class_beliefs=restore("class_beliefs", shapes.class_beliefs),
                 q_networks=q_networks,
             )
     except (OSError, KeyError, ValueError, TypeError) as error:

@@ -14,11 +14,14 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
-from jaxsense.config import CameraConfig, Config, LidarConfig
+from jaxsense.config import ArenaConfig, CameraConfig, Config, LidarConfig
 from jaxsense.sim import amiro, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
 from jaxsense.types import Key
 
+_LEAST_CHROMA = 0.1  # difference of a pixel's channels; walls, robots and the dark have none
+_RANGE_TOLERANCE = 0.05  # m, five standard deviations of the LiDAR's noise
+_SHARE_OF_WIDTH = 0.7  # of a PoI, which is in view however wrong its bearing is believed
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour where a ray leaves the arena
 
 
@@ -51,6 +54,10 @@ class Sensor:
       centre: index, as a real number, of the ray that points along a bearing in radians.
       read: `(key, hits of B rays, [G, 3] albedo of each geom, light) -> [B, ...] readings`.
       window_limit: highest reading that the detector is shown.
+      shows: `(readings [B, ...], distance [], extent) -> [B]` bool, which rays can have met a PoI
+        of that extent [m] with its centre at that distance [m].
+      blind: the reading of every ray when the sensor has failed.
+      scan_bytes: size of a whole scan as ROS sends it.
     """
 
     name: str
@@ -62,6 +69,9 @@ class Sensor:
     centre: Callable[[jax.Array], jax.Array]
     read: Callable[[Key, raycast.Hit, jax.Array, Light], jax.Array]
     window_limit: float
+    shows: Callable[[jax.Array, jax.Array, float], jax.Array]
+    blind: float
+    scan_bytes: int
 
 
 def random_light(key: Key) -> Light:
@@ -95,6 +105,11 @@ def lidar(config: LidarConfig) -> Sensor:
         centre=lambda bearing: (bearing + half) / step,
         read=read,
         window_limit=config.window_range,
+        shows=lambda readings, distance, extent: (
+            jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + _RANGE_TOLERANCE
+        ),
+        blind=config.max_range,
+        scan_bytes=4 * config.num_beams,  # float32
     )
 
 
@@ -130,6 +145,11 @@ def camera(config: CameraConfig) -> Sensor:
         centre=lambda bearing: middle - focal_length * jnp.tan(bearing),
         read=read,
         window_limit=1.0,
+        shows=lambda readings, distance, extent: (
+            readings.max(axis=-1) - readings.min(axis=-1) >= _LEAST_CHROMA
+        ),
+        blind=0.0,
+        scan_bytes=3 * config.num_pixels,  # rgb8
     )
 
 
@@ -190,6 +210,32 @@ def window_rays(sensor: Sensor, bearing: jax.Array) -> jax.Array:
     start = jnp.round(sensor.centre(bearing) - span / 2).astype(jnp.int32)
     start = jnp.clip(start, 0, len(sensor.angles) - 1 - span)
     return start + sensor.stride * jnp.arange(sensor.window)
+
+
+def shows_poi(
+    sensor: Sensor,
+    readings: jax.Array,
+    bearing: jax.Array,
+    distance: jax.Array,
+    arena: ArenaConfig,
+) -> jax.Array:
+    """Whether a PoI is really to be seen where it is expected, from the readings alone.
+
+    Args:
+      sensor: the sensor.
+      readings: `[window, ...]` of the rays around the bearing.
+      bearing: `[]` at which the PoI is expected, in radians in the robot's frame.
+      distance: `[]` at which its centre is expected, in metres.
+      arena: sizes of PoIs.
+
+    Returns:
+      `[]` bool: all rays that must meet a PoI of that size can have met one. Something else before
+      it, a PoI that is not there and a sensor that has failed give False.
+    """
+    angles = jnp.array(sensor.angles)[window_rays(sensor, bearing)] - bearing
+    half_width = jnp.arcsin(jnp.minimum(arena.poi_radius / distance, 1.0))
+    is_within = jnp.abs(angles) <= _SHARE_OF_WIDTH * half_width
+    return jnp.all(sensor.shows(readings, distance, arena.poi_extent) | ~is_within)
 
 
 def as_window(sensor: Sensor, readings: jax.Array) -> jax.Array:

@@ -46,7 +46,7 @@ def random_viewpoint(
     side = jnp.pi * (2 * draws[NUM_CANDIDATES:-2] - 1)
     target = layout.position[poi]
     position = target[0] + distance * jnp.cos(side), target[1] + distance * jnp.sin(side)
-    room = free_room(*position, config, arena, layout, others, poi)
+    room = free_room(*position, config.clearance, arena, layout, others, poi)
     first_free = jnp.argmax(room > 0)
     chosen = jnp.where(jnp.any(room > 0), first_free, jnp.argmax(room))
 
@@ -59,7 +59,7 @@ def random_viewpoint(
 def free_room(
     x: jax.Array,
     y: jax.Array,
-    config: ViewpointConfig,
+    clearance: float,
     arena: ArenaConfig,
     layout: Layout,
     others: jax.Array,
@@ -70,7 +70,7 @@ def free_room(
     Args:
       x: `[C]` of the candidates, in metres.
       y: `[C]` of the candidates, in metres.
-      config: the clearance around a robot.
+      clearance: free space that a robot needs around it, in metres.
       arena: sizes of arena and PoIs.
       layout: where the PoIs stand.
       others: `[K, 2]` positions of the other robots, in metres.
@@ -81,7 +81,7 @@ def free_room(
       too close to something, or something covers part of the view of the PoI.
     """
     chex.assert_equal_shape([x, y], custom_message="x, y")
-    reach = amiro.BODY_RADIUS + config.clearance
+    reach = amiro.BODY_RADIUS + clearance
     to_wall = arena.side / 2 - jnp.maximum(jnp.abs(x), jnp.abs(y)) - reach
     target = layout.position[poi]
     view_x, view_y = target[0] - x, target[1] - y

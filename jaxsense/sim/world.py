@@ -95,13 +95,27 @@ def look(
     others = jnp.delete(scene.poses, robot, axis=0)
     pose, bearing = _viewpoint(viewpoint_key, world, scene.layout, others, poi)
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
+    readings = scan_around(noise_key, world, scene, robot, bearing)
+    return sensors.as_window(world.sensors[robot], readings), scene
+
+
+def scan_around(key: Key, world: World, scene: Scene, robot: int, bearing: jax.Array) -> jax.Array:
+    """What a robot's sensor reads around a bearing from where the robot stands.
+
+    Args:
+      key: random key of the noise.
+      world: the simulation.
+      scene: where everything stands.
+      robot: index of the robot; static.
+      bearing: `[]` in the robot's frame, in radians.
+
+    Returns:
+      `[window, ...]` readings of the rays that the detector reads.
+    """
     data = arenas.place(world.arena, scene.layout, scene.poses)
     sensor = world.sensors[robot]
     angles = jnp.array(sensor.angles)[sensors.window_rays(sensor, bearing)]
-    readings = sensors.scan(
-        noise_key, sensor, world.arena, data, scene.layout, scene.light, robot, angles
-    )
-    return sensors.as_window(sensor, readings), scene
+    return sensors.scan(key, sensor, world.arena, data, scene.layout, scene.light, robot, angles)
 
 
 def first_look(key: Key, world: World, robot: int, poi_class: jax.Array) -> jax.Array:

@@ -1,0 +1,25 @@
+"""The mission: all robots at once in one MJX arena, in closed loop over one shared map.
+
+Each robot asks its policy which PoI to look at, drives to a viewpoint, turns to the PoI, scans it,
+writes what its detector makes of the scan into the shared map, and asks again, until the policy
+says NOP. Robots decide each at its own time; one whose policy reads the map decides again when the
+map has changed under way. Everything is a pure function of one episode: `vmap` over episodes.
+"""
+
+from jaxsense.mission.figures import REASONS as REASONS
+from jaxsense.mission.figures import figures as figures
+from jaxsense.mission.figures import reason as reason
+from jaxsense.mission.rollout import rollout as rollout
+from jaxsense.mission.rollout import step as step
+from jaxsense.mission.state import LATENT as LATENT
+from jaxsense.mission.state import NAIVE as NAIVE
+from jaxsense.mission.state import POLICIES as POLICIES
+from jaxsense.mission.state import RANDOM as RANDOM
+from jaxsense.mission.state import Faults as Faults
+from jaxsense.mission.state import Mission as Mission
+from jaxsense.mission.state import MissionState as MissionState
+from jaxsense.mission.state import Record as Record
+from jaxsense.mission.state import make_mission as make_mission
+from jaxsense.mission.state import no_faults as no_faults
+from jaxsense.mission.state import reset as reset
+from jaxsense.mission.state import start as start

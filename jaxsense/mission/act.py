@@ -1,0 +1,157 @@
+"""Getting to a viewpoint, turning to the PoI, scanning it, and writing the map."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense.mission.decide import sees
+from jaxsense.mission.state import (
+    BACKING,
+    DRIVING,
+    FACING,
+    IDLE,
+    Mission,
+    MissionState,
+    now,
+    update_robot,
+)
+from jaxsense.models import Models, jmvae_shape
+from jaxsense.sim import navigation, roadmap, sensors
+from jaxsense.sim import world as worlds
+from jaxsense.sim.world import Scene
+from jaxsense.types import Key
+from jaxsense.vae import detectors, fusion
+
+_PROGRESS = 0.02  # m, by which a way must become shorter to count as progress
+_TURNS_SLOWLY = 0.35  # rad/s, at which a robot may scan
+
+
+def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
+    """Drives to the viewpoint, turns to the PoI, and backs off where there is no progress."""
+    config, robots, scene = mission.config, state.robots, state.scene
+    settings, period = config.navigation, config.mission.control_period
+    time = now(mission, state)
+    phase, view = robots.phase[robot], robots.view[robot]
+    num_views = state.roadmap.viewpoints.shape[1]
+    poi = jnp.minimum(robots.target[robot], config.arena.num_pois - 1)
+    pose = scene.poses[robot]
+
+    goal = jnp.minimum(view, num_views - 1)
+    way_left, waypoint = roadmap.next_place(
+        config, scene.layout, state.roadmap, pose[:2], poi, goal
+    )
+    offset = state.roadmap.viewpoints[poi, goal] - pose[:2]
+    is_near = jnp.linalg.norm(offset) <= settings.goal_distance
+    arrives = (view == num_views) | (is_near & sees(mission, state, robot, poi))
+    arrives &= phase == DRIVING
+
+    progresses = (phase == DRIVING) & (way_left < robots.way_left[robot] - _PROGRESS)
+    waits = time - robots.progress_at[robot]
+    is_stuck = (phase == DRIVING) & ~arrives & ~progresses & (waits > settings.stuck_time)
+    state = _fail(state, robot, is_stuck, "unreachable", config.mission.attempts)
+    robots = state.robots
+    is_back = (phase == BACKING) & (time >= robots.backs_off_until[robot])
+    phase = jnp.select([arrives, is_stuck, is_back], [FACING, BACKING, IDLE], phase)
+
+    drive = navigation.drive_to(
+        settings,
+        config.arena,
+        scene.layout,
+        scene.poses,
+        robots.command,
+        robot,
+        waypoint,
+        period,
+        backs_off=phase == BACKING,
+    )
+    turn = navigation.face(_bearing(scene, robot, poi))
+    is_driving = (phase == DRIVING) | (phase == BACKING)
+    wanted = jnp.where(is_driving, drive, jnp.where(phase == FACING, turn, 0.0))
+    return update_robot(
+        state,
+        robot,
+        phase=phase,
+        wanted=wanted,
+        reached=robots.reached[robot] + arrives,
+        way_left=jnp.where(progresses, way_left, robots.way_left[robot]),
+        progress_at=jnp.where(progresses, time, robots.progress_at[robot]),
+        backs_off_until=jnp.where(
+            is_stuck, time + settings.recovery_time, robots.backs_off_until[robot]
+        ),
+    )
+
+
+def _fail(
+    state: MissionState, robot: int, applies: jax.Array, given_up_as: str, attempts: int
+) -> MissionState:
+    """Notes that a viewpoint has failed; after some attempts the robot gives its target up."""
+    robots = state.robots
+    failures = robots.attempts[robot] + applies
+    gives_up = applies & (failures >= attempts)
+    given_up = getattr(robots, given_up_as)[robot]
+    excluded = robots.excluded[robot]
+    return update_robot(
+        state,
+        robot,
+        attempts=failures,
+        excluded=jnp.where(applies, excluded.at[robots.view[robot]].set(True), excluded),
+        **{
+            given_up_as: jnp.where(
+                gives_up, given_up.at[robots.target[robot]].set(True, mode="drop"), given_up
+            )
+        },
+    )
+
+
+def scan(
+    key: Key, mission: Mission, models: Models, state: MissionState, robot: int
+) -> MissionState:
+    """Takes a scan of the PoI that the robot faces, and writes what it shows into the map."""
+    config, world, scene, robots = mission.config, mission.world, state.scene, state.robots
+    error_key, noise_key = jax.random.split(key)
+    poi = jnp.minimum(robots.target[robot], config.arena.num_pois - 1)
+    bearing = _bearing(scene, robot, poi)
+    is_aligned = jnp.abs(bearing) <= jnp.radians(config.navigation.goal_angle)
+    is_calm = jnp.abs(robots.command[robot, 1]) <= _TURNS_SLOWLY
+    scans = (robots.phase[robot] == FACING) & is_aligned & is_calm
+
+    sensor = world.sensors[robot]
+    error = jnp.radians(config.viewpoint.bearing_error)
+    believed = bearing + jax.random.uniform(error_key, (), minval=-error, maxval=error)
+    readings = worlds.scan_around(noise_key, world, scene, robot, believed)
+    is_blind = now(mission, state) >= state.faults.blind_at[robot]
+    readings = jnp.where(is_blind, sensor.blind, readings)
+    distance = jnp.linalg.norm(scene.layout.position[poi] - scene.poses[robot, :2])
+    shows = sensors.shows_poi(sensor, readings, believed, distance, config.arena)
+    features = detectors.detect(models.detectors[robot], sensors.as_window(sensor, readings))
+    detects = scans & shows
+
+    old = jax.tree.map(lambda x: x[poi], state.belief)
+    new = fusion.write(models.jmvae, jmvae_shape(config), old, state.seen[poi], features, robot)
+    entry = jax.tree.map(lambda o, n: jnp.where(detects, n, o), old, new)
+    state = _fail(state, robot, scans & ~shows, "undetected", config.mission.attempts)
+    robots = state.robots
+    state = update_robot(
+        state,
+        robot,
+        phase=jnp.where(scans, IDLE, robots.phase[robot]),
+        # After a detection the same PoI is a new target.
+        target=jnp.where(detects, config.arena.num_pois, robots.target[robot]),
+        looks=robots.looks[robot] + scans,
+        detections=robots.detections[robot] + detects,
+    )
+    return dataclasses.replace(
+        state,
+        belief=jax.tree.map(lambda m, e: m.at[poi].set(e), state.belief, entry),
+        seen=state.seen.at[poi, robot].set(state.seen[poi, robot] | detects),
+        version=state.version + detects,
+    )
+
+
+def _bearing(scene: Scene, robot: int, poi: jax.Array) -> jax.Array:
+    """`[]` angle from a robot's heading to a PoI, in radians within -pi and pi."""
+    pose = scene.poses[robot]
+    to_poi = scene.layout.position[poi] - pose[:2]
+    angle = jnp.arctan2(to_poi[1], to_poi[0]) - pose[2]
+    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi

@@ -1,0 +1,131 @@
+"""Which PoI a robot looks at next, and from where."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense.dqn import belief_mdp
+from jaxsense.mission.state import (
+    DRIVING,
+    ENDED,
+    FACING,
+    IDLE,
+    LATENT,
+    Mission,
+    MissionState,
+    now,
+    update_robot,
+)
+from jaxsense.models import Models
+from jaxsense.networks import MLP
+from jaxsense.sim import roadmap, viewpoints
+from jaxsense.types import Key
+
+_DETOUR = 2.0  # m, that a robot would go to avoid a viewpoint on which another robot stands
+
+
+def decide(
+    key: Key, mission: Mission, models: Models, state: MissionState, robot: int
+) -> MissionState:
+    """Asks the policy where one is due, and sets out for a viewpoint of what it says."""
+    robots, config = state.robots, mission.config
+    phase, target = robots.phase[robot], robots.target[robot]
+    is_idle = phase == IDLE
+    is_under_way = (phase == DRIVING) | (phase == FACING)
+    has_news = (state.version != robots.decided_on[robot]) & (state.policy == LATENT)
+    decides = is_idle | (is_under_way & has_news)
+    action = jnp.where(decides, _choose(key, mission, models, state, robot), target)
+    is_new = action != target
+    sets_out = decides & (is_idle | is_new) & (action < config.arena.num_pois)
+
+    # What is known of failures belongs to one target.
+    excluded = jnp.where(is_new, False, robots.excluded[robot])
+    attempts = jnp.where(is_new, 0, robots.attempts[robot])
+    view, length = _best_view(mission, state, robot, action, excluded)
+    has_way = jnp.isfinite(length)
+    sets_out_now, gives_up = sets_out & has_way, sets_out & ~has_way
+    poi = jnp.minimum(action, config.arena.num_pois - 1)
+    unreachable = robots.unreachable[robot]
+    ends = decides & (action == config.arena.num_pois)
+    phase = jnp.select([ends, sets_out_now, gives_up], [ENDED, DRIVING, IDLE], phase)
+    was_needless = decides & is_new & (robots.phase[robot] == DRIVING)
+    return update_robot(
+        state,
+        robot,
+        phase=phase,
+        target=action,
+        view=jnp.where(sets_out_now, view, robots.view[robot]),
+        decided_on=jnp.where(decides, state.version, robots.decided_on[robot]),
+        excluded=excluded,
+        attempts=attempts,
+        unreachable=jnp.where(gives_up, unreachable.at[poi].set(True), unreachable),
+        way_left=jnp.where(sets_out_now, length, robots.way_left[robot]),
+        progress_at=jnp.where(sets_out_now, now(mission, state), robots.progress_at[robot]),
+        goals=robots.goals[robot] + sets_out_now - was_needless,
+    )
+
+
+def _choose(
+    key: Key, mission: Mission, models: Models, state: MissionState, robot: int
+) -> jax.Array:
+    """`[]` int32, the PoI that a robot's policy says, or N for NOP."""
+    config, robots = mission.config, state.robots
+    num_pois = config.arena.num_pois
+    given_up = robots.unreachable[robot] | robots.undetected[robot]
+    # To the network a PoI that was given up is one of which everything is known: it would count on
+    # the information that is left in it.
+    known = jax.tree.map(
+        lambda old, sure: jnp.where(given_up[:, None], sure[:1], old),
+        state.belief,
+        models.class_beliefs,
+    )
+    network = MLP(config.dqn.hidden, num_pois + 1)
+    q = network.apply(models.q_networks[robot], belief_mdp.as_state(known))
+    naive = jnp.append(jnp.where(state.seen[:, robot], -1.0, 1.0), 0.0)
+    random = jax.nn.one_hot(jax.random.randint(key, (), 0, num_pois + 1), num_pois + 1)
+    values = jnp.stack([jnp.asarray(q), naive, random])[state.policy]
+    of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
+    is_best = of_pois >= jnp.max(of_pois) - config.mission.equal_values
+
+    place = state.scene.poses[robot, :2]
+    distance = jnp.linalg.norm(state.scene.layout.position - place[None], axis=-1)
+    is_kept = jnp.arange(num_pois) == robots.target[robot]
+    others = jnp.delete(robots.target, robot)
+    is_others = jnp.any(jnp.arange(num_pois)[:, None] == others[None], axis=-1)
+    # A PoI that the robot is heading for already, then one that no other heads for, then distance.
+    rank = distance - 1e4 * is_kept + 1e2 * is_others
+    poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
+    return jnp.where(jnp.max(of_pois) > values[num_pois], poi, num_pois)
+
+
+def _best_view(
+    mission: Mission, state: MissionState, robot: int, target: jax.Array, excluded: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The viewpoint of a PoI with the shortest way, and its length; V is where the robot stands."""
+    config, scene = mission.config, state.scene
+    poi = jnp.minimum(target, config.arena.num_pois - 1)
+    length = roadmap.lengths(config, scene.layout, state.roadmap, scene.poses[robot, :2], poi)
+    places = state.roadmap.viewpoints[poi]
+    others = jnp.delete(scene.poses[:, :2], robot, axis=0)
+    clearance = config.viewpoint.clearance
+    room = viewpoints.free_room(
+        places[:, 0], places[:, 1], clearance, config.arena, scene.layout, others, poi
+    )
+    length += jnp.where(room > 0, 0.0, _DETOUR)
+    here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
+    cost = jnp.where(excluded, jnp.inf, jnp.append(length, here))
+    view = jnp.argmin(cost)
+    return view, cost[view]
+
+
+def sees(mission: Mission, state: MissionState, robot: int, poi: jax.Array) -> jax.Array:
+    """`[]` bool: from where a robot stands, a PoI is in range and nothing known covers it."""
+    config, scene = mission.config, state.scene
+    place = scene.poses[robot, :2]
+    distance = jnp.linalg.norm(scene.layout.position[poi] - place)
+    others = jnp.delete(scene.poses[:, :2], robot, axis=0)
+    settings = config.viewpoint
+    room = viewpoints.free_room(place[:1], place[1:], 0.0, config.arena, scene.layout, others, poi)[
+        0
+    ]
+    in_range = (distance >= settings.min_distance) & (distance <= settings.max_distance)
+    return in_range & (room > 0)

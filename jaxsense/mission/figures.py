@@ -1,0 +1,67 @@
+"""How a mission has ended and what it has achieved."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense.config import MODALITIES
+from jaxsense.dqn import belief_mdp
+from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
+from jaxsense.models import Models
+from jaxsense.vae import metrics
+
+REASONS = ("running", "finished", "time limit", "unreachable", "undetected", "no robot left")
+"""How a mission has ended. `unreachable`: a robot gave up a PoI to which it found no way;
+`undetected`: one gave up a PoI after looks that showed nothing. The index is the reason's code."""
+
+
+def reason(state: MissionState) -> jax.Array:
+    """`[]` int32 index into `REASONS`."""
+    robots = state.robots
+    working = robots.phase != FAILED
+    cases = [
+        (~state.is_over, "running"),
+        (~jnp.any(working), "no robot left"),
+        (jnp.any(working & (robots.phase != ENDED)), "time limit"),
+        (jnp.any(robots.unreachable), "unreachable"),
+        (jnp.any(robots.undetected), "undetected"),
+    ]
+    code = jnp.int32(REASONS.index("finished"))
+    for applies, name in reversed(cases):
+        code = jnp.where(applies, REASONS.index(name), code)
+    return code
+
+
+def figures(mission: Mission, models: Models, state: MissionState) -> dict[str, jax.Array]:
+    """What a mission has achieved.
+
+    Returns:
+      `accuracy` of the map's most likely classes, and `accuracy_MODALITY` of what one sensor can
+      tell of them; `ambiguous` and `is_right`, `[N]` each; `observations_per_poi`; `time_s`;
+      `collisions`, control periods with contact; `goals` and `goals_reached`; `information`, the
+      sum over the map; `detections` `[R]`; and `reason`.
+    """
+    config = mission.config
+    nearest = jax.vmap(lambda b: metrics.nearest_class(b, models.class_beliefs.mean))(state.belief)
+    plausible = jax.vmap(lambda b: metrics.plausible_classes(b, models.class_beliefs.mean))(
+        state.belief
+    )
+    is_right = nearest == state.classes
+    told = {}
+    for modality in config.modalities:
+        labels = jnp.array(config.arena.label_of_class(MODALITIES[modality]))
+        told[f"accuracy_{modality}"] = jnp.mean(labels[nearest] == labels[state.classes])
+    robots = state.robots
+    return {
+        "accuracy": jnp.mean(is_right),
+        **told,
+        "is_right": is_right,
+        "ambiguous": jnp.sum(plausible, axis=-1) > 1,
+        "observations_per_poi": jnp.sum(robots.looks) / config.arena.num_pois,
+        "time_s": state.steps * config.mission.control_period,
+        "collisions": state.contacts,
+        "goals": jnp.sum(robots.goals),
+        "goals_reached": jnp.sum(robots.reached),
+        "information": jnp.sum(belief_mdp.information(state.belief.std)),
+        "detections": robots.detections,
+        "reason": reason(state),
+    }

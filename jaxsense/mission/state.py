@@ -1,0 +1,307 @@
+"""What a mission is made of, and how it begins."""
+
+import dataclasses
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxsense.config import Config
+from jaxsense.models import jmvae_shape
+from jaxsense.sim import arena as arenas
+from jaxsense.sim import roadmap, sensors
+from jaxsense.sim import world as worlds
+from jaxsense.sim.arena import Arena
+from jaxsense.sim.roadmap import Roadmap
+from jaxsense.sim.world import Scene, World
+from jaxsense.types import Belief, Key
+from jaxsense.vae import fusion
+
+POLICIES = ("latent", "naive", "random")
+"""`latent` asks the Q-networks; `naive` visits every PoI once, the nearest first; `random` takes
+any PoI, or ends. The index is the policy's code."""
+LATENT, NAIVE, RANDOM = range(3)
+
+IDLE, DRIVING, FACING, BACKING, ENDED, FAILED = range(6)
+"""What a robot is doing: asking its policy, driving to a viewpoint, turning to a PoI and scanning
+it, backing off after it got stuck, nothing more (NOP), or nothing because it has failed."""
+
+_FREE_DRAWS = 32
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mission:
+    """What is the same for all missions of a configuration. Static under `jit`.
+
+    Attributes:
+      world: the simulation, with contacts or without.
+      free_arena: its arena without contacts, see `motion.move`.
+    """
+
+    world: World
+    free_arena: Arena
+
+    @property
+    def config(self) -> Config:
+        """All settings."""
+        return self.world.config
+
+
+@struct.dataclass
+class Faults:
+    """When robots fail, in seconds from the start; infinite for never.
+
+    Attributes:
+      stops_at: `[R]` the robot stops for good and does nothing any more.
+      blind_at: `[R]` its sensor reads nothing any more; the robot does not know.
+    """
+
+    stops_at: jax.Array
+    blind_at: jax.Array
+
+
+@struct.dataclass
+class Robots:
+    """What the robots are up to, `[R]` each unless said otherwise.
+
+    Attributes:
+      phase: int32, one of IDLE to FAILED.
+      target: int32 PoI, or N for none.
+      view: int32 viewpoint of the target, or V for the place where the robot stands.
+      command: `[R, 2]` speeds that the wheels are driven at, see `navigation`.
+      wanted: `[R, 2]` speeds that they are to reach.
+      decided_on: int32 version of the map that the last decision was made on.
+      excluded: `[R, V + 1]` bool viewpoints of the target that have failed.
+      attempts: int32 failures at the target.
+      way_left: length in metres of the way that was left when there was progress.
+      progress_at: seconds, when that was.
+      backs_off_until: seconds.
+      unreachable: `[R, N]` bool, PoIs given up because there was no way.
+      undetected: `[R, N]` bool, PoIs given up because looks showed nothing.
+      goals: int32 viewpoints set out for, without those that a new decision made needless.
+      reached: int32 of them reached.
+      looks: int32 scans.
+      detections: int32 scans that were written into the map.
+    """
+
+    phase: jax.Array
+    target: jax.Array
+    view: jax.Array
+    command: jax.Array
+    wanted: jax.Array
+    decided_on: jax.Array
+    excluded: jax.Array
+    attempts: jax.Array
+    way_left: jax.Array
+    progress_at: jax.Array
+    backs_off_until: jax.Array
+    unreachable: jax.Array
+    undetected: jax.Array
+    goals: jax.Array
+    reached: jax.Array
+    looks: jax.Array
+    detections: jax.Array
+
+
+@struct.dataclass
+class MissionState:
+    """One mission at one moment.
+
+    Attributes:
+      scene: PoIs, light and the robots' poses.
+      classes: `[N]` int32 true classes, hidden from everybody.
+      roadmap: ways through the layout.
+      faults: which robots will fail.
+      policy: `[]` int32 index into `POLICIES`.
+      velocity: `[R, 3]` of the poses.
+      warmstart: `[3 R]` MJX's last accelerations.
+      belief: `[N, D]` the shared map.
+      seen: `[N, R]` bool, which robots have written which PoI.
+      version: `[]` int32, writes into the map so far.
+      robots: what they are up to.
+      steps: `[]` int32 control periods so far.
+      contacts: `[]` int32 control periods in which a robot touched something.
+      least_clearance: `[]` smallest free distance around any robot so far, in metres.
+      is_over: `[]` bool.
+    """
+
+    scene: Scene
+    classes: jax.Array
+    roadmap: Roadmap
+    faults: Faults
+    policy: jax.Array
+    velocity: jax.Array
+    warmstart: jax.Array
+    belief: Belief
+    seen: jax.Array
+    version: jax.Array
+    robots: Robots
+    steps: jax.Array
+    contacts: jax.Array
+    least_clearance: jax.Array
+    is_over: jax.Array
+
+
+@struct.dataclass
+class Record:
+    """What is kept of one control period, for plots and tests.
+
+    Attributes:
+      time: `[]` seconds from the start, at its end.
+      poses: `[R, 3]` at its end.
+      command: `[R, 2]` at its end.
+      wanted: `[R, 2]` in it.
+      phase: `[R]`.
+      target: `[R]`.
+      scanned: `[R]` bool, the robot took a scan.
+      detected: `[R]` bool, and it was written into the map.
+      belief: `[N, D]` the map.
+      seen: `[N, R]` bool.
+      clearance: `[]` smallest free distance around any robot in it, in metres.
+    """
+
+    time: jax.Array
+    poses: jax.Array
+    command: jax.Array
+    wanted: jax.Array
+    phase: jax.Array
+    target: jax.Array
+    scanned: jax.Array
+    detected: jax.Array
+    belief: Belief
+    seen: jax.Array
+    clearance: jax.Array
+
+
+def make_mission(config: Config, *, contacts: bool = True) -> Mission:
+    """Compiles the arena of a mission, with contacts unless told otherwise."""
+    free = worlds.make_world(config)
+    world = worlds.make_world(config, contacts=True) if contacts else free
+    return Mission(world, free.arena)
+
+
+def no_faults(config: Config) -> Faults:
+    """Robots that never fail."""
+    never = jnp.full(len(config.modalities), jnp.inf)
+    return Faults(never, never)
+
+
+def reset(
+    key: Key,
+    mission: Mission,
+    policy: jax.Array | int = LATENT,
+    faults: Faults | None = None,
+    classes: jax.Array | None = None,
+) -> MissionState:
+    """A random arena before anybody has looked at anything.
+
+    Args:
+      key: random key; the same key gives the same arena for every policy and all faults.
+      mission: the mission.
+      policy: `[]` int32 index into `POLICIES`.
+      faults: which robots will fail; none if not given.
+      classes: `[N]` int32 classes of the PoIs; drawn independently if not given.
+
+    Returns:
+      The state. Robots stand at random places with room around them.
+    """
+    config = mission.config
+    class_key, layout_key, light_key, pose_key = jax.random.split(key, 4)
+    num_pois = config.arena.num_pois
+    if classes is None:
+        classes = jax.random.randint(class_key, (num_pois,), 0, len(config.arena.classes))
+    layout = arenas.random_layout(layout_key, config.arena, classes)
+    poses = _random_poses(pose_key, config, layout)
+    return start(
+        mission,
+        Scene(layout, sensors.random_light(light_key), poses),
+        classes,
+        jnp.asarray(policy, jnp.int32),
+        no_faults(config) if faults is None else faults,
+    )
+
+
+def start(
+    mission: Mission, scene: Scene, classes: jax.Array, policy: jax.Array, faults: Faults
+) -> MissionState:
+    """A given arena before anybody has looked at anything; see `reset` for the arguments."""
+    config = mission.config
+    num_robots, num_pois = len(config.modalities), config.arena.num_pois
+    chex.assert_shape(classes, (num_pois,), custom_message="classes")
+    chex.assert_shape(scene.poses, (num_robots, 3), custom_message="scene.poses")
+    for name in ("stops_at", "blind_at"):
+        shape = (num_robots,)
+        chex.assert_shape(getattr(faults, name), shape, custom_message=f"faults.{name}")
+    entry = fusion.unseen(jmvae_shape(config), config.mdp.unseen_variance)
+    ways = roadmap.build(config, scene.layout)
+    number = jnp.zeros(num_robots, jnp.int32)
+    seconds = jnp.zeros(num_robots)
+    robots = Robots(
+        phase=number + IDLE,
+        target=number + num_pois,
+        view=number,
+        command=jnp.zeros((num_robots, 2)),
+        wanted=jnp.zeros((num_robots, 2)),
+        decided_on=number,
+        excluded=jnp.zeros((num_robots, ways.is_free.shape[1] + 1), bool),
+        attempts=number,
+        way_left=seconds,
+        progress_at=seconds,
+        backs_off_until=seconds,
+        unreachable=jnp.zeros((num_robots, num_pois), bool),
+        undetected=jnp.zeros((num_robots, num_pois), bool),
+        goals=number,
+        reached=number,
+        looks=number,
+        detections=number,
+    )
+    return MissionState(
+        scene=scene,
+        classes=classes,
+        roadmap=ways,
+        faults=faults,
+        policy=policy,
+        velocity=jnp.zeros((num_robots, 3)),
+        warmstart=jnp.zeros(3 * num_robots),
+        belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), entry),
+        seen=jnp.zeros((num_pois, num_robots), bool),
+        version=jnp.int32(0),
+        robots=robots,
+        steps=jnp.int32(0),
+        contacts=jnp.int32(0),
+        least_clearance=jnp.float32(jnp.inf),
+        is_over=jnp.bool_(False),
+    )
+
+
+def _random_poses(key: Key, config: Config, layout: arenas.Layout) -> jax.Array:
+    """`[R, 3]` poses with room around the robots, drawn one after the other."""
+    num_robots = len(config.modalities)
+    draws = jax.random.uniform(key, (num_robots, 3, _FREE_DRAWS), minval=-1.0)
+    reach = config.arena.side / 2 - config.navigation.robot_radius
+    poses = jnp.zeros((0, 3))
+    for draw in draws:
+        places = reach * draw[:2].T
+        to_pois = jnp.linalg.norm(places[:, None] - layout.position[None], axis=-1)
+        room = jnp.min(to_pois, axis=-1) - config.arena.poi_extent - config.navigation.robot_radius
+        for other in poses:
+            apart = jnp.linalg.norm(places - other[None, :2], axis=-1)
+            room = jnp.minimum(room, apart - 3 * config.navigation.robot_radius)
+        chosen = jnp.where(jnp.any(room > 0), jnp.argmax(room > 0), jnp.argmax(room))
+        pose = jnp.append(places[chosen], jnp.pi * draw[2, chosen])
+        poses = jnp.concatenate([poses, pose[None]])
+    return poses
+
+
+def update_robot(state: MissionState, robot: int, **values: Any) -> MissionState:
+    """The state with some entries of one robot replaced."""
+    robots = state.robots
+    changed = {name: getattr(robots, name).at[robot].set(value) for name, value in values.items()}
+    return dataclasses.replace(state, robots=dataclasses.replace(robots, **changed))
+
+
+def now(mission: Mission, state: MissionState) -> jax.Array:
+    """`[]` seconds since the start."""
+    return state.steps * mission.config.mission.control_period

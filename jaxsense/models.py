@@ -1,0 +1,58 @@
+"""Everything that a run trains, as one pytree."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxsense.config import MODALITIES, Config
+from jaxsense.networks import MLP
+from jaxsense.sim import sensors
+from jaxsense.training import Params
+from jaxsense.types import Belief, Key
+from jaxsense.vae import detectors, jmvae
+from jaxsense.vae.detectors import Detector
+from jaxsense.vae.jmvae import Jmvae
+
+
+@struct.dataclass
+class Models:
+    """Everything that a run trains.
+
+    Attributes:
+      detectors: one for each modality.
+      jmvae: parameters of the JMVAE.
+      class_beliefs: `[C, D]` mean joint posterior of each class, by which the map is read.
+      q_networks: parameters of one Q-network for each modality.
+    """
+
+    detectors: tuple[Detector, ...]
+    jmvae: Params
+    class_beliefs: Belief
+    q_networks: tuple[Params, ...]
+
+
+def jmvae_shape(config: Config) -> Jmvae:
+    """The JMVAE that fits the modalities and classes of a configuration."""
+    sizes = tuple(len(config.arena.labels(MODALITIES[m])) for m in config.modalities)
+    return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
+
+
+def untrained(key: Key, config: Config) -> Models:
+    """Models of the right shapes with random parameters, for a first look at the functions."""
+    detector_key, jmvae_key, dqn_key = jax.random.split(key, 3)
+    num_labels = jmvae_shape(config).feature_sizes
+    keys = jax.random.split(detector_key, len(config.modalities))
+    trained = tuple(
+        detectors.init(k, jnp.zeros((2, s.window * s.channels)), size, config.detector)
+        for k, s, size in zip(keys, sensors.make(config), num_labels, strict=True)
+    )
+    state = jnp.zeros(2 * config.jmvae.latent_size * config.arena.num_pois)
+    q_network = MLP(config.dqn.hidden, config.arena.num_pois + 1)
+    dqn_keys = jax.random.split(dqn_key, len(config.modalities))
+    shape = (len(config.arena.classes), config.jmvae.latent_size)
+    return Models(
+        detectors=trained,
+        jmvae=jmvae.init(jmvae_key, jmvae_shape(config)),
+        class_beliefs=Belief(jnp.zeros(shape), jnp.ones(shape)),
+        q_networks=tuple(q_network.init(k, state) for k in dqn_keys),
+    )

@@ -1,0 +1,173 @@
+"""Shortest ways around the PoIs of an arena, and the viewpoints that they lead to.
+
+A robot does not know which shape a PoI has before it has looked, so every PoI is the circle that
+holds both shapes. A few nodes around each circle and the lengths of the free ways between them are
+worked out once for a layout; a way from anywhere to any viewpoint is then a minimum over two of
+them. This is the part of the paper's move_base that knows the map of the arena.
+"""
+
+import math
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxsense.config import Config
+from jaxsense.sim import amiro, viewpoints
+from jaxsense.sim.arena import Layout
+
+NODES_PER_POI = 10
+_LEEWAY = 0.035  # m, within which of a node the next one is still in view
+_MARGIN = 0.02  # m, by which ways keep farther off than trajectories must
+_SLACK = 1e-3  # m, by which a way may cut an obstacle: nodes touch their own circle
+
+
+@struct.dataclass
+class Roadmap:
+    """Ways through one layout. K nodes, N PoIs, V viewpoints for each PoI.
+
+    Attributes:
+      nodes: `[K, 2]` in metres.
+      viewpoints: `[N, V, 2]` places from which a PoI can be looked at, in metres.
+      to_viewpoint: `[N, V, K]` length of the shortest way from each node to each viewpoint, in
+        metres; infinite where there is none, or where the viewpoint is of no use.
+      is_free: `[N, V]` bool, viewpoints where a robot has room and sees the PoI.
+    """
+
+    nodes: jax.Array
+    viewpoints: jax.Array
+    to_viewpoint: jax.Array
+    is_free: jax.Array
+
+
+def build(config: Config, layout: Layout) -> Roadmap:
+    """Works out the ways and the viewpoints of a layout."""
+    arena, settings = config.arena, config.navigation
+    radius = _radius(config)
+    sides = 2 * jnp.pi * jnp.arange(NODES_PER_POI) / NODES_PER_POI
+    # So far out that the ways between neighbours do not cut the circle.
+    ring = (radius + _LEEWAY) / math.cos(math.pi / NODES_PER_POI)
+    around = ring * jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
+    nodes = (layout.position[:, None] + around[None]).reshape(-1, 2)
+    reach = arena.side / 2 - settings.robot_radius
+    to_pois = jnp.linalg.norm(nodes[:, None] - layout.position[None], axis=-1)
+    is_usable = jnp.all(to_pois >= radius, axis=-1) & (jnp.max(jnp.abs(nodes), axis=-1) <= reach)
+    edges = _straight(nodes, nodes, layout.position, radius)
+    between = _shortest(jnp.where(is_usable[:, None] & is_usable[None], edges, jnp.inf))
+
+    places, is_free = _viewpoints(config, layout)
+    last = _straight(places.reshape(-1, 2), nodes, layout.position, radius)
+    to_places = _min_plus(jnp.where(is_usable[None], last, jnp.inf), between)
+    to_viewpoint = to_places.reshape(*is_free.shape, -1)
+    return Roadmap(nodes, places, jnp.where(is_free[..., None], to_viewpoint, jnp.inf), is_free)
+
+
+def lengths(
+    config: Config, layout: Layout, roadmap: Roadmap, place: jax.Array, poi: jax.Array
+) -> jax.Array:
+    """`[V]` metres from a place to the viewpoints of a PoI; infinite where there is no way.
+
+    Args:
+      config: all settings.
+      layout: where the PoIs stand.
+      roadmap: of the layout.
+      place: `[2]` in metres; may be closer to a PoI than planning allows, if the way leads off.
+      poi: `[]` int32.
+    """
+    chex.assert_shape(place, (2,), custom_message="place")
+    goals, radius = roadmap.viewpoints[poi], _radius(config)
+    direct = _straight(place[None], goals, layout.position, radius)[0]
+    to_node = _straight(place[None], roadmap.nodes, layout.position, radius)[0]
+    around = jnp.min(to_node[None] + roadmap.to_viewpoint[poi], axis=-1)
+    return jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
+
+
+def next_place(
+    config: Config,
+    layout: Layout,
+    roadmap: Roadmap,
+    place: jax.Array,
+    poi: jax.Array,
+    view: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """The way to one viewpoint.
+
+    Args:
+      config: all settings.
+      layout: where the PoIs stand.
+      roadmap: of the layout.
+      place: `[2]` in metres, see `lengths`.
+      poi: `[]` int32.
+      view: `[]` int32, one of the PoI's viewpoints.
+
+    Returns:
+      `[]` its length, infinite where there is no way, and `[2]` the first place on it, to which a
+      straight line is free.
+    """
+    chex.assert_shape(place, (2,), custom_message="place")
+    goal, radius = roadmap.viewpoints[poi, view], _radius(config)
+    ends = jnp.concatenate([goal[None], roadmap.nodes])
+    straight = _straight(place[None], ends, layout.position, radius)[0]
+    # Of two nodes on the same way the farther one, or a robot that has reached a node would stay.
+    remaining = jnp.append(0.0, 1.001 * roadmap.to_viewpoint[poi, view])
+    total = straight + jnp.where(roadmap.is_free[poi, view], remaining, jnp.inf)
+    first = jnp.argmin(total)
+    return total[first], ends[first]
+
+
+def _radius(config: Config) -> float:
+    """Distance that ways keep from the centres of PoIs, in metres."""
+    return config.arena.poi_extent + config.navigation.robot_radius + _MARGIN
+
+
+def _viewpoints(config: Config, layout: Layout) -> tuple[jax.Array, jax.Array]:
+    """`[N, V, 2]` places around each PoI, and whether they are free and see it."""
+    settings, num_pois = config.navigation, config.arena.num_pois
+    sides = 2 * jnp.pi * jnp.arange(settings.view_sides) / settings.view_sides
+    distances = jnp.array(settings.view_distances)
+    ring = jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
+    offsets = (distances[:, None, None] * ring[None]).reshape(-1, 2)
+    places = layout.position[:, None] + offsets[None]
+    none = jnp.zeros((0, 2))
+    # Room for the robot as planning sees it, not only for its body.
+    clearance = settings.robot_radius - amiro.BODY_RADIUS
+
+    def room(places: jax.Array, poi: jax.Array) -> jax.Array:
+        x, y = places[:, 0], places[:, 1]
+        return viewpoints.free_room(x, y, clearance, config.arena, layout, none, poi)
+
+    return places, jax.vmap(room)(places, jnp.arange(num_pois)) > 0
+
+
+def _straight(start: jax.Array, end: jax.Array, centres: jax.Array, radius: float) -> jax.Array:
+    """`[A, B]` lengths of straight ways between `[A, 2]` and `[B, 2]`, infinite where not free.
+
+    A way is free if it keeps `radius` from all `[N, 2]` centres, or where it begins or ends closer
+    than that, comes no closer on the way.
+    """
+    start_x, start_y = start[:, None, 0], start[:, None, 1]
+    along_x, along_y = end[None, :, 0] - start_x, end[None, :, 1] - start_y
+    squared = along_x**2 + along_y**2
+    is_free = jnp.ones(squared.shape, bool)
+    for centre in centres:
+        to_x, to_y = centre[0] - start_x, centre[1] - start_y
+        share = jnp.clip((to_x * along_x + to_y * along_y) / jnp.maximum(squared, 1e-12), 0.0, 1.0)
+        nearest = jnp.hypot(to_x - share * along_x, to_y - share * along_y)
+        from_end = jnp.hypot(to_x - along_x, to_y - along_y)
+        kept = jnp.minimum(jnp.minimum(jnp.hypot(to_x, to_y), from_end), radius)
+        is_free &= nearest >= kept - _SLACK
+    return jnp.where(is_free, jnp.sqrt(squared), jnp.inf)
+
+
+def _shortest(edges: jax.Array) -> jax.Array:
+    """`[K, K]` lengths of shortest ways over any number of nodes, from those of single edges."""
+    ways = jnp.where(jnp.eye(len(edges), dtype=bool), 0.0, edges)
+    for _ in range(max(1, math.ceil(math.log2(len(edges))))):
+        ways = _min_plus(ways, ways)
+    return ways
+
+
+def _min_plus(first: jax.Array, second: jax.Array) -> jax.Array:
+    """`[A, C]` the least sum over B of `[A, B]` and `[B, C]`."""
+    return jax.lax.map(lambda row: jnp.min(row[:, None] + second, axis=0), first)
