@@ -412,14 +412,16 @@ class NavigationConfig:
     """Distances of viewpoints from a PoI's centre, in metres."""
     view_sides: int = 16
     """Directions of viewpoints around a PoI."""
-    stuck_time: float = 3.0
+    view_range: float = 1.0
+    """Longest distance from which a robot scans a PoI, in metres."""
+    stuck_time: float = 6.0
     """Seconds without progress after which a robot backs off and tries another viewpoint."""
     recovery_time: float = 1.0
     """Seconds for which a robot backs off."""
 
     def __post_init__(self):
         _require_positive(self, "horizon", "robot_radius", "goal_distance", "goal_angle")
-        _require_positive(self, "view_sides", "stuck_time", "recovery_time")
+        _require_positive(self, "view_sides", "view_range", "stuck_time", "recovery_time")
         _require_not_negative(self, "inflation")
         _require(self.speed_samples >= 3, self, "speed_samples", "must be at least 3")
         odd = self.turn_samples >= 3 and self.turn_samples % 2 == 1
@@ -450,6 +452,8 @@ class MissionConfig:
     """Actions whose values differ by less than this from the best count as equally good, in inverse
     latent units; the robot takes the PoI that no other robot is heading for, and of these the
     nearest."""
+    least_confidence: float = 0.95
+    """Probability that a detector must give to its answer for it to be written into the map."""
     attempts: int = 3
     """Looks that detect nothing, or goals that are not reached, after which a robot gives a PoI
     up."""
@@ -457,6 +461,9 @@ class MissionConfig:
     def __post_init__(self):
         _require_positive(self, "episodes", "time_limit", "control_period", "attempts")
         _require_not_negative(self, "equal_values")
+        _require(
+            0 <= self.least_confidence < 1, self, "least_confidence", "must be at least 0, below 1"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -510,12 +517,20 @@ class Config:
             self.arena.poi_extent + self.navigation.robot_radius, self.viewpoint.min_distance
         )
         distances = self.navigation.view_distances
-        if not nearest <= min(distances) <= max(distances) <= self.viewpoint.max_distance:
+        farthest = self.navigation.view_range
+        if farthest > self.viewpoint.max_distance:
+            raise ConfigError(
+                "navigation.view_range",
+                farthest,
+                f"must be at most viewpoint.max_distance = {self.viewpoint.max_distance} m, up to "
+                "where the detectors are trained",
+            )
+        if not nearest <= min(distances) <= max(distances) <= farthest:
             raise ConfigError(
                 "navigation.view_distances",
                 distances,
-                f"must lie between {nearest:.3f} m and {self.viewpoint.max_distance} m, where the "
-                "robot is clear of the PoI and its detector works",
+                f"must lie between {nearest:.3f} m, where the robot is clear of the PoI, and "
+                f"navigation.view_range = {farthest} m",
             )
         looks = self.arena.num_pois * len(self.modalities)
         if self.mdp.partly_seen_starts and not 2 <= looks <= 30:

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from jaxsense.mission.decide import sees
+from jaxsense.mission.decide import planning_margin, sees, standing_robots
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
@@ -17,7 +17,7 @@ from jaxsense.mission.state import (
     update_robot,
 )
 from jaxsense.models import Models, jmvae_shape
-from jaxsense.sim import navigation, roadmap, sensors
+from jaxsense.sim import navigation, roadmap, sensors, viewpoints
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene
 from jaxsense.types import Key
@@ -37,22 +37,31 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
     poi = jnp.minimum(robots.target[robot], config.arena.num_pois - 1)
     pose = scene.poses[robot]
 
-    goal = jnp.minimum(view, num_views - 1)
+    goal, others = jnp.minimum(view, num_views - 1), standing_robots(state, robot)
     way_left, waypoint = roadmap.next_place(
-        config, scene.layout, state.roadmap, pose[:2], poi, goal
+        config, scene.layout, state.roadmap, pose[:2], others, poi, goal
     )
-    offset = state.roadmap.viewpoints[poi, goal] - pose[:2]
-    is_near = jnp.linalg.norm(offset) <= settings.goal_distance
-    arrives = (view == num_views) | (is_near & sees(mission, state, robot, poi))
-    arrives &= phase == DRIVING
+    place = state.roadmap.viewpoints[poi, goal]
+    is_near = jnp.linalg.norm(place - pose[:2]) <= settings.goal_distance
+    is_there = (view == num_views) | (is_near & sees(mission, state, robot, poi))
+    arrives = (phase == DRIVING) & is_there
+    # Another robot has come to stand there or in the view; that is nobody's failure.
+    margin = planning_margin(config)
+    room = viewpoints.free_room(
+        place[:1], place[1:], margin, config.arena, scene.layout, others, poi
+    )
+    is_taken = (phase == DRIVING) & ~is_there & (room[0] <= 0)
 
     progresses = (phase == DRIVING) & (way_left < robots.way_left[robot] - _PROGRESS)
     waits = time - robots.progress_at[robot]
-    is_stuck = (phase == DRIVING) & ~arrives & ~progresses & (waits > settings.stuck_time)
+    is_stuck = (phase == DRIVING) & ~is_there & ~is_taken & ~progresses
+    is_stuck &= waits > settings.stuck_time
     state = _fail(state, robot, is_stuck, "unreachable", config.mission.attempts)
     robots = state.robots
     is_back = (phase == BACKING) & (time >= robots.backs_off_until[robot])
-    phase = jnp.select([arrives, is_stuck, is_back], [FACING, BACKING, IDLE], phase)
+    cases = [arrives, is_taken, is_stuck, is_back]
+    phase = jnp.select(cases, [FACING, IDLE, BACKING, IDLE], phase)
+    excluded = robots.excluded[robot]
 
     drive = navigation.drive_to(
         settings,
@@ -73,9 +82,11 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
         robot,
         phase=phase,
         wanted=wanted,
+        goals=robots.goals[robot] - is_taken,
         reached=robots.reached[robot] + arrives,
+        excluded=jnp.where(is_taken, excluded.at[view].set(True), excluded),
         way_left=jnp.where(progresses, way_left, robots.way_left[robot]),
-        progress_at=jnp.where(progresses, time, robots.progress_at[robot]),
+        progress_at=jnp.where(progresses | arrives, time, robots.progress_at[robot]),
         backs_off_until=jnp.where(
             is_stuck, time + settings.recovery_time, robots.backs_off_until[robot]
         ),
@@ -114,7 +125,12 @@ def scan(
     bearing = _bearing(scene, robot, poi)
     is_aligned = jnp.abs(bearing) <= jnp.radians(config.navigation.goal_angle)
     is_calm = jnp.abs(robots.command[robot, 1]) <= _TURNS_SLOWLY
-    scans = (robots.phase[robot] == FACING) & is_aligned & is_calm
+    # A robot that drives through the view is waited for, but not for long.
+    place, others = scene.poses[robot, :2], jnp.delete(scene.poses[:, :2], robot, axis=0)
+    room = viewpoints.free_room(place[:1], place[1:], 0.0, config.arena, scene.layout, others, poi)
+    waits = now(mission, state) - robots.progress_at[robot]
+    is_ready = is_aligned & is_calm & ((room[0] > 0) | (waits > config.navigation.stuck_time))
+    scans = (robots.phase[robot] == FACING) & is_ready
 
     sensor = world.sensors[robot]
     error = jnp.radians(config.viewpoint.bearing_error)
@@ -125,12 +141,13 @@ def scan(
     distance = jnp.linalg.norm(scene.layout.position[poi] - scene.poses[robot, :2])
     shows = sensors.shows_poi(sensor, readings, believed, distance, config.arena)
     features = detectors.detect(models.detectors[robot], sensors.as_window(sensor, readings))
-    detects = scans & shows
+    is_sure = jnp.max(features) >= config.mission.least_confidence
+    detects = scans & shows & is_sure
 
     old = jax.tree.map(lambda x: x[poi], state.belief)
     new = fusion.write(models.jmvae, jmvae_shape(config), old, state.seen[poi], features, robot)
     entry = jax.tree.map(lambda o, n: jnp.where(detects, n, o), old, new)
-    state = _fail(state, robot, scans & ~shows, "undetected", config.mission.attempts)
+    state = _fail(state, robot, scans & ~detects, "undetected", config.mission.attempts)
     robots = state.robots
     state = update_robot(
         state,

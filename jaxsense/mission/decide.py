@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 
+from jaxsense.config import ROBOT_RADIUS, Config
 from jaxsense.dqn import belief_mdp
 from jaxsense.mission.state import (
+    BACKING,
     DRIVING,
     ENDED,
     FACING,
@@ -103,12 +105,11 @@ def _best_view(
     """The viewpoint of a PoI with the shortest way, and its length; V is where the robot stands."""
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
-    length = roadmap.lengths(config, scene.layout, state.roadmap, scene.poses[robot, :2], poi)
-    places = state.roadmap.viewpoints[poi]
-    others = jnp.delete(scene.poses[:, :2], robot, axis=0)
-    clearance = config.viewpoint.clearance
+    place, others = scene.poses[robot, :2], standing_robots(state, robot)
+    length = roadmap.lengths(config, scene.layout, state.roadmap, place, others, poi)
+    places, margin = state.roadmap.viewpoints[poi], planning_margin(config)
     room = viewpoints.free_room(
-        places[:, 0], places[:, 1], clearance, config.arena, scene.layout, others, poi
+        places[:, 0], places[:, 1], margin, config.arena, scene.layout, others, poi
     )
     length += jnp.where(room > 0, 0.0, _DETOUR)
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
@@ -118,14 +119,24 @@ def _best_view(
 
 
 def sees(mission: Mission, state: MissionState, robot: int, poi: jax.Array) -> jax.Array:
-    """`[]` bool: from where a robot stands, a PoI is in range and nothing known covers it."""
-    config, scene = mission.config, state.scene
-    place = scene.poses[robot, :2]
-    distance = jnp.linalg.norm(scene.layout.position[poi] - place)
-    others = jnp.delete(scene.poses[:, :2], robot, axis=0)
-    settings = config.viewpoint
-    room = viewpoints.free_room(place[:1], place[1:], 0.0, config.arena, scene.layout, others, poi)[
-        0
-    ]
-    in_range = (distance >= settings.min_distance) & (distance <= settings.max_distance)
-    return in_range & (room > 0)
+    """`[]` bool: from where a robot stands, a PoI is in range and nothing that stands covers it."""
+    config, place = mission.config, state.scene.poses[robot, :2]
+    layout, others = state.scene.layout, standing_robots(state, robot)
+    distance = jnp.linalg.norm(layout.position[poi] - place)
+    in_range = distance >= config.viewpoint.min_distance
+    in_range &= distance <= config.navigation.view_range
+    room = viewpoints.free_room(place[:1], place[1:], 0.0, config.arena, layout, others, poi)
+    return in_range & (room[0] > 0)
+
+
+def standing_robots(state: MissionState, robot: int) -> jax.Array:
+    """`[R - 1, 2]` where the other robots stand; those that drive will be elsewhere: far away."""
+    phase = jnp.delete(state.robots.phase, robot)
+    drives = (phase == DRIVING) | (phase == BACKING)
+    others = jnp.delete(state.scene.poses[:, :2], robot, axis=0)
+    return jnp.where(drives[:, None], 1e3, others)
+
+
+def planning_margin(config: Config) -> float:
+    """Free space around a robot's body that planning asks for, in metres."""
+    return config.navigation.robot_radius - ROBOT_RADIUS

@@ -19,7 +19,7 @@ from jaxsense.sim.arena import Layout
 
 NODES_PER_POI = 10
 _LEEWAY = 0.035  # m, within which of a node the next one is still in view
-_MARGIN = 0.02  # m, by which ways keep farther off than trajectories must
+_MARGIN = 0.02  # m, by which ways between nodes keep farther off than a robot must
 _SLACK = 1e-3  # m, by which a way may cut an obstacle: nodes touch their own circle
 
 
@@ -64,7 +64,12 @@ def build(config: Config, layout: Layout) -> Roadmap:
 
 
 def lengths(
-    config: Config, layout: Layout, roadmap: Roadmap, place: jax.Array, poi: jax.Array
+    config: Config,
+    layout: Layout,
+    roadmap: Roadmap,
+    place: jax.Array,
+    others: jax.Array,
+    poi: jax.Array,
 ) -> jax.Array:
     """`[V]` metres from a place to the viewpoints of a PoI; infinite where there is no way.
 
@@ -73,12 +78,14 @@ def lengths(
       layout: where the PoIs stand.
       roadmap: of the layout.
       place: `[2]` in metres; may be closer to a PoI than planning allows, if the way leads off.
+      others: `[R', 2]` robots in the way, in metres; their places are not passed through.
       poi: `[]` int32.
     """
     chex.assert_shape(place, (2,), custom_message="place")
-    goals, radius = roadmap.viewpoints[poi], _radius(config)
+    goals, radius = roadmap.viewpoints[poi], _radius(config) - _MARGIN
     direct = _straight(place[None], goals, layout.position, radius)[0]
     to_node = _straight(place[None], roadmap.nodes, layout.position, radius)[0]
+    to_node = jnp.where(_is_taken(config, roadmap.nodes, others), jnp.inf, to_node)
     around = jnp.min(to_node[None] + roadmap.to_viewpoint[poi], axis=-1)
     return jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
 
@@ -88,6 +95,7 @@ def next_place(
     layout: Layout,
     roadmap: Roadmap,
     place: jax.Array,
+    others: jax.Array,
     poi: jax.Array,
     view: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
@@ -98,6 +106,7 @@ def next_place(
       layout: where the PoIs stand.
       roadmap: of the layout.
       place: `[2]` in metres, see `lengths`.
+      others: `[R', 2]` robots in the way, see `lengths`.
       poi: `[]` int32.
       view: `[]` int32, one of the PoI's viewpoints.
 
@@ -106,18 +115,26 @@ def next_place(
       straight line is free.
     """
     chex.assert_shape(place, (2,), custom_message="place")
-    goal, radius = roadmap.viewpoints[poi, view], _radius(config)
+    goal, radius = roadmap.viewpoints[poi, view], _radius(config) - _MARGIN
     ends = jnp.concatenate([goal[None], roadmap.nodes])
     straight = _straight(place[None], ends, layout.position, radius)[0]
     # Of two nodes on the same way the farther one, or a robot that has reached a node would stay.
     remaining = jnp.append(0.0, 1.001 * roadmap.to_viewpoint[poi, view])
     total = straight + jnp.where(roadmap.is_free[poi, view], remaining, jnp.inf)
+    is_taken = jnp.append(False, _is_taken(config, roadmap.nodes, others))
+    total = jnp.where(is_taken, jnp.inf, total)
     first = jnp.argmin(total)
     return total[first], ends[first]
 
 
+def _is_taken(config: Config, places: jax.Array, others: jax.Array) -> jax.Array:
+    """`[K]` bool, places of `[K, 2]` that are too near to other robots to be gone to."""
+    apart = jnp.linalg.norm(places[:, None] - others[None], axis=-1)
+    return jnp.any(apart < 2 * config.navigation.robot_radius, axis=-1)
+
+
 def _radius(config: Config) -> float:
-    """Distance that ways keep from the centres of PoIs, in metres."""
+    """Distance that ways between nodes keep from the centres of PoIs, in metres."""
     return config.arena.poi_extent + config.navigation.robot_radius + _MARGIN
 
 
