@@ -442,8 +442,8 @@ class NavigationConfig:
 class MissionConfig:
     """The closed loop of all robots in one arena."""
 
-    episodes: int = 256
-    """Episodes that are played with each policy at the end of a run."""
+    episodes: int = 128
+    """Missions that are played with each policy at the end of a run."""
     time_limit: float = 120.0
     """Seconds after which a mission ends in any case."""
     control_period: float = 0.1
@@ -573,6 +573,7 @@ _SMOKE = Config(
         num_starts=64,
     ),
     evaluation=EvaluationConfig(num_starts=32, num_repeats=1),
+    mission=MissionConfig(episodes=4, time_limit=60.0),
 )
 
 PRESETS: dict[str, Config] = {"default": Config(), "paper": _PAPER, "smoke": _SMOKE}

@@ -26,9 +26,15 @@ class Monitor:
         self.seconds: dict[str, dict[str, float]] = {}
         self._listener = listener
 
-    def compile(self, stage: str, function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
-        """Compiles a function for arguments of these shapes; the result counts its own run time."""
-        self._listener(stage, 0, 0, {})
+    def compile(
+        self, stage: str, function: Callable[..., Any], *args: Any, announce: bool = True
+    ) -> Callable[..., Any]:
+        """Compiles a function for arguments of these shapes; the result counts its own run time.
+
+        Without `announce` the listener is not told, as for a compilation in the background.
+        """
+        if announce:
+            self._listener(stage, 0, 0, {})
         begin = time.perf_counter()
         compiled = jax.jit(function).lower(*args).compile()
         self._add(stage, "compile_s", time.perf_counter() - begin)
@@ -46,6 +52,10 @@ class Monitor:
         output = self.compile(stage, function, *args)(*args)
         self._listener(stage, 1, 1, {})
         return output
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """Reports progress of a stage that has no loss."""
+        self._listener(stage, done, total, {})
 
     def check_finite(self, stage: str, params: Any) -> None:
         """Raises a `StageError` if a trained parameter is not finite."""

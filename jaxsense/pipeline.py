@@ -4,6 +4,7 @@ Stages run on the host and call jitted functions; between two chunks of work the
 `Monitor`, so that nothing calls back from inside a compiled loop.
 """
 
+import concurrent.futures
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -18,6 +19,7 @@ from jaxsense.config import MODALITIES, Config
 from jaxsense.dqn import evaluation, policies
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.belief_mdp import MapMdp, random_start, reset
+from jaxsense.mission import POLICIES, Player, cases, make_mission, summary
 from jaxsense.models import Models, jmvae_shape
 from jaxsense.monitor import Monitor
 from jaxsense.observe import Bank
@@ -55,7 +57,7 @@ class RunResult:
       posteriors: for each set of modalities, `[C, S', D]` beliefs of held-out detections.
       rewards: for each modality `[epochs]` mean total reward of the episodes that ended; NaN where
         none did.
-      summary: the blocks `detectors`, `jmvae` and `dqn` of `summary.json`.
+      summary: the blocks `detectors`, `jmvae`, `dqn` and `mission` of `summary.json`.
     """
 
     models: Models
@@ -86,7 +88,12 @@ def run(
       StageError: if a loss is not finite.
     """
     world = make_world(config)
-    detector_key, jmvae_key, *dqn_keys = jax.random.split(key, 2 + len(config.modalities))
+    num_robots = len(config.modalities)
+    detector_key, jmvae_key, mission_key, *dqn_keys = jax.random.split(key, 3 + num_robots)
+    # Compiling the mission takes long and needs no trained network.
+    background = concurrent.futures.ThreadPoolExecutor(1)
+    player = background.submit(_compile_missions, config, monitor)
+    background.shutdown(wait=False)
     trained, banks, windows, accuracy = train_detectors(detector_key, world, monitor)
     keep("detectors", trained)
 
@@ -107,8 +114,11 @@ def run(
         q_networks.append(q_network)
         dqn_figures[name] = {**figures, **speed}
 
+    models = Models(trained, params, class_beliefs, tuple(q_networks))
+    policies = {name: case for name, case in cases(config).items() if name in POLICIES}
+    missions = summary(mission_key, player.result(), models, policies, config.mission.episodes)
     return RunResult(
-        models=Models(trained, params, class_beliefs, tuple(q_networks)),
+        models=models,
         windows=windows,
         posteriors=posteriors,
         rewards=rewards,
@@ -116,8 +126,13 @@ def run(
             "detectors": {m: {"accuracy": a} for m, a in accuracy.items()},
             "jmvae": jmvae_figures,
             "dqn": dqn_figures,
+            "mission": missions,
         },
     )
+
+
+def _compile_missions(config: Config, monitor: Monitor) -> Player:
+    return Player(make_mission(config), monitor, batch=len(POLICIES) * config.mission.episodes)
 
 
 def train_detectors(

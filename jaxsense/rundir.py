@@ -38,10 +38,8 @@ class RunDirectory:
             raise ConfigError("out", str(path), reason) from None
 
     def write_json(self, name: str, content: Any) -> None:
-        """Writes a file as a whole, so that a reader never sees half of it."""
-        unfinished = self.path / f".{name}.unfinished"
-        unfinished.write_text(json.dumps(content, indent=2) + "\n")
-        unfinished.rename(self.path / name)
+        """Writes a file of the run, see the function of the same name."""
+        write_json(self.path / name, content)
 
     def append_metrics(self, **figures: Any) -> None:
         """Adds a line to `metrics.jsonl`."""
@@ -52,6 +50,22 @@ class RunDirectory:
         """Saves parameters as `checkpoints/NAME`."""
         with ocp.StandardCheckpointer() as checkpointer:
             checkpointer.save(self.path.absolute() / "checkpoints" / name, jax.device_get(tree))
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Writes a file as a whole, so that a reader never sees half of it."""
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    unfinished.write_text(json.dumps(content, indent=2) + "\n")
+    unfinished.rename(path)
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """The `summary.json` of a finished run; a `ConfigError` if there is none."""
+    try:
+        return json.loads((path / "summary.json").read_text())
+    except (OSError, ValueError) as error:
+        reason = f"must hold the summary.json of a finished run ({error})"
+        raise ConfigError("run", str(path), reason) from None
 
 
 def load(path: Path | str) -> tuple[Config, Models]:

@@ -1,5 +1,7 @@
 """How a mission has ended and what it has achieved."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -31,14 +33,15 @@ def reason(state: MissionState) -> jax.Array:
     return code
 
 
-def figures(mission: Mission, models: Models, state: MissionState) -> dict[str, jax.Array]:
+def figures(mission: Mission, models: Models, state: MissionState) -> dict[str, Any]:
     """What a mission has achieved.
 
     Returns:
-      `accuracy` of the map's most likely classes, and `accuracy_MODALITY` of what one sensor can
-      tell of them; `ambiguous` and `is_right`, `[N]` each; `observations_per_poi`; `time_s`;
-      `collisions`, control periods with contact; `goals` and `goals_reached`; `information`, the
-      sum over the map; `detections` `[R]`; and `reason`.
+      `classes`, the true ones, `is_right`, whether the map's most likely class is that, and
+      `ambiguous`, whether it leaves more than one open, `[N]` each; `told`, for each modality `[]`
+      the share of the map that is right in what the sensor can tell; `observations_per_poi`;
+      `time_s`; `collisions`, control periods with contact; `goals` and `goals_reached`;
+      `information`, the sum over the map; `detections` `[R]`; and `reason`.
     """
     config = mission.config
     nearest = jax.vmap(lambda b: metrics.nearest_class(b, models.class_beliefs.mean))(state.belief)
@@ -49,12 +52,12 @@ def figures(mission: Mission, models: Models, state: MissionState) -> dict[str, 
     told = {}
     for modality in config.modalities:
         labels = jnp.array(config.arena.label_of_class(MODALITIES[modality]))
-        told[f"accuracy_{modality}"] = jnp.mean(labels[nearest] == labels[state.classes])
+        told[modality] = jnp.mean(labels[nearest] == labels[state.classes])
     robots = state.robots
     return {
-        "accuracy": jnp.mean(is_right),
-        **told,
+        "classes": state.classes,
         "is_right": is_right,
+        "told": told,
         "ambiguous": jnp.sum(plausible, axis=-1) > 1,
         "observations_per_poi": jnp.sum(robots.looks) / config.arena.num_pois,
         "time_s": state.steps * config.mission.control_period,

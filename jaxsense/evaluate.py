@@ -1,0 +1,123 @@
+"""`python -m jaxsense.evaluate RUN_DIR`: missions with the policies of a finished run."""
+
+import dataclasses
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import rich.console
+import rich.table
+import tyro
+
+from jaxsense import animation, cli, mission, rundir
+from jaxsense.config import Config, ConfigError
+from jaxsense.display import Display
+from jaxsense.monitor import Monitor
+from jaxsense.sim.arena import TIMESTEP
+
+PROGRAM = "jaxsense.evaluate"
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Play missions with the policies of a finished run, and compare them in the same arenas."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Directory of the run."""
+    episodes: int = 256
+    """Missions of each policy."""
+    seed: int = 0
+    """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
+    policy: str = "all"
+    """`latent`, `naive`, `random`; `camera_alone`, `camera_stops`, `camera_blind` and the same for
+    the LiDAR, with the latent policy: the robot is alone, stops or goes blind after 6 s; or `all`
+    of them."""
+    animate: bool = False
+    """Also write an animation of the first mission as `mission-POLICY-SEED.gif`."""
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    try:
+        config, models = rundir.load(arguments.run)
+        played = _cases(arguments, config)
+        summary = rundir.read_summary(arguments.run)
+    except ConfigError as error:
+        cli.fail(PROGRAM, str(error))
+    console = rich.console.Console()
+    key = jax.random.key(arguments.seed)
+    team = mission.make_mission(config)
+    with Display(console) as display:
+        monitor = Monitor(display.show)
+        display.show("mission", 0, 0, {})
+        player = mission.Player(team, monitor)
+        begin = time.perf_counter()
+        found = mission.summary(key, player, models, played, arguments.episodes)
+        seconds = time.perf_counter() - begin
+    summary["mission"] = {**summary.get("mission", {}), **found}
+    try:
+        rundir.write_json(arguments.run / "summary.json", summary)
+    except OSError as error:
+        cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({error.strerror})")
+    _print_table(console, found)
+    number = arguments.episodes * len(played)
+    rate, compiling = player.control_steps / seconds, monitor.seconds["mission"]["compile_s"]
+    console.print(
+        f"{number} missions in {seconds:.1f} s after {compiling:.0f} s of compilation: "
+        f"{rate:.0f} control steps/s, "
+        f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
+    )
+    if arguments.animate:
+        name = next(iter(played))
+        path = arguments.run / f"mission-{name}-{arguments.seed}.gif"
+        animation.write(path, key, team, models, played[name], name)
+        console.print(f"The first mission of {name} is in {path}.")
+    console.print(f"The figures are in {arguments.run / 'summary.json'}.")
+
+
+def _cases(arguments: Arguments, config: Config) -> dict[str, mission.Case]:
+    """What is to be played; a `ConfigError` names what cannot be."""
+    if arguments.episodes < 1:
+        raise ConfigError("episodes", arguments.episodes, "must be greater than 0")
+    if not 0 <= arguments.seed < 2**32:
+        raise ConfigError("seed", arguments.seed, "must be within 0 and 2^32 - 1")
+    cases = mission.cases(config)
+    if arguments.policy == "all":
+        return cases
+    if arguments.policy not in cases:
+        known = ", ".join(["all", *cases])
+        raise ConfigError("policy", arguments.policy, f"must be one of {known}")
+    return {arguments.policy: cases[arguments.policy]}
+
+
+def _print_table(console: rich.console.Console, found: dict[str, Any]) -> None:
+    """All cases beside one another."""
+    columns = {
+        "accuracy": "accuracy",
+        "looks per PoI": "observations_per_poi",
+        "time [s]": "time_s",
+        "contacts": "collisions",
+        "goals reached": "goals_reached_fraction",
+        "information": "information",
+        "told apart": "told",
+        "ambiguous reported": "ambiguous_reported",
+    }
+    table = rich.table.Table("policy", *columns, "ended")
+    for name, block in found.items():
+        if name == "bytes_per_detection":
+            continue
+        cells = [f"{block[key]:.4g}" if key in block else "" for key in columns.values()]
+        table.add_row(name, *cells, ", ".join(f"{n} {r}" for r, n in block["ended"].items()))
+    console.print(table)
+    size = found["bytes_per_detection"]
+    console.print(
+        f"A detection takes {size['latent']:.0f} bytes in the map and {size['raw']:.0f} as a raw "
+        f"scan, {size['raw'] / size['latent']:.0f} times as much."
+    )
+
+
+if __name__ == "__main__":
+    main()

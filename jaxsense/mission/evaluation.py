@@ -1,0 +1,200 @@
+"""Many missions, to compare policies and to see what failures do: the summary's `mission` block."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsense.config import MODALITIES, Config
+from jaxsense.mission.figures import REASONS, figures
+from jaxsense.mission.rollout import rollout
+from jaxsense.mission.state import (
+    LATENT,
+    POLICIES,
+    Faults,
+    Mission,
+    MissionState,
+    no_faults,
+    reset,
+)
+from jaxsense.models import Models, untrained
+from jaxsense.monitor import Monitor
+from jaxsense.types import Key
+
+BATCH = 256
+_CHUNK_TIME = 10.0  # s, after which the host looks whether all missions are over
+FAULT_TIME = 6.0  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """Something to play missions with.
+
+    Attributes:
+      policy: index into `POLICIES`.
+      faults: which robots fail, and when.
+    """
+
+    policy: int
+    faults: Faults
+
+
+def cases(config: Config) -> dict[str, Case]:
+    """The policies, each robot alone, and each robot failing in mid-mission.
+
+    `latent`, `naive` and `random` are the policies; `MODALITY_alone` has all other robots stand
+    still from the start; in `MODALITY_stops` and `MODALITY_blind` the robot stops or its sensor
+    goes blind after 6 s. Failures are played with the latent policy.
+    """
+    healthy = no_faults(config)
+    found = {name: Case(policy, healthy) for policy, name in enumerate(POLICIES)}
+    for m, modality in enumerate(config.modalities if len(config.modalities) > 1 else ()):
+        own = jnp.arange(len(config.modalities)) == m
+        alone = Faults(jnp.where(own, jnp.inf, 0.0), healthy.blind_at)
+        failing = jnp.where(own, FAULT_TIME, jnp.inf)
+        found[f"{modality}_alone"] = Case(LATENT, alone)
+        found[f"{modality}_stops"] = Case(LATENT, Faults(failing, healthy.blind_at))
+        found[f"{modality}_blind"] = Case(LATENT, Faults(healthy.stops_at, failing))
+    return found
+
+
+class Player:
+    """Plays missions in batches, with programs that are compiled once, before there are models.
+
+    Episode i has the same arena in every case, and in every batch.
+
+    Attributes:
+      mission: the mission.
+      control_steps: control periods of missions played so far, until they were over.
+    """
+
+    def __init__(self, mission: Mission, monitor: Monitor, batch: int = BATCH):
+        """Compiles for batches of `batch` missions."""
+        self.mission, self._monitor, self._batch = mission, monitor, batch
+        self.control_steps = 0
+        config = mission.config
+        self._chunk = round(_CHUNK_TIME / config.mission.control_period)
+        self._most_chunks = math.ceil(
+            config.mission.time_limit / config.mission.control_period / self._chunk
+        )
+
+        def begin(keys: Key, policies: jax.Array, faults: Faults):
+            return jax.vmap(lambda k, p, f: reset(k, mission, p, f))(keys, policies, faults)
+
+        def go_on(keys: Key, models: Models, state: MissionState):
+            roll = jax.vmap(lambda k, s: rollout(k, mission, models, s, self._chunk)[0])
+            state = roll(keys, state)
+            return state, jax.vmap(lambda s: figures(mission, models, s))(state)
+
+        keys = jax.random.split(jax.random.key(0), batch)
+        faults = jax.tree.map(lambda x: jnp.tile(x, (batch, 1)), no_faults(config))
+        inputs = keys, jnp.zeros(batch, jnp.int32), faults
+        self._begin = monitor.compile("mission", begin, *inputs, announce=False)
+        state = jax.eval_shape(begin, *inputs)
+        models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
+        self._go_on = monitor.compile("mission", go_on, keys, models, state, announce=False)
+
+    def play(
+        self, key: Key, models: Models, played: dict[str, Case], episodes: int
+    ) -> dict[str, dict[str, Any]]:
+        """Plays every case in the same arenas.
+
+        Args:
+          key: random key.
+          models: trained networks.
+          played: what to play with.
+          episodes: how many missions of each case.
+
+        Returns:
+          For each case the `[episodes, ...]` figures of `figures.figures`.
+        """
+        total = episodes * len(played)
+        row = np.arange(math.ceil(total / self._batch) * self._batch) % total
+        case, episode = row // episodes, row % episodes
+        policies = jnp.array([c.policy for c in played.values()], jnp.int32)
+        faults = jax.tree.map(lambda *x: jnp.stack(x), *[c.faults for c in played.values()])
+        arena_key, play_key = jax.random.split(key)
+        results = []
+        for begin in range(0, len(row), self._batch):
+            rows = slice(begin, begin + self._batch)
+            chosen, numbers = jnp.array(case[rows]), jnp.array(episode[rows])
+            arena_keys = jax.vmap(lambda i: jax.random.fold_in(arena_key, i))(numbers)
+            keys = jax.vmap(lambda i: jax.random.fold_in(play_key, i))(numbers)
+            state = self._begin(
+                arena_keys,
+                policies[chosen],
+                jax.tree.map(lambda x: x[chosen], faults),  # noqa: B023
+            )
+            found: Any = {}
+            for chunk in range(self._most_chunks):
+                chunk_keys = jax.vmap(lambda k: jax.random.fold_in(k, chunk))(keys)  # noqa: B023
+                state, found = self._go_on(chunk_keys, models, state)
+                if bool(state.is_over.all()):
+                    break
+            results.append(jax.tree.map(np.asarray, found))
+            self.control_steps += int(state.steps.sum())
+            self._monitor.progress("mission", min(begin + self._batch, total), total)
+        joined = jax.tree.map(lambda *x: np.concatenate(x)[:total], *results)
+        return {
+            name: jax.tree.map(lambda x: x[i * episodes : (i + 1) * episodes], joined)  # noqa: B023
+            for i, name in enumerate(played)
+        }
+
+
+def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any]:
+    """One case's block of `summary.json`.
+
+    Args:
+      config: all settings.
+      name: of the case.
+      found: `[E, ...]` from `Player.play`.
+
+    Returns:
+      Means over the missions, but for `time_s`, which is the median, and `collisions`, the sum.
+      For a robot alone also `told`, the accuracy of what its sensor can tell apart, and
+      `ambiguous_reported`, how many of the PoIs it cannot tell apart the map shows as ambiguous.
+    """
+    block: dict[str, Any] = {
+        "accuracy": float(found["is_right"].mean()),
+        "observations_per_poi": float(found["observations_per_poi"].mean()),
+        "time_s": float(np.median(found["time_s"])),
+        "collisions": int(found["collisions"].sum()),
+        "goals_reached_fraction": float(found["goals_reached"].sum() / found["goals"].sum()),
+        "information": float(found["information"].mean()),
+        "episodes": len(found["time_s"]),
+        "ended": {
+            reason: int(np.sum(found["reason"] == code))
+            for code, reason in enumerate(REASONS)
+            if np.any(found["reason"] == code)
+        },
+    }
+    modality = name.removesuffix("_alone")
+    if modality != name:
+        labels = np.array(config.arena.label_of_class(MODALITIES[modality]))
+        shares_label = np.array([np.sum(labels == label) > 1 for label in labels])
+        cannot_tell = shares_label[found["classes"]]
+        block["told"] = float(found["told"][modality].mean())
+        block["ambiguous_reported"] = float(found["ambiguous"][cannot_tell].mean())
+    return block
+
+
+def bytes_per_detection(mission: Mission, found: dict[str, Any]) -> dict[str, float]:
+    """What a detection puts on the network: an entry of the map, or the raw scan, in bytes."""
+    detections = found["detections"].sum(axis=0)
+    scans = np.array([sensor.scan_bytes for sensor in mission.world.sensors])
+    entry = 2 * mission.config.jmvae.latent_size * np.dtype(np.float32).itemsize
+    return {"latent": float(entry), "raw": float(np.average(scans, weights=detections))}
+
+
+def summary(
+    key: Key, player: Player, models: Models, played: dict[str, Case], episodes: int
+) -> dict[str, Any]:
+    """Plays missions and gives the summary's block `mission`; see `Player.play` for arguments."""
+    found = player.play(key, models, played, episodes)
+    config = player.mission.config
+    blocks = {name: summarise(config, name, figures) for name, figures in found.items()}
+    first = next(iter(found.values()))
+    return {**blocks, "bytes_per_detection": bytes_per_detection(player.mission, first)}
