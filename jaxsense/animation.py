@@ -180,6 +180,12 @@ def _poi(radius: float, layout: Layout, n: int) -> Patch:
     if layout.shape[n] == 0:
         return Circle((x, y), radius, color=colour, zorder=2)
     turn = np.degrees(float(layout.yaw[n]))
-    square = Rectangle((x - radius, y - radius), 2 * radius, 2 * radius, color=colour, zorder=2)
-    square.set(angle=turn, rotation_point="center")
-    return square
+    return Rectangle(
+        (x - radius, y - radius),
+        2 * radius,
+        2 * radius,
+        angle=turn,
+        rotation_point="center",
+        color=colour,
+        zorder=2,
+    )

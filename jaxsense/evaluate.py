@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
+import rich.box
 import rich.console
 import rich.table
 import tyro
@@ -97,21 +98,30 @@ def _print_table(console: rich.console.Console, found: dict[str, Any]) -> None:
     """All cases beside one another."""
     columns = {
         "accuracy": "accuracy",
-        "looks per PoI": "observations_per_poi",
-        "time [s]": "time_s",
+        "looks": "observations_per_poi",
+        "time": "time_s",
         "contacts": "collisions",
-        "goals reached": "goals_reached_fraction",
-        "information": "information",
-        "told apart": "told",
-        "ambiguous reported": "ambiguous_reported",
+        "goals": "goals_reached_fraction",
+        "inform.": "information",
+        "told": "told",
+        "ambig.": "ambiguous_reported",
     }
-    table = rich.table.Table("policy", *columns, "ended")
-    for name, block in found.items():
-        if name == "bytes_per_detection":
-            continue
-        cells = [f"{block[key]:.4g}" if key in block else "" for key in columns.values()]
-        table.add_row(name, *cells, ", ".join(f"{n} {r}" for r, n in block["ended"].items()))
+    table = rich.table.Table("policy", *columns, box=rich.box.SIMPLE, pad_edge=False)
+    blocks = {name: block for name, block in found.items() if name != "bytes_per_detection"}
+    for name, block in blocks.items():
+        cells = (f"{block[key]:.4g}" if key in block else "" for key in columns.values())
+        table.add_row(name, *cells)
     console.print(table)
+    console.print(
+        "accuracy of the finished map; looks per PoI; median time [s]; control periods with "
+        "contact; share of goals that were reached; information in the map; accuracy of what a "
+        "robot alone can tell; share of the other PoIs that the map shows as ambiguous.\n"
+    )
+    for name, block in blocks.items():
+        others = {reason: n for reason, n in block["ended"].items() if reason != "finished"}
+        if others:
+            reasons = ", ".join(f"{n} {reason}" for reason, n in others.items())
+            console.print(f"{name}: of {block['episodes']} missions {reasons}")
     size = found["bytes_per_detection"]
     console.print(
         f"A detection takes {size['latent']:.0f} bytes in the map and {size['raw']:.0f} as a raw "

@@ -9,6 +9,7 @@ from jaxsense.mission.decide import planning_margin, sees, standing_robots
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
+    ENDED,
     FACING,
     IDLE,
     Mission,
@@ -24,6 +25,8 @@ from jaxsense.types import Key
 from jaxsense.vae import detectors, fusion
 
 _PROGRESS = 0.02  # m, by which a way must become shorter to count as progress
+_PATIENCE = 2.0  # s without progress of another robot, after which one that has ended makes room
+_NEARBY = 0.5  # m, between their middles
 _TURNS_SLOWLY = 0.35  # rad/s, at which a robot may scan
 
 
@@ -39,7 +42,13 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
 
     goal, others = jnp.minimum(view, num_views - 1), standing_robots(state, robot)
     way_left, waypoint = roadmap.next_place(
-        config, scene.layout, state.roadmap, pose[:2], others, poi, goal
+        config,
+        scene.layout,
+        state.roadmap,
+        pose[:2],
+        others,
+        poi,
+        goal,
     )
     place = state.roadmap.viewpoints[poi, goal]
     is_near = jnp.linalg.norm(place - pose[:2]) <= settings.goal_distance
@@ -63,6 +72,7 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
     phase = jnp.select(cases, [FACING, IDLE, BACKING, IDLE], phase)
     excluded = robots.excluded[robot]
 
+    makes_room = (phase == ENDED) & _is_in_the_way(mission, state, robot)
     drive = navigation.drive_to(
         settings,
         config.arena,
@@ -72,10 +82,10 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
         robot,
         waypoint,
         period,
-        backs_off=phase == BACKING,
+        backs_off=(phase == BACKING) | makes_room,
     )
     turn = navigation.face(_bearing(scene, robot, poi))
-    is_driving = (phase == DRIVING) | (phase == BACKING)
+    is_driving = (phase == DRIVING) | (phase == BACKING) | makes_room
     wanted = jnp.where(is_driving, drive, jnp.where(phase == FACING, turn, 0.0))
     return update_robot(
         state,
@@ -91,6 +101,14 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
             is_stuck, time + settings.recovery_time, robots.backs_off_until[robot]
         ),
     )
+
+
+def _is_in_the_way(mission: Mission, state: MissionState, robot: int) -> jax.Array:
+    """`[]` bool: a robot nearby drives and makes no progress."""
+    robots, poses = state.robots, state.scene.poses
+    waits = now(mission, state) - robots.progress_at > _PATIENCE
+    is_near = jnp.linalg.norm(poses[:, :2] - poses[robot, None, :2], axis=-1) < _NEARBY
+    return jnp.any(jnp.delete((robots.phase == DRIVING) & waits & is_near, robot))
 
 
 def _fail(

@@ -17,9 +17,10 @@ from jaxsense.sim.arena import Layout
 
 BACKWARD_SPEED = 0.1  # m/s
 _SAMPLE_TIMES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0)  # shares of the horizon
+_GRAZE = 0.005  # m, by which a trajectory may cut the planning radius: samples are coarse
 _SIDESTEP = 0.06  # m, by which a way around another robot is wider than it must be
 _LOOKS_AHEAD = 3  # of these times; leaving an arc at once would make standing still worth as much
-_INFLATION_COST = 0.5  # s, of a way that just touches the planning radius
+_INFLATION_COST = 0.1  # s, of a way that just touches the planning radius
 
 
 def wheel_speeds(command: jax.Array) -> jax.Array:
@@ -159,7 +160,7 @@ def drive_to(
     turn *= jnp.clip(distance / 0.08 - 0.25, 0.0, 1.0)
     cost = _INFLATION_COST * jnp.clip(1.0 - room_of_map / max(settings.inflation, 1e-6), 0.0, 1.0)
     arrival = times + turn / amiro.MAX_TURN_RATE + distance / amiro.MAX_SPEED + cost
-    is_safe = least >= jnp.minimum(room_now - 1e-3, 0.0)
+    is_safe = least >= jnp.minimum(room_now - 1e-4, -_GRAZE)
     value = jnp.min(jnp.where(is_safe, arrival, jnp.inf)[:, _LOOKS_AHEAD:], axis=1)
     value = jnp.where(backs_off, -room[:, len(_SAMPLE_TIMES) // 2], value)
     change = seconds * jnp.array([amiro.MAX_ACCELERATION, amiro.MAX_TURN_ACCELERATION]) + 1e-6

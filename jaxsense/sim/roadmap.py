@@ -78,14 +78,14 @@ def lengths(
       layout: where the PoIs stand.
       roadmap: of the layout.
       place: `[2]` in metres; may be closer to a PoI than planning allows, if the way leads off.
-      others: `[R', 2]` robots in the way, in metres; their places are not passed through.
+      others: `[R', 2]` robots that stand, in metres.
       poi: `[]` int32.
     """
     chex.assert_shape(place, (2,), custom_message="place")
-    goals, radius = roadmap.viewpoints[poi], _radius(config) - _MARGIN
-    direct = _straight(place[None], goals, layout.position, radius)[0]
-    to_node = _straight(place[None], roadmap.nodes, layout.position, radius)[0]
-    to_node = jnp.where(_is_taken(config, roadmap.nodes, others), jnp.inf, to_node)
+    goals = roadmap.viewpoints[poi]
+    ends = jnp.concatenate([goals, roadmap.nodes])
+    first = _first_parts(config, layout, place, others, ends)
+    direct, to_node = first[: len(goals)], first[len(goals) :]
     around = jnp.min(to_node[None] + roadmap.to_viewpoint[poi], axis=-1)
     return jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
 
@@ -106,7 +106,7 @@ def next_place(
       layout: where the PoIs stand.
       roadmap: of the layout.
       place: `[2]` in metres, see `lengths`.
-      others: `[R', 2]` robots in the way, see `lengths`.
+      others: `[R', 2]` robots that stand, see `lengths`.
       poi: `[]` int32.
       view: `[]` int32, one of the PoI's viewpoints.
 
@@ -115,22 +115,29 @@ def next_place(
       straight line is free.
     """
     chex.assert_shape(place, (2,), custom_message="place")
-    goal, radius = roadmap.viewpoints[poi, view], _radius(config) - _MARGIN
-    ends = jnp.concatenate([goal[None], roadmap.nodes])
-    straight = _straight(place[None], ends, layout.position, radius)[0]
+    ends = jnp.concatenate([roadmap.viewpoints[poi, view][None], roadmap.nodes])
+    first = _first_parts(config, layout, place, others, ends)
     # Of two nodes on the same way the farther one, or a robot that has reached a node would stay.
     remaining = jnp.append(0.0, 1.001 * roadmap.to_viewpoint[poi, view])
-    total = straight + jnp.where(roadmap.is_free[poi, view], remaining, jnp.inf)
-    is_taken = jnp.append(False, _is_taken(config, roadmap.nodes, others))
-    total = jnp.where(is_taken, jnp.inf, total)
-    first = jnp.argmin(total)
-    return total[first], ends[first]
+    total = first + jnp.where(roadmap.is_free[poi, view], remaining, jnp.inf)
+    best = jnp.argmin(total)
+    return total[best], ends[best]
 
 
-def _is_taken(config: Config, places: jax.Array, others: jax.Array) -> jax.Array:
-    """`[K]` bool, places of `[K, 2]` that are too near to other robots to be gone to."""
-    apart = jnp.linalg.norm(places[:, None] - others[None], axis=-1)
-    return jnp.any(apart < 2 * config.navigation.robot_radius, axis=-1)
+def _first_parts(
+    config: Config,
+    layout: Layout,
+    place: jax.Array,
+    others: jax.Array,
+    ends: jax.Array,
+) -> jax.Array:
+    """`[E]` lengths of straight ways to `[E, 2]` ends; infinite if not free or if one is taken."""
+    radius, keep = _radius(config) - _MARGIN, 2 * config.navigation.robot_radius
+    length = _straight(place[None], ends, layout.position, radius)[0]
+    for other in others:
+        apart = jnp.linalg.norm(ends - other[None], axis=-1)
+        length = jnp.where(apart < keep, jnp.inf, length)
+    return length
 
 
 def _radius(config: Config) -> float:
@@ -163,18 +170,24 @@ def _straight(start: jax.Array, end: jax.Array, centres: jax.Array, radius: floa
     A way is free if it keeps `radius` from all `[N, 2]` centres, or where it begins or ends closer
     than that, comes no closer on the way.
     """
+    along = end[None] - start[:, None]
+    is_free = jnp.ones(along.shape[:2], bool)
+    for centre in centres:
+        from_start = jnp.linalg.norm(start - centre[None], axis=-1)[:, None]
+        from_end = jnp.linalg.norm(end - centre[None], axis=-1)[None]
+        kept = jnp.minimum(jnp.minimum(from_start, from_end), radius)
+        is_free &= _from_segments(start, end, centre) >= kept - _SLACK
+    return jnp.where(is_free, jnp.linalg.norm(along, axis=-1), jnp.inf)
+
+
+def _from_segments(start: jax.Array, end: jax.Array, point: jax.Array) -> jax.Array:
+    """`[A, B]` distances of a point from the straight ways between `[A, 2]` and `[B, 2]`."""
     start_x, start_y = start[:, None, 0], start[:, None, 1]
     along_x, along_y = end[None, :, 0] - start_x, end[None, :, 1] - start_y
-    squared = along_x**2 + along_y**2
-    is_free = jnp.ones(squared.shape, bool)
-    for centre in centres:
-        to_x, to_y = centre[0] - start_x, centre[1] - start_y
-        share = jnp.clip((to_x * along_x + to_y * along_y) / jnp.maximum(squared, 1e-12), 0.0, 1.0)
-        nearest = jnp.hypot(to_x - share * along_x, to_y - share * along_y)
-        from_end = jnp.hypot(to_x - along_x, to_y - along_y)
-        kept = jnp.minimum(jnp.minimum(jnp.hypot(to_x, to_y), from_end), radius)
-        is_free &= nearest >= kept - _SLACK
-    return jnp.where(is_free, jnp.sqrt(squared), jnp.inf)
+    to_x, to_y = point[0] - start_x, point[1] - start_y
+    squared = jnp.maximum(along_x**2 + along_y**2, 1e-12)
+    share = jnp.clip((to_x * along_x + to_y * along_y) / squared, 0.0, 1.0)
+    return jnp.hypot(to_x - share * along_x, to_y - share * along_y)
 
 
 def _shortest(edges: jax.Array) -> jax.Array:
