@@ -26,7 +26,7 @@ from jaxsense.vae import detectors, fusion
 
 _PROGRESS = 0.02  # m, by which a way must become shorter to count as progress
 _PATIENCE = 2.0  # s without progress of another robot, after which one that has ended makes room
-_NEARBY = 0.5  # m, between their middles
+_NEARBY = 1.0  # m, between their middles
 _TURNS_SLOWLY = 0.35  # rad/s, at which a robot may scan
 
 

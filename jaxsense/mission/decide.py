@@ -105,8 +105,8 @@ def _best_view(
     """The viewpoint of a PoI with the shortest way, and its length; V is where the robot stands."""
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
-    place, others = scene.poses[robot, :2], standing_robots(state, robot)
-    length = roadmap.lengths(config, scene.layout, state.roadmap, place, others, poi)
+    others = standing_robots(state, robot)
+    length = roadmap.lengths(config, scene.layout, state.roadmap, scene.poses[robot, :2], poi)
     places, margin = state.roadmap.viewpoints[poi], planning_margin(config)
     room = viewpoints.free_room(
         places[:, 0], places[:, 1], margin, config.arena, scene.layout, others, poi

@@ -64,27 +64,23 @@ def build(config: Config, layout: Layout) -> Roadmap:
 
 
 def lengths(
-    config: Config,
-    layout: Layout,
-    roadmap: Roadmap,
-    place: jax.Array,
-    others: jax.Array,
-    poi: jax.Array,
+    config: Config, layout: Layout, roadmap: Roadmap, place: jax.Array, poi: jax.Array
 ) -> jax.Array:
     """`[V]` metres from a place to the viewpoints of a PoI; infinite where there is no way.
+
+    Other robots are left out: they will be elsewhere, or make room.
 
     Args:
       config: all settings.
       layout: where the PoIs stand.
       roadmap: of the layout.
       place: `[2]` in metres; may be closer to a PoI than planning allows, if the way leads off.
-      others: `[R', 2]` robots that stand, in metres.
       poi: `[]` int32.
     """
     chex.assert_shape(place, (2,), custom_message="place")
     goals = roadmap.viewpoints[poi]
     ends = jnp.concatenate([goals, roadmap.nodes])
-    first = _first_parts(config, layout, place, others, ends)
+    first = _straight(place[None], ends, layout.position, _radius(config) - _MARGIN)[0]
     direct, to_node = first[: len(goals)], first[len(goals) :]
     around = jnp.min(to_node[None] + roadmap.to_viewpoint[poi], axis=-1)
     return jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
@@ -106,7 +102,7 @@ def next_place(
       layout: where the PoIs stand.
       roadmap: of the layout.
       place: `[2]` in metres, see `lengths`.
-      others: `[R', 2]` robots that stand, see `lengths`.
+      others: `[R', 2]` robots that stand, in metres; the way does not begin where one is.
       poi: `[]` int32.
       view: `[]` int32, one of the PoI's viewpoints.
 
@@ -116,28 +112,15 @@ def next_place(
     """
     chex.assert_shape(place, (2,), custom_message="place")
     ends = jnp.concatenate([roadmap.viewpoints[poi, view][None], roadmap.nodes])
-    first = _first_parts(config, layout, place, others, ends)
+    first = _straight(place[None], ends, layout.position, _radius(config) - _MARGIN)[0]
+    apart = jnp.linalg.norm(ends[:, None] - others[None], axis=-1)
+    is_taken = jnp.any(apart < 2 * config.navigation.robot_radius, axis=-1)
     # Of two nodes on the same way the farther one, or a robot that has reached a node would stay.
     remaining = jnp.append(0.0, 1.001 * roadmap.to_viewpoint[poi, view])
     total = first + jnp.where(roadmap.is_free[poi, view], remaining, jnp.inf)
+    total = jnp.where(is_taken, jnp.inf, total)
     best = jnp.argmin(total)
     return total[best], ends[best]
-
-
-def _first_parts(
-    config: Config,
-    layout: Layout,
-    place: jax.Array,
-    others: jax.Array,
-    ends: jax.Array,
-) -> jax.Array:
-    """`[E]` lengths of straight ways to `[E, 2]` ends; infinite if not free or if one is taken."""
-    radius, keep = _radius(config) - _MARGIN, 2 * config.navigation.robot_radius
-    length = _straight(place[None], ends, layout.position, radius)[0]
-    for other in others:
-        apart = jnp.linalg.norm(ends - other[None], axis=-1)
-        length = jnp.where(apart < keep, jnp.inf, length)
-    return length
 
 
 def _radius(config: Config) -> float:
