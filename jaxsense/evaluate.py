@@ -115,7 +115,8 @@ def _print_table(console: rich.console.Console, found: dict[str, Any]) -> None:
     console.print(
         "accuracy of the finished map; looks per PoI; median time [s]; control periods with "
         "contact; share of goals that were reached; information in the map; accuracy of what a "
-        "robot alone can tell; share of the other PoIs that the map shows as ambiguous.\n"
+        "robot alone can tell; share of the other PoIs that the map shows as ambiguous.\n",
+        markup=False,
     )
     for name, block in blocks.items():
         others = {reason: n for reason, n in block["ended"].items() if reason != "finished"}

@@ -213,18 +213,20 @@ def reset(
     if classes is None:
         classes = jax.random.randint(class_key, (num_pois,), 0, len(config.arena.classes))
     layout = arenas.random_layout(layout_key, config.arena, classes)
-    poses = _random_poses(pose_key, config, layout)
-    return start(
-        mission,
-        Scene(layout, sensors.random_light(light_key), poses),
-        classes,
-        jnp.asarray(policy, jnp.int32),
-        no_faults(config) if faults is None else faults,
-    )
+    ways = roadmap.build(config, layout)
+    poses = _random_poses(pose_key, config, layout, ways)
+    scene = Scene(layout, sensors.random_light(light_key), poses)
+    faults = no_faults(config) if faults is None else faults
+    return start(mission, scene, classes, jnp.asarray(policy, jnp.int32), faults, ways)
 
 
 def start(
-    mission: Mission, scene: Scene, classes: jax.Array, policy: jax.Array, faults: Faults
+    mission: Mission,
+    scene: Scene,
+    classes: jax.Array,
+    policy: jax.Array,
+    faults: Faults,
+    ways: Roadmap | None = None,
 ) -> MissionState:
     """A given arena before anybody has looked at anything; see `reset` for the arguments."""
     config = mission.config
@@ -235,7 +237,7 @@ def start(
         shape = (num_robots,)
         chex.assert_shape(getattr(faults, name), shape, custom_message=f"faults.{name}")
     entry = fusion.unseen(jmvae_shape(config), config.mdp.unseen_variance)
-    ways = roadmap.build(config, scene.layout)
+    ways = roadmap.build(config, scene.layout) if ways is None else ways
     number = jnp.zeros(num_robots, jnp.int32)
     seconds = jnp.zeros(num_robots)
     robots = Robots(
@@ -276,16 +278,25 @@ def start(
     )
 
 
-def _random_poses(key: Key, config: Config, layout: arenas.Layout) -> jax.Array:
-    """`[R, 3]` poses with room around the robots, drawn one after the other."""
+def _random_poses(key: Key, config: Config, layout: arenas.Layout, ways: Roadmap) -> jax.Array:
+    """`[R, 3]` poses with room around the robots and a way to every PoI that there is one to."""
     num_robots = len(config.modalities)
     draws = jax.random.uniform(key, (num_robots, 3, _FREE_DRAWS), minval=-1.0)
     reach = config.arena.side / 2 - config.navigation.robot_radius
+
+    def to_each_poi(place: jax.Array) -> jax.Array:
+        of_poi = jax.vmap(lambda poi: roadmap.lengths(config, layout, ways, place, poi).min())
+        return of_poi(jnp.arange(config.arena.num_pois))
+
     poses = jnp.zeros((0, 3))
     for draw in draws:
         places = reach * draw[:2].T
         to_pois = jnp.linalg.norm(places[:, None] - layout.position[None], axis=-1)
         room = jnp.min(to_pois, axis=-1) - config.arena.poi_extent - config.navigation.robot_radius
+        to_pois = jax.vmap(to_each_poi)(places)
+        # From a corner behind a PoI there may be no way out.
+        is_cut_off = jnp.any(jnp.isinf(to_pois), axis=-1)
+        room = jnp.where(is_cut_off, room - config.arena.side, room)
         for other in poses:
             apart = jnp.linalg.norm(places - other[None, :2], axis=-1)
             room = jnp.minimum(room, apart - 3 * config.navigation.robot_radius)
