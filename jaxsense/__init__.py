@@ -7,11 +7,13 @@ Latent Space Representation", 2018.
 
 The parts are `jaxsense.sim` (arena, ray-caster, sensors), `jaxsense.vae` (detectors, JMVAE, fusion)
 and `jaxsense.dqn` (map MDP, Q-learning); `jaxsense.observe` joins them, and `jaxsense.pipeline`
-trains them one after the other. Every function is pure, takes its random key first, and works on
+trains them one after the other; `jaxsense.mission` plays
+all robots in closed loop. Every function is pure, takes its random key first, and works on
 one example: `vmap` and `jit` are yours.
 """
 
 from jaxsense import dqn as dqn
+from jaxsense import mission as mission
 from jaxsense import sim as sim
 from jaxsense import vae as vae
 from jaxsense.config import PRESETS as PRESETS

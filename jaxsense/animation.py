@@ -13,6 +13,7 @@ from matplotlib.patches import Circle, Ellipse, Patch, Rectangle
 
 from jaxsense.config import COLOURS, Config
 from jaxsense.mission import Case, Mission, MissionState, Record, reset, rollout
+from jaxsense.mission.evaluation import chunks, keys_of_episode
 from jaxsense.mission.state import ENDED
 from jaxsense.models import Models
 from jaxsense.sim import amiro, raycast
@@ -38,16 +39,9 @@ def write(path: Path, key: Key, mission: Mission, models: Models, case: Case, ti
       title: what to call it.
     """
     settings = mission.config.mission
-    arena_key, play_key = (jax.random.fold_in(k, 0) for k in jax.random.split(key))
-    steps = round(settings.time_limit / settings.control_period)
-
-    def play(models: Models) -> tuple[MissionState, Record]:
-        start = reset(arena_key, mission, case.policy, case.faults)
-        return rollout(play_key, mission, models, start, steps)
-
-    state, record = jax.jit(play)(models)
+    state, record = play_first(key, mission, models, case)
     # A little longer than the mission, to look at the finished map.
-    last = min(int(state.steps) + round(2.0 / settings.control_period), steps)
+    last = min(int(state.steps) + round(2.0 / settings.control_period), len(record.time))
     frames = np.arange(0, last, max(1, round(FRAME_PERIOD / settings.control_period)))
     record = jax.tree.map(lambda x: np.asarray(x)[frames], record)
     beams = np.asarray(_beams(mission, state, jnp.asarray(record.poses)))
@@ -71,6 +65,26 @@ def write(path: Path, key: Key, mission: Mission, models: Models, case: Case, ti
 
     film = FuncAnimation(figure, draw, frames=len(frames), blit=False)
     film.save(path, PillowWriter(fps=round(SPEED / FRAME_PERIOD)), dpi=80)
+
+
+def play_first(
+    key: Key, mission: Mission, models: Models, case: Case
+) -> tuple[MissionState, Record]:
+    """The first mission of `Player.play` with this key: its end and the records on the way."""
+    arena_key, play_key = keys_of_episode(key, 0)
+    chunk, most_chunks = chunks(mission.config)
+    steps = chunk * most_chunks
+
+    def play(models: Models) -> tuple[MissionState, Record]:
+        start = reset(arena_key, mission, case.policy, case.faults)
+
+        def go_on(state: MissionState, number: jax.Array) -> tuple[MissionState, Record]:
+            return rollout(jax.random.fold_in(play_key, number), mission, models, state, chunk)
+
+        state, record = jax.lax.scan(go_on, start, jnp.arange(most_chunks))
+        return state, jax.tree.map(lambda x: x.reshape(steps, *x.shape[2:]), record)
+
+    return jax.jit(play)(models)
 
 
 def _beams(mission: Mission, state: MissionState, poses: jax.Array) -> jax.Array:

@@ -421,6 +421,7 @@ class NavigationConfig:
 
     def __post_init__(self):
         _require_positive(self, "horizon", "robot_radius", "goal_distance", "goal_angle")
+        _require(self.horizon >= 1.0, self, "horizon", "must be at least 1 s")
         _require_positive(self, "view_sides", "view_range", "stuck_time", "recovery_time")
         _require_not_negative(self, "inflation")
         _require(self.speed_samples >= 3, self, "speed_samples", "must be at least 3")
@@ -460,6 +461,16 @@ class MissionConfig:
 
     def __post_init__(self):
         _require_positive(self, "episodes", "time_limit", "control_period", "attempts")
+        steps = self.control_period / 0.01
+        _require(
+            abs(steps - round(steps)) < 1e-6 and 5 <= round(steps) <= 20,
+            self,
+            "control_period",
+            "must be a multiple of 0.01 s within 0.05 and 0.2 s",
+        )
+        _require(
+            self.time_limit >= self.control_period, self, "time_limit", "must be a period or more"
+        )
         _require_not_negative(self, "equal_values")
         _require(
             0 <= self.least_confidence < 1, self, "least_confidence", "must be at least 0, below 1"

@@ -19,6 +19,7 @@ from jaxsense.config import MODALITIES, Config
 from jaxsense.dqn import evaluation, policies
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.belief_mdp import MapMdp, random_start, reset
+from jaxsense.mission import BATCH as MISSION_BATCH
 from jaxsense.mission import POLICIES, Player, cases, make_mission, summary
 from jaxsense.models import Models, jmvae_shape
 from jaxsense.monitor import Monitor
@@ -132,7 +133,8 @@ def run(
 
 
 def _compile_missions(config: Config, monitor: Monitor) -> Player:
-    return Player(make_mission(config), monitor, batch=len(POLICIES) * config.mission.episodes)
+    batch = min(len(POLICIES) * config.mission.episodes, MISSION_BATCH)
+    return Player(make_mission(config), monitor, batch)
 
 
 def train_detectors(

@@ -55,14 +55,17 @@ class RunDirectory:
 def write_json(path: Path, content: Any) -> None:
     """Writes a file as a whole, so that a reader never sees half of it."""
     unfinished = path.with_name(f".{path.name}.unfinished")
-    unfinished.write_text(json.dumps(content, indent=2) + "\n")
+    unfinished.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     unfinished.rename(path)
 
 
 def read_summary(path: Path) -> dict[str, Any]:
     """The `summary.json` of a finished run; a `ConfigError` if there is none."""
     try:
-        return json.loads((path / "summary.json").read_text())
+        summary = json.loads((path / "summary.json").read_text())
+        if not isinstance(summary, dict):
+            raise ValueError("not an object")
+        return summary
     except (OSError, ValueError) as error:
         reason = f"must hold the summary.json of a finished run ({error})"
         raise ConfigError("run", str(path), reason) from None
@@ -100,7 +103,7 @@ def load(path: Path | str) -> tuple[Config, Models]:
                 class_beliefs=restore("class_beliefs", shapes.class_beliefs),
                 q_networks=q_networks,
             )
-    except (OSError, KeyError, ValueError, TypeError) as error:
+    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError("run", str(path), f"must be a finished run ({reason})") from error
 

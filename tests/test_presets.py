@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxsense import train
+from jaxsense import evaluate, train
 
 pytestmark = pytest.mark.slow
 
@@ -28,8 +28,13 @@ def summary_of(preset: str, seed: int, path: Path, *options: str) -> dict:
 
 
 @pytest.fixture(scope="module")
-def default(seed, tmp_path_factory):
-    return summary_of("default", seed, tmp_path_factory.mktemp("runs") / "default")
+def default_run(seed, tmp_path_factory):
+    return tmp_path_factory.mktemp("runs") / "default"
+
+
+@pytest.fixture(scope="module")
+def default(seed, default_run):
+    return summary_of("default", seed, default_run)
 
 
 @pytest.fixture(scope="module")
@@ -92,3 +97,19 @@ def test_memory_stays_below_four_gibibytes(default):
 
     unit = 1 if sys.platform == "darwin" else 1024
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit <= 4 * 2**30
+
+
+def test_missions_with_the_default_preset(default, default_run):
+    evaluate.main([str(default_run), "--episodes", "1024"])
+    mission = json.loads((default_run / "summary.json").read_text())["mission"]
+    latent, naive = mission["latent"], mission["naive"]
+    assert latent["accuracy"] >= max(0.99, naive["accuracy"])
+    assert latent["observations_per_poi"] <= 1.75
+    assert latent["time_s"] <= naive["time_s"]
+    for policy in ("latent", "naive", "random"):
+        assert mission[policy]["collisions"] == 0
+        assert mission[policy]["goals_reached_fraction"] >= 0.99
+    assert mission["lidar_alone"]["told"] >= 0.98
+    assert mission["lidar_alone"]["ambiguous_reported"] >= 0.98
+    size = mission["bytes_per_detection"]
+    assert size["raw"] / size["latent"] >= 100

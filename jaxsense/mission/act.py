@@ -73,6 +73,7 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
     excluded = robots.excluded[robot]
 
     makes_room = (phase == ENDED) & _is_in_the_way(mission, state, robot)
+    makes_room &= time < state.faults.stops_at[robot]
     drive = navigation.drive_to(
         settings,
         config.arena,
@@ -93,7 +94,7 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
         phase=phase,
         wanted=wanted,
         goals=robots.goals[robot] - is_taken,
-        reached=robots.reached[robot] + arrives,
+        reached=robots.reached[robot] + (arrives & (view < num_views)),
         excluded=jnp.where(is_taken, excluded.at[view].set(True), excluded),
         way_left=jnp.where(progresses, way_left, robots.way_left[robot]),
         progress_at=jnp.where(progresses | arrives, time, robots.progress_at[robot]),

@@ -22,6 +22,7 @@ from jaxsense.networks import MLP
 from jaxsense.sim import roadmap, viewpoints
 from jaxsense.types import Key
 
+_KEPT, _HEADED_FOR = -1e4, 1e2  # m, in place of a distance: more than any that there is
 _DETOUR = 2.0  # m, that a robot would go to avoid a viewpoint on which another robot stands
 
 
@@ -42,14 +43,18 @@ def decide(
     # What is known of failures belongs to one target.
     excluded = jnp.where(is_new, False, robots.excluded[robot])
     attempts = jnp.where(is_new, 0, robots.attempts[robot])
-    view, length = _best_view(mission, state, robot, action, excluded)
+    view, length, excluded = _best_view(mission, state, robot, action, excluded)
     has_way = jnp.isfinite(length)
     sets_out_now, gives_up = sets_out & has_way, sets_out & ~has_way
     poi = jnp.minimum(action, config.arena.num_pois - 1)
     unreachable = robots.unreachable[robot]
     ends = decides & (action == config.arena.num_pois)
     phase = jnp.select([ends, sets_out_now, gives_up], [ENDED, DRIVING, IDLE], phase)
+    # A look from where the robot stands is no goal; a PoI that there is no way to is one missed.
+    num_views = state.roadmap.viewpoints.shape[1]
+    is_goal = (sets_out_now & (view < num_views)) | gives_up
     was_needless = decides & is_new & (robots.phase[robot] == DRIVING)
+    was_needless &= robots.view[robot] < num_views
     return update_robot(
         state,
         robot,
@@ -62,7 +67,7 @@ def decide(
         unreachable=jnp.where(gives_up, unreachable.at[poi].set(True), unreachable),
         way_left=jnp.where(sets_out_now, length, robots.way_left[robot]),
         progress_at=jnp.where(sets_out_now, now(mission, state), robots.progress_at[robot]),
-        goals=robots.goals[robot] + sets_out_now - was_needless,
+        goals=robots.goals[robot] + is_goal - was_needless,
     )
 
 
@@ -86,7 +91,9 @@ def _choose(
     random = jax.nn.one_hot(jax.random.randint(key, (), 0, num_pois + 1), num_pois + 1)
     values = jnp.stack([jnp.asarray(q), naive, random])[state.policy]
     of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
-    is_best = of_pois >= jnp.max(of_pois) - config.mission.equal_values
+    is_latent = state.policy == LATENT
+    tolerance = jnp.where(is_latent, config.mission.equal_values, 0.0)
+    is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > values[num_pois])
 
     place = state.scene.poses[robot, :2]
     distance = jnp.linalg.norm(state.scene.layout.position - place[None], axis=-1)
@@ -94,15 +101,20 @@ def _choose(
     others = jnp.delete(robots.target, robot)
     is_others = jnp.any(jnp.arange(num_pois)[:, None] == others[None], axis=-1)
     # A PoI that the robot is heading for already, then one that no other heads for, then distance.
-    rank = distance - 1e4 * is_kept + 1e2 * is_others
+    rank = distance + _KEPT * is_kept + _HEADED_FOR * (is_others & is_latent)
     poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
-    return jnp.where(jnp.max(of_pois) > values[num_pois], poi, num_pois)
+    return jnp.where(jnp.any(is_best), poi, num_pois)
 
 
 def _best_view(
     mission: Mission, state: MissionState, robot: int, target: jax.Array, excluded: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """The viewpoint of a PoI with the shortest way, and its length; V is where the robot stands."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The viewpoint of a PoI with the shortest way, V being where the robot stands.
+
+    Returns:
+      The viewpoint, the length of the way, and the `[V + 1]` viewpoints that stay excluded: if all
+      to which there is a way have been, they are tried once more.
+    """
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
     others = standing_robots(state, robot)
@@ -113,9 +125,11 @@ def _best_view(
     )
     length += jnp.where(room > 0, 0.0, _DETOUR)
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
-    cost = jnp.where(excluded, jnp.inf, jnp.append(length, here))
+    cost = jnp.append(length, here)
+    excluded &= jnp.any(jnp.isfinite(cost) & ~excluded)
+    cost = jnp.where(excluded, jnp.inf, cost)
     view = jnp.argmin(cost)
-    return view, cost[view]
+    return view, cost[view], excluded
 
 
 def sees(mission: Mission, state: MissionState, robot: int, poi: jax.Array) -> jax.Array:

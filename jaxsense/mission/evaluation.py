@@ -24,7 +24,7 @@ from jaxsense.models import Models, untrained
 from jaxsense.monitor import Monitor
 from jaxsense.types import Key
 
-BATCH = 256
+BATCH = 384
 _CHUNK_TIME = 10.0  # s, after which the host looks whether all missions are over
 FAULT_TIME = 6.0  # s
 
@@ -61,6 +61,19 @@ def cases(config: Config) -> dict[str, Case]:
     return found
 
 
+def chunks(config: Config) -> tuple[int, int]:
+    """Control periods of a chunk, after which the host looks on, and the most chunks there are."""
+    settings = config.mission
+    chunk = math.ceil(min(_CHUNK_TIME, settings.time_limit) / settings.control_period)
+    return chunk, math.ceil(settings.time_limit / settings.control_period / chunk)
+
+
+def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
+    """Keys of an episode's arena, and of what happens in it; fold the number of a chunk into it."""
+    arena_key, play_key = jax.random.split(key)
+    return jax.random.fold_in(arena_key, episode), jax.random.fold_in(play_key, episode)
+
+
 class Player:
     """Plays missions in batches, with programs that are compiled once, before there are models.
 
@@ -76,16 +89,13 @@ class Player:
         self.mission, self._monitor, self._batch = mission, monitor, batch
         self.control_steps = 0
         config = mission.config
-        self._chunk = round(_CHUNK_TIME / config.mission.control_period)
-        self._most_chunks = math.ceil(
-            config.mission.time_limit / config.mission.control_period / self._chunk
-        )
+        chunk, self._most_chunks = chunks(config)
 
         def begin(keys: Key, policies: jax.Array, faults: Faults):
             return jax.vmap(lambda k, p, f: reset(k, mission, p, f))(keys, policies, faults)
 
         def go_on(keys: Key, models: Models, state: MissionState):
-            roll = jax.vmap(lambda k, s: rollout(k, mission, models, s, self._chunk)[0])
+            roll = jax.vmap(lambda k, s: rollout(k, mission, models, s, chunk)[0])
             state = roll(keys, state)
             return state, jax.vmap(lambda s: figures(mission, models, s))(state)
 
@@ -116,13 +126,12 @@ class Player:
         case, episode = row // episodes, row % episodes
         policies = jnp.array([c.policy for c in played.values()], jnp.int32)
         faults = jax.tree.map(lambda *x: jnp.stack(x), *[c.faults for c in played.values()])
-        arena_key, play_key = jax.random.split(key)
+        episode_keys = jax.vmap(lambda i: keys_of_episode(key, i))
         results = []
         for begin in range(0, len(row), self._batch):
             rows = slice(begin, begin + self._batch)
             chosen, numbers = jnp.array(case[rows]), jnp.array(episode[rows])
-            arena_keys = jax.vmap(lambda i: jax.random.fold_in(arena_key, i))(numbers)
-            keys = jax.vmap(lambda i: jax.random.fold_in(play_key, i))(numbers)
+            arena_keys, keys = episode_keys(numbers)
             state = self._begin(
                 arena_keys,
                 policies[chosen],
@@ -135,7 +144,7 @@ class Player:
                 if bool(state.is_over.all()):
                     break
             results.append(jax.tree.map(np.asarray, found))
-            self.control_steps += int(state.steps.sum())
+            self.control_steps += int(state.steps[: max(0, total - begin)].sum())
             self._monitor.progress("mission", min(begin + self._batch, total), total)
         joined = jax.tree.map(lambda *x: np.concatenate(x)[:total], *results)
         return {
@@ -162,7 +171,7 @@ def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any
         "observations_per_poi": float(found["observations_per_poi"].mean()),
         "time_s": float(np.median(found["time_s"])),
         "collisions": int(found["collisions"].sum()),
-        "goals_reached_fraction": float(found["goals_reached"].sum() / found["goals"].sum()),
+        "goals_reached_fraction": _share(found["goals_reached"].sum(), found["goals"].sum()),
         "information": float(found["information"].mean()),
         "episodes": len(found["time_s"]),
         "ended": {
@@ -177,13 +186,28 @@ def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any
         shares_label = np.array([np.sum(labels == label) > 1 for label in labels])
         cannot_tell = shares_label[found["classes"]]
         block["told"] = float(found["told"][modality].mean())
-        block["ambiguous_reported"] = float(found["ambiguous"][cannot_tell].mean())
+        reported = found["ambiguous"][cannot_tell]
+        block["ambiguous_reported"] = _share(reported.sum(), reported.size)
     return block
 
 
-def bytes_per_detection(mission: Mission, found: dict[str, Any]) -> dict[str, float]:
-    """What a detection puts on the network: an entry of the map, or the raw scan, in bytes."""
-    detections = found["detections"].sum(axis=0)
+def _share(part: Any, whole: Any) -> float | None:
+    """A share; None of nothing."""
+    return float(part / whole) if whole else None
+
+
+def bytes_per_detection(mission: Mission, detections: np.ndarray) -> dict[str, float]:
+    """What a detection puts on the network, in bytes.
+
+    Args:
+      mission: the mission.
+      detections: `[R]` how many of each robot.
+
+    Returns:
+      `latent`, the size of an entry of the map, and `raw`, the mean size of the scans that the
+      detections were made of; of the sensors' scans if there were none.
+    """
+    detections = np.maximum(detections, 0 if np.any(detections) else 1)
     scans = np.array([sensor.scan_bytes for sensor in mission.world.sensors])
     entry = 2 * mission.config.jmvae.latent_size * np.dtype(np.float32).itemsize
     return {"latent": float(entry), "raw": float(np.average(scans, weights=detections))}
@@ -196,5 +220,6 @@ def summary(
     found = player.play(key, models, played, episodes)
     config = player.mission.config
     blocks = {name: summarise(config, name, figures) for name, figures in found.items()}
-    first = next(iter(found.values()))
-    return {**blocks, "bytes_per_detection": bytes_per_detection(player.mission, first)}
+    detections = sum(figures["detections"].sum(axis=0) for figures in found.values())
+    size = bytes_per_detection(player.mission, np.asarray(detections))
+    return {**blocks, "bytes_per_detection": size}

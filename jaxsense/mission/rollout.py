@@ -79,8 +79,13 @@ def _act(
     choice_key, scan_key = jax.random.split(key)
     stops = now(mission, state) >= state.faults.stops_at[robot]
     robots = state.robots
-    phase = jnp.where(stops & (robots.phase[robot] != ENDED), FAILED, robots.phase[robot])
-    state = update_robot(state, robot, phase=phase)
+    fails = stops & (robots.phase[robot] != ENDED)
+    state = update_robot(
+        state,
+        robot,
+        phase=jnp.where(fails, FAILED, robots.phase[robot]),
+        target=jnp.where(fails, mission.config.arena.num_pois, robots.target[robot]),
+    )
     state = decide.decide(choice_key, mission, models, state, robot)
     state = act.approach(mission, state, robot)
     return act.scan(scan_key, mission, models, state, robot)

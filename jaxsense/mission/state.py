@@ -78,10 +78,12 @@ class Robots:
       way_left: length in metres of the way that was left when there was progress.
       progress_at: seconds, when that was.
       backs_off_until: seconds.
-      unreachable: `[R, N]` bool, PoIs given up because there was no way.
-      undetected: `[R, N]` bool, PoIs given up because looks showed nothing.
-      goals: int32 viewpoints set out for, without those that a new decision made needless.
-      reached: int32 of them reached.
+      unreachable: `[R, N]` bool, PoIs given up because there was no way, or after the robot got
+        stuck on its last attempt.
+      undetected: `[R, N]` bool, PoIs given up because the last attempt's look showed nothing.
+      goals: int32 viewpoints set out for, and PoIs given up because there was no way; without
+        goals that a new decision made needless or that another robot came to stand on.
+      reached: int32 goals reached.
       looks: int32 scans.
       detections: int32 scans that were written into the map.
     """

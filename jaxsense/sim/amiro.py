@@ -38,13 +38,15 @@ _WHEEL_TORQUE = _MASS * MAX_ACCELERATION * WHEEL_RADIUS / 2  # N m
 _SLIP_GAIN = _MASS / _TIME_CONSTANT  # N s / m
 _SLIP_FORCE = 0.8 * _MASS * 9.81  # N, friction coefficient of rubber on a smooth floor
 
+_WHEEL_INERTIA = WHEEL_MASS * (WHEEL_RADIUS**2 / 4 + WHEEL_WIDTH**2 / 12)  # about its upright axis
+_YAW_INERTIA = BODY_MASS * BODY_RADIUS**2 / 2 + 2 * (
+    _WHEEL_INERTIA + WHEEL_MASS * (WHEEL_SEPARATION / 2) ** 2
+)  # kg m^2
+# Both accelerations come from the same motors: each rad/s^2 of turning takes this much from what is
+# left for going forward.
+FORWARD_PER_TURN = 2 * _YAW_INERTIA / (_MASS * WHEEL_SEPARATION)  # m/rad
+
 MAX_WHEEL_SPEED = (MAX_SPEED + MAX_TURN_RATE * WHEEL_SEPARATION / 2) / WHEEL_RADIUS  # rad/s
-
-
-def wheel_speeds(forward: float, turn: float) -> tuple[float, float]:
-    """Left and right wheel speeds [rad/s] for a forward speed [m/s] and a turn rate [rad/s]."""
-    half = WHEEL_SEPARATION / 2
-    return (forward - turn * half) / WHEEL_RADIUS, (forward + turn * half) / WHEEL_RADIUS
 
 
 def body(name: str, has_lidar: bool, reach: float) -> str:

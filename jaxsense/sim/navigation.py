@@ -32,6 +32,8 @@ def wheel_speeds(command: jax.Array) -> jax.Array:
 def ramp(command: jax.Array, wanted: jax.Array, seconds: float) -> jax.Array:
     """The command after some time on the way to a wanted one, within the robot's limits.
 
+    What turning takes of the motors' force is not there for going forward.
+
     Args:
       command: `[..., 2]` the present one.
       wanted: `[..., 2]`, cut to the limits of speed and turn rate.
@@ -40,9 +42,13 @@ def ramp(command: jax.Array, wanted: jax.Array, seconds: float) -> jax.Array:
     Returns:
       `[..., 2]` the next command.
     """
-    most = jnp.array([amiro.MAX_SPEED, amiro.MAX_TURN_RATE])
-    change = seconds * jnp.array([amiro.MAX_ACCELERATION, amiro.MAX_TURN_ACCELERATION])
-    return command + jnp.clip(jnp.clip(wanted, -most, most) - command, -change, change)
+    forward = jnp.clip(wanted[..., 0], -amiro.MAX_SPEED, amiro.MAX_SPEED) - command[..., 0]
+    turn = jnp.clip(wanted[..., 1], -amiro.MAX_TURN_RATE, amiro.MAX_TURN_RATE) - command[..., 1]
+    most = seconds * amiro.MAX_TURN_ACCELERATION
+    turn = jnp.clip(turn, -most, most)
+    most = seconds * amiro.MAX_ACCELERATION - amiro.FORWARD_PER_TURN * jnp.abs(turn)
+    forward = jnp.clip(forward, -most, most)
+    return command + jnp.stack([forward, turn], axis=-1)
 
 
 def face(bearing: jax.Array) -> jax.Array:
@@ -93,11 +99,12 @@ def drive_to(
 ) -> jax.Array:
     """The command that brings a robot to a waypoint soonest without touching anything.
 
-    Arcs that come closer to something than `robot_radius` are out, but for those that lead away
-    from what is too close already. PoIs are the circles that hold both shapes. Other robots are
-    held to go on as they do now. The value of an arc is the least time to the waypoint over the
-    points where the robot may leave it: the time so far, that of turning to the waypoint, and that
-    of a straight drive; ways through the inflation around obstacles cost extra time.
+    Arcs that come closer to something than `robot_radius` (less 5 mm, for their coarse samples) are
+    out, but for those that lead away from what is too close already. PoIs are the circles that hold
+    both shapes. Other robots are held to stay and, just as well, to go straight on as they do now.
+    The value of an arc is the least time to the waypoint over the points where the robot may leave
+    it: the time so far, that of turning to the waypoint, and that of a straight drive; ways through
+    the inflation around obstacles cost extra time.
 
     Args:
       settings: of the planner.
@@ -108,7 +115,7 @@ def drive_to(
       robot: which one is asking; static.
       waypoint: `[2]` in metres.
       seconds: for which the command will be held.
-      backs_off: `[]` bool: instead, gain as much room as possible.
+      backs_off: `[]` bool: instead, have as much room as possible a second from now.
 
     Returns:
       `[2]` the wanted command.
@@ -159,10 +166,10 @@ def drive_to(
     # Near the waypoint its direction means nothing.
     turn *= jnp.clip(distance / 0.08 - 0.25, 0.0, 1.0)
     cost = _INFLATION_COST * jnp.clip(1.0 - room_of_map / max(settings.inflation, 1e-6), 0.0, 1.0)
-    arrival = times + turn / amiro.MAX_TURN_RATE + distance / amiro.MAX_SPEED + cost
+    arrival = times[None] + turn / amiro.MAX_TURN_RATE + distance / amiro.MAX_SPEED + cost
     is_safe = least >= jnp.minimum(room_now - 1e-4, -_GRAZE)
     value = jnp.min(jnp.where(is_safe, arrival, jnp.inf)[:, _LOOKS_AHEAD:], axis=1)
-    value = jnp.where(backs_off, -room[:, len(_SAMPLE_TIMES) // 2], value)
+    value = jnp.where(backs_off, -room[:, _LOOKS_AHEAD], value)
     change = seconds * jnp.array([amiro.MAX_ACCELERATION, amiro.MAX_TURN_ACCELERATION]) + 1e-6
     in_window = jnp.all(jnp.abs(samples - present[None]) <= change[None], axis=-1)
     # The first part of the arc must be safe in any case: it will be driven.

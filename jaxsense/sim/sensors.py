@@ -219,7 +219,10 @@ def shows_poi(
     distance: jax.Array,
     arena: ArenaConfig,
 ) -> jax.Array:
-    """Whether a PoI is really to be seen where it is expected, from the readings alone.
+    """Whether a PoI may be seen where it is expected, from the readings alone.
+
+    The LiDAR tells by the distance. A camera tells a PoI from walls, robots and darkness by its
+    colour, but not from another PoI before or behind it: viewpoints are chosen to have none there.
 
     Args:
       sensor: the sensor.

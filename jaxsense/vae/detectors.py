@@ -55,7 +55,7 @@ def detect(detector: Detector, window: jax.Array) -> jax.Array:
 
     Args:
       detector: a trained detector.
-      window: `[F]` readings around the PoI's bearing, see `sim.sensors.scan_window`.
+      window: `[F]` readings around the PoI's bearing, see `sim.sensors.as_window`.
 
     Returns:
       `[D_m]` probabilities of the labels, for example (red, green).

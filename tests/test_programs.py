@@ -1,6 +1,9 @@
-"""The command line, run as a user runs it: in-process, with the smoke preset."""
+"""The command lines, run as a user runs them: in-process, with the smoke preset."""
 
+import contextlib
+import io
 import json
+import shutil
 from pathlib import Path
 
 import jax
@@ -8,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import train
+from jaxsense import evaluate, train
 from jaxsense.config import PRESETS, Config
 
 SMOKE = ["--preset", "smoke", "--seed", "3"]
@@ -28,6 +31,12 @@ def run(tmp_path_factory, cached_compilation) -> Path:
     path = tmp_path_factory.mktemp("runs") / "first"
     train.main([*SMOKE, "--out", str(path)])
     return path
+
+
+MISSION_KEYS = {
+    "accuracy", "observations_per_poi", "time_s", "collisions", "goals_reached_fraction",
+    "information", "episodes", "ended",
+}  # fmt: skip
 
 
 def without_times(summary: dict) -> dict:
@@ -50,7 +59,8 @@ def test_run_directory_holds_everything(run):
 def test_summary_keeps_its_contract(run):
     summary = json.loads((run / "summary.json").read_text())
     assert set(summary) == {
-        "preset", "seed", "versions", "devices", "timing", "detectors", "jmvae", "dqn"
+        "preset", "seed", "versions", "devices", "timing", "detectors", "jmvae", "dqn",
+        "mission",
     }  # fmt: skip
     assert summary["preset"] == "smoke"
     assert summary["seed"] == 3
@@ -77,6 +87,16 @@ def test_summary_keeps_its_contract(run):
         assert block["num_states"] == 384
         assert block["env_steps"] == 60 * 32  # epochs x environments of the smoke preset
         assert block["fraction_of_optimal"] == pytest.approx(block["return"] / block["optimal"])
+    assert set(summary["mission"]) == {"latent", "naive", "random", "bytes_per_detection"}
+    for policy in ("latent", "naive", "random"):
+        block = summary["mission"][policy]
+        assert set(block) == MISSION_KEYS
+        assert block["episodes"] == 4
+        assert sum(block["ended"].values()) == 4
+        assert block["collisions"] == 0
+    # Two float32 for each of two dimensions, against more than 1920 bytes of pixels or beams.
+    assert summary["mission"]["bytes_per_detection"]["latent"] == 16
+    assert 1920 <= summary["mission"]["bytes_per_detection"]["raw"] <= 2732
 
 
 def test_same_seed_gives_the_same_summary(run, tmp_path):
@@ -119,10 +139,10 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
     assert not (out / "summary.json").exists()
 
 
-def error_line(argv: list[str], capsys) -> str:
-    """Runs the program, which must end with status 2 and one line of error."""
+def error_line(argv: list[str], capsys, program=train) -> str:
+    """Runs a program, which must end with status 2 and one line of error."""
     with pytest.raises(SystemExit) as stop:
-        train.main(argv)
+        program.main(argv)
     assert stop.value.code == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1, error
@@ -199,3 +219,92 @@ def test_presets_are_configurations():
     assert PRESETS["paper"].dqn.observe == "bank"
     assert (PRESETS["paper"].jmvae.alpha, PRESETS["paper"].jmvae.beta) == (1.0, 0.1)
     assert (PRESETS["paper"].dqn.epochs, PRESETS["paper"].dqn.num_envs) == (2000, 512)
+
+
+@pytest.fixture(scope="module")
+def evaluated(run, tmp_path_factory, cached_compilation):
+    """A copy of the run, evaluated, its summary before, and what was printed."""
+    path = tmp_path_factory.mktemp("runs") / "copy"
+    shutil.copytree(run, path)
+    before = json.loads((path / "summary.json").read_text())
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        evaluate.main([str(path), "--episodes", "3", "--policy", "policies", "--animate"])
+    return path, before, printed.getvalue()
+
+
+def test_evaluate_writes_the_mission_block_and_nothing_else(evaluated):
+    path, before, _ = evaluated
+    after = json.loads((path / "summary.json").read_text())
+    mission = after.pop("mission")
+    before.pop("mission")
+    assert after == before
+    assert set(mission) == {"latent", "naive", "random", "bytes_per_detection"}
+    for policy in ("latent", "naive", "random"):
+        assert set(mission[policy]) == MISSION_KEYS | {"seed"}
+        assert (mission[policy]["episodes"], mission[policy]["seed"]) == (3, 0)
+
+
+def test_evaluate_prints_the_comparison(evaluated):
+    _, _, printed = evaluated
+    for words in (
+        "latent",
+        "naive",
+        "random",
+        "accuracy",
+        "goals",
+        "control steps/s",
+        "9 missions",
+    ):
+        assert words in printed
+
+
+def test_evaluate_makes_an_animation_that_moves(evaluated):
+    from PIL import Image
+
+    path, _, _ = evaluated
+    with Image.open(path / "mission-latent-0.gif") as film:
+        assert film.n_frames > 10
+        first = np.asarray(film.convert("RGB"))
+        film.seek(film.n_frames - 1)
+        last = np.asarray(film.convert("RGB"))
+    assert np.mean(np.any(first != last, axis=-1)) > 0.01
+
+
+def test_the_animation_shows_the_mission_that_was_evaluated(run):
+    from jaxsense import animation, mission
+    from jaxsense.monitor import Monitor
+
+    config, models = jaxsense.load(run)
+    team, key = mission.make_mission(config), jax.random.key(5)
+    case = mission.cases(config)["naive"]
+    player = mission.Player(team, Monitor(), batch=2)
+    found = player.play(key, models, {"naive": case}, 2)["naive"]
+    state, record = animation.play_first(key, team, models, case)
+    np.testing.assert_allclose(
+        found["time_s"][0], state.steps * config.mission.control_period, rtol=1e-6
+    )
+    np.testing.assert_array_equal(found["detections"][0], np.sum(record.detected, axis=0))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--policy", "best"], "policy = 'best': must be one of all, policies, latent, naive"),
+        (["--episodes", "0"], "episodes = 0: must be greater than 0"),
+        (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
+        (["--episode", "3"], "Unrecognized options: --episode, 3; perhaps --episodes"),
+    ],
+)
+def test_bad_options_of_evaluate_are_named_in_one_line(run, options, expected, capsys):
+    before = (run / "summary.json").read_text()
+    assert expected in error_line([str(run), *options], capsys, evaluate)
+    assert (run / "summary.json").read_text() == before
+
+
+def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
+    line = error_line([str(tmp_path / "none")], capsys, evaluate)
+    assert f"run = {str(tmp_path / 'none')!r}: must be a finished run" in line
+    (tmp_path / "config.json").write_text('{"config": {"colour": 1}}')
+    line = error_line([str(tmp_path)], capsys, evaluate)
+    assert "must be a finished run" in line

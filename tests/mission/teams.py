@@ -1,0 +1,25 @@
+"""Settings and models for missions that need no training."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense.config import PRESETS
+
+# Untrained detectors are never sure; what they say is of no importance here.
+CONFIG = replace(PRESETS["smoke"], mission=replace(PRESETS["smoke"].mission, least_confidence=0.0))
+FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
+
+
+def with_values(models, *values):
+    """Models whose Q-networks give the same values [N + 1] for every map, one for each robot."""
+
+    def constant(network, value):
+        zero = jax.tree.map(jnp.zeros_like, network)
+        last = max(zero["params"], key=lambda name: int(name.split("_")[1]))
+        zero["params"][last]["bias"] = jnp.array(value, jnp.float32)
+        return zero
+
+    networks = tuple(constant(n, v) for n, v in zip(models.q_networks, values, strict=True))
+    return replace(models, q_networks=networks)

@@ -1,0 +1,216 @@
+"""Scanning: what is seen is written, what is not is not, and a robot does not try for ever."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from teams import CONFIG
+
+from jaxsense import mission
+from jaxsense.mission import act
+from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults
+from jaxsense.sim import sensors, world
+
+# PoI 0 is 0.8 m ahead of the robot under test, a red cube.
+POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
+CAMERA, LIDAR = 0, 1
+AWAY = [0.0, 1.2, 0.0]
+IN_THE_VIEW = [0.4, 0.0, 0.0]
+BLIND = Faults(jnp.full(2, jnp.inf), jnp.zeros(2))
+
+
+@pytest.fixture(scope="module")
+def scan(team, models):
+    return [
+        jax.jit(lambda key, state, r=robot: act.scan(key, team, models, state, r))
+        for robot in (CAMERA, LIDAR)
+    ]
+
+
+@pytest.fixture(scope="module")
+def facing(arena_of, set_robot):
+    def make(robot, pose=(0.0, 0.0, 0.0), other=AWAY, faults=None):
+        poses = [list(pose), other] if robot == CAMERA else [other, list(pose)]
+        state = arena_of(POSITIONS, poses, classes=(2, 0, 1), faults=faults)
+        # It has waited long enough to scan whatever is in the way.
+        return set_robot(state, robot, phase=FACING, target=0, progress_at=-100.0)
+
+    return make
+
+
+@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
+def test_what_is_seen_is_written_into_the_map(scan, facing, robot):
+    before = facing(robot)
+    after = scan[robot](jax.random.key(0), before)
+    assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, 1)
+    assert after.robots.phase[robot] == IDLE
+    assert after.robots.target[robot] == CONFIG.arena.num_pois
+    expected = np.zeros((3, 2), bool)
+    expected[0, robot] = True
+    np.testing.assert_array_equal(after.seen, expected)
+    assert after.version == 1
+    assert not np.array_equal(after.belief.mean[0], before.belief.mean[0])
+    np.testing.assert_array_equal(after.belief.mean[1:], before.belief.mean[1:])
+
+
+@pytest.mark.parametrize(
+    ("robot", "setting"),
+    [
+        (CAMERA, {"other": IN_THE_VIEW}),
+        (CAMERA, {"other": [0.4, 0.03, 0.0]}),  # in a part of the view
+        (CAMERA, {"faults": BLIND}),
+        (LIDAR, {"faults": BLIND}),
+    ],
+)
+def test_what_is_hidden_or_not_seen_gives_no_detection(scan, facing, robot, setting):
+    before = facing(robot, **setting)
+    after = scan[robot](jax.random.key(0), before)
+    assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, 0)
+    assert after.version == 0
+    assert not np.any(after.seen)
+    jax.tree.map(np.testing.assert_array_equal, after.belief, before.belief)
+    assert after.robots.attempts[robot] == 1
+    assert after.robots.target[robot] == 0
+
+
+def test_the_lidar_looks_over_a_robot_without_one(scan, facing):
+    # Its beams are at 0.152 m; the camera robot is 0.094 m high.
+    after = scan[LIDAR](jax.random.key(0), facing(LIDAR, other=IN_THE_VIEW))
+    assert after.robots.detections[LIDAR] == 1
+
+
+@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
+def test_a_poi_that_is_not_where_it_is_expected_is_not_shown(facing, robot, team):
+    sensor, scene = team.world.sensors[robot], facing(robot).scene
+    gone = replace(
+        scene, layout=replace(scene.layout, position=scene.layout.position.at[0, 1].set(1.0))
+    )
+    bearing = jnp.float32(0)
+
+    @jax.jit
+    def shows(scene, distance):
+        readings = world.scan_around(jax.random.key(1), team.world, scene, robot, bearing)
+        return sensors.shows_poi(sensor, readings, bearing, distance, CONFIG.arena)
+
+    assert shows(scene, 0.8)
+    assert not shows(gone, 0.8)
+    # The LiDAR also tells that it is nearer than expected; the camera cannot.
+    assert shows(scene, 1.1) == (robot == CAMERA)
+
+
+@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
+def test_an_unsure_detector_writes_nothing(models, facing, robot):
+    # All parameters zero: every label has a probability of one half.
+    unsure = jax.tree.map(jnp.zeros_like, models.detectors[robot].params)
+    detectors = list(models.detectors)
+    detectors[robot] = replace(detectors[robot], params=unsure)
+    models = replace(models, detectors=tuple(detectors))
+    for least, detections in ((0.4, 1), (0.6, 0)):
+        settings = replace(CONFIG.mission, least_confidence=least)
+        strict = mission.make_mission(replace(CONFIG, mission=settings), contacts=False)
+        scan = jax.jit(lambda key, state, m=strict: act.scan(key, m, models, state, robot))
+        after = scan(jax.random.key(0), facing(robot))
+        assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, detections)
+
+
+@pytest.mark.parametrize(
+    ("pose", "turning", "scans"),
+    [
+        ((0.0, 0.0, np.radians(5.0)), 0.0, True),
+        ((0.0, 0.0, np.radians(7.0)), 0.0, False),  # more than 6 degrees off
+        ((0.0, 0.0, 0.0), 0.3, True),
+        ((0.0, 0.0, 0.0), 0.4, False),  # rad/s
+    ],
+)
+def test_only_a_robot_that_faces_the_poi_and_is_calm_scans(
+    scan, facing, set_robot, pose, turning, scans
+):
+    state = set_robot(facing(CAMERA, pose), CAMERA, command=jnp.array([0.0, turning]))
+    after = scan[CAMERA](jax.random.key(0), state)
+    assert after.robots.looks[CAMERA] == scans
+
+
+def test_a_robot_that_passes_through_the_view_is_waited_for(scan, facing, set_robot):
+    passing = set_robot(facing(CAMERA, other=IN_THE_VIEW), LIDAR, phase=DRIVING)
+    waits = set_robot(passing, CAMERA, progress_at=0.0)
+    assert scan[CAMERA](jax.random.key(0), waits).robots.looks[CAMERA] == 0
+    assert scan[CAMERA](jax.random.key(0), passing).robots.looks[CAMERA] == 1
+
+
+def test_after_some_failures_the_poi_is_given_up(scan, facing, set_robot):
+    state = facing(CAMERA, other=IN_THE_VIEW)
+    for attempt in range(1, CONFIG.mission.attempts + 1):
+        assert not state.robots.undetected[CAMERA, 0]
+        state = set_robot(state, CAMERA, phase=FACING, view=attempt)
+        state = scan[CAMERA](jax.random.key(attempt), state)
+        assert state.robots.attempts[CAMERA] == attempt
+        assert state.robots.excluded[CAMERA].sum() == attempt
+    np.testing.assert_array_equal(state.robots.undetected[CAMERA], [True, False, False])
+
+
+@pytest.fixture(scope="module")
+def approach(team):
+    return jax.jit(lambda state: act.approach(team, state, CAMERA))
+
+
+def driving(state, set_robot, view, seconds, progress_at, way_left=0.1):
+    steps = round(seconds / CONFIG.mission.control_period)
+    state = replace(state, steps=jnp.int32(steps))
+    values = {"phase": DRIVING, "target": 0, "view": view, "goals": 1}
+    return set_robot(state, CAMERA, **values, progress_at=progress_at, way_left=way_left)
+
+
+def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
+    approach, facing, set_robot
+):
+    # It wants to a viewpoint on the far side of the PoI.
+    patience = CONFIG.navigation.stuck_time
+    start = facing(CAMERA)
+    still = approach(driving(start, set_robot, 0, patience - 0.1, 0.0))
+    assert still.robots.phase[CAMERA] == DRIVING
+    stuck = approach(driving(start, set_robot, 0, patience + 0.2, 0.0))
+    assert stuck.robots.phase[CAMERA] == BACKING
+    assert stuck.robots.attempts[CAMERA] == 1
+    np.testing.assert_array_equal(np.flatnonzero(stuck.robots.excluded[CAMERA]), [0])
+    assert (stuck.robots.goals[CAMERA], stuck.robots.reached[CAMERA]) == (1, 0)
+    # A way that has become shorter is progress.
+    goes_on = approach(driving(start, set_robot, 0, patience + 0.2, 0.0, way_left=9.0))
+    assert goes_on.robots.phase[CAMERA] == DRIVING
+    assert goes_on.robots.way_left[CAMERA] < 9.0
+    # And after the time of recovery it asks again.
+    later = patience + 0.2 + CONFIG.navigation.recovery_time + 0.1
+    steps = jnp.int32(round(later / CONFIG.mission.control_period))
+    assert approach(replace(stuck, steps=steps)).robots.phase[CAMERA] == IDLE
+
+
+def test_a_viewpoint_on_which_a_robot_has_come_to_stand_is_left_without_blame(
+    approach, facing, set_robot
+):
+    view = 8  # on the other side than the PoI is from the robot's start
+    start = facing(CAMERA, pose=(-1.0, 0.0, 0.0))
+    place = start.roadmap.viewpoints[0, view]
+    taken = replace(start, scene=replace(start.scene, poses=start.scene.poses.at[1, :2].set(place)))
+    state = approach(driving(taken, set_robot, view, 1.0, 0.9))
+    assert state.robots.phase[CAMERA] == IDLE
+    assert state.robots.goals[CAMERA] == 0
+    assert state.robots.attempts[CAMERA] == 0
+    assert state.robots.excluded[CAMERA, view]
+    # One that only drives past will be gone.
+    passing = set_robot(driving(taken, set_robot, view, 1.0, 0.9), LIDAR, phase=DRIVING)
+    assert approach(passing).robots.phase[CAMERA] == DRIVING
+
+
+def test_a_robot_that_has_ended_makes_room_for_one_that_is_stuck(team, facing, set_robot):
+    state = facing(CAMERA, pose=(0.0, 0.0, 0.0), other=[0.3, 0.0, 0.0])
+    state = set_robot(state, LIDAR, phase=ENDED, target=3)
+    state = driving(state, set_robot, 0, 3.0, 0.0)
+    approach = jax.jit(lambda state: act.approach(team, state, LIDAR))
+    assert np.any(approach(state).robots.wanted[LIDAR] != 0)
+    # But not for one that gets on, nor for one that is far away.
+    gets_on = set_robot(state, CAMERA, progress_at=2.5)
+    np.testing.assert_array_equal(approach(gets_on).robots.wanted[LIDAR], 0.0)
+    far = state.scene.poses.at[LIDAR, :2].set(jnp.array([-1.3, 0.0]))
+    far = replace(state, scene=replace(state.scene, poses=far))
+    np.testing.assert_array_equal(approach(far).robots.wanted[LIDAR], 0.0)

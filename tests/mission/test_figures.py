@@ -1,0 +1,166 @@
+"""What is reported of missions, on made-up ends of them."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from teams import CONFIG
+
+from jaxsense import mission
+from jaxsense.mission import evaluation
+from jaxsense.mission.state import DRIVING, ENDED, FAILED
+from jaxsense.types import Belief
+
+POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
+POSES = [[0.0, 0.0, 0.0], [0.0, 1.2, 0.0]]
+# Green cylinder, red cylinder, red cube.
+MEANS = jnp.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
+
+
+@pytest.fixture(scope="module")
+def known(models):
+    return replace(models, class_beliefs=Belief(MEANS, jnp.full((3, 2), 0.3)))
+
+
+@pytest.fixture
+def ended(arena_of):
+    state = arena_of(POSITIONS, POSES, classes=(0, 1, 2))
+    robots = replace(state.robots, phase=jnp.full(2, ENDED))
+    return replace(state, robots=robots, is_over=jnp.bool_(True), steps=jnp.int32(123))
+
+
+def test_figures_as_worked_by_hand(team, known, ended):
+    # PoI 0 is known; PoI 1, a red cylinder, may as well be a red cube; PoI 2 is taken for green.
+    mean = jnp.array([[-1.0, 1.0], [1.0, 0.1], [-1.0, 1.0]])
+    std = jnp.array([[0.3, 0.4], [0.3, 1.2], [0.3, 0.4]])
+    robots = replace(
+        ended.robots,
+        goals=jnp.array([3, 2]),
+        reached=jnp.array([3, 1]),
+        looks=jnp.array([3, 2]),
+        detections=jnp.array([3, 1]),
+    )
+    state = replace(ended, belief=Belief(mean, std), robots=robots, contacts=jnp.int32(4))
+    state = replace(state, seen=jnp.array([[True, False]] * 3))
+    found = mission.figures(team, known, state)
+    np.testing.assert_array_equal(found["is_right"], [True, True, False])
+    np.testing.assert_array_equal(found["ambiguous"], [False, True, False])
+    # Colours: green, red and, wrongly, green; shapes: round, round and, wrongly, round.
+    np.testing.assert_allclose(found["told"]["camera"], 2 / 3)
+    np.testing.assert_allclose(found["told"]["lidar"], 2 / 3)
+    np.testing.assert_allclose(found["observations_per_poi"], 5 / 3)
+    np.testing.assert_allclose(found["time_s"], 12.3, rtol=1e-6)
+    assert (found["collisions"], found["goals"], found["goals_reached"]) == (4, 5, 4)
+    # 1 / .5 + 1 / sqrt(.09 + 1.44) + 1 / .5
+    np.testing.assert_allclose(found["information"], 4 + 1 / np.sqrt(1.53), rtol=1e-5)
+    # What nobody has seen is neither right nor reported.
+    unseen = mission.figures(team, known, replace(state, seen=jnp.zeros((3, 2), bool)))
+    assert not np.any(unseen["is_right"])
+    assert not np.any(unseen["ambiguous"])
+    assert unseen["told"]["camera"] == 0
+
+
+def one(flag_of, robot, poi):
+    return flag_of.at[robot, poi].set(True)
+
+
+@pytest.mark.parametrize(
+    ("expected", "change"),
+    [
+        ("finished", lambda s: s),
+        ("running", lambda s: replace(s, is_over=jnp.bool_(False))),
+        ("time limit", lambda s: _phases(s, ENDED, DRIVING)),
+        ("no robot left", lambda s: _phases(s, FAILED, FAILED)),
+        ("robot failed", lambda s: _phases(s, FAILED, ENDED)),
+        ("unreachable", lambda s: _flags(s, "unreachable")),
+        ("undetected", lambda s: _flags(s, "undetected")),
+        ("unreachable", lambda s: _flags(_flags(s, "undetected"), "unreachable")),
+    ],
+)
+def test_a_mission_says_how_it_ended(ended, expected, change):
+    assert mission.REASONS[mission.reason(change(ended))] == expected
+
+
+def _phases(state, *phases):
+    return replace(state, robots=replace(state.robots, phase=jnp.array(phases)))
+
+
+def _flags(state, name):
+    flags = one(getattr(state.robots, name), 1, 2)
+    return replace(state, robots=replace(state.robots, **{name: flags}))
+
+
+def test_summary_of_a_case_as_worked_by_hand():
+    found = {
+        "classes": np.array([[0, 1, 2], [2, 2, 1]]),
+        "is_right": np.array([[True, True, False], [True, True, True]]),
+        "ambiguous": np.array([[False, True, False], [True, True, False]]),
+        "told": {"camera": np.array([2 / 3, 1.0]), "lidar": np.array([1 / 3, 2 / 3])},
+        "observations_per_poi": np.array([1.0, 2.0]),
+        "time_s": np.array([10.0, 20.0]),
+        "collisions": np.array([0, 2]),
+        "goals": np.array([4, 6]),
+        "goals_reached": np.array([4, 5]),
+        "information": np.array([5.0, 6.0]),
+        "detections": np.array([[2, 3], [2, 3]]),
+        "reason": np.array([1, 2]),
+    }
+    block = evaluation.summarise(CONFIG, "latent", found)
+    assert block == {
+        "accuracy": pytest.approx(5 / 6),
+        "observations_per_poi": 1.5,
+        "time_s": 15.0,
+        "collisions": 2,
+        "goals_reached_fraction": 0.9,
+        "information": 5.5,
+        "episodes": 2,
+        "ended": {"finished": 1, "time limit": 1},
+    }
+    # LiDAR alone cannot tell the two cylinders apart: classes 0 and 1, of which one of three is
+    # reported as ambiguous.
+    alone = evaluation.summarise(CONFIG, "lidar_alone", found)
+    assert alone["told"] == pytest.approx(0.5)
+    assert alone["ambiguous_reported"] == pytest.approx(1 / 3)
+    # Nothing of nothing is no number.
+    nothing = {**found, "goals": np.zeros(2, int), "goals_reached": np.zeros(2, int)}
+    assert evaluation.summarise(CONFIG, "latent", nothing)["goals_reached_fraction"] is None
+    # The camera cannot tell red ones apart: classes 1 and 2; three of five.
+    assert evaluation.summarise(CONFIG, "camera_alone", found)[
+        "ambiguous_reported"
+    ] == pytest.approx(3 / 5)
+
+
+def test_bytes_of_a_detection_as_worked_by_hand(team):
+    # Two float32 for each of two latent dimensions; 640 pixels of 3 bytes, 683 beams of 4.
+    size = evaluation.bytes_per_detection(team, np.array([1, 3]))
+    assert size["latent"] == 16
+    assert size["raw"] == pytest.approx((1 * 1920 + 3 * 2732) / 4)
+    # Without any detection, the mean of both.
+    assert evaluation.bytes_per_detection(team, np.zeros(2))["raw"] == (1920 + 2732) / 2
+
+
+def test_cases_are_the_policies_and_every_failure_of_every_robot():
+    cases = mission.cases(CONFIG)
+    assert list(cases) == [
+        "latent", "naive", "random",
+        "camera_alone", "camera_stops", "camera_blind",
+        "lidar_alone", "lidar_stops", "lidar_blind",
+    ]  # fmt: skip
+    np.testing.assert_array_equal(cases["camera_alone"].faults.stops_at, [np.inf, 0.0])
+    np.testing.assert_array_equal(cases["lidar_stops"].faults.stops_at, [np.inf, 6.0])
+    np.testing.assert_array_equal(cases["lidar_blind"].faults.blind_at, [np.inf, 6.0])
+    np.testing.assert_array_equal(cases["naive"].faults.stops_at, [np.inf, np.inf])
+    settings = replace(CONFIG.jmvae, reconstruction_weights=(1.0,))
+    single = replace(CONFIG, modalities=("camera",), jmvae=settings)
+    assert list(mission.cases(single)) == ["latent", "naive", "random"]
+
+
+def test_a_mission_of_another_size_is_named(team, arena_of):
+    scene = arena_of(POSITIONS, POSES).scene
+    with pytest.raises(AssertionError, match="classes"):
+        mission.start(team, scene, jnp.zeros(4, int), 0, mission.no_faults(CONFIG))
+    faults = mission.Faults(jnp.zeros(3), jnp.zeros(2))
+    with pytest.raises(AssertionError, match=r"faults\.stops_at"):
+        jax.eval_shape(lambda: mission.start(team, scene, jnp.zeros(3, int), 0, faults))

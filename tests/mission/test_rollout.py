@@ -1,0 +1,175 @@
+"""Whole missions of the naive policy, which needs no training, with and without failures."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from teams import CONFIG, FAST_TO_COMPILE
+
+from jaxsense import mission
+from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
+from jaxsense.sim import amiro
+
+NUM_ARENAS = 24
+STEPS = 500
+NUM_POIS = CONFIG.arena.num_pois
+PERIOD = CONFIG.mission.control_period
+FAULT_TIME = 4.0
+
+
+@pytest.fixture(scope="module")
+def play(team, models, as_numpy):
+    """Plays all arenas with given faults: states before, states after and records."""
+
+    @jax.jit
+    def begin(keys, faults):
+        return jax.vmap(lambda k: mission.reset(k, team, mission.NAIVE, faults))(keys)
+
+    def go_on(keys, state):
+        return jax.vmap(lambda k, s: mission.rollout(k, team, models, s, STEPS))(keys, state)
+
+    go_on = jax.jit(go_on, compiler_options=FAST_TO_COMPILE)
+
+    def played(faults):
+        start = begin(jax.random.split(jax.random.key(0), NUM_ARENAS), faults)
+        with jax.numpy_rank_promotion("allow"):  # MJX's step needs it
+            end, record = go_on(jax.random.split(jax.random.key(1), NUM_ARENAS), start)
+        return as_numpy((start, end, record))
+
+    return played
+
+
+@pytest.fixture(scope="module")
+def healthy(play):
+    return play(mission.no_faults(CONFIG))
+
+
+def reasons(state):
+    return [mission.REASONS[code] for code in jax.vmap(mission.reason)(state)]
+
+
+def test_every_robot_visits_every_poi_once_and_ends(healthy):
+    _, end, record = healthy
+    assert reasons(end) == ["finished"] * NUM_ARENAS
+    assert np.all(end.robots.phase == ENDED)
+    assert np.all(end.seen)
+    np.testing.assert_array_equal(record.detected.sum(axis=1), NUM_POIS)
+    assert np.all(end.robots.looks >= NUM_POIS)
+
+
+def test_nobody_touches_anything(healthy):
+    _, end, record = healthy
+    assert np.all(end.contacts == 0)
+    assert np.min(end.least_clearance) > 0.03
+    moving = record.time > 0
+    np.testing.assert_allclose(
+        np.where(moving, record.clearance, np.inf).min(axis=1), end.least_clearance, rtol=1e-6
+    )
+
+
+def test_limits_of_speed_and_acceleration_hold(healthy):
+    _, _, record = healthy
+    for commands in (record.command, record.wanted):
+        assert np.all(np.abs(commands[..., 0]) <= amiro.MAX_SPEED + 1e-6)
+        assert np.all(np.abs(commands[..., 1]) <= amiro.MAX_TURN_RATE + 1e-6)
+    change = np.abs(np.diff(record.command, axis=1)) / PERIOD
+    assert np.all(change[..., 0] <= amiro.MAX_ACCELERATION + 1e-4)
+    assert np.all(change[..., 1] <= amiro.MAX_TURN_ACCELERATION + 1e-4)
+    # And the robots really move no faster than that: the wheels reach what they are told.
+    moved = np.linalg.norm(np.diff(record.poses[..., :2], axis=1), axis=-1) / PERIOD
+    turned = np.abs(np.diff(record.poses[..., 2], axis=1)) / PERIOD
+    assert np.max(moved) <= 1.01 * amiro.MAX_SPEED
+    assert np.max(turned) <= 1.01 * amiro.MAX_TURN_RATE
+    assert np.max(moved) > 0.99 * amiro.MAX_SPEED
+
+
+def test_scans_are_taken_in_range_and_facing_the_poi(healthy):
+    start, _, record = healthy
+    new = record.seen[:, 1:] & ~record.seen[:, :-1]
+    arena, step, target, robot = np.nonzero(new)
+    pose = record.poses[arena, step, robot]  # at the end of the period before
+    to_poi = start.scene.layout.position[arena, target] - pose[:, :2]
+    distance = np.linalg.norm(to_poi, axis=-1)
+    bearing = np.arctan2(to_poi[:, 1], to_poi[:, 0]) - pose[:, 2]
+    bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
+    # Some were taken in the very first period.
+    assert len(distance) >= 0.9 * 2 * NUM_POIS * NUM_ARENAS
+    assert np.all(distance >= CONFIG.viewpoint.min_distance)
+    assert np.all(distance <= CONFIG.navigation.view_range + 1e-3)
+    assert np.max(np.abs(bearing)) <= np.radians(CONFIG.navigation.goal_angle) + 1e-3
+
+
+def test_the_map_changes_where_something_was_detected_and_nowhere_else(healthy):
+    _, end, record = healthy
+    wrote = record.detected.any(axis=-1)
+    changed = np.any(np.diff(record.belief.mean, axis=1) != 0, axis=(-1, -2))
+    np.testing.assert_array_equal(changed, wrote[:, 1:])
+    np.testing.assert_array_equal(end.version, record.detected.sum(axis=(1, 2)))
+    assert np.all(np.diff(record.seen.astype(int), axis=1) >= 0)
+
+
+def test_one_robot_drives_while_another_one_scans(healthy):
+    _, _, record = healthy
+    phases = record.phase
+    apart = (phases[..., 0] == DRIVING) & (phases[..., 1] == FACING)
+    assert np.mean(apart.any(axis=1)) > 0.5
+
+
+def test_a_mission_that_is_over_stays_as_it_is(healthy):
+    _, end, record = healthy
+    last = end.steps - 1
+    assert np.all(end.steps < STEPS)
+    for arena in range(NUM_ARENAS):
+        after = record.poses[arena, last[arena] :]
+        np.testing.assert_array_equal(after, np.broadcast_to(after[0], after.shape))
+        assert np.all(record.time[arena, last[arena] :] == record.time[arena, -1])
+
+
+@pytest.mark.parametrize("robot", [0, 1])
+def test_a_robot_that_stops_leaves_the_other_one_working(play, robot):
+    own = np.arange(2) == robot
+    faults = Faults(jnp.where(own, FAULT_TIME, jnp.inf), jnp.full(2, jnp.inf))
+    _, end, record = play(faults)
+    assert np.all(end.robots.phase[:, robot] == FAILED)
+    assert np.all(end.robots.phase[:, 1 - robot] == ENDED)
+    after = record.time[0] > FAULT_TIME + 0.5
+    assert not record.detected[:, after, robot].any()
+    assert np.all(record.command[:, after, robot] == 0)
+    moved = np.ptp(record.poses[:, after, robot], axis=1)
+    assert np.max(np.abs(moved)) < 1e-3
+    assert np.all(end.seen[:, :, 1 - robot])
+    assert np.all(end.contacts == 0)
+    assert np.all(np.isfinite(end.belief.mean))
+    assert np.all(end.belief.std > 0)
+
+
+@pytest.mark.parametrize("robot", [0, 1])
+def test_a_robot_that_goes_blind_detects_nothing_more_and_the_mission_says_so(play, robot):
+    own = np.arange(2) == robot
+    faults = Faults(jnp.full(2, jnp.inf), jnp.where(own, FAULT_TIME, jnp.inf))
+    _, end, record = play(faults)
+    after = record.time[0] > FAULT_TIME + 0.2
+    assert record.scanned[:, after, robot].any()
+    assert not record.detected[:, after, robot].any()
+    missed = ~end.seen[:, :, robot]
+    assert missed.any()
+    np.testing.assert_array_equal(end.robots.undetected[:, robot], missed)
+    assert np.all(end.seen[:, :, 1 - robot])
+    expected = ["undetected" if m else "finished" for m in missed.any(axis=1)]
+    assert reasons(end) == expected
+
+
+def test_without_any_robot_the_mission_ends_at_once(play):
+    _, end, _ = play(Faults(jnp.zeros(2), jnp.full(2, jnp.inf)))
+    assert reasons(end) == ["no robot left"] * NUM_ARENAS
+    assert np.all(end.steps == 1)
+    assert np.all(end.robots.looks == 0)
+
+
+def test_same_keys_give_the_same_mission_and_the_policy_does_not_change_the_arena(team):
+    reset = jax.jit(lambda key, policy: mission.reset(key, team, policy))
+    first, again = (reset(jax.random.key(3), mission.NAIVE) for _ in range(2))
+    latent, other = reset(jax.random.key(3), mission.LATENT), reset(jax.random.key(4), 0)
+    jax.tree.map(np.testing.assert_array_equal, first, again)
+    jax.tree.map(np.testing.assert_array_equal, first.scene, latent.scene)
+    assert not np.array_equal(first.scene.poses, other.scene.poses)
