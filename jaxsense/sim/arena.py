@@ -232,7 +232,9 @@ def drive(arena: Arena, data: mjx.Data, wheel_speeds: jax.Array) -> mjx.Data:
       The next MJX state.
     """
     chex.assert_shape(wheel_speeds, (arena.num_robots, 2), custom_message="wheel_speeds")
-    return mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds)))
+    # MJX promotes ranks, which a caller may have forbidden for their own code.
+    with jax.numpy_rank_promotion("allow"):
+        return mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds)))
 
 
 def as_control(wheel_speeds: jax.Array) -> jax.Array:

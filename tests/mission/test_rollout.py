@@ -32,9 +32,7 @@ def play(team, models, as_numpy):
 
     def played(faults):
         start = begin(jax.random.split(jax.random.key(0), NUM_ARENAS), faults)
-        with jax.numpy_rank_promotion("allow"):  # MJX's step needs it
-            end, record = go_on(jax.random.split(jax.random.key(1), NUM_ARENAS), start)
-        return as_numpy((start, end, record))
+        return as_numpy((start, *go_on(jax.random.split(jax.random.key(1), NUM_ARENAS), start)))
 
     return played
 
