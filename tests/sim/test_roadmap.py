@@ -234,8 +234,8 @@ def test_following_the_next_place_reaches_the_viewpoint_by_the_promised_way(foll
     assert length.max() > 2.5
     away = np.linalg.norm(path - goal[:, None], axis=-1)
     assert away[:, -1].max() < 1e-5
-    # One thousandth is what `next_place` adds to prefer the farther of two nodes on a way, and
-    # each of them may cut one step short.
+    # One thousandth is what `next_place` adds to prefer the farther of two nodes on a way; the last
+    # step is short.
     walked = 0.02 * (away > 1e-5).sum(axis=-1)
     assert np.all(walked <= 1.001 * length + 0.02 + 1e-4)
     np.testing.assert_allclose(left[:, 0], length, rtol=1.1e-3)
