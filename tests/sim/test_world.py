@@ -74,7 +74,7 @@ def room(x, y, others, poi=0):
     position = jnp.array([[0.0, 0.0], [1.0, 0.0], [-1.0, -1.0]])
     layout = sim.make_layout(ArenaConfig(), position, jnp.zeros(3), CLASSES)
     place = jnp.array([x]), jnp.array([y])
-    config = ViewpointConfig(), ArenaConfig(), layout
+    config = ViewpointConfig().clearance, ArenaConfig(), layout
     return float(viewpoints.free_room(*place, *config, jnp.array(others), jnp.int32(poi))[0])
 
 
