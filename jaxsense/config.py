@@ -238,11 +238,11 @@ class DetectorConfig:
 
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers."""
-    num_scans: int = 131072
+    num_scans: int = 65536
     """Simulated scans to train on, for each modality."""
     num_held_out: int = 8192
     """Further simulated scans, on which accuracy is measured."""
-    steps: int = 5000
+    steps: int = 3000
     """Gradient steps."""
     batch: int = 512
     """Scans of one gradient step."""
@@ -276,7 +276,7 @@ class JmvaeConfig:
     """Trainings from different random parameters, of which the one with the lowest loss is kept."""
     samples_per_class: int = 10000
     """Detections of each class and modality in the training set."""
-    steps: int = 3000
+    steps: int = 2400
     """Gradient steps."""
     batch: int = 256
     """Pairs of detections in one gradient step."""
@@ -349,8 +349,9 @@ class DqnConfig:
     """Factor on epsilon for each epoch."""
     target_period: int = 50
     """Epochs between two copies of the network to the target network."""
-    num_starts: int = 2048
-    """Start states that are prepared for one chunk of epochs; episodes start from a random one."""
+    num_starts: int = 8192
+    """Start states that are prepared; each environment has a share of them, from which its episodes
+    start. A multiple of num_envs."""
     chunk: int = 100
     """Epochs between two reports of progress."""
 
@@ -370,6 +371,12 @@ class DqnConfig:
             f"must be a multiple of num_envs = {self.num_envs}",
         )
         _require(
+            self.num_starts % self.num_envs == 0,
+            self,
+            "num_starts",
+            f"must be a multiple of num_envs = {self.num_envs}",
+        )
+        _require(
             self.epochs % self.chunk == 0,
             self,
             "epochs",
@@ -383,8 +390,9 @@ class EvaluationConfig:
 
     num_starts: int = 512
     """Start states from which whole episodes are played."""
-    num_repeats: int = 256
-    """Episodes from each start state, over which the noise of detections is averaged."""
+    num_repeats: int = 192
+    """Episodes from each start state, over which the noise of detections is averaged; for
+    the naive and the random policy an eighth of them."""
 
     def __post_init__(self):
         _require_positive(self, "num_starts", "num_repeats")

@@ -66,7 +66,7 @@ class Display:
             print(f"{clock}: compiling", flush=True)
         elif total:
             rate = done / max(now - self._first.setdefault(stage, self._begin), 1e-9)
-            left = (total - done) / rate
+            left = (total - done) / max(rate, 1e-9)
             progress = f"{done} of {total}, {rate:.0f}/s, {left:.0f} s left"
             progress = "done" if total == 1 else progress
             print(f"{clock}: {progress}  {text}", flush=True)

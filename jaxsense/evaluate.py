@@ -60,7 +60,7 @@ def main(argv: list[str] | None = None) -> None:
         monitor = Monitor(display.show)
         display.show("mission", 0, 0, {})
         number = arguments.episodes * len(played)
-        player = mission.Player(team, monitor, batch=min(mission.BATCH, number))
+        player = mission.Player(team, monitor, batch=mission.batch_of(number))
         begin = time.perf_counter()
         found = mission.summary(key, player, models, played, arguments.episodes)
         seconds = time.perf_counter() - begin

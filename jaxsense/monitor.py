@@ -1,7 +1,9 @@
 """What a stage tells the outside while it runs: time, progress, figures, and bad ends."""
 
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -11,47 +13,110 @@ Listener = Callable[[str, int, int, dict[str, float]], None]
 """`(stage, done, total, figures)`, called from the host between two chunks of work."""
 
 
+_COMPILERS = 2
+
+
+def _compiler_options() -> Any:
+    """On CPU a lower level of optimisation: it saves a third of the time and costs no speed."""
+    return {"xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else {}
+
+
 class StageError(RuntimeError):
     """A training that cannot go on: names the stage and the step."""
 
 
+class Program:
+    """A function of a stage that is compiled in the background; a call waits for that and runs it.
+
+    It may be called, from another thread, before it is known what it does.
+    """
+
+    def __init__(self, monitor: "Monitor", stage: str):
+        self._monitor, self._stage = monitor, stage
+        self._compiled: Future[Callable[..., Any]] = Future()
+
+    def compile(
+        self,
+        function: Callable[..., Any],
+        *args: Any,
+        donate: tuple[int, ...] = (),
+        **shardings: Any,
+    ) -> Any:
+        """Traces a function and begins to compile it.
+
+        Args:
+          function: what to compile.
+          *args: arguments or their shapes, for example the result of another program's `compile`.
+          donate: positions of arguments whose memory the program may use for its results.
+          **shardings: `in_shardings` and `out_shardings` of `jax.jit`.
+
+        Returns:
+          Shapes and dtypes of the results, as a pytree.
+        """
+        begin = time.perf_counter()
+        traced = jax.jit(function, donate_argnums=donate, **shardings).trace(*args)
+        lowered = traced.lower()
+        self._monitor.add(self._stage, "compile_s", time.perf_counter() - begin)
+
+        def compile_lowered() -> None:
+            begin = time.perf_counter()
+            try:
+                compiled = lowered.compile(compiler_options=_compiler_options())
+            except Exception as error:
+                self.fail(error)
+            else:
+                self._monitor.add(self._stage, "compile_s", time.perf_counter() - begin)
+                self._compiled.set_result(compiled)
+
+        self._monitor.compiler.submit(compile_lowered)
+        return traced.out_info
+
+    def fail(self, error: BaseException) -> None:
+        """Raises an error from all calls, unless the program is there already."""
+        if not self._compiled.done():
+            self._compiled.set_exception(error)
+
+    def __call__(self, *args: Any) -> Any:
+        """Runs the program until its results are there."""
+        if not self._compiled.done():
+            self._monitor.announce(self._stage)
+        compiled = self._compiled.result()
+        begin = time.perf_counter()
+        output = jax.block_until_ready(compiled(*args))
+        self._monitor.add(self._stage, "run_s", time.perf_counter() - begin)
+        return output
+
+
 class Monitor:
-    """Runs jitted functions, with the time of compiling and of running apart.
+    """What the programs of a run have in common: compilers, a clock and a listener.
 
     Attributes:
       seconds: for each stage, `{"compile_s": ..., "run_s": ...}` so far.
+      compiler: threads that compile.
     """
 
     def __init__(self, listener: Listener = lambda stage, done, total, figures: None):
         self.seconds: dict[str, dict[str, float]] = {}
-        self._listener = listener
+        self._lock = threading.Lock()
+        self._listener = self._one_at_a_time(listener)
+        self.compiler = ThreadPoolExecutor(_COMPILERS)
 
-    def compile(
-        self, stage: str, function: Callable[..., Any], *args: Any, announce: bool = True
-    ) -> Callable[..., Any]:
-        """Compiles a function for arguments of these shapes; the result counts its own run time.
+    def _one_at_a_time(self, listener: Listener) -> Listener:
+        """Stages may run side by side."""
 
-        Without `announce` the listener is not told, as for a compilation in the background.
-        """
-        if announce:
-            self._listener(stage, 0, 0, {})
-        begin = time.perf_counter()
-        compiled = jax.jit(function).lower(*args).compile()
-        self._add(stage, "compile_s", time.perf_counter() - begin)
+        def listen(stage: str, done: int, total: int, figures: dict[str, float]) -> None:
+            with self._lock:
+                listener(stage, done, total, figures)
 
-        def run(*args: Any) -> Any:
-            begin = time.perf_counter()
-            output = jax.block_until_ready(compiled(*args))
-            self._add(stage, "run_s", time.perf_counter() - begin)
-            return output
+        return listen
 
-        return run
+    def close(self) -> None:
+        """Gives up what is still waiting to be compiled."""
+        self.compiler.shutdown(wait=False, cancel_futures=True)
 
-    def run(self, stage: str, function: Callable[..., Any], *args: Any) -> Any:
-        """Compiles a function and runs it once; reports the stage as done."""
-        output = self.compile(stage, function, *args)(*args)
-        self._listener(stage, 1, 1, {})
-        return output
+    def announce(self, stage: str) -> None:
+        """Reports that a stage is being compiled."""
+        self._listener(stage, 0, 0, {})
 
     def progress(self, stage: str, done: int, total: int) -> None:
         """Reports progress of a stage that has no loss."""
@@ -83,6 +148,8 @@ class Monitor:
             raise StageError(f"{stage}: loss = {losses[bad[0]]} at step {step} of {total}")
         self._listener(stage, done, total, {"loss": float(np.mean(losses)), **figures})
 
-    def _add(self, stage: str, kind: str, seconds: float) -> None:
-        entry = self.seconds.setdefault(stage, {"compile_s": 0.0, "run_s": 0.0})
-        entry[kind] += seconds
+    def add(self, stage: str, kind: str, seconds: float) -> None:
+        """Adds to the time of a stage; `kind` is "compile_s" or "run_s"."""
+        with self._lock:
+            entry = self.seconds.setdefault(stage, {"compile_s": 0.0, "run_s": 0.0})
+            entry[kind] += seconds

@@ -69,29 +69,34 @@ def _mdp(config: Config, params: Params, model: Jmvae, new_scene, observe) -> Ma
     )
 
 
-def first_looks(
-    key: Key, world: worlds.World, modality: int, per_class: int, chunk: int = 1536
-) -> jax.Array:
-    """Looks at PoIs of every class, each in a scene of its own.
+def surveys(
+    keys: Key, world: worlds.World, classes: jax.Array, chunk: int = 512
+) -> tuple[worlds.Scene, tuple[jax.Array, ...]]:
+    """Surveys of many scenes, see `sim.survey`.
 
     Args:
-      key: random key.
+      keys: `[S]` random keys.
       world: the simulation.
-      modality: index of the sensor; static.
-      per_class: how many of each class, S.
-      chunk: how many are simulated side by side.
+      classes: `[S, N]` int32 classes of the PoIs.
+      chunk: how many scenes are simulated side by side.
 
     Returns:
-      `[C, S, F]` windows.
+      `[S]` scenes, and for each modality `[S, N, F]` windows.
     """
-    num_classes = len(world.config.arena.classes)
-    chunk = min(chunk, num_classes * per_class)
-    num_chunks = -(-num_classes * per_class // chunk)
-    classes = jnp.arange(num_chunks * chunk) % num_classes
-    keys = jax.random.split(key, (num_chunks, chunk))
-    windows = jax.lax.map(
-        jax.vmap(lambda inputs: worlds.first_look(inputs[0], world, modality, inputs[1])),
-        (keys, classes.reshape(num_chunks, chunk)),
+    number = len(keys)
+    chunk = min(chunk, number)
+    # A remainder would be compiled once more.
+    rows = jnp.arange(-(-number // chunk) * chunk) % number
+    found = jax.lax.map(
+        lambda scene: worlds.survey(scene[0], world, scene[1]),
+        (keys[rows], classes[rows]),
+        batch_size=chunk,
     )
-    windows = windows.reshape(num_chunks * chunk, -1)[: num_classes * per_class]
-    return windows.reshape(per_class, num_classes, -1).swapaxes(0, 1)
+    return jax.tree.map(lambda x: x[:number], found)
+
+
+def balanced_classes(key: Key, config: Config, number: int) -> jax.Array:
+    """`[number, N]` int32 classes in random order, all equally frequent but for a remainder."""
+    num_pois = config.arena.num_pois
+    even = jnp.arange(number * num_pois) % len(config.arena.classes)
+    return jax.random.permutation(key, even).reshape(number, num_pois)

@@ -13,8 +13,9 @@ import jax
 import rich.console
 import rich.table
 import tyro
+from jax.sharding import Mesh
 
-from jaxsense import __version__, cli, pipeline, report
+from jaxsense import __version__, cli, devices, pipeline, report
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.display import Display
 from jaxsense.monitor import Monitor, StageError
@@ -35,6 +36,12 @@ class Arguments:
     """Seed of all randomness, from 0 to 2^32 - 1."""
     out: Path | None = None
     """Directory to write; must be new. By default `runs/DATE-TIME-PRESET`."""
+    devices: int | None = None
+    """Devices that environments are split over: accelerators, or threads of the CPU. By default all
+    accelerators there are; on a CPU as many threads as cores, at most 8, for simulations, and one
+    for Q-learning."""
+    cache: Path | None = Path("~/.cache/jaxsense")
+    """Directory in which compiled programs are kept for later runs; `None` to keep none."""
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -42,6 +49,7 @@ def main(argv: list[str] | None = None) -> None:
     begin = time.perf_counter()
     arguments = parse(sys.argv[1:] if argv is None else argv)
     console = rich.console.Console()
+    meshes = _start(arguments)
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
     try:
         run = RunDirectory(
@@ -52,11 +60,13 @@ def main(argv: list[str] | None = None) -> None:
         )
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
+    if arguments.cache is not None:
+        devices.keep_programs(arguments.cache.expanduser())
     with Display(console, run.append_metrics) as display:
         monitor = Monitor(display.show)
         try:
             result = pipeline.run(
-                jax.random.key(arguments.seed), arguments.config, monitor, run.save
+                jax.random.key(arguments.seed), arguments.config, monitor, run.save, *meshes
             )
         except StageError as error:
             cli.fail(PROGRAM, f"{error}; must be finite. What was written before is in {run.path}")
@@ -85,6 +95,14 @@ def parse(argv: list[str]) -> Arguments:
     if not 0 <= arguments.seed < 2**32:
         cli.fail(PROGRAM, f"seed = {arguments.seed}: must be within 0 and 2^32 - 1")
     return arguments
+
+
+def _start(arguments: Arguments) -> tuple[Mesh | None, Mesh | None]:
+    """The devices, see `devices.start`."""
+    try:
+        return devices.start(arguments.devices, arguments.config.dqn)
+    except ConfigError as error:
+        cli.fail(PROGRAM, str(error))
 
 
 def _preset_of(argv: list[str]) -> str:

@@ -64,11 +64,18 @@ def world():
 def looks(request, world):
     """A modality, a detector of a short training, its training windows and new ones."""
     modality = request.param
-    first_looks = jax.jit(
-        lambda key: observe.first_looks(key, world, modality, 500 + NUM_LOOKS, chunk=1274),
-        compiler_options=FAST_TO_COMPILE,
-    )
-    windows, new = jnp.split(first_looks(jax.random.key(0)), [500], axis=1)
+    number = 500 + NUM_LOOKS
+
+    def survey(key):
+        class_key, survey_key = jax.random.split(key)
+        classes = observe.balanced_classes(class_key, CONFIG, number)
+        keys = jax.random.split(survey_key, number)
+        return classes, observe.surveys(keys, world, classes)[1][modality]
+
+    survey = jax.jit(survey, compiler_options=FAST_TO_COMPILE)
+    classes, surveyed = survey(jax.random.key(0))
+    by_class = jnp.stack([surveyed[classes == c] for c in range(3)])
+    windows, new = jnp.split(by_class, [500], axis=1)
     labels = jnp.array(CONFIG.arena.label_of_class(MODALITIES[CONFIG.modalities[modality]]))
     config, flat = CONFIG.detector, windows.reshape(-1, windows.shape[-1])
     detector = detectors.init(jax.random.key(1), flat, 2, config)
@@ -104,7 +111,7 @@ def features(looks, world):
     return modality, np.asarray(bank(detector, new)), jax.tree.map(np.asarray, live)
 
 
-def test_first_looks_come_in_the_order_of_the_classes(looks):
+def test_surveys_look_at_pois_of_the_classes_that_they_tell(looks):
     modality, _, windows, _ = looks
     sensor = (CONFIG.camera, CONFIG.lidar)[modality]
     values = 3 if modality == 0 else 1  # red, green and blue
@@ -120,7 +127,7 @@ def test_first_looks_come_in_the_order_of_the_classes(looks):
         assert np.mean((middle > 0.1) & (middle < 1.2)) > 0.98
 
 
-def test_first_looks_are_all_different(looks):
+def test_looks_are_all_different(looks):
     windows = np.asarray(looks[2])
     assert len(np.unique(windows.reshape(1500, -1), axis=0)) == 1500
 

@@ -35,19 +35,20 @@ def imports_of(path: Path) -> set[str]:
 def test_imports_run_one_way():
     parts = ("sim", "vae", "dqn")
     top = (
-        "observe", "models", "mission", "pipeline", "rundir", "report", "animation", "train",
-        "evaluate", "cli", "display", "monitor",
+        "observe", "models", "mission", "programs", "pipeline", "examine", "rundir", "report",
+        "animation", "train", "evaluate", "cli", "display", "monitor",
     )  # fmt: skip
     for part in parts:
         for path in (ROOT / "jaxsense" / part).glob("*.py"):
             for name in imports_of(path):
                 imported = name.split(".")[1]
                 assert imported == part or imported not in (*parts, *top), f"{path}: {name}"
-    for module in ("types", "config", "networks", "training", "monitor"):
-        allowed = {"types", "config", "networks", "training"} - {module}
+    base = {"types", "config", "networks", "training", "indexing", "devices"}
+    for module in (*base, "monitor"):
+        allowed = base - {module}
         for name in imports_of(ROOT / "jaxsense" / f"{module}.py"):
             assert name.split(".")[1] in allowed, f"{module}: {name}"
-    below = {"types", "config", "networks", "training", "models", "monitor", "mission", *parts}
+    below = {*base, "models", "monitor", "mission", *parts}
     for path in (ROOT / "jaxsense" / "mission").glob("*.py"):
         for name in imports_of(path):
             assert name.split(".")[1] in below, f"{path}: {name}"

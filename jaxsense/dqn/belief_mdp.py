@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxsense.config import MdpConfig
+from jaxsense.indexing import Index, call, is_static
 from jaxsense.types import Belief, Key
 
 Scene = Any
@@ -123,23 +124,47 @@ def reset(
       The state. What has been seen was really looked at: the map holds real detections. Each PoI
       has its looks written in the order of the modalities, from a random one on.
     """
-    start_key, scene_key, order_key, look_key = jax.random.split(key, 4)
-    shape = (mdp.num_pois, mdp.num_modalities)
+    start_key, scene_key, begin_key, look_key = jax.random.split(key, 4)
     random_classes, random_seen = random_start(start_key, mdp)
     classes = random_classes if classes is None else classes
     seen = random_seen if seen is None else seen
     chex.assert_shape(classes, (mdp.num_pois,), custom_message="classes")
-    chex.assert_shape(seen, shape, custom_message="seen")
     scene = mdp.new_scene(scene_key, classes)
-    first = jax.random.randint(order_key, (mdp.num_pois,), 0, mdp.num_modalities)
-    look_keys = jax.random.split(look_key, shape)
     pois = jnp.arange(mdp.num_pois)
-    entries = jax.vmap(lambda *poi: _looked_at(mdp, scene, *poi))(look_keys, pois, seen, first)
+    looks = tuple(
+        jax.vmap(lambda key, poi: mdp.observe(key, scene, poi, m)[0])(keys, pois)  # noqa: B023
+        for m, keys in enumerate(jax.random.split(look_key, (mdp.num_modalities, mdp.num_pois)))
+    )
+    return begin(begin_key, mdp, scene, classes, seen, looks)
+
+
+def begin(
+    key: Key,
+    mdp: MapMdp,
+    scene: Scene,
+    classes: jax.Array,
+    seen: jax.Array,
+    looks: tuple[jax.Array, ...],
+) -> MapState:
+    """The start of an episode in a given scene; `reset` says how the map is written.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      scene: what `observe` will look at.
+      classes: `[N]` int32 true classes.
+      seen: `[N, M]` bool, who has seen what.
+      looks: for each modality `[N, D_m]` features of a look at each PoI; those that `seen` does not
+        tell of are not used.
+    """
+    chex.assert_shape(seen, (mdp.num_pois, mdp.num_modalities), custom_message="seen")
+    first = jax.random.randint(key, (mdp.num_pois,), 0, mdp.num_modalities)
+    entries = jax.vmap(lambda *poi: _looked_at(mdp, *poi))(looks, seen, first)
     return MapState(entries, seen, classes, scene, jnp.int32(0))
 
 
 def step(
-    key: Key, mdp: MapMdp, state: MapState, action: jax.Array, modality: int
+    key: Key, mdp: MapMdp, state: MapState, action: jax.Array, modality: Index
 ) -> tuple[MapState, Outcome]:
     """Looks at a PoI with one modality's sensor, or ends the episode.
 
@@ -148,7 +173,8 @@ def step(
       mdp: the MDP.
       state: the present state.
       action: `[]` int32, a PoI or N for NOP.
-      modality: index of the agent's own sensor; static.
+      modality: index of the agent's own sensor. As a `[]` int32 array one program serves all
+        modalities; an index that does not exist is not noticed then.
 
     Returns:
       The next state and the outcome. The reward is the gain of information; -1 if that is not above
@@ -157,7 +183,7 @@ def step(
     Raises:
       ValueError: if there is no such modality.
     """
-    if not 0 <= modality < mdp.num_modalities:
+    if is_static(modality) and not 0 <= modality < mdp.num_modalities:
         raise ValueError(f"modality = {modality}: must be below {mdp.num_modalities}, not negative")
     chex.assert_rank(action, 0, custom_message="action")
     shape = (mdp.num_pois, *mdp.unseen.mean.shape)
@@ -165,9 +191,13 @@ def step(
         chex.assert_shape(part, shape, custom_message="state.belief")
     is_nop = action == mdp.num_pois
     poi = jnp.minimum(action, mdp.num_pois - 1)
-    features, scene = mdp.observe(key, state.scene, poi, modality)
     old = jax.tree.map(lambda x: x[poi], state.belief)
-    new = mdp.write(old, state.seen[poi], features, modality)
+
+    def look(modality: int) -> tuple[Belief, Scene]:
+        features, scene = mdp.observe(key, state.scene, poi, modality)
+        return mdp.write(old, state.seen[poi], features, modality), scene
+
+    new, scene = call(look, modality, mdp.num_modalities)
     gain = information(new.std) - information(old.std)
     reward = jnp.where(gain > mdp.config.min_increase, gain, -1.0)
 
@@ -196,9 +226,8 @@ def _random_seen(key: Key, shape: tuple[int, int], is_partial: bool) -> jax.Arra
     return (code >> jnp.arange(num_bits) & 1).astype(bool).reshape(shape)
 
 
-def _looked_at(mdp: MapMdp, scene: Scene, keys, poi, seen, first) -> Belief:
-    """The entry of one PoI after the looks that `seen` [M] tells of, in rotated order."""
-    looks = [mdp.observe(keys[m], scene, poi, m)[0] for m in range(mdp.num_modalities)]
+def _looked_at(mdp: MapMdp, looks: tuple[jax.Array, ...], seen, first) -> Belief:
+    """The entry of one PoI after those of the looks that `seen` [M] tells of, in rotated order."""
     entry = mdp.unseen
     for start in range(mdp.num_modalities):
         order = [(start + i) % mdp.num_modalities for i in range(mdp.num_modalities)]

@@ -10,13 +10,14 @@ import numpy as np
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.policies import Policy
+from jaxsense.indexing import Index
 from jaxsense.types import Key
 
 MOST_STATES = 4096
 
 
 def play(
-    key: Key, mdp: MapMdp, policy: Policy, start: MapState, modality: int
+    key: Key, mdp: MapMdp, policy: Policy, start: MapState, modality: Index
 ) -> tuple[jax.Array, jax.Array]:
     """Plays one episode with a policy.
 
@@ -29,7 +30,7 @@ def play(
       mdp: the MDP.
       policy: what to do.
       start: from `belief_mdp.reset`.
-      modality: index of the agent's own sensor; static.
+      modality: index of the agent's own sensor, see `belief_mdp.step`.
 
     Returns:
       `[]` total reward, without discount, and `[]` reward of the first action.

@@ -1,15 +1,27 @@
-"""Deep Q-learning over many environments at once (Mnih et al. 2015), as pure functions."""
+"""Deep Q-learning over many environments at once (Mnih et al. 2015), as pure functions.
+
+Environments may be split over devices: each device steps its own, remembers what they saw and draws
+from that; gradients are averaged over the devices. All random numbers are drawn for a whole chunk
+of epochs at once and for all environments, so that the number of devices changes nothing but
+rounding.
+"""
+
+import functools
+from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.sharding import Mesh, PartitionSpec
 
 from jaxsense.config import DqnConfig
+from jaxsense.devices import AXIS
 from jaxsense.dqn import belief_mdp, losses, replay
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.policies import q_network
+from jaxsense.indexing import Index
 from jaxsense.training import Params
 from jaxsense.types import Key, Transition
 
@@ -56,18 +68,44 @@ class EpochInfo:
     epsilon: jax.Array
 
 
-def init(key: Key, mdp: MapMdp, config: DqnConfig) -> DqnState:
-    """A fresh network, an empty replay, and environments that wait for their first start."""
-    shapes = jax.eval_shape(lambda: _starts(key, mdp, config.num_envs))
-    envs = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+@struct.dataclass
+class _Draws:
+    """The random numbers of one epoch: uniform in [0, 1), but for the keys.
+
+    Attributes:
+      coin: `[E]` whether an environment explores.
+      action: `[E]` which action it tries then.
+      start: `[E]` which start follows an episode that has ended.
+      step: `[E]` keys of the steps.
+      replay: `[updates, B, 2]` what is learnt from.
+    """
+
+    coin: jax.Array
+    action: jax.Array
+    start: jax.Array
+    step: jax.Array
+    replay: jax.Array
+
+
+def init(key: Key, mdp: MapMdp, config: DqnConfig, prepared: MapState) -> DqnState:
+    """A fresh network, an empty replay, and environments that wait for their first start.
+
+    Args:
+      key: random key of the network.
+      mdp: the MDP.
+      config: the settings.
+      prepared: from `starts`, for the shapes alone.
+    """
+    envs = jax.tree.map(lambda x: jnp.zeros((config.num_envs, *x.shape[1:]), x.dtype), prepared)
     s = belief_mdp.as_state(jax.tree.map(lambda x: x[0], envs.belief))
     params = q_network(mdp, config.hidden).init(key, s)
     example = Transition(s, jnp.int32(0), jnp.float32(0), jnp.float32(0), s)
+    rounds = config.replay_capacity // config.num_envs
     return DqnState(
         params=params,
         target=params,
         optimiser=_optimiser(config).init(params),
-        replay=replay.init(example, config.replay_capacity),
+        replay=replay.init(example, rounds, config.num_envs),
         envs=envs,
         needs_start=jnp.ones(config.num_envs, bool),
         total_reward=jnp.zeros(config.num_envs),
@@ -75,68 +113,143 @@ def init(key: Key, mdp: MapMdp, config: DqnConfig) -> DqnState:
     )
 
 
-def train(key: Key, mdp: MapMdp, modality: int, config: DqnConfig) -> tuple[DqnState, EpochInfo]:
-    """A whole training; `vmap` over `key` for several seeds.
+def starts(key: Key, mdp: MapMdp, number: int) -> MapState:
+    """`[number]` random states for episodes to start from.
+
+    They are prepared once for a training: a start takes a look at everything that has been seen in
+    it, which costs far more than a step.
+    """
+    keys = jax.random.split(key, number)
+    return jax.vmap(lambda key: belief_mdp.reset(key, mdp))(keys)
+
+
+def train(
+    key: Key, mdp: MapMdp, modality: Index, config: DqnConfig, mesh: Mesh | None = None
+) -> tuple[DqnState, EpochInfo]:
+    """A whole training; `vmap` over `key` for several seeds, over `modality` for several agents.
 
     Args:
       key: random key.
       mdp: the MDP.
-      modality: index of the agent's own sensor; static.
+      modality: index of the agent's own sensor, see `belief_mdp.step`.
       config: the settings.
+      mesh: devices that the environments are split over, see `train_chunk`.
 
     Returns:
       The last state and the `[epochs]` infos.
     """
-    init_key, chunk_key = jax.random.split(key)
-    state = init(init_key, mdp, config)
+    init_key, start_key, chunk_key = jax.random.split(key, 3)
+    prepared = starts(start_key, mdp, config.num_starts)
+    state = init(init_key, mdp, config, prepared)
     keys = jax.random.split(chunk_key, config.epochs // config.chunk)
     state, infos = jax.lax.scan(
-        lambda state, key: train_chunk(key, mdp, modality, config, state), state, keys
+        lambda state, key: train_chunk(key, mdp, modality, config, state, prepared, mesh),
+        state,
+        keys,
     )
     return state, jax.tree.map(lambda x: x.reshape(-1), infos)
 
 
 def train_chunk(
-    key: Key, mdp: MapMdp, modality: int, config: DqnConfig, state: DqnState
+    key: Key,
+    mdp: MapMdp,
+    modality: Index,
+    config: DqnConfig,
+    state: DqnState,
+    prepared: MapState,
+    mesh: Mesh | None = None,
 ) -> tuple[DqnState, EpochInfo]:
     """`config.chunk` epochs.
-
-    Episodes that end are followed by one of `num_starts` start states that are prepared here, once
-    for the chunk; a start takes a look at everything that has been seen in it, which would cost far
-    more than a step if every environment prepared its own at every step.
 
     Args:
       key: random key.
       mdp: the MDP.
-      modality: index of the agent's own sensor; static.
+      modality: index of the agent's own sensor, see `belief_mdp.step`.
       config: the settings.
       state: the present state.
+      prepared: `[num_starts]` from `starts`. Each environment has a share of them, and every
+        episode starts from a random one of the share.
+      mesh: devices that the environments are split over; their number must divide `num_envs` and
+        `batch`. On one device if not given.
 
     Returns:
       The next state and the `[chunk]` infos.
     """
-    start_key, epoch_key = jax.random.split(key)
-    starts = _starts(start_key, mdp, config.num_starts)
-    keys = jax.random.split(epoch_key, config.chunk)
-    return jax.lax.scan(
-        lambda state, key: _epoch(key, mdp, modality, config, starts, state), state, keys
+    chex.assert_axis_dimension(prepared.steps, 0, config.num_starts, custom_message="prepared")
+    shares = jax.tree.map(lambda x: x.reshape(config.num_envs, -1, *x.shape[1:]), prepared)
+    draws = _draw(key, mdp, config)
+    if mesh is None:
+        epoch = functools.partial(_epoch, mdp, modality, config, None)
+        return jax.lax.scan(lambda state, draws: epoch(shares, state, draws), state, draws)
+
+    one, split = PartitionSpec(), PartitionSpec(AXIS)
+    later, batch = PartitionSpec(None, AXIS), PartitionSpec(None, None, AXIS)
+    draws_specs = _Draws(later, later, later, later, batch)  # pyright: ignore[reportArgumentType]
+
+    def chunk(modality, shares: MapState, state: DqnState, draws: _Draws):
+        epoch = functools.partial(_epoch, mdp, modality, config, AXIS)
+        return jax.lax.scan(lambda state, draws: epoch(shares, state, draws), state, draws)
+
+    return jax.shard_map(
+        chunk,
+        mesh=mesh,
+        in_specs=(one, split, state_specs(), draws_specs),
+        out_specs=(state_specs(), one),
+        check_vma=False,
+    )(jnp.asarray(modality), shares, state, draws)
+
+
+def state_specs() -> DqnState:
+    """Which parts of a `DqnState` are split over devices, as a prefix of its tree."""
+    one, split = PartitionSpec(), PartitionSpec(AXIS)
+    specs: Any = {
+        "params": one,
+        "target": one,
+        "optimiser": one,
+        "replay": replay.Replay(PartitionSpec(None, AXIS), one),  # pyright: ignore
+        "envs": split,
+        "needs_start": split,
+        "total_reward": split,
+        "epoch": one,
+    }
+    return DqnState(**specs)
+
+
+def _draw(key: Key, mdp: MapMdp, config: DqnConfig) -> _Draws:
+    """`[chunk]` of random numbers: drawn in one go, they cost a small part of what they would."""
+    env_key, step_key, replay_key = jax.random.split(key, 3)
+    shape = (config.chunk, config.num_envs)
+    coin, action, start = jax.random.uniform(env_key, (3, *shape))
+    return _Draws(
+        coin=coin,
+        action=jnp.floor(action * (mdp.num_pois + 1)).astype(jnp.int32),
+        start=jnp.floor(start * (config.num_starts // config.num_envs)).astype(jnp.int32),
+        step=jax.random.split(step_key, shape),
+        replay=jax.random.uniform(replay_key, (config.chunk, config.updates, config.batch, 2)),
     )
 
 
 def _epoch(
-    key: Key, mdp: MapMdp, modality: int, config: DqnConfig, starts: MapState, state: DqnState
+    mdp: MapMdp,
+    modality: Index,
+    config: DqnConfig,
+    axis: str | None,
+    shares: MapState,
+    state: DqnState,
+    draws: _Draws,
 ) -> tuple[DqnState, EpochInfo]:
-    explore_key, step_key, start_key, learn_key = jax.random.split(key, 4)
+    """One step of each environment of a device and `config.updates` gradient steps."""
     epsilon = jnp.maximum(
         config.epsilon_min, config.epsilon_start * config.epsilon_decay**state.epoch
     )
-
-    started = _restart(start_key, state.envs, starts, state.needs_start)
+    started = _restart(draws.start, state.envs, shares, state.needs_start)
     s_tm1 = jax.vmap(belief_mdp.as_state)(started.belief)
-    a_tm1 = _epsilon_greedy(explore_key, mdp, config, state.params, s_tm1, epsilon)
-    step_keys = jax.random.split(step_key, config.num_envs)
+    values = jnp.asarray(q_network(mdp, config.hidden).apply(state.params, s_tm1))
+    chex.assert_shape(values, (None, mdp.num_pois + 1))
+    greedy = jnp.argmax(values, axis=-1).astype(jnp.int32)
+    a_tm1 = jnp.where(draws.coin < epsilon, draws.action, greedy)
     envs, outcome = jax.vmap(lambda k, env, a: belief_mdp.step(k, mdp, env, a, modality))(
-        step_keys, started, a_tm1
+        draws.step, started, a_tm1
     )
     s_t = jax.vmap(belief_mdp.as_state)(envs.belief)
     discount_t = jnp.where(outcome.is_over, 0.0, 1.0)
@@ -145,10 +258,10 @@ def _epoch(
 
     has_ended = outcome.is_over | outcome.is_cut
     total_reward = state.total_reward + outcome.reward
-    episodes = jnp.sum(has_ended)
-    ended_reward = jnp.sum(jnp.where(has_ended, total_reward, 0.0))
+    ended = jnp.sum(has_ended), jnp.sum(jnp.where(has_ended, total_reward, 0.0))
+    episodes, ended_reward = ended if axis is None else jax.lax.psum(ended, axis)
 
-    params, optimiser, loss = _learn(learn_key, mdp, config, state, memory)
+    params, optimiser, loss = _learn(mdp, config, axis, state, memory, draws.replay)
     is_copied = (state.epoch + 1) % config.target_period == 0
     target = jax.tree.map(lambda new, old: jnp.where(is_copied, new, old), params, state.target)
     info = EpochInfo(loss, ended_reward / jnp.maximum(episodes, 1), episodes, epsilon)
@@ -165,17 +278,15 @@ def _epoch(
     return state, info
 
 
-def _epsilon_greedy(key: Key, mdp: MapMdp, config: DqnConfig, params: Params, s, epsilon):
-    coin_key, action_key = jax.random.split(key)
-    values = jnp.asarray(q_network(mdp, config.hidden).apply(params, s))
-    chex.assert_shape(values, (config.num_envs, mdp.num_pois + 1))
-    explores = jax.random.uniform(coin_key, (config.num_envs,)) < epsilon
-    random = jax.random.randint(action_key, (config.num_envs,), 0, mdp.num_pois + 1)
-    return jnp.where(explores, random, jnp.argmax(values, axis=-1).astype(jnp.int32))
-
-
-def _learn(key: Key, mdp: MapMdp, config: DqnConfig, state: DqnState, memory: replay.Replay):
-    """`config.updates` gradient steps."""
+def _learn(
+    mdp: MapMdp,
+    config: DqnConfig,
+    axis: str | None,
+    state: DqnState,
+    memory: replay.Replay,
+    draws: jax.Array,
+) -> tuple[Params, optax.OptState, jax.Array]:
+    """Gradient steps, one for each of the `[updates, B, 2]` draws."""
     network = q_network(mdp, config.hidden)
     optimiser = _optimiser(config)
 
@@ -187,15 +298,15 @@ def _learn(key: Key, mdp: MapMdp, config: DqnConfig, state: DqnState, memory: re
         )
         return jnp.mean(losses.pseudo_huber(error))
 
-    def update(carry, key: Key):
+    def update(carry, draws: jax.Array):
         params, optimiser_state = carry
-        batch = replay.sample(key, memory, config.batch)
-        value, gradient = jax.value_and_grad(loss)(params, batch)
+        batch = replay.sample(draws, memory)
+        result = jax.value_and_grad(loss)(params, batch)
+        value, gradient = result if axis is None else jax.lax.pmean(result, axis)
         change, optimiser_state = optimiser.update(gradient, optimiser_state, params)
         return (optax.apply_updates(params, change), optimiser_state), value
 
-    keys = jax.random.split(key, config.updates)
-    (params, optimiser_state), values = jax.lax.scan(update, (state.params, state.optimiser), keys)
+    (params, optimiser_state), values = jax.lax.scan(update, (state.params, state.optimiser), draws)
     return params, optimiser_state, jnp.mean(jnp.asarray(values))
 
 
@@ -208,17 +319,11 @@ def _optimiser(config: DqnConfig) -> optax.GradientTransformation:
     return optax.adam(schedule)
 
 
-def _starts(key: Key, mdp: MapMdp, number: int) -> MapState:
-    keys = jax.random.split(key, number)
-    return jax.vmap(lambda key: belief_mdp.reset(key, mdp))(keys)
+def _restart(rows: jax.Array, envs: MapState, shares: MapState, needs_start: jax.Array) -> MapState:
+    """Gives each environment that needs it the start of that row of its share."""
 
-
-def _restart(key: Key, envs: MapState, starts: MapState, needs_start: jax.Array) -> MapState:
-    """Gives each environment that needs it a random one of the starts."""
-    rows = jax.random.randint(key, needs_start.shape, 0, starts.steps.shape[0])
-
-    def pick(env: jax.Array, start: jax.Array) -> jax.Array:
+    def pick(env: jax.Array, share: jax.Array) -> jax.Array:
         mask = needs_start.reshape(-1, *[1] * (env.ndim - 1))
-        return jnp.where(mask, start[rows], env)
+        return jnp.where(mask, share[jnp.arange(len(rows)), rows], env)
 
-    return jax.tree.map(pick, envs, starts)
+    return jax.tree.map(pick, envs, shares)

@@ -9,11 +9,13 @@ map has changed under way. Everything is a pure function of one episode: `vmap` 
 from jaxsense.mission.evaluation import BATCH as BATCH
 from jaxsense.mission.evaluation import Case as Case
 from jaxsense.mission.evaluation import Player as Player
+from jaxsense.mission.evaluation import batch_of as batch_of
 from jaxsense.mission.evaluation import cases as cases
 from jaxsense.mission.evaluation import summary as summary
 from jaxsense.mission.figures import REASONS as REASONS
 from jaxsense.mission.figures import figures as figures
 from jaxsense.mission.figures import reason as reason
+from jaxsense.mission.rollout import play as play
 from jaxsense.mission.rollout import rollout as rollout
 from jaxsense.mission.rollout import step as step
 from jaxsense.mission.state import LATENT as LATENT

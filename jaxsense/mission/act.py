@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from jaxsense.indexing import Index, call, others
 from jaxsense.mission.decide import planning_margin, sees, standing_robots
 from jaxsense.mission.state import (
     BACKING,
@@ -18,10 +19,11 @@ from jaxsense.mission.state import (
     update_robot,
 )
 from jaxsense.models import Models, jmvae_shape
+from jaxsense.sim import arena as arenas
 from jaxsense.sim import navigation, roadmap, sensors, viewpoints
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene
-from jaxsense.types import Key
+from jaxsense.types import Belief, Key
 from jaxsense.vae import detectors, fusion
 
 _PROGRESS = 0.02  # m, by which a way must become shorter to count as progress
@@ -30,7 +32,7 @@ _NEARBY = 1.0  # m, between their middles
 _TURNS_SLOWLY = 0.35  # rad/s, at which a robot may scan
 
 
-def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
+def approach(mission: Mission, state: MissionState, robot: Index) -> MissionState:
     """Drives to the viewpoint, turns to the PoI, and backs off where there is no progress."""
     config, robots, scene = mission.config, state.robots, state.scene
     settings, period = config.navigation, config.mission.control_period
@@ -40,13 +42,13 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
     poi = jnp.minimum(robots.target[robot], config.arena.num_pois - 1)
     pose = scene.poses[robot]
 
-    goal, others = jnp.minimum(view, num_views - 1), standing_robots(state, robot)
+    goal, standing = jnp.minimum(view, num_views - 1), standing_robots(state, robot)
     way_left, waypoint = roadmap.next_place(
         config,
         scene.layout,
         state.roadmap,
         pose[:2],
-        others,
+        standing,
         poi,
         goal,
     )
@@ -57,7 +59,7 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
     # Another robot has come to stand there or in the view; that is nobody's failure.
     margin = planning_margin(config)
     room = viewpoints.free_room(
-        place[:1], place[1:], margin, config.arena, scene.layout, others, poi
+        place[:1], place[1:], margin, config.arena, scene.layout, standing, poi
     )
     is_taken = (phase == DRIVING) & ~is_there & (room[0] <= 0)
 
@@ -104,16 +106,16 @@ def approach(mission: Mission, state: MissionState, robot: int) -> MissionState:
     )
 
 
-def _is_in_the_way(mission: Mission, state: MissionState, robot: int) -> jax.Array:
+def _is_in_the_way(mission: Mission, state: MissionState, robot: Index) -> jax.Array:
     """`[]` bool: a robot nearby drives and makes no progress."""
     robots, poses = state.robots, state.scene.poses
     waits = now(mission, state) - robots.progress_at > _PATIENCE
-    is_near = jnp.linalg.norm(poses[:, :2] - poses[robot, None, :2], axis=-1) < _NEARBY
-    return jnp.any(jnp.delete((robots.phase == DRIVING) & waits & is_near, robot))
+    is_near = jnp.linalg.norm(poses[:, :2] - poses[robot][None, :2], axis=-1) < _NEARBY
+    return jnp.any(others((robots.phase == DRIVING) & waits & is_near, robot))
 
 
 def _fail(
-    state: MissionState, robot: int, applies: jax.Array, given_up_as: str, attempts: int
+    state: MissionState, robot: Index, applies: jax.Array, given_up_as: str, attempts: int
 ) -> MissionState:
     """Notes that a viewpoint has failed; after some attempts the robot gives its target up."""
     robots = state.robots
@@ -135,7 +137,7 @@ def _fail(
 
 
 def scan(
-    key: Key, mission: Mission, models: Models, state: MissionState, robot: int
+    key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> MissionState:
     """Takes a scan of the PoI that the robot faces, and writes what it shows into the map."""
     config, world, scene, robots = mission.config, mission.world, state.scene, state.robots
@@ -145,26 +147,40 @@ def scan(
     is_aligned = jnp.abs(bearing) <= jnp.radians(config.navigation.goal_angle)
     is_calm = jnp.abs(robots.command[robot, 1]) <= _TURNS_SLOWLY
     # A robot that drives through the view is waited for, but not for long.
-    place, others = scene.poses[robot, :2], jnp.delete(scene.poses[:, :2], robot, axis=0)
-    room = viewpoints.free_room(place[:1], place[1:], 0.0, config.arena, scene.layout, others, poi)
+    place = scene.poses[robot, :2]
+    room = viewpoints.free_room(
+        place[:1],
+        place[1:],
+        0.0,
+        config.arena,
+        scene.layout,
+        others(scene.poses[:, :2], robot),
+        poi,
+    )
     waits = now(mission, state) - robots.progress_at[robot]
     is_ready = is_aligned & is_calm & ((room[0] > 0) | (waits > config.navigation.stuck_time))
     scans = (robots.phase[robot] == FACING) & is_ready
 
-    sensor = world.sensors[robot]
     error = jnp.radians(config.viewpoint.bearing_error)
     believed = bearing + jax.random.uniform(error_key, (), minval=-error, maxval=error)
-    readings = worlds.scan_around(noise_key, world, scene, robot, believed)
     is_blind = now(mission, state) >= state.faults.blind_at[robot]
-    readings = jnp.where(is_blind, sensor.blind, readings)
-    distance = jnp.linalg.norm(scene.layout.position[poi] - scene.poses[robot, :2])
-    shows = sensors.shows_poi(sensor, readings, believed, distance, config.arena)
-    features = detectors.detect(models.detectors[robot], sensors.as_window(sensor, readings))
-    is_sure = jnp.max(features) >= config.mission.least_confidence
-    detects = scans & shows & is_sure
-
+    distance = jnp.linalg.norm(scene.layout.position[poi] - place)
     old = jax.tree.map(lambda x: x[poi], state.belief)
-    new = fusion.write(models.jmvae, jmvae_shape(config), old, state.seen[poi], features, robot)
+    data = arenas.place(world.arena, scene.layout, scene.poses)
+
+    def look(robot: int) -> tuple[jax.Array, Belief]:
+        sensor = world.sensors[robot]
+        readings = worlds.scan_around(noise_key, world, scene, data, robot, believed)
+        readings = jnp.where(is_blind, sensor.blind, readings)
+        shows = sensors.shows_poi(sensor, readings, believed, distance, config.arena)
+        features = detectors.detect(models.detectors[robot], sensors.as_window(sensor, readings))
+        is_sure = jnp.max(features) >= config.mission.least_confidence
+        seen = state.seen[poi]
+        entry = fusion.write(models.jmvae, jmvae_shape(config), old, seen, features, robot)
+        return shows & is_sure, entry
+
+    is_seen, new = call(look, robot, len(world.sensors))
+    detects = scans & is_seen
     entry = jax.tree.map(lambda o, n: jnp.where(detects, n, o), old, new)
     state = _fail(state, robot, scans & ~detects, "undetected", config.mission.attempts)
     robots = state.robots
@@ -185,7 +201,7 @@ def scan(
     )
 
 
-def _bearing(scene: Scene, robot: int, poi: jax.Array) -> jax.Array:
+def _bearing(scene: Scene, robot: Index, poi: jax.Array) -> jax.Array:
     """`[]` angle from a robot's heading to a PoI, in radians within -pi and pi."""
     pose = scene.poses[robot]
     to_poi = scene.layout.position[poi] - pose[:2]

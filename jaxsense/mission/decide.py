@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from jaxsense.config import ROBOT_RADIUS, Config
 from jaxsense.dqn import belief_mdp
+from jaxsense.indexing import Index, others
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
@@ -27,7 +28,7 @@ _DETOUR = 2.0  # m, that a robot would go to avoid a viewpoint on which another 
 
 
 def decide(
-    key: Key, mission: Mission, models: Models, state: MissionState, robot: int
+    key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> MissionState:
     """Asks the policy where one is due, and sets out for a viewpoint of what it says."""
     robots, config = state.robots, mission.config
@@ -72,7 +73,7 @@ def decide(
 
 
 def _choose(
-    key: Key, mission: Mission, models: Models, state: MissionState, robot: int
+    key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> jax.Array:
     """`[]` int32, the PoI that a robot's policy says, or N for NOP."""
     config, robots = mission.config, state.robots
@@ -86,7 +87,8 @@ def _choose(
         models.class_beliefs,
     )
     network = MLP(config.dqn.hidden, num_pois + 1)
-    q = network.apply(models.q_networks[robot], belief_mdp.as_state(known))
+    q_network = jax.tree.map(lambda *x: jnp.stack(x)[robot], *models.q_networks)
+    q = network.apply(q_network, belief_mdp.as_state(known))
     naive = jnp.append(jnp.where(state.seen[:, robot], -1.0, 1.0), 0.0)
     random = jax.nn.one_hot(jax.random.randint(key, (), 0, num_pois + 1), num_pois + 1)
     values = jnp.stack([jnp.asarray(q), naive, random])[state.policy]
@@ -98,8 +100,8 @@ def _choose(
     place = state.scene.poses[robot, :2]
     distance = jnp.linalg.norm(state.scene.layout.position - place[None], axis=-1)
     is_kept = jnp.arange(num_pois) == robots.target[robot]
-    others = jnp.delete(robots.target, robot)
-    is_others = jnp.any(jnp.arange(num_pois)[:, None] == others[None], axis=-1)
+    targets = others(robots.target, robot)
+    is_others = jnp.any(jnp.arange(num_pois)[:, None] == targets[None], axis=-1)
     # A PoI that the robot is heading for already, then one that no other heads for, then distance.
     rank = distance + _KEPT * is_kept + _HEADED_FOR * (is_others & is_latent)
     poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
@@ -107,7 +109,7 @@ def _choose(
 
 
 def _best_view(
-    mission: Mission, state: MissionState, robot: int, target: jax.Array, excluded: jax.Array
+    mission: Mission, state: MissionState, robot: Index, target: jax.Array, excluded: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The viewpoint of a PoI with the shortest way, V being where the robot stands.
 
@@ -117,11 +119,11 @@ def _best_view(
     """
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
-    others = standing_robots(state, robot)
+    standing = standing_robots(state, robot)
     length = roadmap.lengths(config, scene.layout, state.roadmap, scene.poses[robot, :2], poi)
     places, margin = state.roadmap.viewpoints[poi], planning_margin(config)
     room = viewpoints.free_room(
-        places[:, 0], places[:, 1], margin, config.arena, scene.layout, others, poi
+        places[:, 0], places[:, 1], margin, config.arena, scene.layout, standing, poi
     )
     length += jnp.where(room > 0, 0.0, _DETOUR)
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
@@ -132,23 +134,22 @@ def _best_view(
     return view, cost[view], excluded
 
 
-def sees(mission: Mission, state: MissionState, robot: int, poi: jax.Array) -> jax.Array:
+def sees(mission: Mission, state: MissionState, robot: Index, poi: jax.Array) -> jax.Array:
     """`[]` bool: from where a robot stands, a PoI is in range and nothing that stands covers it."""
     config, place = mission.config, state.scene.poses[robot, :2]
-    layout, others = state.scene.layout, standing_robots(state, robot)
+    layout, standing = state.scene.layout, standing_robots(state, robot)
     distance = jnp.linalg.norm(layout.position[poi] - place)
     in_range = distance >= config.viewpoint.min_distance
     in_range &= distance <= config.navigation.view_range
-    room = viewpoints.free_room(place[:1], place[1:], 0.0, config.arena, layout, others, poi)
+    room = viewpoints.free_room(place[:1], place[1:], 0.0, config.arena, layout, standing, poi)
     return in_range & (room[0] > 0)
 
 
-def standing_robots(state: MissionState, robot: int) -> jax.Array:
+def standing_robots(state: MissionState, robot: Index) -> jax.Array:
     """`[R - 1, 2]` where the other robots stand; those that drive will be elsewhere: far away."""
-    phase = jnp.delete(state.robots.phase, robot)
+    phase = others(state.robots.phase, robot)
     drives = (phase == DRIVING) | (phase == BACKING)
-    others = jnp.delete(state.scene.poses[:, :2], robot, axis=0)
-    return jnp.where(drives[:, None], 1e3, others)
+    return jnp.where(drives[:, None], 1e3, others(state.scene.poses[:, :2], robot))
 
 
 def planning_margin(config: Config) -> float:

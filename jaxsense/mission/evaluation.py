@@ -7,10 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
+from jaxsense import devices
 from jaxsense.config import MODALITIES, Config
 from jaxsense.mission.figures import REASONS, figures
-from jaxsense.mission.rollout import rollout
+from jaxsense.mission.rollout import play
 from jaxsense.mission.state import (
     LATENT,
     POLICIES,
@@ -21,11 +23,12 @@ from jaxsense.mission.state import (
     reset,
 )
 from jaxsense.models import Models, untrained
-from jaxsense.monitor import Monitor
+from jaxsense.monitor import Monitor, Program
 from jaxsense.types import Key
 
 BATCH = 384
-_CHUNK_TIME = 10.0  # s, after which the host looks whether all missions are over
+"""Most missions that are played side by side."""
+_CHUNK_TIME = 2.5  # s, after which the host looks which missions are over
 FAULT_TIME = 6.0  # s
 
 
@@ -68,6 +71,11 @@ def chunks(config: Config) -> tuple[int, int]:
     return chunk, math.ceil(settings.time_limit / settings.control_period / chunk)
 
 
+def batch_of(total: int) -> int:
+    """How many of all missions to play side by side: fewer than all, as some last long."""
+    return min(BATCH, -(-total // 3))
+
+
 def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
     """Keys of an episode's arena, and of what happens in it; fold the number of a chunk into it."""
     arena_key, play_key = jax.random.split(key)
@@ -84,28 +92,34 @@ class Player:
       control_steps: control periods of missions played so far, until they were over.
     """
 
-    def __init__(self, mission: Mission, monitor: Monitor, batch: int = BATCH):
-        """Compiles for batches of `batch` missions."""
+    def __init__(
+        self, mission: Mission, monitor: Monitor, batch: int = BATCH, mesh: Mesh | None = None
+    ):
+        """Compiles for about `batch` missions side by side, which are split over the devices."""
+        num_devices = 1 if mesh is None else mesh.size
+        batch = -(-batch // num_devices) * num_devices
         self.mission, self._monitor, self._batch = mission, monitor, batch
         self.control_steps = 0
         config = mission.config
-        chunk, self._most_chunks = chunks(config)
+        chunk, _ = chunks(config)
 
         def begin(keys: Key, policies: jax.Array, faults: Faults):
             return jax.vmap(lambda k, p, f: reset(k, mission, p, f))(keys, policies, faults)
 
         def go_on(keys: Key, models: Models, state: MissionState):
-            roll = jax.vmap(lambda k, s: rollout(k, mission, models, s, chunk)[0])
-            state = roll(keys, state)
+            state = play(keys, mission, models, state, chunk)
             return state, jax.vmap(lambda s: figures(mission, models, s))(state)
 
         keys = jax.random.split(jax.random.key(0), batch)
         faults = jax.tree.map(lambda x: jnp.tile(x, (batch, 1)), no_faults(config))
         inputs = keys, jnp.zeros(batch, jnp.int32), faults
-        self._begin = monitor.compile("mission", begin, *inputs, announce=False)
-        state = jax.eval_shape(begin, *inputs)
+        self._begin = Program(monitor, "mission")
+        state = self._begin.compile(devices.spread(begin, mesh), *inputs)
         models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
-        self._go_on = monitor.compile("mission", go_on, keys, models, state, announce=False)
+        go_on = devices.spread(go_on, mesh, whole=(1,))
+        self._go_on = Program(monitor, "mission")
+        self._go_on.compile(go_on, keys, models, state)
+        self._chunk_keys = jax.jit(jax.vmap(jax.random.fold_in))
 
     def play(
         self, key: Key, models: Models, played: dict[str, Case], episodes: int
@@ -122,35 +136,53 @@ class Player:
           For each case the `[episodes, ...]` figures of `figures.figures`.
         """
         total = episodes * len(played)
-        row = np.arange(math.ceil(total / self._batch) * self._batch) % total
+        row = np.arange(-(-total // self._batch) * self._batch) % total
         case, episode = row // episodes, row % episodes
-        policies = jnp.array([c.policy for c in played.values()], jnp.int32)
-        faults = jax.tree.map(lambda *x: jnp.stack(x), *[c.faults for c in played.values()])
-        episode_keys = jax.vmap(lambda i: keys_of_episode(key, i))
-        results = []
-        for begin in range(0, len(row), self._batch):
-            rows = slice(begin, begin + self._batch)
-            chosen, numbers = jnp.array(case[rows]), jnp.array(episode[rows])
-            arena_keys, keys = episode_keys(numbers)
-            state = self._begin(
-                arena_keys,
-                policies[chosen],
-                jax.tree.map(lambda x: x[chosen], faults),  # noqa: B023
-            )
-            found: Any = {}
-            for chunk in range(self._most_chunks):
-                chunk_keys = jax.vmap(lambda k: jax.random.fold_in(k, chunk))(keys)  # noqa: B023
-                state, found = self._go_on(chunk_keys, models, state)
-                if bool(state.is_over.all()):
-                    break
-            results.append(jax.tree.map(np.asarray, found))
-            self.control_steps += int(state.steps[: max(0, total - begin)].sum())
-            self._monitor.progress("mission", min(begin + self._batch, total), total)
-        joined = jax.tree.map(lambda *x: np.concatenate(x)[:total], *results)
+        policies = jnp.array([c.policy for c in played.values()], jnp.int32)[case]
+        faults = jax.tree.map(lambda *x: jnp.stack(x)[case], *[c.faults for c in played.values()])
+        arena_keys, play_keys = jax.vmap(lambda i: keys_of_episode(key, i))(episode)
+        begun = [
+            self._begin(*jax.tree.map(lambda x: x[i : i + self._batch], inputs))  # noqa: B023
+            for inputs in [(arena_keys, policies, faults)]
+            for i in range(0, len(row), self._batch)
+        ]
+        starts = jax.tree.map(lambda *x: np.concatenate(x), *begun)
+
+        # A mission that is over makes room for the next one, so that short ones do not wait.
+        state = jax.tree.map(lambda x: x[: self._batch].copy(), starts)
+        playing, waiting = np.arange(self._batch), iter(range(self._batch, total))
+        chunk, done = np.zeros(self._batch, np.int32), np.zeros(len(row), bool)
+        results: Any = None
+        while not done[:total].all():
+            keys = self._chunk_keys(play_keys[playing], chunk)
+            state, found = self._go_on(keys, models, state)
+            state, found = jax.tree.map(np.array, (state, found))
+            if results is None:
+                results = jax.tree.map(lambda x: np.zeros((len(row), *x.shape[1:]), x.dtype), found)
+            chunk += 1
+            for slot in np.flatnonzero(state.is_over & ~done[playing]).tolist():
+                done[playing[slot]] = True
+                self.control_steps += int(state.steps[slot])
+                _set_row(results, int(playing[slot]), found, slot)
+                following = next(waiting, None)
+                if following is not None:
+                    playing[slot], chunk[slot] = following, 0
+                    _set_row(state, slot, starts, following)
+            self._monitor.progress("mission", int(done[:total].sum()), total)
+        joined = jax.tree.map(lambda x: x[:total], results)
         return {
             name: jax.tree.map(lambda x: x[i * episodes : (i + 1) * episodes], joined)  # noqa: B023
             for i, name in enumerate(played)
         }
+
+
+def _set_row(target: Any, row: int, source: Any, from_row: int) -> None:
+    """Copies a row of every array of a tree into another."""
+
+    def copy(target: np.ndarray, source: np.ndarray) -> None:
+        target[row] = source[from_row]
+
+    jax.tree.map(copy, target, source)
 
 
 def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any]:

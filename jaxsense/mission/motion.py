@@ -1,9 +1,11 @@
 """The robots' motion in one control period, in MJX."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from mujoco import mjx
 
@@ -24,13 +26,20 @@ class _Motion:
     clearance: jax.Array
 
 
-def move(mission: Mission, state: MissionState) -> tuple[MissionState, jax.Array]:
+def move(
+    mission: Mission, state: MissionState, axis: str | None = None
+) -> tuple[MissionState, jax.Array]:
     """One control period of physics.
 
-    Contacts cost ten times as much as all the rest, and the planner sees to it that there are none.
-    As long as no robot is near enough to anything to touch it within the period, the same arena
-    without contacts is integrated, which gives the same motion. Under `vmap` that is decided for
-    the whole batch at once; under two of them contacts are always computed.
+    Contacts cost several times as much as all the rest, and the planner sees to it that there are
+    none. As long as no robot is near enough to anything to touch it within the period, the robots
+    are integrated in an empty arena, which gives the same motion.
+
+    Args:
+      mission: the mission.
+      state: its present state.
+      axis: name of the `vmap` that this is under. The choice is then made for the whole batch at
+        once; under a `vmap` without a name contacts are always computed.
 
     Returns:
       The next state, and `[]` the smallest free distance around any robot in the period, in metres.
@@ -39,35 +48,18 @@ def move(mission: Mission, state: MissionState) -> tuple[MissionState, jax.Array
     motion = _Motion(
         state.scene.poses, state.velocity, state.warmstart, robots.command, jnp.full((), jnp.inf)
     )
-    inputs = motion, robots.wanted, layout
     # Two robots that drive at each other, and a margin for what the wheels lag behind.
     reach = 2 * amiro.MAX_SPEED * config.mission.control_period + 0.005
+    is_near = jnp.any(navigation.clearance(config.arena, layout, motion.poses) < reach)
+    if axis is not None:
+        is_near = jax.lax.pmax(is_near.astype(jnp.int32), axis) > 0
 
-    def is_near(motion: _Motion, wanted: jax.Array, layout: Layout) -> jax.Array:
-        return jnp.any(navigation.clearance(config.arena, layout, motion.poses) < reach)
-
-    def touching(*inputs) -> _Motion:
-        return _integrate(mission, mission.world.arena, *inputs)
-
-    def free(*inputs) -> _Motion:
-        return _integrate(mission, mission.free_arena, *inputs)
-
-    @jax.custom_batching.custom_vmap
-    def integrate(inputs) -> _Motion:
-        return jax.lax.cond(is_near(*inputs), touching, free, *inputs)
-
-    @integrate.def_vmap
-    def _(size: int, is_batched, inputs):
-        inputs = jax.tree.map(
-            lambda x, b: x if b else jnp.broadcast_to(x, (size, *jnp.shape(x))),
-            inputs,
-            is_batched[0],
-        )
-        any_near = jnp.any(jax.vmap(is_near)(*inputs))
-        motion = jax.lax.cond(any_near, jax.vmap(touching), jax.vmap(free), *inputs)
-        return motion, jax.tree.map(lambda _: True, motion)
-
-    motion = integrate(inputs)
+    motion = jax.lax.cond(
+        is_near,
+        functools.partial(_integrate, mission, mission.world.arena),
+        functools.partial(_integrate, mission, mission.free_arena),
+        *(motion, robots.wanted, layout),
+    )
     state = dataclasses.replace(
         state,
         scene=dataclasses.replace(state.scene, poses=motion.poses),
@@ -84,7 +76,8 @@ def _integrate(
     mission: Mission, arena: Arena, motion: _Motion, wanted: jax.Array, layout: Layout
 ) -> _Motion:
     """Physics steps, in each of which the commands go on towards the wanted ones."""
-    still = arenas.place(arena, layout, motion.poses)
+    is_empty = not np.any(arena.poi_of_geom >= 0)
+    still = arena.data if is_empty else arenas.put(arena, layout, motion.poses)
 
     def substep(motion: _Motion, _) -> tuple[_Motion, None]:
         command = navigation.ramp(motion.command, wanted, arenas.TIMESTEP)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxsense.config import Config
+from jaxsense.indexing import Index
 from jaxsense.models import jmvae_shape
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import roadmap, sensors
@@ -37,7 +38,7 @@ class Mission:
 
     Attributes:
       world: the simulation, with contacts or without.
-      free_arena: its arena without contacts, see `motion.move`.
+      free_arena: its robots in an empty arena, see `motion.move`.
     """
 
     world: World
@@ -179,9 +180,9 @@ class Record:
 
 def make_mission(config: Config, *, contacts: bool = True) -> Mission:
     """Compiles the arena of a mission, with contacts unless told otherwise."""
-    free = worlds.make_world(config)
-    world = worlds.make_world(config, contacts=True) if contacts else free
-    return Mission(world, free.arena)
+    carries_lidar = tuple(modality == "lidar" for modality in config.modalities)
+    free = arenas.build(config.arena, carries_lidar, obstacles=False)
+    return Mission(worlds.make_world(config, contacts=contacts), free)
 
 
 def no_faults(config: Config) -> Faults:
@@ -308,7 +309,7 @@ def _random_poses(key: Key, config: Config, layout: arenas.Layout, ways: Roadmap
     return poses
 
 
-def update_robot(state: MissionState, robot: int, **values: Any) -> MissionState:
+def update_robot(state: MissionState, robot: Index, **values: Any) -> MissionState:
     """The state with some entries of one robot replaced."""
     robots = state.robots
     changed = {name: getattr(robots, name).at[robot].set(value) for name, value in values.items()}

@@ -28,3 +28,4 @@ from jaxsense.sim.world import World as World
 from jaxsense.sim.world import look as look
 from jaxsense.sim.world import make_world as make_world
 from jaxsense.sim.world import random_scene as random_scene
+from jaxsense.sim.world import survey as survey

@@ -79,13 +79,21 @@ class Arena:
         )
 
 
-def build(config: ArenaConfig, lidar_robots: tuple[bool, ...], *, contacts: bool = False) -> Arena:
+def build(
+    config: ArenaConfig,
+    lidar_robots: tuple[bool, ...],
+    *,
+    contacts: bool = False,
+    obstacles: bool = True,
+) -> Arena:
     """Compiles an arena.
 
     Args:
       config: sizes and number of PoIs.
       lidar_robots: for each robot, whether it carries a laser scanner.
       contacts: whether robots collide with PoIs, with each other and with the walls.
+      obstacles: whether there are PoIs and walls; without them robots move as they do where nothing
+        is near, and nothing can be seen.
 
     Returns:
       The arena; its `data` holds every robot and PoI at the origin.
@@ -93,11 +101,25 @@ def build(config: ArenaConfig, lidar_robots: tuple[bool, ...], *, contacts: bool
     reach = config.side / 2 - amiro.BODY_RADIUS
     robots = [f"robot{r}" for r in range(len(lidar_robots))]
     size = f"{config.poi_radius} {config.poi_radius} {config.poi_height / 2}"
+    # MJX finds contacts of cylinders by descent and those of capsules in closed form. At the height
+    # of a robot's collider both are the same.
+    upright = f"{config.poi_radius} {config.poi_height / 2}"
+    kinds = (
+        ("cylinder", "" if contacts else 'class="obstacle"'),
+        ("box", 'class="obstacle"'),
+    )
     pois = "".join(
         f'<body name="poi{n}_{shape}" mocap="true">'
-        f'<geom name="poi{n}_{shape}" type="{kind}" size="{size}" class="obstacle"/></body>'
+        f'<geom name="poi{n}_{shape}" type="{kind}" size="{size}" {collides}/>'
+        + (
+            f'<geom name="poi{n}_{shape}_collider" type="capsule" size="{upright}" group="3" '
+            f'class="obstacle"/>'
+            if contacts and kind == "cylinder"
+            else ""
+        )
+        + "</body>"
         for n in range(config.num_pois)
-        for shape, kind in zip(SHAPES, ("cylinder", "box"), strict=True)
+        for shape, (kind, collides) in zip(SHAPES, kinds, strict=True)
     )
     offset = (config.side + WALL_THICKNESS) / 2
     half = (WALL_THICKNESS / 2, config.side / 2 + WALL_THICKNESS)
@@ -127,7 +149,7 @@ def build(config: ArenaConfig, lidar_robots: tuple[bool, ...], *, contacts: bool
         </default>
       </default>
       <worldbody>
-        {walls}{pois}
+        {walls + pois if obstacles else ""}
         {"".join(amiro.body(n, h, reach) for n, h in zip(robots, lidar_robots, strict=True))}
       </worldbody>
       <actuator>{"".join(map(amiro.actuators, robots))}</actuator>
@@ -178,6 +200,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: jax.Array) -> Layout:
     return make_layout(config, corner + cell_side / 2 + place, yaw, classes)
 
 
+@functools.partial(jax.jit, static_argnums=0)  # traced once for all who look
 def place(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
     """The MJX state with PoIs and robots at rest where they are told to be.
 
@@ -189,6 +212,11 @@ def place(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
     Returns:
       The state after MJX's kinematics, which fill `geom_xpos` and `geom_xmat`.
     """
+    return mjx.kinematics(arena.model, put(arena, layout, poses))
+
+
+def put(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
+    """`place` without the kinematics, which a physics step does itself."""
     chex.assert_shape(poses, (arena.num_robots, 3), custom_message="poses")
     check_layout(arena.config, layout)
     shown = layout.shape[:, None] == jnp.arange(len(SHAPES))[None]
@@ -198,12 +226,11 @@ def place(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
     )
     zero = jnp.zeros_like(layout.yaw)
     turn = jnp.stack([jnp.cos(layout.yaw / 2), zero, zero, jnp.sin(layout.yaw / 2)], axis=-1)
-    data = arena.data.replace(
+    return arena.data.replace(
         mocap_pos=position.reshape(-1, 3),
         mocap_quat=jnp.repeat(turn, len(SHAPES), axis=0),
         qpos=poses.reshape(-1),
     )
-    return mjx.kinematics(arena.model, data)
 
 
 def check_layout(config: ArenaConfig, layout: Layout) -> None:

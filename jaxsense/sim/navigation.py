@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense.config import ArenaConfig, NavigationConfig
+from jaxsense.indexing import Index, others
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
 
@@ -92,7 +93,7 @@ def drive_to(
     layout: Layout,
     poses: jax.Array,
     commands: jax.Array,
-    robot: int,
+    robot: Index,
     waypoint: jax.Array,
     seconds: float,
     backs_off: jax.Array,
@@ -112,7 +113,7 @@ def drive_to(
       layout: the PoIs' places; their shapes are not used.
       poses: `[R, 3]` of all robots.
       commands: `[R, 2]` of all robots.
-      robot: which one is asking; static.
+      robot: which one is asking.
       waypoint: `[2]` in metres.
       seconds: for which the command will be held.
       backs_off: `[]` bool: instead, have as much room as possible a second from now.
@@ -141,11 +142,9 @@ def drive_to(
         room = jnp.minimum(room, jnp.hypot(x - at_x, y - at_y) - keep)
         room_now = jnp.minimum(room_now, jnp.hypot(at_x, at_y) - keep)
     room_of_map = jax.lax.cummin(room, axis=1)
-    for other in range(len(poses)):
-        if other == robot:
-            continue
-        at_x, at_y = in_frame(poses[other])
-        course, speed = poses[other, 2] - pose[2], commands[other, 0]
+    for other, command in zip(others(poses, robot), others(commands, robot), strict=True):
+        at_x, at_y = in_frame(other)
+        course, speed = other[2] - pose[2], command[0]
         then_x, then_y = (
             at_x + times * speed * jnp.cos(course),
             at_y + times * speed * jnp.sin(course),
@@ -158,8 +157,8 @@ def drive_to(
         room_now = jnp.minimum(room_now, jnp.hypot(at_x, at_y) - keep)
     least = jax.lax.cummin(room, axis=1)
 
-    others = jnp.delete(poses[:, :2], robot, axis=0)
-    goal_x, goal_y = in_frame(sidestep(settings, arena, layout, pose[:2], waypoint, others))
+    beside = sidestep(settings, arena, layout, pose[:2], waypoint, others(poses[:, :2], robot))
+    goal_x, goal_y = in_frame(beside)
     distance = jnp.hypot(goal_x - x, goal_y - y)
     turn = jnp.arctan2(goal_y - y, goal_x - x) - heading
     turn = jnp.abs((turn + jnp.pi) % (2 * jnp.pi) - jnp.pi)
@@ -184,7 +183,7 @@ def sidestep(
     layout: Layout,
     place: jax.Array,
     waypoint: jax.Array,
-    others: jax.Array,
+    blocking: jax.Array,
 ) -> jax.Array:
     """The next place to go to on a straight way that another robot may stand in.
 
@@ -194,7 +193,7 @@ def sidestep(
       layout: the PoIs' places.
       place: `[2]` where the robot is, in metres.
       waypoint: `[2]` where it is going.
-      others: `[K, 2]` where the other robots are.
+      blocking: `[K, 2]` where the other robots are.
 
     Returns:
       `[2]` the waypoint, or a place beside the robot that is in the way: on the side of the shorter
@@ -203,7 +202,7 @@ def sidestep(
     keep = 2 * settings.robot_radius + _SIDESTEP
     reach = arena.side / 2 - settings.robot_radius
     result = waypoint
-    for other in others:
+    for other in blocking:
         along = waypoint - place
         length = jnp.maximum(jnp.linalg.norm(along), 1e-6)
         along /= length

@@ -1,13 +1,16 @@
 """Looking at points of interest in simulated arenas: all that training needs of the simulator."""
 
 import dataclasses
+import functools
 
 import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
+from mujoco import mjx
 
 from jaxsense.config import Config
+from jaxsense.indexing import others
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors, viewpoints
 from jaxsense.types import Key
@@ -95,38 +98,69 @@ def look(
     others = jnp.delete(scene.poses, robot, axis=0)
     pose, bearing = _viewpoint(viewpoint_key, world, scene.layout, others, poi)
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
-    readings = scan_around(noise_key, world, scene, robot, bearing)
+    data = arenas.place(world.arena, scene.layout, scene.poses)
+    readings = scan_around(noise_key, world, scene, data, robot, bearing)
     return sensors.as_window(world.sensors[robot], readings), scene
 
 
-def scan_around(key: Key, world: World, scene: Scene, robot: int, bearing: jax.Array) -> jax.Array:
+def scan_around(
+    key: Key, world: World, scene: Scene, data: mjx.Data, robot: int, bearing: jax.Array
+) -> jax.Array:
     """What a robot's sensor reads around a bearing from where the robot stands.
 
     Args:
       key: random key of the noise.
       world: the simulation.
       scene: where everything stands.
+      data: the MJX state of the scene, from `place`.
       robot: index of the robot; static.
       bearing: `[]` in the robot's frame, in radians.
 
     Returns:
       `[window, ...]` readings of the rays that the detector reads.
     """
-    data = arenas.place(world.arena, scene.layout, scene.poses)
     sensor = world.sensors[robot]
     angles = jnp.array(sensor.angles)[sensors.window_rays(sensor, bearing)]
     return sensors.scan(key, sensor, world.arena, data, scene.layout, scene.light, robot, angles)
 
 
-def first_look(key: Key, world: World, robot: int, poi_class: jax.Array) -> jax.Array:
-    """`[F]` what a robot's detector reads of a PoI of a class in a new random scene."""
-    chex.assert_rank(poi_class, 0, custom_message="poi_class")
-    class_key, scene_key, look_key = jax.random.split(key, 3)
-    arena = world.config.arena
-    others = jax.random.randint(class_key, (arena.num_pois - 1,), 0, len(arena.classes))
-    scene = random_scene(scene_key, world, jnp.append(others, poi_class))
-    window, _ = look(look_key, world, scene, robot, jnp.int32(arena.num_pois - 1))
-    return window
+def survey(key: Key, world: World, classes: jax.Array) -> tuple[Scene, tuple[jax.Array, ...]]:
+    """A random scene, and what each robot reads of each PoI in it.
+
+    Args:
+      key: random key.
+      world: the simulation.
+      classes: `[N]` int32 index into `config.arena.classes`.
+
+    Returns:
+      The scene, and for each robot the `[N, F]` inputs of its detector.
+    """
+    scene_key, viewpoint_key, noise_key = jax.random.split(key, 3)
+    scene = random_scene(scene_key, world, classes)
+    robots, pois = jnp.arange(len(world.sensors)), jnp.arange(world.config.arena.num_pois)
+    shape = (len(robots), len(pois))
+
+    def stand(key: Key, robot: jax.Array, poi: jax.Array):
+        standing = others(scene.poses, robot)
+        pose, bearing = _viewpoint(key, world, scene.layout, standing, poi)
+        poses = scene.poses.at[robot].set(pose)
+        return poses, bearing, arenas.place(world.arena, scene.layout, poses)
+
+    of_pois = jax.vmap(stand, in_axes=(0, None, 0))
+    each = jax.vmap(of_pois, in_axes=(0, 0, None))
+    poses, bearing, data = each(jax.random.split(viewpoint_key, shape), robots, pois)
+
+    def read(robot: int, key: Key, poses: jax.Array, bearing: jax.Array, data: mjx.Data):
+        stood = dataclasses.replace(scene, poses=poses)
+        readings = scan_around(key, world, stood, data, robot, bearing)
+        return sensors.as_window(world.sensors[robot], readings)
+
+    inputs = jax.random.split(noise_key, shape), poses, bearing, data
+    windows = tuple(
+        jax.vmap(functools.partial(read, robot))(*jax.tree.map(lambda x: x[robot], inputs))  # noqa: B023
+        for robot in range(len(world.sensors))
+    )
+    return scene, windows
 
 
 def _viewpoint(key: Key, world: World, layout: arenas.Layout, others: jax.Array, poi: jax.Array):

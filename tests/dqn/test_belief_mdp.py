@@ -174,7 +174,7 @@ def test_permuting_pois_permutes_what_a_step_does(mdp, modality):
     pairs = jax.vmap(jax.vmap(both_ways, in_axes=(None, 0)), in_axes=(0, None))
     here, there = jax.jit(pairs)(ORDERS, jnp.arange(4))
     jax.tree.map(np.testing.assert_array_equal, here, there)
-    assert len(np.unique(here[1].reward)) > 2  # the actions differ
+    assert len(np.unique(here[1].reward)) >= 2  # the actions differ
 
 
 def test_permuting_pois_permutes_what_a_reset_does():

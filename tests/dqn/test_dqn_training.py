@@ -91,7 +91,7 @@ def test_loss_falls_and_info_is_per_epoch(probe):
     assert np.all(info.loss[:, -50:].mean(axis=1) < 0.1 * info.loss[:, :50].mean(axis=1))
     assert np.all(state.epoch == PROBE.epochs)
     np.testing.assert_array_equal(info.episodes, PROBE.num_envs)  # all are cut after one action
-    np.testing.assert_array_equal(state.replay.count, PROBE.epochs * PROBE.num_envs)
+    np.testing.assert_array_equal(state.replay.count, PROBE.epochs)
 
 
 def test_returns_of_exploring_and_learnt_behaviour(probe):
@@ -106,14 +106,15 @@ def test_returns_of_exploring_and_learnt_behaviour(probe):
 def chunks():
     """States of a small training after every epoch, and the infos, stepped from the host."""
     config = SMALL
+    init_key, start_key, chunk_key = jax.random.split(jax.random.key(0), 3)
+    prepared = training.starts(start_key, MDP, config.num_starts)
 
     @chex.assert_max_traces(n=1)  # a second chunk must not be traced again
     def chunk(key, state):
-        return training.train_chunk(key, MDP, 0, config, state)
+        return training.train_chunk(key, MDP, 0, config, state, prepared)
 
     chunk = jax.jit(chunk, compiler_options=FAST_TO_COMPILE)
-    init_key, chunk_key = jax.random.split(jax.random.key(0))
-    all_states, infos = [training.init(init_key, MDP, config)], []
+    all_states, infos = [training.init(init_key, MDP, config, prepared)], []
     for key in jax.random.split(chunk_key, config.epochs):
         state, info = chunk(key, all_states[-1])
         all_states.append(state)
@@ -180,12 +181,13 @@ def test_an_episode_goes_on_until_nop_or_the_cut():
         epsilon_min=0.0,
         num_starts=8,
     )
-    state = training.init(jax.random.key(0), mdp, config)
+    prepared = training.starts(jax.random.key(2), mdp, config.num_starts)
+    state = training.init(jax.random.key(0), mdp, config, prepared)
     layers = state.params["params"]
     layers = {**layers, "Dense_1": {**layers["Dense_1"], "bias": jnp.array([1e3, -1e3])}}
     state = replace(state, params={"params": layers})
     chunk = jax.jit(
-        lambda state: training.train_chunk(jax.random.key(1), mdp, 0, config, state),
+        lambda state: training.train_chunk(jax.random.key(1), mdp, 0, config, state, prepared),
         compiler_options=FAST_TO_COMPILE,
     )
     state, info = chunk(state)
@@ -198,4 +200,4 @@ def test_an_episode_goes_on_until_nop_or_the_cut():
     np.testing.assert_array_equal(state.needs_start, False)
     np.testing.assert_array_equal(state.envs.steps, 1)
     # The replay tells what is left of an episode that was cut, so the discount is never 0 here.
-    np.testing.assert_array_equal(state.replay.items.discount_t[:28], 1.0)
+    np.testing.assert_array_equal(state.replay.items.discount_t[:7], 1.0)

@@ -129,7 +129,8 @@ def test_a_batch_moves_like_its_members(team, pushing):
     gaps = jnp.array([0.002, 0.5, 0.03])
     states = [pushing(float(gap)) for gap in gaps]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
-    together, clearance = jax.jit(jax.vmap(lambda s: motion.move(team, s)))(batch)
+    move = jax.vmap(lambda s: motion.move(team, s, "batch"), axis_name="batch")
+    together, clearance = jax.jit(move)(batch)
     alone = jax.jit(lambda s: motion.move(team, s))
     for i, state in enumerate(states):
         single, expected = alone(state)
@@ -137,9 +138,16 @@ def test_a_batch_moves_like_its_members(team, pushing):
         np.testing.assert_allclose(clearance[i], expected, atol=1e-6)
 
 
-def test_a_robot_that_is_near_nothing_is_moved_without_contacts(team, pushing):
-    # An arena without contacts lets a robot through: it is used where nothing can be touched.
-    broken = mission.Mission(replace(team.world, arena=team.free_arena), team.free_arena)
-    far, _ = jax.jit(lambda s: motion.move(team, s))(pushing(0.3))
-    free, _ = jax.jit(lambda s: motion.move(broken, s))(pushing(0.3))
-    np.testing.assert_array_equal(far.scene.poses, free.scene.poses)
+def test_where_nothing_can_be_touched_the_empty_arena_gives_the_same_motion(team, pushing):
+    always = mission.Mission(team.world, team.world.arena)
+    empty, _ = jax.jit(lambda s: motion.move(team, s))(pushing(0.05))
+    full, _ = jax.jit(lambda s: motion.move(always, s))(pushing(0.05))
+    np.testing.assert_allclose(empty.scene.poses, full.scene.poses, atol=1e-6)
+    # And it is used there, and nowhere else: with wheels that do not pull, a robot stays.
+    model = team.free_arena.model
+    idle = replace(
+        team.free_arena, model=model.replace(actuator_gainprm=0 * model.actuator_gainprm)
+    )
+    move = jax.jit(lambda s: motion.move(mission.Mission(team.world, idle), s)[0].scene.poses[0, 0])
+    assert move(pushing(0.05)) - pushing(0.05).scene.poses[0, 0] < 1e-3
+    assert move(pushing(0.04)) - pushing(0.04).scene.poses[0, 0] > 1e-2

@@ -1,9 +1,10 @@
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import sim
+from jaxsense import observe, sim
 from jaxsense.config import ArenaConfig, Config, ViewpointConfig
 from jaxsense.sim import viewpoints, world
 
@@ -152,19 +153,15 @@ def test_look_is_centred_on_the_poi(looks):
     assert depth.max() < 0.1415 + 0.03
 
 
-def test_first_look_is_at_a_poi_of_the_class_that_it_is_told(simulation, monkeypatch):
-    seen = []
-
-    def look(key, simulation, classes, robot, poi):
-        seen.append([int(c) for c in jnp.delete(classes, poi)])
-        return classes[poi], classes
-
-    monkeypatch.setattr(world, "random_scene", lambda key, simulation, classes: classes)
-    monkeypatch.setattr(world, "look", look)
-    for seed in range(12):
-        told = world.first_look(jax.random.key(seed), simulation, 0, jnp.int32(seed % 3))
-        assert told == seed % 3
-    assert {c for others in seen for c in others} == {0, 1, 2}
+def test_surveys_equal_single_ones(simulation):
+    keys = jax.random.split(jax.random.key(0), 5)
+    classes = jnp.tile(CLASSES, (5, 1))
+    surveys = jax.jit(lambda k, c: observe.surveys(k, simulation, c, chunk=2))
+    single = jax.jit(lambda k, c: world.survey(k, simulation, c))
+    together = surveys(keys, classes)
+    for i in range(5):
+        alone = single(keys[i], classes[i])
+        chex.assert_trees_all_close(jax.tree.map(lambda x: x[i], together), alone, atol=1e-5)  # noqa: B023
 
 
 def test_wrong_shapes_are_named_while_tracing(simulation):

@@ -1,0 +1,110 @@
+"""Work spread over several devices: the cores of a CPU, several accelerators, several processes."""
+
+import contextlib
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from jaxsense.config import ConfigError, DqnConfig
+
+AXIS = "devices"
+_MOST_THREADS = 8
+
+
+def keep_programs(directory: Path) -> None:
+    """Keeps compiled programs in a directory, from which later runs take them."""
+    jax.config.update("jax_compilation_cache_dir", str(directory))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def start(number: int | None, config: DqnConfig) -> tuple[Mesh | None, Mesh | None]:
+    """The devices of a program; which should be called before JAX is used.
+
+    Args:
+      number: of devices; on a CPU each is a thread. If not given, all accelerators there are, or as
+        many threads as there are cores, but no more than can share the environments evenly.
+      config: whose environments and batch must be divisible by the number.
+
+    Returns:
+      Devices to split simulations over and to split Q-learning over; None for a single one. Unless
+      asked to, threads do not share Q-learning: to agree on a gradient takes them longer than to
+      work it out.
+
+    Raises:
+      ConfigError: if there are not that many devices, or they cannot share the environments.
+    """
+    divisible = math.gcd(config.num_envs, config.batch)
+    threads = min(os.cpu_count() or 1, _MOST_THREADS) if number is None else max(number, 1)
+    # Where JAX is in use already, its devices are what they are.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", threads)
+    is_chosen = number is not None or jax.default_backend() != "cpu"
+    if number is None:
+        number = max(n for n in range(1, jax.device_count() + 1) if divisible % n == 0)
+    if not 1 <= number <= jax.device_count():
+        raise ConfigError("devices", number, f"must be within 1 and {jax.device_count()}")
+    if divisible % number:
+        raise ConfigError(
+            "devices",
+            number,
+            f"must divide dqn.num_envs = {config.num_envs} and dqn.batch = {config.batch}",
+        )
+    mesh = make_mesh(number) if number > 1 else None
+    return mesh, mesh if is_chosen else None
+
+
+def make_mesh(number: int | None = None) -> Mesh:
+    """A row of devices.
+
+    Args:
+      number: how many; all there are if not given. Devices of all processes count.
+
+    Returns:
+      The mesh, with the axis `AXIS`.
+
+    Raises:
+      ValueError: if there are not that many devices.
+    """
+    there = jax.devices()
+    number = len(there) if number is None else number
+    if not 1 <= number <= len(there):
+        raise ValueError(
+            f"devices = {number}: must be within 1 and {len(there)}, as many there are"
+        )
+    return Mesh(np.array(there[:number]), (AXIS,))
+
+
+def spread(
+    function: Callable[..., Any], mesh: Mesh | None, whole: tuple[int, ...] = ()
+) -> Callable[..., Any]:
+    """A function whose inputs and outputs are split along their first axis, a part on each device.
+
+    Args:
+      function: of arrays, or pytrees of them, with a batch as first axis; rows must not depend on
+        one another.
+      mesh: from `make_mesh`; its size must divide the batch. Without one nothing is split.
+      whole: positions of arguments that every device gets as they are.
+
+    Returns:
+      The same function, to be called under `jit`.
+    """
+    if mesh is None:
+        return function
+
+    def split(*args: Any) -> Any:
+        specs = tuple(
+            PartitionSpec() if i in whole else PartitionSpec(AXIS) for i in range(len(args))
+        )
+        # What varies over the mesh is not checked: MJX builds constants inside its loops.
+        return jax.shard_map(
+            function, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(AXIS), check_vma=False
+        )(*args)
+
+    return split

@@ -1,0 +1,287 @@
+"""The compiled functions of a run.
+
+All of them are known before the run begins. They are traced in the order of their use, in a thread,
+and compiled as soon as they are traced, while the stages in `pipeline` run those that are ready.
+"""
+
+import dataclasses
+import functools
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxsense import devices, examine, mission, observe
+from jaxsense.config import Config
+from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import training as dqn
+from jaxsense.models import Models, jmvae_shape, untrained
+from jaxsense.monitor import Monitor, Program
+from jaxsense.observe import Bank
+from jaxsense.sim.world import Scene, World
+from jaxsense.training import Params
+from jaxsense.types import Key
+from jaxsense.vae import detectors, jmvae
+from jaxsense.vae.detectors import Detector
+
+_MOST_CHUNKS = 20
+
+
+@struct.dataclass
+class Surveys:
+    """Looks at every PoI of many scenes by every robot.
+
+    Attributes:
+      classes: `[S, N]` int32 true classes.
+      scenes: `[S]` scenes.
+      windows: for each modality `[S, N, F]` what its detector reads.
+    """
+
+    classes: jax.Array
+    scenes: Scene
+    windows: tuple[jax.Array, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Programs:
+    """The programs of each stage; for the detectors one for each modality.
+
+    Attributes:
+      simulate: `(key) -> Surveys`.
+      begin_detectors: `(key, windows [S, F]) -> (detector, state)`.
+      train_detectors: `(key, state, detector, windows, labels [S]) -> (state, losses)`, a chunk.
+      detect: `(detectors, windows of each modality [S, N, F]) -> features of each [S, N, D_m]`.
+      begin_jmvae: `(key) -> states`, one for each restart.
+      train_jmvae: `(key, states, bank) -> (states, losses)`, a chunk.
+      examine_jmvae: `(params, bank) -> (posteriors, figures)`, see `examine.latent_space`.
+      start_dqn: `(key, starts, *trained) -> [num_starts] states of the map MDP`; `trained` is the
+        detectors, the JMVAE's parameters and the bank.
+      begin_dqn: `(key, starts, *trained) -> DqnState`.
+      train_dqn: `(key, modality, DqnState, starts, *trained) -> (DqnState, infos)`, a chunk.
+      examine_dqn: see `examine.play`, without the config.
+      player: of the missions.
+    """
+
+    simulate: Program
+    begin_detectors: tuple[Program, ...]
+    train_detectors: tuple[Program, ...]
+    detect: Program
+    begin_jmvae: Program
+    train_jmvae: Program
+    examine_jmvae: Program
+    start_dqn: Program
+    begin_dqn: Program
+    train_dqn: Program
+    examine_dqn: Program
+    player: Future[mission.Player]
+
+
+def compile_programs(
+    config: Config,
+    world: World,
+    monitor: Monitor,
+    mesh: Mesh | None = None,
+    learner_mesh: Mesh | None = None,
+) -> Programs:
+    """Begins to trace and to compile; see `pipeline.run` for the arguments."""
+    stages = [f"detector_{name}" for name in config.modalities]
+    programs = Programs(
+        simulate=Program(monitor, "simulate"),
+        begin_detectors=tuple(Program(monitor, stage) for stage in stages),
+        train_detectors=tuple(Program(monitor, stage) for stage in stages),
+        detect=Program(monitor, "detect"),
+        begin_jmvae=Program(monitor, "jmvae"),
+        train_jmvae=Program(monitor, "jmvae"),
+        examine_jmvae=Program(monitor, "evaluate_jmvae"),
+        start_dqn=Program(monitor, "dqn"),
+        begin_dqn=Program(monitor, "dqn"),
+        train_dqn=Program(monitor, "dqn"),
+        examine_dqn=Program(monitor, "evaluate_dqn"),
+        player=Future(),
+    )
+
+    def trace() -> None:
+        try:
+            models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
+            surveys = _trace_detectors(programs, config, world, models, mesh)
+            banks = _trace_jmvae(programs, config, models)
+            _trace_dqn(programs, config, world, models, surveys, banks, learner_mesh)
+            batch = mission.batch_of(len(mission.POLICIES) * config.mission.episodes)
+            team = mission.make_mission(config)
+            programs.player.set_result(mission.Player(team, monitor, batch, mesh))
+        except BaseException as error:
+            # Whoever waits for a program must hear of it.
+            for program in jax.tree.leaves(dataclasses.astuple(programs)):
+                program.fail(error) if isinstance(program, Program) else None
+            programs.player.set_exception(error)
+
+    thread = ThreadPoolExecutor(1)
+    thread.submit(trace)
+    thread.shutdown(wait=False)
+    return programs
+
+
+def num_chunks(steps: int) -> int:
+    """The most chunks, up to 20, into which steps can be cut evenly."""
+    return max(n for n in range(1, _MOST_CHUNKS + 1) if steps % n == 0)
+
+
+def num_scenes(config: Config) -> tuple[int, int, int]:
+    """How many scenes are surveyed to train the detectors, for the bank, and to measure."""
+    num_pois, num_classes = config.arena.num_pois, len(config.arena.classes)
+    num_bank = -(-config.jmvae.samples_per_class * num_classes // num_pois)
+    num_held_out = -(-num_held_out_per_class(config) * num_classes // num_pois)
+    num_train = -(-config.detector.num_scans // num_pois)
+    return num_train, max(num_bank, num_scene_starts(config)), num_held_out
+
+
+def num_held_out_per_class(config: Config) -> int:
+    """Detections of each class that are kept for measuring."""
+    return -(-config.detector.num_held_out // len(config.arena.classes))
+
+
+def num_scene_starts(config: Config) -> int:
+    """Surveyed scenes in which episodes start; with a bank there are no scenes."""
+    return config.dqn.num_starts if config.dqn.observe == "live" else 0
+
+
+def _trace_detectors(
+    programs: Programs, config: Config, world: World, models: Models, mesh: Mesh | None
+) -> Surveys:
+    """Simulation and detectors; returns the shapes of the surveys."""
+    key, settings = jax.random.key(0), config.detector
+    steps = settings.steps // num_chunks(settings.steps)
+    surveys = programs.simulate.compile(lambda k: _simulate(k, config, world, mesh), key)
+    num_train = num_scenes(config)[0]
+    rows = num_train * config.arena.num_pois
+    for m, windows in enumerate(surveys.windows):
+        num_labels = models.detectors[m].num_labels
+
+        def begin(key: Key, windows: jax.Array):
+            detector = detectors.init(key, windows, num_labels, settings)  # noqa: B023
+            return detector, detectors.start(detector, settings)
+
+        def train(key: Key, state, detector, windows, labels):
+            return detectors.train(key, state, detector, windows, labels, settings, steps)
+
+        flat = jax.ShapeDtypeStruct((rows, windows.shape[-1]), windows.dtype)
+        labels = jax.ShapeDtypeStruct((rows,), jnp.int32)
+        detector, state = programs.begin_detectors[m].compile(begin, key, flat)
+        programs.train_detectors[m].compile(train, key, state, detector, flat, labels)
+
+    def detect(trained: tuple[Detector, ...], windows: tuple[jax.Array, ...]):
+        each = jax.vmap(jax.vmap(detectors.detect, in_axes=(None, 0)), in_axes=(None, 0))
+        return tuple(each(d, w) for d, w in zip(trained, windows, strict=True))
+
+    others = tuple(
+        jax.ShapeDtypeStruct((w.shape[0] - num_train, *w.shape[1:]), w.dtype)
+        for w in surveys.windows
+    )
+    programs.detect.compile(detect, models.detectors, others)
+    return surveys
+
+
+def _simulate(key: Key, config: Config, world: World, mesh: Mesh | None) -> Surveys:
+    """Surveys for all purposes: simulating takes longer to compile than to run."""
+    class_key, scene_key = jax.random.split(key)
+    numbers = num_scenes(config)
+    keys = jax.random.split(class_key, len(numbers))
+    parts = [observe.balanced_classes(k, config, n) for k, n in zip(keys, numbers, strict=True)]
+    classes = jnp.concatenate(parts)
+    num_devices = 1 if mesh is None else mesh.size
+    rows = jnp.arange(-(-len(classes) // num_devices) * num_devices) % len(classes)
+    scene_keys = jax.random.split(scene_key, len(classes))
+    survey = devices.spread(lambda keys, classes: observe.surveys(keys, world, classes), mesh)
+    scenes, windows = survey(scene_keys[rows], classes[rows])
+    return jax.tree.map(lambda x: x[: len(classes)], Surveys(classes, scenes, windows))
+
+
+def _trace_jmvae(programs: Programs, config: Config, models: Models) -> tuple[Bank, Bank]:
+    """The JMVAE; returns the shapes of the banks for training and for measuring."""
+    key, settings, model = jax.random.key(0), config.jmvae, jmvae_shape(config)
+    num_classes, steps = len(config.arena.classes), settings.steps // num_chunks(settings.steps)
+
+    def bank(number: int) -> Any:
+        shapes = [(num_classes, number, size) for size in model.feature_sizes]
+        return tuple(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)
+
+    def begin(key: Key):
+        keys = jax.random.split(key, settings.restarts)
+        return jax.vmap(lambda k: jmvae.start(jmvae.init(k, model), settings))(keys)
+
+    def train(key: Key, states, bank: Bank):
+        one = jax.vmap(lambda key, state: jmvae.train(key, state, model, bank, settings, steps))
+        return one(jax.random.split(key, settings.restarts), states)
+
+    banks = bank(settings.samples_per_class), bank(num_held_out_per_class(config))
+    states = programs.begin_jmvae.compile(begin, key)
+    programs.train_jmvae.compile(train, key, states, banks[0])
+    programs.examine_jmvae.compile(
+        lambda params, bank: examine.latent_space(params, bank, config), models.jmvae, banks[1]
+    )
+    return banks
+
+
+def _trace_dqn(
+    programs: Programs,
+    config: Config,
+    world: World,
+    models: Models,
+    surveys: Surveys,
+    banks: tuple[Bank, Bank],
+    mesh: Mesh | None,
+) -> None:
+    """Q-learning and the policies' examination; one program serves all modalities."""
+    key, settings, model = jax.random.key(0), config.dqn, jmvae_shape(config)
+
+    def make_mdp(trained: tuple[Detector, ...], params: Params, bank: Bank):
+        if settings.observe == "live":
+            return observe.live_mdp(config, world, trained, params, model)
+        return observe.bank_mdp(config, bank, params, model)
+
+    def start(key: Key, starts, *trained: Any):
+        mdp = make_mdp(*trained)
+        if settings.observe == "bank":
+            return dqn.starts(key, mdp, settings.num_starts)
+
+        def begin(key: Key, classes: jax.Array, scene: Scene, looks: tuple[jax.Array, ...]):
+            seen_key, begin_key = jax.random.split(key)
+            seen = belief_mdp.random_start(seen_key, mdp)[1]
+            return belief_mdp.begin(begin_key, mdp, scene, classes, seen, looks)
+
+        return jax.vmap(begin)(jax.random.split(key, settings.num_starts), *starts)
+
+    def train(key: Key, modality: jax.Array, state: dqn.DqnState, starts, *trained: Any):
+        return dqn.train_chunk(key, make_mdp(*trained), modality, settings, state, starts, mesh)
+
+    trained = models.detectors, models.jmvae, banks[0]
+    modality = jax.ShapeDtypeStruct((), jnp.int32)
+    number, num_pois = num_scene_starts(config), config.arena.num_pois
+    looks = [(number, num_pois, size) for size in model.feature_sizes]
+    scene_starts = (
+        *jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((number, *x.shape[1:]), x.dtype),
+            (surveys.classes, surveys.scenes),
+        ),
+        tuple(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in looks),
+    )
+    starts = programs.start_dqn.compile(start, key, scene_starts, *trained)
+    state = programs.begin_dqn.compile(
+        lambda key, starts, *trained: dqn.init(key, make_mdp(*trained), settings, starts),
+        *(key, starts, *trained),
+    )
+    inputs = key, modality, state, starts, *trained
+    shardings: Any = {}
+    if mesh is not None:
+        whole = NamedSharding(mesh, PartitionSpec())
+        split = jax.tree.map(lambda spec: NamedSharding(mesh, spec), dqn.state_specs())
+        shardings["in_shardings"] = whole, whole, split, *[whole] * (len(inputs) - 3)
+        shardings["out_shardings"] = split, whole
+    programs.train_dqn.compile(train, *inputs, donate=(2,), **shardings)
+    programs.examine_dqn.compile(
+        functools.partial(examine.play, config=config),
+        *(key, modality, models.q_networks[0], models.jmvae, banks[1]),
+    )
