@@ -238,11 +238,11 @@ class DetectorConfig:
 
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers."""
-    num_scans: int = 65536
+    num_scans: int = 98304
     """Simulated scans to train on, for each modality."""
     num_held_out: int = 8192
     """Further simulated scans, on which accuracy is measured."""
-    steps: int = 3000
+    steps: int = 4000
     """Gradient steps."""
     batch: int = 512
     """Scans of one gradient step."""
@@ -276,7 +276,7 @@ class JmvaeConfig:
     """Trainings from different random parameters, of which the one with the lowest loss is kept."""
     samples_per_class: int = 10000
     """Detections of each class and modality in the training set."""
-    steps: int = 2400
+    steps: int = 3000
     """Gradient steps."""
     batch: int = 256
     """Pairs of detections in one gradient step."""

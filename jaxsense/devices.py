@@ -40,6 +40,7 @@ def start(number: int | None, config: DqnConfig) -> tuple[Mesh | None, Mesh | No
     Raises:
       ConfigError: if there are not that many devices, or they cannot share the environments.
     """
+    jax.config.update("jax_default_matmul_precision", "highest")
     divisible = math.gcd(config.num_envs, config.batch)
     threads = min(os.cpu_count() or 1, _MOST_THREADS) if number is None else max(number, 1)
     # Where JAX is in use already, its devices are what they are.

@@ -58,9 +58,9 @@ def main(argv: list[str] | None = None) -> None:
     team = mission.make_mission(config)
     with Display(console) as display:
         monitor = Monitor(display.show)
-        display.show("mission", 0, 0, {})
         number = arguments.episodes * len(played)
         player = mission.Player(team, monitor, batch=mission.batch_of(number))
+        player.wait()
         begin = time.perf_counter()
         found = mission.summary(key, player, models, played, arguments.episodes)
         seconds = time.perf_counter() - begin

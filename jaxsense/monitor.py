@@ -76,11 +76,15 @@ class Program:
         if not self._compiled.done():
             self._compiled.set_exception(error)
 
-    def __call__(self, *args: Any) -> Any:
-        """Runs the program until its results are there."""
+    def wait(self) -> Callable[..., Any]:
+        """Waits until the program is compiled, and gives it."""
         if not self._compiled.done():
             self._monitor.announce(self._stage)
-        compiled = self._compiled.result()
+        return self._compiled.result()
+
+    def __call__(self, *args: Any) -> Any:
+        """Runs the program until its results are there."""
+        compiled = self.wait()
         begin = time.perf_counter()
         output = jax.block_until_ready(compiled(*args))
         self._monitor.add(self._stage, "run_s", time.perf_counter() - begin)

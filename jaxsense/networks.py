@@ -1,5 +1,7 @@
 """The one network of jaxsense: dense layers with ReLU between them."""
 
+import functools
+
 import jax
 from flax import linen as nn
 
@@ -18,6 +20,8 @@ class MLP(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[..., F]` to `[..., outputs]`."""
+        # In full precision, so that an accelerator gives what a CPU does.
+        dense = functools.partial(nn.Dense, precision=jax.lax.Precision.HIGHEST)
         for size in self.hidden:
-            x = nn.relu(nn.Dense(size, kernel_init=nn.initializers.he_normal())(x))
-        return nn.Dense(self.outputs)(x)
+            x = nn.relu(dense(size, kernel_init=nn.initializers.he_normal())(x))
+        return dense(self.outputs)(x)

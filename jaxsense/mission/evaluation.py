@@ -121,6 +121,11 @@ class Player:
         self._go_on.compile(go_on, keys, models, state)
         self._chunk_keys = jax.jit(jax.vmap(jax.random.fold_in))
 
+    def wait(self) -> None:
+        """Waits until the programs are compiled."""
+        self._begin.wait()
+        self._go_on.wait()
+
     def play(
         self, key: Key, models: Models, played: dict[str, Case], episodes: int
     ) -> dict[str, dict[str, Any]]:

@@ -1,0 +1,99 @@
+"""`python -m benchmarks`: one table of how fast each stage is, and how fast its peer."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import rich.console
+import rich.table
+import tyro
+
+from benchmarks import ROWS
+from benchmarks.measure import Options, Row
+from jaxsense import cli
+
+PROGRAM = "benchmarks"
+_WIDTH_OF_FILES = 160
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Measure each stage, and with --peers those who do the same, and print one table."""
+
+    names: tyro.conf.Positional[
+        Annotated[tuple[str, ...], tyro.conf.arg(help=f"Rows, of {', '.join(ROWS)}; all if none.")]
+    ] = ()
+    peers: Annotated[bool, tyro.conf.arg(help="Measure peers on the same work, in turn.")] = False
+    json: Annotated[Path | None, tyro.conf.arg(help="File to write; must be new.")] = None
+    quick: Annotated[bool, tyro.conf.arg(help="Tiny sizes, to see that everything runs.")] = False
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    for name in arguments.names:
+        if name not in ROWS:
+            cli.fail(PROGRAM, f"name = {name!r}: must be one of {', '.join(ROWS)}")
+    if arguments.json is not None:
+        _reserve(arguments.json)
+    # A device for each core. Called from another program, the devices may be fixed already.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", os.cpu_count())
+    console = rich.console.Console()
+    if not console.is_terminal:
+        console.width = _WIDTH_OF_FILES
+    rows: list[Row] = []
+    for name in dict.fromkeys(arguments.names or ROWS):
+        with console.status(name):
+            rows.append(ROWS[name](Options(arguments.peers, arguments.quick)))
+        if arguments.json is not None:
+            # After each row, so that what was measured before a failure is kept.
+            arguments.json.write_text(json.dumps([row.as_json() for row in rows], indent=2) + "\n")
+    _print_table(console, rows)
+
+
+def _reserve(path: Path) -> None:
+    """Makes an empty list of rows, or ends the program, before anything is measured."""
+    try:
+        with path.open("x") as file:
+            file.write("[]\n")
+    except FileExistsError:
+        cli.fail(PROGRAM, f"json = {str(path)!r}: exists already; must be new")
+    except OSError as error:
+        cli.fail(PROGRAM, f"json = {str(path)!r}: cannot be written: {error.strerror}")
+
+
+def _print_table(console: rich.console.Console, rows: list[Row]) -> None:
+    table = rich.table.Table(
+        "row", "unit", "ours", "peer", "theirs", "ratio", "compile [s]", "device", "batch"
+    )
+    for row in rows:
+        bound = ">= " if row.is_bound else ""
+        table.add_row(
+            row.row,
+            row.unit,
+            _number(row.ours),
+            row.peer or "",
+            "" if row.theirs is None else bound + _number(row.theirs),
+            "" if row.ratio is None else f"{bound}{_number(row.ratio)} x",
+            f"{row.compile_s:.1f}",
+            row.device,
+            str(row.batch),
+        )
+    console.print(table)
+    versions = {name: version for row in rows for name, version in row.versions.items()}
+    console.print(", ".join(f"{name} {version}" for name, version in versions.items()))
+
+
+def _number(value: float) -> str:
+    """Three digits, and thousands apart."""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""Q-learning on the map MDP: environment steps per second, with a gradient step per vector step."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from benchmarks import measure, peers
+from benchmarks.maps import MODALITY, Task, untrained_task
+from benchmarks.measure import Options, Row, Side
+from jaxsense import devices, models, observe
+from jaxsense.config import PRESETS, DqnConfig
+from jaxsense.dqn import training
+from jaxsense.dqn.belief_mdp import MapMdp
+from jaxsense.sim import world as worlds
+
+_UNIT = "env-steps/s"
+
+
+def dqn_rejax(options: Options) -> Row:
+    """Against rejax, with as many environments and the same batch, network and replay."""
+    task, _ = untrained_task(_settings(options))
+    peer = peers.load("rejax", options)
+    theirs = [peer.throughput(task, options)] if peer else []
+    return measure.compare(
+        "dqn_rejax",
+        _UNIT,
+        _our_sides(task, options),
+        theirs,
+        options,
+        peer="rejax DQN",
+        packages=("rejax",),
+    )
+
+
+def dqn_sb3(options: Options) -> Row:
+    """Against Stable-Baselines3, which steps one environment in NumPy."""
+    task, _ = untrained_task(_settings(options))
+    peer = peers.load("sb3", options)
+    theirs = peer.throughputs(task, options) if peer else []
+    return measure.compare(
+        "dqn_sb3",
+        _UNIT,
+        _our_sides(task, options),
+        theirs,
+        options,
+        peer="Stable-Baselines3 DQN",
+        packages=("stable-baselines3", "torch"),
+    )
+
+
+def dqn_live(options: Options) -> Row:
+    """With a scan cast in each environment's own arena at every step."""
+    task, networks = untrained_task(_settings(options, epochs=100))
+    world = worlds.make_world(task.config)
+    shape = models.jmvae_shape(task.config)
+
+    def make_mdp(detectors: Any, params: Any) -> MapMdp:
+        return observe.live_mdp(task.config, world, detectors, params, shape)
+
+    inputs = make_mdp, networks.detectors, task.params
+    ours = [_train_side(task, mesh, *inputs) for mesh in _meshes(options)]
+    return measure.compare("dqn_live", _UNIT, ours, [], options)
+
+
+def dqn_seeds(options: Options) -> Row:
+    """Many seeds of the agents of both modalities in one program, with the paper's settings."""
+    task, _ = untrained_task(_settings(options))
+    is_accelerated = jax.default_backend() != "cpu"
+    num_seeds = 64 if is_accelerated and not options.quick else 2
+    if not options.quick:
+        paper = PRESETS["paper"].dqn
+        # On a CPU a twentieth of the epochs: the rate is the same.
+        epochs = paper.epochs if is_accelerated else paper.epochs // 20
+        settings = dataclasses.replace(paper, epochs=epochs)
+        task = dataclasses.replace(task, config=dataclasses.replace(task.config, dqn=settings))
+    settings, modalities = task.config.dqn, jnp.arange(len(task.config.modalities))
+
+    def train(keys: jax.Array, params: Any, bank: Any):
+        mdp = task.mdp_of(params, bank)
+        of_seeds = jax.vmap(lambda key, m: training.train(key, mdp, m, settings), (0, None))
+        state, infos = jax.vmap(of_seeds, (None, 0))(keys, modalities)
+        return state.params, infos
+
+    agents = num_seeds * len(modalities)
+    work = agents * settings.epochs * settings.num_envs
+    keys = jax.random.split(jax.random.key(3), num_seeds)
+    side = measure.compiled(train, keys, task.params, task.bank, work=work, batch=agents)
+    return measure.compare("dqn_seeds", _UNIT, [side], [], options)
+
+
+def _settings(options: Options, epochs: int = 400) -> DqnConfig:
+    """512 environments, one gradient step of batch 512 for each step of all of them."""
+    if options.quick:
+        return DqnConfig(
+            observe="bank",
+            num_envs=16,
+            epochs=4,
+            chunk=2,
+            updates=1,
+            batch=16,
+            replay_capacity=1024,
+            num_starts=16,
+        )
+    return DqnConfig(
+        observe="bank",
+        num_envs=512,
+        epochs=epochs,
+        chunk=100,
+        updates=1,
+        batch=512,
+        replay_capacity=131072,
+    )
+
+
+def _our_sides(task: Task, options: Options) -> list[Side]:
+    """On one device, and with the environments split over all."""
+
+    def make_mdp(params: Any, bank: Any) -> MapMdp:
+        return task.mdp_of(params, bank)
+
+    return [_train_side(task, mesh, make_mdp, task.params, task.bank) for mesh in _meshes(options)]
+
+
+def _meshes(options: Options) -> list[Mesh | None]:
+    mesh = devices.make_mesh()
+    if mesh.size == 1:
+        return [None]
+    return [mesh] if options.quick else [None, mesh]
+
+
+def _train_side(
+    task: Task, mesh: Mesh | None, make_mdp: Callable[..., MapMdp], *networks: Any
+) -> Side:
+    settings = task.config.dqn
+
+    def train(key: jax.Array, *networks: Any):
+        return training.train(key, make_mdp(*networks), MODALITY, settings, mesh)
+
+    work = settings.epochs * settings.num_envs
+    side = measure.compiled(train, jax.random.key(2), *networks, work=work, batch=settings.num_envs)
+    return dataclasses.replace(side, num_devices=1 if mesh is None else mesh.size)

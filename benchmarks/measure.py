@@ -1,0 +1,212 @@
+"""What every row is measured with: compile time apart, both sides in turn, medians."""
+
+import dataclasses
+import importlib.metadata
+import platform
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxsense import devices
+
+_PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What a row is asked for.
+
+    Attributes:
+      peers: measure the peer too.
+      quick: tiny sizes, to see that everything runs; the figures mean nothing.
+    """
+
+    peers: bool = False
+    quick: bool = False
+
+    @property
+    def repeats(self) -> int:
+        """How often each side is measured."""
+        return 1 if self.quick else 7
+
+
+@dataclasses.dataclass(frozen=True)
+class Side:
+    """One way of doing the work of a row.
+
+    Attributes:
+      run: does the work once, and returns when all of it is done.
+      work: units of work in one run, for example physics steps.
+      batch: how many were done side by side.
+      compile_s: seconds it took to compile.
+      num_devices: how many JAX devices it uses.
+    """
+
+    run: Callable[[], Any]
+    work: float
+    batch: int
+    compile_s: float = 0.0
+    num_devices: int = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One line of the table and one object of the JSON.
+
+    Attributes:
+      row: its name.
+      unit: of `ours` and `theirs`: work per second, or "s", of which less is better.
+      ours: median over the repetitions.
+      peer: who is compared with, or None.
+      theirs: median over the repetitions; None if the peer was not measured.
+      ratio: how many times faster we are.
+      compile_s: seconds that ours took to compile, not contained in `ours` unless it says so.
+      device: what ours ran on.
+      batch: how many of ours were done side by side.
+      versions: of Python, packages and the peer.
+      is_bound: the peer was stopped before it was done: `theirs` and `ratio` are lower bounds.
+    """
+
+    row: str
+    unit: str
+    ours: float
+    peer: str | None
+    theirs: float | None
+    ratio: float | None
+    compile_s: float
+    device: str
+    batch: int
+    versions: dict[str, str]
+    is_bound: bool = False
+
+    def as_json(self) -> dict[str, Any]:
+        """The public keys; that a peer was stopped is told beside its name."""
+        values = dataclasses.asdict(self)
+        if values.pop("is_bound"):
+            values["peer"] = f"{self.peer} (stopped)"
+        return values
+
+
+def batches(
+    options: Options, *, quick: int, cpu: tuple[int, ...], accelerator: tuple[int, ...]
+) -> tuple[int, ...]:
+    """The batches to try: an accelerator needs large ones to be busy."""
+    if options.quick:
+        return (quick,)
+    return cpu if jax.default_backend() == "cpu" else accelerator
+
+
+def make_row(
+    name: str,
+    unit: str,
+    ours: float,
+    *,
+    theirs: float | None = None,
+    peer: str | None = None,
+    packages: tuple[str, ...] = (),
+    compile_s: float,
+    batch: int,
+    num_devices: int = 1,
+    is_bound: bool = False,
+) -> Row:
+    """A row from its figures; `packages` are the distributions that the peer needs."""
+    ratio = None
+    if theirs is not None:
+        ratio = theirs / ours if unit == "s" else ours / theirs
+    versions = {"python": platform.python_version()}
+    for package in (*_PACKAGES, *(packages if theirs is not None else ())):
+        versions[package] = importlib.metadata.version(package)
+    kind = jax.devices()[0].device_kind
+    return Row(
+        row=name,
+        unit=unit,
+        ours=ours,
+        peer=peer,
+        theirs=theirs,
+        ratio=ratio,
+        compile_s=compile_s,
+        device=kind if num_devices == 1 else f"{num_devices} x {kind}",
+        batch=batch,
+        versions=versions,
+        is_bound=is_bound,
+    )
+
+
+def compiled(
+    function: Callable[..., Any], *args: Any, work: float, batch: int, mesh: Mesh | None = None
+) -> Side:
+    """Compiles a function for its arguments; the side runs it on them and blocks on the outputs.
+
+    With a mesh, arguments and outputs are split over its devices along their first axis.
+    """
+    if mesh is not None:
+        function = devices.spread(function, mesh)
+        args = jax.device_put(args, NamedSharding(mesh, PartitionSpec(devices.AXIS)))
+    begin = time.perf_counter()
+    program = jax.jit(function).lower(*args).compile()
+    compile_s = time.perf_counter() - begin
+    number = 1 if mesh is None else mesh.size
+    return Side(lambda: jax.block_until_ready(program(*args)), work, batch, compile_s, number)
+
+
+def compare(
+    name: str,
+    unit: str,
+    ours: Sequence[Side],
+    theirs: Sequence[Side],
+    options: Options,
+    *,
+    peer: str | None = None,
+    packages: tuple[str, ...] = (),
+) -> Row:
+    """Measures the best of our ways and the best of theirs, in turn, so that noise hits both.
+
+    Args:
+      name: of the row.
+      unit: of work per second.
+      ours: ways to do it; the fastest counts.
+      theirs: the peer's ways; none if it is not to be measured.
+      options: how often to repeat.
+      peer: who they are.
+      packages: distributions that the peer needs.
+
+    Returns:
+      The row, with medians.
+    """
+    sides = [_fastest(ours)] + ([_fastest(theirs)] if theirs else [])
+    rates: list[list[float]] = [[] for _ in sides]
+    for _ in range(options.repeats):
+        for side, measured in zip(sides, rates, strict=True):
+            measured.append(side.work / seconds(side.run))
+    medians = [statistics.median(measured) for measured in rates]
+    return make_row(
+        name,
+        unit,
+        medians[0],
+        theirs=medians[1] if theirs else None,
+        peer=peer,
+        packages=packages,
+        compile_s=sides[0].compile_s,
+        batch=sides[0].batch,
+        num_devices=sides[0].num_devices,
+    )
+
+
+def seconds(run: Callable[[], Any]) -> float:
+    """How long a call takes."""
+    begin = time.perf_counter()
+    run()
+    return time.perf_counter() - begin
+
+
+def _fastest(sides: Sequence[Side]) -> Side:
+    """The one that does most work per second, after a warm-up of each."""
+    for side in sides:
+        side.run()
+    if len(sides) == 1:
+        return sides[0]
+    return max(sides, key=lambda side: side.work / min(seconds(side.run) for _ in range(2)))

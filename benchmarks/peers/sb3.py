@@ -1,0 +1,125 @@
+"""Stable-Baselines3's DQN on the map MDP in NumPy."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium  # pyright: ignore[reportMissingImports]
+import numpy as np
+import torch  # pyright: ignore[reportMissingImports]
+from stable_baselines3 import DQN  # pyright: ignore[reportMissingImports]
+from stable_baselines3.common.callbacks import (  # pyright: ignore[reportMissingImports]
+    BaseCallback,
+)
+
+from benchmarks.maps import MODALITY, Task
+from benchmarks.measure import Options, Side
+from benchmarks.peers.numpy_mdp import NumpyMdp
+from jaxsense.training import Params
+
+
+class MapEnv(gymnasium.Env):
+    """The NumPy MDP behind gymnasium's interface."""
+
+    def __init__(self, task: Task):
+        self._mdp = NumpyMdp(task.config, task.params, task.bank, MODALITY)
+        self._state: Any = None
+        size = (self._mdp.observation_size,)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float32)
+        self.action_space = gymnasium.spaces.Discrete(self._mdp.num_pois + 1)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """A random start."""
+        super().reset(seed=seed, options=options)
+        self._state = self._mdp.reset(self.np_random)
+        return self._mdp.observation(self._state), {}
+
+    def step(self, action: Any):
+        """One action."""
+        reward, is_over, is_cut = self._mdp.step(self.np_random, self._state, int(action))
+        return self._mdp.observation(self._state), reward, is_over, is_cut, {}
+
+
+def make(task: Task, **settings: Any) -> DQN:
+    """The algorithm with our network, learning rate and discount."""
+    dqn = task.config.dqn
+    return DQN(
+        "MlpPolicy",
+        MapEnv(task),
+        learning_rate=dqn.learning_rate,
+        gamma=dqn.discount,
+        batch_size=dqn.batch,
+        exploration_final_eps=dqn.epsilon_min,
+        policy_kwargs={"net_arch": list(dqn.hidden), "activation_fn": torch.nn.ReLU},
+        device="cpu",
+        seed=0,
+        **settings,
+    )
+
+
+def throughputs(task: Task, options: Options) -> list[Side]:
+    """Its speed with a gradient step for each environment step, and with one for four of them."""
+    steps = 20 if options.quick else 1000
+
+    def side(train_freq: int) -> Side:
+        torch.set_num_threads(1)  # faster than two for networks of this size
+        model = make(task, train_freq=train_freq, learning_starts=1, buffer_size=131072)
+
+        def run() -> None:
+            model.learn(steps, reset_num_timesteps=False)
+
+        return Side(run, steps, 1)
+
+    return [side(1), side(4)]
+
+
+def as_our_params(model: DQN) -> Params:
+    """Its Q-network as one of ours."""
+    linear = [m for m in model.q_net.q_net if isinstance(m, torch.nn.Linear)]
+    return {
+        "params": {
+            f"Dense_{i}": {
+                "kernel": layer.weight.detach().numpy().T.copy(),
+                "bias": layer.bias.detach().numpy().copy(),
+            }
+            for i, layer in enumerate(linear)
+        }
+    }
+
+
+def time_to(task: Task, passes: Callable[[Params], bool], limit: float) -> tuple[float, bool]:
+    """Seconds of training until an examination is passed, without the examinations.
+
+    Args:
+      task: what to learn.
+      passes: the examination; taken every 1,000 steps.
+      limit: seconds after which it is stopped.
+
+    Returns:
+      The seconds, and whether it was stopped.
+    """
+    period, most = 1000, 1_000_000
+    spent, is_stopped = 0.0, True
+
+    class Examination(BaseCallback):
+        def _on_step(self) -> bool:
+            nonlocal spent, is_stopped, begin
+            if self.num_timesteps % period and time.perf_counter() - begin + spent < limit:
+                return True
+            spent += time.perf_counter() - begin
+            is_stopped = not passes(as_our_params(model))
+            begin = time.perf_counter()
+            return is_stopped and spent < limit
+
+    begin = time.perf_counter()
+    torch.set_num_threads(1)
+    model = make(
+        task,
+        train_freq=4,
+        learning_starts=500,
+        buffer_size=65536,
+        target_update_interval=500,
+        exploration_fraction=0.02,
+    )
+    model.learn(most, callback=Examination())
+    return spent, is_stopped

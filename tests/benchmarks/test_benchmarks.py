@@ -1,0 +1,168 @@
+"""Every row at tiny size, as a user runs it, so that none of them rots."""
+
+import importlib
+import json
+import math
+import os
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks import ROWS, __main__, peers
+from benchmarks.measure import Options, Side, compare, make_row
+
+TRAIN = ("train", "train_warm")
+KEYS = {
+    "row", "unit", "ours", "peer", "theirs", "ratio", "compile_s", "device", "batch", "versions",
+}  # fmt: skip
+PEERS = {
+    "jmvae": "multivae",
+    "dqn_rejax": "rejax",
+    "dqn_sb3": "stable_baselines3",
+    "time_to_optimal_rejax": "rejax",
+    "time_to_optimal_sb3": "stable_baselines3",
+}
+
+
+def start(path, *names):
+    """The program in a process of its own, for the devices it asks for."""
+    command = [sys.executable, "-m", "benchmarks", *names, "--quick", "--peers", "--json"]
+    # Compiling takes nearly all the time, and the figures mean nothing here.
+    flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen([*command, str(path)], env=environment, text=True, **pipes)
+
+
+def finish(process, path):
+    """The rows that it wrote, and what it printed."""
+    printed = process.communicate()
+    assert process.returncode == 0, printed[1]
+    return {row["row"]: row for row in json.loads(path.read_text())}, *printed
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("json")
+    simulation = [name for name in ROWS if name.startswith(("physics", "rays"))]
+    learning = [name for name in ROWS if name not in (*simulation, *TRAIN)]
+    paths = folder / "simulation.json", folder / "learning.json"
+    processes = [start(p, *names) for p, names in zip(paths, (simulation, learning), strict=True)]
+    results = [finish(process, path) for process, path in zip(processes, paths, strict=True)]
+    rows, outputs, errors = zip(*results, strict=True)
+    return rows[0] | rows[1], "".join(outputs), "".join(errors)
+
+
+def check_row(row, has_peer):
+    assert set(row) == KEYS
+    assert row["unit"] == "s" or row["unit"].endswith("/s")
+    assert {"jax", "jaxlib", "mujoco", "numpy", "python"} <= set(row["versions"])
+    assert row["batch"] >= 1
+    assert "cpu" in row["device"]
+    figures = ["ours", "compile_s"] + (["theirs", "ratio"] if has_peer else [])
+    for figure in figures:
+        assert math.isfinite(row[figure]), figure
+        assert row[figure] > 0, figure
+    if has_peer:
+        order = ("theirs", "ours") if row["unit"] == "s" else ("ours", "theirs")
+        assert row["ratio"] == pytest.approx(row[order[0]] / row[order[1]])
+    else:
+        assert row["theirs"] is None
+        assert row["ratio"] is None
+
+
+def has_package(name):
+    try:
+        importlib.import_module(name)
+    except (ImportError, RuntimeError):
+        return False
+    return True
+
+
+@pytest.mark.parametrize("name", [name for name in ROWS if name not in TRAIN])
+def test_row(quick, name):
+    package = "mujoco" if name.startswith(("physics", "rays")) else PEERS.get(name)
+    check_row(quick[0][name], package is not None and has_package(package))
+
+
+def test_table_and_missing_peers_are_printed(quick):
+    rows, output, errors = quick
+    for name in rows:
+        assert name in output
+    for row, package in PEERS.items():
+        adapter = row.split("_")[-1] if row != "jmvae" else "multivae"
+        assert has_package(package) or f"peer {adapter} is left out" in errors
+
+
+@pytest.mark.slow
+def test_train_rows(tmp_path):
+    path = tmp_path / "rows.json"
+    rows, _, _ = finish(start(path, *TRAIN), path)
+    for name in TRAIN:
+        check_row(rows[name], has_peer=False)
+        assert rows[name]["unit"] == "s"
+
+
+def test_missing_peer_is_named_and_left_out(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rejax", None)
+    monkeypatch.delitem(sys.modules, "benchmarks.peers.rejax", raising=False)
+    assert peers.load("rejax", Options(peers=True)) is None
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "peer rejax is left out" in message
+
+
+def test_peers_are_not_loaded_unless_asked_for(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rejax", None)
+    assert peers.load("rejax", Options(peers=False)) is None
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (["nonsense"], "name = 'nonsense': must be one of physics"),
+        (["--json", "no/such/folder/rows.json"], "cannot be written"),
+        (["--jsn", "rows.json"], "--jsn"),
+    ],
+)
+def test_bad_input_is_one_line(capsys, argv, expected):
+    with pytest.raises(SystemExit) as stop:
+        __main__.main(argv)
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert expected in message
+
+
+def test_an_existing_file_is_not_overwritten(tmp_path, capsys):
+    path = tmp_path / "rows.json"
+    path.write_text("precious")
+    with pytest.raises(SystemExit):
+        __main__.main(["--json", str(path)])
+    assert path.read_text() == "precious"
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_a_ratio_is_how_many_times_faster_we_are():
+    rate = make_row("a", "steps/s", 10.0, theirs=5.0, compile_s=1.0, batch=1)
+    seconds = make_row("a", "s", 10.0, theirs=5.0, compile_s=1.0, batch=1)
+    assert (rate.ratio, seconds.ratio) == (2.0, 0.5)
+
+
+def test_a_stopped_peer_is_told_in_the_json():
+    row = make_row("a", "s", 1.0, theirs=9.0, peer="X", compile_s=1.0, batch=1, is_bound=True)
+    assert row.as_json()["peer"] == "X (stopped)"
+
+
+def test_sides_take_turns_and_the_fastest_of_each_counts():
+    calls = []
+
+    def side(name, work):
+        return Side(lambda: calls.append(name), work, batch=len(name), compile_s=1.0)
+
+    ours = [side("slow", 1e-9), side("a", 1.0)]
+    row = compare("row", "x/s", ours, [side("b", 1.0)], Options(), peer="B")
+    assert calls[-2 * Options().repeats :] == ["a", "b"] * Options().repeats
+    assert row.batch == 1

@@ -1,0 +1,78 @@
+"""The peer's MDP in NumPy is ours, number for number, when both see the same detections."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.maps import untrained_task
+from benchmarks.peers.numpy_mdp import NumpyMdp
+from jaxsense.config import DqnConfig
+from jaxsense.dqn import belief_mdp
+
+TOLERANCE = 1e-5  # latent units, over a few float32 layers
+
+
+@pytest.fixture(scope="module")
+def task():
+    # One detection of each class, so that there is nothing to draw.
+    return untrained_task(DqnConfig(observe="bank"), samples=1)[0]
+
+
+@pytest.mark.parametrize("modality", [0, 1])
+def test_every_step_equals_ours(task, modality):
+    mdp = task.mdp
+    step = jax.jit(lambda key, state, a: belief_mdp.step(key, mdp, state, a, modality))
+    theirs = NumpyMdp(task.config, task.params, task.bank, modality)
+    rng = np.random.default_rng(0)
+    for episode in range(10):
+        classes = rng.integers(3, size=3)
+        state = belief_mdp.reset(
+            jax.random.key(episode), mdp, jnp.array(classes), jnp.zeros((3, 2), bool)
+        )
+        their_state = theirs.reset(rng, classes, np.zeros((3, 2), bool))
+        for action in [*rng.integers(3, size=7), 3]:
+            np.testing.assert_allclose(
+                theirs.observation(their_state),
+                belief_mdp.as_state(state.belief),
+                atol=TOLERANCE,
+            )
+            state, outcome = step(jax.random.key(1), state, jnp.int32(action))
+            reward, is_over, is_cut = theirs.step(rng, their_state, int(action))
+            np.testing.assert_allclose(reward, outcome.reward, atol=TOLERANCE)
+            assert (is_over, is_cut) == (bool(outcome.is_over), bool(outcome.is_cut))
+            np.testing.assert_array_equal(their_state.seen, state.seen)
+
+
+def test_episodes_are_cut_as_ours(task):
+    theirs = NumpyMdp(task.config, task.params, task.bank, 0)
+    rng = np.random.default_rng(0)
+    state = theirs.reset(rng)
+    cuts = [theirs.step(rng, state, 0)[2] for _ in range(task.config.mdp.max_steps)]
+    assert cuts == [False] * (task.config.mdp.max_steps - 1) + [True]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_starts_write_looks_in_rotated_order(task, first):
+    """A PoI that both have seen: the second writes over the first, as `write` does."""
+    mdp = task.mdp
+    theirs = NumpyMdp(task.config, task.params, task.bank, 0)
+    classes = np.array([0, 1, 2])
+    state = theirs.reset(
+        np.random.default_rng(0), classes, np.ones((3, 2), bool), np.full(3, first)
+    )
+    for poi, poi_class in enumerate(classes):
+        entry, seen = mdp.unseen, jnp.zeros(2, bool)
+        for modality in (first, 1 - first):
+            entry = mdp.write(entry, seen, task.bank[modality][poi_class, 0], modality)
+            seen = seen.at[modality].set(True)
+        np.testing.assert_allclose(state.mean[poi], entry.mean, atol=TOLERANCE)
+        np.testing.assert_allclose(state.std[poi], entry.std, atol=TOLERANCE)
+
+
+def test_starts_have_fair_coins(task):
+    theirs = NumpyMdp(task.config, task.params, task.bank, 0)
+    rng = np.random.default_rng(0)
+    seen = np.array([theirs.reset(rng).seen for _ in range(400)])
+    # 2,400 fair coins: three standard deviations are 0.031.
+    assert abs(seen.mean() - 0.5) < 0.031
