@@ -89,7 +89,7 @@ def dqn_seeds(options: Options) -> Row:
     work = agents * settings.epochs * settings.num_envs
     keys = jax.random.split(jax.random.key(3), num_seeds)
     side = measure.compiled(train, keys, task.params, task.bank, work=work, batch=agents)
-    return measure.compare("dqn_seeds", _UNIT, [side], [], options)
+    return measure.compare("dqn_seeds", _UNIT, [side], [], options, repeats=1)
 
 
 def _settings(options: Options, epochs: int = 400) -> DqnConfig:

@@ -162,6 +162,7 @@ def compare(
     *,
     peer: str | None = None,
     packages: tuple[str, ...] = (),
+    repeats: int | None = None,
 ) -> Row:
     """Measures the best of our ways and the best of theirs, in turn, so that noise hits both.
 
@@ -170,16 +171,17 @@ def compare(
       unit: of work per second.
       ours: ways to do it; the fastest counts.
       theirs: the peer's ways; none if it is not to be measured.
-      options: how often to repeat.
+      options: how often to repeat, unless told by `repeats`.
       peer: who they are.
       packages: distributions that the peer needs.
+      repeats: how often each side is measured.
 
     Returns:
       The row, with medians.
     """
     sides = [_fastest(ours)] + ([_fastest(theirs)] if theirs else [])
     rates: list[list[float]] = [[] for _ in sides]
-    for _ in range(options.repeats):
+    for _ in range(repeats or options.repeats):
         for side, measured in zip(sides, rates, strict=True):
             measured.append(side.work / seconds(side.run))
     medians = [statistics.median(measured) for measured in rates]

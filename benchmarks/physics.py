@@ -56,10 +56,10 @@ class Drives:
 
 
 def physics(options: Options) -> Row:
-    """Without contacts: random layouts, poses and wheel speeds."""
+    """Without contacts: random poses and wheel speeds in an empty arena, as missions have it."""
     batches = measure.batches(options, quick=64, cpu=(256, 1024, 4096), accelerator=(32768, 262144))
     steps = 10 if options.quick else 100
-    arena = arenas.build(_UNTRAINED.arena, (False, True))
+    arena = arenas.build(_UNTRAINED.arena, (False, True), obstacles=False)
     ours, theirs = [], []
     for batch in batches:
         drives = _random_drives(jax.random.key(0), _UNTRAINED, batch, steps)
@@ -177,7 +177,8 @@ def _drive_side(arena: Arena, drives: Drives) -> Side:
     """Our physics, `arena.drive`, on all devices."""
 
     def drive(drives: Drives) -> tuple[jax.Array, jax.Array]:
-        still = arenas.place(arena, drives.layout, drives.poses)
+        is_empty = not np.any(arena.poi_of_geom >= 0)
+        still = arena.data if is_empty else arenas.put(arena, drives.layout, drives.poses)
 
         def step(carry, wheel_speeds: jax.Array):
             qpos, qvel, warmstart = carry
@@ -214,9 +215,8 @@ def _move_side(team: Mission, states: MissionState) -> Side:
 
 def _native_sides(arena: Arena, drives: Drives) -> list[Side]:
     """C MuJoCo on the same drives, with one thread and more."""
-    placed = jax.jit(jax.vmap(lambda layout, poses: arenas.place(arena, layout, poses)))(
-        drives.layout, drives.poses
-    )
+    put = jax.jit(jax.vmap(lambda layout, poses: arenas.put(arena, layout, poses)))
+    placed = put(drives.layout, drives.poses)
     control = jax.vmap(jax.vmap(arenas.as_control))(drives.wheel_speeds)
     batch, steps = control.shape[:2]
     inputs = native.RolloutInputs(
@@ -224,8 +224,8 @@ def _native_sides(arena: Arena, drives: Drives) -> list[Side]:
         qvel=np.asarray(drives.velocity).reshape(batch, -1),
         warmstart=np.asarray(drives.warmstart),
         control=np.asarray(control),
-        mocap_pos=np.asarray(placed.mocap_pos).reshape(batch, -1),
-        mocap_quat=np.asarray(placed.mocap_quat).reshape(batch, -1),
+        mocap_pos=np.asarray(placed.mocap_pos)[:, : arena.mj_model.nmocap].reshape(batch, -1),
+        mocap_quat=np.asarray(placed.mocap_quat)[:, : arena.mj_model.nmocap].reshape(batch, -1),
     )
     cores = os.cpu_count() or 1
     return [

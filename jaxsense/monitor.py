@@ -1,5 +1,6 @@
 """What a stage tells the outside while it runs: time, progress, figures, and bad ends."""
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -13,7 +14,7 @@ Listener = Callable[[str, int, int, dict[str, float]], None]
 """`(stage, done, total, figures)`, called from the host between two chunks of work."""
 
 
-_COMPILERS = 2
+_COMPILERS = min(os.cpu_count() or 1, 8)
 
 
 def _compiler_options() -> Any:

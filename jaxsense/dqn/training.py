@@ -316,7 +316,8 @@ def _optimiser(config: DqnConfig) -> optax.GradientTransformation:
         config.epochs * config.updates,
         config.final_learning_rate / config.learning_rate,
     )
-    return optax.adam(schedule)
+    # As one vector: the network is so small that every array costs more than what is in it.
+    return optax.flatten(optax.adam(schedule))
 
 
 def _restart(rows: jax.Array, envs: MapState, shares: MapState, needs_start: jax.Array) -> MapState:

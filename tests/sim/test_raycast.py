@@ -11,7 +11,7 @@ from mujoco import mjx
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig
-from jaxsense.sim import amiro
+from jaxsense.sim import amiro, raycast
 
 DISTANCE_TOLERANCE = 1e-4  # m
 NORMAL_TOLERANCE = 1e-3
@@ -266,3 +266,18 @@ def test_wrong_shapes_are_named_while_tracing(arena, place, known_layout):
         jax.eval_shape(sim.cast, section, jnp.zeros(3), jnp.float32(0))
     with pytest.raises(AssertionError, match="angle"):
         jax.eval_shape(sim.cast, section, jnp.zeros(2), jnp.zeros(4))
+
+
+def test_one_loop_and_two_find_the_same(arena, known_layout, place):
+    """Accelerators use the one and CPUs the other."""
+    data = place(known_layout, jnp.zeros((2, 3)))
+    section = raycast.cross_section(arena, data, 0.152, 0)
+    origins = jax.random.uniform(jax.random.key(0), (200, 2), minval=-1.4, maxval=1.4)
+    angles = jax.random.uniform(jax.random.key(1), (200,), maxval=2 * jnp.pi)
+    one, two = (
+        jax.jit(jax.vmap(find, in_axes=(None, 0, 0)))(section, origins, angles)
+        for find in (raycast._nearest_by_one_loop, raycast._nearest_by_two_loops)
+    )
+    np.testing.assert_allclose(one[0], two[0], atol=1e-5)
+    assert np.mean(np.asarray(one[1]) == two[1]) > 0.99  # grazing rays may differ
+    assert len(np.unique(one[1])) > 4

@@ -1,0 +1,136 @@
+"""Work split over devices and over processes gives what one device gives."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import devices, models, observe
+from jaxsense.config import PRESETS, ConfigError, DqnConfig
+from jaxsense.dqn import training
+
+ROOT = Path(__file__).parents[1]
+SETTINGS = DqnConfig(
+    observe="bank",
+    num_envs=16,
+    epochs=30,
+    chunk=15,
+    updates=2,
+    batch=32,
+    replay_capacity=256,
+    num_starts=32,
+    target_period=10,
+)
+CONFIG = replace(PRESETS["smoke"], dqn=SETTINGS)
+# Sums of gradients in another order; float32, 60 steps of Adam.
+TOLERANCE = 1e-4
+
+
+def train(mesh):
+    """Parameters and losses of the camera's agent, from random detections."""
+    shape = models.jmvae_shape(CONFIG)
+    params = models.untrained(jax.random.key(0), CONFIG).jmvae
+    bank = tuple(jax.random.uniform(k, (3, 50, 2)) for k in jax.random.split(jax.random.key(1)))
+    mdp = observe.bank_mdp(CONFIG, bank, params, shape)
+    state, info = training.train(jax.random.key(2), mdp, 0, SETTINGS, mesh)
+    return state.params, info
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return jax.jit(lambda: train(None))()
+
+
+def test_two_devices_learn_what_one_learns(alone):
+    mesh = devices.make_mesh(2)
+    together = jax.jit(lambda: train(mesh))()
+    chex.assert_trees_all_close(together, alone, atol=TOLERANCE)
+    start = jax.jit(lambda: training.train(jax.random.key(2), *initial(), mesh)[0].params)()
+    moved = jax.tree.map(lambda x, y: np.abs(x - y).max(), start, alone[0])
+    assert max(jax.tree.leaves(moved)) > 10 * TOLERANCE  # there was something to learn
+
+
+def initial():
+    """The same training, but of a single epoch."""
+    settings = replace(SETTINGS, epochs=1, chunk=1)
+    config = replace(CONFIG, dqn=settings)
+    params = models.untrained(jax.random.key(0), config).jmvae
+    bank = tuple(jax.random.uniform(k, (3, 50, 2)) for k in jax.random.split(jax.random.key(1)))
+    return observe.bank_mdp(config, bank, params, models.jmvae_shape(config)), 0, settings
+
+
+def test_two_processes_train_together_and_stop(alone):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    program = f"""
+import json, sys
+import jax
+jax.config.update("jax_num_cpu_devices", 1)
+jax.distributed.initialize({address!r}, 2, int(sys.argv[1]))
+sys.path.insert(0, {str(ROOT / "tests")!r})
+import numpy as np
+from jaxsense import devices
+from test_devices import train
+assert (jax.process_count(), jax.device_count(), jax.local_device_count()) == (2, 2, 1)
+mesh = devices.make_mesh()
+params, info = jax.jit(lambda: train(mesh))()
+print(json.dumps([np.asarray(x).tolist() for x in jax.tree.leaves((params, info))]))
+jax.distributed.shutdown()
+"""
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", program, str(i)],
+            env=environment,
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for i in range(2)
+    ]
+    outputs = [process.communicate(timeout=240) for process in processes]
+    for process, (_, errors) in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, errors
+    for text, _ in outputs:
+        leaves = [np.array(leaf, np.float32) for leaf in json.loads(text.splitlines()[-1])]
+        for here, there in zip(leaves, jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(here, np.asarray(there), atol=TOLERANCE)
+
+
+def test_a_spread_function_gives_what_it_gives_alone():
+    mesh = devices.make_mesh(2)
+
+    def function(x, scale):
+        return {"sum": x.sum(axis=1) * scale, "x": x}
+
+    x = jnp.arange(12.0).reshape(6, 2)
+    spread = jax.jit(devices.spread(function, mesh, whole=(1,)))
+    chex.assert_trees_all_close(spread(x, jnp.float32(3)), function(x, jnp.float32(3)))
+    assert spread(x, jnp.float32(3))["sum"].sharding.num_devices == 2
+    assert devices.spread(function, None) is function
+
+
+def test_a_number_of_devices_that_cannot_be_is_named():
+    with pytest.raises(ConfigError, match=r"devices = 3: must be within 1 and 2"):
+        devices.start(3, SETTINGS)
+    odd = replace(SETTINGS, num_envs=15, replay_capacity=150, num_starts=30)
+    with pytest.raises(ConfigError, match=r"devices = 2: must divide dqn.num_envs = 15"):
+        devices.start(2, odd)
+    with pytest.raises(ValueError, match="devices = 0"):
+        devices.make_mesh(0)
+    mesh, learners = devices.start(2, SETTINGS)
+    assert mesh.size == learners.size == 2
+    mesh, learners = devices.start(None, SETTINGS)
+    assert (mesh.size, learners) == (2, None)
+    assert devices.start(1, SETTINGS) == (None, None)
