@@ -104,7 +104,7 @@ def make(task: Task, settings: Settings) -> Any:
     keys = jax.random.split(jax.random.key(3), dqn.num_starts)
     starts = jax.jit(jax.vmap(lambda key: belief_mdp.reset(key, task.mdp)))(keys)
     env = MapEnv(task)
-    algorithm = DQN.create(
+    algorithm = DQN.create(  # pyright: ignore[reportAttributeAccessIssue]
         env=env,
         env_params=MapParams(task.params, task.bank, starts, task.config.mdp.max_steps),
         num_envs=dqn.num_envs,
