@@ -70,6 +70,9 @@ def main(argv: list[str] | None = None) -> None:
             )
         except StageError as error:
             cli.fail(PROGRAM, f"{error}; must be finite. What was written before is in {run.path}")
+        finally:
+            # Else the process would go on compiling what nobody waits for.
+            monitor.close()
     report.write_plots(run.path, arguments.config, result)
     summary = {
         "preset": arguments.preset,
