@@ -329,9 +329,9 @@ class DqnConfig:
     """Environments that are stepped side by side."""
     epochs: int = 1000
     """Epochs; in each, every environment makes one step, and the network `updates` steps."""
-    updates: int = 24
+    updates: int = 32
     """Gradient steps of one epoch."""
-    batch: int = 256
+    batch: int = 512
     """Transitions of one gradient step."""
     replay_capacity: int = 512000
     """Transitions that the replay holds; a multiple of num_envs."""
