@@ -78,6 +78,16 @@ class Programs:
     examine_dqn: Program
     player: Future[mission.Player]
 
+    def fail(self, error: BaseException) -> None:
+        """Raises an error from whoever waits for a program, now or later."""
+        for field in dataclasses.fields(self):
+            waited_for = getattr(self, field.name)
+            for each in waited_for if isinstance(waited_for, tuple) else (waited_for,):
+                if isinstance(each, Program):
+                    each.fail(error)
+                elif not each.done():
+                    each.set_exception(error)
+
 
 def compile_programs(
     config: Config,
@@ -113,10 +123,7 @@ def compile_programs(
             team = mission.make_mission(config)
             programs.player.set_result(mission.Player(team, monitor, batch, mesh))
         except BaseException as error:
-            # Whoever waits for a program must hear of it.
-            for program in jax.tree.leaves(dataclasses.astuple(programs)):
-                program.fail(error) if isinstance(program, Program) else None
-            programs.player.set_exception(error)
+            programs.fail(error)
 
     thread = ThreadPoolExecutor(1)
     thread.submit(trace)
