@@ -14,7 +14,7 @@ from jaxsense.dqn import belief_mdp, evaluation, policies
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.models import Models
 from jaxsense.observe import Bank
-from jaxsense.training import Params
+from jaxsense.networks import Params
 
 MODALITY = 0
 """The agent looks with the camera."""

@@ -13,7 +13,7 @@ from jaxsense.config import MODALITIES, PRESETS, Config, DetectorConfig, DqnConf
 from jaxsense.models import jmvae_shape
 from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
-from jaxsense.training import Params
+from jaxsense.networks import Params
 from jaxsense.types import Key
 from jaxsense.vae import detectors, jmvae
 

@@ -26,6 +26,9 @@ MODALITIES: dict[str, Literal["colour", "shape"]] = {"camera": "colour", "lidar"
 """The sensors that `sim` knows, and the attribute of a PoI that each one tells apart."""
 
 
+_MOST_SHARES = 32
+
+
 class ConfigError(ValueError):
     """A setting that cannot be used: `field = value: what would be right`."""
 
@@ -382,6 +385,16 @@ class DqnConfig:
             "epochs",
             f"must be a multiple of chunk = {self.chunk}",
         )
+
+    @property
+    def shares(self) -> int:
+        """Shares that environments and batch can be cut into; a number of devices must divide it."""
+        return math.gcd(self.num_envs, self.batch, _MOST_SHARES)
+
+    @property
+    def block(self) -> int:
+        """Neighbouring environments whose transitions are drawn together, see `dqn.replay`."""
+        return math.gcd(self.num_envs, self.batch) // self.shares
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Work spread over several devices: the cores of a CPU, several accelerators, several processes."""
 
 import contextlib
-import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -41,21 +40,21 @@ def start(number: int | None, config: DqnConfig) -> tuple[Mesh | None, Mesh | No
       ConfigError: if there are not that many devices, or they cannot share the environments.
     """
     jax.config.update("jax_default_matmul_precision", "highest")
-    divisible = math.gcd(config.num_envs, config.batch)
     threads = min(os.cpu_count() or 1, _MOST_THREADS) if number is None else max(number, 1)
     # Where JAX is in use already, its devices are what they are.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", threads)
     is_chosen = number is not None or jax.default_backend() != "cpu"
     if number is None:
-        number = max(n for n in range(1, jax.device_count() + 1) if divisible % n == 0)
+        number = max(n for n in range(1, jax.device_count() + 1) if config.shares % n == 0)
     if not 1 <= number <= jax.device_count():
         raise ConfigError("devices", number, f"must be within 1 and {jax.device_count()}")
-    if divisible % number:
+    if config.shares % number:
         raise ConfigError(
             "devices",
             number,
-            f"must divide dqn.num_envs = {config.num_envs} and dqn.batch = {config.batch}",
+            f"must divide {config.shares}, the shares that dqn.num_envs = {config.num_envs} and "
+            f"dqn.batch = {config.batch} can be cut into",
         )
     mesh = make_mesh(number) if number > 1 else None
     return mesh, mesh if is_chosen else None

@@ -13,7 +13,7 @@ from jaxsense.dqn import evaluation, policies
 from jaxsense.dqn.belief_mdp import MapState, random_start, reset
 from jaxsense.models import jmvae_shape
 from jaxsense.observe import Bank
-from jaxsense.training import Params
+from jaxsense.networks import Params
 from jaxsense.types import Belief, Key
 from jaxsense.vae import fusion, jmvae, metrics
 

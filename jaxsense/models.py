@@ -5,9 +5,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxsense.config import MODALITIES, Config
-from jaxsense.networks import MLP
+from jaxsense.networks import MLP, Params
 from jaxsense.sim import sensors
-from jaxsense.training import Params
 from jaxsense.types import Belief, Key
 from jaxsense.vae import detectors, jmvae
 from jaxsense.vae.detectors import Detector

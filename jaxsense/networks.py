@@ -1,9 +1,14 @@
 """The one network of jaxsense: dense layers with ReLU between them."""
 
 import functools
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 from flax import linen as nn
+
+Params = Any
+"""A pytree of network parameters."""
 
 
 class MLP(nn.Module):
@@ -25,3 +30,23 @@ class MLP(nn.Module):
         for size in self.hidden:
             x = nn.relu(dense(size, kernel_init=nn.initializers.he_normal())(x))
         return dense(self.outputs)(x)
+
+
+def apply_to_columns(params: Params, x: jax.Array) -> jax.Array:
+    """What `MLP` gives for every column of `[F, B]`: `[outputs, B]`.
+
+    For training: with the batch as last axis, layers of this size and their gradients take a CPU
+    half as long.
+
+    Args:
+      params: of an `MLP`.
+      x: inputs, one in each column.
+    """
+    layers = params["params"]
+    for i in range(len(layers)):
+        layer = layers[f"Dense_{i}"]
+        x = jnp.matmul(layer["kernel"].T, x, precision=jax.lax.Precision.HIGHEST)
+        x = x + layer["bias"][:, None]
+        if i < len(layers) - 1:
+            x = nn.relu(x)
+    return x

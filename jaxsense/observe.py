@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxsense.config import Config
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.sim import world as worlds
-from jaxsense.training import Params
+from jaxsense.networks import Params
 from jaxsense.types import Key
 from jaxsense.vae import detectors, fusion
 from jaxsense.vae.detectors import Detector
@@ -48,7 +48,7 @@ def bank_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> MapMdp
 
     def observe(key: Key, classes: jax.Array, poi: jax.Array, modality: int):
         samples = bank[modality]
-        row = jax.random.randint(key, (), 0, samples.shape[1])
+        row = jax.random.key_data(key)[-1] % samples.shape[1]
         return samples[classes[poi], row], classes
 
     return _mdp(config, params, model, lambda key, classes: classes, observe)

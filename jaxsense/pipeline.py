@@ -29,7 +29,7 @@ from jaxsense.programs import (
     num_scenes,
 )
 from jaxsense.sim.world import Scene, make_world
-from jaxsense.training import Params
+from jaxsense.networks import Params
 from jaxsense.types import Belief, Key
 from jaxsense.vae.detectors import Detector
 

@@ -22,7 +22,7 @@ from jaxsense.models import Models, jmvae_shape, untrained
 from jaxsense.monitor import Monitor, Program
 from jaxsense.observe import Bank
 from jaxsense.sim.world import Scene, World
-from jaxsense.training import Params
+from jaxsense.networks import Params
 from jaxsense.types import Key
 from jaxsense.vae import detectors, jmvae
 from jaxsense.vae.detectors import Detector

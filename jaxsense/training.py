@@ -8,11 +8,8 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from jaxsense.networks import Params
 from jaxsense.types import Key
-
-Params = Any
-"""A pytree of network parameters."""
-
 
 @struct.dataclass
 class FitState:

@@ -18,7 +18,7 @@ from benchmarks.maps import MODALITY, Learner, Task
 from benchmarks.measure import Options, Side
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapState
-from jaxsense.training import Params
+from jaxsense.networks import Params
 
 
 @struct.dataclass

@@ -1,4 +1,4 @@
-"""The temporal-difference loss of a Q-network, for one transition."""
+"""The temporal-difference loss of a Q-network."""
 
 import chex
 import jax
@@ -12,21 +12,25 @@ def td_error(
     discount_t: jax.Array,
     q_t: jax.Array,
 ) -> jax.Array:
-    """One-step Q-learning error (Mnih et al. 2015, Eq. 2).
+    """One-step Q-learning error (Mnih et al. 2015, Eq. 2), of one transition or of many.
 
     Args:
-      q_tm1: `[A]` values before the action.
-      a_tm1: `[]` int32 action.
-      r_t: `[]` reward.
-      discount_t: `[]` discount factor, 0 where the episode ended.
-      q_t: `[A]` the target network's values after the action; no gradient flows into them.
+      q_tm1: `[A, ...]` values before the action.
+      a_tm1: `[...]` int32 action.
+      r_t: `[...]` reward.
+      discount_t: `[...]` discount factor, 0 where the episode ended.
+      q_t: `[A, ...]` the target network's values after the action; no gradient flows into them.
 
     Returns:
-      `[]` target minus value.
+      `[...]` target minus value.
     """
-    chex.assert_rank([q_tm1, a_tm1, r_t, discount_t, q_t], [1, 0, 0, 0, 1])
-    target = r_t + discount_t * jnp.max(q_t)
-    return jax.lax.stop_gradient(target) - q_tm1[a_tm1]
+    chex.assert_equal_shape([a_tm1, r_t, discount_t])
+    chex.assert_shape([q_tm1, q_t], (None, *a_tm1.shape))
+    target = r_t + discount_t * jnp.max(q_t, axis=0)
+    # Cheaper than to index, whose gradient is a scatter.
+    actions = jnp.arange(q_tm1.shape[0]).reshape(-1, *[1] * a_tm1.ndim)
+    value = jnp.sum(jnp.where(actions == a_tm1[None], q_tm1, 0.0), axis=0)
+    return jax.lax.stop_gradient(target) - value
 
 
 def pseudo_huber(error: jax.Array) -> jax.Array:

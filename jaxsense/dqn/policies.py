@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.indexing import Index
-from jaxsense.networks import MLP
-from jaxsense.training import Params
+from jaxsense.networks import MLP, Params
 from jaxsense.types import Key
 
 Policy = Callable[[Key, MapState], jax.Array]

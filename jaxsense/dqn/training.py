@@ -22,7 +22,7 @@ from jaxsense.dqn import belief_mdp, losses, replay
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.policies import q_network
 from jaxsense.indexing import Index
-from jaxsense.training import Params
+from jaxsense.networks import Params, apply_to_columns
 from jaxsense.types import Key, Transition
 
 
@@ -77,7 +77,7 @@ class _Draws:
       action: `[E]` which action it tries then.
       start: `[E]` which start follows an episode that has ended.
       step: `[E]` keys of the steps.
-      replay: `[updates, B, 2]` what is learnt from.
+      replay: `[updates, blocks, 2]` what is learnt from.
     """
 
     coin: jax.Array
@@ -99,13 +99,12 @@ def init(key: Key, mdp: MapMdp, config: DqnConfig, prepared: MapState) -> DqnSta
     envs = jax.tree.map(lambda x: jnp.zeros((config.num_envs, *x.shape[1:]), x.dtype), prepared)
     s = belief_mdp.as_state(jax.tree.map(lambda x: x[0], envs.belief))
     params = q_network(mdp, config.hidden).init(key, s)
-    example = Transition(s, jnp.int32(0), jnp.float32(0), jnp.float32(0), s)
-    rounds = config.replay_capacity // config.num_envs
+    rounds, blocks = config.replay_capacity // config.num_envs, config.num_envs // config.block
     return DqnState(
         params=params,
         target=params,
         optimiser=_optimiser(config).init(params),
-        replay=replay.init(example, rounds, config.num_envs),
+        replay=replay.init(s.size, rounds, blocks, config.block),
         envs=envs,
         needs_start=jnp.ones(config.num_envs, bool),
         total_reward=jnp.zeros(config.num_envs),
@@ -218,14 +217,14 @@ def state_specs() -> DqnState:
 def _draw(key: Key, mdp: MapMdp, config: DqnConfig) -> _Draws:
     """`[chunk]` of random numbers: drawn in one go, they cost a small part of what they would."""
     env_key, step_key, replay_key = jax.random.split(key, 3)
-    shape = (config.chunk, config.num_envs)
+    shape, blocks = (config.chunk, config.num_envs), config.batch // config.block
     coin, action, start = jax.random.uniform(env_key, (3, *shape))
     return _Draws(
         coin=coin,
         action=jnp.floor(action * (mdp.num_pois + 1)).astype(jnp.int32),
         start=jnp.floor(start * (config.num_starts // config.num_envs)).astype(jnp.int32),
         step=jax.random.split(step_key, shape),
-        replay=jax.random.uniform(replay_key, (config.chunk, config.updates, config.batch, 2)),
+        replay=jax.random.uniform(replay_key, (config.chunk, config.updates, blocks, 2)),
     )
 
 
@@ -243,16 +242,17 @@ def _epoch(
         config.epsilon_min, config.epsilon_start * config.epsilon_decay**state.epoch
     )
     started = _restart(draws.start, state.envs, shares, state.needs_start)
-    s_tm1 = jax.vmap(belief_mdp.as_state)(started.belief)
-    values = jnp.asarray(q_network(mdp, config.hidden).apply(state.params, s_tm1))
-    chex.assert_shape(values, (None, mdp.num_pois + 1))
-    greedy = jnp.argmax(values, axis=-1).astype(jnp.int32)
+    as_states = jax.vmap(belief_mdp.as_state, out_axes=-1)
+    s_tm1 = as_states(started.belief)
+    values = apply_to_columns(state.params, s_tm1)
+    chex.assert_shape(values, (mdp.num_pois + 1, None))
+    greedy = jnp.argmax(values, axis=0).astype(jnp.int32)
     a_tm1 = jnp.where(draws.coin < epsilon, draws.action, greedy)
     envs, outcome = jax.vmap(lambda k, env, a: belief_mdp.step(k, mdp, env, a, modality))(
         draws.step, started, a_tm1
     )
-    s_t = jax.vmap(belief_mdp.as_state)(envs.belief)
     discount_t = jnp.where(outcome.is_over, 0.0, 1.0)
+    s_t = as_states(envs.belief)
     transitions = Transition(s_tm1, a_tm1, outcome.reward, discount_t, s_t)
     memory = replay.add(state.replay, transitions)
 
@@ -261,7 +261,7 @@ def _epoch(
     ended = jnp.sum(has_ended), jnp.sum(jnp.where(has_ended, total_reward, 0.0))
     episodes, ended_reward = ended if axis is None else jax.lax.psum(ended, axis)
 
-    params, optimiser, loss = _learn(mdp, config, axis, state, memory, draws.replay)
+    params, optimiser, loss = _learn(config, axis, state, memory, draws.replay)
     is_copied = (state.epoch + 1) % config.target_period == 0
     target = jax.tree.map(lambda new, old: jnp.where(is_copied, new, old), params, state.target)
     info = EpochInfo(loss, ended_reward / jnp.maximum(episodes, 1), episodes, epsilon)
@@ -279,23 +279,20 @@ def _epoch(
 
 
 def _learn(
-    mdp: MapMdp,
     config: DqnConfig,
     axis: str | None,
     state: DqnState,
     memory: replay.Replay,
     draws: jax.Array,
 ) -> tuple[Params, optax.OptState, jax.Array]:
-    """Gradient steps, one for each of the `[updates, B, 2]` draws."""
-    network = q_network(mdp, config.hidden)
+    """Gradient steps, one for each of the `[updates, blocks, 2]` draws."""
     optimiser = _optimiser(config)
 
     def loss(params: Params, batch: Transition) -> jax.Array:
-        q_tm1 = jnp.asarray(network.apply(params, batch.s_tm1))
-        q_t = jnp.asarray(network.apply(state.target, batch.s_t))
-        error = jax.vmap(losses.td_error)(
-            q_tm1, batch.a_tm1, batch.r_t, config.discount * batch.discount_t, q_t
-        )
+        q_tm1 = apply_to_columns(params, batch.s_tm1)
+        q_t = apply_to_columns(state.target, batch.s_t)
+        discount_t = config.discount * batch.discount_t
+        error = losses.td_error(q_tm1, batch.a_tm1, batch.r_t, discount_t, q_t)
         return jnp.mean(losses.pseudo_huber(error))
 
     def update(carry, draws: jax.Array):

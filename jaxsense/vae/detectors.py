@@ -10,8 +10,8 @@ from flax import struct
 
 from jaxsense import training
 from jaxsense.config import DetectorConfig
-from jaxsense.networks import MLP
-from jaxsense.training import FitState, Params
+from jaxsense.networks import MLP, Params
+from jaxsense.training import FitState
 from jaxsense.types import Key
 
 

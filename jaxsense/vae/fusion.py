@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.training import Params
+from jaxsense.networks import Params
 from jaxsense.types import Belief
 from jaxsense.vae import jmvae
 from jaxsense.vae.jmvae import Jmvae

@@ -16,8 +16,8 @@ import optax
 
 from jaxsense import training
 from jaxsense.config import JmvaeConfig
-from jaxsense.networks import MLP
-from jaxsense.training import FitState, Params
+from jaxsense.networks import MLP, Params
+from jaxsense.training import FitState
 from jaxsense.types import Belief, Features, Key
 from jaxsense.vae import gaussian
 

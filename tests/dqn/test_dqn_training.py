@@ -10,7 +10,7 @@ import pytest
 from toys import paying_once_mdp
 
 from jaxsense.config import DqnConfig
-from jaxsense.dqn import belief_mdp, policies, training
+from jaxsense.dqn import belief_mdp, policies, replay, training
 
 # Every episode is cut after one action: no value could be learnt beyond it, were a cut an end.
 MDP = paying_once_mdp(num_pois=2, max_steps=1)
@@ -200,4 +200,6 @@ def test_an_episode_goes_on_until_nop_or_the_cut():
     np.testing.assert_array_equal(state.needs_start, False)
     np.testing.assert_array_equal(state.envs.steps, 1)
     # The replay tells what is left of an episode that was cut, so the discount is never 0 here.
-    np.testing.assert_array_equal(state.replay.items.discount_t[:7], 1.0)
+    drawn = replay.sample(jax.random.uniform(jax.random.key(3), (64, 2)), state.replay)
+    np.testing.assert_array_equal(drawn.discount_t, 1.0)
+    assert set(np.asarray(drawn.a_tm1)) == {0}

@@ -30,9 +30,20 @@ def test_no_gradient_flows_into_the_target():
     np.testing.assert_array_equal(by_target, [0.0, 0.0, 0.0])
 
 
-def test_td_error_takes_one_transition():
+def test_td_errors_of_many_transitions_are_those_of_each():
+    keys = jax.random.split(jax.random.key(0), 4)
+    q_tm1, q_t = jax.random.normal(keys[0], (2, 3, 7))
+    actions = jax.random.randint(keys[1], (7,), 0, 3)
+    rewards, discounts = jax.random.uniform(keys[2], (2, 7))
+    together = losses.td_error(q_tm1, actions, rewards, discounts, q_t)
+    for i in range(7):
+        alone = losses.td_error(q_tm1[:, i], actions[i], rewards[i], discounts[i], q_t[:, i])
+        np.testing.assert_allclose(together[i], alone, rtol=1e-6)
+
+
+def test_values_of_other_transitions_than_the_actions_raise():
     with pytest.raises(AssertionError):
-        td_error(Q_TM1[None], Q_T)
+        td_error(Q_TM1[:, None], Q_T)
 
 
 def test_pseudo_huber_as_worked_by_hand():

@@ -1,6 +1,7 @@
 """The replay ring against a deque, and that draws are uniform."""
 
 import collections
+from dataclasses import astuple
 
 import chex
 import jax
@@ -9,79 +10,104 @@ import numpy as np
 import pytest
 
 from jaxsense.dqn import replay
+from jaxsense.types import Transition
 
-EXAMPLE = {"s": jnp.zeros(2), "a": jnp.int32(0)}
-ROUNDS, NUM_ENVS = 4, 3
+ROUNDS, BLOCKS, WIDTH = 4, 3, 2
+NUM_ENVS = BLOCKS * WIDTH
 
 
-def items(numbers):
-    """Items that can be told apart: s is (i, -i) and a is i."""
-    numbers = np.asarray(numbers)
-    s = jnp.array(np.stack([numbers, -numbers], axis=-1), jnp.float32)
-    return {"s": s, "a": jnp.array(numbers, jnp.int32)}
+def transitions(numbers):
+    """Transitions that can be told apart: each part is a multiple of i."""
+    i = jnp.asarray(np.asarray(numbers), jnp.float32)
+    return Transition(
+        s_tm1=jnp.stack([i, -i]),
+        a_tm1=i.astype(jnp.int32),
+        r_t=2 * i,
+        discount_t=3 * i,
+        s_t=jnp.stack([4 * i, -4 * i]),
+    )
+
+
+def everything(ring, rounds):
+    """All that is in the first rounds of a ring, by drawing each of its blocks."""
+    draws = jnp.stack([(jnp.arange(rounds) + 0.5) / rounds, jnp.zeros(rounds)], axis=-1)
+    # A draw for each block takes that block.
+    each = jax.vmap(lambda draw: replay.sample(jnp.tile(draw, (BLOCKS, 1)), ring))(draws)
+    return each
 
 
 def test_the_ring_holds_what_a_deque_would():
-    ring, deque = replay.init(EXAMPLE, ROUNDS, NUM_ENVS), collections.deque(maxlen=ROUNDS)
+    ring, deque = replay.init(2, ROUNDS, BLOCKS, WIDTH), collections.deque(maxlen=ROUNDS)
     add = jax.jit(replay.add)
-    numbers = np.random.default_rng(0).permutation(30).reshape(-1, NUM_ENVS)
+    numbers = np.random.default_rng(0).permutation(60).reshape(-1, NUM_ENVS)
     for i, batch in enumerate(numbers):
-        ring = add(ring, items(batch))
+        ring = add(ring, transitions(batch))
         deque.append(batch)
         filled = min(i + 1, ROUNDS)
-        held = np.asarray(ring.items["a"])[:filled]
+        held = everything(ring, filled)
         assert ring.count == i + 1
         # Rolled so that the oldest comes first.
         oldest = (i + 1) % ROUNDS if filled == ROUNDS else 0
-        np.testing.assert_array_equal(np.roll(held, -oldest, axis=0), deque)
-        np.testing.assert_array_equal(ring.items["s"][:filled], items(held)["s"])
+        np.testing.assert_array_equal(np.roll(held.a_tm1, -oldest, axis=0), deque)
+        for row in range(filled):
+            expected = transitions(held.a_tm1[row])
+            chex.assert_trees_all_equal(jax.tree.map(lambda x: x[row], held), expected)  # noqa: B023
 
 
 @pytest.mark.parametrize("rounds", [1, 3, 7])
-def test_every_item_that_is_there_is_drawn_with_the_same_chance(rounds):
-    ring = replay.init(EXAMPLE, ROUNDS, NUM_ENVS)
+def test_every_transition_that_is_there_is_drawn_with_the_same_chance(rounds):
+    ring = replay.init(2, ROUNDS, BLOCKS, WIDTH)
     for i in range(rounds):
-        ring = replay.add(ring, items(NUM_ENVS * i + np.arange(NUM_ENVS)))
-    drawn = replay.sample(jax.random.uniform(jax.random.key(0), (4000, 2)), ring)
-    np.testing.assert_array_equal(drawn["s"][:, 0], drawn["a"])  # rows stay together
-    counts = np.bincount(drawn["a"], minlength=NUM_ENVS * rounds)
+        ring = replay.add(ring, transitions(NUM_ENVS * i + np.arange(NUM_ENVS)))
+    drawn = replay.sample(jax.random.uniform(jax.random.key(0), (6000, 2)), ring)
+    chex.assert_trees_all_equal(drawn, transitions(drawn.a_tm1))  # what belongs together stays so
+    counts = np.bincount(drawn.a_tm1, minlength=NUM_ENVS * rounds)
     there = counts[NUM_ENVS * max(0, rounds - ROUNDS) :]
-    assert counts.sum() == there.sum() == 4000
-    chance = 1 / len(there)
-    np.testing.assert_allclose(there, 4000 * chance, atol=4 * np.sqrt(4000 * chance))
+    assert counts.sum() == there.sum() == 6000 * WIDTH
+    expected = counts.sum() / len(there)
+    np.testing.assert_allclose(there, expected, atol=4 * np.sqrt(expected))
 
 
-def test_draws_are_tied_to_environments_in_order():
-    ring = replay.add(replay.init(EXAMPLE, ROUNDS, 8), items(np.arange(8)))
-    # 4 draws of 8 environments: the first takes 0 or 1, by the half of [0, 1) that it is in.
+def test_draws_are_tied_to_blocks_in_order():
+    ring = replay.add(replay.init(2, ROUNDS, 8, 1), transitions(np.arange(8)))
+    # 4 draws of 8 blocks: the first takes 0 or 1, by the half of [0, 1) that it is in.
     draws = jnp.array([[0.9, 0.4], [0.0, 0.6], [0.5, 0.0], [0.2, 0.99]])
-    np.testing.assert_array_equal(replay.sample(draws, ring)["a"], [0, 3, 4, 7])
-    # 8 draws of 4 environments: two of each, wherever in [0, 1) they are.
-    ring = replay.add(replay.init(EXAMPLE, ROUNDS, 4), items(np.arange(4)))
+    np.testing.assert_array_equal(replay.sample(draws, ring).a_tm1, [0, 3, 4, 7])
+    # 8 draws of 4 blocks of 2: two of each, wherever in [0, 1) they are.
+    ring = replay.add(replay.init(2, ROUNDS, 4, 2), transitions(np.arange(8)))
     draws = jax.random.uniform(jax.random.key(0), (8, 2))
-    np.testing.assert_array_equal(replay.sample(draws, ring)["a"], [0, 0, 1, 1, 2, 2, 3, 3])
+    blocks = [0, 1, 0, 1, 2, 3, 2, 3, 4, 5, 4, 5, 6, 7, 6, 7]
+    np.testing.assert_array_equal(replay.sample(draws, ring).a_tm1, blocks)
 
 
 def test_the_largest_number_below_one_draws_what_is_there():
-    ring = replay.add(replay.init(EXAMPLE, ROUNDS, 512), items(np.arange(512)))
+    ring = replay.add(replay.init(2, ROUNDS, 512, 1), transitions(np.arange(512)))
     last = replay.sample(jnp.full((512, 2), np.nextafter(np.float32(1), np.float32(0))), ring)
-    assert last["a"][-1] == 511
+    assert last.a_tm1[-1] == 511
 
 
-def test_a_round_that_does_not_fit_raises():
-    ring = replay.init(EXAMPLE, ROUNDS, NUM_ENVS)
-    with pytest.raises(AssertionError):
-        replay.add(ring, items(range(NUM_ENVS + 1)))
-    with pytest.raises(AssertionError):
-        replay.add(ring, {"s": jnp.zeros((3, 2)), "a": jnp.zeros(3, jnp.float32)})
+def test_what_does_not_fit_raises():
+    ring = replay.init(2, ROUNDS, BLOCKS, WIDTH)
+    with pytest.raises(AssertionError, match="transitions"):
+        replay.add(ring, transitions(range(NUM_ENVS + 1)))
+    with pytest.raises(AssertionError, match="transitions"):
+        replay.add(replay.init(3, ROUNDS, BLOCKS, WIDTH), transitions(range(NUM_ENVS)))
     with pytest.raises(AssertionError, match="draws"):
         replay.sample(jnp.zeros(3), ring)
 
 
 def test_add_takes_a_donated_state_and_is_traced_once():
     add = jax.jit(chex.assert_max_traces(replay.add, n=1), donate_argnums=0)
-    ring = replay.init(EXAMPLE, 2, 2)
+    ring = replay.init(2, 2, 1, 2)
     for i in range(3):
-        before, ring = ring, add(ring, items([i, i + 10]))
-        assert before.items["s"].is_deleted()
-    np.testing.assert_array_equal(ring.items["a"], [[2, 12], [1, 11]])
+        before, ring = ring, add(ring, transitions([i, i + 10]))
+        assert before.columns.is_deleted()
+    both = replay.sample(jnp.array([[0.0, 0.0], [0.9, 0.0]]), ring)
+    np.testing.assert_array_equal(both.a_tm1, [2, 12, 1, 11])
+
+
+def test_parts_of_a_transition_have_the_dtypes_they_were_added_with():
+    ring = replay.add(replay.init(2, ROUNDS, BLOCKS, WIDTH), transitions(range(NUM_ENVS)))
+    drawn = replay.sample(jnp.zeros((BLOCKS, 2)), ring)
+    kinds = [x.dtype for x in astuple(drawn)]
+    assert kinds == [x.dtype for x in astuple(transitions(range(NUM_ENVS)))]
