@@ -147,7 +147,7 @@ def compiled(
         function = devices.spread(function, mesh)
         args = jax.device_put(args, NamedSharding(mesh, PartitionSpec(devices.AXIS)))
     begin = time.perf_counter()
-    program = jax.jit(function).lower(*args).compile()
+    program = jax.jit(function).lower(*args).compile(devices.compiler_options())
     compile_s = time.perf_counter() - begin
     number = 1 if mesh is None else mesh.size
     return Side(lambda: jax.block_until_ready(program(*args)), work, batch, compile_s, number)

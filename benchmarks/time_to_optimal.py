@@ -12,10 +12,9 @@ from benchmarks import measure, peers
 from benchmarks.maps import MODALITY, Examiner, Learner, Task
 from benchmarks.measure import Options, Row
 from benchmarks.trained import trained_task
+from jaxsense import devices
 from jaxsense.dqn import training
 
-# As in a run: a lower level of optimisation compiles faster and runs as fast.
-_COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
 _LONGEST = 60.0  # s that we may take
 _MOST_TIMES = 20  # our time, after which a peer is stopped
 
@@ -95,7 +94,7 @@ def _learner(task: Task) -> Learner:
     carry = jax.eval_shape(start, key)
     lowered = jax.jit(start).lower(key), jax.jit(go_on, donate_argnums=0).lower(carry)
     with concurrent.futures.ThreadPoolExecutor(len(lowered)) as pool:
-        begin, train = pool.map(lambda program: program.compile(_COMPILER_OPTIONS), lowered)
+        begin, train = pool.map(lambda program: program.compile(devices.compiler_options()), lowered)
     return Learner(start=lambda: begin(key), go_on=train, as_params=lambda carry: carry[1].params)
 
 

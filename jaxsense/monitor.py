@@ -10,16 +10,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxsense import devices
+
 Listener = Callable[[str, int, int, dict[str, float]], None]
 """`(stage, done, total, figures)`, called from the host between two chunks of work."""
 
-
 _COMPILERS = min(os.cpu_count() or 1, 8)
-
-
-def _compiler_options() -> Any:
-    """On CPU a lower level of optimisation: it saves a third of the time and costs no speed."""
-    return {"xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else {}
 
 
 class StageError(RuntimeError):
@@ -62,7 +58,7 @@ class Program:
         def compile_lowered() -> None:
             begin = time.perf_counter()
             try:
-                compiled = lowered.compile(compiler_options=_compiler_options())
+                compiled = lowered.compile(compiler_options=devices.compiler_options())
             except Exception as error:
                 self.fail(error)
             else:

@@ -48,6 +48,7 @@ def bank_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> MapMdp
 
     def observe(key: Key, classes: jax.Array, poi: jax.Array, modality: int):
         samples = bank[modality]
+        # A key that comes from a split is as random as what would be drawn from it.
         row = jax.random.key_data(key)[-1] % samples.shape[1]
         return samples[classes[poi], row], classes
 

@@ -9,7 +9,6 @@ import optax
 from flax import struct
 
 from jaxsense.networks import Params
-from jaxsense.types import Key
 
 @struct.dataclass
 class FitState:
@@ -28,7 +27,8 @@ class FitState:
 
 def adam(learning_rate: float, steps: int) -> optax.GradientTransformation:
     """Adam with a learning rate that falls from `learning_rate` to zero along a cosine."""
-    return optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
+    # As one vector: the networks are so small that every array costs more than what is in it.
+    return optax.flatten(optax.adam(optax.cosine_decay_schedule(learning_rate, steps)))
 
 
 def start(params: Params, optimiser: optax.GradientTransformation) -> FitState:
@@ -37,39 +37,30 @@ def start(params: Params, optimiser: optax.GradientTransformation) -> FitState:
 
 
 def fit(
-    key: Key,
     state: FitState,
-    loss: Callable[[Key, Params, Any, jax.Array], jax.Array],
-    draw_batch: Callable[[Key], Any],
+    loss: Callable[[Params, Any, jax.Array], jax.Array],
+    drawn: Any,
     optimiser: optax.GradientTransformation,
-    steps: int,
 ) -> tuple[FitState, jax.Array]:
     """Makes gradient steps.
 
     Args:
-      key: random key.
       state: where to start.
-      loss: `(key, params, batch, step) -> []`, where step counts from the start of the training.
-      draw_batch: `(key) -> batch`.
+      loss: `(params, drawn, step) -> []`, where step counts from the start of the training.
+      drawn: pytree of `[steps, ...]` arrays, all that is random in each step. Drawn for all steps
+        at once, random numbers cost a small part of what they would in the loop.
       optimiser: of optax.
-      steps: how many.
 
     Returns:
       The state after the last step and the `[steps]` losses. A loss that is not finite is not
       caught here: look at the losses.
     """
 
-    def make_step(state: FitState, keys) -> tuple[FitState, jax.Array]:
-        batch_key, loss_key = keys
-        batch = draw_batch(batch_key)
-        value, gradient = jax.value_and_grad(
-            lambda params: loss(loss_key, params, batch, state.step)
-        )(state.params)
+    def make_step(state: FitState, drawn: Any) -> tuple[FitState, jax.Array]:
+        value, gradient = jax.value_and_grad(loss)(state.params, drawn, state.step)
         update, optimiser_state = optimiser.update(gradient, state.optimiser, state.params)
         params = optax.apply_updates(state.params, update)
         return FitState(params, optimiser_state, state.step + 1), value
 
-    batch_key, loss_key = jax.random.split(key)
-    keys = jax.random.split(batch_key, steps), jax.random.split(loss_key, steps)
-    state, losses = jax.lax.scan(make_step, state, keys)
+    state, losses = jax.lax.scan(make_step, state, drawn)
     return state, jnp.asarray(losses)

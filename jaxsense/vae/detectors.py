@@ -10,7 +10,7 @@ from flax import struct
 
 from jaxsense import training
 from jaxsense.config import DetectorConfig
-from jaxsense.networks import MLP, Params
+from jaxsense.networks import MLP, Params, apply_to_columns
 from jaxsense.training import FitState
 from jaxsense.types import Key
 
@@ -93,17 +93,15 @@ def train(
     """
     chex.assert_equal_shape_prefix([windows, labels], 1)
 
-    def draw_batch(key: Key):
-        rows = jax.random.randint(key, (config.batch,), 0, windows.shape[0])
-        return windows[rows], labels[rows]
+    rows = jax.random.randint(key, (steps, config.batch), 0, windows.shape[0])
+    standard = (windows - detector.offset[None]) / detector.scale
 
-    def loss(key: Key, params: Params, batch, step) -> jax.Array:
-        del key, step
-        new = dataclasses.replace(detector, params=params)
-        predicted = jax.vmap(lambda window: logits(new, window))(batch[0])
-        return optax.softmax_cross_entropy_with_integer_labels(predicted, batch[1]).mean()
+    def loss(params: Params, rows: jax.Array, step: jax.Array) -> jax.Array:
+        del step
+        predicted = apply_to_columns(params, standard[rows].T)
+        return optax.softmax_cross_entropy_with_integer_labels(predicted, labels[rows], 0).mean()
 
-    return training.fit(key, state, loss, draw_batch, _optimiser(config), steps)
+    return training.fit(state, loss, rows, _optimiser(config))
 
 
 def _optimiser(config: DetectorConfig) -> optax.GradientTransformation:

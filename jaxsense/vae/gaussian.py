@@ -4,8 +4,6 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.types import Key
-
 
 def kl_divergence(
     mean_p: jax.Array, log_var_p: jax.Array, mean_q: jax.Array, log_var_q: jax.Array
@@ -35,10 +33,17 @@ def kl_to_standard_normal(mean: jax.Array, log_var: jax.Array) -> jax.Array:
     return kl_divergence(mean, log_var, jnp.zeros_like(mean), jnp.zeros_like(log_var))
 
 
-def sample(key: Key, mean: jax.Array, log_var: jax.Array) -> jax.Array:
-    """A draw of shape `[D]`, differentiable in `mean` and `log_var` (reparameterised)."""
+def sample(noise: jax.Array, mean: jax.Array, log_var: jax.Array) -> jax.Array:
+    """A draw, differentiable in `mean` and `log_var` (reparameterised).
+
+    Args:
+      noise: `[D, ...]` standard normal numbers.
+      mean: `[D, ...]`.
+      log_var: `[D, ...]` logarithm of the variances.
+    """
     chex.assert_shape(log_var, mean.shape, custom_message="log_var")
-    return mean + jnp.exp(0.5 * log_var) * jax.random.normal(key, mean.shape)
+    chex.assert_shape(noise, mean.shape, custom_message="noise")
+    return mean + jnp.exp(0.5 * log_var) * noise
 
 
 def moment_match(mean: jax.Array, std: jax.Array) -> tuple[jax.Array, jax.Array]:

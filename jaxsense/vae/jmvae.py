@@ -16,7 +16,7 @@ import optax
 
 from jaxsense import training
 from jaxsense.config import JmvaeConfig
-from jaxsense.networks import MLP, Params
+from jaxsense.networks import MLP, Params, apply_to_columns
 from jaxsense.training import FitState
 from jaxsense.types import Belief, Features, Key
 from jaxsense.vae import gaussian
@@ -160,31 +160,73 @@ def loss(
     """
     if any(x is None for x in features):
         raise ValueError(f"features = {features}: must hold every one of {model.modalities}")
+    noise = jax.random.normal(key, (model.latent_size, 1))
+    total, parts = losses(
+        noise,
+        params,
+        model,
+        tuple(x[:, None] for x in features),
+        alpha=alpha,
+        beta=beta,
+        reconstruction_weights=reconstruction_weights,
+    )
+    return total[0], {name: part[0] for name, part in parts.items()}
+
+
+def losses(
+    noise: jax.Array,
+    params: Params,
+    model: Jmvae,
+    features: tuple[jax.Array, ...],
+    *,
+    alpha: float | jax.Array,
+    beta: float | jax.Array,
+    reconstruction_weights: tuple[float, ...],
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """`loss` of a batch, whose axis is the last one of everything.
+
+    Args:
+      noise: `[D, B]` standard normal numbers, by which z is drawn.
+      params: from `init`.
+      model: the shape.
+      features: `[D_m, B]` of every modality.
+      alpha: see `loss`.
+      beta: see `loss`.
+      reconstruction_weights: see `loss`.
+
+    Returns:
+      `[B]` losses, and their `[B]` parts before weighting.
+
+    Raises:
+      ValueError: if a modality's weight is missing.
+    """
     if len(reconstruction_weights) != len(model.modalities):
         raise ValueError(
             f"reconstruction_weights = {reconstruction_weights}: must hold one weight for each of "
             f"{model.modalities}"
         )
-    mean, log_var = encode(params, model, features)
-    decoded = decode(params, model, gaussian.sample(key, mean, log_var))
-    reconstruction = sum(
-        weight * 0.5 * jnp.sum((x - x_decoded) ** 2)
-        for weight, x, x_decoded in zip(reconstruction_weights, features, decoded, strict=True)
-    )
-    prior = gaussian.kl_to_standard_normal(mean, log_var)
-    divergences = [
-        gaussian.kl_divergence(
-            mean,
-            log_var,
-            *encode(
-                params, model, tuple(x if m in subset else None for m, x in enumerate(features))
-            ),
-        )
-        for subset in model.subsets[:-1]
-    ]
-    subsets = jnp.sum(jnp.array(divergences))
-    parts = {"reconstruction": jnp.asarray(reconstruction), "prior": prior, "subsets": subsets}
-    return parts["reconstruction"] + beta * prior + alpha * subsets, parts
+    batch = noise.shape[-1]
+    for x, size in zip(features, model.feature_sizes, strict=True):
+        chex.assert_shape(x, (size, batch), custom_message="features")
+
+    def posterior_of(subset: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
+        network = params["encoders"][model.encoder_name(subset)]
+        output = apply_to_columns(network, jnp.concatenate([features[m] for m in subset]))
+        mean, log_var = jnp.split(output, 2)
+        return mean, log_var
+
+    joint = posterior_of(model.subsets[-1])
+    z = gaussian.sample(noise, *joint)
+    reconstruction = jnp.zeros(batch)
+    for name, x, weight in zip(model.modalities, features, reconstruction_weights, strict=True):
+        decoded = apply_to_columns(params["decoders"][name], z)
+        reconstruction += weight * 0.5 * jnp.sum((x - decoded) ** 2, axis=0)
+    prior = jax.vmap(gaussian.kl_to_standard_normal, in_axes=-1)(*joint)
+    divergence, subsets = jax.vmap(gaussian.kl_divergence, in_axes=-1), jnp.zeros(batch)
+    for subset in model.subsets[:-1]:
+        subsets += divergence(*joint, *posterior_of(subset))
+    parts = {"reconstruction": reconstruction, "prior": prior, "subsets": subsets}
+    return reconstruction + beta * prior + alpha * subsets, parts
 
 
 def start(params: Params, config: JmvaeConfig) -> FitState:
@@ -217,33 +259,33 @@ def train(
     for features, size in zip(bank, model.feature_sizes, strict=True):
         chex.assert_shape(features, (bank[0].shape[0], None, size), custom_message="bank")
     num_classes = bank[0].shape[0]
+    columns = [jnp.moveaxis(x, -1, 0) for x in bank]
 
-    def draw_batch(key: Key):
-        class_key, *row_keys = jax.random.split(key, 1 + len(bank))
-        classes = jax.random.randint(class_key, (config.batch,), 0, num_classes)
-        return tuple(
-            x[classes, jax.random.randint(k, (config.batch,), 0, x.shape[1])]
-            for x, k in zip(bank, row_keys, strict=True)
+    def draw(key: Key):
+        class_key, noise_key, *row_keys = jax.random.split(key, 2 + len(bank))
+        shape = (steps, config.batch)
+        classes = jax.random.randint(class_key, shape, 0, num_classes)
+        features = [
+            jnp.moveaxis(x[:, classes, jax.random.randint(k, shape, 0, x.shape[-1])], 1, 0)
+            for x, k in zip(columns, row_keys, strict=True)
+        ]
+        noise = jax.random.normal(noise_key, (steps, model.latent_size, config.batch))
+        return noise, tuple(features)
+
+    def batch_loss(params: Params, drawn, step: jax.Array) -> jax.Array:
+        noise, features = drawn
+        total, _ = losses(
+            noise,
+            params,
+            model,
+            features,
+            alpha=config.alpha,
+            beta=annealed_beta(step, config),
+            reconstruction_weights=config.reconstruction_weights,
         )
+        return jnp.mean(total)
 
-    def batch_loss(key: Key, params: Params, batch, step: jax.Array) -> jax.Array:
-        beta = annealed_beta(step, config)
-
-        def example_loss(key: Key, *features: jax.Array) -> jax.Array:
-            weights = config.reconstruction_weights
-            return loss(
-                key,
-                params,
-                model,
-                features,
-                alpha=config.alpha,
-                beta=beta,
-                reconstruction_weights=weights,
-            )[0]
-
-        return jnp.mean(jax.vmap(example_loss)(jax.random.split(key, config.batch), *batch))
-
-    return training.fit(key, state, batch_loss, draw_batch, _optimiser(config), steps)
+    return training.fit(state, batch_loss, draw(key), _optimiser(config))
 
 
 def annealed_beta(step: jax.Array, config: JmvaeConfig) -> jax.Array:

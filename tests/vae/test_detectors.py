@@ -61,6 +61,19 @@ def test_detect_gives_probabilities_of_the_labels_in_order(trained):
     np.testing.assert_array_equal(features[:, 1] > 0.5, labels == 1)
 
 
+def test_a_training_starts_from_the_loss_of_the_detector_it_is_given():
+    windows, labels = synthetic_windows(jax.random.key(0), 1000)
+    detector = detectors.init(jax.random.key(1), windows, 2, CONFIG)
+    config = replace(CONFIG, steps=20, batch=256, learning_rate=1e-12)
+    start = detectors.start(detector, config)
+    _, losses = detectors.train(jax.random.key(2), start, detector, windows, labels, config, 20)
+    assert len(np.unique(losses)) == 20  # every step draws anew
+    each = jax.vmap(detectors.detect, in_axes=(None, 0))(detector, windows)
+    expected = -np.log(np.asarray(each)[np.arange(1000), labels])
+    error = expected.std() / np.sqrt(20 * 256)
+    np.testing.assert_allclose(losses.mean(), expected.mean(), atol=4 * error)
+
+
 def test_init_standardises_the_readings():
     windows = jnp.array([[1.0, 10.0], [3.0, 14.0]])
     detector = detectors.init(jax.random.key(0), windows, 2, CONFIG)

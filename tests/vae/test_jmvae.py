@@ -174,6 +174,41 @@ def test_loss_of_three_modalities_follows_from_encode_and_decode():
     assert losses.min() > divergence
 
 
+def test_losses_of_a_batch_are_those_of_its_examples():
+    params = jmvae.init(jax.random.key(0), THREE)
+    keys = jax.random.split(jax.random.key(1), 5)
+    examples = jax.vmap(lambda k: some_features(THREE, k))(jnp.arange(5))
+    options = {"alpha": 0.7, "beta": 0.3, "reconstruction_weights": (2.0, 0.5, 3.0)}
+    noise = jax.vmap(lambda k: jax.random.normal(k, (THREE.latent_size,)), out_axes=-1)(keys)
+    columns = tuple(x.T for x in examples)
+    together, parts = jmvae.losses(noise, params, THREE, columns, **options)
+    assert together.shape == (5,)
+    for i, key in enumerate(keys):
+        alone, of_one = jmvae.loss(key, params, THREE, tuple(x[i] for x in examples), **options)
+        np.testing.assert_allclose(together[i], alone, rtol=1e-5)
+        for name, part in of_one.items():
+            np.testing.assert_allclose(parts[name][i], part, rtol=1e-5)
+
+
+def test_loss_is_that_of_encode_and_decode_with_the_keys_draw():
+    params, features = jmvae.init(jax.random.key(0), TWO), some_features(TWO)
+    options = {"alpha": 0.0, "beta": 0.0, "reconstruction_weights": (2.0, 0.5)}
+    total, _ = jmvae.loss(jax.random.key(4), params, TWO, features, **options)
+    mean, log_var = jmvae.encode(params, TWO, features)
+    noise = jax.random.normal(jax.random.key(4), mean.shape)
+    camera, lidar = jmvae.decode(params, TWO, gaussian.sample(noise, mean, log_var))
+    expected = jnp.sum((camera - features[0]) ** 2) + 0.25 * jnp.sum((lidar - features[1]) ** 2)
+    np.testing.assert_allclose(total, expected, rtol=1e-5)
+
+
+def test_every_step_of_a_training_draws_anew():
+    config = JmvaeConfig(hidden=(8,), steps=20, batch=4, learning_rate=1e-12)
+    state = jmvae.start(jmvae.init(jax.random.key(0), TWO), config)
+    bank = tuple(jax.random.uniform(k, (3, 50, 2)) for k in jax.random.split(jax.random.key(1)))
+    _, losses = jmvae.train(jax.random.key(2), state, TWO, bank, config, 20)
+    assert len(np.unique(losses)) == 20
+
+
 def test_gradient_of_the_loss_agrees_with_finite_differences():
     with jax.enable_x64(True):
         model = Jmvae(("camera", "lidar"), (2, 2), 2, (4,))
