@@ -13,8 +13,8 @@ from jaxsense.config import MODALITIES, PRESETS, Config, DqnConfig
 from jaxsense.dqn import belief_mdp, evaluation, policies
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.models import Models
-from jaxsense.observe import Bank
 from jaxsense.networks import Params
+from jaxsense.observe import Bank
 
 MODALITY = 0
 """The agent looks with the camera."""

@@ -11,9 +11,9 @@ from benchmarks.maps import Examiner, Task
 from jaxsense import observe
 from jaxsense.config import MODALITIES, PRESETS, Config, DetectorConfig, DqnConfig, JmvaeConfig
 from jaxsense.models import jmvae_shape
+from jaxsense.networks import Params
 from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
-from jaxsense.networks import Params
 from jaxsense.types import Key
 from jaxsense.vae import detectors, jmvae
 

@@ -388,7 +388,7 @@ class DqnConfig:
 
     @property
     def shares(self) -> int:
-        """Shares that environments and batch can be cut into; a number of devices must divide it."""
+        """Shares that environments and batch can be cut into, for example for several devices."""
         return math.gcd(self.num_envs, self.batch, _MOST_SHARES)
 
     @property

@@ -12,8 +12,8 @@ from jaxsense.config import MODALITIES, Config
 from jaxsense.dqn import evaluation, policies
 from jaxsense.dqn.belief_mdp import MapState, random_start, reset
 from jaxsense.models import jmvae_shape
-from jaxsense.observe import Bank
 from jaxsense.networks import Params
+from jaxsense.observe import Bank
 from jaxsense.types import Belief, Key
 from jaxsense.vae import fusion, jmvae, metrics
 

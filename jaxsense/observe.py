@@ -10,8 +10,8 @@ import jax.numpy as jnp
 
 from jaxsense.config import Config
 from jaxsense.dqn.belief_mdp import MapMdp
-from jaxsense.sim import world as worlds
 from jaxsense.networks import Params
+from jaxsense.sim import world as worlds
 from jaxsense.types import Key
 from jaxsense.vae import detectors, fusion
 from jaxsense.vae.detectors import Detector

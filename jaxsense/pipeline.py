@@ -19,6 +19,7 @@ from jaxsense import examine, mission
 from jaxsense.config import MODALITIES, Config
 from jaxsense.models import Models
 from jaxsense.monitor import Monitor
+from jaxsense.networks import Params
 from jaxsense.programs import (
     Programs,
     Surveys,
@@ -29,7 +30,6 @@ from jaxsense.programs import (
     num_scenes,
 )
 from jaxsense.sim.world import Scene, make_world
-from jaxsense.networks import Params
 from jaxsense.types import Belief, Key
 from jaxsense.vae.detectors import Detector
 

@@ -20,9 +20,9 @@ from jaxsense.dqn import belief_mdp
 from jaxsense.dqn import training as dqn
 from jaxsense.models import Models, jmvae_shape, untrained
 from jaxsense.monitor import Monitor, Program
+from jaxsense.networks import Params
 from jaxsense.observe import Bank
 from jaxsense.sim.world import Scene, World
-from jaxsense.networks import Params
 from jaxsense.types import Key
 from jaxsense.vae import detectors, jmvae
 from jaxsense.vae.detectors import Detector

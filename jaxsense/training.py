@@ -10,6 +10,7 @@ from flax import struct
 
 from jaxsense.networks import Params
 
+
 @struct.dataclass
 class FitState:
     """A training between two calls of `fit`.

@@ -14,7 +14,8 @@ def test_a_network_as_worked_by_hand():
             "Dense_1": {"kernel": jnp.array([[3.0], [1.0]]), "bias": jnp.array([-2.0])},
         }
     }
-    # (1, 2): hidden (1 + 4 + 1, -1 + 1) = (6, 0), output 18 - 2. (-1, -1): (-2, 2) -> (0, 2), 2 - 2.
+    # (1, 2): hidden (1 + 4 + 1, -1 + 1) = (6, 0), output 18 - 2.
+    # (-1, -1): hidden (-1 - 2 + 1, 1 + 1), of which the first is cut to 0: output 2 - 2.
     x = jnp.array([[1.0, 2.0], [-1.0, -1.0]])
     rows = networks.MLP((2,), 1).apply(params, x)
     np.testing.assert_allclose(np.asarray(rows), [[16.0], [0.0]])

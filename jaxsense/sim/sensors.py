@@ -125,15 +125,17 @@ def camera(config: CameraConfig) -> Sensor:
         facing = normal_x * light.direction[0] + normal_y * light.direction[1]
         shade = light.ambient + light.diffuse * jnp.maximum(facing, 0.0)
 
-        def channel(of_geom, of_background):
-            lit = shade * raycast.choose(of_geom, hits.geom)
-            return jnp.where(hits.geom >= 0, lit, of_background)
+        noise = config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape))
 
-        # A loop over the channels makes the compiler finish the hits before it shades them; fused
-        # with the ray-caster, each channel would cast the rays many times over.
-        seen = jax.lax.map(lambda c: channel(*c), (albedo.T, jnp.array(_BACKGROUND))).T
-        noise = config.pixel_noise * jax.random.normal(key, seen.shape)
-        return jnp.clip(seen + noise, 0.0, 1.0)
+        def channel(of_geom, of_background, noise):
+            lit = shade * raycast.choose(of_geom, hits.geom)
+            seen = jnp.where(hits.geom >= 0, lit, of_background)
+            return jnp.clip(seen + noise, 0.0, 1.0)
+
+        # A loop over the channels makes the compiler finish hits and noise before it shades them;
+        # fused with the ray-caster, each channel would cast the rays many times over.
+        inputs = albedo.T, jnp.array(_BACKGROUND), noise
+        return jax.lax.map(lambda c: channel(*c), inputs).T
 
     return Sensor(
         name="camera",
@@ -199,8 +201,8 @@ def scan(
     return sensor.read(key, hits, palette(arena, layout), light)
 
 
-def window_rays(sensor: Sensor, bearing: jax.Array) -> jax.Array:
-    """`[window]` int32 indices of the rays that the detector reads of a scan.
+def window_angles(sensor: Sensor, bearing: jax.Array) -> jax.Array:
+    """`[window]` angles of the rays that the detector reads of a scan, in radians.
 
     They lie around a bearing [rad] in the robot's frame; near the edge of the field of view they
     stop at its last ray.
@@ -209,7 +211,12 @@ def window_rays(sensor: Sensor, bearing: jax.Array) -> jax.Array:
     span = (sensor.window - 1) * sensor.stride
     start = jnp.round(sensor.centre(bearing) - span / 2).astype(jnp.int32)
     start = jnp.clip(start, 0, len(sensor.angles) - 1 - span)
-    return start + sensor.stride * jnp.arange(sensor.window)
+    # Cut out as one piece, of every ray that is a stride from the next: a list of indices would
+    # be worked out for each ray from the bearing on.
+    padding = -len(sensor.angles) % sensor.stride
+    strided = jnp.array(np.pad(sensor.angles, (0, padding)).reshape(-1, sensor.stride).T)
+    place = start % sensor.stride, start // sensor.stride
+    return jax.lax.dynamic_slice(strided, place, (1, sensor.window))[0]
 
 
 def shows_poi(
@@ -235,7 +242,7 @@ def shows_poi(
       `[]` bool: all rays that must meet a PoI of that size can have met one. Something else before
       it, a PoI that is not there and a sensor that has failed give False.
     """
-    angles = jnp.array(sensor.angles)[window_rays(sensor, bearing)] - bearing
+    angles = window_angles(sensor, bearing) - bearing
     half_width = jnp.arcsin(jnp.minimum(arena.poi_radius / distance, 1.0))
     is_within = jnp.abs(angles) <= _SHARE_OF_WIDTH * half_width
     return jnp.all(sensor.shows(readings, distance, arena.poi_extent) | ~is_within)

@@ -85,22 +85,24 @@ def free_room(
     to_wall = arena.side / 2 - jnp.maximum(jnp.abs(x), jnp.abs(y)) - reach
     target = layout.position[poi]
     view_x, view_y = target[0] - x, target[1] - y
-    view_length = jnp.hypot(view_x, view_y)
+    view_length = jnp.sqrt(view_x**2 + view_y**2)
 
-    def around(centre: jax.Array, radius: float) -> jax.Array:
+    def around(room: jax.Array, obstacle: tuple[jax.Array, jax.Array]):
+        centre, radius = obstacle
         to_x, to_y = centre[0] - x, centre[1] - y
-        standing = jnp.hypot(to_x, to_y) - radius - reach
+        standing = jnp.sqrt(to_x**2 + to_y**2) - radius - reach
         # The view is the cone from the sensor to the outline of the PoI.
         along = jnp.clip((to_x * view_x + to_y * view_y) / view_length, 0.0, view_length)
         share = along / view_length
-        across = jnp.hypot(to_x - share * view_x, to_y - share * view_y)
-        return jnp.minimum(standing, across - share * arena.poi_extent - radius)
+        beside_x, beside_y = to_x - share * view_x, to_y - share * view_y
+        across = jnp.sqrt(beside_x**2 + beside_y**2)
+        in_view = across - share * arena.poi_extent - radius
+        return jnp.minimum(room, jnp.minimum(standing, in_view)), None
 
-    room = to_wall
-    for n in range(arena.num_pois):
-        is_target = poi == n
-        around_poi = around(layout.position[n], arena.poi_extent)
-        room = jnp.minimum(room, jnp.where(is_target, jnp.inf, around_poi))
-    for robot in others:
-        room = jnp.minimum(room, around(robot, amiro.BODY_RADIUS))
-    return room
+    # The PoI that is looked at is nowhere in the way. A loop makes the compiler finish the
+    # candidates first; fused with what is done for each obstacle, they are worked out every time.
+    is_target = jnp.arange(arena.num_pois) == poi
+    of_pois = jnp.where(is_target, -jnp.inf, arena.poi_extent)
+    of_robots = jnp.full(len(others), amiro.BODY_RADIUS)
+    obstacles = jnp.concatenate([layout.position, others]), jnp.append(of_pois, of_robots)
+    return jax.lax.scan(around, to_wall, obstacles)[0]

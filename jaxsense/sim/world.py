@@ -120,7 +120,7 @@ def scan_around(
       `[window, ...]` readings of the rays that the detector reads.
     """
     sensor = world.sensors[robot]
-    angles = jnp.array(sensor.angles)[sensors.window_rays(sensor, bearing)]
+    angles = sensors.window_angles(sensor, bearing)
     return sensors.scan(key, sensor, world.arena, data, scene.layout, scene.light, robot, angles)
 
 

@@ -1,7 +1,5 @@
 """The scanline detectors f_x and f_w: what a sensor alone can tell of a point of interest."""
 
-import dataclasses
-
 import chex
 import jax
 import jax.numpy as jnp

@@ -204,6 +204,12 @@ def test_first_beam_is_on_the_right(scans, known_layout):
     assert ranges[341 + 255] == pytest.approx(2.5, abs=1e-3)
 
 
+def rays_of(sensor, angles):
+    """Indices of the rays of a full scan that have these angles."""
+    indices = {angle: i for i, angle in enumerate(sensor.angles.tolist())}
+    return np.array([indices[angle] for angle in np.asarray(angles).tolist()])
+
+
 def test_rays_of_a_window_read_what_they_do_in_a_full_scan(
     arena, place, noiseless, view, known_layout
 ):
@@ -211,26 +217,24 @@ def test_rays_of_a_window_read_what_they_do_in_a_full_scan(
 
     def windows(data, bearing):
         for robot, sensor in enumerate(noiseless):
-            rays = sensors.window_rays(sensor, bearing)
-            angles = jnp.array(sensor.angles)[rays]
+            angles = sensors.window_angles(sensor, bearing)
             key = jax.random.key(3)
-            yield rays, sim.scan(key, sensor, arena, data, known_layout, LIGHT, robot, angles)
+            yield angles, sim.scan(key, sensor, arena, data, known_layout, LIGHT, robot, angles)
 
     windows_at = jax.jit(lambda *args: tuple(windows(*args)))
     for bearing in (-0.3, 0.05):
-        for (rays, readings), full in zip(
-            windows_at(data, jnp.float32(bearing)), view, strict=True
-        ):
-            np.testing.assert_allclose(readings, full[np.array(rays)], atol=1e-5)
+        of_robots = windows_at(data, jnp.float32(bearing))
+        for sensor, (angles, readings), full in zip(noiseless, of_robots, view, strict=True):
+            np.testing.assert_allclose(readings, full[rays_of(sensor, angles)], atol=1e-5)
 
 
 def test_windows_are_centred_on_the_bearing(noiseless):
     for sensor in noiseless:
-        rays = sensors.window_rays(sensor, jnp.float32(0.2))
+        rays = rays_of(sensor, sensors.window_angles(sensor, jnp.float32(0.2)))
         assert rays.shape == (sensor.window,)
         np.testing.assert_array_equal(np.diff(rays), sensor.stride)
         # Between the two rays in its middle, 0.2 rad, to within half a ray.
-        middle = sensor.angles[np.array(rays)[[0, -1]]]
+        middle = sensor.angles[rays[[0, -1]]]
         middle = np.arctan(np.tan(middle).mean()) if sensor.name == "camera" else middle.mean()
         assert middle == pytest.approx(0.2, abs=0.004)
 
@@ -239,10 +243,10 @@ def test_windows_stop_at_the_edges(noiseless):
     camera, lidar = noiseless
     # Far left is the camera's first pixel and the LiDAR's last beam. 80 pixels, every 4th, span
     # 79 * 4 = 316; 128 beams span 127.
-    np.testing.assert_array_equal(sensors.window_rays(camera, jnp.float32(0.69))[0], 0)
-    np.testing.assert_array_equal(sensors.window_rays(camera, jnp.float32(-0.69))[0], 639 - 316)
-    np.testing.assert_array_equal(sensors.window_rays(lidar, jnp.float32(2.0))[0], 682 - 127)
-    np.testing.assert_array_equal(sensors.window_rays(lidar, jnp.float32(-2.0))[0], 0)
+    cases = (camera, 0.69, 0), (camera, -0.69, 639 - 316), (lidar, 2.0, 682 - 127), (lidar, -2.0, 0)
+    for sensor, bearing, first in cases:
+        rays = rays_of(sensor, sensors.window_angles(sensor, jnp.float32(bearing)))
+        np.testing.assert_array_equal(rays, first + sensor.stride * np.arange(sensor.window))
 
 
 def test_detector_input_is_flat_and_cut_off(noiseless):
@@ -284,7 +288,7 @@ def test_wrong_shapes_are_named_while_tracing(arena, noiseless, known_layout):
     with pytest.raises(AssertionError, match="angles"):
         jax.eval_shape(scan, jnp.zeros((2, 3)))
     with pytest.raises(AssertionError, match="bearing"):
-        jax.eval_shape(lambda b: sensors.window_rays(noiseless[0], b), jnp.zeros(2))
+        jax.eval_shape(lambda b: sensors.window_angles(noiseless[0], b), jnp.zeros(2))
     with pytest.raises(AssertionError, match="readings"):
         jax.eval_shape(lambda r: sensors.as_window(noiseless[0], r), jnp.zeros((79, 3)))
 
