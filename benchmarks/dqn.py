@@ -88,7 +88,8 @@ def dqn_seeds(options: Options) -> Row:
     agents = num_seeds * len(modalities)
     work = agents * settings.epochs * settings.num_envs
     keys = jax.random.split(jax.random.key(3), num_seeds)
-    side = measure.compiled(train, keys, task.params, task.bank, work=work, batch=agents)
+    inputs = keys, task.params, task.bank
+    side = measure.compiled(train, *inputs, work=work, batch=agents, is_training=True)
     return measure.compare("dqn_seeds", _UNIT, [side], [], options, repeats=1)
 
 
@@ -141,5 +142,7 @@ def _train_side(
         return training.train(key, make_mdp(*networks), MODALITY, settings, mesh)
 
     work = settings.epochs * settings.num_envs
-    side = measure.compiled(train, jax.random.key(2), *networks, work=work, batch=settings.num_envs)
+    inputs, batch = (jax.random.key(2), *networks), settings.num_envs
+    is_training = settings.observe == "bank"
+    side = measure.compiled(train, *inputs, work=work, batch=batch, is_training=is_training)
     return dataclasses.replace(side, num_devices=1 if mesh is None else mesh.size)

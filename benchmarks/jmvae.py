@@ -30,7 +30,8 @@ def jmvae(options: Options) -> Row:
         return our_jmvae.train(train_key, state, model, bank, config, steps)
 
     work, batch = steps * config.batch, config.batch
-    ours = [measure.compiled(train, jax.random.key(1), bank, work=work, batch=batch)]
+    inputs = jax.random.key(1), bank
+    ours = [measure.compiled(train, *inputs, work=work, batch=batch, is_training=True)]
     peer = peers.load("multivae", options)
     theirs = peer.sides(model, config, [np.asarray(x) for x in bank], options) if peer else []
     return measure.compare(

@@ -128,24 +128,27 @@ def _mid_mission(batch: int, periods: int) -> tuple[Mission, MissionState]:
     team = mission.make_mission(_UNTRAINED)
     networks = models.untrained(jax.random.key(0), team.config)
 
-    def play(key: jax.Array) -> MissionState:
-        reset_key, play_key, record_key = jax.random.split(key, 3)
-        state = mission.reset(reset_key, team, mission.NAIVE)
+    def play(keys: jax.Array) -> MissionState:
+        reset_keys, play_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+        states = jax.vmap(lambda key: mission.reset(key, team, mission.NAIVE))(reset_keys)
 
-        def step(state: MissionState, key: jax.Array):
-            after, _ = mission_step(key, team, networks, state)
+        def step(states: MissionState, keys: jax.Array):
+            after, _ = mission_step(keys, team, networks, states)
             # What the robots decided in this period, from where they stood before it.
-            robots = dataclasses.replace(state.robots, wanted=after.robots.wanted)
-            return after, dataclasses.replace(state, robots=robots)
+            robots = dataclasses.replace(states.robots, wanted=after.robots.wanted)
+            return after, dataclasses.replace(states, robots=robots)
 
-        def skip(state: MissionState, key: jax.Array):
-            return step(state, key)[0], None
+        def skip(states: MissionState, keys: jax.Array):
+            return step(states, keys)[0], None
 
-        state, _ = jax.lax.scan(skip, state, jax.random.split(play_key, _PERIODS_BEFORE))
-        return jax.lax.scan(step, state, jax.random.split(record_key, periods))[1]
+        number = _PERIODS_BEFORE + periods
+        step_keys = jax.vmap(lambda key: jax.random.split(key, number), out_axes=1)(play_keys)
+        states, _ = jax.lax.scan(skip, states, step_keys[:_PERIODS_BEFORE])
+        played = jax.lax.scan(step, states, step_keys[_PERIODS_BEFORE:])[1]
+        return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), played)
 
     fast_to_compile = {"xla_backend_optimization_level": 0}
-    record = jax.jit(jax.vmap(play), compiler_options=fast_to_compile)
+    record = jax.jit(play, compiler_options=fast_to_compile)
     played = record(jax.random.split(jax.random.key(1), min(batch, _MOST_PLAYED)))
     rows = jnp.arange(batch) % min(batch, _MOST_PLAYED)
     return team, jax.tree.map(lambda x: x[rows], played)
@@ -201,9 +204,7 @@ def _move_side(team: Mission, states: MissionState) -> Side:
 
     def periods(states: MissionState) -> tuple[jax.Array, jax.Array]:
         by_period = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), states)
-        axis = "missions"
-        each = jax.vmap(lambda one: move(team, one, axis)[0], axis_name=axis)
-        moved = jax.lax.map(each, by_period)
+        moved = jax.lax.map(lambda states: move(team, states)[0], by_period)
         poses, velocity = moved.scene.poses, moved.velocity
         return tuple(jnp.swapaxes(x, 0, 1) for x in (poses, velocity))  # pyright: ignore
 

@@ -64,8 +64,7 @@ def _cast(world: World, data: mjx.Data) -> tuple[Hit, ...]:
         sensor = world.sensors[robot]
         x, y, yaw = arenas.robot_poses(data)[robot]
         section = raycast.cross_section(world.arena, data, sensor.height, robot)
-        cast = jax.vmap(raycast.cast, in_axes=(None, None, 0))
-        return cast(section, jnp.stack([x, y]), yaw + jnp.asarray(sensor.angles))
+        return raycast.cast(section, jnp.stack([x, y]), yaw + jnp.asarray(sensor.angles))
 
     return tuple(scan(robot) for robot in range(len(world.sensors)))
 

@@ -95,7 +95,7 @@ def _learner(task: Task) -> Learner:
     lowered = jax.jit(start).lower(key), jax.jit(go_on, donate_argnums=0).lower(carry)
     with concurrent.futures.ThreadPoolExecutor(len(lowered)) as pool:
         begin, train = pool.map(
-            lambda program: program.compile(devices.compiler_options()), lowered
+            lambda program: program.compile(devices.compiler_options(is_training=True)), lowered
         )
     return Learner(start=lambda: begin(key), go_on=train, as_params=lambda carry: carry[1].params)
 

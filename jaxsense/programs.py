@@ -177,7 +177,8 @@ def _trace_detectors(
         flat = jax.ShapeDtypeStruct((rows, windows.shape[-1]), windows.dtype)
         labels = jax.ShapeDtypeStruct((rows,), jnp.int32)
         detector, state = programs.begin_detectors[m].compile(begin, key, flat)
-        programs.train_detectors[m].compile(train, key, state, detector, flat, labels)
+        inputs = key, state, detector, flat, labels
+        programs.train_detectors[m].compile(train, *inputs, is_training=True)
 
     def detect(trained: tuple[Detector, ...], windows: tuple[jax.Array, ...]):
         each = jax.vmap(jax.vmap(detectors.detect, in_axes=(None, 0)), in_axes=(None, 0))
@@ -225,7 +226,7 @@ def _trace_jmvae(programs: Programs, config: Config, models: Models) -> tuple[Ba
 
     banks = bank(settings.samples_per_class), bank(num_held_out_per_class(config))
     states = programs.begin_jmvae.compile(begin, key)
-    programs.train_jmvae.compile(train, key, states, banks[0])
+    programs.train_jmvae.compile(train, key, states, banks[0], is_training=True)
     programs.examine_jmvae.compile(
         lambda params, bank: examine.latent_space(params, bank, config), models.jmvae, banks[1]
     )
@@ -287,7 +288,9 @@ def _trace_dqn(
         split = jax.tree.map(lambda spec: NamedSharding(mesh, spec), dqn.state_specs())
         shardings["in_shardings"] = whole, whole, split, *[whole] * (len(inputs) - 3)
         shardings["out_shardings"] = split, whole
-    programs.train_dqn.compile(train, *inputs, donate=(2,), **shardings)
+    # With live observations most of the time goes into looking.
+    is_training = settings.observe == "bank"
+    programs.train_dqn.compile(train, *inputs, donate=(2,), is_training=is_training, **shardings)
     programs.examine_dqn.compile(
         functools.partial(examine.play, config=config),
         *(key, modality, models.q_networks[0], models.jmvae, banks[1]),

@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from jaxsense.indexing import Index, call, others
 from jaxsense.mission.decide import planning_margin, sees, standing_robots
@@ -136,11 +137,54 @@ def _fail(
     )
 
 
+@struct.dataclass
+class _Aim:
+    """What a robot is about to scan.
+
+    Attributes:
+      scans: `[]` bool, whether it scans at all.
+      poi: `[]` int32 which it faces.
+      bearing: `[]` of the PoI as the robot believes it, in radians.
+      distance: `[]` of the PoI, in metres.
+      noise_key: random key of the sensor's noise.
+    """
+
+    scans: jax.Array
+    poi: jax.Array
+    bearing: jax.Array
+    distance: jax.Array
+    noise_key: Key
+
+
 def scan(
-    key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
+    keys: Key, mission: Mission, models: Models, states: MissionState, robot: Index
 ) -> MissionState:
-    """Takes a scan of the PoI that the robot faces, and writes what it shows into the map."""
-    config, world, scene, robots = mission.config, mission.world, state.scene, state.robots
+    """Takes a scan of the PoI that a robot faces, and writes what it shows into the map.
+
+    Args:
+      keys: `[B]` random keys.
+      mission: the mission.
+      models: trained networks.
+      states: `[B]` missions side by side.
+      robot: index of the robot, the same in all of them.
+
+    Returns:
+      The `[B]` states after it.
+    """
+    aims = jax.vmap(lambda key, state: _aim(key, mission, state, robot))(keys, states)
+
+    def look(robot: int) -> tuple[jax.Array, Belief]:
+        return jax.vmap(lambda state, aim: _look(mission, models, state, aim, robot))(states, aims)
+
+    # The choice of the sensor outside the batch: inside, it would be traced over and over.
+    is_seen, entries = call(look, robot, len(mission.world.sensors))
+    write = jax.vmap(lambda *one: _write(mission, *one, robot))
+    return write(states, aims, is_seen, entries)
+
+
+def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
+    """Whether a robot scans, and what."""
+    config, scene, robots = mission.config, state.scene, state.robots
     error_key, noise_key = jax.random.split(key)
     poi = jnp.minimum(robots.target[robot], config.arena.num_pois - 1)
     bearing = _bearing(scene, robot, poi)
@@ -148,54 +192,67 @@ def scan(
     is_calm = jnp.abs(robots.command[robot, 1]) <= _TURNS_SLOWLY
     # A robot that drives through the view is waited for, but not for long.
     place = scene.poses[robot, :2]
+    standing = others(scene.poses[:, :2], robot)
     room = viewpoints.free_room(
-        place[:1],
-        place[1:],
-        0.0,
-        config.arena,
-        scene.layout,
-        others(scene.poses[:, :2], robot),
-        poi,
+        place[:1], place[1:], 0.0, config.arena, scene.layout, standing, poi
     )
     waits = now(mission, state) - robots.progress_at[robot]
     is_ready = is_aligned & is_calm & ((room[0] > 0) | (waits > config.navigation.stuck_time))
-    scans = (robots.phase[robot] == FACING) & is_ready
-
     error = jnp.radians(config.viewpoint.bearing_error)
-    believed = bearing + jax.random.uniform(error_key, (), minval=-error, maxval=error)
-    is_blind = now(mission, state) >= state.faults.blind_at[robot]
-    distance = jnp.linalg.norm(scene.layout.position[poi] - place)
-    old = jax.tree.map(lambda x: x[poi], state.belief)
+    return _Aim(
+        scans=(robots.phase[robot] == FACING) & is_ready,
+        poi=poi,
+        bearing=bearing + jax.random.uniform(error_key, (), minval=-error, maxval=error),
+        distance=jnp.linalg.norm(scene.layout.position[poi] - place),
+        noise_key=noise_key,
+    )
+
+
+def _look(
+    mission: Mission, models: Models, state: MissionState, aim: _Aim, robot: int
+) -> tuple[jax.Array, Belief]:
+    """`[]` bool whether the PoI is seen, and the entry that the map would get."""
+    world, scene, sensor = mission.world, state.scene, mission.world.sensors[robot]
     data = arenas.place(world.arena, scene.layout, scene.poses)
+    readings = worlds.scan_around(aim.noise_key, world, scene, data, robot, aim.bearing)
+    is_blind = now(mission, state) >= state.faults.blind_at[robot]
+    readings = jnp.where(is_blind, sensor.blind, readings)
+    shows = sensors.shows_poi(sensor, readings, aim.bearing, aim.distance, mission.config.arena)
+    features = detectors.detect(models.detectors[robot], sensors.as_window(sensor, readings))
+    is_sure = jnp.max(features) >= mission.config.mission.least_confidence
+    old = jax.tree.map(lambda x: x[aim.poi], state.belief)
+    shape, seen = jmvae_shape(mission.config), state.seen[aim.poi]
+    return shows & is_sure, fusion.write(models.jmvae, shape, old, seen, features, robot)
 
-    def look(robot: int) -> tuple[jax.Array, Belief]:
-        sensor = world.sensors[robot]
-        readings = worlds.scan_around(noise_key, world, scene, data, robot, believed)
-        readings = jnp.where(is_blind, sensor.blind, readings)
-        shows = sensors.shows_poi(sensor, readings, believed, distance, config.arena)
-        features = detectors.detect(models.detectors[robot], sensors.as_window(sensor, readings))
-        is_sure = jnp.max(features) >= config.mission.least_confidence
-        seen = state.seen[poi]
-        entry = fusion.write(models.jmvae, jmvae_shape(config), old, seen, features, robot)
-        return shows & is_sure, entry
 
-    is_seen, new = call(look, robot, len(world.sensors))
-    detects = scans & is_seen
-    entry = jax.tree.map(lambda o, n: jnp.where(detects, n, o), old, new)
-    state = _fail(state, robot, scans & ~detects, "undetected", config.mission.attempts)
+def _write(
+    mission: Mission,
+    state: MissionState,
+    aim: _Aim,
+    is_seen: jax.Array,
+    entry: Belief,
+    robot: Index,
+) -> MissionState:
+    """Notes a scan, and writes the entry into the map if the PoI was seen."""
+    poi, detects = aim.poi, aim.scans & is_seen
+    state = _fail(state, robot, aim.scans & ~detects, "undetected", mission.config.mission.attempts)
     robots = state.robots
     state = update_robot(
         state,
         robot,
-        phase=jnp.where(scans, IDLE, robots.phase[robot]),
+        phase=jnp.where(aim.scans, IDLE, robots.phase[robot]),
         # After a detection the same PoI is a new target.
-        target=jnp.where(detects, config.arena.num_pois, robots.target[robot]),
-        looks=robots.looks[robot] + scans,
+        target=jnp.where(detects, mission.config.arena.num_pois, robots.target[robot]),
+        looks=robots.looks[robot] + aim.scans,
         detections=robots.detections[robot] + detects,
     )
     return dataclasses.replace(
         state,
-        belief=jax.tree.map(lambda m, e: m.at[poi].set(e), state.belief, entry),
+        belief=jax.tree.map(
+            lambda map_, new: map_.at[poi].set(jnp.where(detects, new, map_[poi])),
+            state.belief,
+            entry,
+        ),
         seen=state.seen.at[poi, robot].set(state.seen[poi, robot] | detects),
         version=state.version + detects,
     )

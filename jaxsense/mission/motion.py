@@ -9,6 +9,7 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
+from jaxsense.config import ArenaConfig
 from jaxsense.mission.state import Mission, MissionState
 from jaxsense.sim import amiro, navigation
 from jaxsense.sim import arena as arenas
@@ -17,7 +18,15 @@ from jaxsense.sim.arena import Arena, Layout
 
 @struct.dataclass
 class _Motion:
-    """What the physics carries: `[R, 3]` poses, velocities, warmstart, `[R, 2]` commands."""
+    """What the physics carries, for each of B missions.
+
+    Attributes:
+      poses: `[B, R, 3]`.
+      velocity: `[B, R, 3]`.
+      warmstart: `[B, V]`.
+      command: `[B, R, 2]`.
+      clearance: `[B]` the smallest so far.
+    """
 
     poses: jax.Array
     velocity: jax.Array
@@ -26,33 +35,28 @@ class _Motion:
     clearance: jax.Array
 
 
-def move(
-    mission: Mission, state: MissionState, axis: str | None = None
-) -> tuple[MissionState, jax.Array]:
-    """One control period of physics.
+def move(mission: Mission, states: MissionState) -> tuple[MissionState, jax.Array]:
+    """One control period of physics, for missions side by side.
 
     Contacts cost several times as much as all the rest, and the planner sees to it that there are
-    none. As long as no robot is near enough to anything to touch it within the period, the robots
-    are integrated in an empty arena, which gives the same motion.
+    none. As long as no robot of any mission is near enough to anything to touch it within the
+    period, the robots are integrated in an empty arena, which gives the same motion.
 
     Args:
       mission: the mission.
-      state: its present state.
-      axis: name of the `vmap` that this is under. The choice is then made for the whole batch at
-        once; under a `vmap` without a name contacts are always computed.
+      states: `[B]` present states. Under a `vmap` contacts are always computed.
 
     Returns:
-      The next state, and `[]` the smallest free distance around any robot in the period, in metres.
+      The `[B]` next states, and `[B]` the smallest free distance around any robot in the period, in
+      metres.
     """
-    config, robots, layout = mission.config, state.robots, state.scene.layout
-    motion = _Motion(
-        state.scene.poses, state.velocity, state.warmstart, robots.command, jnp.full((), jnp.inf)
-    )
+    config, robots, layout = mission.config, states.robots, states.scene.layout
+    poses = states.scene.poses
+    far = jnp.full(poses.shape[0], jnp.inf)
+    motion = _Motion(poses, states.velocity, states.warmstart, robots.command, far)
     # Two robots that drive at each other, and a margin for what the wheels lag behind.
     reach = 2 * amiro.MAX_SPEED * config.mission.control_period + 0.005
-    is_near = jnp.any(navigation.clearance(config.arena, layout, motion.poses) < reach)
-    if axis is not None:
-        is_near = jax.lax.pmax(is_near.astype(jnp.int32), axis) > 0
+    is_near = jnp.any(_clearance(config.arena, layout, poses) < reach)
 
     motion = jax.lax.cond(
         is_near,
@@ -60,16 +64,22 @@ def move(
         functools.partial(_integrate, mission, mission.free_arena),
         *(motion, robots.wanted, layout),
     )
-    state = dataclasses.replace(
-        state,
-        scene=dataclasses.replace(state.scene, poses=motion.poses),
+    states = dataclasses.replace(
+        states,
+        scene=dataclasses.replace(states.scene, poses=motion.poses),
         velocity=motion.velocity,
         warmstart=motion.warmstart,
         robots=dataclasses.replace(robots, command=motion.command),
-        contacts=state.contacts + (motion.clearance < 0),
-        least_clearance=jnp.minimum(state.least_clearance, motion.clearance),
+        contacts=states.contacts + (motion.clearance < 0),
+        least_clearance=jnp.minimum(states.least_clearance, motion.clearance),
     )
-    return state, motion.clearance
+    return states, motion.clearance
+
+
+def _clearance(config: ArenaConfig, layout: Layout, poses: jax.Array) -> jax.Array:
+    """`[B]` the smallest free distance around any robot, in metres."""
+    around = jax.vmap(lambda layout, poses: navigation.clearance(config, layout, poses))
+    return jnp.min(around(layout, poses), axis=-1)
 
 
 def _integrate(
@@ -77,9 +87,10 @@ def _integrate(
 ) -> _Motion:
     """Physics steps, in each of which the commands go on towards the wanted ones."""
     is_empty = not np.any(arena.poi_of_geom >= 0)
-    still = arena.data if is_empty else arenas.put(arena, layout, motion.poses)
 
-    def substep(motion: _Motion, _) -> tuple[_Motion, None]:
+    def step(motion: _Motion, wanted: jax.Array, layout: Layout) -> _Motion:
+        """One step of one mission."""
+        still = arena.data if is_empty else arenas.put(arena, layout, motion.poses)
         command = navigation.ramp(motion.command, wanted, arenas.TIMESTEP)
         data: mjx.Data = still.replace(
             qpos=motion.poses.reshape(-1),
@@ -87,16 +98,20 @@ def _integrate(
             qacc_warmstart=motion.warmstart,
         )
         data = arenas.drive(arena, data, navigation.wheel_speeds(command))
-        poses = arenas.robot_poses(data)
-        clearance = jnp.min(navigation.clearance(arena.config, layout, poses))
-        after = _Motion(
-            poses=poses,
+        return _Motion(
+            poses=arenas.robot_poses(data),
             velocity=data.qvel.reshape(-1, 3),
             warmstart=data.qacc_warmstart,
             command=command,
-            clearance=jnp.minimum(motion.clearance, clearance),
+            clearance=motion.clearance,
         )
-        return after, None
+
+    def substep(motion: _Motion, _) -> tuple[_Motion, None]:
+        # The batch inside the loop: a loop inside a batch is traced over and over.
+        after = jax.vmap(step)(motion, wanted, layout)
+        clearance = _clearance(arena.config, layout, after.poses)
+        smallest = jnp.minimum(motion.clearance, clearance)
+        return dataclasses.replace(after, clearance=smallest), None
 
     substeps = round(mission.config.mission.control_period / arenas.TIMESTEP)
     return jax.lax.scan(substep, motion, length=substeps)[0]

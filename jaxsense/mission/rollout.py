@@ -35,15 +35,20 @@ def rollout(
     Returns:
       The state after the last one, and the `[steps]` records.
     """
-    return jax.lax.scan(
-        lambda state, key: step(key, mission, models, state), state, jax.random.split(key, steps)
-    )
+
+    def go_on(states: MissionState, key: Key):
+        states, records = step(key[None], mission, models, states)
+        return states, jax.tree.map(lambda x: x[0], records)
+
+    alone = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
+    states, records = jax.lax.scan(go_on, alone, jax.random.split(key, steps))
+    return jax.tree.map(lambda x: x[0], states), records
 
 
 def play(
     keys: Key, mission: Mission, models: Models, states: MissionState, steps: int
 ) -> MissionState:
-    """`rollout` of many missions, whose states alone are kept; written for the batch to be fast.
+    """`rollout` of missions side by side, of which the states alone are kept.
 
     Args:
       keys: `[B]` random keys; each mission goes as `rollout` would with its key.
@@ -55,65 +60,71 @@ def play(
     Returns:
       The `[B]` states after the last one.
     """
-    axis = "missions"
-    each = jax.vmap(lambda key, state: step(key, mission, models, state, axis)[0], axis_name=axis)
-    step_keys = jnp.swapaxes(jax.vmap(lambda key: jax.random.split(key, steps))(keys), 0, 1)
-    return jax.lax.scan(lambda states, keys: (each(keys, states), None), states, step_keys)[0]
+    step_keys = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(keys)
+    return jax.lax.scan(
+        lambda states, keys: (step(keys, mission, models, states)[0], None), states, step_keys
+    )[0]
 
 
 def step(
-    key: Key, mission: Mission, models: Models, state: MissionState, axis: str | None = None
+    keys: Key, mission: Mission, models: Models, states: MissionState
 ) -> tuple[MissionState, Record]:
-    """One control period: all robots look, decide and set their speeds, then all move.
+    """One control period of `[B]` missions side by side.
 
-    `axis` is the name of a batch of missions, see `motion.move`.
+    In each, all robots look, decide and set their speeds, then all move.
     """
-    before = state
-    looks = state.robots.looks, state.robots.detections
+    before = states
+    looks = states.robots.looks, states.robots.detections
     num_robots = mission.world.arena.num_robots
+    robot_keys = jax.vmap(lambda key: jax.random.split(key, num_robots), out_axes=1)(keys)
     # One after the other, so that nobody scans what another one has just made certain.
-    state, _ = jax.lax.scan(
-        lambda state, robot: (_act(robot[1], mission, models, state, robot[0]), None),
-        state,
-        (jnp.arange(num_robots), jax.random.split(key, num_robots)),
+    states, _ = jax.lax.scan(
+        lambda states, robot: (_act(robot[1], mission, models, states, robot[0]), None),
+        states,
+        (jnp.arange(num_robots), robot_keys),
     )
-    state, clearance = move(mission, state, axis)
-    robots = state.robots
-    is_idle = jnp.all((robots.phase == ENDED) | (robots.phase == FAILED))
-    steps = state.steps + 1
-    is_late = steps * mission.config.mission.control_period >= mission.config.mission.time_limit
-    after = dataclasses.replace(state, steps=steps, is_over=is_idle | is_late)
-    state = jax.tree.map(lambda x, y: jnp.where(before.is_over, x, y), before, after)
-    record = Record(
-        time=state.steps * mission.config.mission.control_period,
-        poses=state.scene.poses,
-        command=state.robots.command,
-        wanted=state.robots.wanted,
-        phase=state.robots.phase,
-        target=state.robots.target,
-        scanned=state.robots.looks > looks[0],
-        detected=state.robots.detections > looks[1],
-        belief=state.belief,
-        seen=state.seen,
+    states, clearance = move(mission, states)
+    robots = states.robots
+    is_idle = jnp.all((robots.phase == ENDED) | (robots.phase == FAILED), axis=-1)
+    steps, settings = states.steps + 1, mission.config.mission
+    is_late = steps * settings.control_period >= settings.time_limit
+    after = dataclasses.replace(states, steps=steps, is_over=is_idle | is_late)
+    keep = jax.vmap(jnp.where)
+    states = jax.tree.map(lambda x, y: keep(before.is_over, x, y), before, after)
+    records = Record(
+        time=states.steps * settings.control_period,
+        poses=states.scene.poses,
+        command=states.robots.command,
+        wanted=states.robots.wanted,
+        phase=states.robots.phase,
+        target=states.robots.target,
+        scanned=states.robots.looks > looks[0],
+        detected=states.robots.detections > looks[1],
+        belief=states.belief,
+        seen=states.seen,
         clearance=clearance,
     )
-    return state, record
+    return states, records
 
 
 def _act(
-    key: Key, mission: Mission, models: Models, state: MissionState, robot: jax.Array
+    keys: Key, mission: Mission, models: Models, states: MissionState, robot: jax.Array
 ) -> MissionState:
-    """What one robot does at the beginning of a control period."""
-    choice_key, scan_key = jax.random.split(key)
-    stops = now(mission, state) >= state.faults.stops_at[robot]
-    robots = state.robots
-    fails = stops & (robots.phase[robot] != ENDED)
-    state = update_robot(
-        state,
-        robot,
-        phase=jnp.where(fails, FAILED, robots.phase[robot]),
-        target=jnp.where(fails, mission.config.arena.num_pois, robots.target[robot]),
-    )
-    state = decide.decide(choice_key, mission, models, state, robot)
-    state = act.approach(mission, state, robot)
-    return act.scan(scan_key, mission, models, state, robot)
+    """What one robot of each of `[B]` missions does at the beginning of a control period."""
+
+    def get_there(key: Key, state: MissionState) -> MissionState:
+        stops = now(mission, state) >= state.faults.stops_at[robot]
+        robots = state.robots
+        fails = stops & (robots.phase[robot] != ENDED)
+        state = update_robot(
+            state,
+            robot,
+            phase=jnp.where(fails, FAILED, robots.phase[robot]),
+            target=jnp.where(fails, mission.config.arena.num_pois, robots.target[robot]),
+        )
+        state = decide.decide(key, mission, models, state, robot)
+        return act.approach(mission, state, robot)
+
+    choice_keys, scan_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+    states = jax.vmap(get_there)(choice_keys, states)
+    return act.scan(scan_keys, mission, models, states, robot)

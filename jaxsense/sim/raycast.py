@@ -98,20 +98,19 @@ def cross_section(arena: Arena, data: mjx.Data, height: float, robot: int) -> Cr
 
 
 def cast(section: CrossSection, origin: jax.Array, angle: jax.Array) -> Hit:
-    """Casts one ray; `vmap` over `angle` for a scan.
+    """Casts rays from one place.
 
     A ray that starts inside a geom meets it where it leaves, as in MuJoCo's `mj_ray`.
 
     Args:
       section: the scene.
       origin: `[2]` start, in metres.
-      angle: `[]` direction in the world, in radians.
+      angle: `[...]` directions in the world, in radians.
 
     Returns:
-      The nearest hit.
+      The nearest hits.
     """
     chex.assert_shape(origin, (2,), custom_message="origin")
-    chex.assert_rank(angle, 0, custom_message="angle")
     distance, outline = jax.lax.platform_dependent(
         section, origin, angle, cpu=_nearest_by_two_loops, default=_nearest_by_one_loop
     )
@@ -200,7 +199,7 @@ def _nearest_by_two_loops(
 
 
 def _nearest_outline(section: CrossSection, origin: jax.Array, angle: jax.Array) -> jax.Array:
-    """`[]` float32 index of the outline that a ray meets first; their number if it meets none."""
+    """`[...]` float32 index of the outline that a ray meets first; their number for none."""
     distances = _distances(section, origin, angle)
     nearest = functools.reduce(jnp.minimum, distances)
     squared_index = functools.reduce(

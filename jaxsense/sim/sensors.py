@@ -197,7 +197,7 @@ def scan(
     check_layout(arena.config, layout)
     pose = robot_poses(data)[robot]
     section = raycast.cross_section(arena, data, sensor.height, robot)
-    hits = jax.vmap(raycast.cast, in_axes=(None, None, 0))(section, pose[:2], pose[2] + angles)
+    hits = raycast.cast(section, pose[:2], pose[2] + angles)
     return sensor.read(key, hits, palette(arena, layout), light)
 
 

@@ -12,6 +12,16 @@ CONFIG = replace(PRESETS["smoke"], mission=replace(PRESETS["smoke"].mission, lea
 FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
 
 
+def alone(function):
+    """A function of missions side by side as a function of a single one."""
+
+    def of_one(*args):
+        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], args)
+        return jax.tree.map(lambda x: x[0], function(*batch))
+
+    return of_one
+
+
 def with_values(models, *values):
     """Models whose Q-networks give the same values [N + 1] for every map, one for each robot."""
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG
+from teams import CONFIG, alone
 
 from jaxsense import mission
 from jaxsense.mission import act
@@ -25,7 +25,7 @@ BLIND = Faults(jnp.full(2, jnp.inf), jnp.zeros(2))
 @pytest.fixture(scope="module")
 def scan(team, models):
     return [
-        jax.jit(lambda key, state, r=robot: act.scan(key, team, models, state, r))
+        jax.jit(alone(lambda key, state, r=robot: act.scan(key, team, models, state, r)))
         for robot in (CAMERA, LIDAR)
     ]
 
@@ -112,7 +112,7 @@ def test_an_unsure_detector_writes_nothing(models, facing, robot):
     for least, detections in ((0.4, 1), (0.6, 0)):
         settings = replace(CONFIG.mission, least_confidence=least)
         strict = mission.make_mission(replace(CONFIG, mission=settings), contacts=False)
-        scan = jax.jit(lambda key, state, m=strict: act.scan(key, m, models, state, robot))
+        scan = jax.jit(alone(lambda key, state, m=strict: act.scan(key, m, models, state, robot)))
         after = scan(jax.random.key(0), facing(robot))
         assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, detections)
 
