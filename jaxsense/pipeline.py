@@ -172,7 +172,7 @@ def train_detectors(
         steps = config.detector.steps
         init_key, *chunk_keys = jax.random.split(keys[modality], 1 + num_chunks(steps))
         windows = surveys.windows[modality][:num_train]
-        windows = windows.reshape(-1, windows.shape[-1])
+        windows = jax.device_put(windows.reshape(-1, windows.shape[-1]))
         labels = _labels(config, modality)[surveys.classes[:num_train]].reshape(-1)
         detector, state = programs.begin_detectors[modality](init_key, windows)
         for i, chunk_key in enumerate(chunk_keys):
@@ -224,16 +224,22 @@ def train_jmvae(
 ) -> Params:
     """Trains JMVAEs on a bank of detections and keeps the one with the lowest loss at the end."""
     settings = config.jmvae
-    init_key, *chunk_keys = jax.random.split(key, 1 + num_chunks(settings.steps))
-    states, losses = programs.begin_jmvae(init_key), np.zeros((settings.restarts, 1))
-    for i, chunk_key in enumerate(chunk_keys):
-        states, losses = programs.train_jmvae(chunk_key, states, bank)
-        losses = np.asarray(losses)
-        done = (i + 1) * settings.steps // len(chunk_keys)
+    keys = jax.random.split(key, (settings.restarts, 1 + num_chunks(settings.steps)))
+    states = [programs.begin_jmvae(of_restart[0]) for of_restart in keys]
+    losses = np.zeros((settings.restarts, 1))
+    for i in range(1, keys.shape[1]):
+
+        def train(restart: int):
+            return programs.train_jmvae(keys[restart, i], states[restart], bank)  # noqa: B023
+
+        # On a CPU a batch of small networks takes longer than one after the other.
+        states, losses = zip(*_side_by_side(train, settings.restarts), strict=True)
+        losses = np.stack(losses)
+        done = i * settings.steps // (keys.shape[1] - 1)
         # The worst loss, so that a restart that fails does not go unnoticed.
         monitor.report("jmvae", done, settings.steps, losses.max(axis=0))
     best = int(losses.mean(axis=1).argmin())
-    params = jax.tree.map(lambda x: np.asarray(x)[best], states.params)
+    params = jax.tree.map(np.asarray, states[best].params)
     monitor.check_finite("jmvae", params)
     return params
 

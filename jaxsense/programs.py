@@ -1,7 +1,7 @@
 """The compiled functions of a run.
 
-All of them are known before the run begins. They are traced in the order of their use, in a thread,
-and compiled as soon as they are traced, while the stages in `pipeline` run those that are ready.
+All of them are known before the run begins. They are traced one after the other, in a thread, and
+compiled as soon as they are traced, while the stages in `pipeline` run those that are ready.
 """
 
 import dataclasses
@@ -54,8 +54,8 @@ class Programs:
       begin_detectors: `(key, windows [S, F]) -> (detector, state)`.
       train_detectors: `(key, state, detector, windows, labels [S]) -> (state, losses)`, a chunk.
       detect: `(detectors, windows of each modality [S, N, F]) -> features of each [S, N, D_m]`.
-      begin_jmvae: `(key) -> states`, one for each restart.
-      train_jmvae: `(key, states, bank) -> (states, losses)`, a chunk.
+      begin_jmvae: `(key) -> state`, of one restart.
+      train_jmvae: `(key, state, bank) -> (state, losses)`, a chunk of one restart.
       examine_jmvae: `(params, bank) -> (posteriors, figures)`, see `examine.latent_space`.
       start_dqn: `(key, starts, *trained) -> [num_starts] states of the map MDP`; `trained` is the
         detectors, the JMVAE's parameters and the bank.
@@ -116,12 +116,14 @@ def compile_programs(
     def trace() -> None:
         try:
             models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
-            surveys = _trace_detectors(programs, config, world, models, mesh)
-            banks = _trace_jmvae(programs, config, models)
-            _trace_dqn(programs, config, world, models, surveys, banks, learner_mesh)
+            surveys = _trace_simulation(programs, config, world, mesh)
+            # Needed last, but it takes longest to compile.
             batch = mission.batch_of(len(mission.POLICIES) * config.mission.episodes)
             team = mission.make_mission(config)
             programs.player.set_result(mission.Player(team, monitor, batch, mesh))
+            _trace_detectors(programs, config, models, surveys)
+            banks = _trace_jmvae(programs, config, models)
+            _trace_dqn(programs, config, world, models, surveys, banks, learner_mesh)
         except BaseException as error:
             programs.fail(error)
 
@@ -155,13 +157,18 @@ def num_scene_starts(config: Config) -> int:
     return config.dqn.num_starts if config.dqn.observe == "live" else 0
 
 
-def _trace_detectors(
-    programs: Programs, config: Config, world: World, models: Models, mesh: Mesh | None
+def _trace_simulation(
+    programs: Programs, config: Config, world: World, mesh: Mesh | None
 ) -> Surveys:
-    """Simulation and detectors; returns the shapes of the surveys."""
+    """The surveys; returns their shapes."""
+    key = jax.random.key(0)
+    return programs.simulate.compile(lambda k: _simulate(k, config, world, mesh), key)
+
+
+def _trace_detectors(programs: Programs, config: Config, models: Models, surveys: Surveys) -> None:
+    """Training and use of the detectors."""
     key, settings = jax.random.key(0), config.detector
     steps = settings.steps // num_chunks(settings.steps)
-    surveys = programs.simulate.compile(lambda k: _simulate(k, config, world, mesh), key)
     num_train = num_scenes(config)[0]
     rows = num_train * config.arena.num_pois
     for m, windows in enumerate(surveys.windows):
@@ -189,7 +196,6 @@ def _trace_detectors(
         for w in surveys.windows
     )
     programs.detect.compile(detect, models.detectors, others)
-    return surveys
 
 
 def _simulate(key: Key, config: Config, world: World, mesh: Mesh | None) -> Surveys:
@@ -217,16 +223,14 @@ def _trace_jmvae(programs: Programs, config: Config, models: Models) -> tuple[Ba
         return tuple(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)
 
     def begin(key: Key):
-        keys = jax.random.split(key, settings.restarts)
-        return jax.vmap(lambda k: jmvae.start(jmvae.init(k, model), settings))(keys)
+        return jmvae.start(jmvae.init(key, model), settings)
 
-    def train(key: Key, states, bank: Bank):
-        one = jax.vmap(lambda key, state: jmvae.train(key, state, model, bank, settings, steps))
-        return one(jax.random.split(key, settings.restarts), states)
+    def train(key: Key, state, bank: Bank):
+        return jmvae.train(key, state, model, bank, settings, steps)
 
     banks = bank(settings.samples_per_class), bank(num_held_out_per_class(config))
-    states = programs.begin_jmvae.compile(begin, key)
-    programs.train_jmvae.compile(train, key, states, banks[0], is_training=True)
+    state = programs.begin_jmvae.compile(begin, key)
+    programs.train_jmvae.compile(train, key, state, banks[0], is_training=True)
     programs.examine_jmvae.compile(
         lambda params, bank: examine.latent_space(params, bank, config), models.jmvae, banks[1]
     )

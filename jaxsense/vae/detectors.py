@@ -92,11 +92,11 @@ def train(
     chex.assert_equal_shape_prefix([windows, labels], 1)
 
     rows = jax.random.randint(key, (steps, config.batch), 0, windows.shape[0])
-    standard = (windows - detector.offset[None]) / detector.scale
 
     def loss(params: Params, rows: jax.Array, step: jax.Array) -> jax.Array:
         del step
-        predicted = apply_to_columns(params, standard[rows].T)
+        standard = (windows[rows] - detector.offset[None]) / detector.scale
+        predicted = apply_to_columns(params, standard.T)
         return optax.softmax_cross_entropy_with_integer_labels(predicted, labels[rows], 0).mean()
 
     return training.fit(state, loss, rows, _optimiser(config))
