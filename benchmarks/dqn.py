@@ -89,7 +89,7 @@ def dqn_seeds(options: Options) -> Row:
     work = agents * settings.epochs * settings.num_envs
     keys = jax.random.split(jax.random.key(3), num_seeds)
     inputs = keys, task.params, task.bank
-    side = measure.compiled(train, *inputs, work=work, batch=agents, is_training=True)
+    side = measure.compiled(train, *inputs, work=work, batch=agents)
     return measure.compare("dqn_seeds", _UNIT, [side], [], options, repeats=1)
 
 
@@ -143,6 +143,5 @@ def _train_side(
 
     work = settings.epochs * settings.num_envs
     inputs, batch = (jax.random.key(2), *networks), settings.num_envs
-    is_training = settings.observe == "bank"
-    side = measure.compiled(train, *inputs, work=work, batch=batch, is_training=is_training)
+    side = measure.compiled(train, *inputs, work=work, batch=batch)
     return dataclasses.replace(side, num_devices=1 if mesh is None else mesh.size)

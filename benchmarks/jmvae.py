@@ -31,7 +31,7 @@ def jmvae(options: Options) -> Row:
 
     work, batch = steps * config.batch, config.batch
     inputs = jax.random.key(1), bank
-    ours = [measure.compiled(train, *inputs, work=work, batch=batch, is_training=True)]
+    ours = [measure.compiled(train, *inputs, work=work, batch=batch)]
     peer = peers.load("multivae", options)
     theirs = peer.sides(model, config, [np.asarray(x) for x in bank], options) if peer else []
     return measure.compare(

@@ -142,20 +142,16 @@ def compiled(
     work: float,
     batch: int,
     mesh: Mesh | None = None,
-    is_training: bool = False,
 ) -> Side:
     """Compiles a function for its arguments; the side runs it on them and blocks on the outputs.
 
-    With a mesh, arguments and outputs are split over its devices along their first axis. Programs
-    are compiled as in a run, see `devices.compiler_options`.
+    With a mesh, arguments and outputs are split over its devices along their first axis.
     """
     if mesh is not None:
         function = devices.spread(function, mesh)
         args = jax.device_put(args, NamedSharding(mesh, PartitionSpec(devices.AXIS)))
     begin = time.perf_counter()
-    program = (
-        jax.jit(function).lower(*args).compile(devices.compiler_options(is_training=is_training))
-    )
+    program = jax.jit(function).lower(*args).compile(devices.compiler_options(runs_long=True))
     compile_s = time.perf_counter() - begin
     number = 1 if mesh is None else mesh.size
     return Side(lambda: jax.block_until_ready(program(*args)), work, batch, compile_s, number)

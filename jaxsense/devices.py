@@ -23,19 +23,19 @@ def keep_programs(directory: Path) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
-def compiler_options(*, is_training: bool = False) -> Any:
+def compiler_options(*, runs_long: bool = False) -> Any:
     """What a program is compiled with: on a CPU so that compiling and running take least together.
 
     Optimisation at level 1 takes a third less time than at level 3, and what it gives is as fast.
-    Without the newer code generator it is again a third less; only the many small operations of a
-    training become slower.
+    Without the newer code generator it is again a third less, but what it gives may be a third
+    slower.
 
     Args:
-      is_training: of small networks, for thousands of steps.
+      runs_long: far longer than it takes to compile.
     """
     if jax.default_backend() != "cpu":
         return {}
-    return {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": is_training}
+    return {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": runs_long}
 
 
 def start(number: int | None, config: DqnConfig) -> tuple[Mesh | None, Mesh | None]:

@@ -37,7 +37,7 @@ class Program:
         function: Callable[..., Any],
         *args: Any,
         donate: tuple[int, ...] = (),
-        is_training: bool = False,
+        runs_long: bool = False,
         **shardings: Any,
     ) -> Any:
         """Traces a function and begins to compile it.
@@ -46,7 +46,7 @@ class Program:
           function: what to compile.
           *args: arguments or their shapes, for example the result of another program's `compile`.
           donate: positions of arguments whose memory the program may use for its results.
-          is_training: see `devices.compiler_options`.
+          runs_long: see `devices.compiler_options`.
           **shardings: `in_shardings` and `out_shardings` of `jax.jit`.
 
         Returns:
@@ -60,7 +60,7 @@ class Program:
         def compile_lowered() -> None:
             begin = time.perf_counter()
             try:
-                options = devices.compiler_options(is_training=is_training)
+                options = devices.compiler_options(runs_long=runs_long)
                 compiled = lowered.compile(compiler_options=options)
             except Exception as error:
                 self.fail(error)

@@ -185,7 +185,7 @@ def _trace_detectors(programs: Programs, config: Config, models: Models, surveys
         labels = jax.ShapeDtypeStruct((rows,), jnp.int32)
         detector, state = programs.begin_detectors[m].compile(begin, key, flat)
         inputs = key, state, detector, flat, labels
-        programs.train_detectors[m].compile(train, *inputs, is_training=True)
+        programs.train_detectors[m].compile(train, *inputs, runs_long=True)
 
     def detect(trained: tuple[Detector, ...], windows: tuple[jax.Array, ...]):
         each = jax.vmap(jax.vmap(detectors.detect, in_axes=(None, 0)), in_axes=(None, 0))
@@ -230,7 +230,7 @@ def _trace_jmvae(programs: Programs, config: Config, models: Models) -> tuple[Ba
 
     banks = bank(settings.samples_per_class), bank(num_held_out_per_class(config))
     state = programs.begin_jmvae.compile(begin, key)
-    programs.train_jmvae.compile(train, key, state, banks[0], is_training=True)
+    programs.train_jmvae.compile(train, key, state, banks[0], runs_long=True)
     programs.examine_jmvae.compile(
         lambda params, bank: examine.latent_space(params, bank, config), models.jmvae, banks[1]
     )
@@ -293,8 +293,8 @@ def _trace_dqn(
         shardings["in_shardings"] = whole, whole, split, *[whole] * (len(inputs) - 3)
         shardings["out_shardings"] = split, whole
     # With live observations most of the time goes into looking.
-    is_training = settings.observe == "bank"
-    programs.train_dqn.compile(train, *inputs, donate=(2,), is_training=is_training, **shardings)
+    runs_long = settings.observe == "bank"
+    programs.train_dqn.compile(train, *inputs, donate=(2,), runs_long=runs_long, **shardings)
     programs.examine_dqn.compile(
         functools.partial(examine.play, config=config),
         *(key, modality, models.q_networks[0], models.jmvae, banks[1]),

@@ -88,11 +88,18 @@ def _integrate(
     """Physics steps, in each of which the commands go on towards the wanted ones."""
     is_empty = not np.any(arena.poi_of_geom >= 0)
 
-    def step(motion: _Motion, wanted: jax.Array, layout: Layout) -> _Motion:
+    def place_pois(layout: Layout, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
+        data = arena.data if is_empty else arenas.put(arena, layout, poses)
+        return data.mocap_pos, data.mocap_quat
+
+    placed = jax.vmap(place_pois)(layout, motion.poses)
+
+    def step(motion: _Motion, wanted: jax.Array, placed: tuple[jax.Array, jax.Array]) -> _Motion:
         """One step of one mission."""
-        still = arena.data if is_empty else arenas.put(arena, layout, motion.poses)
         command = navigation.ramp(motion.command, wanted, arenas.TIMESTEP)
-        data: mjx.Data = still.replace(
+        data: mjx.Data = arena.data.replace(
+            mocap_pos=placed[0],
+            mocap_quat=placed[1],
             qpos=motion.poses.reshape(-1),
             qvel=motion.velocity.reshape(-1),
             qacc_warmstart=motion.warmstart,
@@ -108,7 +115,7 @@ def _integrate(
 
     def substep(motion: _Motion, _) -> tuple[_Motion, None]:
         # The batch inside the loop: a loop inside a batch is traced over and over.
-        after = jax.vmap(step)(motion, wanted, layout)
+        after = jax.vmap(step)(motion, wanted, placed)
         clearance = _clearance(arena.config, layout, after.poses)
         smallest = jnp.minimum(motion.clearance, clearance)
         return dataclasses.replace(after, clearance=smallest), None

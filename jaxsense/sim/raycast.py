@@ -111,9 +111,10 @@ def cast(section: CrossSection, origin: jax.Array, angle: jax.Array) -> Hit:
       The nearest hits.
     """
     chex.assert_shape(origin, (2,), custom_message="origin")
-    distance, outline = jax.lax.platform_dependent(
-        section, origin, angle, cpu=_nearest_by_two_loops, default=_nearest_by_one_loop
-    )
+    # Chosen here and not by `platform_dependent`, which is traced and batched twice as long.
+    on_cpu = jax.default_backend() == "cpu"
+    nearest = _nearest_by_two_loops if on_cpu else _nearest_by_one_loop
+    distance, outline = nearest(section, origin, angle)
     is_hit = outline < len(section.geom)
     geom = jnp.where(is_hit, choose(jnp.array(section.geom), outline), -1)
     normal_x, normal_y = _normal(section, outline, origin, angle, distance)
