@@ -97,7 +97,7 @@ def _beams(mission: Mission, state: MissionState, poses: jax.Array) -> jax.Array
         for robot, sensor in enumerate(world.sensors):
             angles = poses[robot, 2] + jnp.linspace(sensor.angles[0], sensor.angles[-1], _RAYS)
             section = raycast.cross_section(world.arena, data, sensor.height, robot)
-            hit = jax.vmap(raycast.cast, in_axes=(None, None, 0))(section, poses[robot, :2], angles)
+            hit = raycast.cast(section, poses[robot, :2], angles)
             distance = jnp.minimum(hit.distance, 5.0)[:, None]
             ends.append(poses[robot, None, :2] + distance * _direction(angles))
         return jnp.stack(ends)

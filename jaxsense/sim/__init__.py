@@ -18,6 +18,7 @@ from jaxsense.sim.arena import robot_poses as robot_poses
 from jaxsense.sim.raycast import CrossSection as CrossSection
 from jaxsense.sim.raycast import Hit as Hit
 from jaxsense.sim.raycast import cast as cast
+from jaxsense.sim.raycast import cast_along as cast_along
 from jaxsense.sim.raycast import cross_section as cross_section
 from jaxsense.sim.sensors import Light as Light
 from jaxsense.sim.sensors import Sensor as Sensor

@@ -73,6 +73,12 @@ class Sensor:
     blind: float
     scan_bytes: int
 
+    @property
+    def directions(self) -> np.ndarray:
+        """`[2, B]` unit vectors along the rays in the robot's frame."""
+        angles = self.angles.astype(np.float64)
+        return np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
+
 
 def random_light(key: Key) -> Light:
     """A light from any side, 20 to 70 degrees high, of random strength."""
@@ -175,7 +181,7 @@ def scan(
     layout: Layout,
     light: Light,
     robot: int,
-    angles: jax.Array,
+    directions: jax.Array,
 ) -> jax.Array:
     """Readings of one robot's sensor along some of its rays.
 
@@ -187,36 +193,46 @@ def scan(
       layout: the PoIs, for their colours.
       light: the light.
       robot: index of the robot that carries the sensor; its own parts are not seen.
-      angles: `[B]` in the robot's frame, in radians; `sensor.angles` for a full scan.
+      directions: `[2, B]` unit vectors in the robot's frame; `sensor.directions` for a full scan.
 
     Returns:
       `[B, ...]` readings.
     """
-    chex.assert_rank(angles, 1, custom_message="angles")
+    chex.assert_shape(directions, (2, None), custom_message="directions")
     chex.assert_shape(light.direction, (3,), custom_message="light.direction")
     check_layout(arena.config, layout)
     pose = robot_poses(data)[robot]
     section = raycast.cross_section(arena, data, sensor.height, robot)
-    hits = raycast.cast(section, pose[:2], pose[2] + angles)
+    x, y = directions
+    forward_x, forward_y = jnp.cos(pose[2]), jnp.sin(pose[2])
+    turned = forward_x * x - forward_y * y, forward_y * x + forward_x * y
+    hits = raycast.cast_along(section, pose[:2], turned)
     return sensor.read(key, hits, palette(arena, layout), light)
 
 
-def window_angles(sensor: Sensor, bearing: jax.Array) -> jax.Array:
-    """`[window]` angles of the rays that the detector reads of a scan, in radians.
+def window_of(sensor: Sensor, values: np.ndarray, bearing: jax.Array) -> jax.Array:
+    """Those values that belong to the rays which the detector reads of a scan.
 
-    They lie around a bearing [rad] in the robot's frame; near the edge of the field of view they
-    stop at its last ray.
+    Args:
+      sensor: the sensor.
+      values: `[..., B]` of all rays, for example `sensor.angles`.
+      bearing: `[]` around which the rays lie, in radians in the robot's frame; near the edge of the
+        field of view they stop at its last ray.
+
+    Returns:
+      `[..., window]` values.
     """
     chex.assert_rank(bearing, 0, custom_message="bearing")
+    *shape, number = values.shape
     span = (sensor.window - 1) * sensor.stride
     start = jnp.round(sensor.centre(bearing) - span / 2).astype(jnp.int32)
-    start = jnp.clip(start, 0, len(sensor.angles) - 1 - span)
+    start = jnp.clip(start, 0, number - 1 - span)
     # Cut out as one piece, of every ray that is a stride from the next: a list of indices would
     # be worked out for each ray from the bearing on.
-    padding = -len(sensor.angles) % sensor.stride
-    strided = jnp.array(np.pad(sensor.angles, (0, padding)).reshape(-1, sensor.stride).T)
-    place = start % sensor.stride, start // sensor.stride
-    return jax.lax.dynamic_slice(strided, place, (1, sensor.window))[0]
+    padded = np.pad(values, [(0, 0)] * len(shape) + [(0, -number % sensor.stride)])
+    strided = jnp.array(padded.reshape(*shape, -1, sensor.stride))
+    place = [0] * len(shape) + [start // sensor.stride, start % sensor.stride]
+    return jax.lax.dynamic_slice(strided, place, (*shape, sensor.window, 1))[..., 0]
 
 
 def shows_poi(
@@ -242,7 +258,7 @@ def shows_poi(
       `[]` bool: all rays that must meet a PoI of that size can have met one. Something else before
       it, a PoI that is not there and a sensor that has failed give False.
     """
-    angles = window_angles(sensor, bearing) - bearing
+    angles = window_of(sensor, sensor.angles, bearing) - bearing
     half_width = jnp.arcsin(jnp.minimum(arena.poi_radius / distance, 1.0))
     is_within = jnp.abs(angles) <= _SHARE_OF_WIDTH * half_width
     return jnp.all(sensor.shows(readings, distance, arena.poi_extent) | ~is_within)

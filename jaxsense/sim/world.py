@@ -120,8 +120,8 @@ def scan_around(
       `[window, ...]` readings of the rays that the detector reads.
     """
     sensor = world.sensors[robot]
-    angles = sensors.window_angles(sensor, bearing)
-    return sensors.scan(key, sensor, world.arena, data, scene.layout, scene.light, robot, angles)
+    rays = sensors.window_of(sensor, sensor.directions, bearing)
+    return sensors.scan(key, sensor, world.arena, data, scene.layout, scene.light, robot, rays)
 
 
 def survey(key: Key, world: World, classes: jax.Array) -> tuple[Scene, tuple[jax.Array, ...]]:

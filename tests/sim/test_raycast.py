@@ -275,8 +275,9 @@ def test_one_loop_and_two_find_the_same(arena, known_layout, place):
     section = raycast.cross_section(arena, data, 0.152, 0)
     origins = jax.random.uniform(jax.random.key(0), (200, 2), minval=-1.4, maxval=1.4)
     angles = jax.random.uniform(jax.random.key(1), (200,), maxval=2 * jnp.pi)
+    directions = jnp.cos(angles), jnp.sin(angles)
     one, two = (
-        jax.jit(jax.vmap(find, in_axes=(None, 0, 0)))(section, origins, angles)
+        jax.jit(jax.vmap(find, in_axes=(None, 0, 0)))(section, origins, directions)
         for find in (raycast._nearest_by_one_loop, raycast._nearest_by_two_loops)
     )
     np.testing.assert_allclose(one[0], two[0], atol=1e-5)

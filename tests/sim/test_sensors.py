@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +40,7 @@ def scan(arena, noiseless):
         data = sim.place(arena, layout, poses)
         key = jax.random.key(0)
         return tuple(
-            sim.scan(key, sensor, arena, data, layout, LIGHT, robot, jnp.array(sensor.angles))
+            sim.scan(key, sensor, arena, data, layout, LIGHT, robot, jnp.array(sensor.directions))
             for robot, sensor in enumerate(noiseless)
         )
 
@@ -217,9 +218,10 @@ def test_rays_of_a_window_read_what_they_do_in_a_full_scan(
 
     def windows(data, bearing):
         for robot, sensor in enumerate(noiseless):
-            angles = sensors.window_angles(sensor, bearing)
+            angles = sensors.window_of(sensor, sensor.angles, bearing)
+            rays = sensors.window_of(sensor, sensor.directions, bearing)
             key = jax.random.key(3)
-            yield angles, sim.scan(key, sensor, arena, data, known_layout, LIGHT, robot, angles)
+            yield angles, sim.scan(key, sensor, arena, data, known_layout, LIGHT, robot, rays)
 
     windows_at = jax.jit(lambda *args: tuple(windows(*args)))
     for bearing in (-0.3, 0.05):
@@ -230,7 +232,7 @@ def test_rays_of_a_window_read_what_they_do_in_a_full_scan(
 
 def test_windows_are_centred_on_the_bearing(noiseless):
     for sensor in noiseless:
-        rays = rays_of(sensor, sensors.window_angles(sensor, jnp.float32(0.2)))
+        rays = rays_of(sensor, sensors.window_of(sensor, sensor.angles, jnp.float32(0.2)))
         assert rays.shape == (sensor.window,)
         np.testing.assert_array_equal(np.diff(rays), sensor.stride)
         # Between the two rays in its middle, 0.2 rad, to within half a ray.
@@ -245,7 +247,7 @@ def test_windows_stop_at_the_edges(noiseless):
     # 79 * 4 = 316; 128 beams span 127.
     cases = (camera, 0.69, 0), (camera, -0.69, 639 - 316), (lidar, 2.0, 682 - 127), (lidar, -2.0, 0)
     for sensor, bearing, first in cases:
-        rays = rays_of(sensor, sensors.window_angles(sensor, jnp.float32(bearing)))
+        rays = rays_of(sensor, sensors.window_of(sensor, sensor.angles, jnp.float32(bearing)))
         np.testing.assert_array_equal(rays, first + sensor.stride * np.arange(sensor.window))
 
 
@@ -281,14 +283,15 @@ def test_make_follows_the_order_of_the_modalities():
 
 
 def test_wrong_shapes_are_named_while_tracing(arena, noiseless, known_layout):
-    def scan(angles):
+    def scan(directions):
         key = jax.random.key(0)
-        return sim.scan(key, noiseless[0], arena, arena.data, known_layout, LIGHT, 0, angles)
+        return sim.scan(key, noiseless[0], arena, arena.data, known_layout, LIGHT, 0, directions)
 
-    with pytest.raises(AssertionError, match="angles"):
-        jax.eval_shape(scan, jnp.zeros((2, 3)))
+    with pytest.raises(AssertionError, match="directions"):
+        jax.eval_shape(scan, jnp.zeros((3, 3)))
+    window = functools.partial(sensors.window_of, noiseless[0], noiseless[0].angles)
     with pytest.raises(AssertionError, match="bearing"):
-        jax.eval_shape(lambda b: sensors.window_angles(noiseless[0], b), jnp.zeros(2))
+        jax.eval_shape(window, jnp.zeros(2))
     with pytest.raises(AssertionError, match="readings"):
         jax.eval_shape(lambda r: sensors.as_window(noiseless[0], r), jnp.zeros((79, 3)))
 
