@@ -1,0 +1,24 @@
+"""Every setting of a run: frozen dataclasses, checked when made, and the presets.
+
+A value that makes no sense raises `ConfigError`, a `ValueError` whose one line names the field, its
+value and what would be right. The attribute docstrings are the text of `--help`.
+"""
+
+from jaxsense.config.checks import ConfigError as ConfigError
+from jaxsense.config.learning import DetectorConfig as DetectorConfig
+from jaxsense.config.learning import DqnConfig as DqnConfig
+from jaxsense.config.learning import EvaluationConfig as EvaluationConfig
+from jaxsense.config.learning import JmvaeConfig as JmvaeConfig
+from jaxsense.config.learning import MdpConfig as MdpConfig
+from jaxsense.config.mission import MissionConfig as MissionConfig
+from jaxsense.config.mission import NavigationConfig as NavigationConfig
+from jaxsense.config.presets import PRESETS as PRESETS
+from jaxsense.config.scene import COLOURS as COLOURS
+from jaxsense.config.scene import MODALITIES as MODALITIES
+from jaxsense.config.scene import ROBOT_RADIUS as ROBOT_RADIUS
+from jaxsense.config.scene import SHAPES as SHAPES
+from jaxsense.config.scene import ArenaConfig as ArenaConfig
+from jaxsense.config.scene import CameraConfig as CameraConfig
+from jaxsense.config.scene import LidarConfig as LidarConfig
+from jaxsense.config.scene import ViewpointConfig as ViewpointConfig
+from jaxsense.config.whole import Config as Config

@@ -1,0 +1,185 @@
+"""What is learned and how: detectors, the JMVAE, the map MDP and its Q-networks."""
+
+import dataclasses
+import math
+from typing import Literal
+
+from jaxsense.config.checks import require, require_not_negative, require_positive, require_sizes
+
+_MOST_SHARES = 32
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectorConfig:
+    """The scanline detectors f_x and f_w."""
+
+    hidden: tuple[int, ...] = (64, 64)
+    """Sizes of the hidden layers."""
+    num_scans: int = 98304
+    """Simulated scans to train on, for each modality."""
+    num_held_out: int = 8192
+    """Further simulated scans, on which accuracy is measured."""
+    steps: int = 4000
+    """Gradient steps."""
+    batch: int = 512
+    """Scans of one gradient step."""
+    learning_rate: float = 2e-3
+    """Highest learning rate of Adam; decays to zero by a cosine."""
+
+    def __post_init__(self):
+        require_sizes(self, "hidden")
+        require_positive(self, "num_scans", "num_held_out", "steps", "batch", "learning_rate")
+
+
+@dataclasses.dataclass(frozen=True)
+class JmvaeConfig:
+    """The joint multi-modal VAE."""
+
+    latent_size: int = 2
+    """Dimensions of the latent space, D_z."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Sizes of the hidden layers of every encoder and decoder."""
+    alpha: float = 0.1
+    """Weight of the divergence from the joint posterior to each uni-modal one."""
+    beta: float = 0.001
+    """Weight of the divergence from the joint posterior to the prior."""
+    initial_beta: float = 0.7
+    """Where beta starts: from far above, one latent dimension after the other comes into use."""
+    annealing: float = 0.5
+    """Share of the training in which beta falls from initial_beta to beta."""
+    reconstruction_weights: tuple[float, ...] = (10.0, 10.0)
+    """Weight of each modality's reconstruction, in the order of `modalities`."""
+    restarts: int = 3
+    """Trainings from different random parameters, of which the one with the lowest loss is kept."""
+    samples_per_class: int = 10000
+    """Detections of each class and modality in the training set."""
+    steps: int = 3000
+    """Gradient steps."""
+    batch: int = 256
+    """Pairs of detections in one gradient step."""
+    learning_rate: float = 2e-3
+    """Highest learning rate of Adam; decays to zero by a cosine."""
+
+    def __post_init__(self):
+        require_sizes(self, "hidden")
+        require_positive(self, "latent_size", "samples_per_class", "steps", "batch")
+        require_positive(self, "learning_rate", "restarts")
+        require_positive(self, "beta", "initial_beta")
+        require_not_negative(self, "alpha")
+        require(0 <= self.annealing <= 1, self, "annealing", "must be within 0 and 1")
+        require(
+            all(math.isfinite(w) and w >= 0 for w in self.reconstruction_weights),
+            self,
+            "reconstruction_weights",
+            "must be numbers that are not negative",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class MdpConfig:
+    """The map of beliefs as a Markov decision process."""
+
+    unseen_variance: float = 20.0
+    """Variance of each latent dimension of a PoI that nobody has seen."""
+    min_increase: float = 0.05
+    """Information that a look must gain, in inverse latent units, or its reward is -1."""
+    max_steps: int = 20
+    """Actions after which an episode is cut off."""
+    partly_seen_starts: bool = False
+    """Leave out the starts in which every PoI has been seen by all modalities, or none by any."""
+
+    def __post_init__(self):
+        require_positive(self, "unseen_variance", "max_steps")
+        require_not_negative(self, "min_increase")
+
+
+@dataclasses.dataclass(frozen=True)
+class DqnConfig:
+    """The deep Q-network of each modality."""
+
+    observe: Literal["live", "bank"] = "live"
+    """`live` casts a scan in the environment's own arena at every step; `bank` draws from stored
+    detections."""
+    hidden: tuple[int, ...] = (24, 24)
+    """Sizes of the hidden layers."""
+    num_envs: int = 512
+    """Environments that are stepped side by side."""
+    epochs: int = 1000
+    """Epochs; in each, every environment makes one step, and the network `updates` steps."""
+    updates: int = 48
+    """Gradient steps of one epoch."""
+    batch: int = 512
+    """Transitions of one gradient step."""
+    replay_capacity: int = 512000
+    """Transitions that the replay holds; a multiple of num_envs."""
+    discount: float = 0.5
+    """Discount factor, gamma."""
+    learning_rate: float = 1e-3
+    """Learning rate of Adam."""
+    final_learning_rate: float = 1e-5
+    """Learning rate of the last epoch; the way there is a cosine."""
+    epsilon_start: float = 1.0
+    """Chance of a random action in the first epoch."""
+    epsilon_min: float = 0.01
+    """Lowest chance of a random action."""
+    epsilon_decay: float = 0.99
+    """Factor on epsilon for each epoch."""
+    target_period: int = 50
+    """Epochs between two copies of the network to the target network."""
+    num_starts: int = 8192
+    """Start states that are prepared; each environment has a share of them, from which its episodes
+    start. A multiple of num_envs."""
+    chunk: int = 100
+    """Epochs between two reports of progress."""
+
+    def __post_init__(self):
+        require_sizes(self, "hidden")
+        require_positive(self, "num_envs", "epochs", "updates", "batch", "replay_capacity")
+        require_positive(self, "learning_rate", "target_period", "num_starts", "chunk")
+        require_not_negative(self, "final_learning_rate", "epsilon_start", "epsilon_min")
+        require(0 <= self.discount <= 1, self, "discount", "must be within 0 and 1")
+        require(0 < self.epsilon_decay <= 1, self, "epsilon_decay", "must be above 0, at most 1")
+        require(self.epsilon_start <= 1, self, "epsilon_start", "must be at most 1")
+        require(self.epsilon_min <= 1, self, "epsilon_min", "must be at most 1")
+        require(
+            self.replay_capacity % self.num_envs == 0,
+            self,
+            "replay_capacity",
+            f"must be a multiple of num_envs = {self.num_envs}",
+        )
+        require(
+            self.num_starts % self.num_envs == 0,
+            self,
+            "num_starts",
+            f"must be a multiple of num_envs = {self.num_envs}",
+        )
+        require(
+            self.epochs % self.chunk == 0,
+            self,
+            "epochs",
+            f"must be a multiple of chunk = {self.chunk}",
+        )
+
+    @property
+    def shares(self) -> int:
+        """Shares that environments and batch can be cut into, for example for several devices."""
+        return math.gcd(self.num_envs, self.batch, _MOST_SHARES)
+
+    @property
+    def block(self) -> int:
+        """Neighbouring environments whose transitions are drawn together, see `dqn.replay`."""
+        return math.gcd(self.num_envs, self.batch) // self.shares
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationConfig:
+    """How the trained policies are examined."""
+
+    num_starts: int = 512
+    """Start states from which whole episodes are played."""
+    num_repeats: int = 192
+    """Episodes from each start state, over which the noise of detections is averaged; for
+    the naive and the random policy an eighth of them."""
+
+    def __post_init__(self):
+        require_positive(self, "num_starts", "num_repeats")
