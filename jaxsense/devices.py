@@ -38,13 +38,13 @@ def compiler_options(*, runs_long: bool = False) -> Any:
     return {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": runs_long}
 
 
-def start(number: int | None, config: DqnConfig) -> tuple[Mesh | None, Mesh | None]:
+def start(number: int | None, config: DqnConfig | None = None) -> tuple[Mesh | None, Mesh | None]:
     """The devices of a program; which should be called before JAX is used.
 
     Args:
       number: of devices; on a CPU each is a thread. If not given, all accelerators there are, or as
         many threads as there are cores, but no more than can share the environments evenly.
-      config: whose environments and batch must be divisible by the number.
+      config: of the Q-learning that is to be shared, if any.
 
     Returns:
       Devices to split simulations over and to split Q-learning over; None for a single one. Unless
@@ -60,11 +60,13 @@ def start(number: int | None, config: DqnConfig) -> tuple[Mesh | None, Mesh | No
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", threads)
     is_chosen = number is not None or jax.default_backend() != "cpu"
+    there = jax.device_count()
     if number is None:
-        number = max(n for n in range(1, jax.device_count() + 1) if config.shares % n == 0)
-    if not 1 <= number <= jax.device_count():
-        raise ConfigError("devices", number, f"must be within 1 and {jax.device_count()}")
-    if config.shares % number:
+        can_share = (n for n in range(1, there + 1) if config is None or config.shares % n == 0)
+        number = max(can_share)
+    if not 1 <= number <= there:
+        raise ConfigError("devices", number, f"must be within 1 and {there}")
+    if config is not None and config.shares % number:
         raise ConfigError(
             "devices",
             number,

@@ -12,7 +12,7 @@ import rich.console
 import rich.table
 import tyro
 
-from jaxsense import animation, cli, mission, rundir
+from jaxsense import animation, cli, devices, mission, rundir
 from jaxsense.config import Config, ConfigError
 from jaxsense.display import Display
 from jaxsense.monitor import Monitor
@@ -35,6 +35,11 @@ class Arguments:
     """`latent`, `naive` or `random`; `MODALITY_alone`, `MODALITY_stops` or `MODALITY_blind`, for
     example `camera_alone`: the latent policy where that robot is alone, stops or goes blind after
     6 s; `policies` for the first three, or `all`."""
+    devices: int | None = None
+    """Devices that missions are split over: accelerators, or threads of the CPU. By default all
+    accelerators there are; on a CPU as many threads as cores, at most 8."""
+    cache: Path | None = Path("~/.cache/jaxsense")
+    """Directory in which compiled programs are kept for later runs; `None` to keep none."""
     animate: bool = False
     """Also write an animation of the first mission as `mission-POLICY-SEED.gif`."""
 
@@ -43,6 +48,7 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
+        mesh, _ = devices.start(arguments.devices)
         config, models = rundir.load(arguments.run)
         played = _cases(arguments, config)
         summary = rundir.read_summary(arguments.run)
@@ -53,13 +59,15 @@ def main(argv: list[str] | None = None) -> None:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({error.strerror})")
+    if arguments.cache is not None:
+        devices.keep_programs(arguments.cache.expanduser())
     console = rich.console.Console()
     key = jax.random.key(arguments.seed)
     team = mission.make_mission(config)
     with Display(console) as display:
         monitor = Monitor(display.show)
         number = arguments.episodes * len(played)
-        player = mission.Player(team, monitor, batch=mission.batch_of(number))
+        player = mission.Player(team, monitor, mission.batch_of(number), mesh)
         player.wait()
         begin = time.perf_counter()
         found = mission.summary(key, player, models, played, arguments.episodes)

@@ -6,7 +6,6 @@ says NOP. Robots decide each at its own time; one whose policy reads the map dec
 map has changed under way. Everything is a pure function of one episode: `vmap` over episodes.
 """
 
-from jaxsense.mission.evaluation import BATCH as BATCH
 from jaxsense.mission.evaluation import Case as Case
 from jaxsense.mission.evaluation import Player as Player
 from jaxsense.mission.evaluation import batch_of as batch_of

@@ -178,7 +178,9 @@ def scan(
 
     # The choice of the sensor outside the batch: inside, it would be traced over and over.
     is_seen, entries = call(look, robot, len(mission.world.sensors))
-    write = jax.vmap(lambda *one: _write(mission, *one, robot))
+    write = jax.vmap(
+        lambda state, aim, seen, entry: _write(mission, state, aim, seen, entry, robot)
+    )
     return write(states, aims, is_seen, entries)
 
 

@@ -26,9 +26,8 @@ from jaxsense.models import Models, untrained
 from jaxsense.monitor import Monitor, Program
 from jaxsense.types import Key
 
-BATCH = 384
-"""Most missions that are played side by side."""
-_CHUNK_TIME = 2.5  # s, after which the host looks which missions are over
+_CHUNK_TIME = 2.5  # s
+_MOST_AT_ONCE = 384
 FAULT_TIME = 6.0  # s
 
 
@@ -73,7 +72,7 @@ def chunks(config: Config) -> tuple[int, int]:
 
 def batch_of(total: int) -> int:
     """How many of all missions to play side by side: fewer than all, as some last long."""
-    return min(BATCH, -(-total // 3))
+    return min(_MOST_AT_ONCE, -(-total // 3))
 
 
 def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
@@ -92,9 +91,7 @@ class Player:
       control_steps: control periods of missions played so far, until they were over.
     """
 
-    def __init__(
-        self, mission: Mission, monitor: Monitor, batch: int = BATCH, mesh: Mesh | None = None
-    ):
+    def __init__(self, mission: Mission, monitor: Monitor, batch: int, mesh: Mesh | None = None):
         """Compiles for about `batch` missions side by side, which are split over the devices."""
         num_devices = 1 if mesh is None else mesh.size
         batch = -(-batch // num_devices) * num_devices
@@ -146,11 +143,12 @@ class Player:
         policies = jnp.array([c.policy for c in played.values()], jnp.int32)[case]
         faults = jax.tree.map(lambda *x: jnp.stack(x)[case], *[c.faults for c in played.values()])
         arena_keys, play_keys = jax.vmap(lambda i: keys_of_episode(key, i))(episode)
-        begun = [
-            self._begin(*jax.tree.map(lambda x: x[i : i + self._batch], inputs))  # noqa: B023
-            for inputs in [(arena_keys, policies, faults)]
-            for i in range(0, len(row), self._batch)
-        ]
+        inputs = arena_keys, policies, faults
+
+        def begin(first: int) -> MissionState:
+            return self._begin(*jax.tree.map(lambda x: x[first : first + self._batch], inputs))
+
+        begun = [begin(first) for first in range(0, len(row), self._batch)]
         starts = jax.tree.map(lambda *x: np.concatenate(x), *begun)
 
         # A mission that is over makes room for the next one, so that short ones do not wait.
