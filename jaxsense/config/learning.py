@@ -106,7 +106,7 @@ class DqnConfig:
     """Environments that are stepped side by side."""
     epochs: int = 1000
     """Epochs; in each, every environment makes one step, and the network `updates` steps."""
-    updates: int = 48
+    updates: int = 64
     """Gradient steps of one epoch."""
     batch: int = 512
     """Transitions of one gradient step."""
