@@ -94,7 +94,7 @@ def _learner(task: Task) -> Learner:
     carry = jax.eval_shape(start, key)
     lowered = jax.jit(start).lower(key), jax.jit(go_on, donate_argnums=0).lower(carry)
     with concurrent.futures.ThreadPoolExecutor(len(lowered)) as pool:
-        options = devices.compiler_options(runs_long=True)
+        options = devices.compiler_options()
         begin, train = pool.map(lambda program: program.compile(options), lowered)
     return Learner(start=lambda: begin(key), go_on=train, as_params=lambda carry: carry[1].params)
 
