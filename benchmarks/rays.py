@@ -26,7 +26,7 @@ _GRAZING = 1e-3  # share of rays that pass an edge so closely that rounding deci
 def rays(options: Options) -> Row:
     """Distance, geom and normal of every ray of both robots' sensors, in random scenes."""
     world = worlds.make_world(PRESETS["default"])
-    batches = measure.batches(options, quick=8, cpu=(64, 256, 1024), accelerator=(4096, 16384))
+    batches = measure.batches(options, quick=8, cpu=(64, 256, 1024), accelerator=(16384, 65536))
     placed = _random_scenes(jax.random.key(0), world, batches[-1])
     num_rays = sum(len(sensor.angles) for sensor in world.sensors)
     mesh = devices.make_mesh()
