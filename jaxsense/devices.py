@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxsense.config import ConfigError, DqnConfig
 
@@ -124,4 +124,12 @@ def spread(
             function, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(AXIS), check_vma=False
         )(*args)
 
-    return split
+    def partition(*args: Any) -> Any:
+        rows = NamedSharding(mesh, PartitionSpec(AXIS))
+        constrain = jax.lax.with_sharding_constraint
+        args = tuple(x if i in whole else constrain(x, rows) for i, x in enumerate(args))
+        return constrain(function(*args), rows)
+
+    # For accelerators XLA's compiler crashes on a step of MJX under `shard_map` (jaxlib 0.11.2);
+    # its partitioner finds the same split. On a CPU that would make threads wait for one another.
+    return split if jax.default_backend() == "cpu" else partition
