@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 import jaxsense
 from jaxsense import evaluate, train
@@ -19,11 +20,14 @@ SMOKE = ["--preset", "smoke", "--seed", "3"]
 
 @pytest.fixture(scope="module")
 def cached_compilation(tmp_path_factory):
-    """Compiles each program once for all runs of this module."""
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("cache")))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-    yield
-    jax.config.update("jax_compilation_cache_dir", None)
+    """Compiles each program once for all runs of this module, and keeps it in a home of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOME", str(tmp_path_factory.mktemp("home")))
+        jax.config.update("jax_enable_compilation_cache", True)
+        compilation_cache.reset_cache()  # whether there is one was found out before
+        yield
+    jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()
 
 
 @pytest.fixture(scope="module")
