@@ -69,7 +69,7 @@ class MissionConfig:
     """Actions whose values differ by less than this from the best count as equally good, in inverse
     latent units; the robot takes the PoI that no other robot is heading for, and of these the
     nearest."""
-    least_confidence: float = 0.95
+    least_confidence: float = 0.98
     """Probability that a detector must give to its answer for it to be written into the map."""
     attempts: int = 3
     """Looks that detect nothing, or goals that are not reached, after which a robot gives a PoI
