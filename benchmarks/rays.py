@@ -64,9 +64,9 @@ def _cast(world: World, data: mjx.Data) -> tuple[Hit, ...]:
         sensor = world.sensors[robot]
         x, y, yaw = arenas.robot_poses(data)[robot]
         section = raycast.cross_section(world.arena, data, sensor.height, robot)
-        sideways = jnp.array([[0.0, -1.0], [1.0, 0.0]]) @ sensor.directions
-        turned = jnp.cos(yaw) * sensor.directions + jnp.sin(yaw) * sideways
-        return raycast.cast_along(section, jnp.stack([x, y]), (turned[0], turned[1]))
+        x_part, y_part = jnp.asarray(sensor.directions)
+        in_world = raycast.turned((x_part, y_part), yaw)
+        return raycast.cast_along(section, jnp.stack([x, y]), in_world)
 
     return tuple(scan(robot) for robot in range(len(world.sensors)))
 

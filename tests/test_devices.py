@@ -108,7 +108,10 @@ jax.distributed.shutdown()
             np.testing.assert_allclose(here, np.asarray(there), atol=TOLERANCE)
 
 
-def test_a_spread_function_gives_what_it_gives_alone():
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_a_spread_function_gives_what_it_gives_alone(backend, monkeypatch):
+    # Threads of a CPU, asked to split the work as accelerators do.
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     mesh = devices.make_mesh(2)
 
     def function(x, scale):

@@ -131,6 +131,13 @@ def cast_along(section: CrossSection, origin: jax.Array, direction: Direction) -
     return Hit(distance, geom, normal)
 
 
+def turned(direction: Direction, yaw: jax.Array) -> Direction:
+    """Unit vectors turned to the left by `[]` yaw, in radians."""
+    x, y = direction
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    return cos * x - sin * y, cos * y + sin * x
+
+
 def choose(table: jax.Array, index: jax.Array) -> jax.Array:
     """`table[index]` along the first axis, as a chain of selects.
 

@@ -203,10 +203,8 @@ def scan(
     check_layout(arena.config, layout)
     pose = robot_poses(data)[robot]
     section = raycast.cross_section(arena, data, sensor.height, robot)
-    x, y = directions
-    forward_x, forward_y = jnp.cos(pose[2]), jnp.sin(pose[2])
-    turned = forward_x * x - forward_y * y, forward_y * x + forward_x * y
-    hits = raycast.cast_along(section, pose[:2], turned)
+    in_world = raycast.turned((directions[0], directions[1]), pose[2])
+    hits = raycast.cast_along(section, pose[:2], in_world)
     return sensor.read(key, hits, palette(arena, layout), light)
 
 

@@ -269,6 +269,13 @@ def test_wrong_shapes_are_named_while_tracing(arena, place, known_layout):
         jax.eval_shape(sim.cast, section, jnp.zeros(3), jnp.float32(0))
 
 
+def test_turned_as_worked_by_hand():
+    # A quarter turn to the left takes east to north, and north to west.
+    x, y = raycast.turned((jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])), jnp.float32(np.pi / 2))
+    np.testing.assert_allclose(x, [0.0, -1.0], atol=1e-6)
+    np.testing.assert_allclose(y, [1.0, 0.0], atol=1e-6)
+
+
 def test_one_loop_and_two_find_the_same(arena, known_layout, place):
     """Accelerators use the one and CPUs the other."""
     data = place(known_layout, jnp.zeros((2, 3)))
