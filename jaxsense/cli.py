@@ -4,11 +4,16 @@ import contextlib
 import io
 import re
 import sys
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+import jax
 import tyro
+from jax.sharding import Mesh
 
-from jaxsense.config import ConfigError
+from jaxsense.compilation import Kept
+from jaxsense.config import Config, ConfigError
 
 T = TypeVar("T")
 
@@ -42,6 +47,32 @@ def fail(program: str, message: str) -> NoReturn:
     """Ends a program for a reason that is the user's to mend."""
     print(f"{program}: {message} (--help tells every option)", file=sys.stderr)
     sys.exit(2)
+
+
+def keep_programs(
+    program: str, directory: Path | None, config: Config, meshes: Iterable[Mesh | None]
+) -> Kept | None:
+    """Where compiled programs are kept.
+
+    Args:
+      program: module that is run.
+      directory: where the user wants them, if anywhere.
+      config: all settings.
+      meshes: devices that work is split over.
+
+    Returns:
+      The programs with these settings; None if the directory cannot be used, which is told.
+    """
+    # Programs of several processes need all of them to load.
+    if directory is None or jax.process_count() > 1:
+        return None
+    try:
+        directory = directory.expanduser()
+        kept = Kept(directory, config, [mesh and mesh.size for mesh in meshes])
+    except (OSError, RuntimeError) as error:
+        print(f"{program}: programs cannot be kept in {directory} ({error})", file=sys.stderr)
+        return None
+    return kept
 
 
 def _one_line(message: str) -> str:

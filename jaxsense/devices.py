@@ -3,7 +3,6 @@
 import contextlib
 import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,13 +13,6 @@ from jaxsense.config import ConfigError, DqnConfig
 
 AXIS = "devices"
 _MOST_THREADS = 8
-
-
-def keep_programs(directory: Path) -> None:
-    """Keeps compiled programs in a directory, from which later runs take them."""
-    jax.config.update("jax_compilation_cache_dir", str(directory))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 def compiler_options(*, runs_long: bool = False) -> Any:

@@ -13,6 +13,7 @@ import rich.table
 import tyro
 
 from jaxsense import animation, cli, devices, mission, rundir
+from jaxsense.compilation import Compiler
 from jaxsense.config import Config, ConfigError
 from jaxsense.display import Display
 from jaxsense.monitor import Monitor
@@ -59,23 +60,22 @@ def main(argv: list[str] | None = None) -> None:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({error.strerror})")
-    if arguments.cache is not None:
-        devices.keep_programs(arguments.cache.expanduser())
+    kept = cli.keep_programs(PROGRAM, arguments.cache, config, (mesh,))
     console = rich.console.Console()
     key = jax.random.key(arguments.seed)
     team = mission.make_mission(config)
-    with Display(console) as display:
-        monitor = Monitor(display.show)
+    with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
         number = arguments.episodes * len(played)
-        player = mission.Player(team, monitor, mission.batch_of(number), mesh)
+        player = mission.Player(team, compiler, mission.batch_of(number), mesh)
         player.wait()
         begin = time.perf_counter()
         found = mission.summary(key, player, models, played, arguments.episodes)
         seconds = time.perf_counter() - begin
+        compiling = compiler.monitor.seconds["mission"]["compile_s"]
     summary["mission"] = _merge(summary.get("mission", {}), found, arguments)
     rundir.write_json(path, summary)
     _print_table(console, found)
-    rate, compiling = player.control_steps / seconds, monitor.seconds["mission"]["compile_s"]
+    rate = player.control_steps / seconds
     console.print(
         f"{number} missions in {seconds:.1f} s after {compiling:.0f} s of compilation: "
         f"{rate:.0f} control steps/s, "

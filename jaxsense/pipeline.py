@@ -16,6 +16,7 @@ from flax import struct
 from jax.sharding import Mesh
 
 from jaxsense import examine, mission
+from jaxsense.compilation import Compiler, Kept
 from jaxsense.config import MODALITIES, Config
 from jaxsense.models import Models
 from jaxsense.monitor import Monitor
@@ -82,6 +83,7 @@ def run(
     keep: Callable[[str, Any], None] = lambda name, tree: None,
     mesh: Mesh | None = None,
     learner_mesh: Mesh | None = None,
+    kept: Kept | None = None,
 ) -> RunResult:
     """All stages.
 
@@ -92,6 +94,7 @@ def run(
       keep: `(stage, parameters)`, called as soon as a stage has been trained.
       mesh: devices that simulations are split over; the first one alone if not given.
       learner_mesh: devices that the environments of Q-learning are split over, likewise.
+      kept: where compiled programs are kept for later runs, if anywhere.
 
     Returns:
       The trained networks and their figures.
@@ -99,18 +102,27 @@ def run(
     Raises:
       StageError: if a loss is not finite.
     """
+    with Compiler(monitor, kept) as compiler:
+        programs = compile_programs(config, make_world(config), compiler, mesh, learner_mesh)
+        return _run(key, config, programs, monitor, keep)
+
+
+def _run(
+    key: Key,
+    config: Config,
+    programs: Programs,
+    monitor: Monitor,
+    keep: Callable[[str, Any], None],
+) -> RunResult:
+    """The stages, with their programs."""
     saver = ThreadPoolExecutor(1)
     saved: list[Future] = []
 
     def keep_soon(name: str, tree: Any) -> None:
         saved.append(saver.submit(keep, name, tree))
 
-    world = make_world(config)
-    programs = compile_programs(config, world, monitor, mesh, learner_mesh)
     names = config.modalities
-    survey_key, detector_key, jmvae_key, mission_key, *dqn_keys = jax.random.split(
-        key, 4 + len(names)
-    )
+    survey_key, detector_key, jmvae_key, mission_key, *dqn_keys = _keys(key, 4 + len(names))
     surveys = jax.tree.map(np.asarray, programs.simulate(survey_key))
     trained, detections = train_detectors(detector_key, surveys, config, programs, monitor)
     keep_soon("detectors", trained)
@@ -123,7 +135,7 @@ def run(
 
     def train_and_examine(modality: int):
         name = names[modality]
-        train_key, examine_key = jax.random.split(dqn_keys[modality])
+        train_key, examine_key = _keys(dqn_keys[modality], 2)
         q_network, rewards, speed = train_dqn(
             train_key, modality, trained, params, detections, config, programs, monitor
         )
@@ -154,6 +166,11 @@ def run(
     )
 
 
+def _keys(key: Key, number: int) -> list[Key]:
+    """Different keys, as from `jax.random.split`, which would compile anew for each number."""
+    return [jax.random.fold_in(key, i) for i in range(number)]
+
+
 def _side_by_side(function: Callable[[int], T], number: int) -> list[T]:
     """`function(0)`, `function(1)` and so on, each in a thread: one alone leaves cores idle."""
     with ThreadPoolExecutor(number) as executor:
@@ -165,12 +182,12 @@ def train_detectors(
 ) -> tuple[tuple[Detector, ...], Detections]:
     """Trains the detectors on some of the surveys and applies them to the others."""
     num_train, num_bank, _ = num_scenes(config)
-    keys = jax.random.split(key, len(config.modalities))
+    keys = _keys(key, len(config.modalities))
 
     def train(modality: int) -> Detector:
         stage = f"detector_{config.modalities[modality]}"
         steps = config.detector.steps
-        init_key, *chunk_keys = jax.random.split(keys[modality], 1 + num_chunks(steps))
+        init_key, *chunk_keys = _keys(keys[modality], 1 + num_chunks(steps))
         windows = surveys.windows[modality][:num_train]
         windows = jax.device_put(windows.reshape(-1, windows.shape[-1]))
         labels = _labels(config, modality)[surveys.classes[:num_train]].reshape(-1)
@@ -224,18 +241,19 @@ def train_jmvae(
 ) -> Params:
     """Trains JMVAEs on a bank of detections and keeps the one with the lowest loss at the end."""
     settings = config.jmvae
-    keys = jax.random.split(key, (settings.restarts, 1 + num_chunks(settings.steps)))
+    num_keys = 1 + num_chunks(settings.steps)
+    keys = [_keys(of_restart, num_keys) for of_restart in _keys(key, settings.restarts)]
     states = [programs.begin_jmvae(of_restart[0]) for of_restart in keys]
     losses = np.zeros((settings.restarts, 1))
-    for i in range(1, keys.shape[1]):
+    for i in range(1, num_keys):
 
         def train(restart: int):
-            return programs.train_jmvae(keys[restart, i], states[restart], bank)  # noqa: B023
+            return programs.train_jmvae(keys[restart][i], states[restart], bank)  # noqa: B023
 
         # On a CPU a batch of small networks takes longer than one after the other.
         states, losses = zip(*_side_by_side(train, settings.restarts), strict=True)
         losses = np.stack(losses)
-        done = i * settings.steps // (keys.shape[1] - 1)
+        done = i * settings.steps // (num_keys - 1)
         # The worst loss, so that a restart that fails does not go unnoticed.
         monitor.report("jmvae", done, settings.steps, losses.max(axis=0))
     best = int(losses.mean(axis=1).argmin())
@@ -262,7 +280,7 @@ def train_dqn(
     """
     settings, stage = config.dqn, f"dqn_{config.modalities[modality]}"
     num_chunks = settings.epochs // settings.chunk
-    start_key, init_key, *chunk_keys = jax.random.split(key, 2 + num_chunks)
+    start_key, init_key, *chunk_keys = _keys(key, 2 + num_chunks)
     models = trained, params, detections.train
     prepared = programs.start_dqn(start_key, detections.starts, *models)
     state = programs.begin_dqn(init_key, prepared, *models)

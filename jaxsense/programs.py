@@ -15,11 +15,11 @@ from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxsense import devices, examine, mission, observe
+from jaxsense.compilation import Compiler, Program
 from jaxsense.config import Config
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn import training as dqn
 from jaxsense.models import Models, jmvae_shape, untrained
-from jaxsense.monitor import Monitor, Program
 from jaxsense.networks import Params
 from jaxsense.observe import Bank
 from jaxsense.sim.world import Scene, World
@@ -92,24 +92,24 @@ class Programs:
 def compile_programs(
     config: Config,
     world: World,
-    monitor: Monitor,
+    compiler: Compiler,
     mesh: Mesh | None = None,
     learner_mesh: Mesh | None = None,
 ) -> Programs:
     """Begins to trace and to compile; see `pipeline.run` for the arguments."""
     stages = [f"detector_{name}" for name in config.modalities]
     programs = Programs(
-        simulate=Program(monitor, "simulate"),
-        begin_detectors=tuple(Program(monitor, stage) for stage in stages),
-        train_detectors=tuple(Program(monitor, stage) for stage in stages),
-        detect=Program(monitor, "detect"),
-        begin_jmvae=Program(monitor, "jmvae"),
-        train_jmvae=Program(monitor, "jmvae"),
-        examine_jmvae=Program(monitor, "evaluate_jmvae"),
-        start_dqn=Program(monitor, "dqn"),
-        begin_dqn=Program(monitor, "dqn"),
-        train_dqn=Program(monitor, "dqn"),
-        examine_dqn=Program(monitor, "evaluate_dqn"),
+        simulate=Program(compiler, "simulate", "run"),
+        begin_detectors=tuple(Program(compiler, stage, "begin") for stage in stages),
+        train_detectors=tuple(Program(compiler, stage, "train") for stage in stages),
+        detect=Program(compiler, "detect", "run"),
+        begin_jmvae=Program(compiler, "jmvae", "begin"),
+        train_jmvae=Program(compiler, "jmvae", "train"),
+        examine_jmvae=Program(compiler, "evaluate_jmvae", "run"),
+        start_dqn=Program(compiler, "dqn", "start"),
+        begin_dqn=Program(compiler, "dqn", "begin"),
+        train_dqn=Program(compiler, "dqn", "train"),
+        examine_dqn=Program(compiler, "evaluate_dqn", "run"),
         player=Future(),
     )
 
@@ -120,7 +120,7 @@ def compile_programs(
             # Needed last, but it takes longest to compile.
             batch = mission.batch_of(len(mission.POLICIES) * config.mission.episodes)
             team = mission.make_mission(config)
-            programs.player.set_result(mission.Player(team, monitor, batch, mesh))
+            programs.player.set_result(mission.Player(team, compiler, batch, mesh))
             _trace_detectors(programs, config, models, surveys)
             banks = _trace_jmvae(programs, config, models)
             _trace_dqn(programs, config, world, models, surveys, banks, learner_mesh)

@@ -60,19 +60,15 @@ def main(argv: list[str] | None = None) -> None:
         )
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
-    if arguments.cache is not None:
-        devices.keep_programs(arguments.cache.expanduser())
+    kept = cli.keep_programs(PROGRAM, arguments.cache, arguments.config, meshes)
     with Display(console, run.append_metrics) as display:
         monitor = Monitor(display.show)
         try:
             result = pipeline.run(
-                jax.random.key(arguments.seed), arguments.config, monitor, run.save, *meshes
+                jax.random.key(arguments.seed), arguments.config, monitor, run.save, *meshes, kept
             )
         except StageError as error:
             cli.fail(PROGRAM, f"{error}; must be finite. What was written before is in {run.path}")
-        finally:
-            # Else the process would go on compiling what nobody waits for.
-            monitor.close()
     report.write_plots(run.path, arguments.config, result)
     summary = {
         "preset": arguments.preset,

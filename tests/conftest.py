@@ -7,5 +7,3 @@ import jax
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# The programs under test keep what they compile for later runs; tests leave nothing behind.
-jax.config.update("jax_enable_compilation_cache", False)

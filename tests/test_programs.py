@@ -9,10 +9,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 
 import jaxsense
 from jaxsense import evaluate, train
+from jaxsense.compilation import Compiler
 from jaxsense.config import PRESETS, Config
 
 SMOKE = ["--preset", "smoke", "--seed", "3"]
@@ -23,11 +23,7 @@ def cached_compilation(tmp_path_factory):
     """Compiles each program once for all runs of this module, and keeps it in a home of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOME", str(tmp_path_factory.mktemp("home")))
-        jax.config.update("jax_enable_compilation_cache", True)
-        compilation_cache.reset_cache()  # whether there is one was found out before
         yield
-    jax.config.update("jax_enable_compilation_cache", False)
-    compilation_cache.reset_cache()
 
 
 @pytest.fixture(scope="module")
@@ -279,7 +275,7 @@ def test_the_animation_shows_the_mission_that_was_evaluated(run):
     config, models = jaxsense.load(run)
     team, key = mission.make_mission(config), jax.random.key(5)
     case = mission.cases(config)["naive"]
-    player = mission.Player(team, Monitor(), batch=2)
+    player = mission.Player(team, Compiler(Monitor()), batch=2)
     found = player.play(key, models, {"naive": case}, 2)["naive"]
     state, record = animation.play_first(key, team, models, case)
     np.testing.assert_allclose(

@@ -104,7 +104,7 @@ class DqnConfig:
     """Sizes of the hidden layers."""
     num_envs: int = 512
     """Environments that are stepped side by side."""
-    epochs: int = 1000
+    epochs: int = 800
     """Epochs; in each, every environment makes one step, and the network `updates` steps."""
     updates: int = 64
     """Gradient steps of one epoch."""

@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxsense import devices
+from jaxsense.compilation import Compiler, Program
 from jaxsense.config import MODALITIES, Config
 from jaxsense.mission.figures import REASONS, figures
 from jaxsense.mission.rollout import play
@@ -23,7 +24,6 @@ from jaxsense.mission.state import (
     reset,
 )
 from jaxsense.models import Models, untrained
-from jaxsense.monitor import Monitor, Program
 from jaxsense.types import Key
 
 _CHUNK_TIME = 2.5  # s
@@ -91,32 +91,40 @@ class Player:
       control_steps: control periods of missions played so far, until they were over.
     """
 
-    def __init__(self, mission: Mission, monitor: Monitor, batch: int, mesh: Mesh | None = None):
+    def __init__(self, mission: Mission, compiler: Compiler, batch: int, mesh: Mesh | None = None):
         """Compiles for about `batch` missions side by side, which are split over the devices."""
         num_devices = 1 if mesh is None else mesh.size
         batch = -(-batch // num_devices) * num_devices
-        self.mission, self._monitor, self._batch = mission, monitor, batch
+        self.mission, self._monitor, self._batch = mission, compiler.monitor, batch
         self.control_steps = 0
         config = mission.config
         chunk, _ = chunks(config)
 
-        def begin(keys: Key, policies: jax.Array, faults: Faults):
-            return jax.vmap(lambda k, p, f: reset(k, mission, p, f))(keys, policies, faults)
+        def begin(key: Key, episode: jax.Array, policies: jax.Array, faults: Faults):
+            def begin_one(episode: jax.Array, policy: jax.Array, faults: Faults):
+                return reset(keys_of_episode(key, episode)[0], mission, policy, faults)
 
-        def go_on(keys: Key, models: Models, state: MissionState):
+            return jax.vmap(begin_one)(episode, policies, faults)
+
+        def go_on(
+            key: Key, episode: jax.Array, number: jax.Array, models: Models, state: MissionState
+        ):
+            keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(episode)
+            keys = jax.vmap(jax.random.fold_in)(keys, number)
             state = play(keys, mission, models, state, chunk)
             return state, jax.vmap(lambda s: figures(mission, models, s))(state)
 
-        keys = jax.random.split(jax.random.key(0), batch)
-        faults = jax.tree.map(lambda x: jnp.tile(x, (batch, 1)), no_faults(config))
-        inputs = keys, jnp.zeros(batch, jnp.int32), faults
-        self._begin = Program(monitor, "mission")
-        state = self._begin.compile(devices.spread(begin, mesh), *inputs)
+        key, numbers = jax.random.key(0), jax.ShapeDtypeStruct((batch,), jnp.int32)
+        faults = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((batch, *x.shape), x.dtype), no_faults(config)
+        )
+        self._begin = Program(compiler, "mission", "begin")
+        begin = devices.spread(begin, mesh, whole=(0,))
+        state = self._begin.compile(begin, key, numbers, numbers, faults)
         models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
-        go_on = devices.spread(go_on, mesh, whole=(1,))
-        self._go_on = Program(monitor, "mission")
-        self._go_on.compile(go_on, keys, models, state)
-        self._chunk_keys = jax.jit(jax.vmap(jax.random.fold_in))
+        self._go_on = Program(compiler, "mission", "go_on")
+        go_on = devices.spread(go_on, mesh, whole=(0, 3))
+        self._go_on.compile(go_on, key, numbers, numbers, models, state)
 
     def wait(self) -> None:
         """Waits until the programs are compiled."""
@@ -138,15 +146,15 @@ class Player:
           For each case the `[episodes, ...]` figures of `figures.figures`.
         """
         total = episodes * len(played)
-        row = np.arange(-(-total // self._batch) * self._batch) % total
+        row = np.arange(-(-total // self._batch) * self._batch, dtype=np.int32) % total
         case, episode = row // episodes, row % episodes
-        policies = jnp.array([c.policy for c in played.values()], jnp.int32)[case]
-        faults = jax.tree.map(lambda *x: jnp.stack(x)[case], *[c.faults for c in played.values()])
-        arena_keys, play_keys = jax.vmap(lambda i: keys_of_episode(key, i))(episode)
-        inputs = arena_keys, policies, faults
+        policies = np.array([c.policy for c in played.values()], np.int32)[case]
+        faults = jax.tree.map(lambda *x: np.stack(x)[case], *[c.faults for c in played.values()])
+        inputs = episode, policies, faults
 
         def begin(first: int) -> MissionState:
-            return self._begin(*jax.tree.map(lambda x: x[first : first + self._batch], inputs))
+            part = jax.tree.map(lambda x: x[first : first + self._batch], inputs)
+            return jax.tree.map(np.asarray, self._begin(key, *part))
 
         begun = [begin(first) for first in range(0, len(row), self._batch)]
         starts = jax.tree.map(lambda *x: np.concatenate(x), *begun)
@@ -157,8 +165,7 @@ class Player:
         chunk, done = np.zeros(self._batch, np.int32), np.zeros(len(row), bool)
         results: Any = None
         while not done[:total].all():
-            keys = self._chunk_keys(play_keys[playing], chunk)
-            state, found = self._go_on(keys, models, state)
+            state, found = self._go_on(key, episode[playing], chunk, models, state)
             state, found = jax.tree.map(np.array, (state, found))
             if results is None:
                 results = jax.tree.map(lambda x: np.zeros((len(row), *x.shape[1:]), x.dtype), found)
