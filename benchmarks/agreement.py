@@ -1,0 +1,77 @@
+"""How far an accelerator's results are from the CPU's: `python -m benchmarks.agreement`."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import jax
+import numpy as np
+import rich.console
+import rich.table
+
+from jaxsense import devices, mission, observe
+from jaxsense.config import PRESETS
+from jaxsense.models import jmvae_shape, untrained
+from jaxsense.vae import detectors, jmvae
+
+_SCENES = 256
+_SECONDS = 1.0
+
+
+def main(argv: list[str]) -> None:
+    """Prints the largest differences; with a file as argument, writes the results there instead."""
+    devices.start(None)
+    if argv:
+        np.savez(argv[0], **_results())
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "cpu.npz"
+        # Some of what is compiled depends on the backend of the process.
+        subprocess.run(
+            [sys.executable, "-m", "benchmarks.agreement", str(file)],
+            check=True,
+            env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        )
+        expected = dict(np.load(file))
+    kind = jax.devices()[0].device_kind
+    table = rich.table.Table("result", "largest difference", title=f"CPU and {kind}")
+    for name, values in _results().items():
+        table.add_row(name, f"{np.abs(values - expected[name]).max():.1e}")
+    rich.console.Console().print(table)
+
+
+def _results() -> dict[str, np.ndarray]:
+    """Scans, beliefs and motion in random scenes, on the default device."""
+    config = PRESETS["default"]
+    team = mission.make_mission(config)
+    models, model = untrained(jax.random.key(0), config), jmvae_shape(config)
+    keys = jax.random.split(jax.random.key(1), _SCENES)
+
+    @jax.jit
+    def run(keys: jax.Array):
+        classes = observe.balanced_classes(jax.random.key(2), config, _SCENES)
+        _, windows = observe.surveys(keys, team.world, classes)
+        features = [
+            jax.vmap(jax.vmap(detectors.detect, (None, 0)), (None, 0))(detector, window)
+            for detector, window in zip(models.detectors, windows, strict=True)
+        ]
+        encode = jax.vmap(jax.vmap(lambda *f: jmvae.posterior(models.jmvae, model, f)))
+        states = jax.vmap(lambda key: mission.reset(key, team, 1))(keys)
+        periods = round(_SECONDS / config.mission.control_period)
+        states = mission.play(keys, team, models, states, periods)
+        found = dict(zip(config.modalities, windows, strict=True))
+        return found, encode(*features), states.scene.poses
+
+    windows, belief, poses = jax.tree.map(np.asarray, run(keys))
+    return {
+        **{f"window of the {name}": window for name, window in windows.items()},
+        "belief, mean": belief.mean,
+        "belief, standard deviation": belief.std,
+        f"poses after {_SECONDS:.0f} s of a mission, in m and rad": poses,
+    }
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
