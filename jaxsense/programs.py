@@ -113,17 +113,24 @@ def compile_programs(
         player=Future(),
     )
 
+    def trace_missions() -> None:
+        batch = mission.batch_of(len(mission.POLICIES) * config.mission.episodes)
+        team = mission.make_mission(config)
+        programs.player.set_result(mission.Player(team, compiler, batch, mesh))
+
     def trace() -> None:
         try:
             models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
             surveys = _trace_simulation(programs, config, world, mesh)
-            # Needed last, but it takes longest to compile.
-            batch = mission.batch_of(len(mission.POLICIES) * config.mission.episodes)
-            team = mission.make_mission(config)
-            programs.player.set_result(mission.Player(team, compiler, batch, mesh))
+            # Needed last, but on a CPU they take longest to compile. Beside an accelerator are cores
+            # enough to compile, and what all wait for is tracing.
+            if _on_cpu():
+                trace_missions()
             _trace_detectors(programs, config, models, surveys)
             banks = _trace_jmvae(programs, config, models)
             _trace_dqn(programs, config, world, models, surveys, banks, learner_mesh)
+            if not _on_cpu():
+                trace_missions()
         except BaseException as error:
             programs.fail(error)
 
@@ -157,6 +164,11 @@ def num_scene_starts(config: Config) -> int:
     return config.dqn.num_starts if config.dqn.observe == "live" else 0
 
 
+def _on_cpu() -> bool:
+    """Whether the programs run on a CPU; accelerators train faster than they compile."""
+    return jax.default_backend() == "cpu"
+
+
 def _trace_simulation(
     programs: Programs, config: Config, world: World, mesh: Mesh | None
 ) -> Surveys:
@@ -185,7 +197,7 @@ def _trace_detectors(programs: Programs, config: Config, models: Models, surveys
         labels = jax.ShapeDtypeStruct((rows,), jnp.int32)
         detector, state = programs.begin_detectors[m].compile(begin, key, flat)
         inputs = key, state, detector, flat, labels
-        programs.train_detectors[m].compile(train, *inputs, runs_long=True)
+        programs.train_detectors[m].compile(train, *inputs, runs_long=_on_cpu())
 
     def detect(trained: tuple[Detector, ...], windows: tuple[jax.Array, ...]):
         each = jax.vmap(jax.vmap(detectors.detect, in_axes=(None, 0)), in_axes=(None, 0))
@@ -230,7 +242,7 @@ def _trace_jmvae(programs: Programs, config: Config, models: Models) -> tuple[Ba
 
     banks = bank(settings.samples_per_class), bank(num_held_out_per_class(config))
     state = programs.begin_jmvae.compile(begin, key)
-    programs.train_jmvae.compile(train, key, state, banks[0], runs_long=True)
+    programs.train_jmvae.compile(train, key, state, banks[0], runs_long=_on_cpu())
     programs.examine_jmvae.compile(
         lambda params, bank: examine.latent_space(params, bank, config), models.jmvae, banks[1]
     )
@@ -293,7 +305,7 @@ def _trace_dqn(
         shardings["in_shardings"] = whole, whole, split, *[whole] * (len(inputs) - 3)
         shardings["out_shardings"] = split, whole
     # With live observations most of the time goes into looking.
-    runs_long = settings.observe == "bank"
+    runs_long = settings.observe == "bank" and _on_cpu()
     programs.train_dqn.compile(train, *inputs, donate=(2,), runs_long=runs_long, **shardings)
     programs.examine_dqn.compile(
         functools.partial(examine.play, config=config),
