@@ -24,7 +24,7 @@ def main(argv: list[str]) -> None:
     """Prints the largest differences; with a file as argument, writes the results there instead."""
     devices.start(None)
     if argv:
-        np.savez(argv[0], **_results())
+        np.savez(argv[0], allow_pickle=False, **_results())
         return
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "cpu.npz"

@@ -10,7 +10,7 @@ import platform
 import shutil
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -214,9 +214,12 @@ class Program:
             self._compiled.set_exception(error)
 
     def wait(self) -> Callable[..., Any]:
-        """Waits until the program is compiled, and gives it."""
+        """Waits until the program is compiled, and gives it; `Stopped` if the run is to stop."""
         if not self._compiled.done():
             self._monitor.announce(self._stage)
+        while not self._compiled.done():
+            self._monitor.check_stop()
+            wait((self._compiled,), timeout=0.2)
         return self._compiled.result()
 
     def __call__(self, *args: Any) -> Any:

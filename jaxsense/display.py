@@ -6,16 +6,29 @@ from collections.abc import Callable
 import rich.console
 import rich.progress
 
+_LINE_PERIOD = 5.0  # s
+
 
 class Display:
     """Progress of a run: a live bar for each stage, or plain lines where there is no terminal."""
 
-    def __init__(self, console: rich.console.Console, record: Callable[..., None] | None = None):
-        """Shows progress on a console; `record` takes the figures of every report."""
-        self._console = console
-        self._record = record
+    def __init__(
+        self,
+        console: rich.console.Console,
+        *records: Callable[..., None],
+        quiet: bool = False,
+    ):
+        """Shows progress on a console.
+
+        Args:
+          console: where to.
+          *records: each takes the figures of every report.
+          quiet: show nothing, but do record.
+        """
+        self._console, self._records, self._quiet = console, records, quiet
         self._tasks: dict[str, rich.progress.TaskID] = {}
-        self._first: dict[str, float] = {}
+        self._first: dict[str, tuple[float, int]] = {}
+        self._last: dict[str, float] = {}
         self._begin = time.perf_counter()
         columns = rich.progress
         self._progress = rich.progress.Progress(
@@ -28,7 +41,7 @@ class Display:
             columns.TimeRemainingColumn(),
             columns.TextColumn("{task.fields[figures]}"),
             console=console,
-            disable=not console.is_terminal,
+            disable=quiet or not console.is_terminal,
         )
 
     def __enter__(self) -> "Display":
@@ -38,18 +51,25 @@ class Display:
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
+    def note(self, text: str) -> None:
+        """Shows a line in between."""
+        self._progress.console.print(text, highlight=False)
+
     def show(self, stage: str, done: int, total: int, figures: dict[str, float]) -> None:
         """Takes a report of a `Monitor`; one without a total says that a stage compiles."""
-        if total and self._record:
-            self._record(stage=stage, step=done, **figures)
-        text = "  ".join(f"{name} {value:.4g}" for name, value in figures.items())
-        if not self._console.is_terminal:
-            self._show_line(stage, done, total, text)
+        if total:
+            for record in self._records:
+                record(stage=stage, step=done, **figures)
+        if self._quiet:
             return
+        text = "  ".join(f"{name} {value:.4g}" for name, value in figures.items())
+        if self._console.is_terminal:
+            self._show_bar(stage, done, total, text)
+        else:
+            self._show_line(stage, done, total, text)
+
+    def _show_bar(self, stage: str, done: int, total: int, text: str) -> None:
         if stage not in self._tasks:
-            for earlier in self._tasks.values():
-                task = self._progress.tasks[earlier]
-                self._progress.update(earlier, completed=task.total or 1, total=task.total or 1)
             self._tasks[stage] = self._progress.add_task(
                 stage, total=None, rate="compiling", figures=""
             )
@@ -59,14 +79,25 @@ class Display:
             self._progress.update(task.id, completed=done, total=total, rate=rate, figures=text)
 
     def _show_line(self, stage: str, done: int, total: int, text: str) -> None:
+        """At most a line in some seconds for each stage, but for its first and its last."""
         now = time.perf_counter()
         clock = f"{now - self._begin:6.1f} s  {stage}"
-        if not total and stage not in self._first:
-            self._first[stage] = now
-            print(f"{clock}: compiling", flush=True)
-        elif total:
-            rate = done / max(now - self._first.setdefault(stage, self._begin), 1e-9)
-            left = (total - done) / max(rate, 1e-9)
-            progress = f"{done} of {total}, {rate:.0f}/s, {left:.0f} s left"
-            progress = "done" if total == 1 else progress
-            print(f"{clock}: {progress}  {text}", flush=True)
+        if not total:
+            if stage not in self._last:
+                self._last[stage] = now
+                print(f"{clock}: compiling", flush=True)
+            return
+        is_first = stage not in self._first
+        # The first report comes at the end of the first part of the work.
+        since, before = self._first.setdefault(stage, (now, done))
+        if done < total and not is_first and now - self._last[stage] < _LINE_PERIOD:
+            return
+        self._last[stage] = now
+        if total == 1:
+            progress = "done"
+        elif done > before and now > since:
+            rate = (done - before) / (now - since)
+            progress = f"{done} of {total}, {rate:.0f}/s, {(total - done) / rate:.0f} s left"
+        else:
+            progress = f"{done} of {total}"
+        print(f"{clock}: {progress}  {text}".rstrip(), flush=True)

@@ -15,6 +15,10 @@ class StageError(RuntimeError):
     """A training that cannot go on: names the stage and the step."""
 
 
+class Stopped(Exception):  # noqa: N818 (nothing is wrong)
+    """A run that was asked to stop; what it trained until then has been saved."""
+
+
 class Monitor:
     """What the stages of a run have in common: a clock and a listener.
 
@@ -25,6 +29,7 @@ class Monitor:
     def __init__(self, listener: Listener = lambda stage, done, total, figures: None):
         self.seconds: dict[str, dict[str, float]] = {}
         self._lock = threading.Lock()
+        self._stop = threading.Event()
         self._listener = self._one_at_a_time(listener)
 
     def _one_at_a_time(self, listener: Listener) -> Listener:
@@ -35,6 +40,20 @@ class Monitor:
                 listener(stage, done, total, figures)
 
         return listen
+
+    def stop(self) -> None:
+        """Asks the stages to save what they have and to stop."""
+        self._stop.set()
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether the stages are to stop."""
+        return self._stop.is_set()
+
+    def check_stop(self) -> None:
+        """Raises `Stopped` if the stages are to stop."""
+        if self.is_stopping:
+            raise Stopped
 
     def announce(self, stage: str) -> None:
         """Reports that a stage is being compiled."""

@@ -16,9 +16,11 @@ from flax import struct
 from jax.sharding import Mesh
 
 from jaxsense import examine, mission
+from jaxsense.checkpoints import Checkpoints, Curves
+from jaxsense.chunks import run_chunks
 from jaxsense.compilation import Compiler, Kept
 from jaxsense.config import MODALITIES, Config
-from jaxsense.models import Models
+from jaxsense.models import Models, untrained
 from jaxsense.monitor import Monitor
 from jaxsense.networks import Params
 from jaxsense.programs import (
@@ -80,7 +82,7 @@ def run(
     key: Key,
     config: Config,
     monitor: Monitor,
-    keep: Callable[[str, Any], None] = lambda name, tree: None,
+    checkpoints: Checkpoints | None = None,
     mesh: Mesh | None = None,
     learner_mesh: Mesh | None = None,
     kept: Kept | None = None,
@@ -91,7 +93,8 @@ def run(
       key: the only source of randomness.
       config: all settings.
       monitor: is told of time and progress.
-      keep: `(stage, parameters)`, called as soon as a stage has been trained.
+      checkpoints: where what is trained is saved, if anywhere; what is there already, from the same
+        key and settings, is not trained again.
       mesh: devices that simulations are split over; the first one alone if not given.
       learner_mesh: devices that the environments of Q-learning are split over, likewise.
       kept: where compiled programs are kept for later runs, if anywhere.
@@ -101,69 +104,266 @@ def run(
 
     Raises:
       StageError: if a loss is not finite.
+      Stopped: if the monitor was told to stop; trainings under way have been saved.
+      ConfigError: if a checkpoint is damaged.
+      OSError: if a checkpoint cannot be written.
     """
-    with Compiler(monitor, kept) as compiler:
+    with Compiler(monitor, kept) as compiler, ThreadPoolExecutor(1) as saver:
         programs = compile_programs(config, make_world(config), compiler, mesh, learner_mesh)
-        return _run(key, config, programs, monitor, keep)
+        checkpoints = checkpoints or Checkpoints()
+        stages = Stages(config, programs, monitor, checkpoints, saver)
+        result = stages.run(key)
+        stages.wait_for_saving()
+    checkpoints.forget_unfinished()
+    return result
 
 
-def _run(
-    key: Key,
-    config: Config,
-    programs: Programs,
-    monitor: Monitor,
-    keep: Callable[[str, Any], None],
-) -> RunResult:
-    """The stages, with their programs."""
-    saver = ThreadPoolExecutor(1)
-    saved: list[Future] = []
+class Stages:
+    """The stages of a run, and what they have in common."""
 
-    def keep_soon(name: str, tree: Any) -> None:
-        saved.append(saver.submit(keep, name, tree))
+    def __init__(
+        self,
+        config: Config,
+        programs: Programs,
+        monitor: Monitor,
+        checkpoints: Checkpoints,
+        saver: ThreadPoolExecutor,
+    ):
+        self._config, self._programs, self._monitor = config, programs, monitor
+        self._checkpoints, self._saver = checkpoints, saver
+        self._shapes = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
+        self._saving: list[Future[None]] = []
 
-    names = config.modalities
-    survey_key, detector_key, jmvae_key, mission_key, *dqn_keys = _keys(key, 4 + len(names))
-    surveys = jax.tree.map(np.asarray, programs.simulate(survey_key))
-    trained, detections = train_detectors(detector_key, surveys, config, programs, monitor)
-    keep_soon("detectors", trained)
-
-    params = train_jmvae(jmvae_key, detections.train, config, programs, monitor)
-    keep_soon("jmvae", params)
-    posteriors, jmvae_figures = programs.examine_jmvae(params, detections.held_out)
-    class_beliefs = jax.tree.map(lambda x: np.asarray(x).mean(axis=1), posteriors["joint"])
-    keep_soon("class_beliefs", class_beliefs)
-
-    def train_and_examine(modality: int):
-        name = names[modality]
-        train_key, examine_key = _keys(dqn_keys[modality], 2)
-        q_network, rewards, speed = train_dqn(
-            train_key, modality, trained, params, detections, config, programs, monitor
+    def run(self, key: Key) -> RunResult:
+        """All stages."""
+        config, programs, names = self._config, self._programs, self._config.modalities
+        survey_key, detector_key, jmvae_key, mission_key, *dqn_keys = _keys(key, 4 + len(names))
+        surveys = jax.tree.map(np.asarray, programs.simulate(survey_key))
+        trained = self._once(
+            "detectors",
+            self._shapes.detectors,
+            lambda: self.train_detectors(detector_key, surveys),
         )
-        keep_soon(f"dqn_{name}", q_network)
-        inputs = modality, q_network, params, detections, config, programs
-        return q_network, rewards, {**examine_dqn(examine_key, *inputs), **speed}
+        detections = self.detect(trained, surveys)
+        params = self._once(
+            "jmvae", self._shapes.jmvae, lambda: self.train_jmvae(jmvae_key, detections.train)
+        )
+        posteriors, jmvae_figures = programs.examine_jmvae(params, detections.held_out)
+        class_beliefs = jax.tree.map(lambda x: np.asarray(x).mean(axis=1), posteriors["joint"])
+        self._save("class_beliefs", class_beliefs)
 
-    q_networks, rewards, dqn_figures = zip(
-        *_side_by_side(train_and_examine, len(names)), strict=True
-    )
-    models = Models(trained, params, class_beliefs, q_networks)
-    played = {n: case for n, case in mission.cases(config).items() if n in mission.POLICIES}
-    player, episodes = programs.player.result(), config.mission.episodes
-    missions = mission.summary(mission_key, player, models, played, episodes)
-    for each in saved:
-        each.result()
-    return RunResult(
-        models=models,
-        windows=detections.windows,
-        posteriors=posteriors,
-        rewards=dict(zip(names, rewards, strict=True)),
-        summary={
-            "detectors": {m: {"accuracy": a} for m, a in detections.accuracy.items()},
-            "jmvae": _as_lists(jmvae_figures),
-            "dqn": dict(zip(names, dqn_figures, strict=True)),
-            "mission": missions,
-        },
-    )
+        def train_and_examine(modality: int):
+            train_key, examine_key = _keys(dqn_keys[modality], 2)
+            q_network, curves = self.train_dqn(train_key, modality, trained, params, detections)
+            figures = self.examine_dqn(examine_key, modality, q_network, params, detections)
+            return q_network, curves, {**figures, **_speed(config, curves)}
+
+        q_networks, curves, dqn_figures = zip(
+            *_side_by_side(train_and_examine, len(names)), strict=True
+        )
+        models = Models(trained, params, class_beliefs, q_networks)
+        played = {n: case for n, case in mission.cases(config).items() if n in mission.POLICIES}
+        player, episodes = programs.player.result(), config.mission.episodes
+        missions = mission.summary(mission_key, player, models, played, episodes)
+        return RunResult(
+            models=models,
+            windows=detections.windows,
+            posteriors=posteriors,
+            rewards={n: np.array(c["reward"]) for n, c in zip(names, curves, strict=True)},
+            summary={
+                "detectors": {m: {"accuracy": a} for m, a in detections.accuracy.items()},
+                "jmvae": _as_lists(jmvae_figures),
+                "dqn": dict(zip(names, dqn_figures, strict=True)),
+                "mission": missions,
+            },
+        )
+
+    def wait_for_saving(self) -> None:
+        """Waits until all is saved; raises the first error."""
+        for each in self._saving:
+            each.result()
+
+    def train_detectors(self, key: Key, surveys: Surveys) -> tuple[Detector, ...]:
+        """Trains the detectors on some of the surveys."""
+        config, settings = self._config, self._config.detector
+        num_train, number = num_scenes(config)[0], num_chunks(settings.steps)
+        keys = _keys(key, len(config.modalities))
+
+        def train(modality: int) -> Detector:
+            stage = f"detector_{config.modalities[modality]}"
+            init_key, *chunk_keys = _keys(keys[modality], 1 + number)
+            windows = surveys.windows[modality][:num_train]
+            windows = jax.device_put(windows.reshape(-1, windows.shape[-1]))
+            labels = _labels(config, modality)[surveys.classes[:num_train]].reshape(-1)
+            detector, state = self._programs.begin_detectors[modality](init_key, windows)
+            step = self._programs.train_detectors[modality]
+
+            def train_chunk(i: int, state: Any) -> tuple[Any, Curves]:
+                state, losses = step(chunk_keys[i], state, detector, windows, labels)
+                done = (i + 1) * settings.steps // number
+                self._monitor.report(stage, done, settings.steps, np.asarray(losses))
+                return state, {}
+
+            state, _ = self._in_chunks(stage, state, number, train_chunk)
+            self._monitor.check_finite(stage, state.params)
+            return dataclasses.replace(detector, params=state.params)
+
+        return tuple(_side_by_side(train, len(config.modalities)))
+
+    def detect(self, trained: tuple[Detector, ...], surveys: Surveys) -> Detections:
+        """Applies the detectors to the surveys that they were not trained on."""
+        config = self._config
+        num_train, num_bank, _ = num_scenes(config)
+        others = jax.tree.map(lambda x: x[num_train:], surveys)
+        features = jax.tree.map(np.asarray, self._programs.detect(trained, others.windows))
+        is_bank = np.arange(len(others.classes)) < num_bank
+
+        def by_class(values: np.ndarray, chosen: np.ndarray, number: int) -> np.ndarray:
+            classes = others.classes[chosen]
+            return np.stack(
+                [values[chosen][classes == c][:number] for c in range(len(config.arena.classes))]
+            )
+
+        held_out = tuple(by_class(f, ~is_bank, num_held_out_per_class(config)) for f in features)
+        accuracy = {
+            name: float(np.mean(looks.argmax(axis=-1) == _labels(config, m)[:, None]))
+            for m, (name, looks) in enumerate(zip(config.modalities, held_out, strict=True))
+        }
+        number = num_scene_starts(config)
+        return Detections(
+            train=tuple(by_class(f, is_bank, config.jmvae.samples_per_class) for f in features),
+            held_out=held_out,
+            starts=jax.tree.map(lambda x: x[:number], (others.classes, others.scenes, features)),
+            accuracy=accuracy,
+            windows={
+                name: by_class(windows, ~is_bank, 1)
+                for name, windows in zip(config.modalities, others.windows, strict=True)
+            },
+        )
+
+    def train_jmvae(self, key: Key, bank: tuple[np.ndarray, ...]) -> Params:
+        """Trains JMVAEs on a bank of detections and keeps the one with the lowest last losses."""
+        settings, step = self._config.jmvae, self._programs.train_jmvae
+        number = num_chunks(settings.steps)
+        keys = [_keys(of_restart, 1 + number) for of_restart in _keys(key, settings.restarts)]
+        states = [self._programs.begin_jmvae(of_restart[0]) for of_restart in keys]
+
+        def train_chunk(i: int, states: Any) -> tuple[Any, Curves]:
+            # On a CPU a batch of small networks takes longer than one after the other.
+            states, losses = zip(
+                *_side_by_side(lambda r: step(keys[r][1 + i], states[r], bank), len(keys)),
+                strict=True,
+            )
+            losses = np.stack(losses)
+            # The worst loss, so that a restart that fails does not go unnoticed.
+            worst, done = losses.max(axis=0), (i + 1) * settings.steps // number
+            self._monitor.report("jmvae", done, settings.steps, worst)
+            return list(states), {str(r): [float(x.mean())] for r, x in enumerate(losses)}
+
+        states, losses = self._in_chunks("jmvae", states, number, train_chunk)
+        best = int(np.argmin([losses[str(r)][-1] for r in range(settings.restarts)]))
+        params = jax.tree.map(np.asarray, states[best].params)
+        self._monitor.check_finite("jmvae", params)
+        return params
+
+    def train_dqn(
+        self,
+        key: Key,
+        modality: int,
+        trained: tuple[Detector, ...],
+        params: Params,
+        detections: Detections,
+    ) -> tuple[Params, Curves]:
+        """Trains the Q-network of one modality.
+
+        Returns:
+          Its parameters and two curves: `reward`, for each epoch the mean total reward of the
+          episodes that ended, NaN where none did, and `seconds` of each chunk of epochs.
+        """
+        settings, name = self._config.dqn, self._config.modalities[modality]
+        stage, number = f"dqn_{name}", settings.epochs // settings.chunk
+        curves_shape = {
+            "reward": np.zeros(settings.epochs, np.float32),
+            "seconds": np.zeros(number, np.float32),
+        }
+        q_network = self._checkpoints.load(stage, self._shapes.q_networks[modality])
+        curves = self._checkpoints.load(f"{stage}_curves", curves_shape)
+        if q_network is not None and curves is not None:
+            return q_network, {name: curve.tolist() for name, curve in curves.items()}
+        start_key, init_key, *chunk_keys = _keys(key, 2 + number)
+        models = trained, params, detections.train
+        prepared = self._programs.start_dqn(start_key, detections.starts, *models)
+
+        def train_chunk(i: int, state: Any) -> tuple[Any, Curves]:
+            begin = time.perf_counter()
+            inputs = chunk_keys[i], np.int32(modality), state, prepared, *models
+            state, info = self._programs.train_dqn(*inputs)
+            seconds = time.perf_counter() - begin
+            episodes, ended = np.asarray(info.episodes), np.asarray(info.episode_return)
+            self._monitor.report(
+                stage,
+                (i + 1) * settings.chunk,
+                settings.epochs,
+                np.asarray(info.loss),
+                reward=float(np.average(ended, weights=np.maximum(episodes, 1e-9))),
+                epsilon=float(info.epsilon[-1]),
+            )
+            reward = np.where(episodes > 0, ended, np.nan)
+            return state, {"reward": reward.tolist(), "seconds": [seconds]}
+
+        state = self._programs.begin_dqn(init_key, prepared, *models)
+        state, curves = self._in_chunks(stage, state, number, train_chunk)
+        self._monitor.check_finite(stage, state.params)
+        q_network = jax.tree.map(np.asarray, state.params)
+        self._save(stage, q_network)
+        self._save(
+            f"{stage}_curves", {n: np.asarray(curve, np.float32) for n, curve in curves.items()}
+        )
+        return q_network, curves
+
+    def examine_dqn(
+        self,
+        key: Key,
+        modality: int,
+        q_network: Params,
+        params: Params,
+        detections: Detections,
+    ) -> dict[str, Any]:
+        """Plays whole episodes with a trained policy and those to compare it with.
+
+        Returns:
+          The block of one modality in the summary's `dqn`, without the speed.
+        """
+        inputs = np.int32(modality), q_network, params, detections.held_out
+        total, first = self._programs.examine_dqn(key, *inputs)
+        num_random = self._config.evaluation.num_starts
+        return examine.policy_figures(np.asarray(total), np.asarray(first), num_random)
+
+    def _once(self, name: str, shapes: T, train: Callable[[], T]) -> T:
+        """What is saved under a name; trained and saved if it is not."""
+        found = self._checkpoints.load(name, shapes)
+        if found is not None:
+            return found
+        trained = train()
+        self._save(name, trained)
+        return trained
+
+    def _save(self, name: str, tree: Any) -> None:
+        """Saves something finished, while the run goes on."""
+        if self._checkpoints.path is not None:
+            self._saving.append(self._saver.submit(self._checkpoints.save, name, tree))
+
+    def _in_chunks(
+        self, stage: str, state: Any, number: int, run: Callable[[int, Any], tuple[Any, Curves]]
+    ) -> tuple[Any, Curves]:
+        """See `chunks.run_chunks`."""
+        return run_chunks(stage, state, number, run, self._monitor, self._checkpoints)
+
+
+def _speed(config: Config, curves: Curves) -> dict[str, float]:
+    """The figures `env_steps` and `env_steps_per_s` of a training."""
+    env_steps = config.dqn.epochs * config.dqn.num_envs
+    return {"env_steps": env_steps, "env_steps_per_s": env_steps / sum(curves["seconds"])}
 
 
 def _keys(key: Key, number: int) -> list[Key]:
@@ -177,153 +377,10 @@ def _side_by_side(function: Callable[[int], T], number: int) -> list[T]:
         return list(executor.map(function, range(number)))
 
 
-def train_detectors(
-    key: Key, surveys: Surveys, config: Config, programs: Programs, monitor: Monitor
-) -> tuple[tuple[Detector, ...], Detections]:
-    """Trains the detectors on some of the surveys and applies them to the others."""
-    num_train, num_bank, _ = num_scenes(config)
-    keys = _keys(key, len(config.modalities))
-
-    def train(modality: int) -> Detector:
-        stage = f"detector_{config.modalities[modality]}"
-        steps = config.detector.steps
-        init_key, *chunk_keys = _keys(keys[modality], 1 + num_chunks(steps))
-        windows = surveys.windows[modality][:num_train]
-        windows = jax.device_put(windows.reshape(-1, windows.shape[-1]))
-        labels = _labels(config, modality)[surveys.classes[:num_train]].reshape(-1)
-        detector, state = programs.begin_detectors[modality](init_key, windows)
-        for i, chunk_key in enumerate(chunk_keys):
-            inputs = chunk_key, state, detector, windows, labels
-            state, losses = programs.train_detectors[modality](*inputs)
-            done = (i + 1) * steps // len(chunk_keys)
-            monitor.report(stage, done, steps, np.asarray(losses))
-        monitor.check_finite(stage, state.params)
-        return dataclasses.replace(detector, params=state.params)
-
-    trained = tuple(_side_by_side(train, len(config.modalities)))
-    others = jax.tree.map(lambda x: x[num_train:], surveys)
-    features = jax.tree.map(np.asarray, programs.detect(trained, others.windows))
-    is_bank = np.arange(len(others.classes)) < num_bank
-
-    def by_class(values: np.ndarray, chosen: np.ndarray, number: int) -> np.ndarray:
-        classes = others.classes[chosen]
-        return np.stack(
-            [values[chosen][classes == c][:number] for c in range(len(config.arena.classes))]
-        )
-
-    held_out = tuple(by_class(f, ~is_bank, num_held_out_per_class(config)) for f in features)
-    accuracy = {
-        name: float(np.mean(looks.argmax(axis=-1) == _labels(config, m)[:, None]))
-        for m, (name, looks) in enumerate(zip(config.modalities, held_out, strict=True))
-    }
-    number = num_scene_starts(config)
-    detections = Detections(
-        train=tuple(by_class(f, is_bank, config.jmvae.samples_per_class) for f in features),
-        held_out=held_out,
-        starts=jax.tree.map(lambda x: x[:number], (others.classes, others.scenes, features)),
-        accuracy=accuracy,
-        windows={
-            name: by_class(windows, ~is_bank, 1)
-            for name, windows in zip(config.modalities, others.windows, strict=True)
-        },
-    )
-    return trained, detections
-
-
 def _labels(config: Config, modality: int) -> np.ndarray:
     """`[C]` int32 what a modality detects of each class."""
     name = config.modalities[modality]
     return np.array(config.arena.label_of_class(MODALITIES[name]), np.int32)
-
-
-def train_jmvae(
-    key: Key, bank: tuple[np.ndarray, ...], config: Config, programs: Programs, monitor: Monitor
-) -> Params:
-    """Trains JMVAEs on a bank of detections and keeps the one with the lowest loss at the end."""
-    settings = config.jmvae
-    num_keys = 1 + num_chunks(settings.steps)
-    keys = [_keys(of_restart, num_keys) for of_restart in _keys(key, settings.restarts)]
-    states = [programs.begin_jmvae(of_restart[0]) for of_restart in keys]
-    losses = np.zeros((settings.restarts, 1))
-    for i in range(1, num_keys):
-
-        def train(restart: int):
-            return programs.train_jmvae(keys[restart][i], states[restart], bank)  # noqa: B023
-
-        # On a CPU a batch of small networks takes longer than one after the other.
-        states, losses = zip(*_side_by_side(train, settings.restarts), strict=True)
-        losses = np.stack(losses)
-        done = i * settings.steps // (num_keys - 1)
-        # The worst loss, so that a restart that fails does not go unnoticed.
-        monitor.report("jmvae", done, settings.steps, losses.max(axis=0))
-    best = int(losses.mean(axis=1).argmin())
-    params = jax.tree.map(np.asarray, states[best].params)
-    monitor.check_finite("jmvae", params)
-    return params
-
-
-def train_dqn(
-    key: Key,
-    modality: int,
-    trained: tuple[Detector, ...],
-    params: Params,
-    detections: Detections,
-    config: Config,
-    programs: Programs,
-    monitor: Monitor,
-) -> tuple[Params, np.ndarray, dict[str, float]]:
-    """Trains the Q-network of one modality.
-
-    Returns:
-      Its parameters, the `[epochs]` mean total reward of the episodes that ended, NaN where none
-      did, and the figures `env_steps` and `env_steps_per_s`.
-    """
-    settings, stage = config.dqn, f"dqn_{config.modalities[modality]}"
-    num_chunks = settings.epochs // settings.chunk
-    start_key, init_key, *chunk_keys = _keys(key, 2 + num_chunks)
-    models = trained, params, detections.train
-    prepared = programs.start_dqn(start_key, detections.starts, *models)
-    state = programs.begin_dqn(init_key, prepared, *models)
-    rewards, seconds = [], 0.0
-    for i, chunk_key in enumerate(chunk_keys):
-        inputs = chunk_key, np.int32(modality), state, prepared, *models
-        begin = time.perf_counter()
-        state, info = programs.train_dqn(*inputs)
-        seconds += time.perf_counter() - begin
-        episodes, ended = np.asarray(info.episodes), np.asarray(info.episode_return)
-        rewards.append(np.where(episodes > 0, ended, np.nan))
-        monitor.report(
-            stage,
-            (i + 1) * settings.chunk,
-            settings.epochs,
-            np.asarray(info.loss),
-            reward=float(np.average(ended, weights=np.maximum(episodes, 1e-9))),
-            epsilon=float(info.epsilon[-1]),
-        )
-    monitor.check_finite(stage, state.params)
-    env_steps = settings.epochs * settings.num_envs
-    speed = {"env_steps": env_steps, "env_steps_per_s": env_steps / seconds}
-    return jax.tree.map(np.asarray, state.params), np.concatenate(rewards), speed
-
-
-def examine_dqn(
-    key: Key,
-    modality: int,
-    q_network: Params,
-    params: Params,
-    detections: Detections,
-    config: Config,
-    programs: Programs,
-) -> dict[str, Any]:
-    """Plays whole episodes with a trained policy and those to compare it with.
-
-    Returns:
-      The block of one modality in the summary's `dqn`, without the speed.
-    """
-    inputs = np.int32(modality), q_network, params, detections.held_out
-    total, first = programs.examine_dqn(key, *inputs)
-    num_random = config.evaluation.num_starts
-    return examine.policy_figures(np.asarray(total), np.asarray(first), num_random)
 
 
 def _as_lists(figures: dict[str, Any]) -> dict[str, Any]:

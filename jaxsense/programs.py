@@ -122,8 +122,8 @@ def compile_programs(
         try:
             models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
             surveys = _trace_simulation(programs, config, world, mesh)
-            # Needed last, but on a CPU they take longest to compile. Beside an accelerator are cores
-            # enough to compile, and what all wait for is tracing.
+            # Needed last, but on a CPU they take longest to compile. Beside an accelerator are
+            # cores enough to compile, and what all wait for is tracing.
             if _on_cpu():
                 trace_missions()
             _trace_detectors(programs, config, models, surveys)

@@ -1,16 +1,37 @@
-"""The directory that a run leaves behind: writing it, and reading the trained models back."""
+"""The directory that a run leaves behind: writing it, going on in it, and reading it back."""
 
 import dataclasses
+import importlib.metadata
 import json
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import jax
-import orbax.checkpoint as ocp
 
 from jaxsense import models
-from jaxsense.config import Config, ConfigError
+from jaxsense.checkpoints import Checkpoints
+from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
 from jaxsense.models import Models
+
+_PACKAGES = ("jaxsense", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """All that a run's results follow from, on the same devices and versions.
+
+    Attributes:
+      preset: where the settings came from.
+      seed: of all randomness.
+      config: the settings.
+      num_seeds: how many seeds are trained, from `seed` on.
+    """
+
+    preset: str
+    seed: int
+    config: Config
+    num_seeds: int = 1
 
 
 class RunDirectory:
@@ -18,24 +39,52 @@ class RunDirectory:
 
     Attributes:
       path: the directory.
+      settings: of the run.
+      checkpoints: what it saves while it trains.
     """
 
-    def __init__(self, path: Path, config: Config, preset: str, seed: int):
+    def __init__(self, path: Path, settings: Settings):
+        """A directory that is there; see `create` and `resume`."""
+        self.path, self.settings = path, settings
+        self.checkpoints = Checkpoints(path / "checkpoints")
+
+    @classmethod
+    def create(cls, path: Path, settings: Settings) -> "RunDirectory":
         """Makes the directory and writes `config.json`.
 
         Raises:
           ConfigError: if the directory holds something already or cannot be written.
         """
-        self.path = path
+        content = {
+            "preset": settings.preset,
+            "seed": settings.seed,
+            "num_seeds": settings.num_seeds,
+            "config": as_plain(settings.config),
+            "versions": versions(),
+            "commit": commit(),
+        }
         try:
             path.mkdir(parents=True, exist_ok=True)
             if any(path.iterdir()):
                 raise ConfigError("out", str(path), "is not empty; must be a new directory")
-            settings = {"preset": preset, "seed": seed, "config": dataclasses.asdict(config)}
-            self.write_json("config.json", settings)
+            write_json(path / "config.json", content)
         except OSError as error:
             reason = f"cannot be written ({error.strerror}); must be a new directory"
             raise ConfigError("out", str(path), reason) from None
+        return cls(path, settings)
+
+    @classmethod
+    def resume(cls, path: Path) -> "RunDirectory":
+        """A directory of a run that has stopped.
+
+        Raises:
+          ConfigError: if there is no such run, if another version wrote it, or if it is finished.
+        """
+        content = _read_config(path / "config.json", "resume", path)
+        _check_version(content, "resume", path)
+        if (path / "summary.json").exists():
+            raise ConfigError("resume", str(path), "is finished; there is nothing to go on with")
+        return cls(path, _settings_of(content))
 
     def write_json(self, name: str, content: Any) -> None:
         """Writes a file of the run, see the function of the same name."""
@@ -46,10 +95,24 @@ class RunDirectory:
         with (self.path / "metrics.jsonl").open("a") as lines:
             lines.write(json.dumps(figures) + "\n")
 
-    def save(self, name: str, tree: Any) -> None:
-        """Saves parameters as `checkpoints/NAME`."""
-        with ocp.StandardCheckpointer() as checkpointer:
-            checkpointer.save(self.path.absolute() / "checkpoints" / name, jax.device_get(tree))
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that results depend on."""
+    return {package: importlib.metadata.version(package) for package in _PACKAGES}
+
+
+def commit() -> str | None:
+    """The commit of jaxsense's source, with `-dirty` if it was changed; None outside of Git."""
+    source = Path(__file__).parents[1]
+    if not (source / ".git").exists():
+        return None
+    command = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=40"]
+    command += ["--exclude", "*"]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip()
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -57,6 +120,17 @@ def write_json(path: Path, content: Any) -> None:
     unfinished = path.with_name(f".{path.name}.unfinished")
     unfinished.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     unfinished.rename(path)
+
+
+def read_settings(file: Path) -> Settings:
+    """The settings in the `config.json` of a run.
+
+    What is not given there is as in the preset `default`, with seed 0.
+
+    Raises:
+      ConfigError: if the file cannot be read, or names the field that is unknown or wrong.
+    """
+    return _settings_of(_read_config(file, "config", file))
 
 
 def read_summary(path: Path) -> dict[str, Any]:
@@ -81,39 +155,70 @@ def load(path: Path | str) -> tuple[Config, Models]:
       The settings and the models, on the default device.
 
     Raises:
-      ConfigError: if the directory holds no finished run.
+      ConfigError: if the directory holds no finished run, one of another version, or a damaged
+        checkpoint.
     """
     path = Path(path)
+    content = _read_config(path / "config.json", "run", path)
+    _check_version(content, "run", path)
+    config = _settings_of(content).config
+    shapes = jax.eval_shape(lambda: models.untrained(jax.random.key(0), config))
+    checkpoints = Checkpoints(path / "checkpoints")
+
+    def restore(name: str, shape: Any) -> Any:
+        found = checkpoints.load(name, shape)
+        if found is None:
+            reason = f"must be a finished run (there is no checkpoint {name!r})"
+            raise ConfigError("run", str(path), reason)
+        return jax.device_put(found)
+
+    q_networks = tuple(
+        restore(f"dqn_{name}", shape)
+        for name, shape in zip(config.modalities, shapes.q_networks, strict=True)
+    )
+    return config, Models(
+        detectors=restore("detectors", shapes.detectors),
+        jmvae=restore("jmvae", shapes.jmvae),
+        class_beliefs=restore("class_beliefs", shapes.class_beliefs),
+        q_networks=q_networks,
+    )
+
+
+def _read_config(file: Path, field: str, value: Path) -> dict[str, Any]:
+    """What lies in a `config.json`; a `ConfigError` about `field = value` if it cannot be read."""
     try:
-        settings = json.loads((path / "config.json").read_text())["config"]
-        config = _config_of(settings)
-        shapes = jax.eval_shape(lambda: models.untrained(jax.random.key(0), config))
-        with ocp.StandardCheckpointer() as checkpointer:
-
-            def restore(name: str, shape: Any) -> Any:
-                return checkpointer.restore(path.absolute() / "checkpoints" / name, shape)
-
-            q_networks = tuple(
-                restore(f"dqn_{name}", shape)
-                for name, shape in zip(config.modalities, shapes.q_networks, strict=True)
-            )
-            return config, Models(
-                detectors=restore("detectors", shapes.detectors),
-                jmvae=restore("jmvae", shapes.jmvae),
-                class_beliefs=restore("class_beliefs", shapes.class_beliefs),
-                q_networks=q_networks,
-            )
-    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ConfigError("run", str(path), f"must be a finished run ({reason})") from error
+        content = json.loads(file.read_text())
+    except OSError as error:
+        reason = f"must hold a run's settings ({file.name}: {error.strerror})"
+        raise ConfigError(field, str(value), reason) from None
+    except ValueError as error:
+        reason = f"must hold a run's settings ({file.name} is no JSON: {error})"
+        raise ConfigError(field, str(value), reason) from None
+    if not isinstance(content, dict):
+        raise ConfigError(field, str(value), f"{file.name} must hold an object")
+    return content
 
 
-def _config_of(settings: dict[str, Any]) -> Config:
-    """The inverse of `dataclasses.asdict`, through JSON."""
+def _settings_of(content: dict[str, Any]) -> Settings:
+    """The settings in what lies in a `config.json`."""
+    unknown = sorted(set(content) - {"preset", "seed", "num_seeds", "config", "versions", "commit"})
+    if unknown:
+        raise ConfigError(unknown[0], "given", "is no field of a run's config.json")
+    preset = content.get("preset", "default")
+    if preset not in PRESETS:
+        raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
+    numbers = {"seed": content.get("seed", 0), "num_seeds": content.get("num_seeds", 1)}
+    for name, number in numbers.items():
+        if not isinstance(number, int) or isinstance(number, bool):
+            raise ConfigError(name, number, "must be a whole number")
+    return Settings(preset, config=from_plain(content.get("config", {})), **numbers)
 
-    def value(default: Any, stored: Any) -> Any:
-        if dataclasses.is_dataclass(default) and not isinstance(default, type):
-            return type(default)(**{k: value(getattr(default, k), v) for k, v in stored.items()})
-        return tuple(stored) if isinstance(stored, list) else stored
 
-    return value(Config(), settings)
+def _check_version(content: dict[str, Any], field: str, path: Path) -> None:
+    """Raises a `ConfigError` if a run was written by a version whose checkpoints may differ."""
+    recorded = content.get("versions")
+    wrote = recorded.get("jaxsense") if isinstance(recorded, dict) else None
+    here = importlib.metadata.version("jaxsense")
+    if not isinstance(wrote, str) or wrote.split(".")[:2] != here.split(".")[:2]:
+        by = f"jaxsense {wrote}" if wrote else "an older jaxsense"
+        raise ConfigError(field, str(path), f"was written by {by}; this is {here}")

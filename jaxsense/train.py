@@ -1,13 +1,12 @@
 """`python -m jaxsense.train`: the whole pipeline, from scanlines to policies, in one command."""
 
 import dataclasses
-import importlib.metadata
 import re
 import sys
 import time
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import rich.console
@@ -15,14 +14,16 @@ import rich.table
 import tyro
 from jax.sharding import Mesh
 
-from jaxsense import __version__, cli, devices, pipeline, report
+from jaxsense import cli, devices, pipeline, report, rundir, tensorboard
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.display import Display
-from jaxsense.monitor import Monitor, StageError
-from jaxsense.rundir import RunDirectory
+from jaxsense.interrupt import on_interrupt
+from jaxsense.monitor import Monitor, StageError, Stopped
+from jaxsense.pipeline import RunResult
+from jaxsense.rundir import RunDirectory, Settings
 
 PROGRAM = "jaxsense.train"
-_PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+_INTERRUPTED = 130  # exit status, as shells give it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +37,14 @@ class Arguments:
     """Seed of all randomness, from 0 to 2^32 - 1."""
     out: Path | None = None
     """Directory to write; must be new. By default `runs/DATE-TIME-PRESET`."""
+    file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    """The `config.json` of a run, to start from its preset, seed and settings."""
+    resume: Path | None = None
+    """Directory of a run that was stopped, to go on in it with its settings."""
+    quiet: bool = False
+    """Show nothing but errors and where everything is."""
+    tensorboard: bool = False
+    """Also write event files for TensorBoard, into `tensorboard/` of the run."""
     devices: int | None = None
     """Devices that environments are split over: accelerators, or threads of the CPU. By default all
     accelerators there are; on a CPU as many threads as cores, at most 8, for simulations, and one
@@ -43,75 +52,129 @@ class Arguments:
     cache: Path | None = Path("~/.cache/jaxsense")
     """Directory in which compiled programs are kept for later runs; `None` to keep none."""
 
+    @property
+    def settings(self) -> Settings:
+        """What the results follow from."""
+        return Settings(self.preset, self.seed, self.config)
+
 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     begin = time.perf_counter()
     arguments = parse(sys.argv[1:] if argv is None else argv)
-    console = rich.console.Console()
-    meshes = _start(arguments)
-    name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
+    console = rich.console.Console(quiet=arguments.quiet)
     try:
-        run = RunDirectory(
-            arguments.out or Path("runs") / name,
-            arguments.config,
-            arguments.preset,
-            arguments.seed,
-        )
+        meshes = devices.start(arguments.devices, arguments.config.dqn)
+        run = _open(arguments)
+        records = [run.append_metrics]
+        if arguments.tensorboard:
+            records.append(tensorboard.make_writer(run.path / "tensorboard"))
+        with Display(console, *records, quiet=arguments.quiet) as display:
+            _train(begin, arguments, run, meshes, display)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
-    kept = cli.keep_programs(PROGRAM, arguments.cache, arguments.config, meshes)
-    with Display(console, run.append_metrics) as display:
-        monitor = Monitor(display.show)
-        try:
-            result = pipeline.run(
-                jax.random.key(arguments.seed), arguments.config, monitor, run.save, *meshes, kept
-            )
-        except StageError as error:
-            cli.fail(PROGRAM, f"{error}; must be finite. What was written before is in {run.path}")
-    report.write_plots(run.path, arguments.config, result)
-    summary = {
-        "preset": arguments.preset,
-        "seed": arguments.seed,
-        "versions": {
-            "jaxsense": __version__,
-            **{package: importlib.metadata.version(package) for package in _PACKAGES},
-        },
-        "devices": [device.device_kind for device in jax.devices()],
-        "timing": {"total_s": time.perf_counter() - begin, "stages": monitor.seconds},
-        **result.summary,
-    }
-    run.write_json("summary.json", summary)
-    _print_summary(console, summary)
-    console.print(f"Everything is in {run.path}; look at {run.path / 'latent_space.png'} first.")
+    except OSError as error:
+        # A full disk, mostly. What is there was written as a whole, or not at all.
+        cli.fail(PROGRAM, f"cannot write: {error}. What was saved before is still there")
+    if not arguments.quiet:
+        _print_summary(console, rundir.read_summary(run.path))
+    # The one thing that a quiet run says.
+    print(f"Everything is in {run.path}; look at {run.path / 'latent_space.png'} first.")
+    print(f"Next: python -m jaxsense.evaluate {run.path} --animate")
 
 
 def parse(argv: list[str]) -> Arguments:
     """Reads the command line; ends the program with status 2 and one line if it is wrong."""
-    preset = _preset_of(argv)
-    default = Arguments(PRESETS[preset], preset)  # pyright: ignore[reportArgumentType]
-    arguments = cli.parse(PROGRAM, Arguments, argv, default)
-    if not 0 <= arguments.seed < 2**32:
-        cli.fail(PROGRAM, f"seed = {arguments.seed}: must be within 0 and 2^32 - 1")
+    try:
+        stored = _stored(argv)
+        default = Arguments(stored.config, stored.preset, stored.seed)  # pyright: ignore[reportArgumentType]
+        arguments = cli.parse(PROGRAM, Arguments, argv, default)
+        if not 0 <= arguments.seed < 2**32:
+            raise ConfigError("seed", arguments.seed, "must be within 0 and 2^32 - 1")
+        if arguments.file is not None and _option(argv, "preset"):
+            raise ConfigError("config", str(arguments.file), "holds a preset; give no --preset")
+        if arguments.resume is not None:
+            if arguments.out is not None or arguments.file is not None:
+                reason = "goes on in its own directory; give no --out and no --config"
+                raise ConfigError("resume", str(arguments.resume), reason)
+            if arguments.settings != stored:
+                reason = "goes on with its own settings; give none that differ"
+                raise ConfigError("resume", str(arguments.resume), reason)
+    except ConfigError as error:
+        cli.fail(PROGRAM, str(error))
     return arguments
 
 
-def _start(arguments: Arguments) -> tuple[Mesh | None, Mesh | None]:
-    """The devices, see `devices.start`."""
-    try:
-        return devices.start(arguments.devices, arguments.config.dqn)
-    except ConfigError as error:
-        cli.fail(PROGRAM, str(error))
-
-
-def _preset_of(argv: list[str]) -> str:
-    """The preset that the other options change, which must be known before they are read."""
-    text = " ".join(argv)
-    found = re.findall(r"(?:^|\s)--preset(?:=|\s+)(\S+)", text)
-    preset = found[-1] if found else "default"
+def _stored(argv: list[str]) -> Settings:
+    """The settings that the other options change, which must be known before they are read."""
+    resume, file = _option(argv, "resume"), _option(argv, "config")
+    if resume:
+        return RunDirectory.resume(Path(resume)).settings
+    if file:
+        return rundir.read_settings(Path(file))
+    preset = _option(argv, "preset") or "default"
     if preset not in PRESETS:
-        cli.fail(PROGRAM, f"preset = {preset!r}: must be one of {', '.join(PRESETS)}")
-    return preset
+        raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
+    return Settings(preset, 0, PRESETS[preset])
+
+
+def _option(argv: list[str], name: str) -> str | None:
+    """What is given for an option last, if it is given."""
+    found = re.findall(rf"(?:^|\0)--{name}(?:=|\0)([^\0]+)", "\0".join(argv))
+    return found[-1] if found else None
+
+
+def _open(arguments: Arguments) -> RunDirectory:
+    """The run directory, which is made unless the run goes on."""
+    if arguments.resume is not None:
+        return RunDirectory.resume(arguments.resume)
+    name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
+    return RunDirectory.create(arguments.out or Path("runs") / name, arguments.settings)
+
+
+def _train(
+    begin: float,
+    arguments: Arguments,
+    run: RunDirectory,
+    meshes: tuple[Mesh | None, Mesh | None],
+    display: Display,
+) -> None:
+    """Trains, and writes all that a finished run holds."""
+    config = arguments.config
+    kept = cli.keep_programs(PROGRAM, arguments.cache, config, meshes)
+    monitor = Monitor(display.show)
+
+    def stop() -> None:
+        display.note("Stopping as soon as all is saved; Ctrl-C again does not wait for that.")
+        monitor.stop()
+
+    try:
+        with on_interrupt(stop):
+            key = jax.random.key(arguments.seed)
+            result = pipeline.run(key, config, monitor, run.checkpoints, *meshes, kept)
+    except Stopped:
+        go_on = f"python -m {PROGRAM} --resume {run.path}"
+        print(f"Stopped; all that was trained is saved. To go on: {go_on}", file=sys.stderr)
+        sys.exit(_INTERRUPTED)
+    except StageError as error:
+        cli.fail(PROGRAM, f"{error}; must be finite. What was written before is in {run.path}")
+    _write(run, result, {"total_s": time.perf_counter() - begin, "stages": monitor.seconds})
+
+
+def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any]) -> None:
+    """Plots and the summary, which says that the run is finished."""
+    settings = run.settings
+    report.write_plots(run.path, settings.config, result)
+    summary = {
+        "preset": settings.preset,
+        "seed": settings.seed,
+        "versions": rundir.versions(),
+        "commit": rundir.commit(),
+        "devices": [device.device_kind for device in jax.devices()],
+        "timing": timing,
+        **result.summary,
+    }
+    run.write_json("summary.json", summary)
 
 
 def _print_summary(console: rich.console.Console, summary: dict) -> None:

@@ -21,4 +21,6 @@ from jaxsense.config.scene import ArenaConfig as ArenaConfig
 from jaxsense.config.scene import CameraConfig as CameraConfig
 from jaxsense.config.scene import LidarConfig as LidarConfig
 from jaxsense.config.scene import ViewpointConfig as ViewpointConfig
+from jaxsense.config.stored import as_plain as as_plain
+from jaxsense.config.stored import from_plain as from_plain
 from jaxsense.config.whole import Config as Config

@@ -165,6 +165,7 @@ class Player:
         chunk, done = np.zeros(self._batch, np.int32), np.zeros(len(row), bool)
         results: Any = None
         while not done[:total].all():
+            self._monitor.check_stop()
             state, found = self._go_on(key, episode[playing], chunk, models, state)
             state, found = jax.tree.map(np.array, (state, found))
             if results is None:

@@ -1,0 +1,65 @@
+"""Settings as plain data, as they are kept in a run's `config.json`."""
+
+import dataclasses
+import difflib
+from typing import Any, get_args
+
+import dacite
+
+from jaxsense.config.checks import ConfigError
+from jaxsense.config.whole import Config
+
+
+def as_plain(config: Config) -> dict[str, Any]:
+    """Dictionaries, lists, numbers and strings, for JSON."""
+    return dataclasses.asdict(config)
+
+
+def from_plain(stored: Any) -> Config:
+    """The inverse of `as_plain`, through JSON; what is not given keeps its default.
+
+    Raises:
+      ConfigError: names a field that is unknown, of the wrong type, or cannot be used.
+    """
+    if not isinstance(stored, dict):
+        raise ConfigError("config", stored, "must be an object with a section for each part")
+    rules = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _number})
+    try:
+        return dacite.from_dict(Config, stored, rules)
+    except dacite.UnexpectedDataError as error:
+        unknown = sorted(error.keys)[0]
+        names = {name.rpartition(".")[2]: name for name in _names(Config)}
+        near = difflib.get_close_matches(unknown, names, 1)
+        hint = f"; perhaps {names[near[0]]}" if near else ""
+        raise ConfigError(unknown, _find(stored, unknown), f"is no setting{hint}") from None
+    except dacite.WrongTypeError as error:
+        is_plain = isinstance(error.field_type, type) and not get_args(error.field_type)
+        kind = error.field_type.__name__ if is_plain else str(error.field_type)
+        wanted = kind.removeprefix("typing.")
+        raise ConfigError(str(error.field_path), error.value, f"must be of type {wanted}") from None
+    except dacite.DaciteError as error:
+        raise ConfigError("config", "given", str(error)) from None
+
+
+def _find(stored: dict[str, Any], name: str) -> Any:
+    """The value of the first field with a name, in any section."""
+    if name in stored:
+        return stored[name]
+    sections = (section for section in stored.values() if isinstance(section, dict))
+    found = (_find(section, name) for section in sections)
+    return next((value for value in found if value is not None), None)
+
+
+def _number(value: Any) -> Any:
+    """JSON writes 1 for 1.0."""
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _names(section: Any, prefix: str = "") -> list[str]:
+    """All settings with their sections."""
+    names = []
+    for field in dataclasses.fields(section):
+        names.append(prefix + field.name)
+        if dataclasses.is_dataclass(field.type):
+            names += _names(field.type, f"{prefix}{field.name}.")
+    return names

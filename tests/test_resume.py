@@ -1,0 +1,150 @@
+"""Runs that are stopped and go on end with what an uninterrupted run ends with."""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import time
+
+import pytest
+
+from jaxsense import train
+from jaxsense.rundir import RunDirectory
+
+SMOKE = ["--preset", "smoke", "--seed", "5", "--quiet"]
+INTERRUPTIONS = [("detector_lidar", 30), ("jmvae", 150), ("dqn_camera", 20), ("dqn_lidar", 40)]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """Programs are compiled once for all runs."""
+    return ["--cache", str(tmp_path_factory.mktemp("cache"))]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, cache):
+    path = tmp_path_factory.mktemp("runs") / "whole"
+    train.main([*SMOKE, *cache, "--out", str(path)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory, cache, whole):
+    """A run that was stopped in each of its trainings, the last time in the last one."""
+    path = tmp_path_factory.mktemp("runs") / "stopped"
+    start = [*SMOKE, "--out", str(path)]
+    for stage, step in INTERRUPTIONS:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(RunDirectory, "append_metrics", interrupting(stage, step))
+            with pytest.raises(SystemExit) as stop:
+                train.main([*start, *cache])
+        assert stop.value.code == 130
+        assert not (path / "summary.json").exists()
+        start = ["--resume", str(path), "--quiet"]
+    return path
+
+
+def interrupting(stage, step):
+    """Writes metrics, and presses Ctrl-C at the first report of a stage at or after a step."""
+    append, pressed = RunDirectory.append_metrics, []
+    before = signal.getsignal(signal.SIGINT)
+
+    def append_metrics(self, **figures):
+        append(self, **figures)
+        if figures["stage"] == stage and figures["step"] >= step and not pressed:
+            pressed.append(stage)
+            os.kill(os.getpid(), signal.SIGINT)
+            # The main thread hears of it; the handler steps back once it has.
+            while signal.getsignal(signal.SIGINT) is not before:
+                time.sleep(0.01)
+
+    return append_metrics
+
+
+def without_times(path):
+    summary = json.loads((path / "summary.json").read_text())
+    del summary["timing"]
+    for block in summary["dqn"].values():
+        del block["env_steps_per_s"]
+    return summary
+
+
+def steps(path, stage):
+    lines = [json.loads(line) for line in (path / "metrics.jsonl").open()]
+    return [line["step"] for line in lines if line["stage"] == stage]
+
+
+def test_a_stopped_run_goes_on_and_ends_the_same(stopped, whole, cache, tmp_path, capsys):
+    path = tmp_path / "run"
+    shutil.copytree(stopped, path)
+    assert (path / "checkpoints" / "unfinished" / "dqn_lidar").is_dir()
+    train.main(["--resume", str(path), "--quiet", *cache])
+    assert without_times(path) == without_times(whole)
+    assert (path / "reward.png").read_bytes() == (whole / "reward.png").read_bytes()
+    assert not (path / "checkpoints" / "unfinished").exists()
+    # Nothing was trained twice.
+    for stage in ("detector_camera", "detector_lidar", "jmvae", "dqn_camera", "dqn_lidar"):
+        assert steps(path, stage) == steps(whole, stage), stage
+    assert capsys.readouterr().out.splitlines() == [
+        f"Everything is in {path}; look at {path / 'latent_space.png'} first.",
+        f"Next: python -m jaxsense.evaluate {path} --animate",
+    ]
+
+
+def test_a_stopped_run_says_how_to_go_on(tmp_path, cache, capsys, monkeypatch):
+    path = tmp_path / "run"
+    monkeypatch.setattr(RunDirectory, "append_metrics", interrupting("detector_camera", 15))
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(SystemExit):
+        train.main([*SMOKE, *cache, "--out", str(path)])
+    assert signal.getsignal(signal.SIGINT) is before
+    assert f"python -m jaxsense.train --resume {path}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (shutil.rmtree, "must hold a run's settings (config.json: No such file"),
+        (lambda path: (path / "summary.json").write_text("{}"), "is finished"),
+        (lambda path: edit(path, "versions", {"jaxsense": "0.0.1"}), "was written by jaxsense 0.0"),
+        (lambda path: edit(path, "versions", None), "was written by an older jaxsense"),
+        (lambda path: edit(path, "config", {"dqn": {"epoch": 3}}), "epoch = 3: is no setting"),
+        (lambda path: truncate(path / "checkpoints" / "jmvae"), "is damaged"),
+        (lambda path: truncate(path / "checkpoints" / "unfinished" / "dqn_lidar"), "is damaged"),
+    ],
+)
+def test_a_run_that_cannot_go_on_is_named(stopped, cache, tmp_path, capsys, change, expected):
+    path = tmp_path / "run"
+    shutil.copytree(stopped, path)
+    change(path)
+    assert expected in error_line(["--resume", str(path), *cache], capsys)
+
+
+def test_a_run_goes_on_with_its_own_settings(stopped, tmp_path, capsys):
+    resume = ["--resume", str(stopped)]
+    for options in (["--seed", "4"], ["--dqn.epochs", "80"]):
+        assert "goes on with its own settings" in error_line([*resume, *options], capsys)
+    assert "goes on in its own directory" in error_line([*resume, "--out", "x"], capsys)
+
+
+def edit(path, field, value):
+    content = json.loads((path / "config.json").read_text())
+    content[field] = value
+    (path / "config.json").write_text(json.dumps(content))
+
+
+def truncate(directory):
+    """Cuts every larger file of a checkpoint in half."""
+    for file in directory.rglob("*"):
+        if file.is_file():
+            content = file.read_bytes()
+            file.write_bytes(content[: len(content) // 2])
+
+
+def error_line(argv, capsys):
+    with contextlib.suppress(KeyError), pytest.raises(SystemExit) as stop:
+        train.main(argv)
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return line
