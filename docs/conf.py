@@ -1,0 +1,61 @@
+"""How Sphinx builds the site: `sphinx-build -W --keep-going -b html docs docs/_build/html`."""
+
+import importlib
+import inspect
+import pkgutil
+from types import ModuleType
+
+import jaxsense
+
+project = "jaxsense"
+author = "the jaxsense authors"
+copyright = f"2026, {author}"
+release = version = jaxsense.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_build"]
+templates_path = ["_templates"]
+
+myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
+myst_heading_anchors = 3
+
+# Docstrings put code between single backquotes.
+default_role = "literal"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+# Attributes of pytrees are described where the class is, not as members of their own.
+napoleon_use_ivar = True
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+maximum_signature_line_length = 88
+
+html_theme = "furo"
+html_title = f"jaxsense {release}"
+html_theme_options = {"navigation_with_keys": True}
+
+
+def public_names(package: ModuleType) -> list[tuple[str, str]]:
+    """What a package exports: each name, and where it is defined and described."""
+    found = []
+    for name, value in vars(package).items():
+        home = getattr(value, "__module__", None)
+        is_own = inspect.isclass(value) or inspect.isfunction(value)
+        if is_own and home and home != package.__name__ and home.startswith("jaxsense."):
+            found.append((f"{package.__name__}.{name}", f"{home}.{value.__name__}"))
+    return sorted(found)
+
+
+packages = ["jaxsense"] + [
+    module.name for module in pkgutil.walk_packages(jaxsense.__path__, "jaxsense.") if module.ispkg
+]
+autosummary_context = {
+    "public_names": {name: public_names(importlib.import_module(name)) for name in packages}
+}
