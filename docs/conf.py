@@ -5,6 +5,11 @@ import inspect
 import pkgutil
 from types import ModuleType
 
+from docutils import nodes
+from latex2mathml.converter import convert
+from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
+
 import jaxsense
 
 project = "jaxsense"
@@ -16,7 +21,6 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
 ]
@@ -37,6 +41,7 @@ autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
 maximum_signature_line_length = 88
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"jaxsense {release}"
 html_theme_options = {"navigation_with_keys": True}
@@ -59,3 +64,21 @@ packages = ["jaxsense"] + [
 autosummary_context = {
     "public_names": {name: public_names(importlib.import_module(name)) for name in packages}
 }
+
+
+def inline_math(translator: HTML5Translator, node: nodes.math) -> None:
+    """Writes MathML, which browsers show without a script, offline as well."""
+    translator.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def block_math(translator: HTML5Translator, node: nodes.math_block) -> None:
+    """The same for a formula on lines of its own."""
+    formula = convert(node.astext(), display="block")
+    translator.body.append(f'<div class="math">{formula}</div>')
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> None:
+    """Registers what this file adds to Sphinx."""
+    app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
