@@ -45,6 +45,8 @@ html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"jaxsense {release}"
 html_theme_options = {"navigation_with_keys": True}
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 
 
 def public_names(package: ModuleType) -> list[tuple[str, str]]:
