@@ -26,6 +26,9 @@ extensions = [
 ]
 exclude_patterns = ["_build"]
 templates_path = ["_templates"]
+# A reference within jaxsense that leads nowhere is a warning.
+nitpicky = True
+nitpick_ignore_regex = [("py:.*", r"(?!jaxsense).*"), ("py:class", r".*\.T")]
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
 myst_heading_anchors = 3
@@ -34,9 +37,10 @@ myst_heading_anchors = 3
 default_role = "literal"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
-# Attributes of pytrees are described where the class is, not as members of their own.
-napoleon_use_ivar = True
+napoleon_attr_annotations = False
 autodoc_member_order = "bysource"
+# Every pytree has the `replace` of flax.
+autodoc_default_options = {"exclude-members": "replace"}
 autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
 maximum_signature_line_length = 88
@@ -68,6 +72,12 @@ autosummary_context = {
 }
 
 
+def keep_colons(app, what: str, name: str, value, options, lines: list[str]) -> None:
+    """Keeps napoleon from reading the first words of an attribute's docstring as its type."""
+    if what in ("attribute", "data"):
+        lines.insert(0, "")
+
+
 def inline_math(translator: HTML5Translator, node: nodes.math) -> None:
     """Writes MathML, which browsers show without a script, offline as well."""
     translator.body.append(convert(node.astext()))
@@ -83,4 +93,5 @@ def block_math(translator: HTML5Translator, node: nodes.math_block) -> None:
 
 def setup(app: Sphinx) -> None:
     """Registers what this file adds to Sphinx."""
+    app.connect("autodoc-process-docstring", keep_colons, priority=400)
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
