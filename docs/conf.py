@@ -75,7 +75,7 @@ autosummary_context = {
 def keep_colons(app, what: str, name: str, value, options, lines: list[str]) -> None:
     """Keeps napoleon from reading the first words of an attribute's docstring as its type."""
     if what in ("attribute", "data"):
-        lines.insert(0, "")
+        lines[:0] = ["..", ""]  # an empty comment, which holds no colon
 
 
 def inline_math(translator: HTML5Translator, node: nodes.math) -> None:
