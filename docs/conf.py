@@ -1,6 +1,7 @@
 """How Sphinx builds the site: `sphinx-build -W --keep-going -b html docs docs/_build/html`."""
 
 import importlib
+import importlib.util
 import inspect
 import pkgutil
 from types import ModuleType
@@ -42,6 +43,12 @@ autodoc_member_order = "bysource"
 # Every pytree has the `replace` of flax.
 autodoc_default_options = {"exclude-members": "replace"}
 autodoc_typehints_format = "short"
+# What only some extras need, and what is too large for building the site.
+autodoc_mock_imports = [
+    name
+    for name in ("gymnasium", "gymnax", "rejax", "stable_baselines3", "tensorboardX", "torch")
+    if importlib.util.find_spec(name) is None
+]
 python_use_unqualified_type_names = True
 maximum_signature_line_length = 88
 
