@@ -38,6 +38,8 @@ myst_heading_anchors = 3
 default_role = "literal"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
+# As a list in the class: a field whose default is a function would be described twice otherwise.
+napoleon_use_ivar = True
 napoleon_attr_annotations = False
 autodoc_member_order = "bysource"
 # Every pytree has the `replace` of flax.
