@@ -1,4 +1,7 @@
-"""The plots of a run: the paper's Fig. 4 and Fig. 5, and what the sensors see."""
+"""The plots of a run: the latent space, the rewards, and what the sensors see.
+
+The first two are the paper's Fig. 4 and Fig. 5.
+"""
 
 from pathlib import Path
 from typing import Any

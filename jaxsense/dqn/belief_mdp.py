@@ -1,8 +1,9 @@
-"""The shared map as a Markov decision process (Korthals et al. 2018, Sec. III and IV).
+"""The shared map as a Markov decision process.
 
-The map holds a Gaussian belief for each of N points of interest. Action n < N looks at PoI n with
-the agent's own sensor and writes what it sees into the map; action N is no operation (NOP), and
-ends the episode. What a look sees, and how it is written, are functions that the caller gives.
+Korthals et al. 2018, Sec. III and IV. The map holds a Gaussian belief for each of N points of
+interest. Action n < N looks at PoI n with the agent's own sensor and writes what it sees into the
+map; action N is no operation (NOP), and ends the episode. What a look sees, and how it is written,
+are functions that the caller gives.
 """
 
 import dataclasses

@@ -1,4 +1,7 @@
-"""Writing a detection into the map: first looks, and fusion in place (the paper's Fig. 3)."""
+"""Writing a detection into the map: first looks, and fusion in place.
+
+Korthals et al. 2018, Sec. III and Fig. 3.
+"""
 
 import itertools
 

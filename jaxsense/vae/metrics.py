@@ -70,8 +70,8 @@ def moment_matching_error(belief: Belief, components: Belief) -> jax.Array:
       components: `[K, D]` the joint posteriors that are consistent with that detection.
 
     Returns:
-      `[]` mean over the dimensions of |mean difference| in matched standard deviations plus |log
-      ratio of the standard deviations|, against the moment-matched Gaussian of the components.
+      `[]` mean over the dimensions of `|mean difference|`, in matched standard deviations, plus
+      `|log(std ratio)|`, against the moment-matched Gaussian of the components.
     """
     mean, std = moment_match(components.mean, components.std)
     shift = jnp.abs(belief.mean - mean) / std

@@ -1,0 +1,106 @@
+"""How Sphinx builds the site: `sphinx-build -W --keep-going -b html docs docs/_build/html`."""
+
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+from types import ModuleType
+
+from docutils import nodes
+from latex2mathml.converter import convert
+from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
+
+import jaxsense
+
+project = "jaxsense"
+author = "the jaxsense authors"
+copyright = f"2026, {author}"
+release = version = jaxsense.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_build"]
+templates_path = ["_templates"]
+# A reference within jaxsense that leads nowhere is a warning.
+nitpicky = True
+nitpick_ignore_regex = [("py:.*", r"(?!jaxsense).*"), ("py:class", r".*\.T")]
+
+myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
+myst_heading_anchors = 3
+
+# Docstrings put code between single backquotes.
+default_role = "literal"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+# As a list in the class: a field whose default is a function would be described twice otherwise.
+napoleon_use_ivar = True
+napoleon_attr_annotations = False
+autodoc_member_order = "bysource"
+# Every pytree has the `replace` of flax.
+autodoc_default_options = {"exclude-members": "replace"}
+autodoc_typehints_format = "short"
+# What only some extras need, and what is too large for building the site.
+autodoc_mock_imports = [
+    name
+    for name in ("gymnasium", "gymnax", "rejax", "stable_baselines3", "tensorboardX", "torch")
+    if importlib.util.find_spec(name) is None
+]
+python_use_unqualified_type_names = True
+maximum_signature_line_length = 88
+
+html_math_renderer = "mathml"
+html_theme = "furo"
+html_title = f"jaxsense {release}"
+html_theme_options = {"navigation_with_keys": True}
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+
+
+def public_names(package: ModuleType) -> list[tuple[str, str]]:
+    """What a package exports: each name, and where it is defined and described."""
+    found = []
+    for name, value in vars(package).items():
+        home = getattr(value, "__module__", None)
+        is_own = inspect.isclass(value) or inspect.isfunction(value)
+        if is_own and home and home != package.__name__ and home.startswith("jaxsense."):
+            found.append((f"{package.__name__}.{name}", f"{home}.{value.__name__}"))
+    return sorted(found)
+
+
+packages = ["jaxsense"] + [
+    module.name for module in pkgutil.walk_packages(jaxsense.__path__, "jaxsense.") if module.ispkg
+]
+autosummary_context = {
+    "public_names": {name: public_names(importlib.import_module(name)) for name in packages}
+}
+
+
+def keep_colons(app, what: str, name: str, value, options, lines: list[str]) -> None:
+    """Keeps napoleon from reading the first words of an attribute's docstring as its type."""
+    if what in ("attribute", "data"):
+        lines[:0] = ["..", ""]  # an empty comment, which holds no colon
+
+
+def inline_math(translator: HTML5Translator, node: nodes.math) -> None:
+    """Writes MathML, which browsers show without a script, offline as well."""
+    translator.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def block_math(translator: HTML5Translator, node: nodes.math_block) -> None:
+    """The same for a formula on lines of its own."""
+    formula = convert(node.astext(), display="block")
+    translator.body.append(f'<div class="math">{formula}</div>')
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> None:
+    """Registers what this file adds to Sphinx."""
+    app.connect("autodoc-process-docstring", keep_colons, priority=400)
+    app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
