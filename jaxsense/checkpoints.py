@@ -42,6 +42,10 @@ class Checkpoints:
     def __init__(self, path: Path | None = None):
         self.path = None if path is None else path.absolute()
 
+    def exists(self) -> bool:
+        """Whether anything was saved."""
+        return self.path is not None and self.path.exists()
+
     def save(self, name: str, tree: Any) -> None:
         """Saves something finished; an `OSError` says that it cannot be written."""
         if self.path is None:

@@ -172,7 +172,7 @@ class Stages:
             rewards={n: np.array(c["reward"]) for n, c in zip(names, curves, strict=True)},
             summary={
                 "detectors": {m: {"accuracy": a} for m, a in detections.accuracy.items()},
-                "jmvae": _as_lists(jmvae_figures),
+                "jmvae": as_lists(jmvae_figures),
                 "dqn": dict(zip(names, dqn_figures, strict=True)),
                 "mission": missions,
             },
@@ -383,7 +383,7 @@ def _labels(config: Config, modality: int) -> np.ndarray:
     return np.array(config.arena.label_of_class(MODALITIES[name]), np.int32)
 
 
-def _as_lists(figures: dict[str, Any]) -> dict[str, Any]:
+def as_lists(figures: dict[str, Any]) -> dict[str, Any]:
     """The summary's block `jmvae` from the arrays of `examine.latent_space`."""
     lists = jax.tree.map(lambda x: x.tolist(), figures)
     lists["unambiguous"] = {

@@ -90,6 +90,11 @@ class RunDirectory:
         """Writes a file of the run, see the function of the same name."""
         write_json(self.path / name, content)
 
+    def save_models(self, models: Models) -> None:
+        """Saves trained models, for `load`; an `OSError` says that they cannot be written."""
+        for name, tree in _named(models, self.settings.config).items():
+            self.checkpoints.save(name, tree)
+
     def append_metrics(self, **figures: Any) -> None:
         """Adds a line to `metrics.jsonl`."""
         with (self.path / "metrics.jsonl").open("a") as lines:
@@ -165,6 +170,9 @@ def load(path: Path | str) -> tuple[Config, Models]:
     shapes = jax.eval_shape(lambda: models.untrained(jax.random.key(0), config))
     checkpoints = Checkpoints(path / "checkpoints")
 
+    if not checkpoints.exists() and content.get("num_seeds", 1) != 1:
+        raise ConfigError("run", str(path), f"holds several seeds; choose one, {path}/seed-...")
+
     def restore(name: str, shape: Any) -> Any:
         found = checkpoints.load(name, shape)
         if found is None:
@@ -172,16 +180,24 @@ def load(path: Path | str) -> tuple[Config, Models]:
             raise ConfigError("run", str(path), reason)
         return jax.device_put(found)
 
-    q_networks = tuple(
-        restore(f"dqn_{name}", shape)
-        for name, shape in zip(config.modalities, shapes.q_networks, strict=True)
-    )
+    found = {name: restore(name, shape) for name, shape in _named(shapes, config).items()}
     return config, Models(
-        detectors=restore("detectors", shapes.detectors),
-        jmvae=restore("jmvae", shapes.jmvae),
-        class_beliefs=restore("class_beliefs", shapes.class_beliefs),
-        q_networks=q_networks,
+        detectors=found["detectors"],
+        jmvae=found["jmvae"],
+        class_beliefs=found["class_beliefs"],
+        q_networks=tuple(found[f"dqn_{name}"] for name in config.modalities),
     )
+
+
+def _named(models: Models, config: Config) -> dict[str, Any]:
+    """The parts of the models by the names of their checkpoints."""
+    q_networks = zip(config.modalities, models.q_networks, strict=True)
+    return {
+        "detectors": models.detectors,
+        "jmvae": models.jmvae,
+        "class_beliefs": models.class_beliefs,
+        **{f"dqn_{name}": q_network for name, q_network in q_networks},
+    }
 
 
 def _read_config(file: Path, field: str, value: Path) -> dict[str, Any]:

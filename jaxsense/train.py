@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 import sys
 import time
 from datetime import datetime
@@ -14,7 +15,7 @@ import rich.table
 import tyro
 from jax.sharding import Mesh
 
-from jaxsense import cli, devices, pipeline, report, rundir, tensorboard
+from jaxsense import cli, devices, pipeline, report, rundir, seeds, sweep, tensorboard
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.display import Display
 from jaxsense.interrupt import on_interrupt
@@ -37,6 +38,9 @@ class Arguments:
     """Seed of all randomness, from 0 to 2^32 - 1."""
     out: Path | None = None
     """Directory to write; must be new. By default `runs/DATE-TIME-PRESET`."""
+    num_seeds: int = 1
+    """Seeds to train side by side in one program, from `seed` on; each gets a directory in that of
+    the run, which holds their means and 95% intervals."""
     file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
     """The `config.json` of a run, to start from its preset, seed and settings."""
     resume: Path | None = None
@@ -55,7 +59,7 @@ class Arguments:
     @property
     def settings(self) -> Settings:
         """What the results follow from."""
-        return Settings(self.preset, self.seed, self.config)
+        return Settings(self.preset, self.seed, self.config, self.num_seeds)
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -76,21 +80,29 @@ def main(argv: list[str] | None = None) -> None:
     except OSError as error:
         # A full disk, mostly. What is there was written as a whole, or not at all.
         cli.fail(PROGRAM, f"cannot write: {error}. What was saved before is still there")
+    first = run.path if arguments.num_seeds == 1 else _of_seed(run, arguments.seed).path
     if not arguments.quiet:
-        _print_summary(console, rundir.read_summary(run.path))
+        _print_summary(console, run)
     # The one thing that a quiet run says.
-    print(f"Everything is in {run.path}; look at {run.path / 'latent_space.png'} first.")
-    print(f"Next: python -m jaxsense.evaluate {run.path} --animate")
+    print(f"Everything is in {run.path}; look at {first / 'latent_space.png'} first.")
+    print(f"Next: python -m jaxsense.evaluate {first} --animate")
 
 
 def parse(argv: list[str]) -> Arguments:
     """Reads the command line; ends the program with status 2 and one line if it is wrong."""
     try:
         stored = _stored(argv)
-        default = Arguments(stored.config, stored.preset, stored.seed)  # pyright: ignore[reportArgumentType]
+        default: Any = Arguments(
+            config=stored.config,
+            preset=stored.preset,  # pyright: ignore[reportArgumentType]
+            seed=stored.seed,
+            num_seeds=stored.num_seeds,
+        )
         arguments = cli.parse(PROGRAM, Arguments, argv, default)
         if not 0 <= arguments.seed < 2**32:
             raise ConfigError("seed", arguments.seed, "must be within 0 and 2^32 - 1")
+        if arguments.num_seeds < 1:
+            raise ConfigError("num_seeds", arguments.num_seeds, "must be greater than 0")
         if arguments.file is not None and _option(argv, "preset"):
             raise ConfigError("config", str(arguments.file), "holds a preset; give no --preset")
         if arguments.resume is not None:
@@ -150,54 +162,103 @@ def _train(
 
     try:
         with on_interrupt(stop):
-            key = jax.random.key(arguments.seed)
-            result = pipeline.run(key, config, monitor, run.checkpoints, *meshes, kept)
+            if arguments.num_seeds > 1:
+                numbers = range(arguments.seed, arguments.seed + arguments.num_seeds)
+                results = seeds.run(numbers, config, monitor, kept)
+            else:
+                key = jax.random.key(arguments.seed)
+                result = pipeline.run(key, config, monitor, run.checkpoints, *meshes, kept)
+                results = {arguments.seed: result}
     except Stopped:
+        saved = (
+            "all that was trained is saved" if run.settings.num_seeds == 1 else "nothing is saved"
+        )
         go_on = f"python -m {PROGRAM} --resume {run.path}"
-        print(f"Stopped; all that was trained is saved. To go on: {go_on}", file=sys.stderr)
+        print(f"Stopped; {saved}. To go on: {go_on}", file=sys.stderr)
         sys.exit(_INTERRUPTED)
     except StageError as error:
         cli.fail(PROGRAM, f"{error}; must be finite. What was written before is in {run.path}")
-    _write(run, result, {"total_s": time.perf_counter() - begin, "stages": monitor.seconds})
+    timing = {"total_s": time.perf_counter() - begin, "stages": monitor.seconds}
+    if arguments.num_seeds == 1:
+        _write(run, results[arguments.seed], timing)
+    else:
+        _write_seeds(run, results, timing)
+
+
+def _write_seeds(run: RunDirectory, results: dict[int, RunResult], timing: dict[str, Any]) -> None:
+    """A directory for each seed, and what they have in common."""
+    for seed, result in results.items():
+        of_seed = _of_seed(run, seed)
+        of_seed.path.mkdir(exist_ok=True)
+        shutil.copy(run.path / "config.json", of_seed.path)
+        of_seed.save_models(result.models)
+        _write(of_seed, result, timing)
+    summaries = {str(seed): result.summary for seed, result in results.items()}
+    over_seeds = sweep.statistics(list(summaries.values()))
+    run.write_json("summary.json", {**_header(run, timing), "seeds": summaries, **over_seeds})
+
+
+def _of_seed(run: RunDirectory, seed: int) -> RunDirectory:
+    """The run directory of one of several seeds."""
+    settings = dataclasses.replace(run.settings, seed=seed)
+    return RunDirectory(run.path / f"seed-{seed}", settings)
 
 
 def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any]) -> None:
     """Plots and the summary, which says that the run is finished."""
+    report.write_plots(run.path, run.settings.config, result)
+    run.write_json("summary.json", {**_header(run, timing), **result.summary})
+
+
+def _header(run: RunDirectory, timing: dict[str, Any]) -> dict[str, Any]:
+    """What a summary says of the run itself."""
     settings = run.settings
-    report.write_plots(run.path, settings.config, result)
-    summary = {
+    return {
         "preset": settings.preset,
         "seed": settings.seed,
         "versions": rundir.versions(),
         "commit": rundir.commit(),
         "devices": [device.device_kind for device in jax.devices()],
         "timing": timing,
-        **result.summary,
     }
-    run.write_json("summary.json", summary)
 
 
-def _print_summary(console: rich.console.Console, summary: dict) -> None:
-    """A table of the figures that matter most."""
-    table = rich.table.Table("figure", *summary["dqn"], title=f"{summary['preset']} preset")
+def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
+    """A table of the figures that matter most; of several seeds mean and 95% interval."""
+    summary = rundir.read_summary(run.path)
+    settings, policies = run.settings, summary["dqn"]
+    seeds = f", seed {settings.seed}"
+    if settings.num_seeds > 1:
+        last = settings.seed + settings.num_seeds - 1
+        seeds = f", seeds {settings.seed} to {last}: mean, 95% interval"
+    table = rich.table.Table("figure", *policies, title=f"{settings.preset} preset{seeds}")
+    table.add_row(
+        "detector accuracy",
+        *(_figure(summary["detectors"][modality]["accuracy"]) for modality in policies),
+    )
     rows = {
-        "detector accuracy": lambda m: f"{summary['detectors'][m]['accuracy']:.4f}",
-        "episode reward, DQN": lambda m: f"{summary['dqn'][m]['return']:.3f}",
-        "episode reward, optimal": lambda m: f"{summary['dqn'][m]['optimal']:.3f}",
-        "episode reward, naive": lambda m: f"{summary['dqn'][m]['naive']:.3f}",
-        "episode reward, random": lambda m: f"{summary['dqn'][m]['random']:.3f}",
-        "fraction of optimal": lambda m: str(summary["dqn"][m]["fraction_of_optimal"])[:6],
-        "optimal in states": lambda m: (
-            f"{summary['dqn'][m]['optimal_states']} of {summary['dqn'][m]['num_states']}"
-        ),
+        "episode reward, DQN": "return",
+        "episode reward, optimal": "optimal",
+        "episode reward, naive": "naive",
+        "episode reward, random": "random",
+        "fraction of optimal": "fraction_of_optimal",
+        "optimal in states": "optimal_states",
+        "states": "num_states",
     }
-    for name, cell in rows.items():
-        table.add_row(name, *(cell(m) for m in summary["dqn"]))
+    for name, key in rows.items():
+        table.add_row(name, *(_figure(policy.get(key)) for policy in policies.values()))
     console.print(table)
     console.print(
-        f"latent units in use: {summary['jmvae']['active_units']}, "
+        f"latent units in use: {_figure(summary['jmvae']['active_units'])}, "
         f"total time: {summary['timing']['total_s']:.0f} s"
     )
+
+
+def _figure(value: Any) -> str:
+    """A figure as a cell of the table."""
+    if isinstance(value, dict):
+        return f"{value['mean']:.4g}, {value['low']:.4g} to {value['high']:.4g}"
+    return "" if value is None else f"{value:.5g}"
 
 
 if __name__ == "__main__":
