@@ -9,8 +9,8 @@ import numpy as np
 
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState, Outcome
+from jaxsense.extras import extra
 from jaxsense.interfaces import episodes
-from jaxsense.interfaces.extras import extra
 from jaxsense.types import Key
 
 with extra("gymnasium"):

@@ -8,8 +8,8 @@ from flax import struct
 
 from jaxsense.dqn import belief_mdp, training
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
+from jaxsense.extras import extra
 from jaxsense.interfaces import episodes
-from jaxsense.interfaces.extras import extra
 from jaxsense.types import Key
 
 with extra("gymnax"):
