@@ -2,7 +2,7 @@
 
 import jax
 
-from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import belief_mdp, training
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.types import Key
 
@@ -23,15 +23,23 @@ def observation_size(mdp: MapMdp) -> int:
     return 2 * mdp.num_pois * mdp.unseen.mean.size
 
 
+def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
+    """`[number]` random states for episodes to start from, compiled.
+
+    A start takes a look at everything that has been seen in it, which costs several steps; drawn
+    from a few thousand that were prepared once, it costs nothing.
+    """
+    return jax.jit(lambda key: training.starts(key, mdp, number))(key)
+
+
 def start(key: Key, mdp: MapMdp, starts: MapState | None) -> MapState:
     """The start of an episode.
 
     Args:
       key: random key.
       mdp: the MDP.
-      starts: `[S]` states from `dqn.starts`, of which a random one is taken. Without, the start is
-        made anew: it then takes a look at everything that has been seen in it, which costs several
-        steps.
+      starts: `[S]` from `prepared_starts`, of which a random one is taken; without, the start is
+        made anew.
     """
     if starts is None:
         return belief_mdp.reset(key, mdp)

@@ -43,7 +43,7 @@ class MapVectorEnv(VectorEnv):
           mdp: the MDP, see `interfaces.map_mdp`.
           modality: index of the agent's own sensor.
           num_envs: how many environments, E.
-          starts: `[S]` prepared states from `dqn.starts`, of which a random one starts each
+          starts: `[S]` from `interfaces.prepared_starts`, of which a random one starts each
             episode; without, each start is made anew, which costs several steps.
           autoreset_mode: what follows the end of an episode, as in `gymnasium.vector`.
 
@@ -127,7 +127,8 @@ class MapVectorEnv(VectorEnv):
         if mode is AutoresetMode.SAME_STEP and self._ended.any():
             ended = self._ended
             final = np.full(self.num_envs, None, object)
-            final[ended] = list(observations[ended])
+            for i in np.flatnonzero(ended):
+                final[i] = observations[i]
             infos = {
                 "final_obs": final,
                 "_final_obs": ended,

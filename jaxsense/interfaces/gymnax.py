@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxsense.dqn import belief_mdp, training
+from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.extras import extra
 from jaxsense.interfaces import episodes
@@ -36,8 +36,8 @@ class MapEnvParams(environment.EnvParams):
 
     Attributes:
       max_steps_in_episode: actions after which an episode is truncated.
-      starts: `[S]` prepared states, of which a random one starts each episode; None to make each
-        start anew, which costs several steps, and in every step, as gymnax resets in every one.
+      starts: `[S]` from `interfaces.prepared_starts`, of which a random one starts each episode;
+        None to make each start anew. gymnax makes one in every step, so that this is slow.
     """
 
     max_steps_in_episode: int = 20
@@ -68,7 +68,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
 
     def prepared_params(self, key: Key, number: int) -> MapEnvParams:
         """The default with `number` prepared starts, which make training many times faster."""
-        starts = jax.jit(lambda key: training.starts(key, self.mdp, number))(key)
+        starts = episodes.prepared_starts(key, self.mdp, number)
         return self.default_params.replace(starts=starts)  # pyright: ignore
 
     def reset_env(self, key: Key, params: MapEnvParams) -> tuple[jax.Array, MapEnvState]:

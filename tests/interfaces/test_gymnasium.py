@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from jaxsense.dqn import belief_mdp
-from jaxsense.dqn.training import starts as prepare
+from jaxsense.interfaces import prepared_starts
 from jaxsense.interfaces.gymnasium import MapVectorEnv
 
 LIDAR, NOP = 1, 3
@@ -21,8 +21,7 @@ LIDAR, NOP = 1, 3
 
 @pytest.fixture(scope="module")
 def starts():
-    mdp = small.small_mdp()
-    return jax.jit(lambda key: prepare(key, mdp, 16))(jax.random.key(0))
+    return prepared_starts(jax.random.key(0), small.small_mdp(), 16)
 
 
 class OneEnv(gymnasium.Env):
