@@ -18,9 +18,6 @@ CONFIG = dataclasses.replace(
 )
 
 
-FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
-
-
 def noisy_bank(key: jax.Array, config: Config, samples: int = 256) -> Bank:
     """Detections that give the true label a probability of .98 to 1."""
     features = []
@@ -71,16 +68,12 @@ def returns(policy: policies.Policy, number: int = 256) -> jax.Array:
         start = belief_mdp.reset(start_key, mdp)
         return evaluation.play(play_key, mdp, policy, start, 0)[0]
 
-    together = jax.jit(jax.vmap(play), compiler_options=FAST_TO_COMPILE)
-    return together(jax.random.split(jax.random.key(3), number))
+    return jax.jit(jax.vmap(play))(jax.random.split(jax.random.key(3), number))
 
 
 def optimal_return() -> float:
     """The mean of the optimal policy's."""
     mdp = small_mdp()
     labels = [CONFIG.arena.label_of_class(MODALITIES[m]) for m in CONFIG.modalities]
-    expect = jax.jit(
-        lambda key: policies.expected_rewards(key, mdp, 0, 256), compiler_options=FAST_TO_COMPILE
-    )
-    table = expect(jax.random.key(4))
+    table = jax.jit(lambda key: policies.expected_rewards(key, mdp, 0, 256))(jax.random.key(4))
     return float(returns(policies.optimal(mdp, table, jnp.array(labels))).mean())

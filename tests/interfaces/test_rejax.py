@@ -48,8 +48,7 @@ def test_its_dqn_reaches_95_percent_of_the_optimal_return():
         ddqn=False,
         exploration_fraction=0.4,
     )
-    train = jax.jit(algorithm.train, compiler_options=small.FAST_TO_COMPILE)
-    state, (lengths, _) = train(jax.random.key(6))
+    state, (lengths, _) = jax.jit(algorithm.train)(jax.random.key(6))
     assert lengths.max() <= small.CONFIG.mdp.max_steps
     act = algorithm.make_act(state)
     reached = small.returns(lambda key, s: act(belief_mdp.as_state(s.belief), key)).mean()
