@@ -37,6 +37,7 @@ def test_imports_run_one_way():
     top = (
         "observe", "models", "mission", "programs", "pipeline", "examine", "rundir", "report",
         "animation", "train", "evaluate", "cli", "display", "monitor",
+        "interfaces", "onboard", "export",
     )  # fmt: skip
     for part in parts:
         for path in (ROOT / "jaxsense" / part).glob("*.py"):
