@@ -4,10 +4,7 @@ import dataclasses
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from flax import linen as nn
-from flax import struct
-from gymnax.environments import spaces  # pyright: ignore[reportMissingImports]
 from rejax import DQN  # pyright: ignore[reportMissingImports]
 from rejax.networks import (  # pyright: ignore[reportMissingImports]
     DiscreteQNetwork,
@@ -16,67 +13,7 @@ from rejax.networks import (  # pyright: ignore[reportMissingImports]
 
 from benchmarks.maps import MODALITY, Learner, Task
 from benchmarks.measure import Options, Side
-from jaxsense.dqn import belief_mdp
-from jaxsense.dqn.belief_mdp import MapState
-from jaxsense.networks import Params
-
-
-@struct.dataclass
-class MapParams:
-    """What the environment is given in each call.
-
-    Attributes:
-      params: of the JMVAE.
-      bank: stored detections.
-      starts: `[S]` states, of which a random one follows the end of an episode, as in our own
-        training: to prepare a start in every step would cost far more than the step.
-      max_steps_in_episode: rejax's name of `mdp.max_steps`.
-    """
-
-    params: Params
-    bank: Any
-    starts: MapState
-    max_steps_in_episode: int = struct.field(pytree_node=False)
-
-
-class MapEnv:
-    """The map MDP behind gymnax's interface of five values, which rejax 0.1.3 expects."""
-
-    default_params = None
-
-    def __init__(self, task: Task):
-        self._mdp_of = task.mdp_of
-        self._num_actions = task.config.arena.num_pois + 1
-        latent_size = task.config.jmvae.latent_size
-        self._num_observations = 2 * latent_size * task.config.arena.num_pois
-
-    def __deepcopy__(self, memo: dict) -> "MapEnv":
-        """Itself, since it never changes: rejax copies its configuration."""
-        return self
-
-    def reset(self, key: jax.Array, params: MapParams) -> tuple[jax.Array, MapState]:
-        """A random start."""
-        row = jax.random.randint(key, (), 0, params.starts.steps.shape[0])
-        state = jax.tree.map(lambda x: x[row], params.starts)
-        return belief_mdp.as_state(state.belief), state
-
-    def step(self, key: jax.Array, state: MapState, action: jax.Array, params: MapParams):
-        """One action; an episode that ends is followed by the next."""
-        step_key, reset_key = jax.random.split(key)
-        mdp = self._mdp_of(params.params, params.bank)
-        after, outcome = belief_mdp.step(step_key, mdp, state, action, MODALITY)
-        done = outcome.is_over | outcome.is_cut
-        _, start = self.reset(reset_key, params)
-        after = jax.tree.map(lambda new, old: jnp.where(done, new, old), start, after)
-        return belief_mdp.as_state(after.belief), after, outcome.reward, done, {}
-
-    def action_space(self, params: MapParams | None = None) -> spaces.Discrete:
-        """PoIs and NOP."""
-        return spaces.Discrete(self._num_actions)
-
-    def observation_space(self, params: MapParams | None = None) -> spaces.Box:
-        """The map."""
-        return spaces.Box(-jnp.inf, jnp.inf, (self._num_observations,), jnp.float32)
+from jaxsense.interfaces.rejax import MapEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,12 +38,11 @@ class Settings:
 def make(task: Task, settings: Settings) -> Any:
     """The algorithm with our network, learning rate, discount and number of environments."""
     dqn = task.config.dqn
-    keys = jax.random.split(jax.random.key(3), dqn.num_starts)
-    starts = jax.jit(jax.vmap(lambda key: belief_mdp.reset(key, task.mdp)))(keys)
-    env = MapEnv(task)
+    env = MapEnv(task.mdp, MODALITY)
     algorithm = DQN.create(  # pyright: ignore[reportAttributeAccessIssue]
         env=env,
-        env_params=MapParams(task.params, task.bank, starts, task.config.mdp.max_steps),
+        # As in our own training: to make a start in every step would cost far more than the step.
+        env_params=env.prepared_params(jax.random.key(3), dqn.num_starts),
         num_envs=dqn.num_envs,
         batch_size=settings.batch,
         num_epochs=settings.updates,

@@ -1,0 +1,104 @@
+"""Runs the file of `python -m jaxsense.export` with nothing but jax, NumPy and flatbuffers.
+
+    python examples/run_exported.py runs/.../exported.zip
+
+plays the looks of two robots at the points of interest of one map: each asks its own policy where
+to look, and writes what its sensor tells of there. In place of real scans, a detector's answer is
+made up; `detect` is what gives it on a robot.
+"""
+
+import argparse
+import json
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax import export
+
+Programs = dict[str, Callable[..., dict[str, jax.Array]]]
+
+
+def load(path: Path | str) -> tuple[dict[str, Any], Programs]:
+    """Reads an exported file.
+
+    Args:
+      path: the file.
+
+    Returns:
+      Its `contents.json`, and its programs by name. They take and give arrays with a leading batch
+      axis of any size; `contents["programs"][name]` tells names, shapes and dtypes of both.
+    """
+    with zipfile.ZipFile(path) as files:
+        contents = json.loads(files.read("contents.json"))
+        programs = {
+            name: jax.jit(export.deserialize(bytearray(files.read(f"{name}.bin"))).call)
+            for name in contents["programs"]
+        }
+    return contents, programs
+
+
+def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) -> list[str]:
+    """Two or more robots look at PoIs of the given classes until their policies say NOP.
+
+    Args:
+      contents: from `load`.
+      programs: from `load`.
+      classes: true class of each PoI.
+
+    Returns:
+      A line for each look, and one for each PoI at the end.
+    """
+    num_pois, modalities = contents["num_pois"], contents["modalities"]
+    mean = np.tile(np.float32(contents["unseen"]["mean"]), (num_pois, 1))
+    std = np.tile(np.float32(contents["unseen"]["std"]), (num_pois, 1))
+    seen = np.zeros((num_pois, len(modalities)), bool)
+    lines = []
+    working = list(modalities)
+    while working and len(lines) < 20 * num_pois:
+        for name in list(working):
+            action = int(programs[f"decide_{name}"](mean[None], std[None])["action"][0])
+            if action == num_pois:
+                working.remove(name)
+                continue
+            label = contents["label_of_class"][name][classes[action]]
+            labels = contents["labels"][name]
+            features = np.eye(len(labels), dtype=np.float32)[label]
+            poi = slice(action, action + 1)
+            entry = programs[f"write_{name}"](mean[poi], std[poi], seen[poi], features[None])
+            mean[poi], std[poi] = entry["mean"], entry["std"]
+            seen[action, modalities.index(name)] = True
+            told = ", ".join(np.array(contents["classes"])[plausible(programs, mean, std)[action]])
+            lines.append(f"{name} looks at PoI {action}: {labels[label]}; it may be: {told}")
+    for poi, told in enumerate(plausible(programs, mean, std)):
+        names = ", ".join(np.array(contents["classes"])[told])
+        lines.append(f"PoI {poi} is a {contents['classes'][classes[poi]]}; the map says: {names}")
+    return lines
+
+
+def plausible(programs: Programs, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """`[N, C]` bool, the classes that the map leaves open."""
+    return np.asarray(programs["classify"](mean, std)["plausible"])
+
+
+def main() -> None:
+    """The program."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("file", type=Path, help="from `python -m jaxsense.export`")
+    path = parser.parse_args().file
+    try:
+        contents, programs = load(path)
+    except (OSError, zipfile.BadZipFile, KeyError) as error:
+        sys.exit(f"{path}: must be a file of `python -m jaxsense.export` ({error})")
+    for name, program in contents["programs"].items():
+        print(f"{name}({', '.join(program['inputs'])}): {program['about']}")
+    num_classes = len(contents["classes"])
+    classes = [n % num_classes for n in range(contents["num_pois"])]
+    print("\n".join(["", *explore(contents, programs, classes)]))
+
+
+if __name__ == "__main__":
+    main()

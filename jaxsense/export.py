@@ -1,0 +1,123 @@
+"""`python -m jaxsense.export RUN_DIR`: a run's models as one file that runs without jaxsense.
+
+The file is a zip archive of `jax.export` artefacts and of a `contents.json` that says what they are
+called, what they take and what they give. `examples/run_exported.py` shows how to run them.
+"""
+
+import dataclasses
+import importlib
+import importlib.metadata
+import io
+import json
+import sys
+import zipfile
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import tyro
+from jax import export
+
+from jaxsense import cli, rundir
+from jaxsense.config import MODALITIES, Config, ConfigError
+from jaxsense.extras import extra
+from jaxsense.models import Models, jmvae_shape
+from jaxsense.onboard import Function, functions
+from jaxsense.vae import fusion
+
+PROGRAM = "jaxsense.export"
+PLATFORMS = ("cpu", "cuda", "tpu")
+"""What the programs of a file run on."""
+
+
+def exported(function: Function) -> export.Exported:
+    """A function for a batch of any size, lowered for all of `PLATFORMS`."""
+    (batch,) = export.symbolic_shape("batch")
+    inputs = (jax.ShapeDtypeStruct((batch, *x.shape), x.dtype) for x in function.inputs.values())
+    return export.export(jax.jit(jax.vmap(function.apply)), platforms=PLATFORMS)(*inputs)
+
+
+def archive(config: Config, models: Models) -> bytes:
+    """The whole file.
+
+    Raises:
+      ModuleNotFoundError: if flatbuffers, which JAX needs for it, is not installed.
+    """
+    with extra("export"):
+        importlib.import_module("flatbuffers")
+    content, programs = io.BytesIO(), {}
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as files:
+        for name, function in functions(config, models).items():
+            program = exported(function)
+            files.writestr(f"{name}.bin", program.serialize())
+            outputs = jax.tree.unflatten(program.out_tree, program.out_avals)
+            programs[name] = {
+                "about": function.about,
+                "inputs": {
+                    name: _described(aval)
+                    for name, aval in zip(function.inputs, program.in_avals, strict=True)
+                },
+                "outputs": {name: _described(aval) for name, aval in outputs.items()},
+            }
+        contents = json.dumps({**_description(config, models), "programs": programs}, indent=2)
+        files.writestr("contents.json", contents + "\n")
+    return content.getvalue()
+
+
+def _description(config: Config, models: Models) -> dict[str, Any]:
+    """What a reader of the file has to know besides the programs."""
+    arena = config.arena
+    packages = ("jaxsense", "jax", "jaxlib")
+    unseen = fusion.unseen(jmvae_shape(config), config.mdp.unseen_variance)
+    return {
+        "modalities": config.modalities,
+        "classes": arena.classes,
+        "labels": {name: arena.labels(MODALITIES[name]) for name in config.modalities},
+        "label_of_class": {
+            name: arena.label_of_class(MODALITIES[name]) for name in config.modalities
+        },
+        "class_means": np.asarray(models.class_beliefs.mean).tolist(),
+        "num_pois": arena.num_pois,
+        "unseen": {name: np.asarray(x).tolist() for name, x in vars(unseen).items()},
+        "platforms": PLATFORMS,
+        "versions": {name: importlib.metadata.version(name) for name in packages},
+    }
+
+
+def _described(aval: Any) -> dict[str, Any]:
+    """Shape, with "batch" for the batch, and dtype."""
+    shape = [n if isinstance(n, int) else str(n) for n in aval.shape]
+    return {"shape": shape, "dtype": aval.dtype.name}
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Write a run's detectors, encoders and policies into one file that runs without jaxsense."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Directory of the run."""
+    out: Path | None = None
+    """The file, which must not exist; by default `exported.zip` in the run's directory."""
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    path = arguments.out or arguments.run / "exported.zip"
+    try:
+        config, models = rundir.load(arguments.run)
+        if path.exists():
+            raise ConfigError("out", str(path), "exists already; must be a new file")
+        content = archive(config, models)
+        with path.open("xb") as file:
+            file.write(content)
+    except (ConfigError, ModuleNotFoundError) as error:
+        cli.fail(PROGRAM, str(error))
+    except OSError as error:
+        cli.fail(PROGRAM, f"out = {str(path)!r}: cannot be written ({error.strerror})")
+    print(f"{path}: {len(content) / 1e3:.0f} kB, for {', '.join(PLATFORMS)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""The map MDP as a vector environment of Gymnasium: `pip install 'jaxsense[gymnasium]'`."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsense.dqn import belief_mdp
+from jaxsense.dqn.belief_mdp import MapMdp, MapState, Outcome
+from jaxsense.extras import extra
+from jaxsense.interfaces import episodes
+from jaxsense.types import Key
+
+with extra("gymnasium"):
+    from gymnasium import error, spaces  # pyright: ignore[reportMissingImports]
+    from gymnasium.vector import (  # pyright: ignore[reportMissingImports]
+        AutoresetMode,
+        VectorEnv,
+    )
+    from gymnasium.vector.utils import batch_space  # pyright: ignore[reportMissingImports]
+
+
+class MapVectorEnv(VectorEnv):
+    """Many environments of one agent, stepped side by side by one compiled program.
+
+    An observation is the `[N * 2D]` map, see `dqn.as_state`. Action n < N looks at PoI n, action N
+    is NOP and terminates the episode. All methods are those of Gymnasium.
+    """
+
+    def __init__(
+        self,
+        mdp: MapMdp,
+        modality: int,
+        num_envs: int,
+        starts: MapState | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ):
+        """Makes the environments; `reset` comes before the first step.
+
+        Args:
+          mdp: the MDP, see `interfaces.map_mdp`.
+          modality: index of the agent's own sensor.
+          num_envs: how many environments, E.
+          starts: `[S]` from `interfaces.prepared_starts`, of which a random one starts each
+            episode; without, each start is made anew, which costs several steps.
+          autoreset_mode: what follows the end of an episode, as in `gymnasium.vector`.
+
+        Raises:
+          ValueError: if there is no such sensor or mode.
+        """
+        episodes.check_modality(mdp, modality)
+        self.num_envs = num_envs
+        self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
+        size = (episodes.observation_size(mdp),)
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, size, np.float32)
+        self.single_action_space = spaces.Discrete(episodes.num_actions(mdp))
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._states: MapState | None = None
+        self._ended = np.zeros(num_envs, bool)
+        self._key = jax.random.key(0)
+        self._step = jax.jit(functools.partial(_step, mdp, modality))
+        self._start = jax.jit(functools.partial(_start, mdp, starts, num_envs))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts new episodes.
+
+        Args:
+          seed: of all that is random from here on; without, it goes on as it was.
+          options: `{"reset_mask": [E] bool}` to restart only some of the environments.
+
+        Returns:
+          `[E, N * 2D]` float32 observations, and no information.
+        """
+        super().reset(seed=seed)
+        if seed is not None or self._states is None:
+            self._key = jax.random.key(int(self.np_random.integers(2**32)))
+        mask = (options or {}).get("reset_mask")
+        if mask is None:
+            self._states, mask = None, np.ones(self.num_envs, bool)
+        elif mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(f"reset_mask = {mask!r}: must be an array of {self.num_envs} booleans")
+        return self._restarted(mask), {}
+
+    def step(
+        self, actions: Any
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One action in each environment.
+
+        Args:
+          actions: `[E]` integers.
+
+        Returns:
+          `[E, N * 2D]` float32 observations, `[E]` float64 rewards, `[E]` bool terminations and
+          truncations, and, where the mode is `SAME_STEP`, the last observation of each episode that
+          has ended as `final_obs`.
+
+        Raises:
+          ResetNeeded: before the first reset; in mode `DISABLED`, if an episode has ended.
+          ValueError: if there is no such action.
+        """
+        if self._states is None:
+            raise error.ResetNeeded("step before reset")
+        mode, ended = self.metadata["autoreset_mode"], self._ended
+        if mode is AutoresetMode.DISABLED and ended.any():
+            raise error.ResetNeeded(f"environments {np.flatnonzero(ended)} have ended")
+        actions = np.asarray(actions)
+        if not self.action_space.contains(actions):
+            raise ValueError(f"actions = {actions!r}: must be in {self.action_space}")
+        self._key, observations, self._states, outcome = self._step(
+            self._key, self._states, actions.astype(np.int32)
+        )
+        observations = np.array(observations)
+        rewards = np.array(outcome.reward, np.float64)
+        terminations, truncations = np.array(outcome.is_over), np.array(outcome.is_cut)
+        infos = {}
+        if mode is AutoresetMode.NEXT_STEP and ended.any():
+            observations = self._restarted(ended)
+            rewards[ended] = 0.0
+            terminations &= ~ended
+            truncations &= ~ended
+        self._ended = terminations | truncations
+        if mode is AutoresetMode.SAME_STEP and self._ended.any():
+            ended = self._ended
+            final = np.full(self.num_envs, None, object)
+            for i in np.flatnonzero(ended):
+                final[i] = observations[i]
+            infos = {
+                "final_obs": final,
+                "_final_obs": ended,
+                "final_info": {},
+                "_final_info": ended,
+            }
+            observations = self._restarted(ended)
+        return observations, rewards, terminations, truncations, infos
+
+    def _restarted(self, mask: np.ndarray) -> np.ndarray:
+        """The observations after new starts where the mask is True."""
+        self._key, observations, self._states = self._start(self._key, self._states, mask)
+        self._ended = self._ended & ~mask
+        return np.array(observations)
+
+
+def _step(
+    mdp: MapMdp, modality: int, key: Key, states: MapState, actions: jax.Array
+) -> tuple[Key, jax.Array, MapState, Outcome]:
+    """Next key, `[E, N * 2D]` observations, `[E]` states and `[E]` outcomes."""
+    next_key, key = jax.random.split(key)
+    step = jax.vmap(lambda k, s, a: belief_mdp.step(k, mdp, s, a, modality))
+    states, outcome = step(jax.random.split(key, len(actions)), states, actions)
+    return next_key, jax.vmap(belief_mdp.as_state)(states.belief), states, outcome
+
+
+def _start(
+    mdp: MapMdp,
+    starts: MapState | None,
+    num_envs: int,
+    key: Key,
+    states: MapState | None,
+    mask: jax.Array,
+) -> tuple[Key, jax.Array, MapState]:
+    """Next key, observations and states, with new starts where `mask` is True or all are new."""
+    next_key, key = jax.random.split(key)
+    keys = jax.random.split(key, num_envs)
+    fresh = jax.vmap(lambda key: episodes.start(key, mdp, starts))(keys)
+
+    def pick(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    begun = fresh if states is None else jax.tree.map(pick, fresh, states)
+    return next_key, jax.vmap(belief_mdp.as_state)(begun.belief), begun

@@ -1,0 +1,123 @@
+"""The map MDP as an environment of gymnax 1.x: `pip install 'jaxsense[gymnax]'`."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxsense.dqn import belief_mdp
+from jaxsense.dqn.belief_mdp import MapMdp, MapState
+from jaxsense.extras import extra
+from jaxsense.interfaces import episodes
+from jaxsense.types import Key
+
+with extra("gymnax"):
+    from gymnax.environments import environment, spaces  # pyright: ignore[reportMissingImports]
+
+
+@struct.dataclass
+class MapEnvState(environment.EnvState):
+    """The state of an environment.
+
+    Attributes:
+      time: `[]` int32 actions so far.
+      map: the state of the MDP.
+      is_over: `[]` bool, the last action was NOP.
+    """
+
+    map: MapState
+    is_over: jax.Array
+
+
+@struct.dataclass
+class MapEnvParams(environment.EnvParams):
+    """What an environment is given in each call.
+
+    Attributes:
+      max_steps_in_episode: actions after which an episode is truncated.
+      starts: `[S]` from `interfaces.prepared_starts`, of which a random one starts each episode;
+        None to make each start anew. gymnax makes one in every step, so that this is slow.
+    """
+
+    max_steps_in_episode: int = 20
+    starts: MapState | None = None
+
+
+class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
+    """The map MDP of one agent.
+
+    An observation is the `[N * 2D]` map, see `dqn.as_state`. Action n < N looks at PoI n, action N
+    is NOP and terminates the episode. All methods are those of gymnax.
+    """
+
+    def __init__(self, mdp: MapMdp, modality: int):
+        """Takes the MDP, see `interfaces.map_mdp`, and the index of the agent's own sensor.
+
+        Raises:
+          ValueError: if there is no such sensor.
+        """
+        episodes.check_modality(mdp, modality)
+        self.mdp = mdp
+        self.modality = modality
+
+    @property
+    def default_params(self) -> MapEnvParams:
+        """With the episode length of the MDP, and a new start for each episode."""
+        return MapEnvParams(max_steps_in_episode=self.mdp.config.max_steps)
+
+    def prepared_params(self, key: Key, number: int) -> MapEnvParams:
+        """The default with `number` prepared starts, which make training many times faster."""
+        starts = episodes.prepared_starts(key, self.mdp, number)
+        return self.default_params.replace(starts=starts)  # pyright: ignore
+
+    def reset_env(self, key: Key, params: MapEnvParams) -> tuple[jax.Array, MapEnvState]:
+        """A random start."""
+        start = episodes.start(key, self.mdp, params.starts)
+        state = MapEnvState(time=start.steps, map=start, is_over=jnp.bool_(False))  # pyright: ignore
+        return self.observe(key, state, None, params), state
+
+    def step_env(
+        self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams
+    ) -> tuple[jax.Array, MapEnvState, jax.Array, jax.Array, dict[Any, Any]]:
+        """One action, without a reset."""
+        action = jnp.asarray(action, jnp.int32)
+        after, outcome = belief_mdp.step(key, self.mdp, state.map, action, self.modality)
+        state = MapEnvState(time=after.steps, map=after, is_over=outcome.is_over)  # pyright: ignore
+        info = {"discount": self.discount(state, params)}
+        observation = self.observe(key, state, action, params)
+        return observation, state, outcome.reward, outcome.is_over, info
+
+    def observe(self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams) -> jax.Array:
+        """`[N * 2D]` the map."""
+        del key, action, params
+        return belief_mdp.as_state(state.map.belief)
+
+    def is_terminated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
+        """`[]` bool, the last action was NOP."""
+        del params
+        return state.is_over
+
+    def is_truncated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
+        """`[]` bool, the episode was too long and did not end by itself."""
+        return ~state.is_over & (state.time >= params.max_steps_in_episode)
+
+    @property
+    def name(self) -> str:
+        """Of the environment."""
+        return "jaxsense-Map"
+
+    @property
+    def num_actions(self) -> int:
+        """A look at each PoI, and NOP."""
+        return episodes.num_actions(self.mdp)
+
+    def action_space(self, params: MapEnvParams | None = None) -> spaces.Discrete:
+        """A look at each PoI, and NOP."""
+        del params
+        return spaces.Discrete(self.num_actions)
+
+    def observation_space(self, params: MapEnvParams | None = None) -> spaces.Box:
+        """The map."""
+        del params
+        return spaces.Box(-jnp.inf, jnp.inf, (episodes.observation_size(self.mdp),), jnp.float32)

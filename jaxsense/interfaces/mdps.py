@@ -1,0 +1,64 @@
+"""The map MDP of a run's models."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsense import observe
+from jaxsense.config import Config
+from jaxsense.dqn.belief_mdp import MapMdp
+from jaxsense.models import Models, jmvae_shape
+from jaxsense.observe import Bank
+from jaxsense.sim import world as worlds
+from jaxsense.types import Key
+from jaxsense.vae import detectors
+
+
+def map_mdp(config: Config, models: Models, bank: Bank | None = None) -> MapMdp:
+    """The map MDP with the detectors and the JMVAE of a run.
+
+    Args:
+      config: the settings.
+      models: from `jaxsense.load`, or `jaxsense.untrained`.
+      bank: stored detections to draw from, for example from `detections`; without, every look casts
+        a scan in the environment's own arena.
+    """
+    shape = jmvae_shape(config)
+    if bank is not None:
+        return observe.bank_mdp(config, bank, models.jmvae, shape)
+    world = worlds.make_world(config)
+    return observe.live_mdp(config, world, models.detectors, models.jmvae, shape)
+
+
+def detections(key: Key, config: Config, models: Models, samples: int) -> Bank:
+    """What the detectors make of simulated looks at every class: a bank for `map_mdp`.
+
+    Args:
+      key: random key.
+      config: the settings.
+      models: the models.
+      samples: looks at each class by each sensor, S.
+
+    Returns:
+      For each modality `[C, S, D_m]` features.
+    """
+    num_classes = len(config.arena.classes)
+    world = worlds.make_world(config)
+    number = -(-samples * num_classes // config.arena.num_pois)
+
+    @jax.jit
+    def look(key: Key) -> tuple[jax.Array, Bank]:
+        class_key, survey_key = jax.random.split(key)
+        classes = observe.balanced_classes(class_key, config, number)
+        windows = observe.surveys(jax.random.split(survey_key, number), world, classes)[1]
+        features = tuple(
+            jax.vmap(jax.vmap(detectors.detect, (None, 0)), (None, 0))(detector, seen)
+            for detector, seen in zip(models.detectors, windows, strict=True)
+        )
+        return classes, features
+
+    classes, features = jax.tree.map(np.asarray, look(key))
+    return tuple(
+        jnp.stack([jnp.asarray(f[classes == c][:samples]) for c in range(num_classes)])
+        for f in features
+    )

@@ -1,0 +1,30 @@
+"""The map MDP as rejax 0.1.3 trains it: `pip install 'jaxsense[rejax]'`."""
+
+from typing import Any
+
+import jax
+
+from jaxsense.extras import extra
+from jaxsense.types import Key
+
+with extra("rejax"):
+    from jaxsense.interfaces import gymnax
+
+
+class MapEnv(gymnax.MapEnv):
+    """The environment of gymnax 1.x, whose step gives five values as before gymnax 1.0.
+
+    rejax 0.1.3 takes a truncated episode for one that has ended, and learns so.
+    """
+
+    def step(  # pyright: ignore
+        self,
+        key: Key,
+        state: gymnax.MapEnvState,
+        action: Any,
+        params: gymnax.MapEnvParams | None = None,
+    ) -> tuple[jax.Array, gymnax.MapEnvState, jax.Array, jax.Array, dict[Any, Any]]:
+        """Observation, state, reward, whether the episode has ended, and info."""
+        result = super().step(key, state, action, params)
+        observation, state, reward, terminated, truncated, info = result
+        return observation, state, reward, terminated | truncated, info

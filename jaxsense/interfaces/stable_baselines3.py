@@ -1,0 +1,78 @@
+"""Gymnasium's vector environments for Stable-Baselines3: `pip install 'jaxsense[sb3]'`."""
+
+from typing import Any
+
+import numpy as np
+
+from jaxsense.extras import extra
+
+with extra("sb3"):
+    from gymnasium.vector import (  # pyright: ignore[reportMissingImports]
+        AutoresetMode,
+        VectorEnv,
+    )
+    from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
+
+
+class MapVecEnv(VecEnv):
+    """A vector environment of Gymnasium as Stable-Baselines3 takes it.
+
+    `MapVecEnv(MapVectorEnv(mdp, modality, num_envs, autoreset_mode="SameStep"))`. All methods are
+    those of Stable-Baselines3. The environments are one program, and not to be had one by one: what
+    is set is set for all.
+    """
+
+    def __init__(self, env: VectorEnv):
+        """Takes an environment whose episodes start again in the step in which they end.
+
+        Raises:
+          ValueError: if they do not.
+        """
+        mode = env.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(f"autoreset_mode = {mode}: must be AutoresetMode.SAME_STEP")
+        self.env = env
+        self._actions: Any = None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        """Starts new episodes, with the seed that `seed` was given."""
+        observations, _ = self.env.reset(seed=self._seeds[0])
+        self._reset_seeds()
+        self._reset_options()
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keeps the actions."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Takes the actions that were kept."""
+        observations, rewards, terminations, truncations, infos = self.env.step(self._actions)
+        dones = terminations | truncations
+        cuts = truncations & ~terminations
+        of_each: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(is_cut)} for is_cut in cuts]
+        for i in np.flatnonzero(dones):
+            of_each[i]["terminal_observation"] = infos["final_obs"][i]
+        return observations, rewards.astype(np.float32), dones, of_each
+
+    def close(self) -> None:
+        """Closes the environment."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The attribute of the whole, once for each index."""
+        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Sets the attribute of the whole."""
+        setattr(self.env, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **more: Any) -> list:
+        """Calls the method of the whole, and gives its result once for each index."""
+        result = getattr(self.env, method_name)(*args, **more)
+        return [result for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """No environment is wrapped by itself."""
+        return [False for _ in self._get_indices(indices)]

@@ -1,0 +1,136 @@
+"""What a robot needs of a run, as functions of one example that know nothing of the run."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsense.config import Config
+from jaxsense.dqn import belief_mdp
+from jaxsense.models import Models, jmvae_shape
+from jaxsense.networks import MLP
+from jaxsense.sim import sensors
+from jaxsense.types import Belief
+from jaxsense.vae import detectors, fusion, jmvae, metrics
+
+
+@dataclasses.dataclass(frozen=True)
+class Function:
+    """A function of one example.
+
+    Attributes:
+      about: what it gives, in one line.
+      inputs: shape and dtype of each input, by its name.
+      apply: `(*inputs) -> {name: output}`.
+    """
+
+    about: str
+    inputs: dict[str, jax.ShapeDtypeStruct]
+    apply: Callable[..., dict[str, jax.Array]]
+
+
+def functions(config: Config, models: Models) -> dict[str, Function]:
+    """All functions, by name.
+
+    For each modality M there are `window_M`, `detect_M`, `write_M` and `decide_M`; for each set of
+    modalities that the JMVAE has an encoder for, an `encode_M`, for example `encode_camera+lidar`;
+    and there is `classify`.
+    """
+    model = jmvae_shape(config)
+    found = {}
+    for m, name in enumerate(model.modalities):
+        found |= {
+            f"window_{name}": _window(config, m),
+            f"detect_{name}": _detect(models, m),
+            f"write_{name}": _write(models, model, m),
+            f"decide_{name}": _decide(config, models, m),
+        }
+    for subset in model.subsets:
+        found[f"encode_{model.encoder_name(subset)}"] = _encode(models, model, subset)
+    return {**found, "classify": _classify(models)}
+
+
+def _window(config: Config, m: int) -> Function:
+    sensor = sensors.make(config)[m]
+    number = len(sensor.angles)
+
+    def apply(readings: jax.Array, bearing: jax.Array) -> dict[str, jax.Array]:
+        rays = sensors.window_of(sensor, np.arange(number), bearing)
+        return {"window": sensors.as_window(sensor, readings[rays])}
+
+    channels = () if sensor.channels == 1 else (sensor.channels,)
+    inputs = {"readings": _floats(number, *channels), "bearing": _floats()}
+    return Function("what the detector reads of a whole scan", inputs, apply)
+
+
+def _detect(models: Models, m: int) -> Function:
+    detector = models.detectors[m]
+
+    def apply(window: jax.Array) -> dict[str, jax.Array]:
+        return {"features": detectors.detect(detector, window)}
+
+    return Function(
+        "probabilities of the labels", {"window": _floats(*detector.offset.shape)}, apply
+    )
+
+
+def _write(models: Models, model: jmvae.Jmvae, m: int) -> Function:
+    def apply(mean: jax.Array, std: jax.Array, seen: jax.Array, features: jax.Array):
+        entry = fusion.write(models.jmvae, model, Belief(mean, std), seen, features, m)
+        return _named(entry)
+
+    inputs = {
+        "mean": _floats(model.latent_size),
+        "std": _floats(model.latent_size),
+        "seen": jax.ShapeDtypeStruct((len(model.modalities),), bool),
+        "features": _floats(model.feature_sizes[m]),
+    }
+    return Function("the map's entry of a PoI after a look", inputs, apply)
+
+
+def _encode(models: Models, model: jmvae.Jmvae, subset: tuple[int, ...]) -> Function:
+    def apply(*features: jax.Array) -> dict[str, jax.Array]:
+        given = dict(zip(subset, features, strict=True))
+        of_each = tuple(given.get(m) for m in range(len(model.modalities)))
+        return _named(jmvae.posterior(models.jmvae, model, of_each))
+
+    inputs = {model.modalities[m]: _floats(model.feature_sizes[m]) for m in subset}
+    return Function("the belief after a detection by each of these", inputs, apply)
+
+
+def _decide(config: Config, models: Models, m: int) -> Function:
+    num_pois = config.arena.num_pois
+    q_network = MLP(config.dqn.hidden, num_pois + 1)
+
+    def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
+        state = belief_mdp.as_state(Belief(mean, std))
+        values = jnp.asarray(q_network.apply(models.q_networks[m], state))
+        return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
+
+    shape = num_pois, config.jmvae.latent_size
+    inputs = {"mean": _floats(*shape), "std": _floats(*shape)}
+    return Function("the PoI to look at next, N for NOP, and the value of each", inputs, apply)
+
+
+def _classify(models: Models) -> Function:
+    means = models.class_beliefs.mean
+
+    def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
+        entry = Belief(mean, std)
+        return {
+            "nearest": metrics.nearest_class(entry, means).astype(jnp.int32),
+            "plausible": metrics.plausible_classes(entry, means),
+        }
+
+    inputs = {"mean": _floats(means.shape[1]), "std": _floats(means.shape[1])}
+    return Function("the nearest class, and those that a belief leaves open", inputs, apply)
+
+
+def _floats(*shape: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, jnp.float32)
+
+
+def _named(belief: Belief) -> dict[str, jax.Array]:
+    return {"mean": belief.mean, "std": belief.std}

@@ -1,0 +1,64 @@
+"""Every example of `docs/interfaces.md` runs and prints what it says."""
+
+import dataclasses
+import importlib
+import re
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsense
+from jaxsense import export
+from jaxsense.models import untrained
+from jaxsense.vae.detectors import Detector
+
+PAGE = Path(__file__).parent.parent.parent / "docs" / "interfaces.md"
+FIRST, *OTHERS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+PACKAGES = ("gymnax", "rejax", "gymnasium", "stable_baselines3", "flatbuffers")
+EXAMPLES = dict(zip(PACKAGES, OTHERS, strict=True))
+
+
+def colour_detector():
+    """A camera's detector made by hand: is there more red or more green in the window?"""
+    kernel = np.zeros((80, 3, 2), np.float32)
+    kernel[:, 0, 0] = kernel[:, 1, 1] = 1.0
+    params = {"params": {"Dense_0": {"kernel": kernel.reshape(-1, 2), "bias": np.zeros(2)}}}
+    return Detector(params, jnp.zeros(240), jnp.float32(1.0), hidden=(), num_labels=2)
+
+
+@pytest.fixture(scope="module")
+def names():
+    """What the first example defines, with a camera that can tell colours apart."""
+    found: dict = {}
+
+    def with_colours(key, config):
+        models = untrained(key, config)
+        return dataclasses.replace(models, detectors=(colour_detector(), models.detectors[1]))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jaxsense, "untrained", with_colours)
+        exec(compile(FIRST, PAGE.name, "exec"), found)
+    return found
+
+
+@pytest.mark.parametrize("package", EXAMPLES)
+def test_examples_run(names, package, tmp_path, monkeypatch, capsys):
+    example = EXAMPLES[package]
+    pytest.importorskip(package, reason="needs the extra that the page names")
+    monkeypatch.chdir(tmp_path)
+    if package == "stable_baselines3":
+        importlib.import_module("torch").set_num_threads(1)  # more get into each other's way
+    if package == "flatbuffers":
+        Path("robot.zip").write_bytes(export.archive(names["config"], names["models"]))
+    exec(compile(example, PAGE.name, "exec"), dict(names))
+    (printed,) = re.findall(r"^print\(.*\)  # (.*)$", example, re.MULTILINE)
+    assert capsys.readouterr().out == f"{printed}\n"
+
+
+def test_detections_are_of_the_classes_that_they_are_stored_under(names):
+    bank = names["bank"]
+    assert [x.shape for x in bank] == [(3, 64, 2)] * 2
+    labels = np.array(names["config"].arena.label_of_class("colour"))
+    np.testing.assert_array_equal(np.argmax(bank[0], axis=-1), np.tile(labels[:, None], 64))

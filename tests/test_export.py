@@ -1,0 +1,226 @@
+"""The exported file, run by the example in a process that cannot import jaxsense."""
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("flatbuffers", reason="needs the extra jaxsense[export]")
+
+from jaxsense import export
+from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
+from jaxsense.dqn import as_state
+from jaxsense.models import jmvae_shape, untrained
+from jaxsense.networks import MLP
+from jaxsense.onboard import functions
+from jaxsense.rundir import RunDirectory
+from jaxsense.sim import sensors
+from jaxsense.types import Belief
+from jaxsense.vae import detectors, fusion, jmvae, metrics
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "run_exported.py"
+CONFIG = dataclasses.replace(
+    PRESETS["smoke"],
+    detector=DetectorConfig(hidden=(8,)),
+    jmvae=JmvaeConfig(hidden=(8,)),
+)
+BATCH = 5
+ALONE = f"""
+import runpy, sys
+
+class NoJaxsense:
+    def find_spec(self, name, *_):
+        if name.partition(".")[0] == "jaxsense":
+            raise ModuleNotFoundError("jaxsense is not here")
+
+sys.meta_path.insert(0, NoJaxsense())
+example = runpy.run_path({str(EXAMPLE)!r})
+"""
+RUN_ALL = """
+import numpy as np
+contents, programs = example["load"](sys.argv[1])
+inputs, found = np.load(sys.argv[2]), {}
+for name, about in contents["programs"].items():
+    given = [inputs[f"{name}/{key}"] for key in about["inputs"]]
+    found |= {f"{name}/{key}": value for key, value in programs[name](*given).items()}
+np.savez(sys.argv[3], **found)
+"""
+
+
+def run_alone(code, *arguments):
+    command = [sys.executable, "-I", "-c", ALONE + code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def models():
+    models = untrained(jax.random.key(0), CONFIG)
+    means = jax.random.normal(jax.random.key(1), models.class_beliefs.mean.shape)
+    return dataclasses.replace(models, class_beliefs=Belief(means, jnp.ones_like(means)))
+
+
+@pytest.fixture(scope="module")
+def run(models, tmp_path_factory):
+    """The directory of a run that trained nothing."""
+    path = tmp_path_factory.mktemp("runs") / "run"
+    directory = RunDirectory(path, CONFIG, "smoke", 0)
+    for name in ("detectors", "jmvae", "class_beliefs"):
+        directory.save(name, getattr(models, name))
+    for name, q_network in zip(CONFIG.modalities, models.q_networks, strict=True):
+        directory.save(f"dqn_{name}", q_network)
+    return path
+
+
+@pytest.fixture(scope="module")
+def file(run, tmp_path_factory):
+    path = tmp_path_factory.mktemp("exported") / "exported.zip"
+    export.main([str(run), "--out", str(path)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def results(models, file, tmp_path_factory):
+    """`{NAME/KEY: array}` of what all programs were given, and of what they gave elsewhere."""
+    rng, inputs = np.random.default_rng(0), {}
+    for name, function in functions(CONFIG, models).items():
+        for key, aval in function.inputs.items():
+            drawn = rng.uniform(0.1, 1.0, (BATCH, *aval.shape)) * (0.3 if key == "bearing" else 1)
+            drawn = drawn > 0.55 if aval.dtype == bool else drawn
+            inputs[f"{name}/{key}"] = drawn.astype(aval.dtype)
+    folder = tmp_path_factory.mktemp("results")
+    np.savez(folder / "in.npz", **inputs)
+    done = run_alone(RUN_ALL, file, folder / "in.npz", folder / "out.npz")
+    assert done.returncode == 0, done.stderr
+    return inputs, dict(np.load(folder / "out.npz"))
+
+
+def check(results, name, expected, *keys):
+    """`expected(*inputs of one example) -> outputs`, for each of the batch."""
+    inputs, outputs = results
+    given = [value for key, value in inputs.items() if key.startswith(f"{name}/")]
+    for row in range(BATCH):
+        for key, value in zip(keys, expected(*(x[row] for x in given)), strict=True):
+            found = outputs[f"{name}/{key}"][row]
+            np.testing.assert_allclose(found, value, atol=1e-5, err_msg=f"{name}/{key}")
+
+
+@pytest.mark.parametrize("m", [0, 1])
+def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
+    name, model = CONFIG.modalities[m], jmvae_shape(CONFIG)
+    sensor = sensors.make(CONFIG)[m]
+
+    def window(readings, bearing):
+        # The nearest window in the scan, ray by ray.
+        centre = float(sensor.centre(bearing))
+        first = round(centre - (sensor.window - 1) * sensor.stride / 2)
+        rays = first + np.arange(sensor.window) * sensor.stride
+        return [np.minimum(readings[rays], sensor.window_limit).reshape(-1)]
+
+    def write(mean, std, seen, features):
+        entry = fusion.write(models.jmvae, model, Belief(mean, std), seen, features, m)
+        return entry.mean, entry.std
+
+    def decide(mean, std):
+        network = MLP(CONFIG.dqn.hidden, CONFIG.arena.num_pois + 1)
+        values = network.apply(models.q_networks[m], as_state(Belief(mean, std)))
+        return np.argmax(values), values
+
+    check(results, f"window_{name}", window, "window")
+    detect = lambda window: [detectors.detect(models.detectors[m], window)]  # noqa: E731
+    check(results, f"detect_{name}", detect, "features")
+    check(results, f"write_{name}", write, "mean", "std")
+    check(results, f"decide_{name}", decide, "action", "values")
+
+
+@pytest.mark.parametrize(
+    ("name", "given"), [("camera", [0]), ("lidar", [1]), ("camera+lidar", [0, 1])]
+)
+def test_encoders_give_what_jaxsense_gives(models, results, name, given):
+    def encode(*features):
+        of_each = [None, None]
+        for m, x in zip(given, features, strict=True):
+            of_each[m] = x
+        mean, log_var = jmvae.encode(models.jmvae, jmvae_shape(CONFIG), tuple(of_each))
+        return mean, jnp.exp(log_var / 2)
+
+    check(results, f"encode_{name}", encode, "mean", "std")
+
+
+def test_the_map_is_read_as_jaxsense_reads_it(models, results):
+    means = models.class_beliefs.mean
+
+    def classify(mean, std):
+        belief = Belief(mean, std)
+        return metrics.nearest_class(belief, means), metrics.plausible_classes(belief, means)
+
+    check(results, "classify", classify, "nearest", "plausible")
+
+
+def test_contents_describe_what_is_there(results, file):
+    with zipfile.ZipFile(file) as files:
+        contents = json.loads(files.read("contents.json"))
+        names = {name.removesuffix(".bin") for name in files.namelist()} - {"contents.json"}
+    assert set(contents["programs"]) == names
+    for given, end in zip(results, ("inputs", "outputs"), strict=True):
+        described = {
+            f"{name}/{key}": ([BATCH, *about["shape"][1:]], about["dtype"])
+            for name, program in contents["programs"].items()
+            for key, about in program[end].items()
+        }
+        assert described == {key: (list(x.shape), x.dtype.name) for key, x in given.items()}
+    assert contents["labels"] == {"camera": ["red", "green"], "lidar": ["cylinder", "cube"]}
+    assert contents["classes"] == list(CONFIG.arena.classes)
+    assert contents["versions"]["jax"] == jax.__version__
+
+
+def test_programs_are_lowered_for_accelerators_too(models):
+    program = export.exported(functions(CONFIG, models)["classify"])
+    assert program.platforms == ("cpu", "cuda", "tpu")
+
+
+def test_the_example_plays_a_map_and_refuses_other_files(file, tmp_path):
+    done = run_alone("sys.argv[0] = 'run_exported.py'; example['main']()", file)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert [line for line in lines if line.startswith("PoI 2 is a red cube; the map says: ")]
+    (tmp_path / "text").write_text("no archive")
+    done = run_alone("example['main']()", tmp_path / "text")
+    assert done.returncode == 1
+    assert "must be a file of `python -m jaxsense.export`" in done.stderr
+
+
+@pytest.mark.parametrize("problem", ["run", "out", "folder"])
+def test_bad_input_is_one_line_and_overwrites_nothing(run, tmp_path, capsys, problem):
+    existing = tmp_path / "precious.zip"
+    existing.write_text("precious")
+    argv, expected = {
+        "run": ([str(tmp_path / "no_run")], "run = .*must be a finished run"),
+        "out": ([str(run), "--out", str(existing)], "out = .*exists already; must be a new file"),
+        "folder": ([str(run), "--out", str(tmp_path / "no" / "x.zip")], "out = .*cannot be writ"),
+    }[problem]
+    with pytest.raises(SystemExit) as stop:
+        export.main(argv)
+    message = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert message.count("\n") == 1
+    assert message.startswith("jaxsense.export: ")
+    assert re.search(expected, message)
+    assert existing.read_text() == "precious"
+    assert list(tmp_path.iterdir()) == [existing]
+
+
+def test_missing_flatbuffers_is_told(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    with pytest.raises(SystemExit) as stop:
+        export.main([str(run), "--out", str(tmp_path / "x.zip")])
+    assert stop.value.code == 2
+    message = "flatbuffers is not installed: pip install 'jaxsense[export]'"
+    assert message in capsys.readouterr().err
