@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 
 from jaxsense import examine, mission
 from jaxsense.compilation import Compiler, Kept
-from jaxsense.config import MODALITIES, Config
+from jaxsense.config import Config
 from jaxsense.models import Models
 from jaxsense.monitor import Monitor
 from jaxsense.networks import Params
@@ -232,8 +232,7 @@ def train_detectors(
 
 def _labels(config: Config, modality: int) -> np.ndarray:
     """`[C]` int32 what a modality detects of each class."""
-    name = config.modalities[modality]
-    return np.array(config.arena.label_of_class(MODALITIES[name]), np.int32)
+    return np.array(config.label_of_class(config.modalities[modality]), np.int32)
 
 
 def train_jmvae(

@@ -9,7 +9,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from jaxsense import models
-from jaxsense.config import Config, ConfigError
+from jaxsense.config import Config, ConfigError, from_plain
 from jaxsense.models import Models
 
 
@@ -86,7 +86,7 @@ def load(path: Path | str) -> tuple[Config, Models]:
     path = Path(path)
     try:
         settings = json.loads((path / "config.json").read_text())["config"]
-        config = _config_of(settings)
+        config = from_plain(Config, settings)
         shapes = jax.eval_shape(lambda: models.untrained(jax.random.key(0), config))
         with ocp.StandardCheckpointer() as checkpointer:
 
@@ -106,14 +106,3 @@ def load(path: Path | str) -> tuple[Config, Models]:
     except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError("run", str(path), f"must be a finished run ({reason})") from error
-
-
-def _config_of(settings: dict[str, Any]) -> Config:
-    """The inverse of `dataclasses.asdict`, through JSON."""
-
-    def value(default: Any, stored: Any) -> Any:
-        if dataclasses.is_dataclass(default) and not isinstance(default, type):
-            return type(default)(**{k: value(getattr(default, k), v) for k, v in stored.items()})
-        return tuple(stored) if isinstance(stored, list) else stored
-
-    return value(Config(), settings)

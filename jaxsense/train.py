@@ -5,6 +5,7 @@ import importlib.metadata
 import re
 import sys
 import time
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,6 +21,7 @@ from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.display import Display
 from jaxsense.monitor import Monitor, StageError
 from jaxsense.rundir import RunDirectory
+from jaxsense.sim import sensors
 
 PROGRAM = "jaxsense.train"
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
@@ -44,10 +46,17 @@ class Arguments:
     """Directory in which compiled programs are kept for later runs; `None` to keep none."""
 
 
-def main(argv: list[str] | None = None) -> None:
-    """The program."""
+def main(
+    argv: list[str] | None = None, change: Callable[[Config], Config] = lambda config: config
+) -> None:
+    """The program.
+
+    Args:
+      argv: the command line without the program; that of the process if not given.
+      change: what a program of your own makes of a preset, before the other options change that.
+    """
     begin = time.perf_counter()
-    arguments = parse(sys.argv[1:] if argv is None else argv)
+    arguments = parse(sys.argv[1:] if argv is None else argv, change)
     console = rich.console.Console()
     meshes = _start(arguments)
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
@@ -86,11 +95,15 @@ def main(argv: list[str] | None = None) -> None:
     console.print(f"Everything is in {run.path}; look at {run.path / 'latent_space.png'} first.")
 
 
-def parse(argv: list[str]) -> Arguments:
+def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: config) -> Arguments:
     """Reads the command line; ends the program with status 2 and one line if it is wrong."""
     preset = _preset_of(argv)
-    default = Arguments(PRESETS[preset], preset)  # pyright: ignore[reportArgumentType]
-    arguments = cli.parse(PROGRAM, Arguments, argv, default)
+    try:
+        default = Arguments(change(PRESETS[preset]), preset)  # pyright: ignore[reportArgumentType]
+        arguments = cli.parse(PROGRAM, Arguments, argv, default)
+        sensors.make(arguments.config)
+    except ConfigError as error:
+        cli.fail(PROGRAM, str(error))
     if not 0 <= arguments.seed < 2**32:
         cli.fail(PROGRAM, f"seed = {arguments.seed}: must be within 0 and 2^32 - 1")
     return arguments
