@@ -7,6 +7,7 @@ with contextlib.redirect_stdout(io.StringIO()):
     # On import, MJX prints that NVIDIA Warp, which nothing here uses, is not installed.
     import mujoco.mjx as _  # noqa: F401
 
+from jaxsense.sim import sensors as sensors
 from jaxsense.sim.arena import Arena as Arena
 from jaxsense.sim.arena import Layout as Layout
 from jaxsense.sim.arena import build as build
@@ -28,6 +29,7 @@ from jaxsense.sim.sensors import cut_out as cut_out
 from jaxsense.sim.sensors import fan as fan
 from jaxsense.sim.sensors import random_light as random_light
 from jaxsense.sim.sensors import scan as scan
+from jaxsense.sim.viewpoints import bearing as bearing
 from jaxsense.sim.world import Scene as Scene
 from jaxsense.sim.world import World as World
 from jaxsense.sim.world import look as look

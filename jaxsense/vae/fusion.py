@@ -5,6 +5,7 @@ import itertools
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsense.networks import Params
 from jaxsense.types import Belief, Features
@@ -13,7 +14,11 @@ from jaxsense.vae.jmvae import Jmvae
 
 
 def fuse(
-    params: Params, model: Jmvae, belief: Belief, seen: jax.Array, features: Features
+    params: Params,
+    model: Jmvae,
+    belief: Belief,
+    seen: jax.Array | np.ndarray,
+    features: Features,
 ) -> Belief:
     """The map's entry of a PoI after a look at it by one sensor, or by several at once.
 
