@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from benchmarks.jmvae import random_bank
 from jaxsense import models, observe
-from jaxsense.config import MODALITIES, PRESETS, Config, DqnConfig
+from jaxsense.config import PRESETS, Config, DqnConfig
 from jaxsense.dqn import belief_mdp, evaluation, policies
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.models import Models
@@ -95,7 +95,7 @@ class Examiner:
             return jnp.mean(jax.vmap(play)(play_keys, starts))
 
         def optimal_return(key: jax.Array, starts: belief_mdp.MapState) -> jax.Array:
-            labels = [config.arena.label_of_class(MODALITIES[m]) for m in config.modalities]
+            labels = [config.label_of_class(m) for m in config.modalities]
             table = policies.expected_rewards(key, mdp, MODALITY, _EXPECTATION_DRAWS)
             return mean_return(policies.optimal(mdp, table, jnp.array(labels)), starts)
 

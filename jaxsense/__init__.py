@@ -17,8 +17,11 @@ from jaxsense import mission as mission
 from jaxsense import sim as sim
 from jaxsense import vae as vae
 from jaxsense.config import PRESETS as PRESETS
+from jaxsense.config import Attribute as Attribute
 from jaxsense.config import Config as Config
 from jaxsense.config import ConfigError as ConfigError
+from jaxsense.config import SensorConfig as SensorConfig
+from jaxsense.config import Shape as Shape
 from jaxsense.models import Models as Models
 from jaxsense.models import jmvae_shape as jmvae_shape
 from jaxsense.models import untrained as untrained

@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Patch, Rectangle
 
-from jaxsense.config import COLOURS, Config
+from jaxsense.config import ArenaConfig, Config
 from jaxsense.mission import Case, Mission, MissionState, Record, reset, rollout
 from jaxsense.mission.evaluation import chunks, keys_of_episode
 from jaxsense.mission.state import ENDED
@@ -117,7 +117,7 @@ class _ArenaView:
         axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", xlabel="x [m]")
         axes.set_title("the arena")
         for n, (x, y) in enumerate(np.asarray(layout.position)):
-            axes.add_patch(_poi(arena.poi_radius, layout, n))
+            axes.add_patch(_poi(arena, layout, n))
             axes.text(x, y, str(n + 1), color="white", ha="center", va="center", weight="bold")
         self._state = state
         self._robots = []
@@ -157,7 +157,7 @@ class _MapView:
         axes.set_title("the shared map: 1-sigma ellipses of the posteriors")
         axes.grid(alpha=0.2)
         for label, mean in zip(config.arena.classes, means, strict=True):
-            colour = COLOURS[label.split(" ")[0]]
+            colour = config.arena.colours[label.split(" ")[0]]
             point = np.pad(mean, (0, 2))[:2]
             axes.plot(*point, "+", color=colour, markersize=14, markeredgewidth=2)
             place = {"textcoords": "offset points", "ha": "center", "color": colour}
@@ -187,17 +187,19 @@ def _doing(phase: int, target: int, num_pois: int) -> str:
     )
 
 
-def _poi(radius: float, layout: Layout, n: int) -> Patch:
+def _poi(arena: ArenaConfig, layout: Layout, n: int) -> Patch:
     """A PoI in its true shape and colour."""
     x, y = np.asarray(layout.position[n])
     colour = np.asarray(layout.colour[n])
-    if layout.shape[n] == 0:
-        return Circle((x, y), radius, color=colour, zorder=2)
+    shape = list(arena.shapes.values())[int(layout.shape[n])]
+    u, v = (share * arena.poi_radius for share in shape.half_sides)
+    if shape.primitive == "cylinder":
+        return Circle((x, y), u, color=colour, zorder=2)
     turn = np.degrees(float(layout.yaw[n]))
     return Rectangle(
-        (x - radius, y - radius),
-        2 * radius,
-        2 * radius,
+        (x - u, y - v),
+        2 * u,
+        2 * v,
         angle=turn,
         rotation_point="center",
         color=colour,

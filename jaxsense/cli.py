@@ -14,6 +14,7 @@ from jax.sharding import Mesh
 
 from jaxsense.compilation import Kept
 from jaxsense.config import Config, ConfigError
+from jaxsense.sim import sensors
 
 T = TypeVar("T")
 
@@ -68,7 +69,9 @@ def keep_programs(
         return None
     try:
         directory = directory.expanduser()
-        kept = Kept(directory, config, [mesh and mesh.size for mesh in meshes])
+        kept = Kept(
+            directory, config, sensors.fingerprints(config), [mesh and mesh.size for mesh in meshes]
+        )
     except (OSError, RuntimeError) as error:
         print(f"{program}: programs cannot be kept in {directory} ({error})", file=sys.stderr)
         return None

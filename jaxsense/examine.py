@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense import observe
-from jaxsense.config import MODALITIES, Config
+from jaxsense.config import Config
 from jaxsense.dqn import evaluation, policies
 from jaxsense.dqn.belief_mdp import MapState, random_start, reset
 from jaxsense.models import jmvae_shape
@@ -38,7 +38,7 @@ def latent_space(
       arrays.
     """
     model = jmvae_shape(config)
-    labels = [config.arena.label_of_class(MODALITIES[m]) for m in config.modalities]
+    labels = [config.label_of_class(m) for m in config.modalities]
     num_modalities, num_classes = len(bank), bank[0].shape[0]
 
     def encode_all(*keep: bool) -> Belief:
@@ -118,7 +118,7 @@ def play(
     """
     settings = config.evaluation
     mdp = observe.bank_mdp(config, bank, params, jmvae_shape(config))
-    labels = jnp.array([config.arena.label_of_class(MODALITIES[m]) for m in config.modalities])
+    labels = jnp.array([config.label_of_class(m) for m in config.modalities])
     start_key, table_key, play_key = jax.random.split(key, 3)
     start_keys = jax.random.split(start_key, settings.num_starts)
     random_starts = jax.vmap(lambda key: random_start(key, mdp))(start_keys)

@@ -20,7 +20,7 @@ import tyro
 from jax import export
 
 from jaxsense import cli, rundir
-from jaxsense.config import MODALITIES, Config, ConfigError
+from jaxsense.config import Config, ConfigError
 from jaxsense.extras import extra
 from jaxsense.models import Models, jmvae_shape
 from jaxsense.onboard import Function, functions
@@ -73,10 +73,8 @@ def _description(config: Config, models: Models) -> dict[str, Any]:
     return {
         "modalities": config.modalities,
         "classes": arena.classes,
-        "labels": {name: arena.labels(MODALITIES[name]) for name in config.modalities},
-        "label_of_class": {
-            name: arena.label_of_class(MODALITIES[name]) for name in config.modalities
-        },
+        "labels": {name: config.labels(name) for name in config.modalities},
+        "label_of_class": {name: config.label_of_class(name) for name in config.modalities},
         "class_means": np.asarray(models.class_beliefs.mean).tolist(),
         "num_pois": arena.num_pois,
         "unseen": {name: np.asarray(x).tolist() for name, x in vars(unseen).items()},

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxsense import examine, observe
-from jaxsense.config import MODALITIES, Config
+from jaxsense.config import Config
 from jaxsense.dqn import training as dqn
 from jaxsense.models import Models, jmvae_shape
 from jaxsense.networks import Params
@@ -163,7 +163,7 @@ def learn_perception(key: Key, config: Config, world: World) -> Perception:
 
 def _labels(config: Config, modality: int) -> tuple[int, ...]:
     """`[C]` what a modality detects of each class."""
-    return config.arena.label_of_class(MODALITIES[config.modalities[modality]])
+    return config.label_of_class(config.modalities[modality])
 
 
 def _survey(

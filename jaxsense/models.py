@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxsense.config import MODALITIES, Config
+from jaxsense.config import Config
 from jaxsense.networks import MLP, Params
 from jaxsense.sim import sensors
 from jaxsense.types import Belief, Key
@@ -32,7 +32,7 @@ class Models:
 
 def jmvae_shape(config: Config) -> Jmvae:
     """The JMVAE that fits the modalities and classes of a configuration."""
-    sizes = tuple(len(config.arena.labels(MODALITIES[m])) for m in config.modalities)
+    sizes = tuple(len(config.labels(m)) for m in config.modalities)
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
 

@@ -19,7 +19,7 @@ from jaxsense import examine, mission
 from jaxsense.checkpoints import Checkpoints, Curves
 from jaxsense.chunks import run_chunks
 from jaxsense.compilation import Compiler, Kept
-from jaxsense.config import MODALITIES, Config
+from jaxsense.config import Config
 from jaxsense.models import Models, untrained
 from jaxsense.monitor import Monitor
 from jaxsense.networks import Params
@@ -379,8 +379,7 @@ def _side_by_side(function: Callable[[int], T], number: int) -> list[T]:
 
 def _labels(config: Config, modality: int) -> np.ndarray:
     """`[C]` int32 what a modality detects of each class."""
-    name = config.modalities[modality]
-    return np.array(config.arena.label_of_class(MODALITIES[name]), np.int32)
+    return np.array(config.label_of_class(config.modalities[modality]), np.int32)
 
 
 def as_lists(figures: dict[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from jaxsense.config import COLOURS, MODALITIES, SHAPES, Config
+from jaxsense.config import Config
 from jaxsense.pipeline import RunResult
 from jaxsense.types import Belief
 
@@ -55,7 +55,7 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
             mean, std = (np.asarray(x)[c, :_MOST_ELLIPSES, :2] for x in (belief.mean, belief.std))
             if mean.shape[1] == 1:
                 mean, std = np.pad(mean, ((0, 0), (0, 1))), np.pad(std, ((0, 0), (0, 1)))
-            colour = _colour_of(label)
+            colour = _colour_of(config, label)
             by_class = [colour] * len(mean)
             by_sigma = sigma_map(scale(norms[name][c, :_MOST_ELLIPSES]))
             for row, colours in enumerate((by_class, by_sigma)):
@@ -86,10 +86,11 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     return figure
 
 
-def _colour_of(label: str) -> np.ndarray:
+def _colour_of(config: Config, label: str) -> np.ndarray:
     """The colour of a class in plots: its own, and half as bright for any shape but the first."""
-    colour, shape = label.split(" ")
-    return np.array(COLOURS[colour]) * (1.0 if shape == SHAPES[0] else 0.5)
+    colour, shape, *_ = label.split(" ")
+    is_first = shape == next(iter(config.arena.shapes))
+    return np.array(config.arena.colours[colour]) * (1.0 if is_first else 0.5)
 
 
 def _ellipses(axes: Any, mean: np.ndarray, std: np.ndarray, colours: Any) -> None:
@@ -131,10 +132,13 @@ def scanlines(config: Config, windows: dict[str, np.ndarray]) -> Figure:
     for row, (name, window) in zip(axes, windows.items(), strict=True):
         for ax, label, readings in zip(row, classes, window[:, 0], strict=True):
             ax.set_title(f"{name}: {label}")
-            if MODALITIES[name] == "colour":
+            if name == "camera":
                 ax.imshow(readings.reshape(1, -1, 3), aspect="auto", interpolation="nearest")
                 ax.set(yticks=[], xlabel="pixel of the window")
             else:
-                ax.plot(readings, ".", color=_colour_of(label), markersize=3)
-                ax.set(xlabel="beam of the window", ylabel="distance [m]", ylim=(0, None))
+                ax.plot(readings, ".", color=_colour_of(config, label), markersize=3)
+                if name == "lidar":
+                    ax.set(xlabel="beam of the window", ylabel="distance [m]", ylim=(0, None))
+                else:
+                    ax.set(xlabel="reading of the window")
     return figure

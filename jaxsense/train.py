@@ -5,6 +5,7 @@ import re
 import shutil
 import sys
 import time
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,6 +23,7 @@ from jaxsense.interrupt import on_interrupt
 from jaxsense.monitor import Monitor, StageError, Stopped
 from jaxsense.pipeline import RunResult
 from jaxsense.rundir import RunDirectory, Settings
+from jaxsense.sim import sensors
 
 PROGRAM = "jaxsense.train"
 _INTERRUPTED = 130  # exit status, as shells give it
@@ -62,10 +64,17 @@ class Arguments:
         return Settings(self.preset, self.seed, self.config, self.num_seeds)
 
 
-def main(argv: list[str] | None = None) -> None:
-    """The program."""
+def main(
+    argv: list[str] | None = None, change: Callable[[Config], Config] = lambda config: config
+) -> None:
+    """The program.
+
+    Args:
+      argv: the command line without the program; that of the process if not given.
+      change: what a program of your own makes of a preset, before the other options change that.
+    """
     begin = time.perf_counter()
-    arguments = parse(sys.argv[1:] if argv is None else argv)
+    arguments = parse(sys.argv[1:] if argv is None else argv, change)
     console = rich.console.Console(quiet=arguments.quiet)
     try:
         meshes = devices.start(arguments.devices, arguments.config.dqn)
@@ -88,10 +97,10 @@ def main(argv: list[str] | None = None) -> None:
     print(f"Next: python -m jaxsense.evaluate {first} --animate")
 
 
-def parse(argv: list[str]) -> Arguments:
+def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: config) -> Arguments:
     """Reads the command line; ends the program with status 2 and one line if it is wrong."""
     try:
-        stored = _stored(argv)
+        stored = _stored(argv, change)
         default: Any = Arguments(
             config=stored.config,
             preset=stored.preset,  # pyright: ignore[reportArgumentType]
@@ -99,6 +108,7 @@ def parse(argv: list[str]) -> Arguments:
             num_seeds=stored.num_seeds,
         )
         arguments = cli.parse(PROGRAM, Arguments, argv, default)
+        sensors.make(arguments.config)
         if not 0 <= arguments.seed < 2**32:
             raise ConfigError("seed", arguments.seed, "must be within 0 and 2^32 - 1")
         if arguments.num_seeds < 1:
@@ -117,7 +127,7 @@ def parse(argv: list[str]) -> Arguments:
     return arguments
 
 
-def _stored(argv: list[str]) -> Settings:
+def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     """The settings that the other options change, which must be known before they are read."""
     resume, file = _option(argv, "resume"), _option(argv, "config")
     if resume:
@@ -127,7 +137,7 @@ def _stored(argv: list[str]) -> Settings:
     preset = _option(argv, "preset") or "default"
     if preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
-    return Settings(preset, 0, PRESETS[preset])
+    return Settings(preset, 0, change(PRESETS[preset]))
 
 
 def _option(argv: list[str], name: str) -> str | None:

@@ -154,7 +154,7 @@ def error_line(argv: list[str], capsys, program=train) -> str:
     ("argv", "expected"),
     [
         (["--preset", "best"], "preset = 'best': must be one of default, paper, smoke"),
-        (["--colour", "red"], "train: Unrecognized options: --colour, red (--help"),
+        (["--taste", "sweet"], "train: Unrecognized options: --taste, sweet (--help"),
         (["--jmvae.hiden", "3"], "--jmvae.hiden, 3; perhaps --jmvae.hidden (--help"),
         (["--arena.side", "x"], "--arena.side: 'x' must be a number"),
         (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),

@@ -2,25 +2,21 @@
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Any
 
-from jaxsense.config.checks import require, require_not_negative, require_positive, require_window
-
-COLOURS: dict[str, tuple[float, float, float]] = {
-    "red": (0.8, 0.1, 0.1),
-    "green": (0.1, 0.7, 0.1),
-    "blue": (0.1, 0.2, 0.8),
-    "yellow": (0.8, 0.7, 0.1),
-}
-"""Albedo of each colour name that a PoI class can have, linear RGB in [0, 1]."""
+from jaxsense.config.checks import (
+    ConfigError,
+    require,
+    require_not_negative,
+    require_positive,
+    require_window,
+)
+from jaxsense.config.objects import COLOURS, SHAPES, Attribute, Shape, require_words
 
 ROBOT_RADIUS = 0.0495
 """Radius of an AMiRo, in metres."""
 
-SHAPES: tuple[str, ...] = ("cylinder", "cube")
-"""Shapes that a PoI class can have; the index is the shape code of `sim.arena.Layout`."""
-
-MODALITIES: dict[str, Literal["colour", "shape"]] = {"camera": "colour", "lidar": "shape"}
+MODALITIES: dict[str, str] = {"camera": "colour", "lidar": "shape"}
 """The sensors that `sim` knows, and the attribute of a PoI that each one tells apart."""
 
 
@@ -33,30 +29,40 @@ class ArenaConfig:
     num_pois: int = 3
     """Number of points of interest."""
     poi_radius: float = 0.1
-    """Radius of a cylinder and half the side of a cube, in metres."""
+    """Radius of a cylinder and half the side of a cube, in metres; other shapes are given as shares
+    of it."""
     poi_height: float = 0.2
     """Height of a PoI, in metres; more than 0.152, or the LiDAR looks over it."""
     poi_gap: float = 0.3
     """Smallest free gap between two PoIs, in metres; a robot needs 0.1 to pass."""
     classes: tuple[str, ...] = ("green cylinder", "red cylinder", "red cube")
-    """Classes of PoIs, each `"COLOUR SHAPE"`, drawn with equal chance."""
+    """Classes of PoIs, each `"COLOUR SHAPE"` and a word for each of `attributes`, drawn with equal
+    chance."""
+    colours: dict[str, tuple[float, float, float]] = dataclasses.field(
+        default_factory=COLOURS.copy, hash=False
+    )
+    """Albedo of each colour that a class can have, linear RGB in [0, 1]."""
+    shapes: dict[str, Shape] = dataclasses.field(default_factory=SHAPES.copy, hash=False)
+    """The solid of each shape that a class can have. Every PoI carries all of them, which the rays
+    are cast at."""
+    attributes: dict[str, Attribute] = dataclasses.field(default_factory=dict, hash=False)
+    """Attributes beside colour and shape that a sensor of one's own can tell."""
 
     def __post_init__(self):
         require_positive(self, "side", "num_pois", "poi_radius", "poi_height", "poi_gap")
         require(self.poi_height > 0.152, self, "poi_height", "must be more than 0.152 m")
-        require(len(self.classes) > 0, self, "classes", 'must name a class, "COLOUR SHAPE"')
-        for name in self.classes:
-            colour, _, shape = name.partition(" ")
-            require(
-                colour in COLOURS and shape in SHAPES,
-                self,
-                "classes",
-                f'{name!r} must be "COLOUR SHAPE" with a colour of {", ".join(COLOURS)} '
-                f"and a shape of {', '.join(SHAPES)}",
-            )
-        require(
-            len(set(self.classes)) == len(self.classes), self, "classes", "must name no class twice"
-        )
+        require_words(self.colours, "arena.colours")
+        require_words(self.shapes, "arena.shapes")
+        for name, rgb in self.colours.items():
+            if len(rgb) != 3 or not all(0 <= part <= 1 for part in rgb):
+                field = f"arena.colours.{name}"
+                raise ConfigError(field, rgb, "must be red, green and blue, each within 0 and 1")
+        if self.attributes:
+            require_words(self.attributes, "arena.attributes")
+        for name in ("colour", "shape"):
+            if name in self.attributes:
+                raise ConfigError("arena.attributes", name, "is there already; must be a new name")
+        self._check_classes()
         most = math.floor(self.side / self.poi_pitch) ** 2
         require(
             self.num_pois <= most,
@@ -64,6 +70,23 @@ class ArenaConfig:
             "num_pois",
             f"at most {most} PoIs of radius {self.poi_radius} m with gaps of {self.poi_gap} m "
             f"fit an arena of side {self.side} m",
+        )
+
+    def _check_classes(self) -> None:
+        form = " ".join(name.upper() for name in self._words)
+        require(len(self.classes) > 0, self, "classes", f'must name a class, "{form}"')
+        kinds = " and ".join(f"a {n} of {', '.join(known)}" for n, known in self._words.items())
+        for name in self.classes:
+            words = name.split(" ")
+            require(
+                len(words) == len(self._words)
+                and all(w in known for w, known in zip(words, self._words.values(), strict=True)),
+                self,
+                "classes",
+                f'{name!r} must be "{form}" with {kinds}',
+            )
+        require(
+            len(set(self.classes)) == len(self.classes), self, "classes", "must name no class twice"
         )
 
     @property
@@ -76,21 +99,40 @@ class ArenaConfig:
         """Distance of two PoIs' centres that leaves the gap between them free, in metres."""
         return 2.0 * self.poi_extent + self.poi_gap
 
-    def labels(self, attribute: Literal["colour", "shape"]) -> tuple[str, ...]:
-        """The distinct colours or shapes of the classes, in order of first appearance.
+    @property
+    def poi_half_width(self) -> float:
+        """Half the width that a PoI of any class shows at least, from any side, in metres."""
+        used = [self.shapes[shape] for shape in self.labels("shape")]
+        return min(min(shape.half_sides) for shape in used) * self.poi_radius
+
+    @property
+    def _words(self) -> dict[str, dict[str, Any]]:
+        """For each word of a class, what it is called and what it can be."""
+        own = {name: attribute.values for name, attribute in self.attributes.items()}
+        return {"colour": self.colours, "shape": self.shapes, **own}
+
+    def values(self, attribute: str) -> tuple[Any, ...]:
+        """For each class, what its word stands for: RGB, a `Shape`, or a number."""
+        known = self._words[attribute]
+        return tuple(known[word] for word in self._words_of_classes(attribute))
+
+    def labels(self, attribute: str) -> tuple[str, ...]:
+        """The distinct colours, shapes or other words of the classes, in order of declaration.
 
         Green and red come as ("red", "green"), round and edgy as ("cylinder", "cube"): the order of
-        the paper's feature vectors, which is the order of `COLOURS` and `SHAPES`.
+        the paper's feature vectors, which is the order of `colours` and `shapes`.
         """
-        known = COLOURS if attribute == "colour" else SHAPES
-        used = {name.split(" ")[0 if attribute == "colour" else 1] for name in self.classes}
-        return tuple(label for label in known if label in used)
+        used = self._words_of_classes(attribute)
+        return tuple(label for label in self._words[attribute] if label in used)
 
-    def label_of_class(self, attribute: Literal["colour", "shape"]) -> tuple[int, ...]:
-        """For each class, the index of its colour or shape in `labels(attribute)`."""
+    def label_of_class(self, attribute: str) -> tuple[int, ...]:
+        """For each class, the index of its colour, shape or other word in `labels(attribute)`."""
         labels = self.labels(attribute)
-        position = 0 if attribute == "colour" else 1
-        return tuple(labels.index(name.split(" ")[position]) for name in self.classes)
+        return tuple(labels.index(word) for word in self._words_of_classes(attribute))
+
+    def _words_of_classes(self, attribute: str) -> list[str]:
+        position = list(self._words).index(attribute)
+        return [name.split(" ")[position] for name in self.classes]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,3 +215,19 @@ class ViewpointConfig:
             "max_distance",
             "must be above min_distance",
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorConfig:
+    """A sensor of one's own, which a robot carries as it does a camera or a LiDAR."""
+
+    make: str
+    """Function of `Config` that makes the `sim.Sensor`, as `package.module:function`. The name of a
+    function and not the function itself, so that a run can be written down and read back."""
+    attribute: str
+    """What it tells apart: `colour`, `shape` or one of `arena.attributes`."""
+
+    def __post_init__(self):
+        module, _, function = self.make.partition(":")
+        is_name = function.isidentifier() and all(p.isidentifier() for p in module.split("."))
+        require(is_name, self, "make", "must be package.module:function")

@@ -14,12 +14,14 @@ from jaxsense.config.learning import (
     MdpConfig,
 )
 from jaxsense.config.mission import MissionConfig, NavigationConfig
+from jaxsense.config.objects import require_words
 from jaxsense.config.scene import (
     MODALITIES,
     ROBOT_RADIUS,
     ArenaConfig,
     CameraConfig,
     LidarConfig,
+    SensorConfig,
     ViewpointConfig,
 )
 
@@ -30,6 +32,8 @@ class Config:
 
     modalities: tuple[str, ...] = ("camera", "lidar")
     """The sensors, one robot each."""
+    sensors: dict[str, SensorConfig] = dataclasses.field(default_factory=dict, hash=False)
+    """Sensors of one's own, by the name of their modality."""
     arena: ArenaConfig = ArenaConfig()
     lidar: LidarConfig = LidarConfig()
     camera: CameraConfig = CameraConfig()
@@ -43,14 +47,7 @@ class Config:
     mission: MissionConfig = MissionConfig()
 
     def __post_init__(self):
-        known = ", ".join(MODALITIES)
-        if not self.modalities:
-            raise ConfigError("modalities", self.modalities, f"must name one or more of {known}")
-        for modality in self.modalities:
-            if modality not in MODALITIES:
-                raise ConfigError("modalities", self.modalities, f"must be some of {known}")
-        if len(set(self.modalities)) != len(self.modalities):
-            raise ConfigError("modalities", self.modalities, "must name no modality twice")
+        self._check_modalities()
         weights = self.jmvae.reconstruction_weights
         if len(weights) != len(self.modalities):
             raise ConfigError(
@@ -97,3 +94,38 @@ class Config:
                 True,
                 f"needs 2 to 30 pairs of PoI and modality, not {looks}; must be False",
             )
+
+    def _check_modalities(self) -> None:
+        known = ", ".join([*MODALITIES, *self.sensors])
+        if self.sensors:
+            require_words(self.sensors, "sensors")
+        attributes = ("colour", "shape", *self.arena.attributes)
+        for name, sensor in self.sensors.items():
+            if name in MODALITIES:
+                raise ConfigError("sensors", name, "is there already; must be a new name")
+            if sensor.attribute not in attributes:
+                raise ConfigError(
+                    f"sensors.{name}.attribute",
+                    sensor.attribute,
+                    f"must be one of {', '.join(attributes)}",
+                )
+        if not self.modalities:
+            raise ConfigError("modalities", self.modalities, f"must name one or more of {known}")
+        for modality in self.modalities:
+            if modality not in MODALITIES and modality not in self.sensors:
+                raise ConfigError("modalities", self.modalities, f"must be some of {known}")
+        if len(set(self.modalities)) != len(self.modalities):
+            raise ConfigError("modalities", self.modalities, "must name no modality twice")
+
+    def attribute(self, modality: str) -> str:
+        """What a modality tells apart: `colour`, `shape` or one of `arena.attributes`."""
+        own = self.sensors.get(modality)
+        return MODALITIES[modality] if own is None else own.attribute
+
+    def labels(self, modality: str) -> tuple[str, ...]:
+        """The words that a modality tells apart, in the order of its features."""
+        return self.arena.labels(self.attribute(modality))
+
+    def label_of_class(self, modality: str) -> tuple[int, ...]:
+        """For each class, the index of what a modality detects of it."""
+        return self.arena.label_of_class(self.attribute(modality))

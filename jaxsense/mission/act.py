@@ -262,7 +262,4 @@ def _write(
 
 def _bearing(scene: Scene, robot: Index, poi: jax.Array) -> jax.Array:
     """`[]` angle from a robot's heading to a PoI, in radians within -pi and pi."""
-    pose = scene.poses[robot]
-    to_poi = scene.layout.position[poi] - pose[:2]
-    angle = jnp.arctan2(to_poi[1], to_poi[0]) - pose[2]
-    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    return viewpoints.bearing(scene.poses[robot], scene.layout.position[poi])

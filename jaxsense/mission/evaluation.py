@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 
 from jaxsense import devices
 from jaxsense.compilation import Compiler, Program
-from jaxsense.config import MODALITIES, Config
+from jaxsense.config import Config
 from jaxsense.mission.figures import REASONS, figures
 from jaxsense.mission.rollout import play
 from jaxsense.mission.state import (
@@ -225,7 +225,7 @@ def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any
     }
     modality = name.removesuffix("_alone")
     if modality != name:
-        labels = np.array(config.arena.label_of_class(MODALITIES[modality]))
+        labels = np.array(config.label_of_class(modality))
         shares_label = np.array([np.sum(labels == label) > 1 for label in labels])
         cannot_tell = shares_label[found["classes"]]
         block["told"] = float(found["told"][modality].mean())

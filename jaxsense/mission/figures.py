@@ -5,7 +5,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import MODALITIES
 from jaxsense.dqn import belief_mdp
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
 from jaxsense.models import Models
@@ -63,7 +62,7 @@ def figures(mission: Mission, models: Models, state: MissionState) -> dict[str, 
     is_right = is_seen & (nearest == state.classes)
     told = {}
     for modality in config.modalities:
-        labels = jnp.array(config.arena.label_of_class(MODALITIES[modality]))
+        labels = jnp.array(config.label_of_class(modality))
         told[modality] = jnp.mean(is_seen & (labels[nearest] == labels[state.classes]))
     robots = state.robots
     return {

@@ -1,7 +1,7 @@
 """The arena in MuJoCo-MJX: walls, robots, and points of interest whose kind is data.
 
-A PoI slot owns one upright cylinder and one cube, each a mocap body; the one that the slot does not
-show waits below the floor. Its pose and shape are therefore entries of the MJX state, its colour an
+A PoI slot owns one upright solid for each shape, each a mocap body; those that the slot does not
+show wait below the floor. Its pose and shape are therefore entries of the MJX state, its colour an
 entry of the layout, and a new layout or class never recompiles anything.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
-from jaxsense.config import COLOURS, SHAPES, ArenaConfig
+from jaxsense.config import ArenaConfig, Shape
 from jaxsense.sim import amiro
 from jaxsense.types import Key
 
@@ -34,14 +34,16 @@ class Layout:
     Attributes:
       position: `[N, 2]` float32 centres of the PoIs, in metres from the arena's centre.
       yaw: `[N]` float32, in radians.
-      shape: `[N]` int32 index into `config.SHAPES`.
+      shape: `[N]` int32 index into `config.shapes`, in their order.
       colour: `[N, 3]` float32 albedo, linear RGB in [0, 1].
+      values: for each of `config.attributes` its `[N]` float32 number.
     """
 
     position: jax.Array
     yaw: jax.Array
     shape: jax.Array
     colour: jax.Array
+    values: dict[str, jax.Array] = struct.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -100,26 +102,10 @@ def build(
     """
     reach = config.side / 2 - amiro.BODY_RADIUS
     robots = [f"robot{r}" for r in range(len(lidar_robots))]
-    size = f"{config.poi_radius} {config.poi_radius} {config.poi_height / 2}"
-    # MJX finds contacts of cylinders by descent and those of capsules in closed form. At the height
-    # of a robot's collider both are the same.
-    upright = f"{config.poi_radius} {config.poi_height / 2}"
-    kinds = (
-        ("cylinder", "" if contacts else 'class="obstacle"'),
-        ("box", 'class="obstacle"'),
-    )
     pois = "".join(
-        f'<body name="poi{n}_{shape}" mocap="true">'
-        f'<geom name="poi{n}_{shape}" type="{kind}" size="{size}" {collides}/>'
-        + (
-            f'<geom name="poi{n}_{shape}_collider" type="capsule" size="{upright}" group="3" '
-            f'class="obstacle"/>'
-            if contacts and kind == "cylinder"
-            else ""
-        )
-        + "</body>"
+        _poi(f"poi{n}_{name}", shape, config, contacts)
         for n in range(config.num_pois)
-        for shape, (kind, collides) in zip(SHAPES, kinds, strict=True)
+        for name, shape in config.shapes.items()
     )
     offset = (config.side + WALL_THICKNESS) / 2
     half = (WALL_THICKNESS / 2, config.side / 2 + WALL_THICKNESS)
@@ -159,16 +145,33 @@ def build(
     return Arena(config, mj_model, model, mjx.make_data(model), len(robots))
 
 
+def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
+    """MJCF of one solid of one PoI."""
+    u, v = (share * config.poi_radius for share in shape.half_sides)
+    half_height = config.poi_height / 2
+    is_box = shape.primitive == "box"
+    size = f"{u} {v} {half_height}" if is_box else f"{u} {half_height}"
+    solid = f'<geom name="{name}" type="{shape.primitive}" size="{size}"'
+    collides = 'class="obstacle"/>'
+    if is_box or not contacts:
+        return f'<body name="{name}" mocap="true">{solid} {collides}</body>'
+    # MJX finds contacts of cylinders by descent and those of capsules in closed form. At the height
+    # of a robot's collider both are the same.
+    capsule = f'<geom name="{name}_collider" type="capsule" size="{size}" group="3" {collides}'
+    return f'<body name="{name}" mocap="true">{solid}/>{capsule}</body>'
+
+
 def make_layout(
     config: ArenaConfig, position: jax.Array, yaw: jax.Array, classes: jax.Array
 ) -> Layout:
     """The layout in which PoI n is of class `classes[n]`, an `[N]` index into `config.classes`."""
     chex.assert_shape(position, (config.num_pois, 2), custom_message="position")
     chex.assert_shape([yaw, classes], (config.num_pois,), custom_message="yaw, classes")
-    words = [name.split(" ") for name in config.classes]
-    shapes = jnp.array([SHAPES.index(shape) for _, shape in words])
-    colours = jnp.array([COLOURS[colour] for colour, _ in words])
-    return Layout(position, yaw, shapes[classes], colours[classes])
+    shapes = jnp.array([list(config.shapes.values()).index(s) for s in config.values("shape")])
+    colours = jnp.array(config.values("colour"))
+    values = {name: jnp.array(config.values(name)) for name in config.attributes}
+    of_pois = {name: numbers[classes] for name, numbers in values.items()}
+    return Layout(position, yaw, shapes[classes], colours[classes], of_pois)
 
 
 def random_layout(key: Key, config: ArenaConfig, classes: jax.Array) -> Layout:
@@ -219,7 +222,7 @@ def put(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
     """`place` without the kinematics, which a physics step does itself."""
     chex.assert_shape(poses, (arena.num_robots, 3), custom_message="poses")
     check_layout(arena.config, layout)
-    shown = layout.shape[:, None] == jnp.arange(len(SHAPES))[None]
+    shown = layout.shape[:, None] == jnp.arange(len(arena.config.shapes))[None]
     height = jnp.where(shown, arena.config.poi_height / 2, _STORE)
     position = jnp.concatenate(
         [jnp.broadcast_to(layout.position[:, None], (*height.shape, 2)), height[..., None]], axis=-1
@@ -228,7 +231,7 @@ def put(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
     turn = jnp.stack([jnp.cos(layout.yaw / 2), zero, zero, jnp.sin(layout.yaw / 2)], axis=-1)
     return arena.data.replace(
         mocap_pos=position.reshape(-1, 3),
-        mocap_quat=jnp.repeat(turn, len(SHAPES), axis=0),
+        mocap_quat=jnp.repeat(turn, len(arena.config.shapes), axis=0),
         qpos=poses.reshape(-1),
     )
 

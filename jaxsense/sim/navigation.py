@@ -75,12 +75,15 @@ def clearance(arena: ArenaConfig, layout: Layout, poses: jax.Array) -> jax.Array
     for n in range(arena.num_pois):
         from_x, from_y = x - layout.position[n, 0], y - layout.position[n, 1]
         cos, sin = jnp.cos(layout.yaw[n]), jnp.sin(layout.yaw[n])
-        along = jnp.abs(cos * from_x + sin * from_y) - arena.poi_radius
-        across = jnp.abs(cos * from_y - sin * from_x) - arena.poi_radius
-        outside = jnp.hypot(jnp.maximum(along, 0.0), jnp.maximum(across, 0.0))
-        to_cube = outside + jnp.minimum(jnp.maximum(along, across), 0.0)
-        to_cylinder = jnp.hypot(from_x, from_y) - arena.poi_radius
-        nearest = jnp.minimum(nearest, jnp.where(layout.shape[n] == 0, to_cylinder, to_cube))
+        for i, shape in enumerate(arena.shapes.values()):
+            half_u, half_v = (share * arena.poi_radius for share in shape.half_sides)
+            along = jnp.abs(cos * from_x + sin * from_y) - half_u
+            across = jnp.abs(cos * from_y - sin * from_x) - half_v
+            outside = jnp.hypot(jnp.maximum(along, 0.0), jnp.maximum(across, 0.0))
+            to_box = outside + jnp.minimum(jnp.maximum(along, across), 0.0)
+            to_cylinder = jnp.hypot(from_x, from_y) - half_u
+            distance = to_box if shape.primitive == "box" else to_cylinder
+            nearest = jnp.where(layout.shape[n] == i, jnp.minimum(nearest, distance), nearest)
     for r in range(len(poses)):
         apart = jnp.hypot(x - x[r], y - y[r]) - amiro.BODY_RADIUS
         nearest = jnp.where(jnp.arange(len(poses)) == r, nearest, jnp.minimum(nearest, apart))

@@ -1,10 +1,12 @@
 """LiDAR scans and camera scanlines: thin layers over the ray-caster.
 
-A sensor is a value: its rays, its height and how it turns hits into readings. Adding one means
-adding an entry to `make`; nothing else in the package names a sensor.
+A sensor is a value: its rays, its height and how it turns hits into readings. One of your own is
+made by a function that `Config.sensors` names; nothing else in the package names a sensor.
 """
 
 import dataclasses
+import hashlib
+import importlib
 from collections.abc import Callable
 
 import chex
@@ -14,7 +16,7 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
-from jaxsense.config import ArenaConfig, CameraConfig, Config, LidarConfig
+from jaxsense.config import ArenaConfig, CameraConfig, Config, ConfigError, LidarConfig
 from jaxsense.sim import amiro, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
 from jaxsense.types import Key
@@ -40,6 +42,17 @@ class Light:
     ambient: jax.Array
 
 
+Surfaces = dict[str, jax.Array]
+"""What each of G geoms shows: `colour`, its `[G, 3]` albedo, and for each of `arena.attributes` its
+`[G]` number."""
+
+
+def _shows_all(readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
+    """Evidence of a sensor that cannot tell a PoI from anything else."""
+    del distance, extent
+    return jnp.ones(len(readings), bool)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sensor:
     """A scanline sensor on a robot.
@@ -48,30 +61,35 @@ class Sensor:
       name: of the modality.
       height: of its rays above the floor, in metres.
       angles: `[B]` of its rays in the robot's frame, in radians, in the order of the readings.
+      centre: index, as a real number, of the ray that points along a bearing in radians.
       window: number of rays that the detector reads.
+      read: `(key, hits of B rays, surfaces, light) -> [B, ...] readings`.
       channels: numbers in the reading of one ray.
       stride: from each ray that the detector reads to the next.
-      centre: index, as a real number, of the ray that points along a bearing in radians.
-      read: `(key, hits of B rays, [G, 3] albedo of each geom, light) -> [B, ...] readings`.
       window_limit: highest reading that the detector is shown.
       shows: `(readings [B, ...], distance [], extent) -> [B]` bool, which rays can have met a PoI
-        of that extent [m] with its centre at that distance [m].
+        of that extent [m] with its centre at that distance [m]; by default all.
       blind: the reading of every ray when the sensor has failed.
-      scan_bytes: size of a whole scan as ROS sends it.
+      ray_bytes: size of one ray's reading as ROS sends it.
     """
 
     name: str
     height: float
     angles: np.ndarray
-    window: int
-    channels: int
-    stride: int
     centre: Callable[[jax.Array], jax.Array]
-    read: Callable[[Key, raycast.Hit, jax.Array, Light], jax.Array]
-    window_limit: float
-    shows: Callable[[jax.Array, jax.Array, float], jax.Array]
-    blind: float
-    scan_bytes: int
+    window: int
+    read: Callable[[Key, raycast.Hit, Surfaces, Light], jax.Array]
+    channels: int = 1
+    stride: int = 1
+    window_limit: float = np.inf
+    shows: Callable[[jax.Array, jax.Array, float], jax.Array] = _shows_all
+    blind: float = 0.0
+    ray_bytes: int = 4  # float32
+
+    @property
+    def scan_bytes(self) -> int:
+        """Size of a whole scan as ROS sends it."""
+        return self.ray_bytes * len(self.angles)
 
     @property
     def directions(self) -> np.ndarray:
@@ -89,14 +107,28 @@ def random_light(key: Key) -> Light:
     return Light(direction, diffuse=0.2 + 0.6 * diffuse, ambient=0.3 + 0.3 * ambient)
 
 
+def fan(num_rays: int, field_of_view: float) -> tuple[np.ndarray, Callable]:
+    """Rays at equal angles, from right to left.
+
+    Args:
+      num_rays: how many.
+      field_of_view: angle between the first and the last, in degrees.
+
+    Returns:
+      A `Sensor`'s `angles` and `centre`.
+    """
+    half = np.radians(field_of_view) / 2
+    angles = np.linspace(-half, half, num_rays, dtype=np.float32)
+    step = 2 * half / max(num_rays - 1, 1)
+    return angles, lambda bearing: (bearing + half) / step
+
+
 def lidar(config: LidarConfig) -> Sensor:
     """The laser scanner: one distance in metres for each beam, from right to left."""
-    half = np.radians(config.field_of_view) / 2
-    angles = np.linspace(-half, half, config.num_beams, dtype=np.float32)
-    step = 2 * half / max(config.num_beams - 1, 1)
+    angles, centre = fan(config.num_beams, config.field_of_view)
 
-    def read(key, hits, albedo, light):
-        del albedo, light
+    def read(key, hits, surfaces, light):
+        del surfaces, light
         noise = config.range_noise * jax.random.normal(key, hits.distance.shape)
         measured = jnp.clip(hits.distance + noise, config.min_range, config.max_range)
         return jnp.where(hits.distance <= config.max_range, measured, config.max_range)
@@ -105,17 +137,15 @@ def lidar(config: LidarConfig) -> Sensor:
         name="lidar",
         height=amiro.LIDAR_HEIGHT,
         angles=angles,
+        centre=centre,
         window=config.window,
-        channels=1,
-        stride=config.stride,
-        centre=lambda bearing: (bearing + half) / step,
         read=read,
+        stride=config.stride,
         window_limit=config.window_range,
         shows=lambda readings, distance, extent: (
             jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + _RANGE_TOLERANCE
         ),
         blind=config.max_range,
-        scan_bytes=4 * config.num_beams,  # float32
     )
 
 
@@ -126,7 +156,7 @@ def camera(config: CameraConfig) -> Sensor:
     columns = np.arange(config.num_pixels)
     angles = np.arctan((middle - columns) / focal_length).astype(np.float32)
 
-    def read(key, hits, albedo, light):
+    def read(key, hits, surfaces, light):
         normal_x, normal_y = hits.normal
         facing = normal_x * light.direction[0] + normal_y * light.direction[1]
         shade = light.ambient + light.diffuse * jnp.maximum(facing, 0.0)
@@ -140,37 +170,92 @@ def camera(config: CameraConfig) -> Sensor:
 
         # A loop over the channels makes the compiler finish hits and noise before it shades them;
         # fused with the ray-caster, each channel would cast the rays many times over.
-        inputs = albedo.T, jnp.array(_BACKGROUND), noise
+        inputs = surfaces["colour"].T, jnp.array(_BACKGROUND), noise
         return jax.lax.map(lambda c: channel(*c), inputs).T
 
     return Sensor(
         name="camera",
         height=amiro.CAMERA_HEIGHT,
         angles=angles,
+        centre=lambda bearing: middle - focal_length * jnp.tan(bearing),
         window=config.window,
+        read=read,
         channels=3,
         stride=config.stride,
-        centre=lambda bearing: middle - focal_length * jnp.tan(bearing),
-        read=read,
         window_limit=1.0,
         shows=lambda readings, distance, extent: (
             readings.max(axis=-1) - readings.min(axis=-1) >= _LEAST_CHROMA
         ),
-        blind=0.0,
-        scan_bytes=3 * config.num_pixels,  # rgb8
+        ray_bytes=3,  # rgb8
     )
 
 
 def make(config: Config) -> tuple[Sensor, ...]:
     """The sensor of each modality, in the order of `config.modalities`."""
     known = {"camera": lambda: camera(config.camera), "lidar": lambda: lidar(config.lidar)}
-    return tuple(known[modality]() for modality in config.modalities)
+    return tuple(
+        _own(name, config) if name in config.sensors else known[name]()
+        for name in config.modalities
+    )
 
 
-def palette(arena: Arena, layout: Layout) -> jax.Array:
-    """`[G, 3]` albedo of every geom: the PoIs' from the layout, the others' from the model."""
+def _own(name: str, config: Config) -> Sensor:
+    """A sensor that the user has declared; a `ConfigError` if it cannot be made or does not fit."""
+    entry, field = config.sensors[name].make, f"sensors.{name}"
+    module, _, function = entry.partition(":")
+    try:
+        make = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        reason = f"must be a function that can be imported ({error})"
+        raise ConfigError(f"{field}.make", entry, reason) from None
+    sensor = make(config)
+    if not isinstance(sensor, Sensor):
+        kind = type(sensor).__name__
+        raise ConfigError(f"{field}.make", entry, f"must give a jaxsense.sim.Sensor, not {kind}")
+    if not 0 < sensor.height < config.arena.poi_height:
+        reason = f"must be above 0 and below arena.poi_height = {config.arena.poi_height} m"
+        raise ConfigError(f"{field}: height", sensor.height, reason)
+    most = (len(sensor.angles) - 1) // sensor.stride + 1
+    if not 1 <= sensor.window <= most:
+        reason = f"must be 1 to {most}: it has {len(sensor.angles)} rays and a stride of "
+        raise ConfigError(f"{field}: window", sensor.window, f"{reason}{sensor.stride}")
+    return dataclasses.replace(sensor, name=name)
+
+
+def fingerprints(config: Config) -> list[str]:
+    """What tells each of the user's own sensors from all others: also what its functions compute.
+
+    Programs that are kept close over sensors, whose code is not in the configuration.
+    """
+    own = [sensor for sensor in make(config) if sensor.name in config.sensors]
+    return [_fingerprint(sensor, tuple(config.arena.attributes)) for sensor in own]
+
+
+def _fingerprint(sensor: Sensor, attributes: tuple[str, ...]) -> str:
+    def functions(key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light, x: jax.Array):
+        readings = sensor.read(key, hits, surfaces, light)
+        return readings, sensor.shows(readings, x, 0.1), sensor.centre(x)
+
+    rays = jnp.zeros(sensor.window)
+    hits = raycast.Hit(rays, rays.astype(jnp.int32), (rays, rays))
+    shown = {"colour": jnp.zeros((2, 3)), **{name: jnp.zeros(2) for name in attributes}}
+    light, x = Light(jnp.zeros(3), jnp.float32(0), jnp.float32(0)), jnp.float32(0)
+    program = jax.jit(functions).lower(jax.random.key(0), hits, shown, light, x).as_text()
+    settings = [getattr(sensor, f.name) for f in dataclasses.fields(sensor)]
+    text = repr([s for s in settings if not callable(s) and not isinstance(s, np.ndarray)])
+    whole = text.encode() + sensor.angles.tobytes() + program.encode()
+    return hashlib.sha256(whole).hexdigest()
+
+
+def surfaces(arena: Arena, layout: Layout) -> Surfaces:
+    """What every geom shows: the PoIs' from the layout, the others' from model and settings."""
     poi = jnp.array(arena.poi_of_geom)
-    return jnp.where((poi >= 0)[:, None], layout.colour[poi], arena.model.geom_rgba[:, :3])
+    albedo = jnp.where((poi >= 0)[:, None], layout.colour[poi], arena.model.geom_rgba[:, :3])
+    own = {
+        name: jnp.where(poi >= 0, layout.values[name][poi], attribute.elsewhere)
+        for name, attribute in arena.config.attributes.items()
+    }
+    return {"colour": albedo, **own}
 
 
 def scan(
@@ -190,7 +275,7 @@ def scan(
       sensor: the sensor.
       arena: the arena.
       data: its MJX state, after kinematics.
-      layout: the PoIs, for their colours.
+      layout: the PoIs, for what their surfaces show.
       light: the light.
       robot: index of the robot that carries the sensor; its own parts are not seen.
       directions: `[2, B]` unit vectors in the robot's frame; `sensor.directions` for a full scan.
@@ -205,7 +290,7 @@ def scan(
     section = raycast.cross_section(arena, data, sensor.height, robot)
     in_world = raycast.turned((directions[0], directions[1]), pose[2])
     hits = raycast.cast_along(section, pose[:2], in_world)
-    return sensor.read(key, hits, palette(arena, layout), light)
+    return sensor.read(key, hits, surfaces(arena, layout), light)
 
 
 def window_of(sensor: Sensor, values: np.ndarray, bearing: jax.Array) -> jax.Array:
@@ -222,15 +307,40 @@ def window_of(sensor: Sensor, values: np.ndarray, bearing: jax.Array) -> jax.Arr
     """
     chex.assert_rank(bearing, 0, custom_message="bearing")
     *shape, number = values.shape
-    span = (sensor.window - 1) * sensor.stride
-    start = jnp.round(sensor.centre(bearing) - span / 2).astype(jnp.int32)
-    start = jnp.clip(start, 0, number - 1 - span)
+    start = _first_ray(sensor, bearing)
     # Cut out as one piece, of every ray that is a stride from the next: a list of indices would
     # be worked out for each ray from the bearing on.
     padded = np.pad(values, [(0, 0)] * len(shape) + [(0, -number % sensor.stride)])
     strided = jnp.array(padded.reshape(*shape, -1, sensor.stride))
     place = [0] * len(shape) + [start // sensor.stride, start % sensor.stride]
     return jax.lax.dynamic_slice(strided, place, (*shape, sensor.window, 1))[..., 0]
+
+
+def _first_ray(sensor: Sensor, bearing: jax.Array) -> jax.Array:
+    """`[]` int32 index of the first ray that the detector reads around a bearing."""
+    span = (sensor.window - 1) * sensor.stride
+    start = jnp.round(sensor.centre(bearing) - span / 2).astype(jnp.int32)
+    return jnp.clip(start, 0, len(sensor.angles) - 1 - span)
+
+
+def cut_out(sensor: Sensor, readings: jax.Array | np.ndarray, bearing: jax.Array | float):
+    """The detector's input from a whole scan, recorded or simulated.
+
+    Args:
+      sensor: the sensor.
+      readings: `[B, ...]` of all its rays in their order: a LiDAR's in metres from right to left, a
+        camera's as linear RGB in [0, 1] from left to right.
+      bearing: `[]` of the PoI in the robot's frame, in radians, positive to the left.
+
+    Returns:
+      `[F]` what `vae.detect` takes.
+    """
+    channels = () if sensor.channels == 1 else (sensor.channels,)
+    shape = (len(sensor.angles), *channels)
+    chex.assert_shape(readings, shape, custom_message=f"readings of {sensor.name}")
+    bearing = jnp.asarray(bearing, jnp.float32)
+    rays = _first_ray(sensor, bearing) + sensor.stride * jnp.arange(sensor.window)
+    return as_window(sensor, jnp.asarray(readings, jnp.float32)[rays])
 
 
 def shows_poi(
@@ -257,7 +367,7 @@ def shows_poi(
       it, a PoI that is not there and a sensor that has failed give False.
     """
     angles = window_of(sensor, sensor.angles, bearing) - bearing
-    half_width = jnp.arcsin(jnp.minimum(arena.poi_radius / distance, 1.0))
+    half_width = jnp.arcsin(jnp.minimum(arena.poi_half_width / distance, 1.0))
     is_within = jnp.abs(angles) <= _SHARE_OF_WIDTH * half_width
     return jnp.all(sensor.shows(readings, distance, arena.poi_extent) | ~is_within)
 

@@ -3,6 +3,7 @@
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsense.config import ArenaConfig, ViewpointConfig
 from jaxsense.sim import amiro
@@ -54,6 +55,21 @@ def random_viewpoint(
     believed = bearing + jnp.radians(config.bearing_error) * (2 * draws[-1] - 1)
     yaw = side[chosen] + jnp.pi - bearing
     return jnp.stack([position[0][chosen], position[1][chosen], yaw]), believed
+
+
+def bearing(pose: jax.Array | np.ndarray, place: jax.Array | np.ndarray) -> jax.Array:
+    """At which angle a robot sees a place.
+
+    Args:
+      pose: `[3]` x [m], y [m] and yaw [rad] of the robot.
+      place: `[2]` in metres.
+
+    Returns:
+      `[]` angle from its heading, positive to the left, in radians within -pi and pi.
+    """
+    to_place = place - pose[:2]
+    angle = jnp.arctan2(to_place[1], to_place[0]) - pose[2]
+    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
 
 
 def free_room(

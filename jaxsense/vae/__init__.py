@@ -2,6 +2,7 @@
 
 from jaxsense.vae.detectors import Detector as Detector
 from jaxsense.vae.detectors import detect as detect
+from jaxsense.vae.fusion import fuse as fuse
 from jaxsense.vae.fusion import unseen as unseen
 from jaxsense.vae.fusion import write as write
 from jaxsense.vae.gaussian import kl_divergence as kl_divergence
@@ -13,5 +14,6 @@ from jaxsense.vae.jmvae import init as init
 from jaxsense.vae.jmvae import loss as loss
 from jaxsense.vae.jmvae import posterior as posterior
 from jaxsense.vae.jmvae import train as train
+from jaxsense.vae.metrics import nearest_class as nearest_class
 from jaxsense.vae.metrics import plausible_classes as plausible_classes
 from jaxsense.vae.metrics import sigma_norm as sigma_norm

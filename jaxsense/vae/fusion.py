@@ -8,11 +8,56 @@ import itertools
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsense.networks import Params
-from jaxsense.types import Belief
+from jaxsense.types import Belief, Features
 from jaxsense.vae import jmvae
 from jaxsense.vae.jmvae import Jmvae
+
+
+def fuse(
+    params: Params,
+    model: Jmvae,
+    belief: Belief,
+    seen: jax.Array | np.ndarray,
+    features: Features,
+) -> Belief:
+    """The map's entry of a PoI after a look at it by one sensor, or by several at once.
+
+    The first look gives `q(z|x)`. If other modalities have seen the PoI, their features are no
+    longer there: they are decoded from the entry's mean and encoded together with the new ones.
+
+    Args:
+      params: of the JMVAE.
+      model: its shape.
+      belief: `[D]` the present entry.
+      seen: `[M]` bool, which modalities have seen the PoI before.
+      features: for each modality `[D_m]` what the look has detected, or None for those that have
+        not looked.
+
+    Returns:
+      The new entry. The old one does not enter it but through the decoder.
+
+    Raises:
+      ValueError: if `features` has not one entry for each modality, or none of them is there.
+    """
+    chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
+    chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
+    chex.assert_shape(seen, (len(model.modalities),), custom_message="seen")
+    jmvae.check_features(model, features)
+    generated = jmvae.decode(params, model, belief.mean)
+    others = [m for m, new in enumerate(features) if new is None]
+    entry = belief
+    # One encoder for each set of modalities that may have looked before; `seen` picks among them.
+    for size in range(len(others) + 1):
+        for subset in itertools.combinations(others, size):
+            inputs = tuple(generated[m] if m in subset else new for m, new in enumerate(features))
+            candidate = jmvae.posterior(params, model, inputs)
+            is_subset = jnp.array([m in subset for m in others], bool)
+            applies = jnp.all(jnp.asarray(seen)[jnp.array(others, int)] == is_subset)
+            entry = jax.tree.map(lambda new, old: jnp.where(applies, new, old), candidate, entry)  # noqa: B023
+    return entry
 
 
 def write(
@@ -23,45 +68,15 @@ def write(
     features: jax.Array,
     modality: int,
 ) -> Belief:
-    """The map's entry of a PoI after a look at it.
-
-    The first look gives `q(z|x)`. If other modalities have seen the PoI, their features are no
-    longer there: they are decoded from the entry's mean and encoded together with the new ones.
-
-    Args:
-      params: of the JMVAE.
-      model: its shape.
-      belief: `[D]` the present entry.
-      seen: `[M]` bool, which modalities have seen the PoI.
-      features: `[D_m]` what the look has detected.
-      modality: index of the sensor that looked; static.
-
-    Returns:
-      The new entry. The old one does not enter it but through the decoder.
+    """`fuse` of a look by the one sensor of that index, with its `[D_m]` features.
 
     Raises:
       ValueError: if there is no such modality.
     """
     if not 0 <= modality < len(model.modalities):
         raise ValueError(f"modality = {modality}: must be an index of {model.modalities}")
-    chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
-    chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
-    chex.assert_shape(seen, (len(model.modalities),), custom_message="seen")
-    generated = jmvae.decode(params, model, belief.mean)
-    others = [m for m in range(len(model.modalities)) if m != modality]
-    entry = belief
-    # One encoder for each set of modalities that may have looked before; `seen` picks among them.
-    for size in range(len(others) + 1):
-        for subset in itertools.combinations(others, size):
-            inputs = tuple(
-                features if m == modality else generated[m] if m in subset else None
-                for m in range(len(model.modalities))
-            )
-            candidate = jmvae.posterior(params, model, inputs)
-            is_subset = jnp.array([m in subset for m in others], bool)
-            applies = jnp.all(seen[jnp.array(others, int)] == is_subset)
-            entry = jax.tree.map(lambda new, old: jnp.where(applies, new, old), candidate, entry)  # noqa: B023
-    return entry
+    of_all = tuple(features if m == modality else None for m in range(len(model.modalities)))
+    return fuse(params, model, belief, seen, of_all)
 
 
 def unseen(model: Jmvae, variance: float) -> Belief:

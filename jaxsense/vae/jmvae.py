@@ -91,14 +91,8 @@ def encode(params: Params, model: Jmvae, features: Features) -> tuple[jax.Array,
     Raises:
       ValueError: if `features` has not one entry for each modality, or none of them is there.
     """
-    if len(features) != len(model.modalities):
-        raise ValueError(
-            f"features has {len(features)} entries: must be {len(model.modalities)}, one for each "
-            f"of {model.modalities}"
-        )
+    check_features(model, features)
     subset = tuple(m for m, feature in enumerate(features) if feature is not None)
-    if not subset:
-        raise ValueError(f"features = {features}: must hold one modality or more")
     for m in subset:
         chex.assert_shape(
             features[m],
@@ -110,6 +104,17 @@ def encode(params: Params, model: Jmvae, features: Features) -> tuple[jax.Array,
     output = network.apply(params["encoders"][model.encoder_name(subset)], joined)
     mean, log_var = jnp.split(jnp.asarray(output), 2)
     return mean, log_var
+
+
+def check_features(model: Jmvae, features: Features) -> None:
+    """Raises a `ValueError` unless there is an entry for each modality, and not only None."""
+    if len(features) != len(model.modalities):
+        raise ValueError(
+            f"features has {len(features)} entries: must be {len(model.modalities)}, one for each "
+            f"of {model.modalities}"
+        )
+    if all(feature is None for feature in features):
+        raise ValueError(f"features = {features}: must hold one modality or more")
 
 
 def decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]:

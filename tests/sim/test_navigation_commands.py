@@ -151,7 +151,7 @@ def test_clearance_is_the_least_distance_that_c_mujoco_finds(arena, place, set_n
             poses[1, :2] = near(poses[0, :2], 0.06, 0.3)
         poses = poses.astype(np.float32)
         mj_data = set_native(place(layout, jnp.array(poses)))
-        shapes = [SHAPES[int(shape)] for shape in layout.shape]
+        shapes = [tuple(SHAPES)[int(shape)] for shape in layout.shape]
         shown = [f"poi{n}_{shape}" for n, shape in enumerate(shapes)]
         for robot in (0, 1):
             distances = [1.5 - np.abs(poses[robot, :2]).max() - 0.0495]

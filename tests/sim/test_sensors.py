@@ -18,6 +18,8 @@ FACE_TO_FACE = jnp.array([[-0.5, 0.0, 0.0], [0.5, 0.0, np.pi]])
 GREEN = np.array([0.1, 0.7, 0.1])
 RED = np.array([0.8, 0.1, 0.1])
 WALL = np.array([0.6, 0.6, 0.6])
+BLACK = {"colour": jnp.zeros((1, 3))}
+WHITE = {"colour": jnp.ones((1, 3))}
 
 
 def hits_at(distance):
@@ -97,11 +99,11 @@ def test_noise_has_the_configured_standard_deviation():
     lidar = sensors.lidar(LidarConfig(range_noise=0.02))
     camera = sensors.camera(CameraConfig(pixel_noise=0.05))
     many = hits_at(jnp.full(20_000, 2.0))
-    ranges = np.array(lidar.read(jax.random.key(0), many, jnp.zeros((1, 3)), LIGHT))
+    ranges = np.array(lidar.read(jax.random.key(0), many, BLACK, LIGHT))
     # Standard error of a standard deviation: 0.02 / sqrt(2 * 20000) = 0.0001.
     assert ranges.std() == pytest.approx(0.02, abs=4e-4)
     assert ranges.mean() == pytest.approx(2.0, abs=6e-4)
-    pixels = np.array(camera.read(jax.random.key(1), many, jnp.ones((1, 3)), LIGHT))
+    pixels = np.array(camera.read(jax.random.key(1), many, WHITE, LIGHT))
     # The normal is zero, so all light is ambient: 0.25, five deviations from being clipped.
     np.testing.assert_allclose(pixels.std(axis=0), 0.05, atol=1e-3)
     np.testing.assert_allclose(pixels.mean(axis=0), 0.25, atol=1.5e-3)
@@ -115,15 +117,15 @@ def test_default_noise_is_the_urdfs():
 
 def test_ranges_stop_at_the_shortest_and_the_longest():
     exact = sensors.lidar(LidarConfig(range_noise=0.0))
-    key, albedo = jax.random.key(0), jnp.zeros((1, 3))
-    ranges = exact.read(key, hits_at([0.02, 0.08, 1.0, 4.99, 5.01, 7.0, jnp.inf]), albedo, LIGHT)
+    distances = [0.02, 0.08, 1.0, 4.99, 5.01, 7.0, jnp.inf]
+    ranges = exact.read(jax.random.key(0), hits_at(distances), BLACK, LIGHT)
     np.testing.assert_allclose(ranges, [0.08, 0.08, 1.0, 4.99, 5.0, 5.0, 5.0], rtol=1e-6)
 
 
 def test_noise_leaves_no_range_outside_the_limits():
     noisy = sensors.lidar(LidarConfig(range_noise=0.1))
     distance = jnp.concatenate([jnp.full(500, 0.1), jnp.full(500, 4.95), jnp.full(500, jnp.inf)])
-    ranges = np.array(noisy.read(jax.random.key(0), hits_at(distance), jnp.zeros((1, 3)), LIGHT))
+    ranges = np.array(noisy.read(jax.random.key(0), hits_at(distance), BLACK, LIGHT))
     assert ranges.min() >= np.float32(0.08)
     assert ranges.max() <= 5.0
     assert len(np.unique(ranges[:1000])) > 100
@@ -132,7 +134,7 @@ def test_noise_leaves_no_range_outside_the_limits():
 def test_pixels_stay_within_full_scale():
     camera = sensors.camera(CameraConfig(pixel_noise=0.5))
     many = hits_at(jnp.full(20_000, 2.0))
-    pixels = np.array(camera.read(jax.random.key(0), many, jnp.ones((1, 3)), LIGHT))
+    pixels = np.array(camera.read(jax.random.key(0), many, WHITE, LIGHT))
     assert pixels.min() == 0.0
     assert pixels.max() == 1.0
 
@@ -171,7 +173,7 @@ def test_light_comes_from_its_side_only():
     camera = sensors.camera(CameraConfig(pixel_noise=0.0))
     side = jnp.linspace(-np.pi, np.pi, 9)  # of the surface's normal, in steps of 45 degrees
     hits = Hit(jnp.ones(9), jnp.zeros(9, jnp.int32), (jnp.cos(side), jnp.sin(side)))
-    seen = camera.read(jax.random.key(0), hits, jnp.ones((1, 3)), LIGHT)
+    seen = camera.read(jax.random.key(0), hits, WHITE, LIGHT)
     # 0.25 + 0.5 * 0.8 * cos: 0.65 facing it, 0.532843 at 45 degrees, 0.25 from 90 degrees on.
     expected = [0.25, 0.25, 0.25, 0.532843, 0.65, 0.532843, 0.25, 0.25, 0.25]
     np.testing.assert_allclose(seen[:, 0], expected, atol=1e-6)
@@ -297,7 +299,7 @@ def test_wrong_shapes_are_named_while_tracing(arena, noiseless, known_layout):
 
 
 def test_palette_colours_pois_from_the_layout_and_the_rest_from_the_model(arena, known_layout):
-    palette = np.array(sensors.palette(arena, known_layout))
+    palette = np.array(sensors.surfaces(arena, known_layout)["colour"])
     colour = {arena.mj_model.geom(g).name: palette[g] for g in range(arena.mj_model.ngeom)}
     np.testing.assert_allclose(colour["poi0_cylinder"], GREEN)
     np.testing.assert_allclose(colour["poi2_cube"], RED)

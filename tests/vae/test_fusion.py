@@ -56,6 +56,23 @@ def test_a_first_look_gives_the_uni_modal_posterior_whatever_the_entry_was(modal
         assert_same(belief, jmvae.encode(params, TWO, alone))
 
 
+def test_several_sensors_may_look_at_once():
+    # What has looked before and does not look now is decoded; all the others are as they are.
+    params = jmvae.init(jax.random.key(0), THREE)
+    camera, sonar = look(THREE, 0), look(THREE, 2)
+    generated = jmvae.decode(params, THREE, OLD.mean)
+    for has_lidar in (False, True):
+        belief = fusion.fuse(
+            params, THREE, OLD, np.array([True, has_lidar, False]), (camera, None, sonar)
+        )
+        lidar = generated[1] if has_lidar else None
+        assert_same(belief, jmvae.encode(params, THREE, (camera, lidar, sonar)))
+    with pytest.raises(ValueError, match="must hold one modality or more"):
+        fusion.fuse(params, THREE, OLD, jnp.zeros(3, bool), (None, None, None))
+    with pytest.raises(ValueError, match="must be 3, one for each"):
+        fusion.fuse(params, THREE, OLD, jnp.zeros(3, bool), (camera, None))
+
+
 def test_fusion_decodes_the_mean_and_ignores_the_width_of_the_old_entry():
     params, new = jmvae.init(jax.random.key(0), TWO), look(TWO, 1)
     seen = jnp.array([True, False])

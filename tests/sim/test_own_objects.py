@@ -1,0 +1,136 @@
+"""Colours, shapes and attributes that a user has declared, in arena and sensors."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import sim
+from jaxsense.config import ArenaConfig, Attribute, CameraConfig, Config, LidarConfig, Shape
+from jaxsense.sim import navigation, sensors
+
+LIGHT = sim.Light(jnp.array([0.8, 0.0, 0.6]), diffuse=jnp.float32(0.5), ambient=jnp.float32(0.25))
+CONFIG = ArenaConfig(
+    colours={"orange": (0.9, 0.4, 0.05), "black": (0.0, 0.0, 0.0)},
+    shapes={"slab": Shape("box", (1.0, 0.6)), "post": Shape("cylinder", (0.5, 0.5))},
+    attributes={"temperature": Attribute({"cold": 5.0, "hot": 60.0}, elsewhere=20.0)},
+    classes=("orange slab hot", "black post cold", "orange post hot"),
+)
+POSITION = jnp.array([[0.0, 0.0], [0.0, 1.0], [1.0, -1.0]])
+LAYOUT = sim.make_layout(CONFIG, POSITION, jnp.zeros(3), jnp.array([0, 1, 0]))
+
+
+@pytest.fixture(scope="module")
+def view():
+    """An arena of them, and its state with a robot before the slab and one in a corner."""
+    arena = sim.build(CONFIG, (False, True), contacts=True)
+    poses = jnp.array([[-0.5, 0.0, 0.0], [-1.3, -1.3, 0.0]])
+    return arena, jax.jit(sim.place, static_argnums=0)(arena, LAYOUT, poses)
+
+
+def test_a_layout_holds_what_the_words_of_the_classes_stand_for():
+    np.testing.assert_allclose(LAYOUT.colour[0], [0.9, 0.4, 0.05])
+    np.testing.assert_array_equal(LAYOUT.shape, [0, 1, 0])
+    np.testing.assert_array_equal(LAYOUT.values["temperature"], [60.0, 5.0, 60.0])
+
+
+def test_rays_meet_shapes_where_their_sides_are(view):
+    arena, data = view
+    section = sim.cross_section(arena, data, 0.152, robot=-1)
+    # The slab at the origin is 0.2 m by 0.12 m, the post at (0, 1) 0.1 m across.
+    for start, angle, distance in (
+        ((0.5, 0.0), np.pi, 0.4),
+        ((0.0, -0.5), np.pi / 2, 0.44),
+        ((0.0, 0.5), np.pi / 2, 0.45),
+        ((0.5, 1.0), np.pi, 0.45),
+    ):
+        hit = sim.cast(section, jnp.array(start), jnp.float32(angle))
+        assert hit.distance == pytest.approx(distance, abs=1e-5)
+
+
+def test_clearance_is_that_of_the_shape(view):
+    # 0.5 m from each centre along x, less half the side of the slab or the post, and the robot.
+    for place, half in (((0.5, 0.0, 0.0), 0.1), ((0.5, 1.0, 0.0), 0.05)):
+        found = navigation.clearance(CONFIG, LAYOUT, jnp.array([place]))
+        wall = 1.5 - max(place[:2])
+        np.testing.assert_allclose(found, [min(0.5 - half, wall) - 0.0495], atol=1e-6)
+    found = navigation.clearance(CONFIG, LAYOUT, jnp.array([[0.0, -0.5, 0.0]]))
+    np.testing.assert_allclose(found, [0.5 - 0.06 - 0.0495], atol=1e-6)
+
+
+def test_surfaces_show_the_attributes_of_pois_and_of_everything_else(view):
+    arena, _ = view
+    shown = sensors.surfaces(arena, LAYOUT)
+    of_geom = {arena.mj_model.geom(g).name: g for g in range(arena.mj_model.ngeom)}
+    for name, temperature in (("poi0_slab", 60), ("poi1_post", 5), ("wall0", 20)):
+        assert shown["temperature"][of_geom[name]] == temperature
+    np.testing.assert_allclose(shown["colour"][of_geom["poi2_slab"]], [0.9, 0.4, 0.05])
+
+
+def test_a_cylinder_is_as_high_as_all_pois_whatever_its_radius():
+    config = ArenaConfig(poi_radius=0.05)
+    layout = sim.make_layout(config, POSITION, jnp.zeros(3), jnp.array([0, 0, 2]))
+    arena = sim.build(config, (True,))
+    data = jax.jit(sim.place, static_argnums=0)(arena, layout, jnp.array([[-0.5, 0.0, 0.0]]))
+    for height in (0.01, 0.152, 0.19):
+        section = sim.cross_section(arena, data, height, robot=0)
+        hit = sim.cast(section, jnp.array([-0.5, 0.0]), jnp.float32(0.0))
+        assert hit.distance == pytest.approx(0.45, abs=1e-5)
+
+
+def test_a_narrow_poi_is_looked_for_where_it_is():
+    # The post at 1 m is 0.05 rad to either side; at 0.06 rad a beam reads the wall behind it.
+    lidar = sensors.lidar(LidarConfig())
+    angles = sensors.window_of(lidar, lidar.angles, jnp.float32(0.0))
+    readings = jnp.where(jnp.abs(angles) < 0.05, 0.95, 1.4)
+    inputs = lidar, readings, jnp.float32(0.0), jnp.float32(1.0)
+    assert sensors.shows_poi(*inputs, CONFIG)
+    assert not sensors.shows_poi(*inputs, ArenaConfig())
+
+
+def test_a_recorded_scan_is_cut_where_the_simulated_one_is():
+    for sensor in sensors.make(Config(lidar=LidarConfig(stride=2), camera=CameraConfig())):
+        shape = (len(sensor.angles), 3) if sensor.channels == 3 else (len(sensor.angles),)
+        scan = np.random.default_rng(0).uniform(0.0, 2.0, shape)  # float64, as NumPy records
+        for bearing in (-0.9, 0.123, 0.6):
+            rows = sensors.window_of(sensor, np.arange(len(scan)), jnp.float32(bearing))
+            expected = np.minimum(scan[np.asarray(rows)], sensor.window_limit).reshape(-1)
+            found = sim.cut_out(sensor, scan, bearing)
+            np.testing.assert_allclose(found, expected.astype(np.float32))
+        with pytest.raises(AssertionError, match=f"readings of {sensor.name}"):
+            sim.cut_out(sensor, scan[:-1], 0.0)
+
+
+def test_bearings_are_counted_from_the_heading_to_the_left():
+    pose, place = np.array([1.0, 0.0, np.pi / 2]), np.array([0.0, 0.0])
+    assert sim.bearing(pose, place) == pytest.approx(np.pi / 2, abs=1e-6)
+    assert sim.bearing(pose, np.array([2.0, 1.0])) == pytest.approx(-np.pi / 4, abs=1e-6)
+
+
+def test_a_sensor_of_ones_own_is_told_from_another_by_what_it_computes():
+    table = np.array([1.0, 2.0])
+
+    def sensor(factor, table=table, height=0.1):
+        angles, centre = sim.fan(32, 60.0)
+
+        def read(key, hits, surfaces, light):
+            return factor * hits.distance + jnp.asarray(table).sum() * surfaces["temperature"][0]
+
+        return sim.Sensor("own", height, angles, centre, window=8, read=read)
+
+    def fingerprint(made):
+        return sensors._fingerprint(made, ("temperature",))
+
+    first = fingerprint(sensor(1.0))
+    assert fingerprint(sensor(1.0)) == first
+    others = (
+        sensor(2.0),
+        sensor(1.0, table + 1),
+        sensor(1.0, height=0.2),
+        dataclasses.replace(sensor(1.0), centre=lambda bearing: bearing),
+        dataclasses.replace(sensor(1.0), shows=lambda readings, distance, extent: readings > 1),
+        dataclasses.replace(sensor(1.0), angles=sim.fan(32, 50.0)[0]),
+    )
+    assert len({first, *map(fingerprint, others)}) == 1 + len(others)

@@ -1,0 +1,144 @@
+"""What a user has declared, in the settings: checks, and the way back from JSON."""
+
+import dataclasses
+import json
+import sys
+import types
+
+import pytest
+
+from jaxsense import sim
+from jaxsense.config import (
+    COLOURS,
+    SHAPES,
+    ArenaConfig,
+    Attribute,
+    Config,
+    ConfigError,
+    SensorConfig,
+    Shape,
+    from_plain,
+)
+
+TEMPERATURE = {"temperature": Attribute({"cold": 5.0, "hot": 60.0})}
+WARM = ArenaConfig(attributes=TEMPERATURE, classes=("red cube hot", "green cylinder cold"))
+OWN = Config(
+    modalities=("lidar", "thermal"),
+    arena=dataclasses.replace(
+        WARM,
+        colours={**COLOURS, "pink": (0.9, 0.5, 0.6)},
+        shapes={**SHAPES, "slab": Shape("box", (1.0, 0.5))},
+    ),
+    sensors={"thermal": SensorConfig("own_sensors:thermal", "temperature")},
+)
+
+
+@pytest.fixture
+def own_sensors(monkeypatch):
+    """A module of the user's."""
+    module = types.ModuleType("own_sensors")
+    monkeypatch.setitem(sys.modules, "own_sensors", module)
+    return module
+
+
+def thermal(config, **changed):
+    angles, centre = sim.fan(32, 60.0)
+    read = lambda key, hits, surfaces, light: hits.distance  # noqa: E731
+    inputs = {"height": 0.1, "angles": angles, "centre": centre, "window": 8, "read": read}
+    return sim.Sensor("any", **{**inputs, **changed})
+
+
+def test_settings_survive_json():
+    for config in (Config(), OWN):
+        stored = json.loads(json.dumps(dataclasses.asdict(config)))
+        assert from_plain(stored) == config
+    assert from_plain({"arena": {"side": 4.0}}).arena == ArenaConfig(side=4.0)
+
+
+def test_changing_the_dictionaries_of_one_leaves_the_others():
+    first = ArenaConfig()
+    first.colours["pink"] = (0.9, 0.5, 0.6)
+    assert "pink" not in ArenaConfig().colours
+    assert "pink" not in COLOURS
+
+
+def test_labels_follow_the_declaration():
+    arena = dataclasses.replace(WARM, classes=("red cube hot", "green cube cold", "red cube cold"))
+    config = Config(modalities=("camera", "thermal"), sensors=OWN.sensors, arena=arena)
+    assert config.labels("camera") == ("red", "green")
+    assert config.labels("thermal") == ("cold", "hot")
+    assert config.label_of_class("thermal") == (1, 0, 0)
+    assert config.label_of_class("camera") == (0, 1, 0)
+    assert arena.values("temperature") == (60.0, 5.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda: ArenaConfig(classes=("pink cube",)), "'pink cube' must be \"COLOUR SHAPE\" with"),
+        (lambda: ArenaConfig(classes=("red slab",)), "a shape of cylinder, cube"),
+        (lambda: ArenaConfig(classes=("red cube hot",)), "'red cube hot' must be"),
+        (
+            lambda: dataclasses.replace(WARM, classes=("red cube",)),
+            "'red cube' must be \"COLOUR SHAPE TEMPERATURE\" with a colour of red",
+        ),
+        (
+            lambda: dataclasses.replace(WARM, classes=("red cube warm",)),
+            "a temperature of cold, hot",
+        ),
+        (lambda: ArenaConfig(colours={"red": (1.0, 0.0, 2.0)}), "arena.colours.red = (1.0, 0.0"),
+        (lambda: ArenaConfig(colours={"sky blue": (0.0, 0.0, 1.0)}), "'sky blue': must be a word"),
+        (lambda: ArenaConfig(shapes={}), "arena.shapes = {}: must name one or more"),
+        (lambda: Shape("cone"), "shape.primitive = 'cone': must be one of cylinder, box"),  # pyright: ignore
+        (lambda: Shape("box", (1.0, 0.1)), "shape.half_sides = (1.0, 0.1): must be two shares"),
+        (lambda: Shape("cylinder", (1.0, 0.5)), "for a cylinder is round"),
+        (lambda: Attribute({"hot": float("inf")}), "must be finite numbers"),
+        (
+            lambda: ArenaConfig(attributes={"shape": TEMPERATURE["temperature"]}),
+            "arena.attributes = 'shape': is there already",
+        ),
+        (lambda: SensorConfig("thermal", "colour"), "sensor.make = 'thermal': must be package."),
+        (
+            lambda: Config(sensors={"thermal": SensorConfig("a:b", "weight")}),
+            "sensors.thermal.attribute = 'weight': must be one of colour, shape",
+        ),
+        (
+            lambda: Config(sensors={"lidar": SensorConfig("a:b", "shape")}),
+            "sensors = 'lidar': is there already",
+        ),
+        (
+            lambda: dataclasses.replace(OWN, modalities=("lidar", "sonar")),
+            "must be some of camera, lidar, thermal",
+        ),
+    ],
+)
+def test_what_cannot_be_is_named_in_one_line(make, expected):
+    with pytest.raises(ConfigError) as error:
+        make()
+    assert expected in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_sensor_is_made_by_the_function_that_is_named(own_sensors):
+    own_sensors.thermal = thermal
+    lidar, found = sim.sensors.make(OWN)
+    assert (lidar.name, found.name) == ("lidar", "thermal")
+    assert found.scan_bytes == 4 * 32
+
+
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        (None, "sensors.thermal.make = 'own_sensors:thermal': must be a function that can be impo"),
+        (lambda config: 3, "must give a jaxsense.sim.Sensor, not int"),
+        (lambda config: thermal(config, height=0.3), "sensors.thermal: height = 0.3: must be abo"),
+        (lambda config: thermal(config, window=40), "window = 40: must be 1 to 32: it has 32 rays"),
+        (lambda config: thermal(config, stride=5), "window = 8: must be 1 to 7: it has 32 rays"),
+    ],
+)
+def test_a_sensor_that_does_not_fit_is_named(own_sensors, function, expected):
+    if function is not None:
+        own_sensors.thermal = function
+    with pytest.raises(ConfigError) as error:
+        sim.sensors.make(OWN)
+    assert expected in str(error.value)
