@@ -66,6 +66,7 @@ class RunResult:
       posteriors: for each set of modalities, `[C, S', D]` beliefs of held-out detections.
       rewards: for each modality `[epochs]` mean total reward of the episodes that ended; NaN where
         none did.
+      recording: the first mission of the latent policy.
       summary: the blocks `detectors`, `jmvae`, `dqn` and `mission` of `summary.json`.
     """
 
@@ -73,6 +74,7 @@ class RunResult:
     windows: dict[str, np.ndarray]
     posteriors: dict[str, Belief]
     rewards: dict[str, np.ndarray]
+    recording: mission.Recording
     summary: dict[str, Any]
 
 
@@ -150,6 +152,7 @@ def _run(
     played = {n: case for n, case in mission.cases(config).items() if n in mission.POLICIES}
     player, episodes = programs.player.result(), config.mission.episodes
     missions = mission.summary(mission_key, player, models, played, episodes)
+    assert player.recording is not None
     for each in saved:
         each.result()
     return RunResult(
@@ -157,6 +160,7 @@ def _run(
         windows=detections.windows,
         posteriors=posteriors,
         rewards=dict(zip(names, rewards, strict=True)),
+        recording=player.recording,
         summary={
             "detectors": {m: {"accuracy": a} for m, a in detections.accuracy.items()},
             "jmvae": _as_lists(jmvae_figures),
