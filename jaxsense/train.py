@@ -15,7 +15,7 @@ import rich.table
 import tyro
 from jax.sharding import Mesh
 
-from jaxsense import __version__, cli, devices, pipeline, report
+from jaxsense import __version__, animation, cli, devices, page, pipeline, report
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.display import Display
 from jaxsense.monitor import Monitor, StageError
@@ -70,6 +70,8 @@ def main(argv: list[str] | None = None) -> None:
         except StageError as error:
             cli.fail(PROGRAM, f"{error}; must be finite. What was written before is in {run.path}")
     report.write_plots(run.path, arguments.config, result)
+    film, beliefs = run.path / "mission.svg", result.models.class_beliefs
+    animation.write(film, arguments.config, result.recording, beliefs, "latent policy")
     summary = {
         "preset": arguments.preset,
         "seed": arguments.seed,
@@ -82,8 +84,9 @@ def main(argv: list[str] | None = None) -> None:
         **result.summary,
     }
     run.write_json("summary.json", summary)
+    page.write(run.path)
     _print_summary(console, summary)
-    console.print(f"Everything is in {run.path}; look at {run.path / 'latent_space.png'} first.")
+    console.print(f"Everything is in {run.path}; look at {run.path / 'report.html'} first.")
 
 
 def parse(argv: list[str]) -> Arguments:
