@@ -55,7 +55,7 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
         axes[0, column].set_title(titles.get(name, f"{name} alone"))
         mean, std = (_in_plane(x[:, :_MOST_ELLIPSES]) for x in (belief.mean, belief.std))
         centre, spread = np.median(mean, axis=1), np.median(std, axis=1)
-        is_far = np.linalg.norm((mean - centre[:, None]) / spread[:, None], axis=-1) > _FAR
+        is_far = _apart(mean, centre[:, None], spread[:, None]) > _FAR
         num_far += int(is_far.sum())
         for c, colour in enumerate(colours):
             by_class = np.tile(colour, (mean.shape[1], 1))
@@ -72,7 +72,12 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
         axes[0, 0].plot([], [], "x", color="0.3", label=label)
     axes[0, 0].set_ylabel("class\n$\\mu_2$")
     axes[1, 0].set_ylabel("uncertainty\n$\\mu_2$")
-    axes[0, 0].margins(0.13)
+    shown = [_in_plane(b.mean[:, :_MOST_ELLIPSES]) for b in posteriors.values()]
+    radii = [_in_plane(b.std[:, :_MOST_ELLIPSES]) for b in posteriors.values()]
+    low = np.min(np.subtract(shown, radii), axis=(0, 1, 2))
+    high = np.max(np.add(shown, radii), axis=(0, 1, 2))
+    room = 0.13 * np.max(high - low)  # for the names of classes
+    axes[0, 0].set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
     for ax in axes.flat:
         ax.set_aspect("equal", adjustable="box")
     mappable = cm.ScalarMappable(scale, sigma_map)
@@ -86,6 +91,11 @@ def _in_plane(values: Any) -> np.ndarray:
     """`[..., D]` as `[..., 2]`: the first two, or zero."""
     values = np.asarray(values)
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, 1)])[..., :2]
+
+
+def _apart(mean: np.ndarray, centre: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """How far means `[..., 2]` are from a centre, in standard deviations."""
+    return np.linalg.norm((mean - centre) / np.maximum(spread, 1e-6), axis=-1)
 
 
 def _ellipses(
@@ -108,7 +118,7 @@ def _name_classes(axes: Any, centre: np.ndarray, spread: np.ndarray) -> None:
     waiting = list(range(len(centre)))
     while waiting:
         first = waiting[0]
-        apart = np.linalg.norm((centre[waiting] - centre[first]) / spread[first], axis=-1)
+        apart = _apart(centre[waiting], centre[first], spread[first])
         together = [c for c, distance in zip(waiting, apart, strict=True) if distance < _FAR]
         waiting = [c for c in waiting if c not in together]
         axes.annotate(

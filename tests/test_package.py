@@ -36,7 +36,7 @@ def test_imports_run_one_way():
     parts = ("sim", "vae", "dqn")
     top = (
         "observe", "models", "mission", "programs", "pipeline", "examine", "rundir", "report",
-        "animation", "train", "evaluate", "cli", "display", "monitor",
+        "animation", "page", "colours", "train", "evaluate", "cli", "display", "monitor",
     )  # fmt: skip
     for part in parts:
         for path in (ROOT / "jaxsense" / part).glob("*.py"):

@@ -14,6 +14,7 @@ PAPER_TABLE = {
     ("red cube", "lidar"): True,
 }
 """Table I of Korthals et al. 2018: whether a sensor alone can tell a class for certain."""
+_YES_OR_NO = ("no", "yes")
 PAPER_CLASSES = {label for label, _ in PAPER_TABLE}
 PAPER_MODALITIES = {modality for _, modality in PAPER_TABLE}
 
@@ -170,43 +171,32 @@ def _range(values: list[float]) -> str:
 
 
 def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[Row]]:
-    """The paper's Table I: its columns, and for each class what holds here.
+    """What each sensor alone, and all together, can tell for certain.
 
     Args:
       summary: of the run.
       classes: of the arena.
 
     Returns:
-      The columns, and rows whose values are "yes" or "no", with "(paper: ...)" where it differs.
+      The columns, and a row for each class: what holds here, and in the paper's Table I if that has
+      the same classes and sensors.
     """
     figures = summary["jmvae"]["unambiguous"]
     alone = [name for name in figures if name != "joint"]
-    columns = {**{name: name for name in alone}, "joint": " & ".join(alone)}
+    is_paper = set(classes) == PAPER_CLASSES and set(alone) == PAPER_MODALITIES
 
     def cell(label: str, name: str, holds: bool) -> str:
-        expected = label in PAPER_CLASSES if name == "joint" else PAPER_TABLE.get((label, name))
-        here = "yes" if holds else "no"
-        return here if not _is_paper(classes, alone) or holds == expected else f"{here} (differs)"
+        here = _YES_OR_NO[holds]
+        if not is_paper:
+            return here
+        return f"{here} / {_YES_OR_NO[name == 'joint' or PAPER_TABLE[label, name]]}"
 
+    columns = [*alone, "joint"]
     rows = [
         Row(label, [cell(label, name, figures[name][c]) for name in columns], "", "")
         for c, label in enumerate(classes)
     ]
-    return list(columns.values()), rows
-
-
-def agrees_with_table(summary: Summary, classes: list[str]) -> str | None:
-    """How many cells are as in the paper's Table I; None if the classes or sensors are others."""
-    columns, rows = unambiguous(summary, classes)
-    if not _is_paper(classes, columns[:-1]):
-        return None
-    cells = [value for row in rows for value in row.values]
-    same = sum("differs" not in value for value in cells)
-    return f"{same} of {len(cells)} cells are as in the paper."
-
-
-def _is_paper(classes: list[str], modalities: list[str]) -> bool:
-    return set(classes) == PAPER_CLASSES and set(modalities) == PAPER_MODALITIES
+    return [*alone, "together"], rows
 
 
 def missions(summary: Summary) -> tuple[list[str], list[Row]]:

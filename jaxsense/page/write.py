@@ -71,7 +71,6 @@ def write(run: Path) -> Path:
         latent_space=tables.latent_space(summary),
         table_columns=columns,
         table=table,
-        table_agrees=tables.agrees_with_table(summary, classes),
         mission_columns=mission_columns,
         missions=missions,
         stages=tables.timing(summary),
