@@ -76,8 +76,9 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     radii = [_in_plane(b.std[:, :_MOST_ELLIPSES]) for b in posteriors.values()]
     low = np.min(np.subtract(shown, radii), axis=(0, 1, 2))
     high = np.max(np.add(shown, radii), axis=(0, 1, 2))
-    room = 0.13 * np.max(high - low)  # for the names of classes
-    axes[0, 0].set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+    half = 0.63 * np.max(high - low)  # with room for the names of classes
+    x, y = (low + high) / 2
+    axes[0, 0].set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     for ax in axes.flat:
         ax.set_aspect("equal", adjustable="box")
     mappable = cm.ScalarMappable(scale, sigma_map)

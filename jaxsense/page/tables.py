@@ -189,7 +189,8 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
         here = _YES_OR_NO[holds]
         if not is_paper:
             return here
-        return f"{here} / {_YES_OR_NO[name == 'joint' or PAPER_TABLE[label, name]]}"
+        there = _YES_OR_NO[name == "joint" or PAPER_TABLE[label, name]]
+        return f"{here}\u00a0/\u00a0{there}"
 
     columns = [*alone, "joint"]
     rows = [
@@ -205,10 +206,6 @@ def missions(summary: Summary) -> tuple[list[str], list[Row]]:
 
     def row(name: str, key: str, digits: int, meaning: str) -> Row:
         return Row(name, [number(block.get(key), digits) for block in blocks.values()], "", meaning)
-
-    def others(block: dict[str, Any]) -> str:
-        reasons = {reason: n for reason, n in block["ended"].items() if reason != "finished"}
-        return ", ".join(f"{n} {reason}" for reason, n in reasons.items()) or "-"
 
     rows = [
         row(
@@ -231,9 +228,10 @@ def missions(summary: Summary) -> tuple[list[str], list[Row]]:
         row("information", "information", 2, "In the finished map: the sum of 1 / sigma norm."),
         row("missions", "episodes", 0, ""),
     ]
-    ended = [others(block) for block in blocks.values()]
-    if any(reason != "-" for reason in ended):
-        rows.append(Row("not finished", ended, "", "Missions that ended otherwise, and how."))
+    reasons = {reason for block in blocks.values() for reason in block["ended"]} - {"finished"}
+    for reason in sorted(reasons):
+        numbers = [number(block["ended"].get(reason, 0)) for block in blocks.values()]
+        rows.append(Row(reason, numbers, "", "Missions that did not finish, for this reason."))
     return [name.replace("_", " ") for name in blocks], rows
 
 
