@@ -12,7 +12,7 @@ import rich.console
 import rich.table
 import tyro
 
-from jaxsense import animation, cli, devices, mission, rundir
+from jaxsense import animation, cli, devices, mission, page, rundir
 from jaxsense.compilation import Compiler
 from jaxsense.config import Config, ConfigError
 from jaxsense.display import Display
@@ -42,7 +42,7 @@ class Arguments:
     cache: Path | None = Path("~/.cache/jaxsense")
     """Directory in which compiled programs are kept for later runs; `None` to keep none."""
     animate: bool = False
-    """Also write an animation of the first mission as `mission-POLICY-SEED.gif`."""
+    """Also write an animation of the first mission as `mission-POLICY-SEED.svg`."""
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -81,15 +81,18 @@ def main(argv: list[str] | None = None) -> None:
         f"{rate:.0f} control steps/s, "
         f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
     )
-    if arguments.animate:
-        name = next(iter(played))
-        film = arguments.run / f"mission-{name}-{arguments.seed}.gif"
-        try:
-            animation.write(film, key, team, models, played[name], name)
-        except OSError as error:
-            cli.fail(PROGRAM, f"{film}: cannot be written ({error.strerror})")
-        console.print(f"The first mission of {name} is in {film}.")
-    console.print(f"The figures are in {path}.")
+    try:
+        if arguments.animate:
+            assert player.recording is not None
+            name = next(iter(played))
+            film = arguments.run / f"mission-{name}-{arguments.seed}.svg"
+            title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
+            animation.write(film, config, player.recording, models.class_beliefs, title)
+            console.print(f"The first mission of {name} is in {film}.")
+        report = page.write(arguments.run)
+    except OSError as error:
+        cli.fail(PROGRAM, f"{error.filename}: cannot be written ({error.strerror})")
+    console.print(f"The figures are in {path}, and with all others in {report}.")
 
 
 def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) -> dict[str, Any]:

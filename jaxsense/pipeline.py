@@ -68,6 +68,7 @@ class RunResult:
       posteriors: for each set of modalities, `[C, S', D]` beliefs of held-out detections.
       rewards: for each modality `[epochs]` mean total reward of the episodes that ended; NaN where
         none did.
+      recording: the first mission of the latent policy.
       summary: the blocks `detectors`, `jmvae`, `dqn` and `mission` of `summary.json`.
     """
 
@@ -75,6 +76,7 @@ class RunResult:
     windows: dict[str, np.ndarray]
     posteriors: dict[str, Belief]
     rewards: dict[str, np.ndarray]
+    recording: mission.Recording
     summary: dict[str, Any]
 
 
@@ -165,11 +167,13 @@ class Stages:
         played = {n: case for n, case in mission.cases(config).items() if n in mission.POLICIES}
         player, episodes = programs.player.result(), config.mission.episodes
         missions = mission.summary(mission_key, player, models, played, episodes)
+        assert player.recording is not None
         return RunResult(
             models=models,
             windows=detections.windows,
             posteriors=posteriors,
             rewards={n: np.array(c["reward"]) for n, c in zip(names, curves, strict=True)},
+            recording=player.recording,
             summary={
                 "detectors": {m: {"accuracy": a} for m, a in detections.accuracy.items()},
                 "jmvae": as_lists(jmvae_figures),

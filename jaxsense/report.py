@@ -1,7 +1,4 @@
-"""The plots of a run: the latent space, the rewards, and what the sensors see.
-
-The first two are the paper's Fig. 4 and Fig. 5.
-"""
+"""The plots of a run: the paper's Fig. 4 and Fig. 5, and what the sensors see."""
 
 from pathlib import Path
 from typing import Any
@@ -12,13 +9,16 @@ from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.patheffects import withStroke
 
+from jaxsense.colours import class_colour
 from jaxsense.config import Config
 from jaxsense.pipeline import RunResult
 from jaxsense.types import Belief
 
 _MOST_ELLIPSES = 40
 _SMOOTHING = 20  # epochs
+_FAR = 0.2  # sigma from the median of its class, beyond which a detection is an outlier
 
 
 def write_plots(path: Path, config: Config, result: RunResult) -> None:
@@ -37,68 +37,101 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
 
     Above, classes by colour; below, `||sigma||` by colour; one column for detections by all
     modalities together, and one for each alone. Of a latent space of more than two dimensions the
-    first two are shown.
+    first two are shown. Detections far from the others of their class are crosses.
     """
     names = ["joint", *config.modalities]
     titles = {"joint": " & ".join(config.modalities)}
-    figure = Figure(figsize=(3.6 * len(names) + 1.2, 7.4), layout="constrained")
+    figure = Figure(figsize=(3.6 * len(names) + 1.2, 7.6), layout="constrained")
     axes = figure.subplots(2, len(names), sharex=True, sharey=True, squeeze=False)
     norms = {name: np.linalg.norm(belief.std, axis=-1) for name, belief in posteriors.items()}
     lowest = min(norm[:, :_MOST_ELLIPSES].min() for norm in norms.values())
     highest = max(norm[:, :_MOST_ELLIPSES].max() for norm in norms.values())
     scale = Normalize(lowest, highest)
     sigma_map = colormaps["viridis"]
+    colours = [class_colour(config.arena, label) for label in config.arena.classes]
+    num_far = 0
     for column, name in enumerate(names):
         belief = posteriors[name]
         axes[0, column].set_title(titles.get(name, f"{name} alone"))
-        for c, label in enumerate(config.arena.classes):
-            mean, std = (np.asarray(x)[c, :_MOST_ELLIPSES, :2] for x in (belief.mean, belief.std))
-            if mean.shape[1] == 1:
-                mean, std = np.pad(mean, ((0, 0), (0, 1))), np.pad(std, ((0, 0), (0, 1)))
-            colour = _colour_of(config, label)
-            by_class = [colour] * len(mean)
+        mean, std = (_in_plane(x[:, :_MOST_ELLIPSES]) for x in (belief.mean, belief.std))
+        centre, spread = np.median(mean, axis=1), np.median(std, axis=1)
+        is_far = _apart(mean, centre[:, None], spread[:, None]) > _FAR
+        num_far += int(is_far.sum())
+        for c, colour in enumerate(colours):
+            by_class = np.tile(colour, (mean.shape[1], 1))
             by_sigma = sigma_map(scale(norms[name][c, :_MOST_ELLIPSES]))
-            for row, colours in enumerate((by_class, by_sigma)):
-                _ellipses(axes[row, column], mean, std, colours)
-            centre = np.median(mean, axis=0)
-            # Classes that a sensor cannot tell apart share a centre; their numbers go side by side.
-            offset = (18 * (c - (len(config.arena.classes) - 1) / 2), 0)
-            axes[0, column].annotate(
-                f"({c + 1})",
-                centre,
-                offset,
-                textcoords="offset points",
-                ha="center",
-                va="center",
-                weight="bold",
-            )
-            if column == 0:
-                axes[0, 0].plot([], [], "o", color=colour, label=f"({c + 1}) {label}")
+            for row, shades in enumerate((by_class, by_sigma)):
+                _ellipses(axes[row, column], mean[c], std[c], shades, is_far[c])
+        _name_classes(axes[0, column], centre, spread)
         axes[1, column].set_xlabel("$\\mu_1$")
+    for c, (colour, label) in enumerate(zip(colours, config.arena.classes, strict=True)):
+        axes[0, 0].plot([], [], "o", color=colour, label=f"({c + 1}) {label}")
+    if num_far:
+        total = sum(norm[:, :_MOST_ELLIPSES].size for norm in norms.values())
+        label = f"{num_far} of {total} detections, where a detector was not sure"
+        axes[0, 0].plot([], [], "x", color="0.3", label=label)
     axes[0, 0].set_ylabel("class\n$\\mu_2$")
     axes[1, 0].set_ylabel("uncertainty\n$\\mu_2$")
-    axes[0, 0].autoscale_view()
+    shown = [_in_plane(b.mean[:, :_MOST_ELLIPSES]) for b in posteriors.values()]
+    radii = [_in_plane(b.std[:, :_MOST_ELLIPSES]) for b in posteriors.values()]
+    low = np.min(np.subtract(shown, radii), axis=(0, 1, 2))
+    high = np.max(np.add(shown, radii), axis=(0, 1, 2))
+    half = 0.63 * np.max(high - low)  # with room for the names of classes
+    x, y = (low + high) / 2
+    axes[0, 0].set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     for ax in axes.flat:
         ax.set_aspect("equal", adjustable="box")
     mappable = cm.ScalarMappable(scale, sigma_map)
     figure.colorbar(mappable, ax=axes[1, :], label="$\\|\\sigma\\|_2$")
-    figure.legend(loc="outside upper center", ncols=len(config.arena.classes), frameon=False)
+    columns = len(config.arena.classes) + bool(num_far)
+    figure.legend(loc="outside upper center", ncols=min(columns, 4), frameon=False)
     return figure
 
 
-def _colour_of(config: Config, label: str) -> np.ndarray:
-    """The colour of a class in plots: its own, and half as bright for any shape but the first."""
-    colour, shape, *_ = label.split(" ")
-    is_first = shape == next(iter(config.arena.shapes))
-    return np.array(config.arena.colours[colour]) * (1.0 if is_first else 0.5)
+def _in_plane(values: Any) -> np.ndarray:
+    """`[..., D]` as `[..., 2]`: the first two, or zero."""
+    values = np.asarray(values)
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, 1)])[..., :2]
 
 
-def _ellipses(axes: Any, mean: np.ndarray, std: np.ndarray, colours: Any) -> None:
-    patches = [Ellipse(m, 2 * s[0], 2 * s[1]) for m, s in zip(mean, std, strict=True)]
-    axes.add_collection(
-        PatchCollection(patches, facecolors="none", edgecolors=colours, alpha=0.5, linewidths=1)
-    )
-    axes.scatter(*mean.T, s=4, c=colours)
+def _apart(mean: np.ndarray, centre: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """How far means `[..., 2]` are from a centre, in standard deviations."""
+    return np.linalg.norm((mean - centre) / np.maximum(spread, 1e-6), axis=-1)
+
+
+def _ellipses(
+    axes: Any, mean: np.ndarray, std: np.ndarray, colours: np.ndarray, is_far: np.ndarray
+) -> None:
+    """Ellipses and their centres, `[S, 2]`, in the colours `[S, 3 or 4]`; crosses if far `[S]`."""
+    for marker, line, chosen in ((".", "-", ~is_far), ("x", ":", is_far)):
+        pairs = zip(mean[chosen], std[chosen], strict=True)
+        patches = [Ellipse(m, 2 * s[0], 2 * s[1]) for m, s in pairs]
+        axes.add_collection(
+            PatchCollection(
+                patches, facecolors="none", edgecolors=colours[chosen], alpha=0.5, linestyles=line
+            )
+        )
+        axes.scatter(*mean[chosen].T, s=25, marker=marker, c=colours[chosen])
+
+
+def _name_classes(axes: Any, centre: np.ndarray, spread: np.ndarray) -> None:
+    """Writes the number of each class, `[C, 2]`, above its ellipse; those in one place together."""
+    waiting = list(range(len(centre)))
+    while waiting:
+        first = waiting[0]
+        apart = _apart(centre[waiting], centre[first], spread[first])
+        together = [c for c, distance in zip(waiting, apart, strict=True) if distance < _FAR]
+        waiting = [c for c in waiting if c not in together]
+        axes.annotate(
+            " & ".join(f"({c + 1})" for c in together),
+            (centre[first, 0], centre[first, 1] + max(spread[c, 1] for c in together)),
+            (0, 4),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            weight="bold",
+            path_effects=[withStroke(linewidth=3, foreground="white")],
+        )
 
 
 def rewards(per_epoch: dict[str, np.ndarray], figures: dict[str, Any]) -> Figure:
@@ -136,7 +169,7 @@ def scanlines(config: Config, windows: dict[str, np.ndarray]) -> Figure:
                 ax.imshow(readings.reshape(1, -1, 3), aspect="auto", interpolation="nearest")
                 ax.set(yticks=[], xlabel="pixel of the window")
             else:
-                ax.plot(readings, ".", color=_colour_of(config, label), markersize=3)
+                ax.plot(readings, ".", color=class_colour(config.arena, label), markersize=3)
                 if name == "lidar":
                     ax.set(xlabel="beam of the window", ylabel="distance [m]", ylim=(0, None))
                 else:

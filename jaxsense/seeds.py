@@ -50,11 +50,14 @@ def run(
             if not one.is_finite:
                 raise StageError(f"learn: a loss of seed {seed} is not finite")
             missions = mission.summary(mission_keys[i], player, one.models, played, episodes)
-            results[seed] = _result(config, one, missions)
+            assert player.recording is not None
+            results[seed] = _result(config, one, missions, player.recording)
     return results
 
 
-def _result(config: Config, learned: Learned, missions: dict[str, Any]) -> RunResult:
+def _result(
+    config: Config, learned: Learned, missions: dict[str, Any], recording: mission.Recording
+) -> RunResult:
     """What `pipeline.run` would give of one seed."""
     names, num_random = config.modalities, config.evaluation.num_starts
     env_steps = {"env_steps": config.dqn.epochs * config.dqn.num_envs}
@@ -71,6 +74,7 @@ def _result(config: Config, learned: Learned, missions: dict[str, Any]) -> RunRe
         },
         posteriors=learned.posteriors,
         rewards={n: np.asarray(r) for n, r in zip(names, learned.reward, strict=True)},
+        recording=recording,
         summary={
             "detectors": {n: {"accuracy": a} for n, a in zip(names, accuracy, strict=True)},
             "jmvae": as_lists(learned.latent),

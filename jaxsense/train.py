@@ -16,7 +16,18 @@ import rich.table
 import tyro
 from jax.sharding import Mesh
 
-from jaxsense import cli, devices, pipeline, report, rundir, seeds, sweep, tensorboard
+from jaxsense import (
+    animation,
+    cli,
+    devices,
+    page,
+    pipeline,
+    report,
+    rundir,
+    seeds,
+    sweep,
+    tensorboard,
+)
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.display import Display
 from jaxsense.interrupt import on_interrupt
@@ -93,7 +104,7 @@ def main(
     if not arguments.quiet:
         _print_summary(console, run)
     # The one thing that a quiet run says.
-    print(f"Everything is in {run.path}; look at {first / 'latent_space.png'} first.")
+    print(f"Everything is in {run.path}; open {first / 'report.html'} first.")
     print(f"Next: python -m jaxsense.evaluate {first} --animate")
 
 
@@ -216,8 +227,12 @@ def _of_seed(run: RunDirectory, seed: int) -> RunDirectory:
 
 def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any]) -> None:
     """Plots and the summary, which says that the run is finished."""
-    report.write_plots(run.path, run.settings.config, result)
+    config = run.settings.config
+    report.write_plots(run.path, config, result)
+    film, beliefs = run.path / "mission.svg", result.models.class_beliefs
+    animation.write(film, config, result.recording, beliefs, "latent policy")
     run.write_json("summary.json", {**_header(run, timing), **result.summary})
+    page.write(run.path)
 
 
 def _header(run: RunDirectory, timing: dict[str, Any]) -> dict[str, Any]:

@@ -5,15 +5,17 @@ import io
 import json
 import shutil
 from pathlib import Path
+from xml.etree import ElementTree
 
 import jax
 import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import evaluate, train
+from jaxsense import evaluate, mission, train
 from jaxsense.compilation import Compiler
 from jaxsense.config import PRESETS, Config
+from jaxsense.monitor import Monitor
 
 SMOKE = ["--preset", "smoke", "--seed", "3"]
 
@@ -49,7 +51,8 @@ def without_times(summary: dict) -> dict:
 def test_run_directory_holds_everything(run):
     names = {path.name for path in run.iterdir()}
     plots = {"latent_space.png", "reward.png", "scanlines.png"}
-    assert names == {"config.json", "metrics.jsonl", "summary.json", "checkpoints"} | plots
+    others = {"config.json", "metrics.jsonl", "summary.json", "checkpoints"}
+    assert names == {*others, *plots, "mission.svg", "report.html"}
     for plot in plots:
         assert (run / plot).read_bytes()[:4] == b"\x89PNG"
     stages = {json.loads(line)["stage"] for line in (run / "metrics.jsonl").open()}
@@ -230,16 +233,16 @@ def evaluated(run, tmp_path_factory, cached_compilation):
     return path, before, printed.getvalue()
 
 
-def test_evaluate_writes_the_mission_block_and_nothing_else(evaluated):
+def test_evaluate_writes_the_mission_block_of_the_summary_and_no_other(evaluated):
     path, before, _ = evaluated
     after = json.loads((path / "summary.json").read_text())
-    mission = after.pop("mission")
+    blocks = after.pop("mission")
     before.pop("mission")
     assert after == before
-    assert set(mission) == {"latent", "naive", "random", "bytes_per_detection"}
+    assert set(blocks) == {"latent", "naive", "random", "bytes_per_detection"}
     for policy in ("latent", "naive", "random"):
-        assert set(mission[policy]) == MISSION_KEYS | {"seed"}
-        assert (mission[policy]["episodes"], mission[policy]["seed"]) == (3, 0)
+        assert set(blocks[policy]) == MISSION_KEYS | {"seed"}
+        assert (blocks[policy]["episodes"], blocks[policy]["seed"]) == (3, 0)
 
 
 def test_evaluate_prints_the_comparison(evaluated):
@@ -256,32 +259,29 @@ def test_evaluate_prints_the_comparison(evaluated):
         assert words in printed
 
 
-def test_evaluate_makes_an_animation_that_moves(evaluated):
-    from PIL import Image
-
+def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(run, evaluated):
     path, _, _ = evaluated
-    with Image.open(path / "mission-latent-0.gif") as film:
-        assert film.n_frames > 10
-        first = np.asarray(film.convert("RGB"))
-        film.seek(film.n_frames - 1)
-        last = np.asarray(film.convert("RGB"))
-    assert np.mean(np.any(first != last, axis=-1)) > 0.01
+    for report, episodes, films in ((run, 4, 1), (path, 3, 2)):
+        text = (report / "report.html").read_text()
+        assert text.count("<img") == 3
+        assert text.count("<use") == films
+        assert f"<td>{episodes}</td>" in text
 
 
-def test_the_animation_shows_the_mission_that_was_evaluated(run):
-    from jaxsense import animation, mission
-    from jaxsense.monitor import Monitor
-
-    config, models = jaxsense.load(run)
-    team, key = mission.make_mission(config), jax.random.key(5)
-    case = mission.cases(config)["naive"]
-    player = mission.Player(team, Compiler(Monitor()), batch=2)
-    found = player.play(key, models, {"naive": case}, 2)["naive"]
-    state, record = animation.play_first(key, team, models, case)
-    np.testing.assert_allclose(
-        found["time_s"][0], state.steps * config.mission.control_period, rtol=1e-6
-    )
-    np.testing.assert_array_equal(found["detections"][0], np.sum(record.detected, axis=0))
+def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated):
+    path, _, _ = evaluated
+    config, models = jaxsense.load(path)
+    case = mission.cases(config)["latent"]
+    with Compiler(Monitor()) as compiler:
+        player = mission.Player(mission.make_mission(config), compiler, batch=1)
+        found = player.play(jax.random.key(0), models, {"latent": case}, 1)["latent"]
+    recording = player.recording
+    np.testing.assert_array_equal(found["detections"][0], recording.records.detected.sum(axis=0))
+    seconds = recording.end.steps * config.mission.control_period
+    assert found["time_s"][0] == pytest.approx(seconds)
+    film = ElementTree.fromstring((path / "mission-latent-0.svg").read_text())
+    texts = {text.text for text in film.iter("{http://www.w3.org/2000/svg}text")}
+    assert {f"{seconds:.1f} s", "latent policy, seed 0"} <= texts
 
 
 @pytest.mark.parametrize(

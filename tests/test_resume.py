@@ -87,7 +87,7 @@ def test_a_stopped_run_goes_on_and_ends_the_same(stopped, whole, cache, tmp_path
     for stage in ("detector_camera", "detector_lidar", "jmvae", "dqn_camera", "dqn_lidar"):
         assert steps(path, stage) == steps(whole, stage), stage
     assert capsys.readouterr().out.splitlines() == [
-        f"Everything is in {path}; look at {path / 'latent_space.png'} first.",
+        f"Everything is in {path}; open {path / 'report.html'} first.",
         f"Next: python -m jaxsense.evaluate {path} --animate",
     ]
 

@@ -8,6 +8,7 @@ map has changed under way. Everything is a pure function of one episode: `vmap` 
 
 from jaxsense.mission.evaluation import Case as Case
 from jaxsense.mission.evaluation import Player as Player
+from jaxsense.mission.evaluation import Recording as Recording
 from jaxsense.mission.evaluation import batch_of as batch_of
 from jaxsense.mission.evaluation import cases as cases
 from jaxsense.mission.evaluation import summary as summary

@@ -20,6 +20,7 @@ from jaxsense.mission.state import (
     Faults,
     Mission,
     MissionState,
+    Record,
     no_faults,
     reset,
 )
@@ -42,6 +43,19 @@ class Case:
 
     policy: int
     faults: Faults
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """A whole mission.
+
+    Attributes:
+      end: the state in which it ended.
+      records: `[steps]` of all control periods, and of some after its end that are like the last.
+    """
+
+    end: MissionState
+    records: Record
 
 
 def cases(config: Config) -> dict[str, Case]:
@@ -89,6 +103,7 @@ class Player:
     Attributes:
       mission: the mission.
       control_steps: control periods of missions played so far, until they were over.
+      recording: the first mission of the first case that `play` played last; None before.
     """
 
     def __init__(self, mission: Mission, compiler: Compiler, batch: int, mesh: Mesh | None = None):
@@ -97,7 +112,8 @@ class Player:
         batch = -(-batch // num_devices) * num_devices
         self.mission, self._monitor, self._batch = mission, compiler.monitor, batch
         self.control_steps = 0
-        config = mission.config
+        self.recording: Recording | None = None
+        config, share = mission.config, batch // num_devices
         chunk, _ = chunks(config)
 
         def begin(key: Key, episode: jax.Array, policies: jax.Array, faults: Faults):
@@ -111,8 +127,8 @@ class Player:
         ):
             keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(episode)
             keys = jax.vmap(jax.random.fold_in)(keys, number)
-            state = play(keys, mission, models, state, chunk)
-            return state, jax.vmap(lambda s: figures(mission, models, s))(state)
+            state, records = play(keys, mission, models, state, chunk, share)
+            return state, jax.vmap(lambda s: figures(mission, models, s))(state), records
 
         key, numbers = jax.random.key(0), jax.ShapeDtypeStruct((batch,), jnp.int32)
         faults = jax.tree.map(
@@ -164,10 +180,13 @@ class Player:
         playing, waiting = np.arange(self._batch), iter(range(self._batch, total))
         chunk, done = np.zeros(self._batch, np.int32), np.zeros(len(row), bool)
         results: Any = None
+        first: list[tuple[MissionState, Record]] = []
         while not done[:total].all():
             self._monitor.check_stop()
-            state, found = self._go_on(key, episode[playing], chunk, models, state)
-            state, found = jax.tree.map(np.array, (state, found))
+            state, found, records = self._go_on(key, episode[playing], chunk, models, state)
+            state, found, records = jax.tree.map(np.array, (state, found, records))
+            if not done[0]:
+                first.append(jax.tree.map(lambda x: x[0].copy(), (state, records)))
             if results is None:
                 results = jax.tree.map(lambda x: np.zeros((len(row), *x.shape[1:]), x.dtype), found)
             chunk += 1
@@ -180,6 +199,9 @@ class Player:
                     playing[slot], chunk[slot] = following, 0
                     _set_row(state, slot, starts, following)
             self._monitor.progress("mission", int(done[:total].sum()), total)
+        ends, chunks_of_records = zip(*first, strict=True)
+        whole = jax.tree.map(lambda *parts: np.concatenate(parts), *chunks_of_records)
+        self.recording = Recording(ends[-1], whole)
         joined = jax.tree.map(lambda x: x[:total], results)
         return {
             name: jax.tree.map(lambda x: x[i * episodes : (i + 1) * episodes], joined)  # noqa: B023

@@ -46,9 +46,9 @@ def rollout(
 
 
 def play(
-    keys: Key, mission: Mission, models: Models, states: MissionState, steps: int
-) -> MissionState:
-    """`rollout` of missions side by side, of which the states alone are kept.
+    keys: Key, mission: Mission, models: Models, states: MissionState, steps: int, every: int
+) -> tuple[MissionState, Record]:
+    """`rollout` of missions side by side, of which only some are recorded.
 
     Args:
       keys: `[B]` random keys; each mission goes as `rollout` would with its key.
@@ -56,14 +56,20 @@ def play(
       models: trained networks.
       states: `[B]` where to begin.
       steps: how many control periods; static.
+      every: the first of so many missions is recorded, and again of so many; divides B. With as
+        many as a device plays, each device records one and none waits for another's.
 
     Returns:
-      The `[B]` states after the last one.
+      The `[B]` states after the last one, and `[B / every, steps]` records.
     """
+
+    def go_on(states: MissionState, keys: Key):
+        states, records = step(keys, mission, models, states)
+        return states, jax.tree.map(lambda x: x.reshape(-1, every, *x.shape[1:])[:, 0], records)
+
     step_keys = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(keys)
-    return jax.lax.scan(
-        lambda states, keys: (step(keys, mission, models, states)[0], None), states, step_keys
-    )[0]
+    states, records = jax.lax.scan(go_on, states, step_keys)
+    return states, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), records)
 
 
 def step(

@@ -1,0 +1,94 @@
+"""Elements of an SVG, and how they change while it plays (SMIL)."""
+
+import dataclasses
+from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def add(parent: Element, tag: str, text: str | None = None, **attributes: Any) -> Element:
+    """Adds an element; `class_` is `class`, and `_` in other names of attributes is `-`."""
+    names = (name.rstrip("_").replace("_", "-") for name in attributes)
+    values = (_text(value) for value in attributes.values())
+    element = ElementTree.SubElement(parent, tag, dict(zip(names, values, strict=True)))
+    element.text = text
+    return element
+
+
+def _text(value: Any) -> str:
+    """Numbers with a tenth of a pixel, which nobody sees, and no more."""
+    return value if isinstance(value, str) else f"{round(float(value), 2):g}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Timeline:
+    """When each frame is shown.
+
+    Attributes:
+      moments: `[F]` as shares of the duration, increasing from 0; the last frame stays to the end.
+      duration: of the animation, in seconds; then it begins again.
+      moves: whether it plays; else there is only the last frame.
+    """
+
+    moments: np.ndarray
+    duration: float
+    moves: bool = True
+
+    def set(self, element: Element, attribute: str, values: ArrayLike) -> None:
+        """Lets an attribute jump from value to value, `[F]`; where nothing plays, it has the last.
+
+        Numbers and text are both possible.
+        """
+        self._animate(
+            element, attribute, [_text(v) for v in np.asarray(values).tolist()], "discrete"
+        )
+
+    def vary(self, element: Element, attribute: str, values: ArrayLike) -> None:
+        """Lets an attribute, a number, run smoothly through `[F]` values; see `set`."""
+        self._animate(element, attribute, [_text(v) for v in np.asarray(values).tolist()], "linear")
+
+    def move(self, element: Element, places: np.ndarray, *, jumps: bool = False) -> None:
+        """Lets an element run, or jump, through `[F, 2]` translations; see `set`."""
+        values = [f"{_text(x)} {_text(y)}" for x, y in places]
+        self._animate(element, "translate", values, "discrete" if jumps else "linear")
+
+    def turn(self, element: Element, angles: np.ndarray) -> None:
+        """Lets an element run through `[F]` rotations in degrees; see `set`."""
+        self._animate(element, "rotate", [_text(angle) for angle in angles], "linear")
+
+    def _animate(self, element: Element, attribute: str, values: list[str], mode: str) -> None:
+        is_transform = attribute in ("translate", "rotate")
+        last = f"{attribute}({values[-1]})" if is_transform else values[-1]
+        element.set("transform" if is_transform else attribute, last)
+        if not self.moves or len(set(values)) == 1:
+            return
+        kept = _turning_points(values, both_ends=mode == "linear")
+        times = [f"{self.moments[i]:.4f}".rstrip("0").rstrip(".") for i in kept]
+        shown = [values[i] for i in kept]
+        if mode == "linear" and times[-1] != "1":
+            times, shown = [*times, "1"], [*shown, shown[-1]]
+        more = {"type": attribute} if is_transform else {}
+        add(
+            element,
+            "animateTransform" if is_transform else "animate",
+            attributeName="transform" if is_transform else attribute,
+            values=";".join(shown),
+            keyTimes=";".join(times),
+            calcMode=mode,
+            dur=f"{self.duration:.2f}s",
+            repeatCount="indefinite",
+            **more,
+        )
+
+
+def _turning_points(values: list[str], *, both_ends: bool) -> list[int]:
+    """Frames that are needed: where the value is new, and, if asked, where it was the last time."""
+    last = len(values) - 1
+    return [
+        i
+        for i, value in enumerate(values)
+        if i == 0 or value != values[i - 1] or (both_ends and (i == last or value != values[i + 1]))
+    ]

@@ -1,0 +1,74 @@
+"""The recording of the first mission, however missions are split over devices."""
+
+import dataclasses
+import importlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from teams import CONFIG
+
+from jaxsense import devices, mission
+from jaxsense.compilation import Compiler
+from jaxsense.mission import evaluation
+from jaxsense.mission.state import Record
+from jaxsense.models import untrained
+from jaxsense.monitor import Monitor
+
+# The package gives its function this name.
+ROLLOUT = importlib.import_module("jaxsense.mission.rollout")
+KEY = jax.random.key(5)
+CHUNK, _ = evaluation.chunks(CONFIG)
+LAST = 2 * CHUNK - 3  # control periods, within the second chunk
+
+
+def fake_step(keys, team, models, states):
+    """No physics, which would take long to compile: every robot walks where chance takes it."""
+    moves = jax.vmap(lambda key: jax.random.normal(key, states.scene.poses.shape[1:]))(keys)
+    moves = jnp.where(states.is_over[:, None, None], 0.0, moves)
+    scene = dataclasses.replace(states.scene, poses=states.scene.poses + moves)
+    steps = states.steps + ~states.is_over
+    states = dataclasses.replace(states, scene=scene, steps=steps, is_over=steps >= LAST)
+    fields = dict.fromkeys((f.name for f in dataclasses.fields(Record)), steps)
+    return states, Record(**{**fields, "poses": scene.poses})
+
+
+@pytest.mark.parametrize("split", ["one device", "cpu", "gpu"])
+def test_the_whole_first_mission_is_recorded(split, team, monkeypatch):
+    state = jax.jit(lambda: mission.reset(KEY, team, mission.NAIVE))()
+
+    def fake_reset(key, team, policy, faults):
+        poses = jax.random.normal(key, state.scene.poses.shape)
+        return dataclasses.replace(state, scene=dataclasses.replace(state.scene, poses=poses))
+
+    monkeypatch.setattr(ROLLOUT, "step", fake_step)
+    monkeypatch.setattr(evaluation, "reset", fake_reset)
+    monkeypatch.setattr(evaluation, "figures", lambda team, models, s: {"steps": s.steps})
+    if split != "one device":
+        # Threads of a CPU, which may be asked to split the work as accelerators do.
+        monkeypatch.setattr(jax, "default_backend", lambda: split)
+    mesh = None if split == "one device" else devices.make_mesh(2)
+    with Compiler(Monitor()) as compiler:
+        player = mission.Player(team, compiler, 4, mesh)
+        assert player.recording is None
+        models = untrained(jax.random.key(0), CONFIG)
+        found = player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, 9)
+    np.testing.assert_array_equal(found["naive"]["steps"], np.full(9, LAST))
+
+    arena_key, play_key = evaluation.keys_of_episode(KEY, 0)
+    step_keys = [
+        key
+        for number in range(2)
+        for key in jax.random.split(jax.random.fold_in(play_key, number), CHUNK)
+    ]
+    moves = [jax.random.normal(key, state.scene.poses.shape) for key in step_keys[:LAST]]
+    start = np.asarray(jax.random.normal(arena_key, state.scene.poses.shape))
+    walk = start + np.cumsum(moves, axis=0)
+    records, end = player.recording.records, player.recording.end
+    assert len(records.time) == 2 * CHUNK
+    np.testing.assert_array_equal(records.time, np.minimum(np.arange(2 * CHUNK) + 1, LAST))
+    np.testing.assert_allclose(records.poses[:LAST], walk, atol=1e-4)
+    np.testing.assert_array_equal(records.poses[LAST:], records.poses[LAST - 1 : -1])
+    np.testing.assert_array_equal(end.scene.poses, records.poses[-1])
+    assert end.is_over

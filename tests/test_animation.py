@@ -1,0 +1,110 @@
+"""The animated SVG, read as a viewer reads it."""
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from recordings import CLASS_BELIEFS, CONFIG, recording
+
+from jaxsense import animation
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def parse(path, steps=60):
+    animation.write(path, CONFIG, recording(steps), CLASS_BELIEFS, "latent policy")
+    return ElementTree.fromstring(path.read_text())
+
+
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory):
+    return parse(tmp_path_factory.mktemp("film") / "mission.svg")
+
+
+def part(picture, name):
+    (group,) = (g for g in picture.iter(f"{SVG}g") if g.get("class") == name)
+    return group
+
+
+def tracks(element):
+    """All animations of an element and what is in it."""
+    return [e for e in element.iter() if e.tag in (f"{SVG}animate", f"{SVG}animateTransform")]
+
+
+def value_at(track, share):
+    """What an attribute is at a share of the duration, as numbers."""
+    times = np.array([float(t) for t in track.get("keyTimes").split(";")])
+    values = np.array(
+        [[float(v) for v in value.split()] for value in track.get("values").split(";")]
+    )
+    if track.get("calcMode") == "discrete":
+        return values[np.searchsorted(times, share, side="right") - 1]
+    return np.array([np.interp(share, times, column) for column in values.T])
+
+
+def test_every_animation_can_be_played(picture):
+    found = tracks(picture)
+    assert len(found) > 15
+    (duration,) = {track.get("dur") for track in found}
+    # 6 s and one more at twice the speed, and 2.5 s of the last frame.
+    assert float(duration.removesuffix("s")) == pytest.approx(6.0, abs=0.2)
+    for track in found:
+        times = [float(t) for t in track.get("keyTimes").split(";")]
+        assert len(times) == len(track.get("values").split(";")) > 1
+        assert times[0] == 0
+        assert np.all(np.diff(times) > 0)
+        assert times[-1] == 1 if track.get("calcMode") == "linear" else times[-1] < 1
+
+
+def test_robots_and_beliefs_are_where_they_were(picture):
+    moving = part(picture, "film-moving")
+    # 340 px for 3 m: from the middle to 1 m right of it.
+    (start, end) = ([170.0, 170.0], [170 + 340 / 3, 170.0])
+    moves = [t for t in tracks(moving) if t.get("type") == "translate"]
+    robot = next(t for t in moves if np.allclose(value_at(t, 0.0), start, atol=0.01))
+    np.testing.assert_allclose(value_at(robot, 1.0), end, atol=0.01)
+    # 20 of 40 periods, one more frame before the first, at twice the speed.
+    half = 0.1 * 21 / 2.0 / 6.0
+    np.testing.assert_allclose(value_at(robot, half)[0], 170 + 340 / 6, atol=4)
+    # It turned by 0.08 rad the short way, not once around.
+    (turn,) = {t.get("values") for t in tracks(moving) if t.get("type") == "rotate"}
+    assert np.ptp([float(v) for v in turn.split(";")]) == pytest.approx(np.degrees(0.083), abs=0.1)
+
+    ellipses = list(moving.iter(f"{SVG}ellipse"))
+    assert len(ellipses) == 3
+    radius = {t.get("attributeName"): t for t in tracks(ellipses[1])}["rx"]
+    assert value_at(radius, 0.0) > 150
+    # Class means reach to 1, ellipses 0.4 and a rim of 1 further: 2.4 for 170 px.
+    assert value_at(radius, 1.0) == pytest.approx(0.4 * 170 / 2.4, abs=0.01)
+    assert not [t for t in tracks(ellipses[0]) if t.get("attributeName") == "rx"]
+
+
+def test_headings_tell_what_a_robot_does_and_the_time(picture):
+    moving = part(picture, "film-moving")
+    texts = {t.text: t for t in moving.iter(f"{SVG}text")}
+    assert {"camera asks", "camera drives to 2", "camera looks at 2", "camera has ended"} <= set(
+        texts
+    )
+    assert {"0 s", "1 s", "5 s", "6.0 s", "lidar has ended"} <= set(texts)
+    (track,) = tracks(texts["camera looks at 2"])
+    # Periods 30 to 39, in frames 31 to 40, of 0.05 s each in 6 s.
+    shown = [value_at(track, (frame + 0.5) * 0.05 / 6.0)[0] for frame in range(60)]
+    np.testing.assert_array_equal(np.flatnonzero(shown), np.arange(31, 41))
+    for frame in range(0, 70, 7):
+        now = [text for text in texts if text.startswith("camera")]
+        now = [t for t in now if value_at(*tracks(texts[t]), (frame + 0.5) * 0.05 / 6.0)[0]]
+        assert len(now) == 1
+
+
+def test_without_motion_the_end_is_shown(picture):
+    moving, still = part(picture, "film-moving"), part(picture, "film-still")
+    assert not tracks(still)
+    for track_less in (moving, still):  # where nothing plays, attributes are as in the file
+        texts = [t.text for t in track_less.iter(f"{SVG}text") if t.get("opacity", "1") == "1"]
+        assert {"camera has ended", "6.0 s"} <= set(texts)
+        assert "camera drives to 2" not in texts
+
+
+def test_the_longest_mission_is_still_small(tmp_path):
+    parse(tmp_path / "mission.svg", steps=1200)
+    assert (tmp_path / "mission.svg").stat().st_size < 300_000

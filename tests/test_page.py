@@ -1,0 +1,212 @@
+"""The report page: what it says, and how a browser shows it."""
+
+import dataclasses
+import html
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import pytest
+from matplotlib.figure import Figure
+from recordings import CLASS_BELIEFS, CONFIG, recording
+
+from jaxsense import animation, page
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+
+POLICY = {
+    "return": 1.2345, "optimal": 1.25, "naive": 1.0, "random": -1.5, "fraction_of_optimal": 0.9876,
+    "one_step": {"policy": 0.86, "optimal": 0.87, "random": -0.1}, "optimal_states": 380,
+    "num_states": 384, "env_steps": 409600, "env_steps_per_s": 50000.4,
+}  # fmt: skip
+MISSION = {
+    "accuracy": 0.998, "observations_per_poi": 1.68, "time_s": 13.8, "collisions": 0,
+    "goals_reached_fraction": None, "information": 5.8, "episodes": 128,
+    "ended": {"finished": 127, "time limit": 1},
+}  # fmt: skip
+TABLE = {"joint": [True] * 3, "camera": [True, False, False], "lidar": [False, True, True]}
+SUMMARY = {
+    "preset": "smoke",
+    "seed": 3,
+    "commit": "0123abc",
+    "versions": {"jaxsense": "0.1.0", "jax": "<0.10>"},
+    "devices": ["cpu", "cpu"],
+    "timing": {"total_s": 23.7, "stages": {"jmvae": {"compile_s": 1.5, "run_s": 4.5}}},
+    "detectors": {"camera": {"accuracy": 1.0}, "lidar": {"accuracy": 0.9995}},
+    "jmvae": {
+        "active_units": 2,
+        "fusion": {"accuracy": 0.9996, "mean_error": 0.021},
+        "moment_matching_error": 0.0067,
+        "sigma_norm": {name: [0.5, 1.25, 1.5] for name in TABLE},
+        "unambiguous": TABLE,
+    },
+    "dqn": {"camera": POLICY, "lidar": POLICY},
+    "mission": {
+        "latent": MISSION,
+        "camera_alone": MISSION,
+        "bytes_per_detection": {"latent": 16.0, "raw": 2326.5},
+    },
+}
+
+
+def write_run(path, summary=SUMMARY, config=CONFIG):
+    path.mkdir(exist_ok=True)
+    settings = {"preset": "smoke", "seed": 3, "config": dataclasses.asdict(config)}
+    (path / "config.json").write_text(json.dumps(settings))
+    (path / "summary.json").write_text(json.dumps(summary))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    path = write_run(tmp_path_factory.mktemp("page") / "run & <more>")
+    for name in ("latent_space", "reward"):
+        Figure(figsize=(8, 4)).savefig(path / f"{name}.png", dpi=20)
+    animation.write(path / "mission.svg", CONFIG, recording(), CLASS_BELIEFS, "latent policy")
+    assert page.write(path) == path / "report.html"
+    return path
+
+
+class Reader(HTMLParser):
+    """Collects the tags of a page with their attributes, and the rows of its tables."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.rows, self.words, self.in_cell = [], [], [], False
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th") and self.rows:
+            self.rows[-1].append("")
+            self.in_cell = True
+
+    def handle_endtag(self, tag):
+        self.in_cell = self.in_cell and tag not in ("td", "th")
+
+    def handle_data(self, data):
+        self.words.append(data)
+        if self.in_cell:
+            self.rows[-1][-1] += data.strip().replace("\u00a0", " ")
+
+
+@pytest.fixture(scope="module")
+def read(run):
+    return Reader((run / "report.html").read_text())
+
+
+def test_the_page_asks_for_nothing(run, read):
+    addresses = [
+        value
+        for _, attributes in read.tags
+        for name, value in attributes.items()
+        if name in ("src", "href", "srcset", "action", "data", "poster") or name.endswith(":href")
+    ]
+    assert len(addresses) > 3
+    assert all(address.startswith(("data:", "#")) for address in addresses)
+    text = (run / "report.html").read_text()
+    assert not re.search(r"@import|url\((?!#)|<script|\son\w+=", text)
+
+
+def test_figures_stand_beside_those_of_the_paper(read):
+    rows = {row[0]: row[1:] for row in read.rows if len(row) > 1}
+    assert rows["reward of an episode: DQN"] == ["1.234", "1.234", "Fig. 5"]
+    assert rows["reward of one step: optimal"] == ["0.870", "0.870", "0.426*"]
+    assert rows["optimal in states"] == ["380 of 384", "380 of 384", "384 states"]
+    assert rows["sigma norm, unambiguous"] == ["0.50 to 1.50", "from 1.05"]
+    assert rows["dimensions in use"] == ["2", "1"]
+    # Camera, LiDAR and both; the paper's LiDAR cannot tell a red cylinder.
+    assert rows["red cylinder"] == ["no / no", "yes / no", "yes / yes"]
+    assert rows["red cube"] == ["no / no", "yes / yes", "yes / yes"]
+    assert rows["accuracy"] == ["0.998", "0.998"]
+    assert rows["goals reached"] == ["-", "-"]
+    assert rows["time limit"] == ["1", "1"]
+    assert rows["jmvae"][:2] == ["1.50", "4.50"]
+
+
+def test_what_was_run_is_told_and_escaped(run, read):
+    text = " ".join(" ".join(read.words).split())
+    for words in ("smoke preset, seed 3", "0 in theory", "0123abc", "jax <0.10>", "nothing: all"):
+        assert words in text
+    assert f"evaluate {run}" in text
+    assert ("html", {"lang": "en"}) in read.tags
+    images = [attributes for tag, attributes in read.tags if tag == "img"]
+    assert len(images) == 2
+    assert all(len(image["alt"]) > 20 for image in images)
+
+
+def test_changed_settings_are_named(tmp_path):
+    config = dataclasses.replace(CONFIG, dqn=dataclasses.replace(CONFIG.dqn, discount=0.9))
+    text = page.write(write_run(tmp_path, config=config)).read_text()
+    assert f"<code>dqn.discount</code> = 0.9 (preset: {CONFIG.dqn.discount})" in text
+    assert "<svg" not in text
+
+
+def test_with_other_classes_there_is_nothing_to_compare(tmp_path):
+    classes = ("blue cylinder", "red cylinder", "red cube")
+    arena = dataclasses.replace(CONFIG.arena, classes=classes)
+    path = write_run(tmp_path, config=dataclasses.replace(CONFIG, arena=arena))
+    rows = {row[0]: row[1:] for row in Reader(page.write(path).read_text()).rows if row}
+    assert rows["blue cylinder"] == ["yes", "no", "yes"]
+
+
+MEASURE = """
+const frame = document.querySelector("iframe");
+frame.onload = () => setTimeout(() => {
+  const page = frame.contentDocument, root = page.documentElement;
+  const [left, right] = page.querySelectorAll("svg");
+  const robot = left.querySelector(".film-moving circle[stroke-width]");
+  const at = t => { left.setCurrentTime(t); return robot.getBoundingClientRect().x; };
+  left.pauseAnimations();
+  document.title = JSON.stringify({
+    width: [root.clientWidth, root.scrollWidth],
+    cut: [...page.querySelectorAll("main > *, section > *, h1, p, li, dd, figcaption")]
+      .filter(e => e.getBoundingClientRect().right > root.clientWidth + 0.5).map(e => e.tagName),
+    text: Math.min(...[...page.querySelectorAll("p, td, th, dd, li span, figcaption")]
+      .map(e => parseFloat(frame.contentWindow.getComputedStyle(e).fontSize))),
+    images: [...page.images].map(image => image.complete && image.naturalWidth > 0),
+    below: right.getBoundingClientRect().top >= left.getBoundingClientRect().bottom,
+    moved: at(2) - at(0),
+    asked: frame.contentWindow.performance.getEntriesByType("resource").map(e => e.name)
+      .filter(name => !name.startsWith("data:")),
+  });
+}, 200);
+"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
+@pytest.mark.parametrize(("width", "is_phone"), [(390, True), (1280, False)])
+def test_a_browser_shows_all_of_it(run, tmp_path, width, is_phone):
+    # A window cannot be as narrow as a phone, a frame can.
+    text = html.escape((run / "report.html").read_text(), quote=True)
+    frame = f'<iframe style="width:{width}px;height:800px;border:0" srcdoc="{text}"></iframe>'
+    wrapper = tmp_path / "wrapper.html"
+    wrapper.write_text(f'<!doctype html><meta charset="utf-8">{frame}<script>{MEASURE}</script>')
+    command = [
+        *(
+            BROWSER,
+            "--headless=new",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--hide-scrollbars",
+            "--window-size=1400,900",
+        ),
+        *("--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'profile'}"),
+        *("--virtual-time-budget=3000", "--dump-dom", wrapper.as_uri()),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    title = re.search(r"<title>(.*?)</title>", done.stdout)
+    assert title, done.stderr[-2000:]
+    found = json.loads(html.unescape(title[1]))
+    assert found["width"] == [width, width]
+    assert found["cut"] == []
+    assert found["text"] >= 13
+    assert found["images"] == [True, True]
+    assert found["asked"] == []
+    assert found["below"] == is_phone
+    assert found["moved"] > 40
