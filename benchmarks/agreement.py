@@ -60,7 +60,7 @@ def _results() -> dict[str, np.ndarray]:
         encode = jax.vmap(jax.vmap(lambda *f: jmvae.posterior(models.jmvae, model, f)))
         states = jax.vmap(lambda key: mission.reset(key, team, 1))(keys)
         periods = round(_SECONDS / config.mission.control_period)
-        states = mission.play(keys, team, models, states, periods)
+        states, _ = mission.play(keys, team, models, states, periods, every=_SCENES)
         found = dict(zip(config.modalities, windows, strict=True))
         return found, encode(*features), states.scene.poses
 

@@ -70,8 +70,8 @@ class ArenaView:
             add(group, "circle", r=u, fill=colour)
         else:
             turn = f"rotate({-np.degrees(float(layout.yaw[n])):.1f})"
-            box = {"x": -u, "y": -v, "width": 2 * u, "height": 2 * v}
-            add(group, "rect", **box, rx=1, fill=colour, transform=turn)
+            box = add(group, "rect", x=-u, y=-v, width=2 * u, height=2 * v, rx=1, fill=colour)
+            box.set("transform", turn)
         add(group, "text", str(n + 1), y=5, class_="film-number", fill="#fff")
         num_robots = len(self._config.modalities)
         for r in range(num_robots):  # who has written it into the map
