@@ -1,6 +1,8 @@
 """What a run saves while it trains, by Orbax: what is finished, and trainings under way."""
 
 import contextlib
+import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -138,7 +140,9 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise OSError(f"{path} ({_first_line(error)})") from error
+        code = re.search(r"os_error_code='(\d+)'", str(error))
+        reason = os.strerror(int(code[1])) if code else _first_line(error)
+        raise OSError(f"{path} ({reason})") from error
 
 
 def _damaged(path: Path, error: Exception) -> ConfigError:

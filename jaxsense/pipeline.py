@@ -353,7 +353,10 @@ class Stages:
         return trained
 
     def _save(self, name: str, tree: Any) -> None:
-        """Saves something finished, while the run goes on."""
+        """Saves something finished, while the run goes on; raises if that failed before."""
+        for each in self._saving:
+            if each.done():
+                each.result()
         if self._checkpoints.path is not None:
             self._saving.append(self._saver.submit(self._checkpoints.save, name, tree))
 

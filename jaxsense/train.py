@@ -14,6 +14,7 @@ import jax
 import rich.console
 import rich.table
 import tyro
+from absl import logging
 from jax.sharding import Mesh
 
 from jaxsense import (
@@ -85,6 +86,8 @@ def main(
       change: what a program of your own makes of a preset, before the other options change that.
     """
     begin = time.perf_counter()
+    # Orbax logs what it raises as well, which here comes as one line.
+    logging.set_verbosity(logging.FATAL)
     arguments = parse(sys.argv[1:] if argv is None else argv, change)
     console = rich.console.Console(quiet=arguments.quiet)
     try:
@@ -99,7 +102,7 @@ def main(
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         # A full disk, mostly. What is there was written as a whole, or not at all.
-        cli.fail(PROGRAM, f"cannot write: {error}. What was saved before is still there")
+        cli.fail(PROGRAM, f"cannot write {error}; what was saved before is still there")
     first = run.path if arguments.num_seeds == 1 else _of_seed(run, arguments.seed).path
     if not arguments.quiet:
         _print_summary(console, run)

@@ -3,12 +3,16 @@
 import contextlib
 import json
 import os
+import resource
 import shutil
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
 
+import jaxsense
 from jaxsense import train
 from jaxsense.rundir import RunDirectory
 
@@ -148,3 +152,67 @@ def error_line(argv, capsys):
     assert stop.value.code == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     return line
+
+
+def test_a_full_disk_is_named_and_nothing_is_lost(whole, cache, tmp_path):
+    path = tmp_path / "run"
+
+    def allow(size):
+        # No file may grow larger, as if there were no room.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+    command = [sys.executable, "-m", "jaxsense.train", *SMOKE, *cache, "--out", str(path)]
+    limited = lambda: allow(20_000)  # noqa: E731
+    ended = subprocess.run(command, preexec_fn=limited, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    (line,) = ended.stderr.strip().splitlines()
+    assert line.startswith("jaxsense.train: cannot write ")
+    assert "detectors (File too large); what was saved before is still there" in line
+    before = (path / "config.json").read_text()
+    assert not (path / "summary.json").exists()
+    train.main(["--resume", str(path), "--quiet", *cache])
+    assert (path / "config.json").read_text() == before
+    assert without_times(path) == without_times(whole)
+
+
+def test_a_config_reproduces_its_run(whole, cache, tmp_path, capsys):
+    path, file = tmp_path / "again", whole / "config.json"
+    train.main(["--config", str(file), "--out", str(path), "--quiet", *cache])
+    assert without_times(path) == without_times(whole)
+    assert (path / "config.json").read_text() == file.read_text()
+    content = json.loads(file.read_text())
+    assert content["seed"] == 5
+    assert content["versions"]["jaxsense"] == jaxsense.__version__
+    assert "give no --preset" in error_line(["--config", str(file), "--preset", "paper"], capsys)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (None, "must hold a run's settings (config.json: No such file or directory)"),
+        ('{"config": {"dqn"', "is no JSON"),
+        ("[1]", "must hold an object"),
+        ('{"colour": 1}', "colour = 1: is no field of a run's config.json"),
+        ('{"seed": 1.5}', "seed = 1.5: must be a whole number"),
+        ('{"preset": "best"}', "preset = 'best': must be one of default, paper, smoke"),
+        ('{"config": {"dqn": {"epoch": 3}}}', "epoch = 3: is no setting; perhaps dqn.epochs"),
+        ('{"config": {"dqn": {"epochs": "many"}}}', "dqn.epochs = 'many': must be of type int"),
+        ('{"config": {"jmvae": {"beta": -1}}}', "jmvae.beta = -1.0: must be a number greater"),
+        ('{"config": {"arena": 3}}', "arena = 3: must be of type ArenaConfig"),
+    ],
+)
+def test_a_config_that_cannot_be_used_is_named(tmp_path, capsys, content, expected):
+    file = tmp_path / "config.json"
+    if content is not None:
+        file.write_text(content)
+    assert expected in error_line(["--config", str(file), "--out", str(tmp_path / "x")], capsys)
+    assert not (tmp_path / "x").exists()
+
+
+def test_event_files_hold_the_metrics(whole, cache, tmp_path):
+    pytest.importorskip("tensorboardX")
+    path = tmp_path / "run"
+    options = ["--dqn.epochs", "20", "--tensorboard"]
+    train.main([*SMOKE, *cache, "--out", str(path), *options])
+    (events,) = (path / "tensorboard").iterdir()
+    assert b"dqn_camera/reward" in events.read_bytes()
