@@ -9,8 +9,8 @@ ROOT = Path(__file__).parent.parent
 
 
 def run_example(path: Path) -> dict:
-    """Runs the one Python example of a page; gives the names that it leaves behind."""
-    (example,) = re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
+    """Runs the last Python example of a page; gives the names that it leaves behind."""
+    *_, example = re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
     names: dict = {}
     exec(compile(example, path.name, "exec"), names)
     return names

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+from pathlib import Path
 
 import chex
 import jax
@@ -37,6 +39,14 @@ def test_settings_vary_in_one_program_as_they_do_in_several():
     differ = jax.tree.map(lambda x: np.abs(x[0] - x[1]).max(), together)
     assert max(jax.tree.leaves(differ)) > 0.1
     assert TINY.jmvae.alpha == PRESETS["smoke"].jmvae.alpha
+
+
+def test_the_example_of_the_documentation_runs(monkeypatch, capsys):
+    page = (Path(__file__).parents[1] / "docs" / "getting-started.md").read_text()
+    example, *_ = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.setitem(PRESETS, "smoke", TINY)
+    exec(compile(example, "getting-started.md", "exec"), {})
+    assert capsys.readouterr().out == "(3, 2)\n"
 
 
 @pytest.mark.parametrize("name", sweep.VARIABLE)
