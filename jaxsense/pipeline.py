@@ -298,6 +298,9 @@ class Stages:
         models = trained, params, detections.train
         prepared = self._programs.start_dqn(start_key, detections.starts, *models)
 
+        # The rate is that of training, without the compilation.
+        self._programs.train_dqn.wait()
+
         def train_chunk(i: int, state: Any) -> tuple[Any, Curves]:
             begin = time.perf_counter()
             inputs = chunk_keys[i], np.int32(modality), state, prepared, *models
