@@ -30,5 +30,4 @@ from jaxsense.observe import live_mdp as live_mdp
 from jaxsense.rundir import load as load
 from jaxsense.types import Belief as Belief
 from jaxsense.types import Transition as Transition
-
-__version__ = "0.1.0"
+from jaxsense.version import __version__ as __version__

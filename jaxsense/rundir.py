@@ -13,8 +13,9 @@ from jaxsense import models
 from jaxsense.checkpoints import Checkpoints
 from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
 from jaxsense.models import Models
+from jaxsense.version import __version__
 
-_PACKAGES = ("jaxsense", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +104,8 @@ class RunDirectory:
 
 def versions() -> dict[str, str]:
     """Versions of the packages that results depend on."""
-    return {package: importlib.metadata.version(package) for package in _PACKAGES}
+    others = {package: importlib.metadata.version(package) for package in _PACKAGES}
+    return {"jaxsense": __version__, **others}
 
 
 def commit() -> str | None:
@@ -234,7 +236,6 @@ def _check_version(content: dict[str, Any], field: str, path: Path) -> None:
     """Raises a `ConfigError` if a run was written by a version whose checkpoints may differ."""
     recorded = content.get("versions")
     wrote = recorded.get("jaxsense") if isinstance(recorded, dict) else None
-    here = importlib.metadata.version("jaxsense")
-    if not isinstance(wrote, str) or wrote.split(".")[:2] != here.split(".")[:2]:
+    if not isinstance(wrote, str) or wrote.split(".")[:2] != __version__.split(".")[:2]:
         by = f"jaxsense {wrote}" if wrote else "an older jaxsense"
-        raise ConfigError(field, str(path), f"was written by {by}; this is {here}")
+        raise ConfigError(field, str(path), f"was written by {by}; this is {__version__}")
