@@ -44,6 +44,8 @@ def main(argv: list[str] | None = None) -> None:
     # A device for each core. Called from another program, the devices may be fixed already.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", os.cpu_count())
+    # As the programs have it.
+    jax.config.update("jax_default_matmul_precision", "highest")
     console = rich.console.Console()
     if not console.is_terminal:
         console.width = _WIDTH_OF_FILES

@@ -116,7 +116,9 @@ class Checkpoints:
                         state=ocp.args.StandardRestore(shapes), curves=ocp.args.JsonRestore()
                     ),
                 )
-                return Unfinished(done, restored.state, restored.curves)
+                # On the host, so that any program may take it, on whatever devices.
+                state = jax.tree.map(np.asarray, restored.state)
+                return Unfinished(done, state, restored.curves)
         except Exception as error:
             raise _damaged(self._unfinished(stage), error) from error
 

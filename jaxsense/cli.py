@@ -4,13 +4,11 @@ import contextlib
 import io
 import re
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import jax
 import tyro
-from jax.sharding import Mesh
 
 from jaxsense.compilation import Kept
 from jaxsense.config import Config, ConfigError
@@ -50,16 +48,13 @@ def fail(program: str, message: str) -> NoReturn:
     sys.exit(2)
 
 
-def keep_programs(
-    program: str, directory: Path | None, config: Config, meshes: Iterable[Mesh | None]
-) -> Kept | None:
+def keep_programs(program: str, directory: Path | None, config: Config) -> Kept | None:
     """Where compiled programs are kept.
 
     Args:
       program: module that is run.
       directory: where the user wants them, if anywhere.
       config: all settings.
-      meshes: devices that work is split over.
 
     Returns:
       The programs with these settings; None if the directory cannot be used, which is told.
@@ -69,9 +64,7 @@ def keep_programs(
         return None
     try:
         directory = directory.expanduser()
-        kept = Kept(
-            directory, config, sensors.fingerprints(config), [mesh and mesh.size for mesh in meshes]
-        )
+        kept = Kept(directory, config, sensors.fingerprints(config))
     except (OSError, RuntimeError) as error:
         print(f"{program}: programs cannot be kept in {directory} ({error})", file=sys.stderr)
         return None

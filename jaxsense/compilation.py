@@ -10,20 +10,26 @@ import platform
 import shutil
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
+from jax.sharding import Mesh
 
 from jaxsense import devices
 from jaxsense.monitor import Monitor
 
 _THREADS = min(os.cpu_count() or 1, 8)
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
-_PACKAGE = Path(__file__).parent
+_DIGEST = hashlib.sha256().digest_size
+# Read when it is imported, as the rest of it is then.
+_SOURCE = [
+    (path.name, hashlib.sha256(path.read_bytes()).hexdigest())
+    for path in sorted(Path(__file__).parent.rglob("*.py"))
+]
 _MOST_KEPT = 8  # runs with different settings
 
 
@@ -48,13 +54,15 @@ class Kept:
         Raises:
           OSError: if the directory cannot be made.
         """
-        text = repr((settings, _surroundings())).encode()
-        self.path = directory / "programs" / hashlib.sha256(_source() + text).hexdigest()[:32]
+        text = repr((settings, _SOURCE, _surroundings())).encode()
+        self.path = directory / "programs" / hashlib.sha256(text).hexdigest()[:32]
         self.path.mkdir(parents=True, exist_ok=True)
         self.path.touch()
-        others = sorted(self.path.parent.iterdir(), key=lambda path: path.stat().st_mtime)
-        for path in others[:-_MOST_KEPT]:
-            shutil.rmtree(path, ignore_errors=True)
+        # Another run may forget some at the same time.
+        with contextlib.suppress(FileNotFoundError):
+            others = sorted(self.path.parent.iterdir(), key=lambda path: path.stat().st_mtime)
+            for path in others[:-_MOST_KEPT]:
+                shutil.rmtree(path, ignore_errors=True)
 
     def find(self, name: str, args: Any) -> "Found | None":
         """A program that was kept.
@@ -68,7 +76,11 @@ class Kept:
         """
         # Whatever is wrong with a file, compiling again mends it.
         with contextlib.suppress(Exception):
-            return Found(*pickle.loads(self._file(name, args).read_bytes()))
+            content = self._file(name, args).read_bytes()
+            digest, program = content[:_DIGEST], content[_DIGEST:]
+            # A single wrong bit could end the process.
+            if hashlib.sha256(program).digest() == digest:
+                return Found(*pickle.loads(program))
         return None
 
     def save(self, name: str, args: Any, results: Any, program: Any) -> None:
@@ -81,7 +93,8 @@ class Kept:
         try:
             number = len(jax.tree.leaves(program.input_shardings)[0].device_set)
             parts = serialize_executable.serialize(program)
-            unfinished.write_bytes(pickle.dumps((results, number, parts)))
+            content = pickle.dumps((results, number, parts))
+            unfinished.write_bytes(hashlib.sha256(content).digest() + content)
             unfinished.replace(path)
         except Exception:
             # A run must not end because the next one will be slower.
@@ -161,6 +174,7 @@ class Program:
         *args: Any,
         donate: tuple[int, ...] = (),
         runs_long: bool = False,
+        mesh: Mesh | None = None,
         **shardings: Any,
     ) -> Any:
         """Begins to load a function that was kept, or traces it and begins to compile it.
@@ -170,13 +184,15 @@ class Program:
           *args: arguments or their shapes, for example the result of another program's `compile`.
           donate: positions of arguments whose memory the program may use for its results.
           runs_long: see `devices.compiler_options`.
+          mesh: devices that the function splits its work over, if it does.
           **shardings: `in_shardings` and `out_shardings` of `jax.jit`.
 
         Returns:
           Shapes and dtypes of the results, as a pytree.
         """
         begin = time.perf_counter()
-        kept, name = self._compiler.kept, f"{self._stage}-{self._name}"
+        number = 1 if mesh is None else mesh.size
+        kept, name = self._compiler.kept, f"{self._stage}-{self._name}-{number}"
 
         def lower() -> tuple[jax.stages.Lowered, Any]:
             traced = jax.jit(function, donate_argnums=donate, **shardings).trace(*args)
@@ -201,7 +217,8 @@ class Program:
                 self.fail(error)
                 return
             self._monitor.add(self._stage, "compile_s", time.perf_counter() - begin)
-            self._compiled.set_result(compiled)
+            with contextlib.suppress(InvalidStateError):  # it has failed for another reason
+                self._compiled.set_result(compiled)
             if kept is not None and is_new:
                 kept.save(name, args, results, compiled)
 
@@ -210,7 +227,7 @@ class Program:
 
     def fail(self, error: BaseException) -> None:
         """Raises an error from all calls, unless the program is there already."""
-        if not self._compiled.done():
+        with contextlib.suppress(InvalidStateError):
             self._compiled.set_exception(error)
 
     def wait(self) -> Callable[..., Any]:
@@ -231,11 +248,6 @@ class Program:
         return output
 
 
-def _source() -> bytes:
-    """All of jaxsense's source."""
-    return b"".join(path.read_bytes() for path in sorted(_PACKAGE.rglob("*.py")))
-
-
 def _surroundings() -> list[Any]:
     """What else tracing and compiling depend on: versions, options, devices and processor."""
     features = set()
@@ -245,7 +257,8 @@ def _surroundings() -> list[Any]:
     return [
         [(package, importlib.metadata.version(package)) for package in _PACKAGES],
         sorted((k, v) for k, v in os.environ.items() if k.startswith(("JAX_", "XLA_"))),
-        jax.config.values["jax_default_matmul_precision"],
+        sorted((name, str(value)) for name, value in jax.config.values.items()),
+        jax.devices()[0].client.platform_version,
         [(device.platform, device.device_kind) for device in jax.devices()],
         sorted(features),
         platform.python_version(),

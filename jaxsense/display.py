@@ -1,5 +1,6 @@
 """What a program shows of its progress."""
 
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -53,7 +54,8 @@ class Display:
 
     def note(self, text: str) -> None:
         """Shows a line in between."""
-        self._progress.console.print(text, highlight=False)
+        if not self._quiet:
+            _print(text)
 
     def show(self, stage: str, done: int, total: int, figures: dict[str, float]) -> None:
         """Takes a report of a `Monitor`; one without a total says that a stage compiles."""
@@ -85,7 +87,7 @@ class Display:
         if not total:
             if stage not in self._last:
                 self._last[stage] = now
-                print(f"{clock}: compiling", flush=True)
+                _print(f"{clock}: compiling")
             return
         is_first = stage not in self._first
         # The first report comes at the end of the first part of the work.
@@ -100,4 +102,10 @@ class Display:
             progress = f"{done} of {total}, {rate:.0f}/s, {(total - done) / rate:.0f} s left"
         else:
             progress = f"{done} of {total}"
-        print(f"{clock}: {progress}  {text}".rstrip(), flush=True)
+        _print(f"{clock}: {progress}  {text}".rstrip())
+
+
+def _print(text: str) -> None:
+    """Prints a line, if anybody still reads: a run must not be lost with what shows it."""
+    with contextlib.suppress(BrokenPipeError):
+        print(text, flush=True)

@@ -60,7 +60,7 @@ def main(argv: list[str] | None = None) -> None:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({error.strerror})")
-    kept = cli.keep_programs(PROGRAM, arguments.cache, config, (mesh,))
+    kept = cli.keep_programs(PROGRAM, arguments.cache, config)
     console = rich.console.Console()
     key = jax.random.key(arguments.seed)
     team = mission.make_mission(config)

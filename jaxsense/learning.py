@@ -17,7 +17,7 @@ from jaxsense.dqn import training as dqn
 from jaxsense.models import Models, jmvae_shape
 from jaxsense.networks import Params
 from jaxsense.observe import Bank
-from jaxsense.programs import num_held_out_per_class
+from jaxsense.programs import last_steps, num_held_out_per_class
 from jaxsense.sim.world import World
 from jaxsense.types import Belief, Key
 from jaxsense.vae import detectors, jmvae
@@ -217,7 +217,7 @@ def _train_jmvae(key: Key, bank: Bank, config: Config) -> tuple[Params, jax.Arra
         return state.params, losses
 
     params, losses = jax.lax.map(train, jax.random.split(key, settings.restarts))
-    best = jnp.argmin(losses[:, -max(settings.steps // 20, 1) :].mean(axis=1))
+    best = jnp.argmin(losses[:, -last_steps(settings) :].mean(axis=1))
     return jax.tree.map(lambda x: x[best], params), losses
 
 

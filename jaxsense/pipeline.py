@@ -21,12 +21,13 @@ from jaxsense.chunks import run_chunks
 from jaxsense.compilation import Compiler, Kept
 from jaxsense.config import Config
 from jaxsense.models import Models, untrained
-from jaxsense.monitor import Monitor
+from jaxsense.monitor import Monitor, Stopped
 from jaxsense.networks import Params
 from jaxsense.programs import (
     Programs,
     Surveys,
     compile_programs,
+    last_steps,
     num_chunks,
     num_held_out_per_class,
     num_scene_starts,
@@ -114,7 +115,12 @@ def run(
         programs = compile_programs(config, make_world(config), compiler, mesh, learner_mesh)
         checkpoints = checkpoints or Checkpoints()
         stages = Stages(config, programs, monitor, checkpoints, saver)
-        result = stages.run(key)
+        try:
+            result = stages.run(key)
+        except Stopped:
+            # Who is told that all is saved must be told if it is not.
+            stages.wait_for_saving()
+            raise
         stages.wait_for_saving()
     checkpoints.forget_unfinished()
     return result
@@ -251,6 +257,7 @@ class Stages:
         number = num_chunks(settings.steps)
         keys = [_keys(of_restart, 1 + number) for of_restart in _keys(key, settings.restarts)]
         states = [self._programs.begin_jmvae(of_restart[0]) for of_restart in keys]
+        last = last_steps(settings)
 
         def train_chunk(i: int, states: Any) -> tuple[Any, Curves]:
             # On a CPU a batch of small networks takes longer than one after the other.
@@ -262,7 +269,7 @@ class Stages:
             # The worst loss, so that a restart that fails does not go unnoticed.
             worst, done = losses.max(axis=0), (i + 1) * settings.steps // number
             self._monitor.report("jmvae", done, settings.steps, worst)
-            return list(states), {str(r): [float(x.mean())] for r, x in enumerate(losses)}
+            return list(states), {str(r): [float(x[-last:].mean())] for r, x in enumerate(losses)}
 
         states, losses = self._in_chunks("jmvae", states, number, train_chunk)
         best = int(np.argmin([losses[str(r)][-1] for r in range(settings.restarts)]))

@@ -16,7 +16,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxsense import devices, examine, mission, observe
 from jaxsense.compilation import Compiler, Program
-from jaxsense.config import Config
+from jaxsense.config import Config, JmvaeConfig
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn import training as dqn
 from jaxsense.models import Models, jmvae_shape, untrained
@@ -145,6 +145,11 @@ def num_chunks(steps: int) -> int:
     return max(n for n in range(1, _MOST_CHUNKS + 1) if steps % n == 0)
 
 
+def last_steps(settings: JmvaeConfig) -> int:
+    """Steps at the end of a JMVAE's training whose losses are compared."""
+    return max(settings.steps // _MOST_CHUNKS, 1)
+
+
 def num_scenes(config: Config) -> tuple[int, int, int]:
     """How many scenes are surveyed to train the detectors, for the bank, and to measure."""
     num_pois, num_classes = config.arena.num_pois, len(config.arena.classes)
@@ -174,7 +179,7 @@ def _trace_simulation(
 ) -> Surveys:
     """The surveys; returns their shapes."""
     key = jax.random.key(0)
-    return programs.simulate.compile(lambda k: _simulate(k, config, world, mesh), key)
+    return programs.simulate.compile(lambda k: _simulate(k, config, world, mesh), key, mesh=mesh)
 
 
 def _trace_detectors(programs: Programs, config: Config, models: Models, surveys: Surveys) -> None:
@@ -306,7 +311,8 @@ def _trace_dqn(
         shardings["out_shardings"] = split, whole
     # With live observations most of the time goes into looking.
     runs_long = settings.observe == "bank" and _on_cpu()
-    programs.train_dqn.compile(train, *inputs, donate=(2,), runs_long=runs_long, **shardings)
+    options: Any = {"donate": (2,), "runs_long": runs_long, "mesh": mesh}
+    programs.train_dqn.compile(train, *inputs, **options, **shardings)
     programs.examine_dqn.compile(
         functools.partial(examine.play, config=config),
         *(key, modality, models.q_networks[0], models.jmvae, banks[1]),

@@ -221,7 +221,7 @@ def _settings_of(content: dict[str, Any]) -> Settings:
     """The settings in what lies in a `config.json`."""
     unknown = sorted(set(content) - {"preset", "seed", "num_seeds", "config", "versions", "commit"})
     if unknown:
-        raise ConfigError(unknown[0], "given", "is no field of a run's config.json")
+        raise ConfigError(unknown[0], content[unknown[0]], "is no field of a run's config.json")
     preset = content.get("preset", "default")
     if preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")

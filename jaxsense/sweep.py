@@ -75,8 +75,8 @@ def statistics(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     Returns:
       The same structure, with `{"mean", "low", "high"}` in place of every number: the mean and the
-      95% interval of it by Student's t. None where a run has no number; what is neither a number
-      nor holds numbers is left out.
+      95% interval of it by Student's t. Left out is what not every run has, and what is neither a
+      number nor holds numbers; in a list, None takes its place.
     """
     return _statistics(list(summaries)) or {}
 

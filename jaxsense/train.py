@@ -1,6 +1,7 @@
 """`python -m jaxsense.train`: the whole pipeline, from scanlines to policies, in one command."""
 
 import dataclasses
+import logging
 import re
 import shutil
 import sys
@@ -14,7 +15,6 @@ import jax
 import rich.console
 import rich.table
 import tyro
-from absl import logging
 from jax.sharding import Mesh
 
 from jaxsense import (
@@ -87,7 +87,7 @@ def main(
     """
     begin = time.perf_counter()
     # Orbax logs what it raises as well, which here comes as one line.
-    logging.set_verbosity(logging.FATAL)
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
     arguments = parse(sys.argv[1:] if argv is None else argv, change)
     console = rich.console.Console(quiet=arguments.quiet)
     try:
@@ -125,6 +125,11 @@ def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: c
         sensors.make(arguments.config)
         if not 0 <= arguments.seed < 2**32:
             raise ConfigError("seed", arguments.seed, "must be within 0 and 2^32 - 1")
+        if arguments.seed + arguments.num_seeds > 2**32:
+            raise ConfigError("num_seeds", arguments.num_seeds, "leads beyond seed 2^32 - 1")
+        if arguments.num_seeds > 1 and arguments.devices is not None:
+            reason = "cannot be chosen for several seeds, which are one program on one device"
+            raise ConfigError("devices", arguments.devices, reason)
         if arguments.num_seeds < 1:
             raise ConfigError("num_seeds", arguments.num_seeds, "must be greater than 0")
         if arguments.file is not None and _option(argv, "preset"):
@@ -177,12 +182,12 @@ def _train(
 ) -> None:
     """Trains, and writes all that a finished run holds."""
     config = arguments.config
-    kept = cli.keep_programs(PROGRAM, arguments.cache, config, meshes)
+    kept = cli.keep_programs(PROGRAM, arguments.cache, config)
     monitor = Monitor(display.show)
 
     def stop() -> None:
-        display.note("Stopping as soon as all is saved; Ctrl-C again does not wait for that.")
         monitor.stop()
+        display.note("Stopping as soon as all is saved; Ctrl-C again does not wait for that.")
 
     try:
         with on_interrupt(stop):
@@ -245,7 +250,6 @@ def _header(run: RunDirectory, timing: dict[str, Any]) -> dict[str, Any]:
         "preset": settings.preset,
         "seed": settings.seed,
         "versions": rundir.versions(),
-        "commit": rundir.commit(),
         "devices": [device.device_kind for device in jax.devices()],
         "timing": timing,
     }

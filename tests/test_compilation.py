@@ -1,6 +1,8 @@
 """Programs that compile in the background, and those that are kept."""
 
+import hashlib
 import os
+import pickle
 import subprocess
 import sys
 import time
@@ -87,9 +89,9 @@ def test_other_settings_shapes_and_names_are_other_programs(tmp_path):
     assert call(kept, lambda x: x + 1, jnp.float32(1)) == 2
     assert call(Kept(tmp_path, "settings", 2), lambda x: x + 2, jnp.float32(1)) == 3
     for args in (jnp.ones(1),), (jnp.int32(1),), (jnp.float32(1), jnp.float32(1)):
-        assert kept.find("stage-run", args) is None
-    assert kept.find("stage-other", (jnp.float32(1),)) is None
-    assert kept.find("stage-run", (jnp.float32(1),)) is not None
+        assert kept.find("stage-run-1", args) is None
+    assert kept.find("stage-other-1", (jnp.float32(1),)) is None
+    assert kept.find("stage-run-1", (jnp.float32(1),)) is not None
 
 
 @pytest.mark.parametrize("damage", [b"", b"no program", None])
@@ -99,19 +101,40 @@ def test_a_damaged_file_is_compiled_anew(tmp_path, damage):
     (file,) = kept.path.glob("*.pickle")
     file.write_bytes(file.read_bytes()[:-100] if damage is None else damage)
     assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
-    while kept.find("stage-run", (jnp.float32(3),)) is None:
+    while kept.find("stage-run-1", (jnp.float32(3),)) is None:
         time.sleep(0.01)
     assert call(kept, never, jnp.float32(3)) == 6
+
+
+def test_a_single_wrong_bit_is_compiled_anew(tmp_path):
+    kept = Kept(tmp_path)
+    call(kept, lambda x: 2 * x, jnp.float32(3))
+    (file,) = kept.path.glob("*.pickle")
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
 
 
 def test_what_jax_cannot_load_is_compiled_anew(tmp_path):
     kept = Kept(tmp_path)
     call(kept, lambda x: 2 * x, jnp.float32(3))
     (file,) = kept.path.glob("*.pickle")
-    content = file.read_bytes()
-    file.write_bytes(content.replace(b"ELF", b"FLE"))
-    assert file.read_bytes() != content
+    results, number, (payload, *trees) = pickle.loads(file.read_bytes()[32:])
+    content = pickle.dumps((results, number, (payload[:100], *trees)))
+    file.write_bytes(hashlib.sha256(content).digest() + content)
+    assert kept.find("stage-run-1", (jnp.float32(3),)) is not None
     assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
+
+
+def test_options_of_jax_are_other_settings(tmp_path):
+    before = Kept(tmp_path).path
+    jax.config.update("jax_threefry_partitionable", False)
+    try:
+        assert Kept(tmp_path).path != before
+    finally:
+        jax.config.update("jax_threefry_partitionable", True)
+    assert Kept(tmp_path).path == before
 
 
 def test_a_kept_program_finds_the_functions_that_it_calls(tmp_path):

@@ -21,7 +21,7 @@ from jaxsense.dqn import as_state
 from jaxsense.models import jmvae_shape, untrained
 from jaxsense.networks import MLP
 from jaxsense.onboard import functions
-from jaxsense.rundir import RunDirectory
+from jaxsense.rundir import RunDirectory, Settings
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
 from jaxsense.vae import detectors, fusion, jmvae, metrics
@@ -71,11 +71,7 @@ def models():
 def run(models, tmp_path_factory):
     """The directory of a run that trained nothing."""
     path = tmp_path_factory.mktemp("runs") / "run"
-    directory = RunDirectory(path, CONFIG, "smoke", 0)
-    for name in ("detectors", "jmvae", "class_beliefs"):
-        directory.save(name, getattr(models, name))
-    for name, q_network in zip(CONFIG.modalities, models.q_networks, strict=True):
-        directory.save(f"dqn_{name}", q_network)
+    RunDirectory.create(path, Settings("smoke", 0, CONFIG)).save_models(models)
     return path
 
 
@@ -202,7 +198,7 @@ def test_bad_input_is_one_line_and_overwrites_nothing(run, tmp_path, capsys, pro
     existing = tmp_path / "precious.zip"
     existing.write_text("precious")
     argv, expected = {
-        "run": ([str(tmp_path / "no_run")], "run = .*must be a finished run"),
+        "run": ([str(tmp_path / "no_run")], "run = .*must hold a run's settings"),
         "out": ([str(run), "--out", str(existing)], "out = .*exists already; must be a new file"),
         "folder": ([str(run), "--out", str(tmp_path / "no" / "x.zip")], "out = .*cannot be writ"),
     }[problem]

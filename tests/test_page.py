@@ -31,7 +31,6 @@ TABLE = {"joint": [True] * 3, "camera": [True, False, False], "lidar": [False, T
 SUMMARY = {
     "preset": "smoke",
     "seed": 3,
-    "commit": "0123abc",
     "versions": {"jaxsense": "0.1.0", "jax": "<0.10>"},
     "devices": ["cpu", "cpu"],
     "timing": {"total_s": 23.7, "stages": {"jmvae": {"compile_s": 1.5, "run_s": 4.5}}},
@@ -54,7 +53,8 @@ SUMMARY = {
 
 def write_run(path, summary=SUMMARY, config=CONFIG):
     path.mkdir(exist_ok=True)
-    settings = {"preset": "smoke", "seed": 3, "config": dataclasses.asdict(config)}
+    settings = {"preset": "smoke", "seed": 3, "commit": "0123abc"}
+    settings["config"] = dataclasses.asdict(config)
     (path / "config.json").write_text(json.dumps(settings))
     (path / "summary.json").write_text(json.dumps(summary))
     return path

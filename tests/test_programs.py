@@ -301,7 +301,11 @@ def test_bad_options_of_evaluate_are_named_in_one_line(run, options, expected, c
 
 def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
     line = error_line([str(tmp_path / "none")], capsys, evaluate)
-    assert f"run = {str(tmp_path / 'none')!r}: must be a finished run" in line
-    (tmp_path / "config.json").write_text('{"config": {"colour": 1}}')
+    assert f"run = {str(tmp_path / 'none')!r}: must hold a run's settings" in line
+    versions = {"jaxsense": jaxsense.__version__}
+    stored = {"versions": versions, "config": {"colour": 1}}
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    assert "colour = 1: is no setting" in error_line([str(tmp_path)], capsys, evaluate)
+    (tmp_path / "config.json").write_text(json.dumps({"versions": versions}))
     line = error_line([str(tmp_path)], capsys, evaluate)
-    assert "must be a finished run" in line
+    assert "must be a finished run (there is no checkpoint 'detectors')" in line

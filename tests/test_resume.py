@@ -216,3 +216,15 @@ def test_event_files_hold_the_metrics(whole, cache, tmp_path):
     train.main([*SMOKE, *cache, "--out", str(path), *options])
     (events,) = (path / "tensorboard").iterdir()
     assert b"dqn_camera/reward" in events.read_bytes()
+
+
+def test_a_run_on_two_devices_goes_on(tmp_path, cache):
+    path = tmp_path / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RunDirectory, "append_metrics", interrupting("dqn_lidar", 20))
+        with pytest.raises(SystemExit) as stop:
+            train.main([*SMOKE, *cache, "--devices", "2", "--out", str(path)])
+    assert stop.value.code == 130
+    assert (path / "checkpoints" / "unfinished" / "dqn_lidar").is_dir()
+    train.main(["--resume", str(path), "--devices", "2", "--quiet", *cache])
+    assert (path / "summary.json").exists()

@@ -88,7 +88,7 @@ def test_each_seed_leaves_a_run(seeds, capsys):
     assert summary["detectors"]["lidar"]["accuracy"]["mean"] == pytest.approx(np.mean(accuracy))
     assert summary["seeds"]["4"]["dqn"] == each[1]["dqn"]
     assert set(each[0]) == {
-        "preset", "seed", "versions", "commit", "devices", "timing", "detectors", "jmvae", "dqn",
+        "preset", "seed", "versions", "devices", "timing", "detectors", "jmvae", "dqn",
         "mission",
     }  # fmt: skip
     assert (each[1]["seed"], each[1]["dqn"]["camera"]["num_states"]) == (4, 384)
@@ -100,8 +100,16 @@ def test_each_seed_leaves_a_run(seeds, capsys):
     assert "holds several seeds; choose one" in capsys.readouterr().err
 
 
-def test_a_number_of_seeds_that_cannot_be_is_named(capsys):
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--num-seeds", "0"], "num_seeds = 0: must be greater than 0"),
+        (["--num-seeds", "2", "--seed", str(2**32 - 1)], "num_seeds = 2: leads beyond seed 2^32"),
+        (["--num-seeds", "2", "--devices", "2"], "devices = 2: cannot be chosen for several seeds"),
+    ],
+)
+def test_several_seeds_that_cannot_be_are_named(options, expected, capsys):
     with pytest.raises(SystemExit) as stop:
-        train.main(["--num-seeds", "0"])
+        train.main(options)
     assert stop.value.code == 2
-    assert "num_seeds = 0: must be greater than 0" in capsys.readouterr().err
+    assert expected in capsys.readouterr().err

@@ -136,11 +136,11 @@ class Player:
         )
         self._begin = Program(compiler, "mission", "begin")
         begin = devices.spread(begin, mesh, whole=(0,))
-        state = self._begin.compile(begin, key, numbers, numbers, faults)
+        state = self._begin.compile(begin, key, numbers, numbers, faults, mesh=mesh)
         models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
         self._go_on = Program(compiler, "mission", "go_on")
         go_on = devices.spread(go_on, mesh, whole=(0, 3))
-        self._go_on.compile(go_on, key, numbers, numbers, models, state)
+        self._go_on.compile(go_on, key, numbers, numbers, models, state, mesh=mesh)
 
     def wait(self) -> None:
         """Waits until the programs are compiled."""

@@ -40,7 +40,7 @@ def number(value: Any, digits: int = 3) -> str:
     """A figure as text; a dash for one that there is not."""
     if value is None:
         return "-"
-    return f"{value:,}" if isinstance(value, int) else f"{value:.{digits}f}"
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.{digits}f}"
 
 
 def policies(summary: Summary) -> list[Row]:
@@ -105,7 +105,8 @@ def policies(summary: Summary) -> list[Row]:
         row(
             "steps per second",
             "Of the environments, with learning.",
-            lambda m: f"{blocks[m]['env_steps_per_s']:,.0f}",
+            # Several seeds in one program have no rate of their own.
+            lambda m: number(blocks[m].get("env_steps_per_s"), 0),
         ),
     ]
 

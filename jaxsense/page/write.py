@@ -64,7 +64,7 @@ def write(run: Path) -> Path:
         modalities=list(summary["dqn"]),
         num_devices=len(summary["devices"]),
         devices=sorted(set(summary["devices"])),
-        commit=summary.get("commit"),
+        commit=settings.get("commit"),
         changed=_changed(settings),
         config=json.dumps(settings["config"], indent=2),
         policies=tables.policies(summary),
