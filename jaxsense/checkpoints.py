@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import shutil
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ import orbax.checkpoint as ocp
 from jaxsense.config import ConfigError
 
 _MOST_TOLD = 200
+_MARGIN = 100_000  # bytes that a checkpoint takes beside its arrays
 
 Curves = dict[str, list[float]]
 """Figures of a training so far, by their names."""
@@ -43,6 +45,8 @@ class Checkpoints:
 
     def __init__(self, path: Path | None = None):
         self.path = None if path is None else path.absolute()
+        # After a failure Orbax closes what another save of the process still needs.
+        self._lock = threading.Lock()
 
     def exists(self) -> bool:
         """Whether anything was saved."""
@@ -52,8 +56,13 @@ class Checkpoints:
         """Saves something finished; an `OSError` says that it cannot be written."""
         if self.path is None:
             return
-        with _writing(self.path / name), ocp.StandardCheckpointer() as checkpointer:
-            checkpointer.save(self.path / name, _on_host(tree), force=True)
+        tree = _on_host(tree)
+        with (
+            self._lock,
+            _writing(self.path / name, tree),
+            ocp.StandardCheckpointer() as checkpointer,
+        ):
+            checkpointer.save(self.path / name, tree, force=True)
 
     def load(self, name: str, shapes: Any) -> Any:
         """Loads what was saved.
@@ -80,11 +89,12 @@ class Checkpoints:
         """Saves a training under way, in place of what was saved of it before; see `save`."""
         if self.path is None:
             return
-        with _writing(self._unfinished(stage)), self._manager(stage) as manager:
+        path, state = self._unfinished(stage), _on_host(unfinished.state)
+        with self._lock, _writing(path, state), self._manager(stage) as manager:
             manager.save(
                 unfinished.done,
                 args=ocp.args.Composite(
-                    state=ocp.args.StandardSave(_on_host(unfinished.state)),
+                    state=ocp.args.StandardSave(state),
                     curves=ocp.args.JsonSave(unfinished.curves),
                 ),
             )
@@ -122,6 +132,11 @@ class Checkpoints:
         except Exception as error:
             raise _damaged(self._unfinished(stage), error) from error
 
+    def forget(self) -> None:
+        """Removes all."""
+        if self.path is not None:
+            shutil.rmtree(self.path, ignore_errors=True)
+
     def forget_unfinished(self) -> None:
         """Removes all trainings under way: the run is finished."""
         if self.path is not None:
@@ -137,8 +152,18 @@ class Checkpoints:
 
 
 @contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Whatever Orbax's storage raises, as an `OSError`."""
+def _writing(path: Path, tree: Any) -> Iterator[None]:
+    """Whatever goes wrong when a tree of arrays is written, as an `OSError`."""
+    # Without room Orbax fails in many threads, and each prints what it has to say.
+    trial = path.parent / f".{path.name}.trial"
+    try:
+        trial.parent.mkdir(parents=True, exist_ok=True)
+        trial.write_bytes(bytes(sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) + _MARGIN))
+    except OSError as error:
+        raise OSError(f"{path} ({error.strerror})") from error
+    finally:
+        with contextlib.suppress(OSError):
+            trial.unlink(missing_ok=True)
     try:
         yield
     except Exception as error:

@@ -2,8 +2,10 @@
 
 import contextlib
 import io
+import os
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -40,6 +42,16 @@ def parse(program: str, arguments: type[T], argv: list[str], default: T | None =
         if stop.code == 0:
             raise
         fail(program, _one_line(messages.getvalue()))
+
+
+def run(main: Callable[[], None]) -> None:
+    """Runs a program, which Ctrl-C ends without many words."""
+    try:
+        main()
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr, flush=True)
+        # Threads that compile would hold up any other way out.
+        os._exit(130)
 
 
 def fail(program: str, message: str) -> NoReturn:

@@ -13,6 +13,7 @@ from jaxsense.config import ConfigError, DqnConfig
 
 AXIS = "devices"
 _MOST_THREADS = 8
+_MOST_DEVICES = 256
 
 
 def compiler_options(*, runs_long: bool = False) -> Any:
@@ -49,6 +50,8 @@ def start(number: int | None, config: DqnConfig | None = None) -> tuple[Mesh | N
       ConfigError: if there are not that many devices, or they cannot share the environments.
     """
     jax.config.update("jax_default_matmul_precision", "highest")
+    if number is not None and not 1 <= number <= _MOST_DEVICES:
+        raise ConfigError("devices", number, f"must be within 1 and {_MOST_DEVICES}")
     threads = min(os.cpu_count() or 1, _MOST_THREADS) if number is None else max(number, 1)
     # Where JAX is in use already, its devices are what they are.
     with contextlib.suppress(RuntimeError):

@@ -8,6 +8,7 @@ import rich.console
 import rich.progress
 
 _LINE_PERIOD = 5.0  # s
+_WIDE = 110  # columns of a terminal, from which there is room for a bar
 
 
 class Display:
@@ -32,14 +33,13 @@ class Display:
         self._last: dict[str, float] = {}
         self._begin = time.perf_counter()
         columns = rich.progress
+        is_wide = console.width >= _WIDE
         self._progress = rich.progress.Progress(
-            columns.TextColumn("{task.description:<16}"),
-            columns.BarColumn(),
-            columns.MofNCompleteColumn(),
-            columns.TextColumn("{task.fields[rate]:>12}"),
-            columns.TimeElapsedColumn(),
-            columns.TextColumn("left"),
-            columns.TimeRemainingColumn(),
+            columns.TextColumn("{task.description}"),
+            *([columns.BarColumn()] if is_wide else []),
+            columns.TextColumn("{task.fields[count]}", justify="right"),
+            columns.TextColumn("{task.fields[rate]}", justify="right"),
+            columns.TextColumn("{task.fields[left]}", justify="right"),
             columns.TextColumn("{task.fields[figures]}"),
             console=console,
             disable=quiet or not console.is_terminal,
@@ -73,12 +73,32 @@ class Display:
     def _show_bar(self, stage: str, done: int, total: int, text: str) -> None:
         if stage not in self._tasks:
             self._tasks[stage] = self._progress.add_task(
-                stage, total=None, rate="compiling", figures=""
+                stage, total=None, count="compiling", rate="", left="", figures=""
             )
-        if total:
-            task = self._progress.tasks[self._tasks[stage]]
-            rate = f"{task.speed:.0f}/s" if task.speed else ""
-            self._progress.update(task.id, completed=done, total=total, rate=rate, figures=text)
+        if not total:
+            return
+        rate, left = self._rate(stage, done, total, time.perf_counter())
+        self._progress.update(
+            self._tasks[stage],
+            completed=done,
+            total=total,
+            count=f"{done}/{total}",
+            rate=rate,
+            left=left,
+            figures=text,
+        )
+        # What only compiles or examines has no end of its own to tell of.
+        for other in self._progress.tasks:
+            if other.total is None and other.description != stage:
+                self._progress.update(other.id, visible=False)
+
+    def _rate(self, stage: str, done: int, total: int, now: float) -> tuple[str, str]:
+        """Rate and time left as text; empty at the first report, which ends the first chunk."""
+        since, before = self._first.setdefault(stage, (now, done))
+        if done <= before or now <= since:
+            return "", ""
+        rate = (done - before) / (now - since)
+        return f"{rate:.0f}/s", f"{(total - done) / rate:.0f} s left"
 
     def _show_line(self, stage: str, done: int, total: int, text: str) -> None:
         """At most a line in some seconds for each stage, but for its first and its last."""
@@ -90,18 +110,12 @@ class Display:
                 _print(f"{clock}: compiling")
             return
         is_first = stage not in self._first
-        # The first report comes at the end of the first part of the work.
-        since, before = self._first.setdefault(stage, (now, done))
+        rate, left = self._rate(stage, done, total, now)
         if done < total and not is_first and now - self._last[stage] < _LINE_PERIOD:
             return
         self._last[stage] = now
-        if total == 1:
-            progress = "done"
-        elif done > before and now > since:
-            rate = (done - before) / (now - since)
-            progress = f"{done} of {total}, {rate:.0f}/s, {(total - done) / rate:.0f} s left"
-        else:
-            progress = f"{done} of {total}"
+        parts = [f"{done} of {total}", rate, left]
+        progress = "done" if total == 1 else ", ".join(part for part in parts if part)
         _print(f"{clock}: {progress}  {text}".rstrip())
 
 

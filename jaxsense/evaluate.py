@@ -73,7 +73,6 @@ def main(argv: list[str] | None = None) -> None:
         seconds = time.perf_counter() - begin
         compiling = compiler.monitor.seconds["mission"]["compile_s"]
     summary["mission"] = _merge(summary.get("mission", {}), found, arguments)
-    rundir.write_json(path, summary)
     _print_table(console, found)
     rate = player.control_steps / seconds
     console.print(
@@ -82,6 +81,7 @@ def main(argv: list[str] | None = None) -> None:
         f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
     )
     try:
+        rundir.write_json(path, summary)
         if arguments.animate:
             assert player.recording is not None
             name = next(iter(played))
@@ -96,16 +96,12 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) -> dict[str, Any]:
-    """The new blocks, and those of before that were played in the same arenas."""
-    size = found["bytes_per_detection"]
+    """The new blocks, each with its seed, and those of before of what was not played now."""
     new = {
-        name: {**block, "seed": arguments.seed}
+        name: {**block, "seed": arguments.seed} if name != "bytes_per_detection" else block
         for name, block in found.items()
-        if name != "bytes_per_detection"
     }
-    same = {"seed": arguments.seed, "episodes": arguments.episodes}
-    kept = {name: block for name, block in before.items() if same.items() <= block.items()}
-    return {**kept, **new, "bytes_per_detection": size}
+    return {**before, **new}
 
 
 def _cases(arguments: Arguments, config: Config) -> dict[str, mission.Case]:
@@ -165,4 +161,4 @@ def _print_table(console: rich.console.Console, found: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    cli.run(main)

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 from jax import export
 
-from jaxsense import cli, rundir
+from jaxsense import cli, files, rundir
 from jaxsense.config import Config, ConfigError
 from jaxsense.extras import extra
 from jaxsense.models import Models, jmvae_shape
@@ -108,8 +108,7 @@ def main(argv: list[str] | None = None) -> None:
         if path.exists():
             raise ConfigError("out", str(path), "exists already; must be a new file")
         content = archive(config, models)
-        with path.open("xb") as file:
-            file.write(content)
+        files.write(path, content)
     except (ConfigError, ModuleNotFoundError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:

@@ -1,7 +1,9 @@
 """Ctrl-C and the end of a job's time: stopping in order."""
 
 import contextlib
+import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from types import FrameType
 
@@ -10,7 +12,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextlib.contextmanager
 def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
-    """Calls `stop` at the first Ctrl-C or SIGTERM; the second one ends the program as usual.
+    """Calls `stop` at the first Ctrl-C or SIGTERM; the second one ends the process at once.
 
     To be used in the main thread, where Python handles signals.
     """
@@ -20,8 +22,14 @@ def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, handler)
 
+    def end(number: int, frame: FrameType | None) -> None:
+        # Threads that compile or save would hold up any other way out.
+        print("Stopped at once; what was saved before is still there.", file=sys.stderr)
+        os._exit(128 + number)
+
     def handle(number: int, frame: FrameType | None) -> None:
-        restore()
+        for each in _SIGNALS:
+            signal.signal(each, end)
         stop()
 
     for number in _SIGNALS:

@@ -1,15 +1,18 @@
 """The directory that a run leaves behind: writing it, going on in it, and reading it back."""
 
+import contextlib
 import dataclasses
+import fcntl
 import importlib.metadata
 import json
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from jaxsense import models
+from jaxsense import files, models
 from jaxsense.checkpoints import Checkpoints
 from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
 from jaxsense.models import Models
@@ -87,6 +90,21 @@ class RunDirectory:
             raise ConfigError("resume", str(path), "is finished; there is nothing to go on with")
         return cls(path, _settings_of(content))
 
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keeps the directory for this process.
+
+        Raises:
+          ConfigError: if another process has it.
+        """
+        with (self.path / "config.json").open() as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                reason = "is being written by another process; wait for its end"
+                raise ConfigError("resume", str(self.path), reason) from None
+            yield
+
     def write_json(self, name: str, content: Any) -> None:
         """Writes a file of the run, see the function of the same name."""
         write_json(self.path / name, content)
@@ -123,16 +141,14 @@ def commit() -> str | None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Writes a file as a whole, so that a reader never sees half of it."""
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    unfinished.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    unfinished.rename(path)
+    """Writes a file, see `files.write`."""
+    files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def read_settings(file: Path) -> Settings:
     """The settings in the `config.json` of a run.
 
-    What is not given there is as in the preset `default`, with seed 0.
+    What is not given there is as in the preset that it names, or `default`, with seed 0.
 
     Raises:
       ConfigError: if the file cannot be read, or names the field that is unknown or wrong.
@@ -144,8 +160,9 @@ def read_summary(path: Path) -> dict[str, Any]:
     """The `summary.json` of a finished run; a `ConfigError` if there is none."""
     try:
         summary = json.loads((path / "summary.json").read_text())
-        if not isinstance(summary, dict):
-            raise ValueError("not an object")
+        parts = {"timing", "detectors", "jmvae", "dqn", "mission"}
+        if not isinstance(summary, dict) or not parts <= set(summary):
+            raise ValueError(f"must be an object with {', '.join(sorted(parts))}")
         return summary
     except (OSError, ValueError) as error:
         reason = f"must hold the summary.json of a finished run ({error})"
@@ -223,13 +240,14 @@ def _settings_of(content: dict[str, Any]) -> Settings:
     if unknown:
         raise ConfigError(unknown[0], content[unknown[0]], "is no field of a run's config.json")
     preset = content.get("preset", "default")
-    if preset not in PRESETS:
+    if not isinstance(preset, str) or preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
     numbers = {"seed": content.get("seed", 0), "num_seeds": content.get("num_seeds", 1)}
     for name, number in numbers.items():
         if not isinstance(number, int) or isinstance(number, bool):
             raise ConfigError(name, number, "must be a whole number")
-    return Settings(preset, config=from_plain(content.get("config", {})), **numbers)
+    config = from_plain(content.get("config", {}), PRESETS[preset])
+    return Settings(preset, config=config, **numbers)
 
 
 def _check_version(content: dict[str, Any], field: str, path: Path) -> None:

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from jaxsense import examine, mission
+from jaxsense.checkpoints import Checkpoints
 from jaxsense.compilation import Compiler, Kept, Program
 from jaxsense.config import Config
 from jaxsense.learning import Learned, learn
@@ -15,7 +16,11 @@ from jaxsense.sim.world import make_world
 
 
 def run(
-    seeds: range, config: Config, monitor: Monitor, kept: Kept | None = None
+    seeds: range,
+    config: Config,
+    monitor: Monitor,
+    checkpoints: Checkpoints,
+    kept: Kept | None = None,
 ) -> dict[int, RunResult]:
     """Trains all seeds side by side and plays missions with each.
 
@@ -23,6 +28,8 @@ def run(
       seeds: of all randomness.
       config: all settings.
       monitor: is told of time and progress.
+      checkpoints: where what has been learned is saved, before missions are played with it; what
+        is there already, from the same seeds and settings, is not learned again.
       kept: where compiled programs are kept for later runs, if anywhere.
 
     Returns:
@@ -30,18 +37,24 @@ def run(
 
     Raises:
       StageError: if a loss of a seed is not finite.
-      Stopped: if the monitor was told to stop; nothing has been saved.
+      Stopped: if the monitor was told to stop, which is looked at after learning.
+      ConfigError: if a checkpoint is damaged.
+      OSError: if a checkpoint cannot be written.
     """
     world = make_world(config)
     keys = jax.vmap(jax.random.key)(np.array(seeds, np.uint32))
     learn_keys, mission_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     with Compiler(monitor, kept) as compiler:
         program = Program(compiler, "learn", "run")
-        program.compile(jax.vmap(lambda key: learn(key, config, world)), learn_keys)
+        learn_all = jax.vmap(lambda key: learn(key, config, world))
+        shapes = program.compile(learn_all, learn_keys)
         team, episodes = mission.make_mission(config), config.mission.episodes
         batch = mission.batch_of(len(mission.POLICIES) * episodes)
         player = mission.Player(team, compiler, batch)
-        learned = jax.tree.map(np.asarray, program(learn_keys))
+        learned = checkpoints.load("learned", shapes)
+        if learned is None:
+            learned = jax.tree.map(np.asarray, program(learn_keys))
+            checkpoints.save("learned", learned)
         monitor.progress("learn", 1, 1)
         played = {n: c for n, c in mission.cases(config).items() if n in mission.POLICIES}
         results = {}

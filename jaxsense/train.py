@@ -3,6 +3,7 @@
 import dataclasses
 import logging
 import re
+import shlex
 import shutil
 import sys
 import time
@@ -96,7 +97,8 @@ def main(
         records = [run.append_metrics]
         if arguments.tensorboard:
             records.append(tensorboard.make_writer(run.path / "tensorboard"))
-        with Display(console, *records, quiet=arguments.quiet) as display:
+        display = Display(console, *records, quiet=arguments.quiet)
+        with run.locked(), display:
             _train(begin, arguments, run, meshes, display)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
@@ -108,7 +110,7 @@ def main(
         _print_summary(console, run)
     # The one thing that a quiet run says.
     print(f"Everything is in {run.path}; open {first / 'report.html'} first.")
-    print(f"Next: python -m jaxsense.evaluate {first} --animate")
+    print(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate")
 
 
 def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: config) -> Arguments:
@@ -193,25 +195,24 @@ def _train(
         with on_interrupt(stop):
             if arguments.num_seeds > 1:
                 numbers = range(arguments.seed, arguments.seed + arguments.num_seeds)
-                results = seeds.run(numbers, config, monitor, kept)
+                results = seeds.run(numbers, config, monitor, run.checkpoints, kept)
             else:
                 key = jax.random.key(arguments.seed)
                 result = pipeline.run(key, config, monitor, run.checkpoints, *meshes, kept)
                 results = {arguments.seed: result}
+            timing = {"total_s": time.perf_counter() - begin, "stages": monitor.seconds}
+            if arguments.num_seeds == 1:
+                _write(run, results[arguments.seed], timing)
+            else:
+                _write_seeds(run, results, timing)
     except Stopped:
-        saved = (
-            "all that was trained is saved" if run.settings.num_seeds == 1 else "nothing is saved"
-        )
-        go_on = f"python -m {PROGRAM} --resume {run.path}"
-        print(f"Stopped; {saved}. To go on: {go_on}", file=sys.stderr)
+        is_one = run.settings.num_seeds == 1
+        saved = "all that was trained" if is_one else "what all seeds have finished"
+        go_on = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}"
+        print(f"Stopped; {saved} is saved. To go on: {go_on}", file=sys.stderr)
         sys.exit(_INTERRUPTED)
     except StageError as error:
         cli.fail(PROGRAM, f"{error}; must be finite. What was written before is in {run.path}")
-    timing = {"total_s": time.perf_counter() - begin, "stages": monitor.seconds}
-    if arguments.num_seeds == 1:
-        _write(run, results[arguments.seed], timing)
-    else:
-        _write_seeds(run, results, timing)
 
 
 def _write_seeds(run: RunDirectory, results: dict[int, RunResult], timing: dict[str, Any]) -> None:
@@ -221,10 +222,12 @@ def _write_seeds(run: RunDirectory, results: dict[int, RunResult], timing: dict[
         of_seed.path.mkdir(exist_ok=True)
         shutil.copy(run.path / "config.json", of_seed.path)
         of_seed.save_models(result.models)
-        _write(of_seed, result, timing)
+    for seed, result in results.items():
+        _write(_of_seed(run, seed), result, timing)
     summaries = {str(seed): result.summary for seed, result in results.items()}
     over_seeds = sweep.statistics(list(summaries.values()))
     run.write_json("summary.json", {**_header(run, timing), "seeds": summaries, **over_seeds})
+    run.checkpoints.forget()
 
 
 def _of_seed(run: RunDirectory, seed: int) -> RunDirectory:
@@ -234,13 +237,14 @@ def _of_seed(run: RunDirectory, seed: int) -> RunDirectory:
 
 
 def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any]) -> None:
-    """Plots and the summary, which says that the run is finished."""
+    """Plots, the report and at last the summary, which says that the run is finished."""
     config = run.settings.config
     report.write_plots(run.path, config, result)
     film, beliefs = run.path / "mission.svg", result.models.class_beliefs
     animation.write(film, config, result.recording, beliefs, "latent policy")
-    run.write_json("summary.json", {**_header(run, timing), **result.summary})
-    page.write(run.path)
+    summary = {**_header(run, timing), **result.summary}
+    page.write(run.path, summary)
+    run.write_json("summary.json", summary)
 
 
 def _header(run: RunDirectory, timing: dict[str, Any]) -> dict[str, Any]:
@@ -294,4 +298,4 @@ def _figure(value: Any) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    cli.run(main)

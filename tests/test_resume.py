@@ -17,7 +17,7 @@ from jaxsense import train
 from jaxsense.rundir import RunDirectory
 
 SMOKE = ["--preset", "smoke", "--seed", "5", "--quiet"]
-INTERRUPTIONS = [("detector_lidar", 30), ("jmvae", 150), ("dqn_camera", 20), ("dqn_lidar", 40)]
+INTERRUPTIONS = [("detector_", 30), ("jmvae", 150), ("dqn_", 20), ("dqn_", 40)]
 
 
 @pytest.fixture(scope="module")
@@ -52,15 +52,15 @@ def stopped(tmp_path_factory, cache, whole):
 def interrupting(stage, step):
     """Writes metrics, and presses Ctrl-C at the first report of a stage at or after a step."""
     append, pressed = RunDirectory.append_metrics, []
-    before = signal.getsignal(signal.SIGINT)
 
     def append_metrics(self, **figures):
         append(self, **figures)
-        if figures["stage"] == stage and figures["step"] >= step and not pressed:
+        if figures["stage"].startswith(stage) and figures["step"] >= step and not pressed:
             pressed.append(stage)
+            waiting = signal.getsignal(signal.SIGINT)
             os.kill(os.getpid(), signal.SIGINT)
-            # The main thread hears of it; the handler steps back once it has.
-            while signal.getsignal(signal.SIGINT) is not before:
+            # The main thread hears of it; another handler waits for the next one then.
+            while signal.getsignal(signal.SIGINT) is waiting:
                 time.sleep(0.01)
 
     return append_metrics
@@ -82,7 +82,7 @@ def steps(path, stage):
 def test_a_stopped_run_goes_on_and_ends_the_same(stopped, whole, cache, tmp_path, capsys):
     path = tmp_path / "run"
     shutil.copytree(stopped, path)
-    assert (path / "checkpoints" / "unfinished" / "dqn_lidar").is_dir()
+    assert list((path / "checkpoints" / "unfinished").glob("dqn_*"))
     train.main(["--resume", str(path), "--quiet", *cache])
     assert without_times(path) == without_times(whole)
     assert (path / "reward.png").read_bytes() == (whole / "reward.png").read_bytes()
@@ -115,7 +115,7 @@ def test_a_stopped_run_says_how_to_go_on(tmp_path, cache, capsys, monkeypatch):
         (lambda path: edit(path, "versions", None), "was written by an older jaxsense"),
         (lambda path: edit(path, "config", {"dqn": {"epoch": 3}}), "epoch = 3: is no setting"),
         (lambda path: truncate(path / "checkpoints" / "jmvae"), "is damaged"),
-        (lambda path: truncate(path / "checkpoints" / "unfinished" / "dqn_lidar"), "is damaged"),
+        (lambda path: truncate(path / "checkpoints" / "unfinished"), "is damaged"),
     ],
 )
 def test_a_run_that_cannot_go_on_is_named(stopped, cache, tmp_path, capsys, change, expected):
@@ -130,6 +130,11 @@ def test_a_run_goes_on_with_its_own_settings(stopped, tmp_path, capsys):
     for options in (["--seed", "4"], ["--dqn.epochs", "80"]):
         assert "goes on with its own settings" in error_line([*resume, *options], capsys)
     assert "goes on in its own directory" in error_line([*resume, "--out", "x"], capsys)
+
+
+def test_a_run_that_is_being_written_is_left_alone(stopped, capsys):
+    with RunDirectory.resume(stopped).locked():
+        assert "is being written by another" in error_line(["--resume", str(stopped)], capsys)
 
 
 def edit(path, field, value):
@@ -221,10 +226,10 @@ def test_event_files_hold_the_metrics(whole, cache, tmp_path):
 def test_a_run_on_two_devices_goes_on(tmp_path, cache):
     path = tmp_path / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RunDirectory, "append_metrics", interrupting("dqn_lidar", 20))
+        patch.setattr(RunDirectory, "append_metrics", interrupting("dqn_", 20))
         with pytest.raises(SystemExit) as stop:
             train.main([*SMOKE, *cache, "--devices", "2", "--out", str(path)])
     assert stop.value.code == 130
-    assert (path / "checkpoints" / "unfinished" / "dqn_lidar").is_dir()
+    assert list((path / "checkpoints" / "unfinished").glob("dqn_*"))
     train.main(["--resume", str(path), "--devices", "2", "--quiet", *cache])
     assert (path / "summary.json").exists()

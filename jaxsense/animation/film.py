@@ -7,6 +7,7 @@ from xml.etree.ElementTree import Element
 import jax
 import numpy as np
 
+from jaxsense import files
 from jaxsense.animation.svg import Timeline, add
 from jaxsense.animation.views import SIZE, ArenaView, MapView
 from jaxsense.colours import ROBOT_COLOURS
@@ -86,7 +87,7 @@ def write(
         timeline = Timeline(moments, duration, moves)
         part = add(film, "g", class_="film-moving" if moves else "film-still")
         _draw(part, timeline, config, record, views, f"{path.stem}-view", (title, seconds))
-    path.write_text(ElementTree.tostring(root, encoding="unicode") + "\n")
+    files.write(path, ElementTree.tostring(root, encoding="unicode") + "\n")
 
 
 def _frames(config: Config, recording: Recording) -> tuple[Record, float]:

@@ -15,17 +15,21 @@ def as_plain(config: Config) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def from_plain(stored: Any) -> Config:
-    """The inverse of `as_plain`, through JSON; what is not given keeps its default.
+def from_plain(stored: Any, base: Config | None = None) -> Config:
+    """The inverse of `as_plain`, through JSON.
+
+    Args:
+      stored: sections and their fields.
+      base: settings that are not given; the defaults, if none are.
 
     Raises:
       ConfigError: names a field that is unknown, of the wrong type, or cannot be used.
     """
     if not isinstance(stored, dict):
         raise ConfigError("config", stored, "must be an object with a section for each part")
-    rules = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _number})
+    rules = dacite.Config(strict=True, type_hooks={float: _number, int: _whole_number})
     try:
-        return dacite.from_dict(Config, stored, rules)
+        return dacite.from_dict(Config, _with_tuples(_over(base or Config(), stored)), rules)
     except dacite.UnexpectedDataError as error:
         unknown = sorted(error.keys)[0]
         names = {name.rpartition(".")[2]: name for name in _names(Config)}
@@ -37,8 +41,10 @@ def from_plain(stored: Any) -> Config:
         kind = error.field_type.__name__ if is_plain else str(error.field_type)
         wanted = kind.removeprefix("typing.")
         raise ConfigError(str(error.field_path), error.value, f"must be of type {wanted}") from None
-    except dacite.DaciteError as error:
-        raise ConfigError("config", "given", str(error)) from None
+    except ConfigError:
+        raise
+    except (dacite.DaciteError, OverflowError, TypeError, ValueError) as error:
+        raise ConfigError("config", "given", f"cannot be used ({error})") from None
 
 
 def _find(stored: dict[str, Any], name: str) -> Any:
@@ -50,9 +56,32 @@ def _find(stored: dict[str, Any], name: str) -> Any:
     return next((value for value in found if value is not None), None)
 
 
+def _over(base: Config, stored: dict[str, Any]) -> dict[str, Any]:
+    """Settings, in which the given fields take the place of those of another one."""
+    plain = as_plain(base)
+    for name, section in stored.items():
+        is_section = dataclasses.is_dataclass(getattr(base, name, None))
+        merges = is_section and isinstance(section, dict)
+        plain[name] = {**plain[name], **section} if merges else section
+    return plain
+
+
+def _with_tuples(value: Any) -> Any:
+    """JSON has lists for tuples."""
+    if isinstance(value, dict):
+        return {name: _with_tuples(each) for name, each in value.items()}
+    return tuple(map(_with_tuples, value)) if isinstance(value, list | tuple) else value
+
+
+def _whole_number(value: Any) -> Any:
+    """Python takes True for 1; as text it is refused."""
+    return str(value) if isinstance(value, bool) else value
+
+
 def _number(value: Any) -> Any:
     """JSON writes 1 for 1.0."""
-    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+    value = _whole_number(value)
+    return float(value) if isinstance(value, int) else value
 
 
 def _names(section: Any, prefix: str = "") -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import jinja2
 
+from jaxsense import files
 from jaxsense.config import PRESETS
 from jaxsense.page import tables
 from jaxsense.page.film import Film, read_film
@@ -33,12 +34,13 @@ PLOTS = {
 """The plots of a run: alternative text and caption."""
 
 
-def write(run: Path) -> Path:
+def write(run: Path, summary: dict[str, Any] | None = None) -> Path:
     """Writes `report.html` from the files that lie in a run directory; again, if they change.
 
     Args:
       run: directory with `config.json` and `summary.json`; plots `NAME.png` and animations
         `mission*.svg` are shown if they are there.
+      summary: what is to be in `summary.json`, if it is not there yet.
 
     Returns:
       The page's path.
@@ -47,7 +49,9 @@ def write(run: Path) -> Path:
       OSError: if a file cannot be read or written.
     """
     settings = json.loads((run / "config.json").read_text())
-    summary = json.loads((run / "summary.json").read_text())
+    if summary is None:
+        summary = json.loads((run / "summary.json").read_text())
+    assert summary is not None
     classes = settings["config"]["arena"]["classes"]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("jaxsense.page", "."),
@@ -78,9 +82,7 @@ def write(run: Path) -> Path:
         films=_films(run),
     )
     path = run / "report.html"
-    unfinished = run / ".report.html.unfinished"
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.rename(path)
+    files.write(path, text)
     return path
 
 
