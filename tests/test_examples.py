@@ -33,6 +33,7 @@ def run(change, out: Path, *options: str) -> dict:
     return json.loads((out / "summary.json").read_text())
 
 
+@pytest.mark.slow  # compiles a whole run, as the next one does; before a release
 def test_new_classes(example, runs):
     # One of its two sensors, which compiles in half the time.
     change = example("new_classes").change

@@ -182,8 +182,11 @@ def test_a_full_disk_is_named_and_nothing_is_lost(whole, cache, tmp_path):
 
 def test_a_config_reproduces_its_run(whole, cache, tmp_path, capsys):
     path, file = tmp_path / "again", whole / "config.json"
-    train.main(["--config", str(file), "--out", str(path), "--quiet", *cache])
+    options = ["--quiet", "--tensorboard"]
+    train.main(["--config", str(file), "--out", str(path), *options, *cache])
     assert without_times(path) == without_times(whole)
+    (events,) = (path / "tensorboard").iterdir()
+    assert b"dqn_camera/reward" in events.read_bytes()
     assert (path / "config.json").read_text() == file.read_text()
     content = json.loads(file.read_text())
     assert content["seed"] == 5
@@ -212,15 +215,6 @@ def test_a_config_that_cannot_be_used_is_named(tmp_path, capsys, content, expect
         file.write_text(content)
     assert expected in error_line(["--config", str(file), "--out", str(tmp_path / "x")], capsys)
     assert not (tmp_path / "x").exists()
-
-
-def test_event_files_hold_the_metrics(whole, cache, tmp_path):
-    pytest.importorskip("tensorboardX")
-    path = tmp_path / "run"
-    options = ["--dqn.epochs", "20", "--tensorboard"]
-    train.main([*SMOKE, *cache, "--out", str(path), *options])
-    (events,) = (path / "tensorboard").iterdir()
-    assert b"dqn_camera/reward" in events.read_bytes()
 
 
 def test_a_run_on_two_devices_goes_on(tmp_path, cache):

@@ -41,6 +41,7 @@ def test_settings_vary_in_one_program_as_they_do_in_several():
     assert TINY.jmvae.alpha == PRESETS["smoke"].jmvae.alpha
 
 
+@pytest.mark.slow  # compiles what the test above does; before a release
 def test_the_example_of_the_documentation_runs(monkeypatch, capsys):
     page = (Path(__file__).parents[1] / "docs" / "getting-started.md").read_text()
     example, *_ = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

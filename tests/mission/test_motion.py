@@ -79,6 +79,7 @@ def test_limits_hold_at_every_physics_step(team, recorded):
     assert np.max(change) > 0.5 * amiro.MAX_ACCELERATION
 
 
+@pytest.mark.slow  # a minute, mostly compiling; before a release
 def test_missions_with_contacts_always_and_never_computed_take_the_same_decisions(team, models):
     never = mission.make_mission(CONFIG, contacts=False)
     always = mission.Mission(team.world, team.world.arena)
