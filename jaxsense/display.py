@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import rich.console
 import rich.progress
+from rich.table import Column
 
 _LINE_PERIOD = 5.0  # s
 _WIDE = 110  # columns of a terminal, from which there is room for a bar
@@ -35,12 +36,12 @@ class Display:
         columns = rich.progress
         is_wide = console.width >= _WIDE
         self._progress = rich.progress.Progress(
-            columns.TextColumn("{task.description}"),
+            columns.TextColumn("{task.description}", table_column=Column(min_width=15)),
             *([columns.BarColumn()] if is_wide else []),
-            columns.TextColumn("{task.fields[count]}", justify="right"),
-            columns.TextColumn("{task.fields[rate]}", justify="right"),
-            columns.TextColumn("{task.fields[left]}", justify="right"),
-            columns.TextColumn("{task.fields[figures]}"),
+            *(
+                columns.TextColumn(f"{{task.fields[{name}]}}", table_column=Column(min_width=width))
+                for name, width in {"count": 10, "rate": 7, "left": 10, "figures": 0}.items()
+            ),
             console=console,
             disable=quiet or not console.is_terminal,
         )

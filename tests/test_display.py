@@ -1,0 +1,51 @@
+"""What a run shows, on a terminal and elsewhere."""
+
+import io
+import re
+
+import pytest
+import rich.console
+
+from jaxsense.display import Display
+
+
+def show(display):
+    with display:
+        display.show("dqn", 0, 0, {})
+        display.show("dqn_camera", 100, 800, {"loss": 0.5, "reward": 1.0})
+        display.show("dqn_camera", 200, 800, {"loss": 0.25, "reward": 1.0})
+        display.note("a note")
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_terminal_shows_count_rate_and_time_left_at_any_width(width):
+    text = io.StringIO()
+    console = rich.console.Console(file=text, force_terminal=True, width=width)
+    show(Display(console))
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text.getvalue())
+    last = [line for line in shown.splitlines() if line.startswith("dqn_camera")][-1]
+    assert re.search(r"200/800 +\d+/s +\d+ s left +loss 0.25", last)
+    assert ("━" in last) == (width == 120)
+
+
+def test_without_a_terminal_there_are_plain_lines_now_and_then(capsys):
+    records = []
+    display = Display(
+        rich.console.Console(file=io.StringIO()), lambda **figures: records.append(figures)
+    )
+    show(display)
+    lines = capsys.readouterr().out.splitlines()
+    assert [re.sub(r"^ *[\d.]+ s  ", "", line) for line in lines] == [
+        "dqn: compiling",
+        "dqn_camera: 100 of 800  loss 0.5  reward 1",
+        "a note",
+    ]
+    assert [record["step"] for record in records] == [100, 200]
+
+
+def test_a_quiet_display_records_and_shows_nothing(capsys):
+    records = []
+    console = rich.console.Console(file=io.StringIO(), quiet=True)
+    show(Display(console, lambda **figures: records.append(figures), quiet=True))
+    assert capsys.readouterr().out == ""
+    assert records[1] == {"stage": "dqn_camera", "step": 200, "loss": 0.25, "reward": 1.0}
