@@ -7,7 +7,7 @@ Stages run on the host and call compiled programs; between two chunks of work th
 import dataclasses
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
 import jax
@@ -391,7 +391,11 @@ def _keys(key: Key, number: int) -> list[Key]:
 def _side_by_side(function: Callable[[int], T], number: int) -> list[T]:
     """`function(0)`, `function(1)` and so on, each in a thread: one alone leaves cores idle."""
     with ThreadPoolExecutor(number) as executor:
-        return list(executor.map(function, range(number)))
+        futures = [executor.submit(function, i) for i in range(number)]
+        # A thread that waits for good may not hear of Ctrl-C.
+        while wait(futures, timeout=0.2).not_done:
+            pass
+        return [future.result() for future in futures]
 
 
 def _labels(config: Config, modality: int) -> np.ndarray:
