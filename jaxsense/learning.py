@@ -128,7 +128,7 @@ def learn_perception(key: Key, config: Config, world: World) -> Perception:
     num_modalities, model = len(config.modalities), jmvae_shape(config)
     survey_key, jmvae_key, *detector_keys = jax.random.split(key, 2 + num_modalities)
     classes, windows = _survey(survey_key, config, world)
-    labels = [jnp.array(_labels(config, m)) for m in range(num_modalities)]
+    labels = [jnp.array(config.label_of_class(name)) for name in config.modalities]
     sizes = model.feature_sizes
     found = [
         _train_detector(k, w[0], label[classes[0]], size, config)
@@ -159,11 +159,6 @@ def learn_perception(key: Key, config: Config, world: World) -> Perception:
         accuracy=jnp.stack([right.mean() for right in is_right]),
         is_finite=jnp.stack(is_finite).all(),
     )
-
-
-def _labels(config: Config, modality: int) -> tuple[int, ...]:
-    """`[C]` what a modality detects of each class."""
-    return config.label_of_class(config.modalities[modality])
 
 
 def _survey(

@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from flax import struct
 from jax.sharding import Mesh
 
 from jaxsense import examine, mission
@@ -20,6 +19,7 @@ from jaxsense.checkpoints import Checkpoints, Curves
 from jaxsense.chunks import run_chunks
 from jaxsense.compilation import Compiler, Kept
 from jaxsense.config import Config
+from jaxsense.detections import Detections, detect, labels_of_classes
 from jaxsense.models import Models, untrained
 from jaxsense.monitor import Monitor, Stopped
 from jaxsense.networks import Params
@@ -29,34 +29,13 @@ from jaxsense.programs import (
     compile_programs,
     last_steps,
     num_chunks,
-    num_held_out_per_class,
-    num_scene_starts,
     num_scenes,
 )
-from jaxsense.sim.world import Scene, make_world
+from jaxsense.sim.world import make_world
 from jaxsense.types import Belief, Key
 from jaxsense.vae.detectors import Detector
 
 T = TypeVar("T")
-
-
-@struct.dataclass
-class Detections:
-    """What the detectors make of surveys that they were not trained on.
-
-    Attributes:
-      train: for each modality a `[C, S, D_m]` bank for training.
-      held_out: the same from other scenes, for measuring.
-      starts: classes, scenes and `[S, N, D_m]` features for each modality, in which episodes start.
-      accuracy: for each modality, on held-out looks.
-      windows: for each modality `[C, 1, F]` one look at each class.
-    """
-
-    train: tuple[np.ndarray, ...]
-    held_out: tuple[np.ndarray, ...]
-    starts: tuple[np.ndarray, Scene, tuple[np.ndarray, ...]]
-    accuracy: dict[str, float]
-    windows: dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +131,7 @@ class Stages:
             self._shapes.detectors,
             lambda: self.train_detectors(detector_key, surveys),
         )
-        detections = self.detect(trained, surveys)
+        detections = detect(programs, trained, surveys, config)
         params = self._once(
             "jmvae", self._shapes.jmvae, lambda: self.train_jmvae(jmvae_key, detections.train)
         )
@@ -204,7 +183,7 @@ class Stages:
             init_key, *chunk_keys = _keys(keys[modality], 1 + number)
             windows = surveys.windows[modality][:num_train]
             windows = jax.device_put(windows.reshape(-1, windows.shape[-1]))
-            labels = _labels(config, modality)[surveys.classes[:num_train]].reshape(-1)
+            labels = labels_of_classes(config, modality)[surveys.classes[:num_train]].reshape(-1)
             detector, state = self._programs.begin_detectors[modality](init_key, windows)
             step = self._programs.train_detectors[modality]
 
@@ -219,37 +198,6 @@ class Stages:
             return dataclasses.replace(detector, params=state.params)
 
         return tuple(_side_by_side(train, len(config.modalities)))
-
-    def detect(self, trained: tuple[Detector, ...], surveys: Surveys) -> Detections:
-        """Applies the detectors to the surveys that they were not trained on."""
-        config = self._config
-        num_train, num_bank, _ = num_scenes(config)
-        others = jax.tree.map(lambda x: x[num_train:], surveys)
-        features = jax.tree.map(np.asarray, self._programs.detect(trained, others.windows))
-        is_bank = np.arange(len(others.classes)) < num_bank
-
-        def by_class(values: np.ndarray, chosen: np.ndarray, number: int) -> np.ndarray:
-            classes = others.classes[chosen]
-            return np.stack(
-                [values[chosen][classes == c][:number] for c in range(len(config.arena.classes))]
-            )
-
-        held_out = tuple(by_class(f, ~is_bank, num_held_out_per_class(config)) for f in features)
-        accuracy = {
-            name: float(np.mean(looks.argmax(axis=-1) == _labels(config, m)[:, None]))
-            for m, (name, looks) in enumerate(zip(config.modalities, held_out, strict=True))
-        }
-        number = num_scene_starts(config)
-        return Detections(
-            train=tuple(by_class(f, is_bank, config.jmvae.samples_per_class) for f in features),
-            held_out=held_out,
-            starts=jax.tree.map(lambda x: x[:number], (others.classes, others.scenes, features)),
-            accuracy=accuracy,
-            windows={
-                name: by_class(windows, ~is_bank, 1)
-                for name, windows in zip(config.modalities, others.windows, strict=True)
-            },
-        )
 
     def train_jmvae(self, key: Key, bank: tuple[np.ndarray, ...]) -> Params:
         """Trains JMVAEs on a bank of detections and keeps the one with the lowest last losses."""
@@ -396,11 +344,6 @@ def _side_by_side(function: Callable[[int], T], number: int) -> list[T]:
         while wait(futures, timeout=0.2).not_done:
             pass
         return [future.result() for future in futures]
-
-
-def _labels(config: Config, modality: int) -> np.ndarray:
-    """`[C]` int32 what a modality detects of each class."""
-    return np.array(config.label_of_class(config.modalities[modality]), np.int32)
 
 
 def as_lists(figures: dict[str, Any]) -> dict[str, Any]:
