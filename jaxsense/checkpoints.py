@@ -1,22 +1,29 @@
-"""What a run saves while it trains, by Orbax: what is finished, and trainings under way."""
+"""What a run saves while it trains: what is finished, and trainings under way.
 
-import contextlib
-import os
-import re
+A checkpoint is one file: a digest of SHA-256, and what `flax.serialization` makes of its arrays.
+"""
+
+import hashlib
+import json
 import shutil
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
+from flax import serialization
 
+from jaxsense import files
 from jaxsense.config import ConfigError
 
-_MOST_TOLD = 200
-_MARGIN = 100_000  # bytes that a checkpoint takes beside its arrays
+T = TypeVar("T")
+
+_DIGEST = hashlib.sha256().digest_size
+_SUFFIX = ".msgpack"
+_LIST = "saved.json"
 
 Curves = dict[str, list[float]]
 """Figures of a training so far, by their names."""
@@ -39,13 +46,20 @@ class Unfinished(NamedTuple):
 class Checkpoints:
     """The checkpoints of a run, in a directory; without one nothing is saved and nothing is there.
 
+    A checkpoint that is damaged is put aside, and what it held is trained again, which comes to the
+    same: a run follows from its seed and settings.
+
     Attributes:
       path: the directory.
     """
 
-    def __init__(self, path: Path | None = None):
-        self.path = None if path is None else path.absolute()
-        # After a failure Orbax closes what another save of the process still needs.
+    def __init__(
+        self,
+        path: Path | None = None,
+        warn: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
+    ):
+        """Names a directory, and who is told of checkpoints that are damaged."""
+        self.path, self._warn = path, warn
         self._lock = threading.Lock()
 
     def exists(self) -> bool:
@@ -53,16 +67,14 @@ class Checkpoints:
         return self.path is not None and self.path.exists()
 
     def save(self, name: str, tree: Any) -> None:
-        """Saves something finished; an `OSError` says that it cannot be written."""
+        """Saves something finished; an `OSError` names the file that cannot be written."""
         if self.path is None:
             return
-        tree = _on_host(tree)
-        with (
-            self._lock,
-            _writing(self.path / name, tree),
-            ocp.StandardCheckpointer() as checkpointer,
-        ):
-            checkpointer.save(self.path / name, tree, force=True)
+        self._file(name).parent.mkdir(parents=True, exist_ok=True)
+        content = serialization.to_bytes(jax.tree.map(np.asarray, tree))
+        files.write(self._file(name), hashlib.sha256(content).digest() + content)
+        with self._lock:
+            self._list(self._listed() | {name})
 
     def load(self, name: str, shapes: Any) -> Any:
         """Loads what was saved.
@@ -75,29 +87,19 @@ class Checkpoints:
           The tree, of arrays on the host; None if there is none.
 
         Raises:
-          ConfigError: if it cannot be read or is of other shapes.
+          ConfigError: names the file if it is damaged, missing, or of other shapes.
         """
-        if self.path is None or not (self.path / name).exists():
-            return None
-        try:
-            with ocp.StandardCheckpointer() as checkpointer:
-                return jax.tree.map(np.asarray, checkpointer.restore(self.path / name, shapes))
-        except Exception as error:  # Orbax hands on whatever its storage raises
-            raise _damaged(self.path / name, error) from error
+        return self._load(name, lambda found: _like(shapes, found))
+
+    def load_or_forget(self, name: str, shapes: Any) -> Any:
+        """`load`, but a file that cannot be used is named, put aside, and counts as not there."""
+        return self._or_forget(name, lambda found: _like(shapes, found))
 
     def save_unfinished(self, stage: str, unfinished: Unfinished) -> None:
         """Saves a training under way, in place of what was saved of it before; see `save`."""
-        if self.path is None:
-            return
-        path, state = self._unfinished(stage), _on_host(unfinished.state)
-        with self._lock, _writing(path, state), self._manager(stage) as manager:
-            manager.save(
-                unfinished.done,
-                args=ocp.args.Composite(
-                    state=ocp.args.StandardSave(state),
-                    curves=ocp.args.JsonSave(unfinished.curves),
-                ),
-            )
+        curves = {name: np.array(values, np.float64) for name, values in unfinished.curves.items()}
+        saved = {"done": np.int64(unfinished.done), "state": unfinished.state, "curves": curves}
+        self.save(_unfinished(stage), saved)
 
     def load_unfinished(self, stage: str, state: Any) -> Unfinished | None:
         """Loads a training under way.
@@ -107,83 +109,90 @@ class Checkpoints:
           state: any state of it, for structure and shapes.
 
         Returns:
-          The training as it was saved last; None if it was not.
-
-        Raises:
-          ConfigError: if it cannot be read or is of other shapes.
+          The training as it was saved last; None if it was not, or if the file is damaged.
         """
-        if self.path is None or not self._unfinished(stage).exists():
-            return None
-        try:
-            with self._manager(stage) as manager:
-                done = manager.latest_step()
-                if done is None:
-                    return None
-                shapes = jax.tree.map(ocp.utils.to_shape_dtype_struct, state)
-                restored = manager.restore(
-                    done,
-                    args=ocp.args.Composite(
-                        state=ocp.args.StandardRestore(shapes), curves=ocp.args.JsonRestore()
-                    ),
-                )
-                # On the host, so that any program may take it, on whatever devices.
-                state = jax.tree.map(np.asarray, restored.state)
-                return Unfinished(done, state, restored.curves)
-        except Exception as error:
-            raise _damaged(self._unfinished(stage), error) from error
 
-    def forget(self) -> None:
-        """Removes all."""
-        if self.path is not None:
-            shutil.rmtree(self.path, ignore_errors=True)
+        def restore(found: Any) -> Unfinished:
+            curves = {name: values.tolist() for name, values in found["curves"].items()}
+            return Unfinished(int(found["done"]), _like(state, found["state"]), curves)
+
+        return self._or_forget(_unfinished(stage), restore)
 
     def forget_unfinished(self) -> None:
         """Removes all trainings under way: the run is finished."""
         if self.path is not None:
-            shutil.rmtree(self.path / "unfinished", ignore_errors=True)
+            shutil.rmtree(self.path / _unfinished(""), ignore_errors=True)
+            with self._lock:
+                self._list(
+                    {name for name in self._listed() if not name.startswith(_unfinished(""))}
+                )
 
-    def _unfinished(self, stage: str) -> Path:
+    def _listed(self) -> set[str]:
+        """Names of all that was saved, so that a missing file is noticed."""
         assert self.path is not None
-        return self.path / "unfinished" / stage
+        try:
+            return set(json.loads((self.path / _LIST).read_text(encoding="utf-8")))
+        except (OSError, ValueError):
+            return set()
 
-    def _manager(self, stage: str) -> ocp.CheckpointManager:
-        options = ocp.CheckpointManagerOptions(max_to_keep=1, enable_async_checkpointing=False)
-        return ocp.CheckpointManager(self._unfinished(stage), options=options)
+    def _list(self, names: set[str]) -> None:
+        assert self.path is not None
+        if names != self._listed():
+            files.write(self.path / _LIST, json.dumps(sorted(names)) + "\n")
+
+    def _load(self, name: str, restore: Callable[[Any], T]) -> T | None:
+        """What `restore` makes of what was saved; see `load`."""
+        if self.path is None:
+            return None
+        if not self._file(name).exists():
+            if name in self._listed():
+                raise ConfigError("checkpoint", str(self._file(name)), "is missing")
+            return None
+        try:
+            return restore(_read(self._file(name)))
+        except (ValueError, KeyError) as error:
+            reason = f"is damaged or of other settings ({str(error).splitlines()[0]})"
+            raise ConfigError("checkpoint", str(self._file(name)), reason) from None
+
+    def _or_forget(self, name: str, restore: Callable[[Any], T]) -> T | None:
+        try:
+            return self._load(name, restore)
+        except ConfigError as error:
+            file = self._file(name)
+            aside = file.with_name(f"{file.name}.damaged")
+            if file.exists():
+                file.replace(aside)
+            self._warn(f"{error}; what it held is trained again")
+            return None
+
+    def _file(self, name: str) -> Path:
+        assert self.path is not None
+        return self.path / f"{name}{_SUFFIX}"
 
 
-@contextlib.contextmanager
-def _writing(path: Path, tree: Any) -> Iterator[None]:
-    """Whatever goes wrong when a tree of arrays is written, as an `OSError`."""
-    # Without room Orbax fails in many threads, and each prints what it has to say.
-    trial = path.parent / f".{path.name}.trial"
-    try:
-        trial.parent.mkdir(parents=True, exist_ok=True)
-        trial.write_bytes(bytes(sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) + _MARGIN))
-    except OSError as error:
-        raise OSError(f"{path} ({error.strerror})") from error
-    finally:
-        with contextlib.suppress(OSError):
-            trial.unlink(missing_ok=True)
-    try:
-        yield
-    except Exception as error:
-        code = re.search(r"os_error_code='(\d+)'", str(error))
-        reason = os.strerror(int(code[1])) if code else _first_line(error)
-        raise OSError(f"{path} ({reason})") from error
+def _unfinished(stage: str) -> str:
+    """Under which name a training under way is saved."""
+    return f"unfinished/{stage}"
 
 
-def _damaged(path: Path, error: Exception) -> ConfigError:
-    """The error of a checkpoint that is there and cannot be read."""
-    reason = f"is damaged or of other settings ({_first_line(error)})"
-    return ConfigError("checkpoint", str(path), reason)
+def _read(file: Path) -> Any:
+    """What lies in a checkpoint, as nested dictionaries; a `ValueError` if it is damaged."""
+    whole = file.read_bytes()
+    content = whole[_DIGEST:]
+    if hashlib.sha256(content).digest() != whole[:_DIGEST]:
+        raise ValueError("its content does not have its digest")
+    return serialization.msgpack_restore(content)
 
 
-def _first_line(error: Exception) -> str:
-    """What an error says, in brief."""
-    lines = str(error).strip().splitlines()
-    return lines[0][:_MOST_TOLD] if lines else type(error).__name__
+def _like(shapes: Any, found: Any) -> Any:
+    """A tree like `shapes` from nested dictionaries; a `ValueError` if it does not fit."""
 
+    def check(expected: Any, found: Any) -> np.ndarray:
+        found = np.asarray(found)
+        if (found.shape, found.dtype) != (expected.shape, expected.dtype):
+            raise ValueError(
+                f"{found.dtype}{found.shape} in place of {expected.dtype}{expected.shape}"
+            )
+        return found
 
-def _on_host(tree: Any) -> Any:
-    """A copy, which nobody gives away to a program while it is written."""
-    return jax.tree.map(np.array, tree)
+    return jax.tree.map(check, shapes, serialization.from_state_dict(shapes, found))

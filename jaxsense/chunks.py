@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from jaxsense.checkpoints import Checkpoints, Curves, Unfinished
-from jaxsense.monitor import Monitor
+from jaxsense.monitor import Monitor, StageError
 
 _SAVE_PERIOD = 60.0  # s
 
@@ -33,6 +33,7 @@ def run_chunks(
 
     Raises:
       Stopped: if the run is to stop before the training is over; it has been saved.
+      StageError: from `run`; what was there before the chunk has been saved.
     """
     done, curves = 0, Curves()
     found = checkpoints.load_unfinished(stage, state)
@@ -40,7 +41,12 @@ def run_chunks(
         done, state, curves = found
     saved = time.monotonic()
     for chunk in range(done, number):
-        state, figures = run(chunk, state)
+        try:
+            after, figures = run(chunk, state)
+        except StageError:
+            checkpoints.save_unfinished(stage, Unfinished(chunk, state, curves))
+            raise
+        state = after
         for name, values in figures.items():
             curves.setdefault(name, []).extend(values)
         is_late = time.monotonic() - saved > _SAVE_PERIOD

@@ -7,7 +7,8 @@ import importlib.metadata
 import os
 import pickle
 import platform
-import shutil
+import re
+import stat
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor, wait
@@ -17,9 +18,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
-from jax.sharding import Mesh
 
 from jaxsense import devices
+from jaxsense.devices import ALONE, Workers
 from jaxsense.monitor import Monitor
 
 _THREADS = min(os.cpu_count() or 1, 8)
@@ -31,6 +32,8 @@ _SOURCE = [
     for path in sorted(Path(__file__).parent.rglob("*.py"))
 ]
 _MOST_KEPT = 8  # runs with different settings
+_FOLDER = re.compile(r"[0-9a-f]{32}")
+_FILE = re.compile(r".+-[0-9a-f]{16}\.(pickle|\d+)")
 
 
 class Kept:
@@ -52,17 +55,29 @@ class Kept:
             whose `repr` tells them apart.
 
         Raises:
-          OSError: if the directory cannot be made.
+          OSError: if the directory cannot be made, or others than this user may write it: a program
+            that is loaded is code that is run.
         """
         text = repr((settings, _SOURCE, _surroundings())).encode()
-        self.path = directory / "programs" / hashlib.sha256(text).hexdigest()[:32]
-        self.path.mkdir(parents=True, exist_ok=True)
+        self.path = directory / "executables" / hashlib.sha256(text).hexdigest()[:32]
+        _make_private(self.path.parent)
+        _make_private(self.path)
         self.path.touch()
         # Another run may forget some at the same time.
         with contextlib.suppress(FileNotFoundError):
-            others = sorted(self.path.parent.iterdir(), key=lambda path: path.stat().st_mtime)
-            for path in others[:-_MOST_KEPT]:
-                shutil.rmtree(path, ignore_errors=True)
+            self._forget_oldest()
+
+    def _forget_oldest(self) -> None:
+        """Removes programs of settings that were not used for longest, and nothing else."""
+        others = [path for path in self.path.parent.iterdir() if _FOLDER.fullmatch(path.name)]
+        others.sort(key=lambda path: path.lstat().st_mtime)
+        for folder in others[:-_MOST_KEPT]:
+            for path in folder.iterdir():
+                if _FILE.fullmatch(path.name):
+                    path.unlink(missing_ok=True)
+            # Not empty, if it holds anything that is not ours.
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
     def find(self, name: str, args: Any) -> "Found | None":
         """A program that was kept.
@@ -167,14 +182,21 @@ class Program:
         self._compiler, self._monitor = compiler, compiler.monitor
         self._stage, self._name = stage, name
         self._compiled: Future[Callable[..., Any]] = Future()
+        self._workers, self._whole = ALONE, ()
+
+    @property
+    def num_workers(self) -> int:
+        """Who shares the rows of the arguments; known once the program is compiled."""
+        self.wait()
+        return self._workers.number
 
     def compile(
         self,
         function: Callable[..., Any],
         *args: Any,
-        donate: tuple[int, ...] = (),
         runs_long: bool = False,
-        mesh: Mesh | None = None,
+        workers: Workers = ALONE,
+        whole: tuple[int, ...] = (),
         **shardings: Any,
     ) -> Any:
         """Begins to load a function that was kept, or traces it and begins to compile it.
@@ -182,20 +204,25 @@ class Program:
         Args:
           function: what to compile.
           *args: arguments or their shapes, for example the result of another program's `compile`.
-          donate: positions of arguments whose memory the program may use for its results.
           runs_long: see `devices.compiler_options`.
-          mesh: devices that the function splits its work over, if it does.
-          **shardings: `in_shardings` and `out_shardings` of `jax.jit`.
+          workers: who shares the rows of the arguments; their number divides the rows.
+          whole: positions of arguments that every worker gets as they are.
+          **shardings: `in_shardings` and `out_shardings` of `jax.jit`, for a function that splits
+            its work itself.
 
         Returns:
           Shapes and dtypes of the results, as a pytree.
         """
         begin = time.perf_counter()
-        number = 1 if mesh is None else mesh.size
+        self._workers, self._whole = workers, whole
+        function = devices.spread(function, workers.mesh, whole)
+        args = devices.part(args, 0, workers.threads, whole)
+        split = jax.tree.leaves(shardings)
+        number = split[0].num_devices if split else 1 if workers.mesh is None else workers.number
         kept, name = self._compiler.kept, f"{self._stage}-{self._name}-{number}"
 
         def lower() -> tuple[jax.stages.Lowered, Any]:
-            traced = jax.jit(function, donate_argnums=donate, **shardings).trace(*args)
+            traced = jax.jit(function, **shardings).trace(*args)
             return traced.lower(), traced.out_info
 
         found = None if kept is None else kept.find(name, args)
@@ -223,7 +250,7 @@ class Program:
                 kept.save(name, args, results, compiled)
 
         self._compiler.submit(compile_lowered)
-        return results
+        return devices.of_all_parts(results, workers.threads)
 
     def fail(self, error: BaseException) -> None:
         """Raises an error from all calls, unless the program is there already."""
@@ -242,10 +269,24 @@ class Program:
     def __call__(self, *args: Any) -> Any:
         """Runs the program until its results are there."""
         compiled = self.wait()
-        begin = time.perf_counter()
-        output = jax.block_until_ready(compiled(*args))
+        begin, number = time.perf_counter(), self._workers.threads
+
+        def run(i: int) -> Any:
+            return jax.block_until_ready(compiled(*devices.part(args, i, number, self._whole)))
+
+        output = devices.joined(devices.side_by_side(run, number))
         self._monitor.add(self._stage, "run_s", time.perf_counter() - begin)
         return output
+
+
+def _make_private(path: Path) -> None:
+    """Makes a directory of this user's alone; an `OSError` says if one is there that is not."""
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700, parents=True)
+    found = path.lstat()
+    is_own = not hasattr(os, "getuid") or found.st_uid == os.getuid()
+    if not (stat.S_ISDIR(found.st_mode) and is_own and found.st_mode & 0o077 == 0):
+        raise PermissionError(f"{path} must be a directory of yours alone, with mode 0700")
 
 
 def _surroundings() -> list[Any]:

@@ -1,9 +1,11 @@
-"""Work spread over several devices: the cores of a CPU, several accelerators, several processes."""
+"""Work spread over the cores of a CPU, over several accelerators, and over several processes."""
 
-import contextlib
+import dataclasses
+import functools
 import os
 from collections.abc import Callable
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -11,40 +13,76 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxsense.config import ConfigError, DqnConfig
 
+T = TypeVar("T")
+
 AXIS = "devices"
 _MOST_THREADS = 8
 _MOST_DEVICES = 256
 
 
-def compiler_options(*, runs_long: bool = False) -> Any:
-    """What a program is compiled with: so that compiling and running take least together.
+def compiler_options(*, runs_long: bool = False) -> dict[str, Any]:
+    """Options with which compiling and running a program take least together.
 
-    On a CPU, optimisation at level 1 takes a third less time than at level 3, and what it gives is
-    as fast. Without the newer code generator it is again a third less, but what it gives may be a
+    On a CPU, optimisation at level 1 takes a third less time than at level 3, and its programs are
+    as fast. Without the newer code generator it is again a third less, but the program may be a
     third slower. On an accelerator most of the time would go into trying kernels for products.
 
     Args:
       runs_long: far longer than it takes to compile.
-    """
-    if jax.default_backend() == "cpu":
-        return {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": runs_long}
-    if runs_long or jax.default_backend() != "gpu":
-        return {}
-    return {"xla_backend_optimization_level": 1, "xla_gpu_autotune_level": 0}
-
-
-def start(number: int | None, config: DqnConfig | None = None) -> tuple[Mesh | None, Mesh | None]:
-    """The devices of a program; which should be called before JAX is used.
-
-    Args:
-      number: of devices; on a CPU each is a thread. If not given, all accelerators there are, or as
-        many threads as there are cores, but no more than can share the environments evenly.
-      config: of the Q-learning that is to be shared, if any.
 
     Returns:
-      Devices to split simulations over and to split Q-learning over; None for a single one. Unless
-      asked to, threads do not share Q-learning: to agree on a gradient takes them longer than to
-      work it out.
+      Those options that the installed compiler knows.
+    """
+    wanted: dict[str, Any] = {}
+    if jax.default_backend() == "cpu":
+        wanted = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": runs_long}
+    elif jax.default_backend() == "gpu" and not runs_long:
+        wanted = {"xla_backend_optimization_level": 1, "xla_gpu_autotune_level": 0}
+    return {name: value for name, value in wanted.items() if _is_known(name, value)}
+
+
+@functools.cache
+def _is_known(option: str, value: Any) -> bool:
+    """Whether the installed compiler has an option; they come and go with its versions."""
+    try:
+        jax.jit(lambda: 0).lower().compile(compiler_options={option: value})
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
+@dataclasses.dataclass(frozen=True)
+class Workers:
+    """What shares the rows of a batch: threads of a CPU, or the devices of a mesh.
+
+    Attributes:
+      threads: how many, each with a program of its own; 1 beside a mesh.
+      mesh: from `make_mesh`; None for a single device.
+    """
+
+    threads: int = 1
+    mesh: Mesh | None = None
+
+    @property
+    def number(self) -> int:
+        """How many parts a batch is cut into."""
+        return self.threads if self.mesh is None else self.mesh.size
+
+
+ALONE = Workers()
+
+
+def start(number: int | None, config: DqnConfig | None = None) -> tuple[Workers, Mesh | None]:
+    """The devices of a program.
+
+    Args:
+      number: of accelerators, or of threads on a CPU. If not given, all accelerators there are, but
+        no more than can share the environments evenly; or as many threads as cores, at most 8.
+      config: of the Q-learning that accelerators are to share, if any.
+
+    Returns:
+      Who shares simulations, and the mesh that shares Q-learning; None for a single device. Threads
+      do not share Q-learning: to agree on a gradient takes them longer than to work it out.
 
     Raises:
       ConfigError: if there are not that many devices, or they cannot share the environments.
@@ -52,16 +90,12 @@ def start(number: int | None, config: DqnConfig | None = None) -> tuple[Mesh | N
     jax.config.update("jax_default_matmul_precision", "highest")
     if number is not None and not 1 <= number <= _MOST_DEVICES:
         raise ConfigError("devices", number, f"must be within 1 and {_MOST_DEVICES}")
-    threads = min(os.cpu_count() or 1, _MOST_THREADS) if number is None else max(number, 1)
-    # Where JAX is in use already, its devices are what they are.
-    with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", threads)
-    is_chosen = number is not None or jax.default_backend() != "cpu"
+    if jax.default_backend() == "cpu" and jax.process_count() == 1:
+        return Workers(threads=number or min(os.cpu_count() or 1, _MOST_THREADS)), None
     there = jax.device_count()
     if number is None:
-        can_share = (n for n in range(1, there + 1) if config is None or config.shares % n == 0)
-        number = max(can_share)
-    if not 1 <= number <= there:
+        number = max(n for n in range(1, there + 1) if config is None or config.shares % n == 0)
+    if number > there:
         raise ConfigError("devices", number, f"must be within 1 and {there}")
     if config is not None and config.shares % number:
         raise ConfigError(
@@ -71,7 +105,7 @@ def start(number: int | None, config: DqnConfig | None = None) -> tuple[Mesh | N
             f"dqn.batch = {config.batch} can be cut into",
         )
     mesh = make_mesh(number) if number > 1 else None
-    return mesh, mesh if is_chosen else None
+    return Workers(mesh=mesh), mesh
 
 
 def make_mesh(number: int | None = None) -> Mesh:
@@ -100,6 +134,10 @@ def spread(
 ) -> Callable[..., Any]:
     """A function whose inputs and outputs are split along their first axis, a part on each device.
 
+    XLA's partitioner finds the split. Under `shard_map`, jaxlib 0.11.2 crashes while it compiles a
+    step of MJX, on a CPU and on accelerators: its Shardy drops inputs that the body does not use
+    (`ManualComputationUnusedInputsPattern`), and MJX closes over a hundred constants.
+
     Args:
       function: of arrays, or pytrees of them, with a batch as first axis; rows must not depend on
         one another.
@@ -112,21 +150,61 @@ def spread(
     if mesh is None:
         return function
 
-    def split(*args: Any) -> Any:
-        specs = tuple(
-            PartitionSpec() if i in whole else PartitionSpec(AXIS) for i in range(len(args))
-        )
-        # What varies over the mesh is not checked: MJX builds constants inside its loops.
-        return jax.shard_map(
-            function, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(AXIS), check_vma=False
-        )(*args)
-
-    def partition(*args: Any) -> Any:
+    def partitioned(*args: Any) -> Any:
         rows = NamedSharding(mesh, PartitionSpec(AXIS))
         constrain = jax.lax.with_sharding_constraint
         args = tuple(x if i in whole else constrain(x, rows) for i, x in enumerate(args))
         return constrain(function(*args), rows)
 
-    # For accelerators XLA's compiler crashes on a step of MJX under `shard_map` (jaxlib 0.11.2);
-    # its partitioner finds the same split. On a CPU that would make threads wait for one another.
-    return split if jax.default_backend() == "cpu" else partition
+    return partitioned
+
+
+def side_by_side(function: Callable[[int], T], number: int) -> list[T]:
+    """`function(0)`, `function(1)` and so on, each in a thread: one alone leaves cores idle."""
+    if number == 1:
+        return [function(0)]
+    with ThreadPoolExecutor(number) as executor:
+        futures = [executor.submit(function, i) for i in range(number)]
+        # A thread that waits for good may not hear of Ctrl-C.
+        while wait(futures, timeout=0.2).not_done:
+            pass
+        return [future.result() for future in futures]
+
+
+def part(
+    args: tuple[Any, ...], i: int, number: int, whole: tuple[int, ...] = ()
+) -> tuple[Any, ...]:
+    """The i-th of `number` equal parts of arguments, along their first axis.
+
+    Args:
+      args: arrays, their shapes, or pytrees of them; `number` divides their first axis.
+      i: which part.
+      number: of parts.
+      whole: positions of arguments that are in every part as they are.
+    """
+    if number == 1:
+        return args
+
+    def cut(x: Any) -> Any:
+        rows = x.shape[0] // number
+        if isinstance(x, jax.ShapeDtypeStruct):
+            return x.update(shape=(rows, *x.shape[1:]))
+        return x[i * rows : (i + 1) * rows]
+
+    return tuple(x if j in whole else jax.tree.map(cut, x) for j, x in enumerate(args))
+
+
+def of_all_parts(shapes: Any, number: int) -> Any:
+    """The shapes of the results of `number` parts together, from those of one."""
+    if number == 1:
+        return shapes
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((number * x.shape[0], *x.shape[1:]), x.dtype), shapes
+    )
+
+
+def joined(parts: list[Any]) -> Any:
+    """The results of parts as one, on the host if there are several."""
+    if len(parts) == 1:
+        return parts[0]
+    return jax.tree.map(lambda *x: np.concatenate([np.asarray(each) for each in x]), *parts)

@@ -53,11 +53,6 @@ class Display:
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
-    def note(self, text: str) -> None:
-        """Shows a line in between."""
-        if not self._quiet:
-            _print(text)
-
     def show(self, stage: str, done: int, total: int, figures: dict[str, float]) -> None:
         """Takes a report of a `Monitor`; one without a total says that a stage compiles."""
         if total:
@@ -108,7 +103,7 @@ class Display:
         if not total:
             if stage not in self._last:
                 self._last[stage] = now
-                _print(f"{clock}: compiling")
+                say(f"{clock}: compiling")
             return
         is_first = stage not in self._first
         rate, left = self._rate(stage, done, total, now)
@@ -117,10 +112,10 @@ class Display:
         self._last[stage] = now
         parts = [f"{done} of {total}", rate, left]
         progress = "done" if total == 1 else ", ".join(part for part in parts if part)
-        _print(f"{clock}: {progress}  {text}".rstrip())
+        say(f"{clock}: {progress}  {text}".rstrip())
 
 
-def _print(text: str) -> None:
+def say(text: str) -> None:
     """Prints a line, if anybody still reads: a run must not be lost with what shows it."""
     with contextlib.suppress(BrokenPipeError):
         print(text, flush=True)

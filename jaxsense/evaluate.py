@@ -49,7 +49,7 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
-        mesh, _ = devices.start(arguments.devices)
+        workers, _ = devices.start(arguments.devices)
         config, models = rundir.load(arguments.run)
         played = _cases(arguments, config)
         summary = rundir.read_summary(arguments.run)
@@ -66,7 +66,7 @@ def main(argv: list[str] | None = None) -> None:
     team = mission.make_mission(config)
     with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
         number = arguments.episodes * len(played)
-        player = mission.Player(team, compiler, mission.batch_of(number), mesh)
+        player = mission.Player(team, compiler, mission.batch_of(number), workers)
         player.wait()
         begin = time.perf_counter()
         found = mission.summary(key, player, models, played, arguments.episodes)

@@ -1,26 +1,72 @@
-"""Files that are written as a whole or not at all."""
+"""Files that are written as a whole or not at all, and directories kept for one process."""
 
 import contextlib
 import os
+import secrets
+from collections.abc import Iterator
 from pathlib import Path
+
+import filelock
 
 
 def write(path: Path, content: str | bytes) -> None:
-    """Writes a file so that a reader never sees half of it, also if there is no room.
+    """Writes a file so that a reader never sees half of it, also after a power failure.
 
     Args:
-      path: the file; what was there before is replaced.
+      path: the file; replaces what was there.
       content: of the file; text as UTF-8.
 
     Raises:
       OSError: names the file, which is then as it was before.
     """
-    unfinished = path.with_name(f".{path.name}.unfinished")
+    # A name of its own, as another process may write the same file.
+    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     try:
-        unfinished.write_bytes(content.encode() if isinstance(content, str) else content)
+        with unfinished.open("xb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
         unfinished.replace(path)
+        _sync(path.parent)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            unfinished.unlink(missing_ok=True)
         reason = os.strerror(error.errno) if error.errno else str(error)
         raise OSError(error.errno, reason, str(path)) from error
+    finally:
+        with contextlib.suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+
+
+def _sync(directory: Path) -> None:
+    """Makes the names in a directory durable, where the system can."""
+    with contextlib.suppress(OSError):
+        number = os.open(directory, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+
+
+@contextlib.contextmanager
+def locked(directory: Path, *, waits: bool) -> Iterator[None]:
+    """Keeps a directory for this process, by a lock on the file `.lock` in it.
+
+    Args:
+      directory: must exist.
+      waits: wait until another process gives the directory up.
+
+    Raises:
+      BlockingIOError: if another process keeps the directory, and `waits` is False.
+      OSError: if the lock cannot be taken.
+    """
+    path = directory / ".lock"
+    lock = filelock.FileLock(path, timeout=-1 if waits else 0)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        raise BlockingIOError(f"{directory} is kept by another process") from None
+    except NotImplementedError as error:  # from some network file systems
+        raise OSError(None, str(error), str(path)) from error
+    try:
+        yield
+    finally:
+        lock.release()

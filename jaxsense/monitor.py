@@ -19,6 +19,11 @@ class Stopped(Exception):  # noqa: N818 (nothing is wrong)
     """A run that was asked to stop; what it trained until then has been saved."""
 
 
+def is_finite(values: Any) -> bool:
+    """Whether all numbers in arrays, or pytrees of them, are finite."""
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(values))
+
+
 class Monitor:
     """What the stages of a run have in common: a clock and a listener.
 
@@ -26,20 +31,31 @@ class Monitor:
       seconds: for each stage, `{"compile_s": ..., "run_s": ...}` so far.
     """
 
-    def __init__(self, listener: Listener = lambda stage, done, total, figures: None):
-        self.seconds: dict[str, dict[str, float]] = {}
+    def __init__(
+        self,
+        listener: Listener = lambda stage, done, total, figures: None,
+        warn: Callable[[str], None] = lambda text: None,
+    ):
+        """Begins a run.
+
+        Args:
+          listener: is told of progress.
+          warn: takes a line about something that went wrong and does not end the run.
+        """
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._listener = self._one_at_a_time(listener)
+        self.warn = warn
+        self.begin(listener)
 
-    def _one_at_a_time(self, listener: Listener) -> Listener:
-        """Stages may run side by side."""
+    def begin(self, listener: Listener) -> None:
+        """Begins another run, with other times and another listener."""
+        self.seconds: dict[str, dict[str, float]] = {}
+        self._one_listener = listener
 
-        def listen(stage: str, done: int, total: int, figures: dict[str, float]) -> None:
-            with self._lock:
-                listener(stage, done, total, figures)
-
-        return listen
+    def _listener(self, stage: str, done: int, total: int, figures: dict[str, float]) -> None:
+        """Tells the listener; stages may run side by side."""
+        with self._lock:
+            self._one_listener(stage, done, total, figures)
 
     def stop(self) -> None:
         """Asks the stages to save what they have and to stop."""
@@ -63,13 +79,25 @@ class Monitor:
         """Reports progress of a stage that has no loss."""
         self._listener(stage, done, total, {})
 
-    def check_finite(self, stage: str, params: Any) -> None:
-        """Raises a `StageError` if a trained parameter is not finite."""
-        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params)):
-            raise StageError(f"{stage}: parameters are not finite after the last step")
+    def check_finite(self, stage: str, name: str, values: Any) -> None:
+        """Raises a `StageError` that names the stage and the values, if one is not finite.
+
+        Args:
+          stage: its name.
+          name: of the values, for example "parameters at step 20 of 40".
+          values: arrays, or pytrees of them.
+        """
+        if not is_finite(values):
+            raise StageError(f"{stage}: {name} are not finite")
 
     def report(
-        self, stage: str, done: int, total: int, losses: np.ndarray, **figures: float
+        self,
+        stage: str,
+        done: int,
+        total: int,
+        losses: np.ndarray,
+        params: Any = (),
+        **figures: float,
     ) -> None:
         """Reports a chunk of training.
 
@@ -78,15 +106,17 @@ class Monitor:
           done: steps so far, those of the chunk included.
           total: steps of the whole stage.
           losses: `[steps]` of the chunk; their mean is reported.
+          params: what was trained, as it is after the chunk.
           **figures: what else to report.
 
         Raises:
-          StageError: if a loss is not finite; names the first such step.
+          StageError: if a loss or a parameter is not finite; names the step.
         """
         bad = np.flatnonzero(~np.isfinite(losses))
         if len(bad):
             step = done - len(losses) + bad[0] + 1
             raise StageError(f"{stage}: loss = {losses[bad[0]]} at step {step} of {total}")
+        self.check_finite(stage, f"parameters after step {done} of {total}", params)
         self._listener(stage, done, total, {"loss": float(np.mean(losses)), **figures})
 
     def add(self, stage: str, kind: str, seconds: float) -> None:

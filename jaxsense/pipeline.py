@@ -4,10 +4,11 @@ Stages run on the host and call compiled programs; between two chunks of work th
 `Monitor`, so that nothing calls back from inside a compiled loop.
 """
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import jax
@@ -20,16 +21,19 @@ from jaxsense.chunks import run_chunks
 from jaxsense.compilation import Compiler, Kept
 from jaxsense.config import Config
 from jaxsense.detections import Detections, detect, labels_of_classes
+from jaxsense.devices import ALONE, Workers, side_by_side
 from jaxsense.models import Models, untrained
-from jaxsense.monitor import Monitor, Stopped
+from jaxsense.monitor import Monitor, Stopped, is_finite
 from jaxsense.networks import Params
 from jaxsense.programs import (
     Programs,
     Surveys,
+    best_restart,
+    chunks_of,
     compile_programs,
-    last_steps,
-    num_chunks,
+    keys_of,
     num_scenes,
+    survey_rows,
 )
 from jaxsense.sim.world import make_world
 from jaxsense.types import Belief, Key
@@ -60,39 +64,56 @@ class RunResult:
     summary: dict[str, Any]
 
 
+@contextlib.contextmanager
+def compiled(
+    config: Config,
+    monitor: Monitor,
+    workers: Workers = ALONE,
+    learner_mesh: Mesh | None = None,
+    kept: Kept | None = None,
+) -> Iterator[Programs]:
+    """The programs of runs with the same settings, compiled in the background.
+
+    Args:
+      config: all settings.
+      monitor: is told how long it takes.
+      workers: who shares simulations.
+      learner_mesh: devices that the environments of Q-learning are split over; the first one alone
+        if not given.
+      kept: where compiled programs are kept for later runs, if anywhere.
+    """
+    with Compiler(monitor, kept) as compiler:
+        yield compile_programs(config, make_world(config), compiler, workers, learner_mesh)
+
+
 def run(
     key: Key,
     config: Config,
+    programs: Programs,
     monitor: Monitor,
     checkpoints: Checkpoints | None = None,
-    mesh: Mesh | None = None,
-    learner_mesh: Mesh | None = None,
-    kept: Kept | None = None,
 ) -> RunResult:
     """All stages.
 
     Args:
       key: the only source of randomness.
       config: all settings.
+      programs: from `compiled`, with the same settings and monitor.
       monitor: is told of time and progress.
       checkpoints: where what is trained is saved, if anywhere; what is there already, from the same
         key and settings, is not trained again.
-      mesh: devices that simulations are split over; the first one alone if not given.
-      learner_mesh: devices that the environments of Q-learning are split over, likewise.
-      kept: where compiled programs are kept for later runs, if anywhere.
 
     Returns:
       The trained networks and their figures.
 
     Raises:
-      StageError: if a loss is not finite.
+      StageError: if something is not finite; trainings under way have been saved as they were
+        before.
       Stopped: if the monitor was told to stop; trainings under way have been saved.
-      ConfigError: if a checkpoint is damaged.
       OSError: if a checkpoint cannot be written.
     """
-    with Compiler(monitor, kept) as compiler, ThreadPoolExecutor(1) as saver:
-        programs = compile_programs(config, make_world(config), compiler, mesh, learner_mesh)
-        checkpoints = checkpoints or Checkpoints()
+    checkpoints = checkpoints or Checkpoints()
+    with ThreadPoolExecutor(1) as saver:
         stages = Stages(config, programs, monitor, checkpoints, saver)
         try:
             result = stages.run(key)
@@ -124,30 +145,34 @@ class Stages:
     def run(self, key: Key) -> RunResult:
         """All stages."""
         config, programs, names = self._config, self._programs, self._config.modalities
-        survey_key, detector_key, jmvae_key, mission_key, *dqn_keys = _keys(key, 4 + len(names))
-        surveys = jax.tree.map(np.asarray, programs.simulate(survey_key))
+        survey_key, detector_key, jmvae_key, mission_key, *dqn_keys = keys_of(key, 4 + len(names))
+        surveys = self.survey(survey_key)
         trained = self._once(
             "detectors",
             self._shapes.detectors,
             lambda: self.train_detectors(detector_key, surveys),
         )
         detections = detect(programs, trained, surveys, config)
+        features = detections.train, detections.held_out, detections.starts[2]
+        self._monitor.check_finite("detect", "features", features)
         params = self._once(
             "jmvae", self._shapes.jmvae, lambda: self.train_jmvae(jmvae_key, detections.train)
         )
         posteriors, jmvae_figures = programs.examine_jmvae(params, detections.held_out)
         class_beliefs = jax.tree.map(lambda x: np.asarray(x).mean(axis=1), posteriors["joint"])
+        self._monitor.check_finite("evaluate_jmvae", "class beliefs", class_beliefs)
         self._save("class_beliefs", class_beliefs)
 
         def train_and_examine(modality: int):
-            train_key, examine_key = _keys(dqn_keys[modality], 2)
+            train_key, examine_key = keys_of(dqn_keys[modality], 2)
             q_network, curves = self.train_dqn(train_key, modality, trained, params, detections)
             figures = self.examine_dqn(examine_key, modality, q_network, params, detections)
             return q_network, curves, {**figures, **_speed(config, curves)}
 
         q_networks, curves, dqn_figures = zip(
-            *_side_by_side(train_and_examine, len(names)), strict=True
+            *side_by_side(train_and_examine, len(names)), strict=True
         )
+        self._monitor.check_stop()
         models = Models(trained, params, class_beliefs, q_networks)
         played = {n: case for n, case in mission.cases(config).items() if n in mission.POLICIES}
         player, episodes = programs.player.result(), config.mission.episodes
@@ -172,15 +197,24 @@ class Stages:
         for each in self._saving:
             each.result()
 
+    def survey(self, key: Key) -> Surveys:
+        """Looks at every PoI of all scenes, on the host."""
+        simulate, total = self._programs.simulate, sum(num_scenes(self._config))
+        found = simulate(key, survey_rows(self._config, simulate.num_workers))
+        surveys = jax.tree.map(lambda x: np.asarray(x)[:total], found)
+        self._monitor.check_finite("simulate", "scans", surveys.windows)
+        self._monitor.check_stop()
+        return surveys
+
     def train_detectors(self, key: Key, surveys: Surveys) -> tuple[Detector, ...]:
         """Trains the detectors on some of the surveys."""
         config, settings = self._config, self._config.detector
-        num_train, number = num_scenes(config)[0], num_chunks(settings.steps)
-        keys = _keys(key, len(config.modalities))
+        num_train, (number, size) = num_scenes(config)[0], chunks_of(settings.steps)
+        keys = keys_of(key, len(config.modalities))
 
         def train(modality: int) -> Detector:
             stage = f"detector_{config.modalities[modality]}"
-            init_key, *chunk_keys = _keys(keys[modality], 1 + number)
+            init_key, *chunk_keys = keys_of(keys[modality], 1 + number)
             windows = surveys.windows[modality][:num_train]
             windows = jax.device_put(windows.reshape(-1, windows.shape[-1]))
             labels = labels_of_classes(config, modality)[surveys.classes[:num_train]].reshape(-1)
@@ -189,41 +223,46 @@ class Stages:
 
             def train_chunk(i: int, state: Any) -> tuple[Any, Curves]:
                 state, losses = step(chunk_keys[i], state, detector, windows, labels)
-                done = (i + 1) * settings.steps // number
-                self._monitor.report(stage, done, settings.steps, np.asarray(losses))
+                done = min((i + 1) * size, settings.steps)
+                losses = np.asarray(losses)[: done - i * size]
+                self._monitor.report(stage, done, settings.steps, losses, state.params)
                 return state, {}
 
             state, _ = self._in_chunks(stage, state, number, train_chunk)
-            self._monitor.check_finite(stage, state.params)
             return dataclasses.replace(detector, params=state.params)
 
-        return tuple(_side_by_side(train, len(config.modalities)))
+        return tuple(side_by_side(train, len(config.modalities)))
 
     def train_jmvae(self, key: Key, bank: tuple[np.ndarray, ...]) -> Params:
         """Trains JMVAEs on a bank of detections and keeps the one with the lowest last losses."""
         settings, step = self._config.jmvae, self._programs.train_jmvae
-        number = num_chunks(settings.steps)
-        keys = [_keys(of_restart, 1 + number) for of_restart in _keys(key, settings.restarts)]
+        number, size = chunks_of(settings.steps)
+        keys = [keys_of(of_restart, 1 + number) for of_restart in keys_of(key, settings.restarts)]
         states = [self._programs.begin_jmvae(of_restart[0]) for of_restart in keys]
-        last = last_steps(settings)
+        failed: set[int] = set()
 
         def train_chunk(i: int, states: Any) -> tuple[Any, Curves]:
             # On a CPU a batch of small networks takes longer than one after the other.
             states, losses = zip(
-                *_side_by_side(lambda r: step(keys[r][1 + i], states[r], bank), len(keys)),
+                *side_by_side(lambda r: step(keys[r][1 + i], states[r], bank), len(keys)),
                 strict=True,
             )
-            losses = np.stack(losses)
-            # The worst loss, so that a restart that fails does not go unnoticed.
-            worst, done = losses.max(axis=0), (i + 1) * settings.steps // number
-            self._monitor.report("jmvae", done, settings.steps, worst)
-            return list(states), {str(r): [float(x[-last:].mean())] for r, x in enumerate(losses)}
+            done = min((i + 1) * size, settings.steps)
+            losses = np.stack(losses)[:, : done - i * size]
+            sound = [r for r in range(len(keys)) if is_finite((losses[r], states[r].params))]
+            for r in set(range(len(keys))) - {*sound, *failed} if sound else ():
+                failed.add(r)
+                self._monitor.warn(f"jmvae: restart {r} is not finite by step {done}: left out")
+            # The worst loss of those that go on; if there is none, this raises.
+            chosen = sound or range(len(keys))
+            worst = losses[list(chosen)].max(axis=0)
+            params = [states[r].params for r in chosen]
+            self._monitor.report("jmvae", done, settings.steps, worst, params)
+            return list(states), {str(r): x.tolist() for r, x in enumerate(losses)}
 
         states, losses = self._in_chunks("jmvae", states, number, train_chunk)
-        best = int(np.argmin([losses[str(r)][-1] for r in range(settings.restarts)]))
-        params = jax.tree.map(np.asarray, states[best].params)
-        self._monitor.check_finite("jmvae", params)
-        return params
+        best = best_restart(np.array([losses[str(r)] for r in range(len(keys))]), settings)
+        return jax.tree.map(np.asarray, states[int(best)].params)
 
     def train_dqn(
         self,
@@ -245,11 +284,11 @@ class Stages:
             "reward": np.zeros(settings.epochs, np.float32),
             "seconds": np.zeros(number, np.float32),
         }
-        q_network = self._checkpoints.load(stage, self._shapes.q_networks[modality])
-        curves = self._checkpoints.load(f"{stage}_curves", curves_shape)
+        q_network = self._checkpoints.load_or_forget(stage, self._shapes.q_networks[modality])
+        curves = self._checkpoints.load_or_forget(f"{stage}_curves", curves_shape)
         if q_network is not None and curves is not None:
             return q_network, {name: curve.tolist() for name, curve in curves.items()}
-        start_key, init_key, *chunk_keys = _keys(key, 2 + number)
+        start_key, init_key, *chunk_keys = keys_of(key, 2 + number)
         models = trained, params, detections.train
         prepared = self._programs.start_dqn(start_key, detections.starts, *models)
 
@@ -267,6 +306,7 @@ class Stages:
                 (i + 1) * settings.chunk,
                 settings.epochs,
                 np.asarray(info.loss),
+                state.params,
                 reward=float(np.average(ended, weights=np.maximum(episodes, 1e-9))),
                 epsilon=float(info.epsilon[-1]),
             )
@@ -275,7 +315,6 @@ class Stages:
 
         state = self._programs.begin_dqn(init_key, prepared, *models)
         state, curves = self._in_chunks(stage, state, number, train_chunk)
-        self._monitor.check_finite(stage, state.params)
         q_network = jax.tree.map(np.asarray, state.params)
         self._save(stage, q_network)
         self._save(
@@ -298,12 +337,14 @@ class Stages:
         """
         inputs = np.int32(modality), q_network, params, detections.held_out
         total, first = self._programs.examine_dqn(key, *inputs)
+        stage = f"evaluate_dqn_{self._config.modalities[modality]}"
+        self._monitor.check_finite(stage, "rewards", (total, first))
         num_random = self._config.evaluation.num_starts
         return examine.policy_figures(np.asarray(total), np.asarray(first), num_random)
 
     def _once(self, name: str, shapes: T, train: Callable[[], T]) -> T:
         """What is saved under a name; trained and saved if it is not."""
-        found = self._checkpoints.load(name, shapes)
+        found = self._checkpoints.load_or_forget(name, shapes)
         if found is not None:
             return found
         trained = train()
@@ -329,21 +370,6 @@ def _speed(config: Config, curves: Curves) -> dict[str, float]:
     """The figures `env_steps` and `env_steps_per_s` of a training."""
     env_steps = config.dqn.epochs * config.dqn.num_envs
     return {"env_steps": env_steps, "env_steps_per_s": env_steps / sum(curves["seconds"])}
-
-
-def _keys(key: Key, number: int) -> list[Key]:
-    """Different keys, as from `jax.random.split`, which would compile anew for each number."""
-    return [jax.random.fold_in(key, i) for i in range(number)]
-
-
-def _side_by_side(function: Callable[[int], T], number: int) -> list[T]:
-    """`function(0)`, `function(1)` and so on, each in a thread: one alone leaves cores idle."""
-    with ThreadPoolExecutor(number) as executor:
-        futures = [executor.submit(function, i) for i in range(number)]
-        # A thread that waits for good may not hear of Ctrl-C.
-        while wait(futures, timeout=0.2).not_done:
-            pass
-        return [future.result() for future in futures]
 
 
 def as_lists(figures: dict[str, Any]) -> dict[str, Any]:

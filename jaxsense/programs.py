@@ -11,14 +11,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxsense import devices, examine, mission, observe
+from jaxsense import examine, mission, observe
 from jaxsense.compilation import Compiler, Program
 from jaxsense.config import Config, JmvaeConfig
+from jaxsense.devices import ALONE, Workers
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn import training as dqn
+from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.models import Models, jmvae_shape, untrained
 from jaxsense.networks import Params
 from jaxsense.observe import Bank
@@ -50,7 +53,7 @@ class Programs:
     """The programs of each stage; for the detectors one for each modality.
 
     Attributes:
-      simulate: `(key) -> Surveys`.
+      simulate: `(key, rows [S']) -> Surveys` of those scenes, see `survey_rows`.
       begin_detectors: `(key, windows [S, F]) -> (detector, state)`.
       train_detectors: `(key, state, detector, windows, labels [S]) -> (state, losses)`, a chunk.
       detect: `(detectors, windows of each modality [S, N, F]) -> features of each [S, N, D_m]`.
@@ -93,10 +96,10 @@ def compile_programs(
     config: Config,
     world: World,
     compiler: Compiler,
-    mesh: Mesh | None = None,
+    workers: Workers = ALONE,
     learner_mesh: Mesh | None = None,
 ) -> Programs:
-    """Begins to trace and to compile; see `pipeline.run` for the arguments."""
+    """Begins to trace and to compile; see `pipeline.compiled` for the arguments."""
     stages = [f"detector_{name}" for name in config.modalities]
     programs = Programs(
         simulate=Program(compiler, "simulate", "run"),
@@ -116,12 +119,12 @@ def compile_programs(
     def trace_missions() -> None:
         batch = mission.batch_of(len(mission.POLICIES) * config.mission.episodes)
         team = mission.make_mission(config)
-        programs.player.set_result(mission.Player(team, compiler, batch, mesh))
+        programs.player.set_result(mission.Player(team, compiler, batch, workers))
 
     def trace() -> None:
         try:
             models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
-            surveys = _trace_simulation(programs, config, world, mesh)
+            surveys = _trace_simulation(programs, config, world, workers)
             # Needed last, but on a CPU they take longest to compile. Beside an accelerator are
             # cores enough to compile, and what all wait for is tracing.
             if _on_cpu():
@@ -140,14 +143,27 @@ def compile_programs(
     return programs
 
 
-def num_chunks(steps: int) -> int:
-    """The most chunks, up to 20, into which steps can be cut evenly."""
-    return max(n for n in range(1, _MOST_CHUNKS + 1) if steps % n == 0)
+def keys_of(key: Key, number: int) -> list[Key]:
+    """Different keys, as from `jax.random.split`, which would compile anew for each number."""
+    return [jax.random.fold_in(key, i) for i in range(number)]
 
 
-def last_steps(settings: JmvaeConfig) -> int:
-    """Steps at the end of a JMVAE's training whose losses are compared."""
-    return max(settings.steps // _MOST_CHUNKS, 1)
+def chunks_of(steps: int) -> tuple[int, int]:
+    """The number of chunks that steps are cut into, at most 20, and the steps of each.
+
+    The last one may have less to do, see `training.fit`.
+    """
+    size = -(-steps // _MOST_CHUNKS)
+    return -(-steps // size), size
+
+
+def best_restart(losses: Any, settings: JmvaeConfig) -> Any:
+    """`[]` the restart with the lowest mean loss at the end, of `[R, steps]` losses.
+
+    One whose losses are not finite is the best only if all are like it.
+    """
+    last = losses[:, -max(settings.steps // _MOST_CHUNKS, 1) :].mean(axis=1)
+    return jnp.argmin(jnp.where(jnp.isfinite(last), last, jnp.inf))
 
 
 def num_scenes(config: Config) -> tuple[int, int, int]:
@@ -174,18 +190,50 @@ def _on_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
+def survey_rows(config: Config, number: int = 1) -> np.ndarray:
+    """`[S']` int32 all scenes to survey, some of them again so that `number` divides S'."""
+    total = sum(num_scenes(config))
+    return np.arange(-(-total // number) * number, dtype=np.int32) % total
+
+
+def survey_scenes(key: Key, rows: jax.Array, config: Config, world: World) -> Surveys:
+    """Surveys for all purposes: simulating takes longer to compile than to run.
+
+    Args:
+      key: random key of all scenes.
+      rows: `[S']` int32 which of them.
+      config: all settings.
+      world: the simulation.
+    """
+    class_key, scene_key = jax.random.split(key)
+    numbers = num_scenes(config)
+    keys = jax.random.split(class_key, len(numbers))
+    parts = [observe.balanced_classes(k, config, n) for k, n in zip(keys, numbers, strict=True)]
+    classes = jnp.concatenate(parts)[rows]
+    scene_keys = jax.random.split(scene_key, sum(numbers))[rows]
+    return Surveys(classes, *observe.surveys(scene_keys, world, classes))
+
+
 def _trace_simulation(
-    programs: Programs, config: Config, world: World, mesh: Mesh | None
+    programs: Programs, config: Config, world: World, workers: Workers
 ) -> Surveys:
     """The surveys; returns their shapes."""
-    key = jax.random.key(0)
-    return programs.simulate.compile(lambda k: _simulate(k, config, world, mesh), key, mesh=mesh)
+    key, rows = jax.random.key(0), survey_rows(config, workers.number)
+    shapes = programs.simulate.compile(
+        lambda key, rows: survey_scenes(key, rows, config, world),
+        key,
+        jax.ShapeDtypeStruct(rows.shape, rows.dtype),
+        workers=workers,
+        whole=(0,),
+    )
+    total = sum(num_scenes(config))
+    return jax.tree.map(lambda x: x.update(shape=(total, *x.shape[1:])), shapes)
 
 
 def _trace_detectors(programs: Programs, config: Config, models: Models, surveys: Surveys) -> None:
     """Training and use of the detectors."""
     key, settings = jax.random.key(0), config.detector
-    steps = settings.steps // num_chunks(settings.steps)
+    _, steps = chunks_of(settings.steps)
     num_train = num_scenes(config)[0]
     rows = num_train * config.arena.num_pois
     for m, windows in enumerate(surveys.windows):
@@ -215,25 +263,10 @@ def _trace_detectors(programs: Programs, config: Config, models: Models, surveys
     programs.detect.compile(detect, models.detectors, others)
 
 
-def _simulate(key: Key, config: Config, world: World, mesh: Mesh | None) -> Surveys:
-    """Surveys for all purposes: simulating takes longer to compile than to run."""
-    class_key, scene_key = jax.random.split(key)
-    numbers = num_scenes(config)
-    keys = jax.random.split(class_key, len(numbers))
-    parts = [observe.balanced_classes(k, config, n) for k, n in zip(keys, numbers, strict=True)]
-    classes = jnp.concatenate(parts)
-    num_devices = 1 if mesh is None else mesh.size
-    rows = jnp.arange(-(-len(classes) // num_devices) * num_devices) % len(classes)
-    scene_keys = jax.random.split(scene_key, len(classes))
-    survey = devices.spread(lambda keys, classes: observe.surveys(keys, world, classes), mesh)
-    scenes, windows = survey(scene_keys[rows], classes[rows])
-    return jax.tree.map(lambda x: x[: len(classes)], Surveys(classes, scenes, windows))
-
-
 def _trace_jmvae(programs: Programs, config: Config, models: Models) -> tuple[Bank, Bank]:
     """The JMVAE; returns the shapes of the banks for training and for measuring."""
     key, settings, model = jax.random.key(0), config.jmvae, jmvae_shape(config)
-    num_classes, steps = len(config.arena.classes), settings.steps // num_chunks(settings.steps)
+    num_classes, (_, steps) = len(config.arena.classes), chunks_of(settings.steps)
 
     def bank(number: int) -> Any:
         shapes = [(num_classes, number, size) for size in model.feature_sizes]
@@ -254,6 +287,35 @@ def _trace_jmvae(programs: Programs, config: Config, models: Models) -> tuple[Ba
     return banks
 
 
+def make_map_mdp(
+    config: Config, world: World, trained: tuple[Detector, ...], params: Params, bank: Bank
+) -> MapMdp:
+    """The map MDP in which the Q-networks learn."""
+    model = jmvae_shape(config)
+    if config.dqn.observe == "live":
+        return observe.live_mdp(config, world, trained, params, model)
+    return observe.bank_mdp(config, bank, params, model)
+
+
+def episode_starts(
+    key: Key,
+    mdp: MapMdp,
+    config: Config,
+    starts: tuple[jax.Array, Scene, tuple[jax.Array, ...]],
+) -> MapState:
+    """`[num_starts]` states in which episodes start; in `starts`, see `Detections`, if live."""
+    number = config.dqn.num_starts
+    if config.dqn.observe == "bank":
+        return dqn.starts(key, mdp, number)
+
+    def begin(key: Key, classes: jax.Array, scene: Scene, looks: tuple[jax.Array, ...]):
+        seen_key, begin_key = jax.random.split(key)
+        seen = belief_mdp.random_start(seen_key, mdp)[1]
+        return belief_mdp.begin(begin_key, mdp, scene, classes, seen, looks)
+
+    return jax.vmap(begin)(jax.random.split(key, number), *starts)
+
+
 def _trace_dqn(
     programs: Programs,
     config: Config,
@@ -266,22 +328,11 @@ def _trace_dqn(
     """Q-learning and the policies' examination; one program serves all modalities."""
     key, settings, model = jax.random.key(0), config.dqn, jmvae_shape(config)
 
-    def make_mdp(trained: tuple[Detector, ...], params: Params, bank: Bank):
-        if settings.observe == "live":
-            return observe.live_mdp(config, world, trained, params, model)
-        return observe.bank_mdp(config, bank, params, model)
+    def make_mdp(*trained: Any) -> MapMdp:
+        return make_map_mdp(config, world, *trained)
 
-    def start(key: Key, starts, *trained: Any):
-        mdp = make_mdp(*trained)
-        if settings.observe == "bank":
-            return dqn.starts(key, mdp, settings.num_starts)
-
-        def begin(key: Key, classes: jax.Array, scene: Scene, looks: tuple[jax.Array, ...]):
-            seen_key, begin_key = jax.random.split(key)
-            seen = belief_mdp.random_start(seen_key, mdp)[1]
-            return belief_mdp.begin(begin_key, mdp, scene, classes, seen, looks)
-
-        return jax.vmap(begin)(jax.random.split(key, settings.num_starts), *starts)
+    def start(key: Key, starts, *trained: Any) -> MapState:
+        return episode_starts(key, make_mdp(*trained), config, starts)
 
     def train(key: Key, modality: jax.Array, state: dqn.DqnState, starts, *trained: Any):
         return dqn.train_chunk(key, make_mdp(*trained), modality, settings, state, starts, mesh)
@@ -311,8 +362,7 @@ def _trace_dqn(
         shardings["out_shardings"] = split, whole
     # With live observations most of the time goes into looking.
     runs_long = settings.observe == "bank" and _on_cpu()
-    options: Any = {"donate": (2,), "runs_long": runs_long, "mesh": mesh}
-    programs.train_dqn.compile(train, *inputs, **options, **shardings)
+    programs.train_dqn.compile(train, *inputs, runs_long=runs_long, **shardings)
     programs.examine_dqn.compile(
         functools.partial(examine.play, config=config),
         *(key, modality, models.q_networks[0], models.jmvae, banks[1]),

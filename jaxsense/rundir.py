@@ -2,8 +2,8 @@
 
 import contextlib
 import dataclasses
-import fcntl
 import importlib.metadata
+import itertools
 import json
 import subprocess
 from collections.abc import Iterator
@@ -18,6 +18,9 @@ from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
 from jaxsense.models import Models
 from jaxsense.version import __version__
 
+BLOCKS = ("detectors", "jmvae", "dqn", "mission")
+"""What a summary holds of what was trained."""
+_METRICS = "metrics.jsonl"
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
@@ -37,9 +40,16 @@ class Settings:
     config: Config
     num_seeds: int = 1
 
+    @property
+    def seeds(self) -> range:
+        """All seeds."""
+        return range(self.seed, self.seed + self.num_seeds)
+
 
 class RunDirectory:
     """Writes the files of one run; never over those of another.
+
+    As a context, it keeps the directory for this process, see `create` and `resume`.
 
     Attributes:
       path: the directory.
@@ -53,11 +63,13 @@ class RunDirectory:
         self.checkpoints = Checkpoints(path / "checkpoints")
 
     @classmethod
-    def create(cls, path: Path, settings: Settings) -> "RunDirectory":
-        """Makes the directory and writes `config.json`.
+    @contextlib.contextmanager
+    def create(cls, path: Path, settings: Settings) -> "Iterator[RunDirectory]":
+        """Makes the directory, writes `config.json`, and keeps the directory for this process.
 
         Raises:
-          ConfigError: if the directory holds something already or cannot be written.
+          ConfigError: if the directory holds something already, cannot be written, or is kept by
+            another process.
         """
         content = {
             "preset": settings.preset,
@@ -67,43 +79,32 @@ class RunDirectory:
             "versions": versions(),
             "commit": commit(),
         }
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            if any(path.iterdir()):
-                raise ConfigError("out", str(path), "is not empty; must be a new directory")
-            write_json(path / "config.json", content)
-        except OSError as error:
-            reason = f"cannot be written ({error.strerror}); must be a new directory"
-            raise ConfigError("out", str(path), reason) from None
-        return cls(path, settings)
+        reason = "cannot be written ({}); must be a new directory"
+        with contextlib.ExitStack() as kept:
+            try:
+                path.mkdir(parents=True, exist_ok=True)
+                # Also before the lock, which would be one file more in somebody's directory.
+                _check_empty(path)
+                kept.enter_context(_locked(path, "out"))
+                _check_empty(path)
+                write_json(path / "config.json", content)
+            except OSError as error:
+                raise ConfigError("out", str(path), reason.format(error.strerror)) from None
+            yield cls(path, settings)
 
     @classmethod
-    def resume(cls, path: Path) -> "RunDirectory":
-        """A directory of a run that has stopped.
-
-        Raises:
-          ConfigError: if there is no such run, if another version wrote it, or if it is finished.
-        """
-        content = _read_config(path / "config.json", "resume", path)
-        _check_version(content, "resume", path)
-        if (path / "summary.json").exists():
-            raise ConfigError("resume", str(path), "is finished; there is nothing to go on with")
-        return cls(path, _settings_of(content))
-
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keeps the directory for this process.
+    def resume(cls, path: Path) -> "Iterator[RunDirectory]":
+        """The directory of a run that has stopped, kept for this process.
 
         Raises:
-          ConfigError: if another process has it.
+          ConfigError: as `resumable`, or if another process keeps the directory.
         """
-        with (self.path / "config.json").open() as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                reason = "is being written by another process; wait for its end"
-                raise ConfigError("resume", str(self.path), reason) from None
-            yield
+        settings = resumable(path)
+        with _locked(path, "resume"):
+            run = cls(path, settings)
+            run._drop_unfinished_line()
+            yield run
 
     def write_json(self, name: str, content: Any) -> None:
         """Writes a file of the run, see the function of the same name."""
@@ -116,8 +117,67 @@ class RunDirectory:
 
     def append_metrics(self, **figures: Any) -> None:
         """Adds a line to `metrics.jsonl`."""
-        with (self.path / "metrics.jsonl").open("a") as lines:
+        with (self.path / _METRICS).open("a", encoding="utf-8") as lines:
             lines.write(json.dumps(figures) + "\n")
+
+    def _drop_unfinished_line(self) -> None:
+        """Cuts what a process that was killed has left of a line of `metrics.jsonl`."""
+        path = self.path / _METRICS
+        if path.exists():
+            content = path.read_bytes()
+            whole = content[: content.rfind(b"\n") + 1]
+            if whole != content:
+                files.write(path, whole)
+
+
+def unused(path: Path) -> Path:
+    """A directory that was not there, made under this name or, if it is taken, a numbered one.
+
+    Raises:
+      ConfigError: if it cannot be made.
+    """
+    first = path
+    for number in itertools.count(2):
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            path = first.with_name(f"{first.name}-{number}")
+        except OSError as error:
+            raise ConfigError("out", str(path), f"cannot be made ({error.strerror})") from None
+        else:
+            break
+    return path
+
+
+def _check_empty(path: Path) -> None:
+    """Raises a `ConfigError` if a directory holds more than a lock."""
+    if {file.name for file in path.iterdir()} - {".lock"}:
+        raise ConfigError("out", str(path), "is not empty; must be a new directory")
+
+
+def resumable(path: Path) -> Settings:
+    """The settings of a run that has stopped.
+
+    Raises:
+      ConfigError: if there is no such run, if another version wrote it, or if it is finished.
+    """
+    content = _read_config(path / "config.json", "resume", path)
+    _check_version(content, "resume", path)
+    if (path / "summary.json").exists():
+        raise ConfigError("resume", str(path), "is finished; there is nothing to go on with")
+    return _settings_of(content)
+
+
+@contextlib.contextmanager
+def _locked(path: Path, field: str) -> Iterator[None]:
+    """Keeps a directory for this process; a `ConfigError` about `field` if another one has it."""
+    with contextlib.ExitStack() as kept:
+        try:
+            kept.enter_context(files.locked(path, waits=False))
+        except BlockingIOError:
+            reason = "is being written by another process; wait for its end"
+            raise ConfigError(field, str(path), reason) from None
+        yield
 
 
 def versions() -> dict[str, str]:
@@ -160,7 +220,7 @@ def read_summary(path: Path) -> dict[str, Any]:
     """The `summary.json` of a finished run; a `ConfigError` if there is none."""
     try:
         summary = json.loads((path / "summary.json").read_text())
-        parts = {"timing", "detectors", "jmvae", "dqn", "mission"}
+        parts = {"timing", *BLOCKS}
         if not isinstance(summary, dict) or not parts <= set(summary):
             raise ValueError(f"must be an object with {', '.join(sorted(parts))}")
         return summary

@@ -81,6 +81,17 @@ def statistics(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return _statistics(list(summaries)) or {}
 
 
+def totals(timings: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """The seconds of each stage of several runs together."""
+    found: dict[str, dict[str, float]] = {}
+    for timing in timings:
+        for stage, seconds in timing.items():
+            entry = found.setdefault(stage, dict.fromkeys(seconds, 0.0))
+            for kind, value in seconds.items():
+                entry[kind] += value
+    return found
+
+
 def _statistics(values: list[Any]) -> Any:
     first = next((value for value in values if value is not None), None)
     if isinstance(first, dict):
@@ -95,7 +106,8 @@ def _statistics(values: list[Any]) -> Any:
 
 
 def _interval(values: np.ndarray) -> dict[str, float]:
-    mean, error = float(values.mean()), float(scipy.stats.sem(values))
+    mean = float(values.mean())
+    error = float(scipy.stats.sem(values)) if len(values) > 1 else 0.0
     low, high = mean, mean
     if error > 0:
         low, high = scipy.stats.t.interval(_CONFIDENCE, len(values) - 1, loc=mean, scale=error)

@@ -1,13 +1,13 @@
 """`python -m jaxsense.train`: the whole pipeline, from scanlines to policies, in one command."""
 
+import contextlib
 import dataclasses
-import logging
 import re
 import shlex
-import shutil
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,15 +26,16 @@ from jaxsense import (
     pipeline,
     report,
     rundir,
-    seeds,
     sweep,
     tensorboard,
 )
 from jaxsense.config import PRESETS, Config, ConfigError
-from jaxsense.display import Display
+from jaxsense.devices import Workers
+from jaxsense.display import Display, say
 from jaxsense.interrupt import on_interrupt
 from jaxsense.monitor import Monitor, StageError, Stopped
 from jaxsense.pipeline import RunResult
+from jaxsense.programs import Programs
 from jaxsense.rundir import RunDirectory, Settings
 from jaxsense.sim import sensors
 
@@ -54,8 +55,8 @@ class Arguments:
     out: Path | None = None
     """Directory to write; must be new. By default `runs/DATE-TIME-PRESET`."""
     num_seeds: int = 1
-    """Seeds to train side by side in one program, from `seed` on; each gets a directory in that of
-    the run, which holds their means and 95% intervals."""
+    """Seeds to train one after the other with the same programs, from `seed` on; each gets a run
+    directory in that of the run, which holds their means and 95% intervals."""
     file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
     """The `config.json` of a run, to start from its preset, seed and settings."""
     resume: Path | None = None
@@ -65,9 +66,8 @@ class Arguments:
     tensorboard: bool = False
     """Also write event files for TensorBoard, into `tensorboard/` of the run."""
     devices: int | None = None
-    """Devices that environments are split over: accelerators, or threads of the CPU. By default all
-    accelerators there are; on a CPU as many threads as cores, at most 8, for simulations, and one
-    for Q-learning."""
+    """Accelerators that environments are split over, by default all there are; on a CPU, threads
+    that share simulations, by default as many as cores, at most 8."""
     cache: Path | None = Path("~/.cache/jaxsense")
     """Directory in which compiled programs are kept for later runs; `None` to keep none."""
 
@@ -87,27 +87,20 @@ def main(
       change: what a program of your own makes of a preset, before the other options change that.
     """
     begin = time.perf_counter()
-    # Orbax logs what it raises as well, which here comes as one line.
-    logging.getLogger("absl").setLevel(logging.CRITICAL)
     arguments = parse(sys.argv[1:] if argv is None else argv, change)
     console = rich.console.Console(quiet=arguments.quiet)
     try:
-        meshes = devices.start(arguments.devices, arguments.config.dqn)
-        run = _open(arguments)
-        records = [run.append_metrics]
-        if arguments.tensorboard:
-            records.append(tensorboard.make_writer(run.path / "tensorboard"))
-        display = Display(console, *records, quiet=arguments.quiet)
-        with run.locked(), display:
-            _train(begin, arguments, run, meshes, display)
+        workers, learners = devices.start(arguments.devices, arguments.config.dqn)
+        with _open(arguments) as run:
+            _train(begin, arguments, run, workers, learners, console)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         # A full disk, mostly. What is there was written as a whole, or not at all.
         cli.fail(PROGRAM, f"cannot write {error}; what was saved before is still there")
-    first = run.path if arguments.num_seeds == 1 else _of_seed(run, arguments.seed).path
     if not arguments.quiet:
         _print_summary(console, run)
+    first = next(path for path in _paths(run) if (path / "report.html").exists())
     # The one thing that a quiet run says.
     print(f"Everything is in {run.path}; open {first / 'report.html'} first.")
     print(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate")
@@ -129,9 +122,6 @@ def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: c
             raise ConfigError("seed", arguments.seed, "must be within 0 and 2^32 - 1")
         if arguments.seed + arguments.num_seeds > 2**32:
             raise ConfigError("num_seeds", arguments.num_seeds, "leads beyond seed 2^32 - 1")
-        if arguments.num_seeds > 1 and arguments.devices is not None:
-            reason = "cannot be chosen for several seeds, which are one program on one device"
-            raise ConfigError("devices", arguments.devices, reason)
         if arguments.num_seeds < 1:
             raise ConfigError("num_seeds", arguments.num_seeds, "must be greater than 0")
         if arguments.file is not None and _option(argv, "preset"):
@@ -152,7 +142,7 @@ def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     """The settings that the other options change, which must be known before they are read."""
     resume, file = _option(argv, "resume"), _option(argv, "config")
     if resume:
-        return RunDirectory.resume(Path(resume)).settings
+        return rundir.resumable(Path(resume))
     if file:
         return rundir.read_settings(Path(file))
     preset = _option(argv, "preset") or "default"
@@ -167,73 +157,116 @@ def _option(argv: list[str], name: str) -> str | None:
     return found[-1] if found else None
 
 
-def _open(arguments: Arguments) -> RunDirectory:
+def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:
     """The run directory, which is made unless the run goes on."""
     if arguments.resume is not None:
         return RunDirectory.resume(arguments.resume)
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
-    return RunDirectory.create(arguments.out or Path("runs") / name, arguments.settings)
+    path = arguments.out or rundir.unused(Path("runs") / name)
+    return RunDirectory.create(path, arguments.settings)
 
 
 def _train(
     begin: float,
     arguments: Arguments,
     run: RunDirectory,
-    meshes: tuple[Mesh | None, Mesh | None],
-    display: Display,
+    workers: Workers,
+    learners: Mesh | None,
+    console: rich.console.Console,
 ) -> None:
-    """Trains, and writes all that a finished run holds."""
-    config = arguments.config
-    kept = cli.keep_programs(PROGRAM, arguments.cache, config)
-    monitor = Monitor(display.show)
+    """Trains one seed after the other with the same programs, and writes what they leave."""
+    settings, failed = run.settings, dict[int, str]()
+    kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config)
+    monitor = Monitor(warn=_warn)
 
     def stop() -> None:
         monitor.stop()
-        display.note("Stopping as soon as all is saved; Ctrl-C again does not wait for that.")
+        if not arguments.quiet:
+            say("Stopping as soon as all is saved; Ctrl-C again does not wait for that.")
 
     try:
-        with on_interrupt(stop):
-            if arguments.num_seeds > 1:
-                numbers = range(arguments.seed, arguments.seed + arguments.num_seeds)
-                results = seeds.run(numbers, config, monitor, run.checkpoints, kept)
-            else:
-                key = jax.random.key(arguments.seed)
-                result = pipeline.run(key, config, monitor, run.checkpoints, *meshes, kept)
-                results = {arguments.seed: result}
-            timing = {"total_s": time.perf_counter() - begin, "stages": monitor.seconds}
-            if arguments.num_seeds == 1:
-                _write(run, results[arguments.seed], timing)
-            else:
-                _write_seeds(run, results, timing)
+        with (
+            on_interrupt(stop),
+            pipeline.compiled(settings.config, monitor, workers, learners, kept) as programs,
+        ):
+            for seed, path in zip(settings.seeds, _paths(run), strict=True):
+                if (path / "summary.json").exists():
+                    continue
+                with _of_seed(run, seed, path) as of_seed:
+                    try:
+                        _train_one(begin, arguments, of_seed, programs, monitor, console)
+                    except StageError as error:
+                        failed[seed] = str(error)
+                        _warn(f"{error}; what was saved before is in {path}")
+                begin = time.perf_counter()
     except Stopped:
-        is_one = run.settings.num_seeds == 1
-        saved = "all that was trained" if is_one else "what all seeds have finished"
         go_on = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}"
-        print(f"Stopped; {saved} is saved. To go on: {go_on}", file=sys.stderr)
+        print(f"Stopped; all that was trained is saved. To go on: {go_on}", file=sys.stderr)
         sys.exit(_INTERRUPTED)
-    except StageError as error:
-        cli.fail(PROGRAM, f"{error}; must be finite. What was written before is in {run.path}")
+    if len(failed) == settings.num_seeds:
+        sys.exit(2)
+    if settings.num_seeds > 1:
+        _summarise_seeds(run, failed)
 
 
-def _write_seeds(run: RunDirectory, results: dict[int, RunResult], timing: dict[str, Any]) -> None:
-    """A directory for each seed, and what they have in common."""
-    for seed, result in results.items():
-        of_seed = _of_seed(run, seed)
-        of_seed.path.mkdir(exist_ok=True)
-        shutil.copy(run.path / "config.json", of_seed.path)
-        of_seed.save_models(result.models)
-    for seed, result in results.items():
-        _write(_of_seed(run, seed), result, timing)
-    summaries = {str(seed): result.summary for seed, result in results.items()}
-    over_seeds = sweep.statistics(list(summaries.values()))
-    run.write_json("summary.json", {**_header(run, timing), "seeds": summaries, **over_seeds})
-    run.checkpoints.forget()
+def _train_one(
+    begin: float,
+    arguments: Arguments,
+    run: RunDirectory,
+    programs: Programs,
+    monitor: Monitor,
+    console: rich.console.Console,
+) -> None:
+    """Trains one seed and writes its run directory; raises what `pipeline.run` raises."""
+    records = [run.append_metrics]
+    if arguments.tensorboard:
+        records.append(tensorboard.make_writer(run.path / "tensorboard"))
+    settings = run.settings
+    with Display(console, *records, quiet=arguments.quiet) as display:
+        monitor.begin(display.show)
+        key = jax.random.key(settings.seed)
+        result = pipeline.run(key, settings.config, programs, monitor, run.checkpoints)
+        timing = {"total_s": time.perf_counter() - begin, "stages": monitor.seconds}
+        _write(run, result, timing)
 
 
-def _of_seed(run: RunDirectory, seed: int) -> RunDirectory:
-    """The run directory of one of several seeds."""
-    settings = dataclasses.replace(run.settings, seed=seed)
-    return RunDirectory(run.path / f"seed-{seed}", settings)
+def _paths(run: RunDirectory) -> list[Path]:
+    """The directory of each seed."""
+    if run.settings.num_seeds == 1:
+        return [run.path]
+    return [run.path / f"seed-{seed}" for seed in run.settings.seeds]
+
+
+def _of_seed(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager[RunDirectory]:
+    """The run directory of one seed: of several, one of its own, as of a run of that seed alone."""
+    if path == run.path:
+        return contextlib.nullcontext(run)
+    if (path / "config.json").exists():
+        return RunDirectory.resume(path)
+    return RunDirectory.create(path, dataclasses.replace(run.settings, seed=seed, num_seeds=1))
+
+
+def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
+    """Writes the summary of several seeds: of each, and over those that did not fail."""
+    found = {
+        str(seed): rundir.read_summary(path)
+        for seed, path in zip(run.settings.seeds, _paths(run), strict=True)
+        if seed not in failed
+    }
+    blocks = [{name: one[name] for name in rundir.BLOCKS} for one in found.values()]
+    timing = {
+        "total_s": sum(one["timing"]["total_s"] for one in found.values()),
+        "stages": sweep.totals([one["timing"]["stages"] for one in found.values()]),
+    }
+    summary = {**_header(run, timing), "seeds": dict(zip(found, blocks, strict=True))}
+    if failed:
+        summary["failed"] = {str(seed): reason for seed, reason in failed.items()}
+    run.write_json("summary.json", {**summary, **sweep.statistics(blocks)})
+
+
+def _warn(text: str) -> None:
+    """A line about something that went wrong."""
+    print(f"{PROGRAM}: {text}", file=sys.stderr)
 
 
 def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any]) -> None:

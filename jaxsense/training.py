@@ -42,8 +42,9 @@ def fit(
     loss: Callable[[Params, Any, jax.Array], jax.Array],
     drawn: Any,
     optimiser: optax.GradientTransformation,
+    total: int,
 ) -> tuple[FitState, jax.Array]:
-    """Makes gradient steps.
+    """Makes gradient steps, but none beyond the last one of the whole training.
 
     Args:
       state: where to start.
@@ -51,17 +52,23 @@ def fit(
       drawn: pytree of `[steps, ...]` arrays, all that is random in each step. Drawn for all steps
         at once, random numbers cost a small part of what they would in the loop.
       optimiser: of optax.
+      total: steps of the whole training.
 
     Returns:
-      The state after the last step and the `[steps]` losses. A loss that is not finite is not
-      caught here: look at the losses.
+      The state after the last step and the `[steps]` losses; those beyond `total` mean nothing. A
+      loss that is not finite is not caught here: look at the losses.
     """
+    steps = jax.tree.leaves(drawn)[0].shape[0]
 
     def make_step(state: FitState, drawn: Any) -> tuple[FitState, jax.Array]:
         value, gradient = jax.value_and_grad(loss)(state.params, drawn, state.step)
         update, optimiser_state = optimiser.update(gradient, state.optimiser, state.params)
         params = optax.apply_updates(state.params, update)
-        return FitState(params, optimiser_state, state.step + 1), value
+        after = FitState(params, optimiser_state, state.step + 1)
+        if total % steps:
+            goes_on = state.step < total
+            after = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), after, state)
+        return after, value
 
     state, losses = jax.lax.scan(make_step, state, drawn)
     return state, jnp.asarray(losses)

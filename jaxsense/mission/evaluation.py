@@ -7,11 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
-from jaxsense import devices
 from jaxsense.compilation import Compiler, Program
 from jaxsense.config import Config
+from jaxsense.devices import ALONE, Workers
 from jaxsense.mission.figures import REASONS, figures
 from jaxsense.mission.rollout import play
 from jaxsense.mission.state import (
@@ -106,14 +105,13 @@ class Player:
       recording: the first mission of the first case that `play` played last; None before.
     """
 
-    def __init__(self, mission: Mission, compiler: Compiler, batch: int, mesh: Mesh | None = None):
-        """Compiles for about `batch` missions side by side, which are split over the devices."""
-        num_devices = 1 if mesh is None else mesh.size
-        batch = -(-batch // num_devices) * num_devices
+    def __init__(self, mission: Mission, compiler: Compiler, batch: int, workers: Workers = ALONE):
+        """Compiles for about `batch` missions side by side, which the workers share."""
+        batch = -(-batch // workers.number) * workers.number
         self.mission, self._monitor, self._batch = mission, compiler.monitor, batch
         self.control_steps = 0
         self.recording: Recording | None = None
-        config, share = mission.config, batch // num_devices
+        config, share = mission.config, batch // workers.number
         chunk, _ = chunks(config)
 
         def begin(key: Key, episode: jax.Array, policies: jax.Array, faults: Faults):
@@ -135,12 +133,14 @@ class Player:
             lambda x: jax.ShapeDtypeStruct((batch, *x.shape), x.dtype), no_faults(config)
         )
         self._begin = Program(compiler, "mission", "begin")
-        begin = devices.spread(begin, mesh, whole=(0,))
-        state = self._begin.compile(begin, key, numbers, numbers, faults, mesh=mesh)
+        state = self._begin.compile(
+            begin, key, numbers, numbers, faults, workers=workers, whole=(0,)
+        )
         models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
         self._go_on = Program(compiler, "mission", "go_on")
-        go_on = devices.spread(go_on, mesh, whole=(0, 3))
-        self._go_on.compile(go_on, key, numbers, numbers, models, state, mesh=mesh)
+        self._go_on.compile(
+            go_on, key, numbers, numbers, models, state, workers=workers, whole=(0, 3)
+        )
 
     def wait(self) -> None:
         """Waits until the programs are compiled."""

@@ -99,7 +99,7 @@ def train(
         predicted = apply_to_columns(params, standard.T)
         return optax.softmax_cross_entropy_with_integer_labels(predicted, labels[rows], 0).mean()
 
-    return training.fit(state, loss, rows, _optimiser(config))
+    return training.fit(state, loss, rows, _optimiser(config), config.steps)
 
 
 def _optimiser(config: DetectorConfig) -> optax.GradientTransformation:

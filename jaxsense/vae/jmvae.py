@@ -290,7 +290,7 @@ def train(
         )
         return jnp.mean(total)
 
-    return training.fit(state, batch_loss, draw(key), _optimiser(config))
+    return training.fit(state, batch_loss, draw(key), _optimiser(config), config.steps)
 
 
 def annealed_beta(step: jax.Array, config: JmvaeConfig) -> jax.Array:
