@@ -195,4 +195,6 @@ def _like(shapes: Any, found: Any) -> Any:
             )
         return found
 
+    if jax.tree.structure(serialization.to_state_dict(shapes)) != jax.tree.structure(found):
+        raise ValueError("it holds other arrays")
     return jax.tree.map(check, shapes, serialization.from_state_dict(shapes, found))

@@ -12,11 +12,11 @@ import rich.console
 import rich.table
 import tyro
 
-from jaxsense import animation, cli, devices, mission, page, rundir
+from jaxsense import animation, cli, devices, files, mission, page, rundir
 from jaxsense.compilation import Compiler
 from jaxsense.config import Config, ConfigError
 from jaxsense.display import Display
-from jaxsense.monitor import Monitor
+from jaxsense.monitor import Monitor, StageError
 from jaxsense.sim.arena import TIMESTEP
 
 PROGRAM = "jaxsense.evaluate"
@@ -52,10 +52,10 @@ def main(argv: list[str] | None = None) -> None:
         workers, _ = devices.start(arguments.devices)
         config, models = rundir.load(arguments.run)
         played = _cases(arguments, config)
-        summary = rundir.read_summary(arguments.run)
         path = arguments.run / "summary.json"
         # Now, not after minutes of work, is the time to find out that it cannot be written.
-        rundir.write_json(path, summary)
+        with files.locked(arguments.run, waits=True):
+            rundir.write_json(path, rundir.read_summary(arguments.run))
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
@@ -69,10 +69,12 @@ def main(argv: list[str] | None = None) -> None:
         player = mission.Player(team, compiler, mission.batch_of(number), workers)
         player.wait()
         begin = time.perf_counter()
-        found = mission.summary(key, player, models, played, arguments.episodes)
+        try:
+            found = mission.summary(key, player, models, played, arguments.episodes)
+        except StageError as error:
+            cli.fail(PROGRAM, str(error))
         seconds = time.perf_counter() - begin
         compiling = compiler.monitor.seconds["mission"]["compile_s"]
-    summary["mission"] = _merge(summary.get("mission", {}), found, arguments)
     _print_table(console, found)
     rate = player.control_steps / seconds
     console.print(
@@ -81,7 +83,11 @@ def main(argv: list[str] | None = None) -> None:
         f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
     )
     try:
-        rundir.write_json(path, summary)
+        # Another evaluation may have written its own since.
+        with files.locked(arguments.run, waits=True):
+            summary = rundir.read_summary(arguments.run)
+            summary["mission"] = _merge(summary["mission"], found, arguments)
+            rundir.write_json(path, summary)
         if arguments.animate:
             assert player.recording is not None
             name = next(iter(played))
@@ -89,7 +95,8 @@ def main(argv: list[str] | None = None) -> None:
             title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
             animation.write(film, config, player.recording, models.class_beliefs, title)
             console.print(f"The first mission of {name} is in {film}.")
-        report = page.write(arguments.run)
+        with files.locked(arguments.run, waits=True):
+            report = page.write(arguments.run)
     except OSError as error:
         cli.fail(PROGRAM, f"{error.filename}: cannot be written ({error.strerror})")
     console.print(f"The figures are in {path}, and with all others in {report}.")

@@ -227,7 +227,7 @@ def _train_one(
         key = jax.random.key(settings.seed)
         result = pipeline.run(key, settings.config, programs, monitor, run.checkpoints)
         timing = {"total_s": time.perf_counter() - begin, "stages": monitor.seconds}
-        _write(run, result, timing)
+        _write(run, result, timing, monitor)
 
 
 def _paths(run: RunDirectory) -> list[Path]:
@@ -269,14 +269,16 @@ def _warn(text: str) -> None:
     print(f"{PROGRAM}: {text}", file=sys.stderr)
 
 
-def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any]) -> None:
+def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any], monitor: Monitor) -> None:
     """Plots, the report and at last the summary, which says that the run is finished."""
     config = run.settings.config
+    monitor.check_stop()
     report.write_plots(run.path, config, result)
     film, beliefs = run.path / "mission.svg", result.models.class_beliefs
     animation.write(film, config, result.recording, beliefs, "latent policy")
     summary = {**_header(run, timing), **result.summary}
     page.write(run.path, summary)
+    monitor.check_stop()
     run.write_json("summary.json", summary)
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import pickle
+import stat
 import subprocess
 import sys
 import time
@@ -165,6 +166,7 @@ def test_a_kept_program_finds_the_functions_that_it_calls(tmp_path):
 
 def test_programs_of_the_oldest_settings_are_forgotten(tmp_path):
     first = Kept(tmp_path, 0)
+    call(first, lambda x: 2 * x, jnp.float32(3))
     os.utime(first.path, (1, 1))
     second = Kept(tmp_path, 1)
     for settings in range(2, 9):
@@ -172,6 +174,36 @@ def test_programs_of_the_oldest_settings_are_forgotten(tmp_path):
     assert not first.path.exists()
     assert second.path.exists()
     assert len(list(second.path.parent.iterdir())) == 8
+
+
+def test_nothing_of_the_user_is_ever_removed(tmp_path):
+    theirs = ["programs/mine/a.py", "executables/mine/a.py", f"executables/{32 * 'a'}/a.py"]
+    for name in theirs:
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_text("precious", encoding="utf-8")
+        os.utime((tmp_path / name).parent, (1, 1))
+    (tmp_path / "executables").chmod(0o700)
+    for settings in range(10):
+        Kept(tmp_path, settings)
+    assert all((tmp_path / name).read_text(encoding="utf-8") == "precious" for name in theirs)
+
+
+def test_programs_lie_in_a_directory_of_the_user_alone(tmp_path, monkeypatch):
+    kept = Kept(tmp_path)
+    for path in (kept.path, kept.path.parent):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o700
+    kept.path.parent.chmod(0o770)
+    with pytest.raises(PermissionError, match="must be a directory of yours alone, with mode 0700"):
+        Kept(tmp_path)
+    kept.path.parent.chmod(0o700)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "getuid", lambda: os.geteuid() + 1)
+        with pytest.raises(PermissionError, match="must be a directory of yours alone"):
+            Kept(tmp_path)
+    (tmp_path / "link").mkdir()
+    (tmp_path / "link" / "executables").symlink_to(kept.path.parent)
+    with pytest.raises(PermissionError, match="must be a directory of yours alone"):
+        Kept(tmp_path / "link")
 
 
 def test_without_room_nothing_is_kept_and_nothing_fails(tmp_path):

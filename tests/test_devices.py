@@ -15,8 +15,12 @@ import numpy as np
 import pytest
 
 from jaxsense import devices, models, observe
+from jaxsense.compilation import Compiler, Program
 from jaxsense.config import PRESETS, ConfigError, DqnConfig
+from jaxsense.devices import Workers
 from jaxsense.dqn import training
+from jaxsense.monitor import Monitor
+from jaxsense.sim import arena as arenas
 
 ROOT = Path(__file__).parents[1]
 SETTINGS = DqnConfig(
@@ -108,10 +112,7 @@ jax.distributed.shutdown()
             np.testing.assert_allclose(here, np.asarray(there), atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "gpu"])
-def test_a_spread_function_gives_what_it_gives_alone(backend, monkeypatch):
-    # Threads of a CPU, asked to split the work as accelerators do.
-    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+def test_a_spread_function_gives_what_it_gives_alone():
     mesh = devices.make_mesh(2)
 
     def function(x, scale):
@@ -124,16 +125,62 @@ def test_a_spread_function_gives_what_it_gives_alone(backend, monkeypatch):
     assert devices.spread(function, None) is function
 
 
-def test_a_number_of_devices_that_cannot_be_is_named():
+def test_a_step_of_the_physics_is_spread_over_two_host_devices():
+    # Under `shard_map`, jaxlib 0.11.2 crashes while it compiles this.
+    arena = arenas.build(CONFIG.arena, (False, True), obstacles=False)
+
+    def drive(speeds):
+        return jax.vmap(lambda s: arenas.drive(arena, arena.data, s).qvel)(speeds)
+
+    speeds = jnp.arange(16.0).reshape(4, 2, 2)
+    together = jax.jit(devices.spread(drive, devices.make_mesh(2)))(speeds)
+    assert together.sharding.num_devices == 2
+    np.testing.assert_allclose(together, jax.jit(drive)(speeds), rtol=1e-5)
+
+
+@pytest.mark.parametrize("workers", [Workers(threads=3), Workers(mesh=None)])
+def test_workers_share_the_rows_of_a_program(workers):
+    seen = []
+
+    def function(scale, x):
+        seen.append(x.shape)
+        return {"scaled": scale * x, "sums": x.sum(axis=1)}
+
+    scale, x = jnp.float32(2), np.arange(12.0, dtype=np.float32).reshape(6, 2)
+    with Compiler(Monitor()) as compiler:
+        program = Program(compiler, "stage", "run")
+        shapes = program.compile(function, scale, x, workers=workers, whole=(0,))
+        output = program(scale, x)
+    assert seen == [(6 // workers.number, 2)]
+    assert program.num_workers == workers.number
+    assert (shapes["scaled"].shape, shapes["sums"].shape) == ((6, 2), (6,))
+    np.testing.assert_array_equal(output["scaled"], 2 * x)
+    np.testing.assert_array_equal(output["sums"], [1, 5, 9, 13, 17, 21])
+
+
+def test_options_that_the_compiler_does_not_know_are_left_out():
+    known = devices.compiler_options(runs_long=True)
+    assert known["xla_backend_optimization_level"] == 1
+    assert not devices._is_known("xla_no_such_option", 1)
+    jax.jit(lambda x: x).lower(1.0).compile(compiler_options=known)
+
+
+def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):
+    for number in (0, -1, 10**9):
+        with pytest.raises(ConfigError, match=rf"devices = {number}: must be within 1 and 256"):
+            devices.start(number, SETTINGS)
+    with pytest.raises(ValueError, match="devices = 0"):
+        devices.make_mesh(0)
+    assert devices.start(3, SETTINGS) == (Workers(threads=3), None)
+    threads, learners = devices.start(None)
+    assert (threads.number, learners) == (min(os.cpu_count(), 8), None)
+    # The two devices of these tests, as if they were accelerators.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with pytest.raises(ConfigError, match=r"devices = 3: must be within 1 and 2"):
         devices.start(3, SETTINGS)
     odd = replace(SETTINGS, num_envs=15, replay_capacity=150, num_starts=30)
     with pytest.raises(ConfigError, match=r"devices = 2: must divide 1, .* dqn.num_envs = 15 and"):
         devices.start(2, odd)
-    with pytest.raises(ValueError, match="devices = 0"):
-        devices.make_mesh(0)
-    mesh, learners = devices.start(2, SETTINGS)
-    assert mesh.size == learners.size == 2
-    mesh, learners = devices.start(None, SETTINGS)
-    assert (mesh.size, learners) == (2, None)
-    assert devices.start(1, SETTINGS) == (None, None)
+    assert devices.start(None, odd) == (Workers(), None)
+    workers, learners = devices.start(None, SETTINGS)
+    assert workers.mesh.size == workers.number == learners.size == 2

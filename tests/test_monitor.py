@@ -15,7 +15,21 @@ def test_the_first_step_with_a_loss_that_is_not_finite_is_named(value):
         Monitor().report("dqn_camera", 8, 12, losses)
 
 
-def test_parameters_that_are_not_finite_are_named():
-    Monitor().check_finite("jmvae", {"a": jnp.ones(2), "b": jnp.zeros(3)})
-    with pytest.raises(StageError, match="jmvae: parameters are not finite after the last step"):
-        Monitor().check_finite("jmvae", {"a": jnp.ones(2), "b": jnp.array([0.0, jnp.nan])})
+def test_what_is_not_finite_is_named():
+    monitor, bad = Monitor(), {"a": jnp.ones(2), "b": jnp.array([0.0, jnp.nan])}
+    monitor.check_finite("jmvae", "weights", {"a": jnp.ones(2), "b": jnp.zeros(3)})
+    with pytest.raises(StageError, match="jmvae: weights are not finite"):
+        monitor.check_finite("jmvae", "weights", bad)
+    with pytest.raises(StageError, match="dqn: parameters after step 8 of 12 are not finite"):
+        monitor.report("dqn", 8, 12, np.ones(4), bad)
+
+
+def test_another_run_has_times_and_a_listener_of_its_own():
+    heard = []
+    monitor = Monitor(lambda *report: heard.append(("first", *report)))
+    monitor.add("jmvae", "run_s", 2.0)
+    monitor.progress("jmvae", 1, 2)
+    monitor.begin(lambda *report: heard.append(("second", *report)))
+    monitor.progress("dqn", 1, 2)
+    assert monitor.seconds == {}
+    assert heard == [("first", "jmvae", 1, 2, {}), ("second", "dqn", 1, 2, {})]

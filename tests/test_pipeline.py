@@ -1,11 +1,19 @@
 """How the stages of a run hang together."""
 
+import dataclasses
+
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from jaxsense import examine, pipeline
-from jaxsense.config import PRESETS
-from jaxsense.monitor import Monitor
+from jaxsense.checkpoints import Checkpoints
+from jaxsense.chunks import run_chunks
+from jaxsense.config import PRESETS, JmvaeConfig
+from jaxsense.monitor import Monitor, StageError, Stopped
+from jaxsense.programs import best_restart, chunks_of
+from jaxsense.vae import detectors
 
 
 def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(monkeypatch):
@@ -13,5 +21,84 @@ def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(monkeypatch
         raise ArithmeticError("no such policy")
 
     monkeypatch.setattr(examine, "latent_space", broken)
-    with pytest.raises(ArithmeticError, match="no such policy"):
-        pipeline.run(jax.random.key(0), PRESETS["smoke"], Monitor())
+    config, monitor = PRESETS["smoke"], Monitor()
+    with (
+        pytest.raises(ArithmeticError, match="no such policy"),
+        pipeline.compiled(config, monitor) as programs,
+    ):
+        pipeline.run(jax.random.key(0), config, programs, monitor)
+
+
+@pytest.mark.parametrize(
+    ("steps", "expected"),
+    [
+        (300, (20, 15)),
+        (4000, (20, 200)),
+        (7, (7, 1)),
+        (1, (1, 1)),
+        (4001, (20, 201)),
+        (23, (12, 2)),
+    ],
+)
+def test_steps_are_cut_into_chunks_also_if_their_number_is_prime(steps, expected):
+    number, size = chunks_of(steps)
+    assert (number, size) == expected
+    assert (number - 1) * size < steps <= number * size
+
+
+def test_the_last_chunk_makes_no_step_too_many():
+    config = dataclasses.replace(PRESETS["smoke"].detector, hidden=(3,), steps=5, batch=4)
+    windows, labels = jnp.arange(12.0).reshape(6, 2), jnp.array([0, 1, 0, 1, 1, 0])
+    detector = detectors.init(jax.random.key(0), windows, 2, config)
+
+    @jax.jit
+    def train(key, state):
+        return detectors.train(key, state, detector, windows, labels, config, 2)
+
+    states = [detectors.start(detector, config)]
+    for i in range(3):
+        states.append(train(jax.random.key(i), states[-1])[0])
+    assert [int(state.step) for state in states] == [0, 2, 4, 5]
+    # The same by two chunks, and by one of a single step.
+    one = detectors.train(jax.random.key(2), states[2], detector, windows, labels, config, 2)[0]
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5), one, states[3])
+    moved = jax.tree.map(lambda x, y: np.abs(x - y).max(), states[3].params, states[2].params)
+    assert max(jax.tree.leaves(moved)) > 0
+
+
+def test_the_restart_with_the_lowest_losses_at_the_end_is_kept():
+    settings = JmvaeConfig(steps=40)  # the last 2 steps count
+    losses = np.ones((3, 40), np.float32)
+    losses[1, :38], losses[2, 38:] = 0.0, 0.5
+    assert best_restart(losses, settings) == 2
+    losses[2, 39] = np.nan
+    losses[0, 38:] = 0.9
+    assert best_restart(losses, settings) == 0
+
+
+def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
+    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
+
+    def run(chunk, state):
+        monitor.report("jmvae", chunk + 1, 4, np.array([np.nan if chunk == 2 else 1.0]))
+        return {"x": state["x"] + 1}, {"chunk": [chunk]}
+
+    start = {"x": np.zeros(2, np.float32)}
+    with pytest.raises(StageError, match="jmvae: loss = nan at step 3 of 4"):
+        run_chunks("jmvae", start, 4, run, monitor, checkpoints)
+    done, state, curves = checkpoints.load_unfinished("jmvae", start)
+    assert (done, curves) == (2, {"chunk": [0, 1]})
+    np.testing.assert_array_equal(state["x"], [2, 2])
+
+
+def test_a_stop_is_heard_after_every_chunk(tmp_path):
+    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
+
+    def run(chunk, state):
+        if chunk == 1:
+            monitor.stop()
+        return state + 1, {}
+
+    with pytest.raises(Stopped):
+        run_chunks("jmvae", np.float32(0), 4, run, monitor, checkpoints)
+    assert checkpoints.load_unfinished("jmvae", np.float32(0))[:2] == (2, 2.0)

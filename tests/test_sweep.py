@@ -1,7 +1,6 @@
 """Several seeds, and several settings, in one program."""
 
 import dataclasses
-import json
 import re
 from pathlib import Path
 
@@ -11,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxsense
-from jaxsense import evaluate, sweep, train
+from jaxsense import sweep
 from jaxsense.config import PRESETS, ConfigError, DetectorConfig, JmvaeConfig
 from jaxsense.learning import learn_perception
 from jaxsense.sim import make_world
@@ -71,46 +69,4 @@ def test_statistics_are_those_of_student():
     assert found["a"]["b"] == pytest.approx({"mean": 2.0, "low": -10.706, "high": 14.706}, abs=1e-3)
     assert found["c"] == [{"mean": 5.0, "low": 5.0, "high": 5.0}, None]
     assert "d" not in found
-
-
-@pytest.fixture(scope="module")
-def seeds(tmp_path_factory):
-    path = tmp_path_factory.mktemp("runs") / "seeds"
-    options = ["--preset", "smoke", "--num-seeds", "2", "--seed", "3", "--cache", "None", "--quiet"]
-    train.main([*options, "--out", str(path)])
-    return path
-
-
-def test_each_seed_leaves_a_run(seeds, capsys):
-    summary = json.loads((seeds / "summary.json").read_text())
-    each = [json.loads((seeds / f"seed-{s}" / "summary.json").read_text()) for s in (3, 4)]
-    accuracy = [s["detectors"]["lidar"]["accuracy"] for s in each]
-    assert accuracy[0] != accuracy[1]
-    assert summary["detectors"]["lidar"]["accuracy"]["mean"] == pytest.approx(np.mean(accuracy))
-    assert summary["seeds"]["4"]["dqn"] == each[1]["dqn"]
-    assert set(each[0]) == {
-        "preset", "seed", "versions", "devices", "timing", "detectors", "jmvae", "dqn",
-        "mission",
-    }  # fmt: skip
-    assert (each[1]["seed"], each[1]["dqn"]["camera"]["num_states"]) == (4, 384)
-    config, models = jaxsense.load(seeds / "seed-4")
-    assert config == PRESETS["smoke"]
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(models))
-    with pytest.raises(SystemExit):
-        evaluate.main([str(seeds)])
-    assert "holds several seeds; choose one" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (["--num-seeds", "0"], "num_seeds = 0: must be greater than 0"),
-        (["--num-seeds", "2", "--seed", str(2**32 - 1)], "num_seeds = 2: leads beyond seed 2^32"),
-        (["--num-seeds", "2", "--devices", "2"], "devices = 2: cannot be chosen for several seeds"),
-    ],
-)
-def test_several_seeds_that_cannot_be_are_named(options, expected, capsys):
-    with pytest.raises(SystemExit) as stop:
-        train.main(options)
-    assert stop.value.code == 2
-    assert expected in capsys.readouterr().err
+    assert sweep.statistics([{"a": 3.0}]) == {"a": {"mean": 3.0, "low": 3.0, "high": 3.0}}

@@ -160,7 +160,12 @@ class Player:
 
         Returns:
           For each case the `[episodes, ...]` figures of `figures.figures`.
+
+        Raises:
+          StageError: if the models or the map of a mission are not finite; a policy would take a
+            value that is not for the end of its mission.
         """
+        self._monitor.check_finite("mission", "models", models)
         total = episodes * len(played)
         row = np.arange(-(-total // self._batch) * self._batch, dtype=np.int32) % total
         case, episode = row // episodes, row % episodes
@@ -185,6 +190,8 @@ class Player:
             self._monitor.check_stop()
             state, found, records = self._go_on(key, episode[playing], chunk, models, state)
             state, found, records = jax.tree.map(np.array, (state, found, records))
+            at = f"beliefs after {chunk.max() + 1} chunks"
+            self._monitor.check_finite("mission", at, state.belief)
             if not done[0]:
                 first.append(jax.tree.map(lambda x: x[0].copy(), (state, records)))
             if results is None:

@@ -1,0 +1,354 @@
+"""`python -m tests.faults`: makes runs go wrong in many ways, and prints what became of them."""
+
+import argparse
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from tests.faults.child import SIGNALS
+
+STAGES = (
+    "simulate", "detector_camera-train", "detect-", "jmvae-train", "evaluate_jmvae", "dqn-train",
+    "evaluate_dqn", "mission-go_on", "write",
+)  # fmt: skip
+"""Where faults strike: the programs of `jaxsense.programs`, and the plots."""
+POISONED = {
+    "simulate": "scans",
+    "detect-": "features",
+    "detector_camera-train": "gradients of a detector",
+    "jmvae-train": "gradients of the JMVAE",
+    "dqn-train": "gradients of a Q-network",
+    "evaluate_jmvae": "class beliefs",
+    "evaluate_dqn": "Q-values",
+    "mission-go_on": "beliefs in missions",
+}
+SMOKE = ["--preset", "smoke", "--quiet"]
+
+
+class BrokenError(AssertionError):
+    """A run that did not do what it must."""
+
+
+def require(condition: Any, text: str) -> None:
+    """Raises `BrokenError` unless the condition holds."""
+    if not condition:
+        raise BrokenError(text)
+
+
+class Runs:
+    """Runs in a temporary directory, with what they are compared with."""
+
+    def __init__(self, folder: Path):
+        self.folder, self._whole, self._lock = folder, dict[str, Any](), threading.Lock()
+
+    def path(self, name: str) -> Path:
+        """A new directory's name."""
+        return self.folder / name.replace(" ", "-").replace("/", "-")
+
+    def train(
+        self, *arguments: str, child: tuple[str, ...] = (), **options: Any
+    ) -> subprocess.CompletedProcess[str]:
+        """Trains in a process of its own; with `child`, a fault and its stage."""
+        return self.start(*arguments, child=child, **options).finish()
+
+    def start(self, *arguments: str, child: tuple[str, ...] = (), **options: Any) -> "Process":
+        """Begins to train."""
+        module = "tests.faults.child" if child else "jaxsense.train"
+        cache = () if "--cache" in arguments else ("--cache", str(self.folder / "cache"))
+        return Process([sys.executable, "-m", module, *child, *arguments, *cache], **options)
+
+    def whole(self, *arguments: str) -> Any:
+        """The summary of a run that nothing has gone wrong with."""
+        name = "-".join(["whole", *arguments]).replace("--", "")
+        with self._lock:
+            if name not in self._whole:
+                path = self.path(name)
+                ended = self.train(*arguments, "--out", str(path))
+                require(ended.returncode == 0, ended.stderr)
+                self._whole[name] = summary(path)
+            return self._whole[name]
+
+    def check_resumed(self, path: Path, *arguments: str) -> None:
+        """Goes on with a run, which must end as if nothing had gone wrong."""
+        again = ["--resume", str(path), "--quiet"]
+        if not (path / "config.json").exists():
+            again = [*arguments, "--out", str(path)]
+        if not (path / "summary.json").exists():
+            ended = self.train(*again)
+            require(ended.returncode == 0, f"{path.name}: {ended.stderr}")
+        require(summary(path) == self.whole(*arguments), f"{path.name}: another summary")
+
+
+class Process:
+    """A program that runs."""
+
+    def __init__(self, command: list[str], cwd: Path | None = None, **options: Any):
+        root = Path(__file__).parents[2]
+        environment = options.pop("env", os.environ) | {
+            "JAX_PLATFORMS": "cpu",
+            "PYTHONPATH": str(root),
+        }
+        self._command = command
+        self._process = subprocess.Popen(
+            command,
+            cwd=cwd or root,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            **options,
+        )
+
+    def kill(self) -> None:
+        """As `kill -9`."""
+        self._process.send_signal(signal.SIGKILL)
+
+    def finish(self) -> subprocess.CompletedProcess[str]:
+        """Waits for its end."""
+        output, errors = self._process.communicate(timeout=1800)
+        return subprocess.CompletedProcess(self._command, self._process.returncode, output, errors)
+
+
+def summary(path: Path) -> Any:
+    """The summary of a run without times."""
+
+    def without(value: Any) -> Any:
+        if isinstance(value, dict):
+            dropped = ("timing", "env_steps_per_s")
+            return {k: without(v) for k, v in value.items() if k not in dropped}
+        return value
+
+    return without(json.loads((path / "summary.json").read_text(encoding="utf-8")))
+
+
+def lines(text: str) -> list[str]:
+    """Lines that say something."""
+    return [line for line in text.splitlines() if line.strip()]
+
+
+def killed(runs: Runs, name: str, arguments: list[str], latest: float, seed: int) -> None:
+    """`kill -9` at a random moment."""
+    path = runs.path(name)
+    process = runs.start(*arguments, "--out", str(path))
+    time.sleep(random.Random(seed).uniform(0.0, latest))
+    process.kill()
+    process.finish()
+    runs.check_resumed(path, *arguments)
+
+
+def stopped(runs: Runs, fault: str, stage: str, *more: str) -> None:
+    """A signal in a stage: status 130, one line, and the run goes on."""
+    path, arguments = runs.path(f"{fault} {stage} {len(more)}"), [*SMOKE, *more]
+    ended = runs.train(*arguments, "--out", str(path), child=(fault, stage))
+    require(ended.returncode == 130, f"{fault} in {stage}: status {ended.returncode}")
+    require(len(lines(ended.stderr)) == 1, f"{fault} in {stage}: {ended.stderr}")
+    runs.check_resumed(path, *arguments)
+
+
+def disk_full(runs: Runs, stage: str) -> None:
+    """No room: one line, and the run goes on when there is room."""
+    path = runs.path(f"disk {stage}")
+    ended = runs.train(*SMOKE, "--out", str(path), child=("disk", stage))
+    require(ended.returncode == 2, f"disk full in {stage}: {ended.returncode} {ended.stderr}")
+    (line,) = lines(ended.stderr)
+    require("cannot write" in line, line)
+    runs.check_resumed(path, *SMOKE)
+
+
+def not_finite(runs: Runs, stage: str) -> None:
+    """NaN: caught, with its stage named, and the run goes on from what was sound."""
+    path = runs.path(f"nan {stage}")
+    ended = runs.train(*SMOKE, "--out", str(path), child=("nan", stage))
+    require(ended.returncode == 2, f"NaN in {stage}: status {ended.returncode}")
+    (line,) = lines(ended.stderr)
+    require("not finite" in line and stage.replace("_", "-").partition("-")[0] in line, line)
+    runs.check_resumed(path, *SMOKE)
+
+
+def damaged(runs: Runs, how: str, name: str) -> None:
+    """A checkpoint that is damaged: named, and the run goes on to the same summary."""
+    path = runs.path(f"{how} {name}")
+    ended = runs.train(*SMOKE, "--out", str(path), child=("ctrl-c", name))
+    require(ended.returncode == 130, f"status {ended.returncode}")
+    for number, file in enumerate(sorted((path / "checkpoints").rglob("*.msgpack"))):
+        one = runs.path(f"{how} {name} {number}")
+        shutil.copytree(path, one)
+        target = one / file.relative_to(path)
+        content = bytearray(target.read_bytes())
+        if how == "missing":
+            target.unlink()
+        elif how == "truncated":
+            target.write_bytes(content[: len(content) // 2])
+        else:
+            content[random.Random(number).randrange(len(content))] ^= 1 << number % 8
+            target.write_bytes(content)
+        resumed = runs.train("--resume", str(one), "--quiet")
+        require(resumed.returncode == 0, resumed.stderr)
+        said = [line for line in lines(resumed.stderr) if target.name in line]
+        is_used = target.stem != "class_beliefs"  # written for who loads the run
+        require(len(said) == 1 or not is_used, f"{how} {target.name}: {resumed.stderr}")
+        require(summary(one) == runs.whole(*SMOKE), f"{how} {target.name}: another summary")
+
+
+def without_rights(command: list[str]) -> list[str]:
+    """Root may write everywhere; this takes that right from a command."""
+    if os.geteuid() != 0:
+        return command
+    caps = "-dac_override,-dac_read_search"
+    return ["setpriv", f"--bounding-set={caps}", f"--inh-caps={caps}", *command]
+
+
+def read_only(runs: Runs) -> None:
+    """A directory that cannot be written."""
+    place = runs.path("read only")
+    place.mkdir()
+    place.chmod(0o555)
+    command = [sys.executable, "-m", "jaxsense.train", *SMOKE, "--out", str(place / "run")]
+    ended = Process(without_rights(command)).finish()
+    require(ended.returncode == 2, f"status {ended.returncode}")
+    (line,) = lines(ended.stderr)
+    require("cannot be written (Permission denied)" in line, line)
+
+
+def surroundings(runs: Runs, name: str, changes: dict[str, str | None], ascii_only: bool) -> None:
+    """Another environment: a plain run, with at most a line more."""
+    env = {k: v for k, v in {**os.environ, **changes}.items() if v is not None}
+    path = runs.path(name)
+    command = [sys.executable, "-m", "jaxsense.train", "--preset", "smoke", "--out", str(path)]
+    if "HOME" not in changes:
+        command += ["--cache", str(runs.folder / "cache")]
+    ended = Process(without_rights(command), env=env).finish()
+    require(ended.returncode == 0, f"{name}: {ended.stderr}")
+    said = [line for line in lines(ended.stderr) if "Matplotlib" not in line]
+    require(len(said) <= 1, f"{name}: {ended.stderr}")
+    require(not ascii_only or ended.stdout.isascii(), f"{name}: not ASCII")
+    require(summary(path) == runs.whole(*SMOKE), f"{name}: another summary")
+
+
+def two_in_one_second(runs: Runs) -> None:
+    """Two runs that would have one name."""
+    place = runs.path("same second")
+    place.mkdir()
+    processes = [runs.start(*SMOKE, cwd=place) for _ in range(2)]
+    ended = [process.finish() for process in processes]
+    require([e.returncode for e in ended] == [0, 0], ended[0].stderr + ended[1].stderr)
+    found = sorted((place / "runs").iterdir())
+    require(len(found) == 2, f"{len(found)} directories")
+    for path in found:
+        require(summary(path) == runs.whole(*SMOKE), "another summary")
+
+
+def two_evaluations(runs: Runs) -> None:
+    """Two evaluations of one run at once."""
+    path = runs.path("evaluated")
+    require(runs.train(*SMOKE, "--out", str(path)).returncode == 0, "a plain run")
+    command = [sys.executable, "-m", "jaxsense.evaluate", str(path), "--episodes", "2"]
+    command += ["--cache", str(runs.folder / "cache"), "--policy"]
+    names = "camera_alone", "lidar_alone"
+    ended = [p.finish() for p in [Process([*command, name]) for name in names]]
+    require([e.returncode for e in ended] == [0, 0], ended[0].stderr + ended[1].stderr)
+    require(set(names) <= set(summary(path)["mission"]), "a block is lost")
+
+
+def shared_cache(runs: Runs) -> None:
+    """Two writers of one cache, in a directory with files of the user."""
+    cache = runs.path("their work")
+    for folder in ("programs/mine", "executables/mine", "executables/" + 32 * "a"):
+        (cache / folder).mkdir(parents=True)
+        (cache / folder / "thesis.txt").write_text("precious", encoding="utf-8")
+    (cache / "executables").chmod(0o700)
+    before = sorted(cache.rglob("*"))
+    paths = [runs.path(f"sharing {i}") for i in range(2)]
+    processes = [runs.start(*SMOKE, "--out", str(p), "--cache", str(cache)) for p in paths]
+    for process, path in zip(processes, paths, strict=True):
+        ended = process.finish()
+        require(ended.returncode == 0, ended.stderr)
+        require(summary(path) == runs.whole(*SMOKE), "another summary")
+    require(set(before) <= set(cache.rglob("*")), "a file of the user is gone")
+
+
+Trial = tuple[str, Callable[[], None]]
+
+
+def trials(runs: Runs, is_quick: bool) -> Iterator[Trial]:
+    """All trials, each with the row that it belongs to."""
+    number, several = 2 if is_quick else 30, ("--num-seeds", "2")
+    stages = ("simulate", "dqn-train") if is_quick else STAGES
+
+    def trial(row: str, function: Callable[..., None], *args: Any) -> Trial:
+        return row, lambda: function(runs, *args)
+
+    for i in range(number):
+        yield trial("kill -9 at a random moment, `smoke`", killed, f"killed {i}", SMOKE, 12.0, i)
+    for fault in SIGNALS:
+        for stage in stages:
+            yield trial(f"{fault} in a stage, one seed", stopped, fault, stage)
+            yield trial(f"{fault} in a stage, two seeds", stopped, fault, stage, *several)
+    for how in ("truncated", "flipped", "missing"):
+        for name in ("jmvae-train", "mission-go_on"):
+            yield trial(f"each checkpoint {how}", damaged, how, name)
+    for stage in stages:
+        yield trial("disk full in a stage", disk_full, stage)
+    for stage, name in POISONED.items():
+        if not is_quick or stage in stages:
+            yield trial(f"NaN in {name}", not_finite, stage)
+    yield trial("a directory that is read-only", read_only)
+    yield trial("HOME that cannot be", surroundings, "home", {"HOME": "/dev/null/home"}, False)
+    yield trial("HOME that is read-only", surroundings, "ro-home", {"HOME": "/proc"}, False)
+    yield trial("no HOME, no TERM", surroundings, "bare", {"HOME": None, "TERM": None}, False)
+    ascii_locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    yield trial("a locale of ASCII", surroundings, "ascii", ascii_locale, True)
+    yield trial("two runs in one second", two_in_one_second)
+    yield trial("two evaluations of one run", two_evaluations)
+    yield trial("two writers of a cache with files of the user", shared_cache)
+    if not is_quick:
+        for i in range(5):
+            row = "kill -9 at a random moment, `default`"
+            yield trial(row, killed, f"killed default {i}", ["--quiet"], 45.0, i)
+
+
+def main(argv: list[str] | None = None) -> bool:
+    """Runs all trials, two at a time, and prints a table; returns whether all have passed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="a few of each kind")
+    parser.add_argument("--only", default="", help="rows that hold this text")
+    arguments = parser.parse_args(argv)
+    failures, table = list[str](), dict[str, list[bool]]()
+    with tempfile.TemporaryDirectory() as folder:
+        runs = Runs(Path(folder))
+        runs.whole(*SMOKE)
+        chosen = [t for t in trials(runs, arguments.quick) if arguments.only in t[0]]
+
+        def attempt(trial: Trial) -> tuple[str, str]:
+            try:
+                trial[1]()
+            except Exception as error:  # whatever a trial finds belongs into the table
+                return trial[0], f"{type(error).__name__}: {error}"
+            return trial[0], ""
+
+        with ThreadPoolExecutor(2) as executor:
+            for row, failure in executor.map(attempt, chosen):
+                table.setdefault(row, []).append(not failure)
+                if failure:
+                    failures.append(f"{row}: {failure}")
+                    print(failures[-1], file=sys.stderr, flush=True)
+    print("| fault | as it must |\n| --- | --- |")
+    for row, passed in table.items():
+        print(f"| {row} | {sum(passed)} of {len(passed)} |")
+    return not failures
+
+
+if __name__ == "__main__":
+    sys.exit(not main())

@@ -1,0 +1,51 @@
+"""The run that tests of whole programs share, and what they do with runs."""
+
+import contextlib
+import json
+import os
+import signal
+import time
+
+import pytest
+
+from jaxsense import train
+from jaxsense.rundir import RunDirectory
+
+SMOKE = ("--preset", "smoke", "--seed", "5", "--quiet")
+
+
+def without_times(path):
+    """The summary of a run, less what is never the same."""
+    summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    del summary["timing"]
+    for block in summary["dqn"].values():
+        del block["env_steps_per_s"]
+    return summary
+
+
+def error_line(argv, capsys, program=train):
+    """Runs a program, which must end with status 2 and one line of error."""
+    with pytest.raises(SystemExit) as stop:
+        program.main(argv)
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "Traceback" not in line
+    return line
+
+
+def interrupting(applies):
+    """Writes metrics, and presses Ctrl-C at the first report where `(run, stage, step)` holds."""
+    append, pressed = RunDirectory.append_metrics, []
+
+    def append_metrics(self, **figures):
+        append(self, **figures)
+        if not pressed and applies(self, figures["stage"], figures["step"]):
+            pressed.append(True)
+            waiting = signal.getsignal(signal.SIGINT)
+            with contextlib.suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+            # The main thread hears of it; another handler waits for the next one then.
+            while signal.getsignal(signal.SIGINT) is waiting:
+                time.sleep(0.01)
+
+    return append_metrics

@@ -1,0 +1,162 @@
+"""Files that are written as a whole, directories that are kept, and checkpoints."""
+
+import os
+import stat
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import files
+from jaxsense.checkpoints import Checkpoints, Unfinished
+from jaxsense.config import ConfigError
+from jaxsense.training import FitState
+
+TREE = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": (np.int32(4), np.array([True]))}
+SHAPES = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, TREE))
+
+
+def test_a_file_is_replaced_as_a_whole_and_made_durable(tmp_path, monkeypatch):
+    path, synced = tmp_path / "file", []
+    sync = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda n: (synced.append(os.fstat(n).st_mode), sync(n)))
+    files.write(path, "first")
+    files.write(path, b"second")
+    assert path.read_bytes() == b"second"
+    assert [stat.S_ISDIR(mode) for mode in synced] == [False, True] * 2
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_cannot_be_written_stays_as_it_was(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    files.write(path, "first")
+
+    def full(number):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*file'"):
+        files.write(path, "second")
+    assert path.read_text(encoding="utf-8") == "first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_many_writers_of_one_file_never_mix(tmp_path):
+    path, texts = tmp_path / "file", [letter * 100_000 for letter in "abcdefgh"]
+    with ThreadPoolExecutor(8) as executor:
+        list(executor.map(lambda text: files.write(path, text), texts * 5))
+    assert path.read_text(encoding="utf-8") in texts
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_directory_is_kept_for_one_at_a_time(tmp_path):
+    order = []
+
+    def wait():
+        with files.locked(tmp_path, waits=True):
+            order.append("second")
+
+    with files.locked(tmp_path, waits=False):
+        with pytest.raises(BlockingIOError), files.locked(tmp_path, waits=False):
+            pass
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        waiting.join(0.2)
+        order.append("first")
+    waiting.join()
+    assert order == ["first", "second"]
+
+
+def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    assert not checkpoints.exists()
+    assert checkpoints.load("tree", SHAPES) is None
+    checkpoints.save("tree", TREE)
+    assert checkpoints.exists()
+    found = checkpoints.load("tree", SHAPES)
+    assert jax.tree.structure(found) == jax.tree.structure(TREE)
+    for here, there in zip(jax.tree.leaves(found), jax.tree.leaves(TREE), strict=True):
+        assert here.dtype == there.dtype
+        np.testing.assert_array_equal(here, there)
+
+
+def test_without_a_directory_nothing_is_saved():
+    checkpoints = Checkpoints()
+    checkpoints.save("tree", TREE)
+    checkpoints.forget_unfinished()
+    assert checkpoints.load("tree", SHAPES) is None
+    assert not checkpoints.exists()
+
+
+DAMAGES = {
+    "flipped bit": lambda content, i: content[:i] + bytes([content[i] ^ 4]) + content[i + 1 :],
+    "truncated": lambda content, i: content[:i],
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_every_damage_is_noticed_and_named_and_put_aside(tmp_path, damage):
+    said = []
+    checkpoints = Checkpoints(tmp_path, said.append)
+    checkpoints.save("tree", TREE)
+    file = tmp_path / "tree.msgpack"
+    content = file.read_bytes()
+    for i in range(len(content)):
+        damaged = DAMAGES[damage](content, i)
+        file.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=r"tree.msgpack': is damaged"):
+            checkpoints.load("tree", SHAPES)
+    assert checkpoints.load_or_forget("tree", SHAPES) is None
+    (line,) = said
+    assert "tree.msgpack': is damaged" in line
+    assert "trained again" in line
+    assert (tmp_path / "tree.msgpack.damaged").read_bytes() == damaged
+    checkpoints.save("tree", TREE)
+    assert checkpoints.load_or_forget("tree", SHAPES) is not None
+    assert len(said) == 1
+
+
+def test_a_missing_checkpoint_is_noticed(tmp_path):
+    said = []
+    checkpoints = Checkpoints(tmp_path, said.append)
+    checkpoints.save("tree", TREE)
+    (tmp_path / "tree.msgpack").unlink()
+    with pytest.raises(ConfigError, match="is missing"):
+        Checkpoints(tmp_path).load("tree", SHAPES)
+    assert checkpoints.load_or_forget("tree", SHAPES) is None
+    assert "tree.msgpack': is missing" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("shapes", "expected"),
+    [
+        ({**SHAPES, "a": jax.ShapeDtypeStruct((3, 2), np.float32)}, r"float32\(2, 3\) in place of"),
+        ({**SHAPES, "a": jax.ShapeDtypeStruct((2, 3), np.int32)}, r"place of int32\(2, 3\)"),
+        ({"a": SHAPES["a"]}, "of other settings"),
+    ],
+)
+def test_a_checkpoint_of_other_shapes_is_named(tmp_path, shapes, expected):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save("tree", TREE)
+    with pytest.raises(ConfigError, match=expected):
+        checkpoints.load("tree", shapes)
+
+
+def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    state = [FitState({"w": np.ones(2, np.float32)}, (np.int32(3),), np.int32(7))]
+    saved = Unfinished(2, state, {"loss": [1.5, float("nan")], "none": []})
+    checkpoints.save_unfinished("jmvae", saved)
+    checkpoints.save("tree", TREE)
+    done, found, curves = checkpoints.load_unfinished("jmvae", state)
+    assert done == 2
+    assert isinstance(found[0], FitState)
+    np.testing.assert_array_equal(found[0].params["w"], [1, 1])
+    np.testing.assert_array_equal(curves["loss"], [1.5, np.nan])
+    assert curves["none"] == []
+    checkpoints.forget_unfinished()
+    assert checkpoints.load_unfinished("jmvae", state) is None
+    assert checkpoints.load("tree", SHAPES) is not None

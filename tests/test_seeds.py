@@ -1,0 +1,89 @@
+"""Several seeds in one command, each a run of its own."""
+
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+from smoke import error_line, interrupting, without_times
+
+import jaxsense
+from jaxsense import evaluate, pipeline, train
+from jaxsense.rundir import RunDirectory, read_settings
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory, cache):
+    """Seeds 4 and 5, stopped while the second one learns and then gone on with."""
+    path = tmp_path_factory.mktemp("runs") / "seeds"
+    options = ["--preset", "smoke", "--num-seeds", "2", "--seed", "4", "--quiet", *cache]
+    with pytest.MonkeyPatch.context() as patch:
+        second = lambda run, stage, step: run.settings.seed == 5 and stage == "jmvae"  # noqa: E731
+        patch.setattr(RunDirectory, "append_metrics", interrupting(second))
+        with pytest.raises(SystemExit) as stop:
+            train.main([*options, "--out", str(path)])
+    assert stop.value.code == 130
+    assert (path / "seed-4" / "summary.json").exists()
+    assert not (path / "seed-5" / "summary.json").exists()
+    train.main(["--resume", str(path), "--quiet", *cache])
+    return path
+
+
+def test_a_seed_of_several_is_the_run_of_that_seed(seeds, smoke_run):
+    assert without_times(seeds / "seed-5") == without_times(smoke_run)
+    models = [jaxsense.load(path)[1] for path in (seeds / "seed-5", smoke_run)]
+    for here, there in zip(*map(jax.tree.leaves, models), strict=True):
+        np.testing.assert_array_equal(here, there)
+    settings = read_settings(seeds / "seed-5" / "config.json")
+    assert (settings.seed, settings.num_seeds, settings.preset) == (5, 1, "smoke")
+    names = {path.name for path in (seeds / "seed-5").iterdir()}
+    assert names == {path.name for path in smoke_run.iterdir()}
+
+
+def test_the_summary_of_several_seeds_is_over_all_of_them(seeds, capsys):
+    summary = json.loads((seeds / "summary.json").read_text(encoding="utf-8"))
+    each = [without_times(seeds / f"seed-{s}") for s in (4, 5)]
+    accuracy = [s["detectors"]["lidar"]["accuracy"] for s in each]
+    assert summary["detectors"]["lidar"]["accuracy"]["mean"] == pytest.approx(np.mean(accuracy))
+    assert summary["seeds"]["4"]["mission"] == each[0]["mission"]
+    assert summary["seeds"]["5"]["dqn"]["camera"]["env_steps_per_s"] > 0
+    assert "failed" not in summary
+    with pytest.raises(SystemExit):
+        evaluate.main([str(seeds)])
+    assert "holds several seeds; choose one" in capsys.readouterr().err
+    assert "is finished" in error_line(["--resume", str(seeds)], capsys)
+
+
+def test_a_seed_that_fails_leaves_the_others(seeds, cache, tmp_path, monkeypatch, capsys):
+    path = tmp_path / "seeds"
+    shutil.copytree(seeds, path)
+    (path / "summary.json").unlink()
+    shutil.rmtree(path / "seed-4")
+
+    def survey(self, key):
+        surveys = original(self, key)
+        surveys.windows[0][0, 0, 0] = np.nan
+        self._monitor.check_finite("simulate", "scans", surveys.windows)
+
+    original = pipeline.Stages.survey
+    monkeypatch.setattr(pipeline.Stages, "survey", survey)
+    train.main(["--resume", str(path), "--quiet", *cache])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "simulate: scans are not finite; what was saved before is in" in line
+    summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    assert summary["failed"] == {"4": "simulate: scans are not finite"}
+    assert list(summary["seeds"]) == ["5"]
+    found = without_times(path / "seed-5")["detectors"]["lidar"]["accuracy"]
+    assert summary["detectors"]["lidar"]["accuracy"] == {"mean": found, "low": found, "high": found}
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--num-seeds", "0"], "num_seeds = 0: must be greater than 0"),
+        (["--num-seeds", "2", "--seed", str(2**32 - 1)], "num_seeds = 2: leads beyond seed 2^32"),
+    ],
+)
+def test_several_seeds_that_cannot_be_are_named(options, expected, capsys):
+    assert expected in error_line(options, capsys)
