@@ -1,17 +1,30 @@
 import os
 from pathlib import Path
 
+# In the environment, so that processes which tests start have them too.
+os.environ["JAX_PLATFORMS"] = "cpu"
+os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
+# Compiling takes nearly all of the time of the tests.
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+
 import filelock
+import jax
 import pytest
+from skips import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401
 from smoke import SMOKE
 
-os.environ["JAX_PLATFORMS"] = "cpu"
+from jaxsense import train
 
-import jax
-
-jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 2)
-jax.config.update("jax_numpy_rank_promotion", "raise")
+
+SLOW = 1800  # s
+
+
+def pytest_collection_modifyitems(items):
+    """Slow tests may take longer."""
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW))
 
 
 @pytest.fixture(scope="session")
@@ -30,8 +43,6 @@ def cache(shared) -> list[str]:
 @pytest.fixture(scope="session")
 def smoke_run(shared, cache) -> Path:
     """A finished run with `SMOKE`, made by whichever worker needs it first; to be read only."""
-    from jaxsense import train
-
     path = shared / "smoke"
     with filelock.FileLock(shared / "smoke.lock"):
         if not (path / "summary.json").exists():

@@ -46,7 +46,7 @@ def names():
 @pytest.mark.parametrize("package", EXAMPLES)
 def test_examples_run(names, package, tmp_path, monkeypatch, capsys):
     example = EXAMPLES[package]
-    pytest.importorskip(package, reason="needs the extra that the page names")
+    pytest.importorskip(package, reason=f"{package}: needs the extra that the page names")
     monkeypatch.chdir(tmp_path)
     if package == "stable_baselines3":
         importlib.import_module("torch").set_num_threads(1)  # more get into each other's way

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import small
 
-pytest.importorskip("gymnax", reason="needs the extra jaxsense[rejax]")
+pytest.importorskip("gymnax", reason="needs the extra jaxsense[gymnax]")
 
 from jaxsense.dqn import belief_mdp
 from jaxsense.interfaces import gymnax
@@ -28,7 +28,7 @@ def test_a_step_is_that_of_gymnax_with_five_values():
 
 
 def test_its_dqn_reaches_95_percent_of_the_optimal_return():
-    rejax = pytest.importorskip("rejax", reason="needs the extra jaxsense[rejax]")
+    rejax = pytest.importorskip("rejax", reason="rejax: needs the extra jaxsense[rejax]")
     env = MapEnv(small.small_mdp(), 0)
     algorithm = rejax.DQN.create(
         env=env,

@@ -23,6 +23,7 @@ def models():
 @pytest.fixture(scope="session")
 def arena_of(team):
     """A mission in a chosen arena: PoIs, robots' poses, classes, policy and faults."""
+    start = jax.jit(lambda *given: mission.start(team, *given))
 
     def make(positions, poses, classes=(0, 1, 2), policy=mission.NAIVE, faults=None):
         classes = jnp.array(classes)
@@ -32,7 +33,7 @@ def arena_of(team):
         light = jaxsense.sim.Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
         scene = jaxsense.sim.Scene(layout, light, jnp.array(poses, jnp.float32))
         faults = mission.no_faults(CONFIG) if faults is None else faults
-        return mission.start(team, scene, classes, jnp.int32(policy), faults)
+        return start(scene, classes, jnp.int32(policy), faults)
 
     return make
 
