@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 import small
 
-pytest.importorskip(
-    "stable_baselines3", reason="stable_baselines3: needs the extra jaxsense[sb3]"
-)
+pytest.importorskip("stable_baselines3", reason="stable_baselines3: needs the extra jaxsense[sb3]")
 
 import stable_baselines3 as sb3
 import torch

@@ -2,44 +2,74 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
-from teams import CONFIG, FAST_TO_COMPILE
+from teams import CONFIG
 
 from jaxsense import mission
 from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
-from jaxsense.sim import amiro
+from jaxsense.sim import amiro, navigation
+from jaxsense.sim import arena as arenas
 
-NUM_ARENAS = 24
-STEPS = 500
+STEPS, CHUNK = 320, 40
 NUM_POIS = CONFIG.arena.num_pois
 PERIOD = CONFIG.mission.control_period
-FAULT_TIME = 4.0
+FAULT_TIME = 4.0  # s
+NEVER = (np.inf, np.inf)
+# For each case: when robots stop and go blind, and the number of its arenas.
+CASES = {
+    "healthy": (NEVER, NEVER, 12),
+    "0 stops": ((FAULT_TIME, np.inf), NEVER, 4),
+    "1 stops": ((np.inf, FAULT_TIME), NEVER, 4),
+    "0 blind": (NEVER, (FAULT_TIME, np.inf), 4),
+    "1 blind": (NEVER, (np.inf, FAULT_TIME), 4),
+    "nobody": ((0.0, 0.0), NEVER, 2),
+}
+NUM_ARENAS = CASES["healthy"][2]
 
 
 @pytest.fixture(scope="module")
-def play(team, models, as_numpy):
-    """Plays all arenas with given faults: states before, states after and records."""
+def go_on(team, models):
+    """One control period after another, in arenas side by side."""
+
+    def roll(keys, state):
+        return jax.vmap(lambda k, s: mission.rollout(k, team, models, s, CHUNK))(keys, state)
+
+    return jax.jit(roll)
+
+
+@pytest.fixture(scope="module")
+def played(team, go_on, as_numpy):
+    """For each case: states before, states after and records; and all states after 4 s."""
+    stops_at, blind_at = (
+        jnp.array([case[i] for case in CASES.values() for _ in range(case[2])], jnp.float32)
+        for i in (0, 1)
+    )
 
     @jax.jit
     def begin(keys, faults):
-        return jax.vmap(lambda k: mission.reset(k, team, mission.NAIVE, faults))(keys)
+        return jax.vmap(lambda k, f: mission.reset(k, team, mission.NAIVE, f))(keys, faults)
 
-    def go_on(keys, state):
-        return jax.vmap(lambda k, s: mission.rollout(k, team, models, s, STEPS))(keys, state)
-
-    go_on = jax.jit(go_on, compiler_options=FAST_TO_COMPILE)
-
-    def played(faults):
-        start = begin(jax.random.split(jax.random.key(0), NUM_ARENAS), faults)
-        return as_numpy((start, *go_on(jax.random.split(jax.random.key(1), NUM_ARENAS), start)))
-
-    return played
+    number = len(stops_at)
+    start = begin(jax.random.split(jax.random.key(0), number), Faults(stops_at, blind_at))
+    states, records = [start], []
+    for i in range(STEPS // CHUNK):
+        keys = jax.random.split(jax.random.key(1 + i), number)
+        state, record = go_on(keys, states[-1])
+        states.append(state)
+        records.append(record)
+    record = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *records)
+    whole, first, found = as_numpy((start, states[-1], record)), 0, {}
+    for name, (_, _, size) in CASES.items():
+        found[name] = jax.tree.map(lambda x: x[first : first + size], whole)  # noqa: B023
+        first += size
+    return found, states[1]
 
 
 @pytest.fixture(scope="module")
-def healthy(play):
-    return play(mission.no_faults(CONFIG))
+def healthy(played):
+    return played[0]["healthy"]
 
 
 def reasons(state):
@@ -124,10 +154,8 @@ def test_a_mission_that_is_over_stays_as_it_is(healthy):
 
 
 @pytest.mark.parametrize("robot", [0, 1])
-def test_a_robot_that_stops_leaves_the_other_one_working(play, robot):
-    own = np.arange(2) == robot
-    faults = Faults(jnp.where(own, FAULT_TIME, jnp.inf), jnp.full(2, jnp.inf))
-    _, end, record = play(faults)
+def test_a_robot_that_stops_leaves_the_other_one_working(played, robot):
+    _, end, record = played[0][f"{robot} stops"]
     assert np.all(end.robots.phase[:, robot] == FAILED)
     assert np.all(end.robots.phase[:, 1 - robot] == ENDED)
     after = record.time[0] > FAULT_TIME + 0.5
@@ -142,10 +170,8 @@ def test_a_robot_that_stops_leaves_the_other_one_working(play, robot):
 
 
 @pytest.mark.parametrize("robot", [0, 1])
-def test_a_robot_that_goes_blind_detects_nothing_more_and_the_mission_says_so(play, robot):
-    own = np.arange(2) == robot
-    faults = Faults(jnp.full(2, jnp.inf), jnp.where(own, FAULT_TIME, jnp.inf))
-    _, end, record = play(faults)
+def test_a_robot_that_goes_blind_detects_nothing_more_and_the_mission_says_so(played, robot):
+    _, end, record = played[0][f"{robot} blind"]
     after = record.time[0] > FAULT_TIME + 0.2
     assert record.scanned[:, after, robot].any()
     assert not record.detected[:, after, robot].any()
@@ -157,9 +183,9 @@ def test_a_robot_that_goes_blind_detects_nothing_more_and_the_mission_says_so(pl
     assert reasons(end) == expected
 
 
-def test_without_any_robot_the_mission_ends_at_once(play):
-    _, end, _ = play(Faults(jnp.zeros(2), jnp.full(2, jnp.inf)))
-    assert reasons(end) == ["no robot left"] * NUM_ARENAS
+def test_without_any_robot_the_mission_ends_at_once(played):
+    _, end, _ = played[0]["nobody"]
+    assert reasons(end) == ["no robot left"] * 2
     assert np.all(end.steps == 1)
     assert np.all(end.robots.looks == 0)
 
@@ -171,3 +197,58 @@ def test_same_keys_give_the_same_mission_and_the_policy_does_not_change_the_aren
     jax.tree.map(np.testing.assert_array_equal, first, again)
     jax.tree.map(np.testing.assert_array_equal, first.scene, latent.scene)
     assert not np.array_equal(first.scene.poses, other.scene.poses)
+
+
+@pytest.fixture(scope="module")
+def driven(team, played, as_numpy):
+    """Physics of eight missions from 4 s on, with commands that go on towards the hardest.
+
+    The states, MuJoCo's data before the first step, and `[E, T, ...]` positions, velocities and
+    wheel speeds.
+    """
+    arena = team.world.arena
+    hardest = jnp.array([[amiro.MAX_SPEED, amiro.MAX_TURN_RATE], [-0.1, -amiro.MAX_TURN_RATE]])
+    recorded = jax.tree.map(lambda x: x[:8], played[1])
+
+    def drive(state):
+        data = arenas.place(arena, state.scene.layout, state.scene.poses)
+        data = data.replace(qvel=state.velocity.reshape(-1), qacc_warmstart=state.warmstart)
+
+        def substep(carry, _):
+            data, command = carry
+            command = navigation.ramp(command, hardest, arenas.TIMESTEP)
+            speeds = navigation.wheel_speeds(command)
+            data = arenas.drive(arena, data, speeds)
+            return (data, command), (data.qpos, data.qvel, speeds)
+
+        return data, jax.lax.scan(substep, (data, state.robots.command), length=20)[1]
+
+    before, after = jax.jit(jax.vmap(drive))(recorded)
+    return as_numpy((recorded, before, *after))
+
+
+def test_a_physics_step_from_recorded_states_is_that_of_c_mujoco(team, driven):
+    arena = team.world.arena
+    recorded, before, qpos, qvel, speeds = driven
+    assert np.max(np.abs(recorded.velocity)) > 0.1  # some of them are driving
+    for e in range(8):
+        native = mujoco.MjData(arena.mj_model)
+        native.mocap_pos[:], native.mocap_quat[:] = before.mocap_pos[e], before.mocap_quat[e]
+        native.qpos[:], native.qvel[:] = before.qpos[e], before.qvel[e]
+        native.ctrl[:] = arenas.as_control(speeds[e, 0])
+        mujoco.mj_step(arena.mj_model, native)
+        np.testing.assert_allclose(qpos[e, 0], native.qpos, atol=1e-5)
+        np.testing.assert_allclose(qvel[e, 0], native.qvel, atol=1e-4)
+
+
+def test_limits_hold_at_every_physics_step(driven):
+    *_, qpos, qvel, speeds = driven
+    assert np.max(np.abs(speeds)) <= amiro.MAX_WHEEL_SPEED + 1e-4
+    velocity, yaw = qvel.reshape(8, 20, 2, 3), qpos.reshape(8, 20, 2, 3)[..., 2]
+    forward = velocity[..., 0] * np.cos(yaw) + velocity[..., 1] * np.sin(yaw)
+    change = np.abs(np.diff(forward, axis=1)) / arenas.TIMESTEP
+    turning = np.abs(np.diff(velocity[..., 2], axis=1)) / arenas.TIMESTEP
+    # A servo that follows a ramp changes no faster than the ramp; one part in fifty for Euler.
+    assert np.max(change) <= 1.02 * amiro.MAX_ACCELERATION
+    assert np.max(turning) <= 1.02 * amiro.MAX_TURN_ACCELERATION
+    assert np.max(change) > 0.5 * amiro.MAX_ACCELERATION
