@@ -110,7 +110,7 @@ def _random_drives(key: jax.Array, config: Config, batch: int, steps: int) -> Dr
         jax.random.split(layout_key, batch), classes
     )
     reach = jnp.array([config.arena.side / 2, config.arena.side / 2, jnp.pi])
-    poses = reach * jax.random.uniform(pose_key, (batch, num_robots, 3), minval=-1.0)
+    poses = reach[None, None] * jax.random.uniform(pose_key, (batch, num_robots, 3), minval=-1.0)
     limit = amiro.MAX_WHEEL_SPEED
     shape = (batch, steps, num_robots, 2)
     return Drives(
