@@ -1,18 +1,26 @@
 """The examples, as a user runs them; small, for most of their time is spent compiling."""
 
+import dataclasses
 import importlib.util
 import json
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import evaluate, train
+from jaxsense import evaluate, examine, sim, train
 from jaxsense.config import PRESETS
+from jaxsense.learning import learn_perception
+from jaxsense.rundir import RunDirectory, Settings
 
 SMALL = ("--preset", "smoke", "--mission.episodes", "1")
+THERMAL = (
+    *("--modalities", "lidar", "thermal"),
+    *("--jmvae.reconstruction-weights", "10", "10"),
+)
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
@@ -24,8 +32,34 @@ def example(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    return tmp_path_factory.mktemp("runs")
+def learned():
+    """Settings with a thermal camera, what was learnt of the sensors, and what it is worth."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(EXAMPLES)
+        change = importlib.import_module("new_modality").change
+        config = train.parse([*SMALL, *THERMAL], change).config
+        world = sim.make_world(config)
+
+    def learn(key):
+        found = learn_perception(key, config, world)
+        return found, *examine.latent_space(found.params, found.held_out, config)
+
+    return config, *jax.jit(learn)(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def runs(learned, tmp_path_factory):
+    """A directory with a run `thermal`, whose Q-networks are not trained."""
+    config, found, posteriors, _ = learned
+    models = dataclasses.replace(
+        jaxsense.untrained(jax.random.key(0), config),
+        detectors=found.trained,
+        jmvae=found.params,
+        class_beliefs=jax.tree.map(lambda x: x.mean(axis=1), posteriors["joint"]),
+    )
+    path = tmp_path_factory.mktemp("runs")
+    RunDirectory.create(path / "thermal", Settings("smoke", 0, config)).save_models(models)
+    return path
 
 
 def run(change, out: Path, *options: str) -> dict:
@@ -34,25 +68,30 @@ def run(change, out: Path, *options: str) -> dict:
 
 
 @pytest.mark.slow  # compiles a whole run, as the next one does; before a release
-def test_new_classes(example, runs):
+def test_new_classes(example, tmp_path):
     # One of its two sensors, which compiles in half the time.
     change = example("new_classes").change
     lidar = ["--modalities", "lidar", "--jmvae.reconstruction-weights", "10"]
-    summary = run(change, runs / "classes", *lidar)
+    summary = run(change, tmp_path / "classes", *lidar)
     assert summary["detectors"]["lidar"]["accuracy"] >= 0.8
     assert len(summary["jmvae"]["sigma_norm"]["lidar"]) == 4
-    config, _ = jaxsense.load(runs / "classes")
+    config, _ = jaxsense.load(tmp_path / "classes")
     assert config == train.parse([*SMALL, *lidar], change).config
     assert config.labels("camera") == ("blue", "orange")
 
 
-def test_new_modality(example, runs):
-    two = ["--modalities", "lidar", "thermal", "--jmvae.reconstruction-weights", "10", "10"]
-    summary = run(example("new_modality").change, runs / "thermal", *two)
+@pytest.mark.slow
+def test_new_modality(example, tmp_path):
+    summary = run(example("new_modality").change, tmp_path / "thermal", *THERMAL)
     assert summary["detectors"]["thermal"]["accuracy"] >= 0.95
     assert set(summary["dqn"]) == {"lidar", "thermal"}
+
+
+def test_the_thermal_camera_tells_what_is_hot(learned):
+    _, found, _, latent = learned
+    assert found.accuracy[1] >= 0.95
     # Only what is hot is told by the thermal camera alone.
-    thermal = summary["jmvae"]["sigma_norm"]["thermal"]
+    thermal = np.asarray(latent["sigma_norm"]["thermal"])
     assert thermal[3] < 0.7 * min(thermal[:3])
 
 
