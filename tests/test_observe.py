@@ -17,7 +17,6 @@ from jaxsense.vae.jmvae import Jmvae
 CONFIG = PRESETS["smoke"]
 MODEL = Jmvae(CONFIG.modalities, (2, 2), 2, (8,))
 NUM_LOOKS = 2048
-FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
 
 
 def numbered_bank():
@@ -60,39 +59,38 @@ def world():
     return worlds.make_world(CONFIG)
 
 
-@pytest.fixture(scope="module", params=[0, 1], ids=CONFIG.modalities)
-def looks(request, world):
-    """A modality, a detector of a short training, its training windows and new ones."""
-    modality = request.param
+@pytest.fixture(scope="module")
+def trained(world):
+    """For each modality a detector of a short training, its training windows and new ones."""
     number = 500 + NUM_LOOKS
 
     def survey(key):
         class_key, survey_key = jax.random.split(key)
         classes = observe.balanced_classes(class_key, CONFIG, number)
         keys = jax.random.split(survey_key, number)
-        return classes, observe.surveys(keys, world, classes)[1][modality]
+        return classes, observe.surveys(keys, world, classes)[1]
 
-    survey = jax.jit(survey, compiler_options=FAST_TO_COMPILE)
-    classes, surveyed = survey(jax.random.key(0))
-    by_class = jnp.stack([surveyed[classes == c] for c in range(3)])
-    windows, new = jnp.split(by_class, [500], axis=1)
-    labels = jnp.array(CONFIG.arena.label_of_class(MODALITIES[CONFIG.modalities[modality]]))
-    config, flat = CONFIG.detector, windows.reshape(-1, windows.shape[-1])
-    detector = detectors.init(jax.random.key(1), flat, 2, config)
+    classes, surveyed = jax.jit(survey)(jax.random.key(0))
     train = jax.jit(detectors.train, static_argnames=("config", "steps"))
-    inputs = detectors.start(detector, config), detector, flat, jnp.repeat(labels, 500)
-    state, _ = train(jax.random.key(2), *inputs, config=config, steps=200)
-    return modality, replace(detector, params=state.params), windows, new
+    config, found = CONFIG.detector, []
+    for name, of_sensor in zip(CONFIG.modalities, surveyed, strict=True):
+        by_class = jnp.stack([of_sensor[classes == c] for c in range(3)])
+        windows, new = jnp.split(by_class, [500], axis=1)
+        flat = windows.reshape(-1, windows.shape[-1])
+        labels = jnp.array(CONFIG.arena.label_of_class(MODALITIES[name]))
+        detector = detectors.init(jax.random.key(1), flat, 2, config)
+        inputs = detectors.start(detector, config), detector, flat, jnp.repeat(labels, 500)
+        state, _ = train(jax.random.key(2), *inputs, config=config, steps=200)
+        found.append((replace(detector, params=state.params), windows, new))
+    return found
 
 
 @pytest.fixture(scope="module")
-def features(looks, world):
-    """A modality, and features `[C, S, 2]` from the bank and, live, with their `[S]` classes."""
-    modality, detector, _, new = looks
-    bank = jax.jit(jax.vmap(jax.vmap(detectors.detect, in_axes=(None, 0)), in_axes=(None, 0)))
-    mdp = observe.live_mdp(CONFIG, world, (detector, detector), {}, MODEL)
+def look_live(trained, world):
+    """A modality's live features of `[S]` looks, and their classes."""
+    mdp = observe.live_mdp(CONFIG, world, tuple(found[0] for found in trained), {}, MODEL)
 
-    def look_thrice(key):
+    def look_thrice(key, modality):
         class_key, poi_key, scene_key, look_key = jax.random.split(key, 4)
         classes = jax.random.randint(class_key, (3,), 0, 3)
         pois = jax.random.randint(poi_key, (3,), 0, 3)
@@ -107,8 +105,21 @@ def features(looks, world):
         return jax.tree.map(lambda x: x[-1], seen)  # the last look of an episode
 
     keys = jax.random.split(jax.random.key(3), NUM_LOOKS)
-    live = jax.jit(jax.vmap(look_thrice), compiler_options=FAST_TO_COMPILE)(keys)
-    return modality, np.asarray(bank(detector, new)), jax.tree.map(np.asarray, live)
+    return lambda modality: jax.jit(jax.vmap(lambda key: look_thrice(key, modality)))(keys)
+
+
+@pytest.fixture(scope="module", params=[0, 1], ids=CONFIG.modalities)
+def looks(request, trained):
+    """A modality, its detector, the detector's training windows and new ones."""
+    return request.param, *trained[request.param]
+
+
+@pytest.fixture(scope="module")
+def features(looks, look_live):
+    """A modality, and features `[C, S, 2]` from the bank and, live, with their `[S]` classes."""
+    modality, detector, _, new = looks
+    bank = jax.jit(jax.vmap(jax.vmap(detectors.detect, in_axes=(None, 0)), in_axes=(None, 0)))
+    return modality, np.asarray(bank(detector, new)), jax.tree.map(np.asarray, look_live(modality))
 
 
 def test_surveys_look_at_pois_of_the_classes_that_they_tell(looks):

@@ -158,7 +158,7 @@ def test_surveys_equal_single_ones(simulation):
     classes = jnp.tile(CLASSES, (5, 1))
     surveys = jax.jit(lambda k, c: observe.surveys(k, simulation, c, chunk=2))
     single = jax.jit(lambda k, c: world.survey(k, simulation, c))
-    together = surveys(keys, classes)
+    together = jax.device_get(surveys(keys, classes))
     for i in range(5):
         alone = single(keys[i], classes[i])
         chex.assert_trees_all_close(jax.tree.map(lambda x: x[i], together), alone, atol=1e-5)  # noqa: B023
