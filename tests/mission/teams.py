@@ -9,7 +9,6 @@ from jaxsense.config import PRESETS
 
 # Untrained detectors are never sure; what they say is of no importance here.
 CONFIG = replace(PRESETS["smoke"], mission=replace(PRESETS["smoke"].mission, least_confidence=0.0))
-FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
 
 
 def alone(function):
