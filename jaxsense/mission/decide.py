@@ -21,7 +21,7 @@ from jaxsense.mission.state import (
 from jaxsense.models import Models
 from jaxsense.networks import MLP
 from jaxsense.sim import roadmap, viewpoints
-from jaxsense.types import Key
+from jaxsense.types import Belief, Key
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, in place of a distance: more than any that there is
 _DETOUR = 2.0  # m, that a robot would go to avoid a viewpoint on which another robot stands
@@ -79,19 +79,22 @@ def _choose(
     config, robots = mission.config, state.robots
     num_pois = config.arena.num_pois
     given_up = robots.unreachable[robot] | robots.undetected[robot]
-    # To the network a PoI that was given up is one of which everything is known: it would count on
-    # the information that is left in it.
-    known = jax.tree.map(
-        lambda old, sure: jnp.where(given_up[:, None], sure[:1], old),
-        state.belief,
-        models.class_beliefs,
-    )
     network = MLP(config.dqn.hidden, num_pois + 1)
     q_network = jax.tree.map(lambda *x: jnp.stack(x)[robot], *models.q_networks)
-    q = network.apply(q_network, belief_mdp.as_state(known))
+
+    def values_if(sure: Belief) -> jax.Array:
+        """What the network says if all that is given up were known to be of one class."""
+        known = jax.tree.map(
+            lambda entry, sure: jnp.where(given_up[:, None], sure[None], entry), state.belief, sure
+        )
+        return jnp.asarray(network.apply(q_network, belief_mdp.as_state(known)))
+
+    # As it is, an entry that was given up would let the network count on what is left to learn of
+    # it. Of one that is known nothing is; since nobody can tell its class, each counts alike.
+    q = jnp.mean(jax.vmap(values_if)(models.class_beliefs), axis=0)
     naive = jnp.append(jnp.where(state.seen[:, robot], -1.0, 1.0), 0.0)
     random = jax.nn.one_hot(jax.random.randint(key, (), 0, num_pois + 1), num_pois + 1)
-    values = jnp.stack([jnp.asarray(q), naive, random])[state.policy]
+    values = jnp.stack([q, naive, random])[state.policy]
     of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
     is_latent = state.policy == LATENT
     tolerance = jnp.where(is_latent, config.mission.equal_values, 0.0)

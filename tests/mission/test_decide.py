@@ -11,16 +11,21 @@ from teams import with_values
 from jaxsense import mission
 from jaxsense.mission import decide
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE
+from jaxsense.types import Belief
 
 # The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
 POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
 POSES = [[0.0, 0.0, 0.0], [1.2, 1.2, 0.0]]
+SURE = Belief(jnp.array([[3.0, 0.0], [-2.0, 0.0], [0.0, 2.0]]), jnp.full((3, 2), 0.25))
 
 
 @pytest.fixture(scope="module")
-def chosen(team, models, arena_of):
-    decides = jax.jit(lambda key, models, state: decide.decide(key, team, models, state, 0))
+def decides(team):
+    return jax.jit(lambda key, models, state: decide.decide(key, team, models, state, 0))
 
+
+@pytest.fixture(scope="module")
+def chosen(decides, models, arena_of):
     def choose(values, policy=mission.LATENT, change=lambda state: state):
         state = change(arena_of(POSITIONS, POSES, policy=policy))
         return decides(jax.random.key(0), with_values(models, values, values), state)
@@ -160,3 +165,46 @@ def test_a_poi_without_any_viewpoint_is_given_up(chosen):
     np.testing.assert_array_equal(state.robots.unreachable[0], [False, False, True])
     # A goal that was not reached.
     assert (state.robots.goals[0], state.robots.reached[0]) == (1, 0)
+
+
+def hoping(network, poi, entry, others):
+    """A Q-network for which looking at a PoI is worth the positive part of an entry of the map.
+
+    The other PoIs and NOP are of the values [N + 1] in `others`.
+    """
+    layers = jax.tree.map(jnp.zeros_like, network)["params"]
+    first, *_, last = sorted(layers)
+    for name, layer in layers.items():
+        row, column = entry if name == first else 0, poi if name == last else 0
+        layer["kernel"] = layer["kernel"].at[row, column].set(1.0)
+    layers[last]["bias"] = jnp.array(others, jnp.float32)
+    return {"params": layers}
+
+
+@pytest.fixture
+def after_giving_up(decides, models, arena_of, set_robot):
+    """The PoI that a robot takes which gave PoI 1 up, and hopes for PoI 0 by an entry of PoI 1."""
+
+    def choose(entry, others, sure=SURE):
+        networks = tuple(hoping(n, 0, 4 + entry, others) for n in models.q_networks)
+        trained = replace(models, class_beliefs=sure, q_networks=networks)
+        state = arena_of(POSITIONS, POSES, policy=mission.LATENT)
+        state = set_robot(state, 0, undetected=jnp.array([False, True, False]))
+        return int(decides(jax.random.key(0), trained, state).robots.target[0])
+
+    return choose
+
+
+@pytest.mark.parametrize("turn", [0, 1, 2])
+@pytest.mark.parametrize(("other", "expected"), [(0.85, 0), (1.15, 2)])
+def test_what_was_given_up_is_of_every_class_alike(after_giving_up, turn, other, expected):
+    # The first number of its entry is 3, -2 or 0 in the classes: a look at PoI 0 is worth (3 + 0 +
+    # 0) / 3 = 1, in whatever order they come. 0.1 counts as equally good, and PoI 0 is nearer.
+    sure = jax.tree.map(lambda x: jnp.roll(x, turn, axis=0), SURE)
+    assert after_giving_up(0, [0.0, 0.0, other, 0.0], sure) == expected
+
+
+@pytest.mark.parametrize(("other", "expected"), [(0.1, 0), (0.4, 2)])
+def test_of_what_was_given_up_nothing_is_left_to_learn(after_giving_up, other, expected):
+    # Its standard deviation is 0.25, that of what is known, not 4.5, that of what nobody has seen.
+    assert after_giving_up(2, [0.0, 0.0, other, 0.0]) == expected
