@@ -17,8 +17,10 @@ from jaxsense.config.objects import SHAPES as SHAPES
 from jaxsense.config.objects import Attribute as Attribute
 from jaxsense.config.objects import Shape as Shape
 from jaxsense.config.presets import PRESETS as PRESETS
+from jaxsense.config.scene import LIDAR_HEIGHT as LIDAR_HEIGHT
 from jaxsense.config.scene import MODALITIES as MODALITIES
 from jaxsense.config.scene import ROBOT_RADIUS as ROBOT_RADIUS
+from jaxsense.config.scene import TIMESTEP as TIMESTEP
 from jaxsense.config.scene import ArenaConfig as ArenaConfig
 from jaxsense.config.scene import CameraConfig as CameraConfig
 from jaxsense.config.scene import LidarConfig as LidarConfig
@@ -26,4 +28,5 @@ from jaxsense.config.scene import SensorConfig as SensorConfig
 from jaxsense.config.scene import ViewpointConfig as ViewpointConfig
 from jaxsense.config.stored import as_plain as as_plain
 from jaxsense.config.stored import from_plain as from_plain
+from jaxsense.config.stored import require_trust as require_trust
 from jaxsense.config.whole import Config as Config

@@ -3,7 +3,7 @@
 import dataclasses
 
 from jaxsense.config.checks import require, require_not_negative, require_positive
-from jaxsense.config.scene import ROBOT_RADIUS
+from jaxsense.config.scene import ROBOT_RADIUS, TIMESTEP
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,12 +77,12 @@ class MissionConfig:
 
     def __post_init__(self):
         require_positive(self, "episodes", "time_limit", "control_period", "attempts")
-        steps = self.control_period / 0.01
+        steps = self.control_period / TIMESTEP
         require(
             abs(steps - round(steps)) < 1e-6 and 5 <= round(steps) <= 20,
             self,
             "control_period",
-            "must be a multiple of 0.01 s within 0.05 and 0.2 s",
+            f"must be a multiple of {TIMESTEP} s within {5 * TIMESTEP} and {20 * TIMESTEP} s",
         )
         require(
             self.time_limit >= self.control_period, self, "time_limit", "must be a period or more"

@@ -16,6 +16,12 @@ from jaxsense.config.objects import COLOURS, SHAPES, Attribute, Shape, require_w
 ROBOT_RADIUS = 0.0495
 """Radius of an AMiRo, in metres."""
 
+LIDAR_HEIGHT = 0.152
+"""Height of an AMiRo's laser beams above the floor, in metres."""
+
+TIMESTEP = 0.01
+"""One step of the physics, in seconds."""
+
 MODALITIES: dict[str, str] = {"camera": "colour", "lidar": "shape"}
 """The sensors that `sim` knows, and the attribute of a PoI that each one tells apart."""
 
@@ -50,7 +56,8 @@ class ArenaConfig:
 
     def __post_init__(self):
         require_positive(self, "side", "num_pois", "poi_radius", "poi_height", "poi_gap")
-        require(self.poi_height > 0.152, self, "poi_height", "must be more than 0.152 m")
+        reason = f"must be more than {LIDAR_HEIGHT} m"
+        require(self.poi_height > LIDAR_HEIGHT, self, "poi_height", reason)
         require_words(self.colours, "arena.colours")
         require_words(self.shapes, "arena.shapes")
         for name, rgb in self.colours.items():

@@ -47,6 +47,13 @@ def from_plain(stored: Any, base: Config | None = None) -> Config:
         raise ConfigError("config", "given", f"cannot be used ({error})") from None
 
 
+def require_trust(config: Config) -> None:
+    """Raises a `ConfigError` if settings name code that making their sensors would run."""
+    for name, sensor in config.sensors.items():
+        reason = "names code that would be run; pass --trust (trust=True) if you trust it"
+        raise ConfigError(f"sensors.{name}.make", sensor.make, reason)
+
+
 def _find(stored: dict[str, Any], name: str) -> Any:
     """The value of the first field with a name, in any section."""
     if name in stored:

@@ -20,7 +20,6 @@ WHEEL_SEPARATION = 0.069  # m
 CASTER_RADIUS = 0.0025  # m
 CASTER_OFFSET = 0.036  # m, fore and aft
 CAMERA_HEIGHT = 0.042  # m, above the floor
-LIDAR_HEIGHT = 0.152  # m, of the beams above the floor
 LIDAR_HALF_WIDTH = 0.025  # m, the URG-04LX is 50 mm x 50 mm x 70 mm
 LIDAR_TOP = 0.164  # m
 

@@ -16,13 +16,12 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
-from jaxsense.config import ArenaConfig, Shape
+from jaxsense.config import TIMESTEP, ArenaConfig, Shape
 from jaxsense.sim import amiro
 from jaxsense.types import Key
 
 WALL_HEIGHT = 0.3  # m
 WALL_THICKNESS = 0.05  # m
-TIMESTEP = 0.01  # s
 _STORE = -2.0  # m, height at which the shapes that are not shown wait below the floor
 _WALL_COLOUR = (0.6, 0.6, 0.6)
 

@@ -18,9 +18,10 @@ from jaxsense.sim.arena import Layout
 
 BACKWARD_SPEED = 0.1  # m/s
 _SAMPLE_TIMES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0)  # shares of the horizon
+# From half the horizon on an arc may be left; at once would make standing still worth as much.
+_MAY_LEAVE = _SAMPLE_TIMES.index(0.5)
 _GRAZE = 0.005  # m, by which a trajectory may cut the planning radius: samples are coarse
 _SIDESTEP = 0.06  # m, by which a way around another robot is wider than it must be
-_LOOKS_AHEAD = 3  # of these times; leaving an arc at once would make standing still worth as much
 _INFLATION_COST = 0.1  # s, of a way that just touches the planning radius
 
 
@@ -107,8 +108,8 @@ def drive_to(
     out, but for those that lead away from what is too close already. PoIs are the circles that hold
     both shapes. Other robots are held to stay and, just as well, to go straight on as they do now.
     The value of an arc is the least time to the waypoint over the points where the robot may leave
-    it: the time so far, that of turning to the waypoint, and that of a straight drive; ways through
-    the inflation around obstacles cost extra time.
+    it, from half the horizon on: the time so far, that of turning to the waypoint, and that of a
+    straight drive; ways through the inflation around obstacles cost extra time.
 
     Args:
       settings: of the planner.
@@ -119,7 +120,7 @@ def drive_to(
       robot: which one is asking.
       waypoint: `[2]` in metres.
       seconds: for which the command will be held.
-      backs_off: `[]` bool: instead, have as much room as possible a second from now.
+      backs_off: `[]` bool: instead, have as much room as possible in half the horizon from now.
 
     Returns:
       `[2]` the wanted command.
@@ -170,8 +171,8 @@ def drive_to(
     cost = _INFLATION_COST * jnp.clip(1.0 - room_of_map / max(settings.inflation, 1e-6), 0.0, 1.0)
     arrival = times[None] + turn / amiro.MAX_TURN_RATE + distance / amiro.MAX_SPEED + cost
     is_safe = least >= jnp.minimum(room_now - 1e-4, -_GRAZE)
-    value = jnp.min(jnp.where(is_safe, arrival, jnp.inf)[:, _LOOKS_AHEAD:], axis=1)
-    value = jnp.where(backs_off, -room[:, _LOOKS_AHEAD], value)
+    value = jnp.min(jnp.where(is_safe, arrival, jnp.inf)[:, _MAY_LEAVE:], axis=1)
+    value = jnp.where(backs_off, -room[:, _MAY_LEAVE], value)
     change = seconds * jnp.array([amiro.MAX_ACCELERATION, amiro.MAX_TURN_ACCELERATION]) + 1e-6
     in_window = jnp.all(jnp.abs(samples - present[None]) <= change[None], axis=-1)
     # The first part of the arc must be safe in any case: it will be driven.

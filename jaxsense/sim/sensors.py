@@ -16,13 +16,21 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
-from jaxsense.config import ArenaConfig, CameraConfig, Config, ConfigError, LidarConfig
+from jaxsense.config import (
+    LIDAR_HEIGHT,
+    ArenaConfig,
+    CameraConfig,
+    Config,
+    ConfigError,
+    LidarConfig,
+)
 from jaxsense.sim import amiro, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
 from jaxsense.types import Key
 
 _LEAST_CHROMA = 0.1  # difference of a pixel's channels; walls, robots and the dark have none
-_RANGE_TOLERANCE = 0.05  # m, five standard deviations of the LiDAR's noise
+_RANGE_TOLERANCE = 5.0  # standard deviations of the LiDAR's noise
+_LEAST_RANGE_TOLERANCE = 0.001  # m, more than what rounding makes of a distance
 _SHARE_OF_WIDTH = 0.7  # of a PoI, which is in view however wrong its bearing is believed
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour where a ray leaves the arena
 
@@ -126,6 +134,7 @@ def fan(num_rays: int, field_of_view: float) -> tuple[np.ndarray, Callable]:
 def lidar(config: LidarConfig) -> Sensor:
     """The laser scanner: one distance in metres for each beam, from right to left."""
     angles, centre = fan(config.num_beams, config.field_of_view)
+    tolerance = max(_RANGE_TOLERANCE * config.range_noise, _LEAST_RANGE_TOLERANCE)
 
     def read(key, hits, surfaces, light):
         del surfaces, light
@@ -135,7 +144,7 @@ def lidar(config: LidarConfig) -> Sensor:
 
     return Sensor(
         name="lidar",
-        height=amiro.LIDAR_HEIGHT,
+        height=LIDAR_HEIGHT,
         angles=angles,
         centre=centre,
         window=config.window,
@@ -143,7 +152,7 @@ def lidar(config: LidarConfig) -> Sensor:
         stride=config.stride,
         window_limit=config.window_range,
         shows=lambda readings, distance, extent: (
-            jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + _RANGE_TOLERANCE
+            jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + tolerance
         ),
         blind=config.max_range,
     )

@@ -10,13 +10,13 @@ import pytest
 from mujoco import mjx
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig
+from jaxsense.config import LIDAR_HEIGHT, ArenaConfig
 from jaxsense.sim import amiro, raycast
 
 DISTANCE_TOLERANCE = 1e-4  # m
 NORMAL_TOLERANCE = 1e-3
 # At the camera and the LiDAR, between body and beams, above the PoIs, above the walls.
-HEIGHTS = np.array([amiro.CAMERA_HEIGHT, amiro.LIDAR_HEIGHT, 0.12, 0.152, 0.25, 0.31], np.float32)
+HEIGHTS = np.array([amiro.CAMERA_HEIGHT, LIDAR_HEIGHT, 0.12, 0.152, 0.25, 0.31], np.float32)
 RAYS_PER_SCENE = 900
 GEOM_GROUPS = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # all but the invisible colliders
 
