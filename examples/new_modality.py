@@ -3,7 +3,9 @@
     python examples/new_modality.py --preset smoke --out runs/thermal
 
 takes every option of `python -m jaxsense.train`. Other programs that read the run must be able to
-import this file: `PYTHONPATH=examples python -m jaxsense.evaluate runs/thermal`.
+import this file, and be told that they may:
+
+    PYTHONPATH=examples python -m jaxsense.evaluate runs/thermal --trust
 """
 
 import dataclasses

@@ -3,6 +3,8 @@
     python -m jaxsense.train --preset smoke --out runs/smoke
     python examples/recorded_scans.py runs/smoke recorded.npz
 
+A run with sensors of your own needs `--trust` at the end, for their functions are imported.
+
 Where there is no such file yet, looks at a PoI of each class are simulated and written to it. Yours
 can come from anywhere. It holds for C PoIs
 
@@ -22,9 +24,9 @@ import jaxsense
 from jaxsense import sim, vae
 
 
-def main(run: Path, recording: Path) -> None:
+def main(run: Path, recording: Path, trust: bool = False) -> None:
     """Reads the run and the recording, and tells what the map makes of it."""
-    config, models = jaxsense.load(run)
+    config, models = jaxsense.load(run, trust)
     if not recording.exists():
         np.savez(recording, **simulate(config))
     recorded = np.load(recording)
@@ -83,4 +85,4 @@ def simulate(config: jaxsense.Config) -> dict[str, np.ndarray]:
 
 if __name__ == "__main__":
     np.set_printoptions(precision=2, suppress=True)
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), trust="--trust" in sys.argv[3:])

@@ -43,6 +43,8 @@ class Arguments:
     """Directory in which compiled programs are kept for later runs; `None` to keep none."""
     animate: bool = False
     """Also write an animation of the first mission as `mission-POLICY-SEED.svg`."""
+    trust: bool = False
+    """Run the functions that the run's `config.json` names for sensors of one's own."""
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -50,7 +52,7 @@ def main(argv: list[str] | None = None) -> None:
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
         workers, _ = devices.start(arguments.devices)
-        config, models = rundir.load(arguments.run)
+        config, models = rundir.load(arguments.run, arguments.trust)
         played = _cases(arguments, config)
         path = arguments.run / "summary.json"
         # Now, not after minutes of work, is the time to find out that it cannot be written.

@@ -97,6 +97,8 @@ class Arguments:
     """Directory of the run."""
     out: Path | None = None
     """The file, which must not exist; by default `exported.zip` in the run's directory."""
+    trust: bool = False
+    """Run the functions that the run's `config.json` names for sensors of one's own."""
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -104,7 +106,7 @@ def main(argv: list[str] | None = None) -> None:
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     path = arguments.out or arguments.run / "exported.zip"
     try:
-        config, models = rundir.load(arguments.run)
+        config, models = rundir.load(arguments.run, arguments.trust)
         if path.exists():
             raise ConfigError("out", str(path), "exists already; must be a new file")
         content = archive(config, models)

@@ -14,7 +14,7 @@ import jax
 
 from jaxsense import files, models
 from jaxsense.checkpoints import Checkpoints
-from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
+from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain, require_trust
 from jaxsense.models import Models
 from jaxsense.version import __version__
 
@@ -94,13 +94,13 @@ class RunDirectory:
 
     @classmethod
     @contextlib.contextmanager
-    def resume(cls, path: Path) -> "Iterator[RunDirectory]":
+    def resume(cls, path: Path, trust: bool = False) -> "Iterator[RunDirectory]":
         """The directory of a run that has stopped, kept for this process.
 
         Raises:
           ConfigError: as `resumable`, or if another process keeps the directory.
         """
-        settings = resumable(path)
+        settings = resumable(path, trust)
         with _locked(path, "resume"):
             run = cls(path, settings)
             run._drop_unfinished_line()
@@ -155,17 +155,18 @@ def _check_empty(path: Path) -> None:
         raise ConfigError("out", str(path), "is not empty; must be a new directory")
 
 
-def resumable(path: Path) -> Settings:
+def resumable(path: Path, trust: bool = False) -> Settings:
     """The settings of a run that has stopped.
 
     Raises:
-      ConfigError: if there is no such run, if another version wrote it, or if it is finished.
+      ConfigError: if there is no such run, if another version wrote it, if it is finished, or if it
+        names code, see `read_settings`.
     """
     content = _read_config(path / "config.json", "resume", path)
     _check_version(content, "resume", path)
     if (path / "summary.json").exists():
         raise ConfigError("resume", str(path), "is finished; there is nothing to go on with")
-    return _settings_of(content)
+    return _settings_of(content, trust)
 
 
 @contextlib.contextmanager
@@ -205,15 +206,20 @@ def write_json(path: Path, content: Any) -> None:
     files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
-def read_settings(file: Path) -> Settings:
+def read_settings(file: Path, trust: bool = False) -> Settings:
     """The settings in the `config.json` of a run.
 
     What is not given there is as in the preset that it names, or `default`, with seed 0.
 
+    Args:
+      file: the file.
+      trust: whether it may name code, which is run when its sensors are made.
+
     Raises:
-      ConfigError: if the file cannot be read, or names the field that is unknown or wrong.
+      ConfigError: if the file cannot be read, or names code without trust; else names the field
+        that is unknown or wrong.
     """
-    return _settings_of(_read_config(file, "config", file))
+    return _settings_of(_read_config(file, "config", file), trust)
 
 
 def read_summary(path: Path) -> dict[str, Any]:
@@ -229,23 +235,24 @@ def read_summary(path: Path) -> dict[str, Any]:
         raise ConfigError("run", str(path), reason) from None
 
 
-def load(path: Path | str) -> tuple[Config, Models]:
+def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     """Reads the settings and the trained models of a finished run.
 
     Args:
       path: the run's directory.
+      trust: whether to run the functions that its `config.json` names for sensors of one's own.
 
     Returns:
       The settings and the models, on the default device.
 
     Raises:
-      ConfigError: if the directory holds no finished run, one of another version, or a damaged
-        checkpoint.
+      ConfigError: if the directory holds no finished run, one of another version, a damaged
+        checkpoint, or one that names code without trust.
     """
     path = Path(path)
     content = _read_config(path / "config.json", "run", path)
     _check_version(content, "run", path)
-    config = _settings_of(content).config
+    config = _settings_of(content, trust).config
     shapes = jax.eval_shape(lambda: models.untrained(jax.random.key(0), config))
     checkpoints = Checkpoints(path / "checkpoints")
 
@@ -294,7 +301,7 @@ def _read_config(file: Path, field: str, value: Path) -> dict[str, Any]:
     return content
 
 
-def _settings_of(content: dict[str, Any]) -> Settings:
+def _settings_of(content: dict[str, Any], trust: bool) -> Settings:
     """The settings in what lies in a `config.json`."""
     unknown = sorted(set(content) - {"preset", "seed", "num_seeds", "config", "versions", "commit"})
     if unknown:
@@ -307,6 +314,8 @@ def _settings_of(content: dict[str, Any]) -> Settings:
         if not isinstance(number, int) or isinstance(number, bool):
             raise ConfigError(name, number, "must be a whole number")
     config = from_plain(content.get("config", {}), PRESETS[preset])
+    if not trust:
+        require_trust(config)
     return Settings(preset, config=config, **numbers)
 
 

@@ -61,6 +61,9 @@ class Arguments:
     """The `config.json` of a run, to start from its preset, seed and settings."""
     resume: Path | None = None
     """Directory of a run that was stopped, to go on in it with its settings."""
+    trust: bool = False
+    """Run the functions that the `config.json` of `--config` or `--resume` names for sensors of
+    one's own."""
     quiet: bool = False
     """Show nothing but errors and where everything is."""
     tensorboard: bool = False
@@ -103,7 +106,8 @@ def main(
     first = next(path for path in _paths(run) if (path / "report.html").exists())
     # The one thing that a quiet run says.
     print(f"Everything is in {run.path}; open {first / 'report.html'} first.")
-    print(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate")
+    trust = " --trust" if arguments.config.sensors else ""
+    print(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
 
 
 def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: config) -> Arguments:
@@ -141,10 +145,11 @@ def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: c
 def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     """The settings that the other options change, which must be known before they are read."""
     resume, file = _option(argv, "resume"), _option(argv, "config")
+    trust = [each for each in argv if each in {"--trust", "--no-trust"}][-1:] == ["--trust"]
     if resume:
-        return rundir.resumable(Path(resume))
+        return rundir.resumable(Path(resume), trust)
     if file:
-        return rundir.read_settings(Path(file))
+        return rundir.read_settings(Path(file), trust)
     preset = _option(argv, "preset") or "default"
     if preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
@@ -160,7 +165,7 @@ def _option(argv: list[str], name: str) -> str | None:
 def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:
     """The run directory, which is made unless the run goes on."""
     if arguments.resume is not None:
-        return RunDirectory.resume(arguments.resume)
+        return RunDirectory.resume(arguments.resume, arguments.trust)
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
     path = arguments.out or rundir.unused(Path("runs") / name)
     return RunDirectory.create(path, arguments.settings)
@@ -200,7 +205,8 @@ def _train(
                         _warn(f"{error}; what was saved before is in {path}")
                 begin = time.perf_counter()
     except Stopped:
-        go_on = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}"
+        trust = " --trust" if settings.config.sensors else ""
+        go_on = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}{trust}"
         print(f"Stopped; all that was trained is saved. To go on: {go_on}", file=sys.stderr)
         sys.exit(_INTERRUPTED)
     if len(failed) == settings.num_seeds:
@@ -242,7 +248,7 @@ def _of_seed(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager
     if path == run.path:
         return contextlib.nullcontext(run)
     if (path / "config.json").exists():
-        return RunDirectory.resume(path)
+        return RunDirectory.resume(path, trust=True)
     return RunDirectory.create(path, dataclasses.replace(run.settings, seed=seed, num_seeds=1))
 
 

@@ -97,7 +97,7 @@ def test_the_thermal_camera_tells_what_is_hot(learned):
 
 def test_recorded_scans(example, runs, tmp_path, capsys):
     main, recording = example("recorded_scans").main, tmp_path / "recorded.npz"
-    main(runs / "thermal", recording)
+    main(runs / "thermal", recording, trust=True)
     told = capsys.readouterr().out
     recorded = np.load(recording)
     assert recorded["lidar_scans"].shape == (4, 683)
@@ -106,7 +106,7 @@ def test_recorded_scans(example, runs, tmp_path, capsys):
     assert told.rstrip().endswith("The map says: red cube hot")
     # Now the file is there, and is read.
     np.savez(recording, **{**recorded, "thermal_scans": np.full((4, 64), 60.0)})
-    main(runs / "thermal", recording)
+    main(runs / "thermal", recording, trust=True)
     assert capsys.readouterr().out.count("thermal: cold 0.00, hot 1.00") == 4
 
 
@@ -114,7 +114,7 @@ def test_a_run_whose_sensor_cannot_be_imported_is_named(runs, capsys, monkeypatc
     monkeypatch.delitem(sys.modules, "new_modality", raising=False)
     assert importlib.util.find_spec("new_modality") is None
     with pytest.raises(SystemExit) as stop:
-        evaluate.main([str(runs / "thermal")])
+        evaluate.main([str(runs / "thermal"), "--trust"])
     assert stop.value.code == 2
     assert "sensors.thermal.make = 'new_modality:thermal': must be" in capsys.readouterr().err
 

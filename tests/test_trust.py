@@ -1,0 +1,97 @@
+"""No code that a run's config.json names is run unless the user says so."""
+
+import dataclasses
+import sys
+
+import pytest
+
+import jaxsense
+from jaxsense import evaluate, export, rundir, train
+from jaxsense.config import PRESETS, ConfigError, SensorConfig
+from jaxsense.rundir import RunDirectory, Settings
+
+REFUSED = (
+    "sensors.thermal.make = 'trap:make': names code that would be run; "
+    "pass --trust (trust=True) if you trust it"
+)
+
+
+class SprungError(Exception):
+    """The trap was imported."""
+
+
+@pytest.fixture(autouse=True)
+def trap(tmp_path, monkeypatch):
+    """A module of somebody else's, which must not be imported."""
+    (tmp_path / "trap.py").write_text("from test_trust import SprungError\nraise SprungError\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "test_trust", sys.modules[__name__])
+
+
+def change(config):
+    sensors = {"thermal": SensorConfig("trap:make", "colour")}
+    return dataclasses.replace(config, sensors=sensors, modalities=("lidar", "thermal"))
+
+
+@pytest.fixture
+def run(tmp_path):
+    """The directory of a run that names the trap."""
+    settings = Settings("smoke", 0, change(PRESETS["smoke"]))
+    return RunDirectory.create(tmp_path / "run", settings).path
+
+
+READERS = {
+    "load": jaxsense.load,
+    "read_settings": lambda run, **trust: rundir.read_settings(run / "config.json", **trust),
+    "resume": RunDirectory.resume,
+}
+
+
+@pytest.mark.parametrize("read", READERS.values(), ids=READERS)
+def test_a_run_that_names_code_is_refused(run, read):
+    for trust in ({}, {"trust": False}):
+        with pytest.raises(ConfigError) as error:
+            read(run, **trust)
+        assert str(error.value) == REFUSED
+
+
+def test_with_trust_it_is_read(run):
+    with pytest.raises(SprungError):
+        READERS["load"](run, trust=True)
+    for name in ("read_settings", "resume"):
+        found = READERS[name](run, trust=True)
+        config = getattr(found, "settings", found).config
+        assert config.sensors["thermal"].make == "trap:make"
+
+
+COMMANDS = {
+    "evaluate": lambda run, *more: evaluate.main([str(run), *more]),
+    "export": lambda run, *more: export.main([str(run), *more]),
+    "train --resume": lambda run, *more: train.main(["--resume", str(run), *more]),
+    "train --config": lambda run, *more: train.main(["--config", str(run / "config.json"), *more]),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
+def test_commands_need_an_option(run, command, capsys):
+    for more in ((), ("--no-trust",), ("--trust", "--no-trust")):
+        with pytest.raises(SystemExit) as stop:
+            command(run, *more)
+        assert stop.value.code == 2
+        told = capsys.readouterr()
+        assert REFUSED in told.err
+        assert (told.out, told.err.count("\n")) == ("", 1)
+    with pytest.raises(SprungError):
+        command(run, "--trust")
+
+
+def test_what_the_users_own_program_names_needs_none(run, tmp_path):
+    with pytest.raises(SprungError):
+        train.main(["--preset", "smoke", "--out", str(tmp_path / "new")], change)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_run_that_names_no_code_needs_none(tmp_path):
+    settings = Settings("smoke", 0, PRESETS["smoke"])
+    path = RunDirectory.create(tmp_path / "plain", settings).path
+    assert rundir.read_settings(path / "config.json") == settings
