@@ -1,18 +1,49 @@
 """The colours of classes and robots in plots and animations."""
 
+import math
+
+import numpy as np
+
 from jaxsense.config import ArenaConfig
 
+RGB = tuple[float, float, float]
+
 ROBOT_COLOURS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
+_APART = 0.25  # of two colours in RGB, which are then told apart at a glance
+_DARKEST, _LIGHTEST = -0.75, 0.6
 
 
-def class_colour(arena: ArenaConfig, label: str) -> tuple[float, float, float]:
-    """The colour of a class, RGB in [0, 1]: its own, and half as bright for all shapes but one."""
-    name, shape, *_ = label.split(" ")
-    red, green, blue = arena.colours[name]
-    brightness = 1.0 if shape == next(iter(arena.shapes)) else 0.5
-    return brightness * red, brightness * green, brightness * blue
+def class_colour(arena: ArenaConfig, label: str) -> RGB:
+    """The colour of a class, RGB in [0, 1], which no other class of the arena has.
+
+    It is that of its PoIs; where classes before it have that, a shade: half as bright, half way to
+    white or, if those are taken as well, the one that differs most from all that are.
+    """
+    classes, taken = arena.classes, []
+    for each in classes[: classes.index(label) + 1]:
+        # More than there are classes, also of black or white, which cannot be darker or lighter.
+        tones = (0.0, -0.5, 0.5, *np.linspace(_DARKEST, _LIGHTEST, 4 * len(classes)).tolist())
+        shades = [_shade(arena.colours[each.split(" ")[0]], tone) for tone in tones]
+        taken.append(max(shades, key=lambda shade: _distance(shade, taken)))
+    return taken[-1]
 
 
-def as_hex(colour: tuple[float, float, float]) -> str:
+def _shade(colour: RGB, tone: float) -> RGB:
+    """A colour, darker (tone < 0) or lighter (tone > 0), up to black at -1 and white at 1."""
+    red, green, blue = (part + abs(tone) * ((tone > 0) - part) for part in colour)
+    return red, green, blue
+
+
+def _distance(colour: RGB, others: list[RGB]) -> float:
+    """How far a colour is from the nearest of others, if it is not far enough."""
+    return min([_APART, *(math.dist(colour, other) for other in others)])
+
+
+def as_hex(colour: RGB) -> str:
     """RGB in [0, 1] as `#rrggbb`."""
     return "#" + "".join(f"{round(255 * part):02x}" for part in colour)
+
+
+def as_srgb(linear: np.ndarray) -> np.ndarray:
+    """Linear RGB in [0, 1] as screens take it, with the gamma of sRGB (IEC 61966-2-1)."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)

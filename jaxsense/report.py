@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
-from jaxsense.colours import class_colour
+from jaxsense.colours import as_srgb, class_colour
 from jaxsense.config import Config
 from jaxsense.pipeline import RunResult
+from jaxsense.sim import sensors
 from jaxsense.types import Belief
 
 _MOST_ELLIPSES = 40
@@ -158,20 +159,21 @@ def rewards(per_epoch: dict[str, np.ndarray], figures: dict[str, Any]) -> Figure
 
 
 def scanlines(config: Config, windows: dict[str, np.ndarray]) -> Figure:
-    """What each detector reads of one look at each class."""
+    """What each detector reads of one look at each class, from left to right."""
     classes = config.arena.classes
     figure = Figure(figsize=(3.6 * len(classes), 2.6 * len(windows)), layout="constrained")
     axes = figure.subplots(len(windows), len(classes), squeeze=False)
-    for row, (name, window) in zip(axes, windows.items(), strict=True):
-        for ax, label, readings in zip(row, classes, window[:, 0], strict=True):
-            ax.set_title(f"{name}: {label}")
+    for row, sensor in zip(axes, sensors.make(config), strict=True):
+        name, ray = sensor.name, {"camera": "pixel", "lidar": "beam"}.get(sensor.name, "ray")
+        from_left = 1 if sensor.angles[0] > sensor.angles[-1] else -1
+        for ax, label, window in zip(row, classes, windows[name][:, 0], strict=True):
+            readings = window.reshape(sensor.window, sensor.channels)[::from_left]
+            ax.set(title=f"{name}: {label}", xlabel=f"{ray} of the window, left to right")
             if name == "camera":
-                ax.imshow(readings.reshape(1, -1, 3), aspect="auto", interpolation="nearest")
-                ax.set(yticks=[], xlabel="pixel of the window")
+                ax.imshow(as_srgb(readings)[None], aspect="auto", interpolation="nearest")
+                ax.set(yticks=[])
             else:
                 ax.plot(readings, ".", color=class_colour(config.arena, label), markersize=3)
-                if name == "lidar":
-                    ax.set(xlabel="beam of the window", ylabel="distance [m]", ylim=(0, None))
-                else:
-                    ax.set(xlabel="reading of the window")
+            if name == "lidar":
+                ax.set(ylabel="distance [m]", ylim=(0, None))
     return figure

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxsense import report
-from jaxsense.config import PRESETS
+from jaxsense import colours, report
+from jaxsense.config import PRESETS, SHAPES, ArenaConfig, Attribute, Shape
+from jaxsense.sim import sensors
 from jaxsense.types import Belief
 
 CONFIG = PRESETS["smoke"]
@@ -51,3 +52,74 @@ def test_outliers_are_counted_and_crossed(outlier, number):
 def test_a_latent_space_of_one_dimension_is_drawn():
     flat = {n: Belief(b.mean[..., :1], b.std[..., :1]) for n, b in posteriors().items()}
     report.latent_space(CONFIG, flat).draw_without_rendering()
+
+
+@pytest.fixture(scope="module")
+def scanlines():
+    """Axes of a plot in which camera and LiDAR look at a place 0.4 full scale, on the left 0.8."""
+    windows = {}
+    for sensor in sensors.make(CONFIG):
+        is_left = sensor.angles[:: sensor.stride][: sensor.window]
+        readings = np.where(is_left > np.median(is_left), 0.8, 0.4)[:, None]
+        readings = np.repeat(readings, sensor.channels, axis=1).reshape(1, 1, -1)
+        windows[sensor.name] = np.repeat(readings, 3, axis=0)
+    figure = report.scanlines(CONFIG, windows)
+    figure.draw_without_rendering()
+    return np.reshape(figure.axes[:6], (2, 3))
+
+
+def test_camera_and_lidar_are_drawn_from_left_to_right(scanlines):
+    for ax in scanlines.flat:
+        assert ax.get_xlabel().endswith("of the window, left to right")
+    row = scanlines[0, 0].images[0].get_array()[0]
+    assert row.shape == (CONFIG.camera.window, 3)
+    ranges = scanlines[1, 0].lines[0].get_ydata()
+    for left, *_, right in (row[:, 0], ranges):
+        assert left > right
+
+
+def test_pixels_are_drawn_with_the_gamma_of_screens(scanlines):
+    # 1.055 * 0.8^(1 / 2.4) - 0.055 = 0.9063 and 1.055 * 0.4^(1 / 2.4) - 0.055 = 0.6652
+    row = np.asarray(scanlines[0, 0].images[0].get_array()[0])
+    np.testing.assert_allclose(row[[0, -1]], [[0.9063] * 3, [0.6652] * 3], atol=1e-4)
+    # Near black it is linear: 12.92 * 0.002 = 0.02584.
+    np.testing.assert_allclose(colours.as_srgb(np.array([0.0, 0.002, 1.0])), [0, 0.02584, 1])
+
+
+ARENAS = {
+    "four alike": ArenaConfig(
+        shapes={**SHAPES, "post": Shape("cylinder", (0.5, 0.5)), "slab": Shape("box", (1.0, 0.5))},
+        classes=("red post", "red slab", "red cube", "red cylinder"),
+    ),
+    "two attributes": ArenaConfig(
+        attributes={
+            "temperature": Attribute({"cold": 30.0, "hot": 60.0}),
+            "gloss": Attribute({"dull": 0.0, "shiny": 1.0}),
+        },
+        classes=tuple(
+            f"{colour} {shape} {temperature} {gloss}"
+            for colour in ("red", "green")
+            for shape in ("cylinder", "cube")
+            for temperature in ("cold", "hot")
+            for gloss in ("dull", "shiny")
+        ),
+    ),
+    "two names of black": ArenaConfig(
+        colours={"black": (0.0, 0.0, 0.0), "jet": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)},
+        classes=("black cube", "jet cube", "black cylinder", "white cube", "white cylinder"),
+    ),
+}
+
+
+@pytest.mark.parametrize("arena", ARENAS.values(), ids=ARENAS)
+def test_every_class_has_a_colour_of_its_own(arena):
+    rgb = np.array([colours.class_colour(arena, label) for label in arena.classes])
+    assert (rgb >= 0).all()
+    assert (rgb <= 1).all()
+    apart = np.linalg.norm(rgb[:, None] - rgb[None], axis=-1)[np.triu_indices(len(rgb), 1)]
+    assert apart.min() > 0.04  # 10 of 255
+
+
+def test_a_class_is_drawn_in_the_colour_of_its_pois_or_else_darker():
+    found = [colours.class_colour(CONFIG.arena, label) for label in CONFIG.arena.classes]
+    np.testing.assert_allclose(found, [[0.1, 0.7, 0.1], [0.8, 0.1, 0.1], [0.4, 0.05, 0.05]])

@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 
 import jax
@@ -259,3 +260,12 @@ def test_wrong_shapes_are_named_while_tracing(name, call, right, wrong):
     jax.eval_shape(lambda: call(right))
     with pytest.raises(AssertionError, match=name):
         jax.eval_shape(lambda: call(wrong))
+
+
+@pytest.mark.parametrize("horizon", [1.0, 4.0])
+def test_a_robot_may_leave_its_arc_after_half_the_horizon(horizon):
+    settings = dataclasses.replace(SETTINGS, horizon=horizon)
+    waypoint = jnp.array([0.1 * horizon / 2, 0.0])  # where it is by then at 0.1 m/s
+    args = layout_of(), jnp.zeros((1, 3)), jnp.array([[0.2, 0.0]]), 0, waypoint, PERIOD
+    drive_to = jax.jit(functools.partial(navigation.drive_to, settings, ARENA, *args))
+    np.testing.assert_allclose(drive_to(jnp.bool_(False)), [0.1, 0.0], atol=1e-6)

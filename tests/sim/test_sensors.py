@@ -304,3 +304,13 @@ def test_palette_colours_pois_from_the_layout_and_the_rest_from_the_model(arena,
     np.testing.assert_allclose(colour["poi0_cylinder"], GREEN)
     np.testing.assert_allclose(colour["poi2_cube"], RED)
     np.testing.assert_allclose(colour["wall0"], WALL)
+
+
+@pytest.mark.parametrize(("noise", "deviation"), [(0.01, 0.01), (0.05, 0.05), (0.0, 0.0002)])
+def test_the_lidar_takes_for_a_poi_what_five_deviations_of_its_noise_allow(noise, deviation):
+    # A PoI of extent 0.14 m around 1 m is met from 0.86 m on, and not behind its centre. Without
+    # noise there is rounding, for which 1 mm is ample.
+    lidar = sensors.lidar(LidarConfig(range_noise=noise))
+    readings = jnp.array([0.86, 0.86, 1.0, 1.0]) + deviation * jnp.array([-5.5, -4.5, 4.5, 5.5])
+    shown = lidar.shows(readings, jnp.float32(1.0), 0.14)
+    np.testing.assert_array_equal(shown, [False, True, True, False])
