@@ -6,6 +6,7 @@ import pytest
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig
+from jaxsense.sim import raycast
 
 
 @pytest.fixture(scope="session")
@@ -40,3 +41,12 @@ def known_layout():
     position = jnp.array([[0.0, 0.0], [0.0, 1.0], [1.0, -1.0]])
     yaw = jnp.array([0.0, np.radians(30.0), 0.0])
     return sim.make_layout(ArenaConfig(), position, yaw, jnp.array([0, 2, 2]))
+
+
+@pytest.fixture(params=["_nearest_by_one_loop", "_nearest_by_two_loops"])
+def by(request, monkeypatch):
+    """Both ways to find what is nearest, that of accelerators and that of CPUs."""
+    find = getattr(raycast, request.param)
+    for name in ("_nearest_by_one_loop", "_nearest_by_two_loops"):
+        monkeypatch.setattr(raycast, name, find)
+    return request.param

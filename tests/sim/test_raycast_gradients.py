@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from sections import TURN, scene
 
 from jaxsense import sim
 from jaxsense.config import LidarConfig
@@ -15,41 +16,6 @@ from jaxsense.sim import raycast, sensors
 STEP = 1e-6  # of central differences, in double precision
 MOST_RAYS = 16
 HALF_PI = np.pi / 2
-TURN = np.radians(30.0)
-
-
-def outlines(*rows):
-    """Centre, axis and half sides from `(x, y, yaw, half_u, half_v)` of each outline."""
-    x, y, yaw, half_u, half_v = np.array(rows, np.float64).T
-    pairs = (x, y), (np.cos(yaw), np.sin(yaw)), (half_u, half_v)
-    return [np.stack(pair, axis=-1) for pair in pairs]
-
-
-def scene(dtype):
-    """Two circles, a cube turned by 30 degrees, two walls, and one of each that is not cut."""
-    arrays = outlines(
-        (0.0, 0.0, 0.0, 0.1, 0.1),
-        (0.8, 0.5, 0.0, 0.05, 0.05),
-        (-0.5, 0.5, 0.0, 0.0, 0.0),
-        (0.0, 1.0, TURN, 0.1, 0.1),
-        (1.525, 0.0, 0.0, 0.025, 1.55),
-        (0.0, -1.525, 0.0, 1.55, 0.025),
-        (-0.5, -0.5, 0.0, 0.0, 0.0),
-    )
-    return raycast.CrossSection(*(x.astype(dtype) for x in arrays), tuple(range(7)), 3)
-
-
-@pytest.fixture(scope="module", params=["one loop", "two loops"])
-def by(request):
-    """Both ways to find what is nearest: that of accelerators and that of CPUs."""
-    finds = {
-        "one loop": raycast._nearest_by_one_loop,
-        "two loops": raycast._nearest_by_two_loops,
-    }
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("_nearest_by_one_loop", "_nearest_by_two_loops"):
-            patch.setattr(raycast, name, finds[request.param])
-        yield
 
 
 def hit(origin, angle, section):
@@ -61,19 +27,57 @@ def hit(origin, angle, section):
 INPUTS = 0, 1, 2
 
 
-@pytest.fixture(scope="module")
-def slopes(by):
-    """What `hit` gives for rays in the scene, and its Jacobian, backwards and forwards."""
+def test_slopes_are_those_of_finite_differences(by):
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        section = scene(np.float64)
+        origins = rng.uniform(-1.4, 1.4, (100, 2))
+        origins[:10] = 0.05 * origins[:10]  # within the first circle
+        origins[10:20] = [0.0, 1.0] + 0.05 * origins[10:20]  # within the cube
+        angles = rng.uniform(-np.pi, np.pi, 100)
+        numbers, unravel = ravel_pytree((origins[0], angles[0], section))
 
-    @jax.jit
-    @functools.partial(jax.vmap, in_axes=(0, 0, None))
-    def jacobians(*ray):
+        values = jax.vmap(lambda start: hit(*unravel(start)))
+        starts = np.column_stack([origins, angles, np.tile(numbers[3:], (100, 1))])
+        steps = STEP * np.eye(len(numbers))
+        around = [starts[:, None] + sign * steps for sign in (1, -1)]
+        after, before = (values(x.reshape(-1, len(numbers))).reshape(100, -1, 3) for x in around)
+        expected = np.swapaxes((after - before) / (2 * STEP), 1, 2)
+        met = np.isfinite(values(np.tile(starts, (len(numbers), 1)))[:100, 0])
+        jacobian = jax.vmap(jax.jacrev(hit, INPUTS), in_axes=(0, 0, None))
+        parts = [
+            np.reshape(x, (100, 3, -1)) for x in jax.tree.leaves(jacobian(origins, angles, section))
+        ]
+    found = np.concatenate(parts, axis=-1)
+    assert 5 <= (~met).sum() <= 50
+    np.testing.assert_allclose(found[met], expected[met], rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(found[~met], 0.0)
+    # Centre, axis and half of each outline that is cut matter; a circle has one radius, no axis.
+    centre, axis, half = np.abs(expected[met]).max(axis=(0, 1))[3:].reshape(3, -1, 2)
+    assert (centre[[0, 1, 3, 4, 5]].max(axis=-1) > 0.1).all()
+    assert (axis[[3, 4, 5]].max(axis=-1) > 0.1).all()
+    assert (half[[0, 1, 3, 4, 5], [0, 0, 0, 0, 1]] > 0.1).all()
+
+
+@functools.cache
+def jacobians(by):
+    """What `hit` gives for `[B]` rays, and its Jacobian, backwards and forwards."""
+    del by  # each way is compiled once
+
+    def of(*ray):
         return hit(*ray), jax.jacrev(hit, INPUTS)(*ray), jax.jacfwd(hit, INPUTS)(*ray)
+
+    return jax.jit(jax.vmap(of, in_axes=(0, 0, None)))
+
+
+@pytest.fixture
+def slopes(by):
+    """The same for some rays in the scene."""
 
     def of(rays):
         origins, angles = zip(*rays, *[rays[0]] * (MOST_RAYS - len(rays)), strict=True)
-        rays_ = np.array(origins, np.float32), np.array(angles, np.float32)
-        found = jax.device_get(jacobians(*rays_, scene(np.float32)))
+        inputs = np.array(origins, np.float32), np.array(angles, np.float32), scene(np.float32)
+        found = jax.device_get(jacobians(by)(*inputs))
         return jax.tree.map(lambda x: x[: len(rays)], found)
 
     return of
@@ -112,41 +116,6 @@ def test_slopes_as_worked_by_hand(slopes):
     close(section.half[4, 0, 3], [-1 / np.cos(TURN), 0.0])
     # A normal of the cube turns as its axis does: (-cos, -sin).
     close(section.axis[4, 1:, 3], [[-1.0, 0.0], [0.0, -1.0]])
-
-
-def test_slopes_are_those_of_finite_differences(by):
-    rng = np.random.default_rng(0)
-    with jax.enable_x64(True):
-        section = scene(np.float64)
-        origins = rng.uniform(-1.4, 1.4, (100, 2))
-        origins[:10] = 0.05 * origins[:10]  # within the first circle
-        origins[10:20] = [0.0, 1.0] + 0.05 * origins[10:20]  # within the cube
-        angles = rng.uniform(-np.pi, np.pi, 100)
-        numbers, unravel = ravel_pytree((origins[0], angles[0], section))
-
-        @jax.jit
-        def values(starts):
-            return jax.vmap(lambda start: hit(*unravel(start)))(starts)
-
-        starts = np.column_stack([origins, angles, np.tile(numbers[3:], (100, 1))])
-        steps = STEP * np.eye(len(numbers))
-        around = [starts[:, None] + sign * steps for sign in (1, -1)]
-        after, before = (values(x.reshape(-1, len(numbers))).reshape(100, -1, 3) for x in around)
-        expected = np.swapaxes((after - before) / (2 * STEP), 1, 2)
-        met = np.isfinite(values(np.tile(starts, (len(numbers), 1)))[:100, 0])
-        jacobian = jax.jit(jax.vmap(jax.jacrev(hit, INPUTS), in_axes=(0, 0, None)))
-        parts = [
-            np.reshape(x, (100, 3, -1)) for x in jax.tree.leaves(jacobian(origins, angles, section))
-        ]
-    found = np.concatenate(parts, axis=-1)
-    assert 5 <= (~met).sum() <= 50
-    np.testing.assert_allclose(found[met], expected[met], rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(found[~met], 0.0)
-    # Centre, axis and half of each outline that is cut matter; a circle has one radius, no axis.
-    centre, axis, half = np.abs(expected[met]).max(axis=(0, 1))[3:].reshape(3, -1, 2)
-    assert (centre[[0, 1, 3, 4, 5]].max(axis=-1) > 0.1).all()
-    assert (axis[[3, 4, 5]].max(axis=-1) > 0.1).all()
-    assert (half[[0, 1, 3, 4, 5], [0, 0, 0, 0, 1]] > 0.1).all()
 
 
 def test_slopes_are_finite_for_every_ray(slopes):
