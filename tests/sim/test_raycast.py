@@ -290,3 +290,9 @@ def test_one_loop_and_two_find_the_same(arena, known_layout, place):
     np.testing.assert_allclose(one[0], two[0], atol=1e-5)
     assert np.mean(np.asarray(one[1]) == two[1]) > 0.99  # grazing rays may differ
     assert len(np.unique(one[1])) > 4
+
+
+@pytest.mark.parametrize("robot", [-2, 2, 3])
+def test_a_robot_that_is_not_there_is_named(arena, robot):
+    with pytest.raises(ValueError, match=f"robot = {robot}: must be -1 or one of the 2 robots"):
+        raycast.cross_section(arena, arena.data, 0.1, robot)
