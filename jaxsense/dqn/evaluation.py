@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import random
 
 import jax
 import jax.numpy as jnp
@@ -60,23 +61,32 @@ def every_state(mdp: MapMdp) -> tuple[np.ndarray, np.ndarray]:
     """The states of the paper's count `N! 2^(N M)`: classes in every order, every set of looks.
 
     With fewer PoIs than classes, the orders are those of N of the classes; with more, all
-    combinations. Of more than 4096 states an even sample of that many is taken.
+    combinations. Of more than 4096 states that many are taken: cut into 4096 equal parts, each part
+    gives a random one of its states, always the same.
 
     Returns:
       `[S, N]` int32 classes and `[S, N, M]` bool looks.
     """
     num_pois, num_classes = mdp.num_pois, mdp.num_classes
-    if num_pois <= num_classes:
-        num_orders = math.perm(num_classes, num_pois)
-        orders = itertools.permutations(range(num_classes), num_pois)
-    else:
-        num_orders = num_classes**num_pois
-        orders = itertools.product(range(num_classes), repeat=num_pois)
+    is_order = num_pois <= num_classes
+    # A state is a number: a digit for the class of each PoI, of those that are left in an order,
+    # then a bit for each look.
+    radices = [num_classes - n if is_order else num_classes for n in range(num_pois)]
     num_bits = num_pois * mdp.num_modalities
-    number = num_orders * 2**num_bits
-    chosen = np.unique(np.linspace(0, number - 1, min(number, MOST_STATES)).astype(np.int64))
-    needed = dict.fromkeys(chosen >> num_bits)
-    classes_of_order = {i: order for i, order in enumerate(orders) if i in needed}
-    classes = np.array([classes_of_order[i] for i in chosen >> num_bits], np.int32)
-    bits = chosen[:, None] >> np.arange(num_bits) & 1
+    number = math.prod(radices) << num_bits
+    parts = min(number, MOST_STATES)
+    edges = [i * number // parts for i in range(parts + 1)]
+    draw = random.Random(0)
+    # Of 25 PoIs there are more states than an int64 can count: Python's integers.
+    states = np.array([draw.randrange(*part) for part in itertools.pairwise(edges)], object)
+    bits = states[:, None] >> np.arange(num_bits, dtype=object) & 1
+    states >>= num_bits
+    classes = np.zeros((parts, num_pois), np.int32)
+    for n in reversed(range(num_pois)):
+        classes[:, n] = states % radices[n]
+        states //= radices[n]
+    if is_order:
+        for row in classes:
+            left = list(range(num_classes))
+            row[:] = [left.pop(digit) for digit in row]
     return classes, bits.astype(bool).reshape(-1, num_pois, mdp.num_modalities)

@@ -1,5 +1,8 @@
 """Whole episodes with known totals, and the count of the map's states."""
 
+import itertools
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,3 +103,54 @@ def test_policies_draw_anew_at_every_step():
     # Looks in vain until the first NOP: geometric, mean 1, variance 2; +- 4 sqrt(2 / 400).
     np.testing.assert_allclose(-totals.mean(), 1.0, atol=0.29)
     assert len(np.unique(totals)) >= 5
+
+
+def every_state_by_enumeration(num_pois, num_classes, num_modalities):
+    """Rows of classes and looks, by `itertools` and in its order."""
+    if num_pois <= num_classes:
+        orders = itertools.permutations(range(num_classes), num_pois)
+    else:
+        orders = itertools.product(range(num_classes), repeat=num_pois)
+    # The first look changes fastest.
+    looks = [bits[::-1] for bits in itertools.product((0, 1), repeat=num_pois * num_modalities)]
+    return [(*order, *bits) for order in orders for bits in looks]
+
+
+@pytest.mark.parametrize(
+    "sizes",
+    # PoIs, classes, modalities: an order of all classes, of some, of more PoIs than classes; 4096.
+    [(3, 3, 2), (2, 3, 2), (2, 5, 3), (4, 2, 1), (3, 1, 2), (6, 2, 1)],
+)
+def test_states_come_in_the_order_of_an_enumeration(sizes):
+    num_pois, num_classes, num_modalities = sizes
+    mdp = replace(classes_mdp(num_pois, num_modalities), num_classes=num_classes)
+    classes, seen = evaluation.every_state(mdp)
+    expected = every_state_by_enumeration(*sizes)
+    np.testing.assert_array_equal(
+        np.concatenate([classes, seen.reshape(len(seen), -1)], axis=1), expected
+    )
+
+
+@pytest.mark.parametrize(
+    "sizes", [(8, 9, 1), (8, 4, 2), (15, 3, 2), (17, 3, 2), (18, 3, 2), (25, 3, 2), (25, 4, 4)]
+)
+def test_of_more_states_than_an_integer_holds_an_even_sample_is_taken(sizes):
+    num_pois, num_classes, num_modalities = sizes
+    mdp = replace(classes_mdp(num_pois, num_modalities), num_classes=num_classes)
+    classes, seen = evaluation.every_state(mdp)
+    assert seen.shape == (4096, num_pois, num_modalities)
+    looks = seen.reshape(4096, -1).astype(int)
+    assert len(np.unique(np.concatenate([classes, looks], axis=1), axis=0)) == 4096
+    # Every class and look is as frequent as it should be, and related to no other: four standard
+    # errors, five for the many pairs.
+    shares = np.stack([np.mean(classes == c, axis=0) for c in range(num_classes)])
+    p = 1 / num_classes
+    np.testing.assert_allclose(shares, p, atol=4 * np.sqrt(p * (1 - p) / 4096))
+    np.testing.assert_allclose(looks.mean(axis=0), 0.5, atol=4 * np.sqrt(0.25 / 4096))
+    pairs = np.corrcoef(looks.T) - np.eye(looks.shape[1])
+    assert np.max(np.abs(pairs)) < 5 / np.sqrt(4096)
+    if num_pois <= num_classes:  # an order holds no class twice
+        assert np.all(np.diff(np.sort(classes, axis=1), axis=1) > 0)
+    again = evaluation.every_state(mdp)
+    np.testing.assert_array_equal(again[0], classes)
+    np.testing.assert_array_equal(again[1], seen)
