@@ -4,6 +4,7 @@ import dataclasses
 import json
 import sys
 import types
+import typing
 
 import pytest
 
@@ -107,6 +108,10 @@ def test_labels_follow_the_declaration():
             "sensors = 'lidar': is there already",
         ),
         (
+            lambda: Config(sensors={"joint": SensorConfig("a:b", "shape")}),
+            "sensors = 'joint': is there already; must be a new name",
+        ),
+        (
             lambda: dataclasses.replace(OWN, modalities=("lidar", "sonar")),
             "must be some of camera, lidar, thermal",
         ),
@@ -142,3 +147,19 @@ def test_a_sensor_that_does_not_fit_is_named(own_sensors, function, expected):
     with pytest.raises(ConfigError) as error:
         sim.sensors.make(OWN)
     assert expected in str(error.value)
+
+
+def choices_of_all_sections():
+    """Sections of the settings with those of their fields that take one of several values."""
+    sections = [f.default for f in dataclasses.fields(Config) if dataclasses.is_dataclass(f.type)]
+    for section in (*sections, Shape("box")):
+        for field in dataclasses.fields(section):
+            if typing.get_origin(field.type) is typing.Literal:
+                yield pytest.param(section, field.name, id=f"{type(section).__name__}.{field.name}")
+
+
+@pytest.mark.parametrize(("section", "field"), list(choices_of_all_sections()))
+@pytest.mark.parametrize("value", ["Live", "", None, 1])
+def test_a_choice_that_is_none_is_named_in_one_line(section, field, value):
+    with pytest.raises(ConfigError, match=rf"\.{field} = {value!r}: must be one of \w+, \w+$"):
+        dataclasses.replace(section, **{field: value})

@@ -1,6 +1,8 @@
 """What is checked when a section is made, and the error of a check that fails."""
 
+import dataclasses
 import math
+from typing import Any, Literal, get_args, get_origin
 
 
 class ConfigError(ValueError):
@@ -36,6 +38,15 @@ def require_not_negative(section: object, *fields: str) -> None:
             field,
             "must be a number that is not negative",
         )
+
+
+def require_choices(section: Any) -> None:
+    """Raises `ConfigError` unless each field of a `Literal` type holds one of its values."""
+    for field in dataclasses.fields(section):
+        if get_origin(field.type) is Literal:
+            choices = get_args(field.type)
+            is_one = getattr(section, field.name) in choices
+            require(is_one, section, field.name, f"must be one of {', '.join(choices)}")
 
 
 def require_sizes(section: object, field: str) -> None:

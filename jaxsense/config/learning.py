@@ -4,7 +4,13 @@ import dataclasses
 import math
 from typing import Literal
 
-from jaxsense.config.checks import require, require_not_negative, require_positive, require_sizes
+from jaxsense.config.checks import (
+    require,
+    require_choices,
+    require_not_negative,
+    require_positive,
+    require_sizes,
+)
 
 _MOST_SHARES = 32
 
@@ -133,6 +139,7 @@ class DqnConfig:
     """Epochs between two reports of progress."""
 
     def __post_init__(self):
+        require_choices(self)
         require_sizes(self, "hidden")
         require_positive(self, "num_envs", "epochs", "updates", "batch", "replay_capacity")
         require_positive(self, "learning_rate", "target_period", "num_starts", "chunk")

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from typing import Literal
 
-from jaxsense.config.checks import ConfigError, require
+from jaxsense.config.checks import ConfigError, require, require_choices
 
 LEAST_SHARE = 0.5
 """Smallest half side of a shape: of a narrower one a sensor may miss what it believes it faces."""
@@ -23,8 +23,7 @@ class Shape:
     from 0.5 to 1."""
 
     def __post_init__(self):
-        known = ("cylinder", "box")
-        require(self.primitive in known, self, "primitive", f"must be one of {', '.join(known)}")
+        require_choices(self)
         require(
             len(self.half_sides) == 2 and all(LEAST_SHARE <= s <= 1 for s in self.half_sides),
             self,

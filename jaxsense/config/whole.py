@@ -101,7 +101,7 @@ class Config:
             require_words(self.sensors, "sensors")
         attributes = ("colour", "shape", *self.arena.attributes)
         for name, sensor in self.sensors.items():
-            if name in MODALITIES:
+            if name in (*MODALITIES, "joint"):
                 raise ConfigError("sensors", name, "is there already; must be a new name")
             if sensor.attribute not in attributes:
                 raise ConfigError(
