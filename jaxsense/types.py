@@ -27,14 +27,14 @@ class Belief:
 
 @struct.dataclass
 class Transition:
-    """One step of the map MDP as a Q-network learns from it.
+    """One step of the map MDP as a Q-network learns from it, or a batch of them as columns.
 
     Attributes:
-      s_tm1: `[..., N * 2D]` float32 map before the action, see `belief_mdp.as_state`.
+      s_tm1: `[N * 2D, ...]` float32 map before the action, see `belief_mdp.as_state`.
       a_tm1: `[...]` int32 action, `N` being no operation.
       r_t: `[...]` float32 reward.
       discount_t: `[...]` float32, 0 where the episode ended and 1 elsewhere.
-      s_t: `[..., N * 2D]` float32 map after the action.
+      s_t: `[N * 2D, ...]` float32 map after the action.
     """
 
     s_tm1: jax.Array
