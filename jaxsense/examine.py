@@ -35,7 +35,7 @@ def latent_space(
 
     Returns:
       `[C, S, D]` beliefs for `joint` and for each modality, and the block `jmvae` of the summary as
-      arrays.
+      arrays. Parameters or detections that are not finite are not caught here: look at the beliefs.
     """
     model = jmvae_shape(config)
     labels = [config.label_of_class(m) for m in config.modalities]
@@ -113,8 +113,9 @@ def play(
       config: all settings.
 
     Returns:
-      `[P, S]` total reward and reward of the first action, means over the noise of detections. The
-      starts are every state of the map, then `evaluation.num_starts` random ones.
+      `[P, S]` total reward and reward of the first action, means over the noise of detections; NaN
+      where a value or a reward was. The starts are every state of the map, then
+      `evaluation.num_starts` random ones.
     """
     settings = config.evaluation
     mdp = observe.bank_mdp(config, bank, params, jmvae_shape(config))

@@ -55,8 +55,9 @@ def fit(
       total: steps of the whole training.
 
     Returns:
-      The state after the last step and the `[steps]` losses; those beyond `total` mean nothing. A
-      loss that is not finite is not caught here: look at the losses.
+      The state after the last step and the `[steps]` losses; those beyond `total` mean nothing.
+      Nothing that is not finite is caught here: look at the losses, of which the last is NaN if the
+      parameters after it are not finite.
     """
     steps = jax.tree.leaves(drawn)[0].shape[0]
 
@@ -71,4 +72,6 @@ def fit(
         return after, value
 
     state, losses = jax.lax.scan(make_step, state, drawn)
-    return state, jnp.asarray(losses)
+    # Parameters of the steps before show in the loss of the next one.
+    is_finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(state.params)]).all()
+    return state, jnp.asarray(losses).at[-1].mul(jnp.where(is_finite, 1.0, jnp.nan))

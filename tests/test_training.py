@@ -59,3 +59,16 @@ def test_the_loss_is_told_the_step_counted_from_the_start():
         )
         counted.extend(steps.tolist())
     assert counted == [0, 1, 2, 3, 4, 5]
+
+
+def test_the_last_loss_tells_of_parameters_that_are_not_finite():
+    # sqrt(p) at p = 0 is 0, and its slope infinite.
+    optimiser = optax.sgd(0.5)
+    start = training.start({"p": jnp.float32(0), "q": jnp.float32(0)}, optimiser)
+
+    def loss(params, drawn, step):
+        return jnp.sqrt(params["p"]) + params["q"]
+
+    for is_finite in ([False], [True, False]):
+        _, losses = training.fit(start, loss, jnp.zeros(len(is_finite)), optimiser)
+        np.testing.assert_array_equal(np.isfinite(losses), is_finite)

@@ -179,7 +179,7 @@ def step(
 
     Returns:
       The next state and the outcome. The reward is the gain of information; -1 if that is not above
-      `min_increase`; 0 for NOP.
+      `min_increase`; 0 for NOP; NaN if the gain is NaN or the action is none of these.
 
     Raises:
       ValueError: if there is no such modality.
@@ -200,7 +200,8 @@ def step(
 
     new, scene = call(look, modality, mdp.num_modalities)
     gain = information(new.std) - information(old.std)
-    reward = jnp.where(gain > mdp.config.min_increase, gain, -1.0)
+    reward = jnp.where(gain <= mdp.config.min_increase, -1.0, gain)
+    exists = (action >= 0) & (action <= mdp.num_pois)
 
     looked = dataclasses.replace(
         state,
@@ -211,7 +212,7 @@ def step(
     after = jax.tree.map(lambda x, y: jnp.where(is_nop, x, y), state, looked)
     after = dataclasses.replace(after, steps=state.steps + 1)
     outcome = Outcome(
-        reward=jnp.where(is_nop, 0.0, reward),
+        reward=jnp.where(exists, jnp.where(is_nop, 0.0, reward), jnp.nan),
         is_over=is_nop,
         is_cut=~is_nop & (after.steps >= mdp.config.max_steps),
     )

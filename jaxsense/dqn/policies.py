@@ -22,12 +22,12 @@ def q_network(mdp: MapMdp, hidden: tuple[int, ...]) -> MLP:
 
 
 def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
-    """The action of highest value in a Q-network."""
+    """The action of highest value in a Q-network, or -1, whose reward is NaN, if one is NaN."""
 
     def act(key: Key, state: MapState) -> jax.Array:
         del key
         values = q_network(mdp, hidden).apply(params, belief_mdp.as_state(state.belief))
-        return jnp.argmax(jnp.asarray(values))
+        return _best(jnp.asarray(values))
 
     return act
 
@@ -91,7 +91,7 @@ def optimal(mdp: MapMdp, rewards: jax.Array, label_of_class: jax.Array) -> Polic
         modality that has looked detects as it does the true one are equally likely.
 
     Returns:
-      The policy; it uses the hidden parts of the state.
+      The policy; it uses the hidden parts of the state. Its action is -1 if a reward is NaN.
     """
     shape = (mdp.num_modalities, mdp.num_classes)
     chex.assert_shape(label_of_class, shape, custom_message="label_of_class")
@@ -105,6 +105,11 @@ def optimal(mdp: MapMdp, rewards: jax.Array, label_of_class: jax.Array) -> Polic
 
     def act(key: Key, state: MapState) -> jax.Array:
         del key
-        return jnp.argmax(jnp.append(jax.vmap(of_poi)(state.seen, state.classes), 0.0))
+        return _best(jnp.append(jax.vmap(of_poi)(state.seen, state.classes), 0.0))
 
     return act
+
+
+def _best(values: jax.Array) -> jax.Array:
+    """`[]` int32 action of the highest of `[N + 1]` values; -1, which is none, if one is NaN."""
+    return jnp.where(jnp.any(jnp.isnan(values)), -1, jnp.argmax(values))

@@ -60,12 +60,14 @@ class EpochInfo:
       episode_return: `[]` mean total reward of the episodes that ended, of the exploring policy.
       episodes: `[]` int32 episodes that ended.
       epsilon: `[]` chance of a random action.
+      is_finite: `[]` bool, whether values, rewards, the loss and the parameters after it are.
     """
 
     loss: jax.Array
     episode_return: jax.Array
     episodes: jax.Array
     epsilon: jax.Array
+    is_finite: jax.Array
 
 
 @struct.dataclass
@@ -264,7 +266,17 @@ def _epoch(
     params, optimiser, loss = _learn(config, axis, state, memory, draws.replay)
     is_copied = (state.epoch + 1) % config.target_period == 0
     target = jax.tree.map(lambda new, old: jnp.where(is_copied, new, old), params, state.target)
-    info = EpochInfo(loss, ended_reward / jnp.maximum(episodes, 1), episodes, epsilon)
+    # What one device sees may be finite where what another sees is not.
+    seen = jnp.isfinite(values).all() & jnp.isfinite(outcome.reward).all()
+    seen = seen if axis is None else jax.lax.pmin(seen.astype(jnp.int32), axis) > 0
+    learnt = [jnp.isfinite(x).all() for x in (loss, *jax.tree.leaves(params))]
+    info = EpochInfo(
+        loss=loss,
+        episode_return=ended_reward / jnp.maximum(episodes, 1),
+        episodes=episodes,
+        epsilon=epsilon,
+        is_finite=seen & jnp.stack(learnt).all(),
+    )
     state = DqnState(
         params=params,
         target=target,
