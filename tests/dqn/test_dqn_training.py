@@ -203,3 +203,37 @@ def test_an_episode_goes_on_until_nop_or_the_cut():
     drawn = replay.sample(jax.random.uniform(jax.random.key(3), (64, 2)), state.replay)
     np.testing.assert_array_equal(drawn.discount_t, 1.0)
     assert set(np.asarray(drawn.a_tm1)) == {0}
+
+
+def with_bias(params, bias):
+    """A network whose values are the same for every state."""
+    layers = jax.tree.map(jnp.zeros_like, params["params"])
+    return {"params": {**layers, "Dense_1": {**layers["Dense_1"], "bias": jnp.array(bias)}}}
+
+
+def test_values_after_an_action_are_those_of_the_target_network():
+    # Nothing is left to see: every look costs 1, and the greedy one looks at PoI 0 for ever.
+    mdp = paying_once_mdp(num_pois=1, max_steps=9)
+    config = replace(
+        SMALL, discount=0.5, epsilon_start=0.0, epsilon_min=0.0, chunk=2, target_period=2,
+        learning_rate=1e-9, final_learning_rate=1e-9,
+    )  # fmt: skip
+    seen = jnp.ones((1, 1), bool)
+    one = belief_mdp.reset(jax.random.key(0), mdp, jnp.zeros(1, int), seen)
+    prepared = jax.tree.map(lambda x: jnp.stack([x] * config.num_starts), one)
+    state = training.init(jax.random.key(0), mdp, config, prepared)
+    state = replace(
+        state,
+        params=with_bias(state.params, [1.0, 0.0]),
+        target=with_bias(state.params, [-2.0, 3.0]),
+    )
+    chunk = jax.jit(
+        lambda state: training.train_chunk(jax.random.key(1), mdp, 0, config, state, prepared),
+        compiler_options=FAST_TO_COMPILE,
+    )
+    state, first = chunk(state)
+    _, second = chunk(state)
+    # The value of the look is 1. By the target -1 + .5 x max(-2, 3) - 1 = -.5, and from its first
+    # copy on, after two epochs, -1 + .5 x max(1, 0) - 1 = -1.5: sqrt(1 + e^2) - 1.
+    losses = np.sqrt(1 + np.array([0.5, 0.5, 1.5, 1.5]) ** 2) - 1
+    np.testing.assert_allclose([*first.loss, *second.loss], losses, rtol=1e-5)

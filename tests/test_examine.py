@@ -1,0 +1,200 @@
+"""The figures of a latent space and of policies, on networks whose weights are set by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import examine
+from jaxsense.config import Config, DqnConfig, EvaluationConfig, JmvaeConfig, MdpConfig
+
+# Classes: green cylinder, red cylinder, red cube. Three latent dimensions, of which one is unused.
+CONFIG = Config(
+    jmvae=JmvaeConfig(latent_size=3, hidden=(4,)),
+    mdp=MdpConfig(min_increase=0.0, max_steps=8),
+    dqn=DqnConfig(hidden=(2,)),
+    evaluation=EvaluationConfig(num_starts=16, num_repeats=8),
+)
+GREEN, CUBE = 1, 1  # where features (red, green) and (cylinder, cube) hold them
+LN4, LN25, LN26 = np.log([4.0, 25.0, 26.0])
+
+
+def network(inputs, outputs, weights, bias=()):
+    """A hidden layer that passes on what is not negative, then outputs by their weights.
+
+    Args:
+      inputs: number of inputs.
+      outputs: number of outputs.
+      weights: `{(input, output): weight}`.
+      bias: `{output: bias}`.
+    """
+    kernel = np.zeros((4, outputs), np.float32)
+    for place, weight in weights.items():
+        kernel[place] = weight
+    biases = np.zeros(outputs, np.float32)
+    for output, each in dict(bias).items():
+        biases[output] = each
+    hidden = {"kernel": jnp.eye(inputs, 4), "bias": jnp.zeros(4)}
+    last = {"kernel": jnp.array(kernel), "bias": jnp.array(biases)}
+    return {"params": {"Dense_0": hidden, "Dense_1": last}}
+
+
+PARAMS = {
+    "encoders": {
+        # (10 green, 10 cube, 0), of deviation 1, but 2 in two dimensions for a cube.
+        "camera+lidar": network(
+            4, 6, {(GREEN, 0): 10, (2 + CUBE, 1): 10, (3, 3): LN4, (3, 4): LN4}
+        ),
+        # Green is class 0; red lies between the classes 1 and 2, in the second dimension.
+        "camera": network(2, 6, {(GREEN, 0): 10, (0, 1): 5, (0, 4): LN25}),
+        # A cube is class 2; a cylinder lies between the classes 0 and 1, in the first.
+        "lidar": network(2, 6, {(CUBE, 1): 10, (0, 0): 5, (0, 3): LN26, (CUBE, 4): LN4}),
+    },
+    "decoders": {
+        "camera": network(3, 2, {(0, GREEN): 0.1}),
+        # Wrong by .6: too much of a cube.
+        "lidar": network(3, 2, {(1, CUBE): 0.1}, {CUBE: 0.6}),
+    },
+}
+# Two looks at each class. The second LiDAR look at class 0 tells half a cylinder.
+CAMERA = jnp.array([[[0, 1], [0, 1]], [[1, 0], [1, 0]], [[1, 0], [1, 0]]], jnp.float32)
+LIDAR = jnp.array([[[1, 0], [0.5, 0]], [[1, 0], [1, 0]], [[0, 1], [0, 1]]], jnp.float32)
+BANK = (CAMERA, LIDAR)
+
+
+@pytest.fixture(scope="module")
+def latent():
+    return jax.jit(lambda bank: examine.latent_space(PARAMS, bank, CONFIG))
+
+
+@pytest.fixture(scope="module")
+def found(latent):
+    return jax.tree.map(np.asarray, latent(BANK))
+
+
+def test_posteriors_are_of_both_sensors_and_of_each(found):
+    posteriors, _ = found
+    assert list(posteriors) == ["camera", "joint", "lidar"]
+    expected = {
+        "joint": ([[10, 0, 0], [0, 0, 0], [0, 10, 0]], [[1, 1, 1], [1, 1, 1], [2, 2, 1]]),
+        "camera": ([[10, 0, 0], [0, 5, 0], [0, 5, 0]], [[1, 1, 1], [1, 5, 1], [1, 5, 1]]),
+        "lidar": ([[5, 0, 0], [5, 0, 0], [0, 10, 0]], [[26**0.5, 1, 1]] * 2 + [[1, 2, 1]]),
+    }
+    for name, (mean, std) in expected.items():
+        np.testing.assert_allclose(posteriors[name].mean[:, 0], mean, atol=1e-5)
+        np.testing.assert_allclose(posteriors[name].std[:, 0], std, rtol=1e-5)
+    np.testing.assert_allclose(posteriors["lidar"].mean[0, 1], [2.5, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(posteriors["lidar"].std[0, 1], [26**0.25, 1, 1], rtol=1e-5)
+
+
+def test_figures_of_the_latent_space_as_worked_by_hand(found):
+    _, figures = found
+    assert figures["active_units"] == 2
+    norms = {
+        "joint": [3**0.5, 3**0.5, 3],  # 1 + 1 + 1; 4 + 4 + 1
+        "camera": [3**0.5, 27**0.5, 27**0.5],  # 1 + 25 + 1
+        # 26 + 1 + 1, and sqrt(26) + 1 + 1 at the second look; 1 + 4 + 1.
+        "lidar": [(28**0.5 + (26**0.5 + 2) ** 0.5) / 2, 28**0.5, 6**0.5],
+    }
+    for name, expected in norms.items():
+        np.testing.assert_allclose(figures["sigma_norm"][name], expected, rtol=1e-5)
+    # At most 2 deviations away. At the second look at class 0, (2.5, 0) is 7.5 / 2.26 deviations
+    # from class 0 and 2.5 / 2.26 from class 1, the only one that it leaves open.
+    shares = {"joint": [1, 1, 1], "camera": [1, 0, 0], "lidar": [0, 0, 1]}
+    for name, expected in shares.items():
+        np.testing.assert_array_equal(figures["unambiguous"][name], expected)
+
+
+def test_moment_matching_as_worked_by_hand(found):
+    # Mean over three dimensions, then looks, classes and sensors.
+    # Camera, green: itself. Red: classes 1 and 2, mean 5, variances (1 + 4) / 2 = 2.5 and 2.5 + 25.
+    red = (np.log(2.5) / 2 + np.log(27.5 / 25) / 2) / 3
+    # LiDAR, cylinder: classes 0 and 1, mean 5, variances 1 + 25 and 1. A cube: class 2, of 4 and 4.
+    cube = np.log(2) / 3
+    # The second look at class 0: 2.5 / sqrt(26) off, and ln(26) / 4 too narrow.
+    half = (2.5 / 26**0.5 + LN26 / 4) / 3
+    camera, lidar = [0, red, red], [half / 2, 0, cube]
+    error = found[1]["moment_matching_error"]
+    np.testing.assert_allclose(error, np.mean([*camera, *lidar]), rtol=1e-4)
+
+
+def test_fusion_as_worked_by_hand(found):
+    # The LiDAR's look after the camera's is exact. The camera's after the LiDAR's is encoded with a
+    # cube of .6 more, and so lies 6 further along the second dimension: class 1 at (0, 6) is nearer
+    # to class 2 at (0, 10), class 2 lies 6 / 2 deviations off. Cubes of .6 also widen, which does
+    # not count.
+    np.testing.assert_allclose(found[1]["fusion"]["accuracy"], 5 / 6, rtol=1e-6)
+    np.testing.assert_allclose(found[1]["fusion"]["mean_error"], (6 + 6 + 3) / 6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("modality", [0, 1])
+def test_one_detection_that_is_not_a_number_shows_in_the_beliefs(latent, modality):
+    bank = tuple(x.at[2, 1, 0].set(jnp.nan) if m == modality else x for m, x in enumerate(BANK))
+    posteriors, figures = latent(bank)
+    for name in ("joint", CONFIG.modalities[modality]):
+        is_finite = np.isfinite(posteriors[name].std).all(axis=-1)
+        np.testing.assert_array_equal(is_finite, [[True, True], [True, True], [True, False]])
+        assert np.isnan(figures["sigma_norm"][name][2])
+
+
+# One look at each class, so that nothing is left to chance but the starts.
+EXACT = tuple(x[:, :1] for x in BANK)
+
+
+@pytest.fixture(scope="module")
+def played():
+    shape = 2 * 3 * CONFIG.arena.num_pois
+
+    def play(bias, bank):
+        layers = {
+            "Dense_0": {"kernel": jnp.zeros((shape, 2)), "bias": jnp.zeros(2)},
+            "Dense_1": {"kernel": jnp.zeros((2, 4)), "bias": bias},
+        }
+        inputs = jnp.int32(0), {"params": layers}, PARAMS, bank, CONFIG
+        return examine.play(jax.random.key(0), *inputs)
+
+    return jax.jit(play)
+
+
+def test_policies_are_played_from_every_state_and_from_random_starts(played):
+    total, first = map(np.asarray, played(jnp.array([0.0, 0.0, 0.0, 1.0]), EXACT))
+    assert total.shape == first.shape == (4, 384 + 16)
+    of = dict(zip(examine.POLICIES, total, strict=True))
+    np.testing.assert_array_equal(of["return"], 0.0)  # always NOP
+    # The means over all states; a policy is at best as good.
+    assert of["optimal"][:384].mean() > of["naive"][:384].mean() > of["random"][:384].mean()
+    # The camera's own looks alone: no state pays more than three of the best, from a variance of
+    # 20 in three dimensions to sqrt(3).
+    most = 3 * (1 / 3**0.5 - 1 / 60**0.5)
+    assert np.max(total) <= most + 1e-4
+
+
+def test_values_that_are_not_numbers_give_totals_that_are_none(played):
+    total, first = map(np.asarray, played(jnp.array([0.0, jnp.nan, 0.0, 1.0]), EXACT))
+    assert np.isnan(total[0]).all()
+    assert np.isnan(first[0]).all()
+    assert np.isfinite(total[1:]).all()
+
+
+def test_figures_of_policies_as_worked_by_hand():
+    # Two states and three random starts, of which the figures are means.
+    total = np.array(
+        [
+            [1.0, 2.0, 0.9, 1.0, 1.1],
+            [1.02, 2.009, 1.0, 1.1, 1.2],
+            [0.0, 0.0, 0.5, 0.5, 0.8],
+            [0.0, 0.0, -1.0, 0.0, -0.5],
+        ]
+    )
+    figures = examine.policy_figures(total, total / 2, 3)
+    expected = {"return": 1.0, "optimal": 1.1, "naive": 0.6, "random": -0.5}
+    assert {name: figures[name] for name in expected} == pytest.approx(expected)
+    assert figures["fraction_of_optimal"] == pytest.approx(1 / 1.1)
+    one_step = {"policy": 0.5, "optimal": 0.55, "random": -0.25}
+    assert figures["one_step"] == pytest.approx(one_step)
+    # .02 and .009 below the optimum, of which .01 is let pass; more than the optimum is too.
+    assert (figures["optimal_states"], figures["num_states"]) == (1, 2)
+    total[0, 0] = 5.0
+    assert examine.policy_figures(total, total, 3)["optimal_states"] == 2
+    nothing = examine.policy_figures(np.zeros((4, 5)), np.zeros((4, 5)), 3)
+    assert nothing["fraction_of_optimal"] is None
