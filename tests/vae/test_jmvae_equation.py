@@ -70,3 +70,62 @@ def test_every_term_is_that_of_the_equation(example):
         np.testing.assert_allclose(parts["subsets"][i], subsets, rtol=1e-4)
         expected = reconstruction + 0.7 * prior + 0.3 * subsets
         np.testing.assert_allclose(total[i], expected, rtol=1e-4)
+
+
+@pytest.mark.slow  # imports PyTorch
+def test_every_term_is_that_of_multivae(example, monkeypatch):
+    """On the same weights, with the same noise."""
+    try:
+        import torch
+        from multivae.data.datasets import MultimodalBaseDataset
+        from multivae.models import JMVAE, JMVAEConfig
+    except (ImportError, RuntimeError) as error:  # the latter where torchvision does not fit torch
+        pytest.skip(f"multivae cannot be imported: {error}")
+    from benchmarks.peers import multivae as peer
+
+    params, noise, features, (_, parts) = example
+    of_each = dict(zip(MODEL.modalities, MODEL.feature_sizes, strict=True))
+    network = JMVAE(
+        JMVAEConfig(2, MODEL.latent_size, {n: (size,) for n, size in of_each.items()}, warmup=1),
+        encoders={n: peer._Encoder(size, MODEL) for n, size in of_each.items()},
+        decoders={n: peer._Decoder(size, MODEL) for n, size in of_each.items()},
+        joint_encoder=peer._JointEncoder(MODEL),
+    )
+    copies = {
+        "camera+lidar": network.joint_encoder,
+        **{name: network.encoders[name] for name in MODEL.modalities},
+    }
+    for name, ours in params["encoders"].items():
+        copy_into(copies[name].layers, ours)
+    for name, ours in params["decoders"].items():
+        copy_into(network.decoders[name].layers, ours)
+    weights = OPTIONS["reconstruction_weights"]
+    network.rescale_factors = dict(zip(MODEL.modalities, weights, strict=True))
+    columns = torch.tensor(np.array(noise.T))
+    monkeypatch.setattr(torch.distributions.normal, "_standard_normal", lambda *_, **__: columns)
+    tensors = {n: torch.tensor(np.array(x.T)) for n, x in zip(of_each, features, strict=True)}
+
+    def total(alpha, beta):
+        network.alpha, network.beta = alpha, beta
+        return network(MultimodalBaseDataset(tensors)).loss_sum.item()
+
+    # MultiVae keeps the constant of the density of each feature: ln(2 pi) / 2.
+    sizes = MODEL.feature_sizes
+    constant = BATCH * sum(w * n for w, n in zip(weights, sizes, strict=True)) * np.log(2 * np.pi)
+    reconstruction = total(0.0, 0.0) - constant / 2
+    np.testing.assert_allclose(parts["reconstruction"].sum(), reconstruction, rtol=1e-5)
+    np.testing.assert_allclose(parts["prior"].sum(), total(0.0, 1.0) - total(0.0, 0.0), rtol=1e-4)
+    np.testing.assert_allclose(parts["subsets"].sum(), total(1.0, 0.0) - total(0.0, 0.0), rtol=1e-4)
+    expected = reconstruction + 0.7 * parts["prior"].sum() + 0.3 * parts["subsets"].sum()
+    np.testing.assert_allclose(total(0.3, 0.7) - constant / 2, expected, rtol=1e-5)
+
+
+def copy_into(layers, ours):
+    """Weights of ours into the linear layers of PyTorch, which holds them transposed."""
+    import torch
+
+    linear = [layer for layer in layers if isinstance(layer, torch.nn.Linear)]
+    for i, layer in enumerate(linear):
+        dense = ours["params"][f"Dense_{i}"]
+        layer.weight.data = torch.tensor(np.array(dense["kernel"]).T)
+        layer.bias.data = torch.tensor(np.array(dense["bias"]))
