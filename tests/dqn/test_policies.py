@@ -89,3 +89,16 @@ def test_greedy_takes_the_action_of_highest_value():
         bias = 100.0 * (jnp.arange(4) == best)
         layers = {**params["params"], "Dense_1": {**params["params"]["Dense_1"], "bias": bias}}
         assert policies.greedy(MDP, {"params": layers}, (4,))(KEY, state) == best
+
+
+def test_rewards_of_one_poi_and_three_modalities():
+    mdp = classes_mdp(num_pois=1, num_modalities=3)
+    rewards = jax.jit(lambda: policies.expected_rewards(KEY, mdp, 1, num_draws=2))()
+    # By who has looked, first modality in the lowest bit: nobody .2 - .158114, one other 1 - .2,
+    # both others 2 - 1, and in vain where the own bit is set.
+    of_codes = [0.041886, 0.8, -1.0, -1.0, 0.8, 1.0, -1.0, -1.0]
+    np.testing.assert_allclose(rewards, np.repeat(of_codes, 3).reshape(8, 3), rtol=1e-4)
+    act = policies.optimal(mdp, rewards, jnp.zeros((3, 3), int))
+    for seen, expected in (((0, 0, 1), 0), ((0, 1, 1), 1)):
+        state = belief_mdp.reset(KEY, mdp, jnp.array([2]), jnp.array([seen], bool))
+        assert act(KEY, state) == expected

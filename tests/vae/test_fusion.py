@@ -122,3 +122,10 @@ def test_wrong_shapes_raise_errors_that_name_the_argument():
         fusion.write(params, TWO, OLD, jnp.array([False]), new, 0)
     with pytest.raises(AssertionError, match="features of camera"):
         fusion.write(params, TWO, OLD, seen, jnp.zeros(3), 0)
+
+
+@pytest.mark.parametrize("modality", [-1, 2, 3])
+def test_a_modality_that_is_not_there_is_named(modality):
+    params, seen = jmvae.init(jax.random.key(0), TWO), jnp.array([False, False])
+    with pytest.raises(ValueError, match=rf"modality = {modality}: must be an index of"):
+        fusion.write(params, TWO, OLD, seen, look(TWO, 0), modality)
