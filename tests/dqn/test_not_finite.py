@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from toys import classes_mdp, paying_once_mdp
 
+from jaxsense import devices
 from jaxsense.config import DqnConfig
 from jaxsense.dqn import belief_mdp, evaluation, policies, training
 from jaxsense.types import Belief
@@ -67,23 +68,23 @@ CONFIG = DqnConfig(
     epsilon_min=1.0,
 )
 
+# A look gains what the scene holds.
+SCENE_MDP = replace(
+    paying_once_mdp(),
+    new_scene=lambda key, classes: jnp.float32(1.0),
+    observe=lambda key, scene, poi, modality: (scene[None], scene),
+    write=lambda belief, seen, features, modality: Belief(belief.mean, jnp.full(2, 1.0) * features),
+)
+
 
 @pytest.fixture(scope="module")
 def chunk():
-    """Two epochs of exploration whose looks gain what the scene holds."""
-    mdp = replace(
-        paying_once_mdp(),
-        new_scene=lambda key, classes: jnp.float32(1.0),
-        observe=lambda key, scene, poi, modality: (scene[None], scene),
-        write=lambda belief, seen, features, modality: Belief(
-            belief.mean, jnp.full(2, 1.0) * features
-        ),
-    )
-    prepared = training.starts(KEY, mdp, CONFIG.num_starts)
-    state = training.init(KEY, mdp, CONFIG, prepared)
+    """Two epochs of exploration, and where they start."""
+    prepared = training.starts(KEY, SCENE_MDP, CONFIG.num_starts)
+    state = training.init(KEY, SCENE_MDP, CONFIG, prepared)
 
     def run(state, prepared):
-        return training.train_chunk(KEY, mdp, 0, CONFIG, state, prepared)
+        return training.train_chunk(KEY, SCENE_MDP, 0, CONFIG, state, prepared)
 
     return jax.jit(run, compiler_options=FAST_TO_COMPILE), state, prepared
 
@@ -115,3 +116,14 @@ def test_a_gradient_that_is_not_a_number_is_told_in_its_epoch(chunk):
     _, info = run(replace(state, optimiser=bad), prepared)
     assert np.isfinite(info.loss[0])
     np.testing.assert_array_equal(info.is_finite, [False, False])
+
+
+def test_what_one_of_two_devices_sees_is_told(chunk):
+    _, state, prepared = chunk
+    mesh = devices.make_mesh(2)
+    run = jax.jit(
+        lambda prepared: training.train_chunk(KEY, SCENE_MDP, 0, CONFIG, state, prepared, mesh)
+    )
+    for last, is_finite in ((1.0, [True, True]), (jnp.nan, [False, False])):
+        _, info = run(replace(prepared, scene=prepared.scene.at[-1].set(last)))
+        np.testing.assert_array_equal(info.is_finite, is_finite)
