@@ -16,6 +16,7 @@ import tyro
 from benchmarks import ROWS
 from benchmarks.measure import Options, Row
 from jaxsense import cli
+from jaxsense.config.checks import require_types
 
 PROGRAM = "benchmarks"
 _WIDTH_OF_FILES = 160
@@ -31,6 +32,9 @@ class Arguments:
     peers: Annotated[bool, tyro.conf.arg(help="Measure peers on the same work, in turn.")] = False
     json: Annotated[Path | None, tyro.conf.arg(help="File to write; must be new.")] = None
     quick: Annotated[bool, tyro.conf.arg(help="Tiny sizes, to see that everything runs.")] = False
+
+    def __post_init__(self):
+        require_types(self)
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -55,14 +59,16 @@ def main(argv: list[str] | None = None) -> None:
             rows.append(ROWS[name](Options(arguments.peers, arguments.quick)))
         if arguments.json is not None:
             # After each row, so that what was measured before a failure is kept.
-            arguments.json.write_text(json.dumps([row.as_json() for row in rows], indent=2) + "\n")
+            arguments.json.write_text(
+                json.dumps([row.as_json() for row in rows], indent=2) + "\n", encoding="utf-8"
+            )
     _print_table(console, rows)
 
 
 def _reserve(path: Path) -> None:
     """Makes an empty list of rows, or ends the program, before anything is measured."""
     try:
-        with path.open("x") as file:
+        with path.open("x", encoding="utf-8") as file:
             file.write("[]\n")
     except FileExistsError:
         cli.fail(PROGRAM, f"json = {str(path)!r}: exists already; must be new")

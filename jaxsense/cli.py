@@ -1,16 +1,20 @@
 """Command lines: options by tyro, and errors of the user as one line."""
 
 import contextlib
+import dataclasses
+import difflib
 import io
+import itertools
 import os
-import re
 import sys
+import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import jax
 import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from jaxsense.compilation import Kept
 from jaxsense.config import Config, ConfigError
@@ -24,24 +28,34 @@ def parse(program: str, arguments: type[T], argv: list[str], default: T | None =
 
     Args:
       program: module that is run, for example "jaxsense.train".
-      arguments: dataclass of the options.
+      arguments: dataclass of the options, which checks their types when it is made.
       argv: the command line without the program.
       default: options that are not given.
 
     Returns:
       The options.
     """
-    messages = io.StringIO()
     more: dict[str, Any] = {} if default is None else {"default": default}
     try:
-        with contextlib.redirect_stderr(messages):
-            return tyro.cli(arguments, prog=f"python -m {program}", args=argv, **more)
+        with contextlib.redirect_stderr(io.StringIO()):
+            found, unknown = tyro.cli(
+                arguments,
+                prog=f"python -m {program}",
+                args=argv,
+                return_unknown_args=True,
+                registry=_texts_of_wrong_types(),
+                **more,
+            )
+        if unknown:
+            raise _unknown(arguments, unknown)
+        return found
     except ConfigError as error:
-        fail(program, str(error))
+        wrong = error
     except SystemExit as stop:
         if stop.code == 0:
             raise
-        fail(program, _one_line(messages.getvalue()))
+        wrong = _cause(stop) or _lacking(arguments, argv)
+    fail(program, f"{wrong} (--help tells every option)")
 
 
 def run(main: Callable[[], None]) -> None:
@@ -56,8 +70,19 @@ def run(main: Callable[[], None]) -> None:
 
 def fail(program: str, message: str) -> NoReturn:
     """Ends a program for a reason that is the user's to mend."""
-    print(f"{program}: {message} (--help tells every option)", file=sys.stderr)
+    print(f"{program}: {' '.join(message.splitlines())}", file=sys.stderr)
     sys.exit(2)
+
+
+def reason(error: OSError) -> str:
+    """What the system refuses, as one line."""
+    return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+
+
+def require_directory(field: str, path: Path | None) -> None:
+    """Raises `ConfigError` if something else than a directory lies at a path."""
+    if path is not None and path.exists() and not path.is_dir():
+        raise ConfigError(field, str(path), "must be a directory")
 
 
 def keep_programs(program: str, directory: Path | None, config: Config) -> Kept | None:
@@ -83,13 +108,94 @@ def keep_programs(program: str, directory: Path | None, config: Config) -> Kept 
     return kept
 
 
-def _one_line(message: str) -> str:
-    """What tyro says in a box, as one line without the box and without the help text."""
-    _, *lines = message.splitlines()  # the first is the title of the box
-    flat = " ".join(re.sub(r"[╰╯│─]|-{4,}", " ", " ".join(lines)).split())
-    error = re.split(r" (?:For full helptext|Argument helptext|Perhaps you meant)", flat)[0]
-    error = re.sub(r"^.*?Error parsing (?:config\S* )?", "", error)
-    error = re.sub(r"invalid literal for int.*?: (.*)", r"\1 must be a whole number", error)
-    error = re.sub(r"could not convert string to float: (.*)", r"\1 must be a number", error)
-    similar = re.search(r"Perhaps you meant: (--\S+)", flat)
-    return f"{error}; perhaps {similar[1]}" if similar else error
+def _texts_of_wrong_types() -> ConstructorRegistry:
+    """Rules by which tyro leaves a text that is not of an option's type as it is.
+
+    The dataclass that is made of it names the option, the text and what would be right.
+    """
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def read(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        kind: Any = info.type
+        if kind not in (int, float, Path, int | None, Path | None) and not _is_literal(kind):
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar=_metavar(kind),
+            instance_from_str=lambda texts: _read(kind, texts[0]),
+            is_instance=lambda value: True,
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    return registry
+
+
+def _is_literal(kind: Any) -> bool:
+    return get_origin(kind) is Literal
+
+
+def _metavar(kind: Any) -> str:
+    """How `--help` writes the value of an option."""
+    if get_origin(kind) in (Union, types.UnionType):
+        return "|".join(map(_metavar, get_args(kind)))
+    if _is_literal(kind):
+        return f"{{{','.join(get_args(kind))}}}"
+    return "{None}" if kind is types.NoneType else kind.__name__.upper()
+
+
+def _read(kind: Any, text: str) -> Any:
+    """What a text stands for, or the text itself if that is of another type."""
+    if get_origin(kind) in (Union, types.UnionType):
+        return None if text == "None" else _read(get_args(kind)[0], text)
+    if _is_literal(kind):
+        return text
+    if kind is Path:
+        return Path(text) if text and text.isprintable() else text
+    try:
+        return kind(text)
+    except ValueError:
+        return text
+
+
+def _options(arguments: Any, prefix: str = "--") -> dict[str, Any]:
+    """The options of a dataclass, with their types."""
+    found = {}
+    for field, annotated in get_type_hints(arguments, include_extras=True).items():
+        kind, *marks = get_args(annotated) if hasattr(annotated, "__metadata__") else [annotated]
+        names = [mark.name for mark in marks if getattr(mark, "name", None) is not None]
+        name = names[0] if names else field.replace("_", "-")
+        if dataclasses.is_dataclass(kind):
+            found |= _options(kind, f"{prefix}{name}." if name else prefix)
+        elif tyro.conf.Positional not in marks:
+            found[prefix + name] = kind
+    return found
+
+
+def _cause(error: BaseException | None) -> ConfigError | None:
+    """The error of a dataclass that ended tyro."""
+    while error is not None and not isinstance(error, ConfigError):
+        error = error.__context__
+    return error
+
+
+def _unknown(arguments: Any, words: list[str]) -> ConfigError:
+    """The error of words that belong to no option."""
+    word = next((word for word in words if word.startswith("-")), words[0])
+    name = word.partition("=")[0].replace("_", "-")
+    similar = difflib.get_close_matches(name, _options(arguments), 1, 0.7)
+    hint = f"; perhaps {similar[0]}" if similar else ""
+    return ConfigError("option", word, f"must be one of the program{hint}")
+
+
+def _lacking(arguments: Any, argv: list[str]) -> ConfigError:
+    """The error of an option that lacks values, or of a word that must be there."""
+    options = _options(arguments)
+    for word, following in itertools.pairwise([*argv, "--"]):
+        kind = options.get(word.replace("_", "-"), bool)
+        if kind is not bool and following.startswith("--"):
+            return ConfigError(word.removeprefix("--"), "", "must have a value")
+    for field in dataclasses.fields(arguments):
+        if tyro.conf.Positional in get_args(field.type):
+            return ConfigError(field.name, "", "must be given")
+    return ConfigError("options", " ".join(argv), "must have as many values as each option takes")

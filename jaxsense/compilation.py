@@ -293,7 +293,7 @@ def _surroundings() -> list[Any]:
     """What else tracing and compiling depend on: versions, options, devices and processor."""
     features = set()
     with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         features = {line for line in lines if line.startswith(("flags", "model name", "Features"))}
     return [
         [(package, importlib.metadata.version(package)) for package in _PACKAGES],

@@ -15,9 +15,12 @@ import tyro
 from jaxsense import animation, cli, devices, files, mission, page, rundir
 from jaxsense.compilation import Compiler
 from jaxsense.config import Config, ConfigError
+from jaxsense.config.checks import require, require_types
+from jaxsense.config.mission import MOST_EPISODES
 from jaxsense.display import Display
 from jaxsense.monitor import Monitor, StageError
 from jaxsense.sim.arena import TIMESTEP
+from jaxsense.types import Belief
 
 PROGRAM = "jaxsense.evaluate"
 
@@ -46,6 +49,13 @@ class Arguments:
     trust: bool = False
     """Run the functions that the run's `config.json` names for sensors of one's own."""
 
+    def __post_init__(self):
+        require_types(self, bits=64)
+        most = f"must be within 1 and {MOST_EPISODES:,}"
+        require(1 <= self.episodes <= MOST_EPISODES, self, "episodes", most)
+        require(0 <= self.seed < 2**32, self, "seed", "must be within 0 and 2^32 - 1")
+        cli.require_directory("cache", self.cache)
+
 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
@@ -55,13 +65,15 @@ def main(argv: list[str] | None = None) -> None:
         config, models = rundir.load(arguments.run, arguments.trust)
         played = _cases(arguments, config)
         path = arguments.run / "summary.json"
-        # Now, not after minutes of work, is the time to find out that it cannot be written.
+        # Now, not after minutes of work, is the time to find out that they cannot be written.
         with files.locked(arguments.run, waits=True):
-            rundir.write_json(path, rundir.read_summary(arguments.run))
+            summary = rundir.read_summary(arguments.run)
+            page.write(arguments.run, config, summary)
+            rundir.write_json(path, summary)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
-        cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({error.strerror})")
+        cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be used ({cli.reason(error)})")
     kept = cli.keep_programs(PROGRAM, arguments.cache, config)
     console = rich.console.Console()
     key = jax.random.key(arguments.seed)
@@ -85,22 +97,34 @@ def main(argv: list[str] | None = None) -> None:
         f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
     )
     try:
-        # Another evaluation may have written its own since.
-        with files.locked(arguments.run, waits=True):
-            summary = rundir.read_summary(arguments.run)
-            summary["mission"] = _merge(summary["mission"], found, arguments)
-            rundir.write_json(path, summary)
-        if arguments.animate:
-            assert player.recording is not None
-            name = next(iter(played))
-            film = arguments.run / f"mission-{name}-{arguments.seed}.svg"
-            title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
-            animation.write(film, config, player.recording, models.class_beliefs, title)
-            console.print(f"The first mission of {name} is in {film}.")
-        with files.locked(arguments.run, waits=True):
-            report = page.write(arguments.run)
+        _write(console, arguments, config, models.class_beliefs, found, player.recording)
     except OSError as error:
-        cli.fail(PROGRAM, f"{error.filename}: cannot be written ({error.strerror})")
+        cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({cli.reason(error)})")
+
+
+def _write(
+    console: rich.console.Console,
+    arguments: Arguments,
+    config: Config,
+    class_beliefs: Belief,
+    found: dict[str, Any],
+    recording: mission.Recording | None,
+) -> None:
+    """Writes the figures into the run's summary and its page, and the animation if asked for."""
+    path = arguments.run / "summary.json"
+    if arguments.animate:
+        assert recording is not None
+        name = next(name for name in found if name != "bytes_per_detection")
+        film = arguments.run / f"mission-{name}-{arguments.seed}.svg"
+        title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
+        animation.write(film, config, recording, class_beliefs, title)
+        console.print(f"The first mission of {name} is in {film}.")
+    # Another evaluation may have written its own figures since this one began.
+    with files.locked(arguments.run, waits=True):
+        summary = rundir.read_summary(arguments.run)
+        summary["mission"] = _merge(summary["mission"], found, arguments)
+        rundir.write_json(path, summary)
+        report = page.write(arguments.run, config, summary)
     console.print(f"The figures are in {path}, and with all others in {report}.")
 
 
@@ -115,10 +139,9 @@ def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) 
 
 def _cases(arguments: Arguments, config: Config) -> dict[str, mission.Case]:
     """What is to be played; a `ConfigError` names what cannot be."""
-    if arguments.episodes < 1:
-        raise ConfigError("episodes", arguments.episodes, "must be greater than 0")
-    if not 0 <= arguments.seed < 2**32:
-        raise ConfigError("seed", arguments.seed, "must be within 0 and 2^32 - 1")
+    # As many as one of the run's own evaluations may have, with these settings.
+    settings = dataclasses.replace(config.mission, episodes=arguments.episodes)
+    dataclasses.replace(config, mission=settings)
     cases = mission.cases(config)
     if arguments.policy == "all":
         return cases

@@ -21,10 +21,12 @@ from jax import export
 
 from jaxsense import cli, files, rundir
 from jaxsense.config import Config, ConfigError
+from jaxsense.config.checks import require_types
 from jaxsense.extras import extra
 from jaxsense.models import Models, jmvae_shape
 from jaxsense.onboard import Function, functions
 from jaxsense.vae import fusion
+from jaxsense.version import __version__
 
 PROGRAM = "jaxsense.export"
 PLATFORMS = ("cpu", "cuda", "tpu")
@@ -68,7 +70,7 @@ def archive(config: Config, models: Models) -> bytes:
 def _description(config: Config, models: Models) -> dict[str, Any]:
     """What a reader of the file has to know besides the programs."""
     arena = config.arena
-    packages = ("jaxsense", "jax", "jaxlib")
+    versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib")}
     unseen = fusion.unseen(jmvae_shape(config), config.mdp.unseen_variance)
     return {
         "modalities": config.modalities,
@@ -79,7 +81,7 @@ def _description(config: Config, models: Models) -> dict[str, Any]:
         "num_pois": arena.num_pois,
         "unseen": {name: np.asarray(x).tolist() for name, x in vars(unseen).items()},
         "platforms": PLATFORMS,
-        "versions": {name: importlib.metadata.version(name) for name in packages},
+        "versions": {"jaxsense": __version__, **versions},
     }
 
 
@@ -100,6 +102,9 @@ class Arguments:
     trust: bool = False
     """Run the functions that the run's `config.json` names for sensors of one's own."""
 
+    def __post_init__(self):
+        require_types(self)
+
 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
@@ -114,7 +119,7 @@ def main(argv: list[str] | None = None) -> None:
     except (ConfigError, ModuleNotFoundError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
-        cli.fail(PROGRAM, f"out = {str(path)!r}: cannot be written ({error.strerror})")
+        cli.fail(PROGRAM, f"out = {str(path)!r}: cannot be written ({cli.reason(error)})")
     print(f"{path}: {len(content) / 1e3:.0f} kB, for {', '.join(PLATFORMS)}")
 
 

@@ -9,6 +9,10 @@ from pathlib import Path
 import filelock
 
 
+class WriteError(OSError):
+    """A file that cannot be written."""
+
+
 def write(path: Path, content: str | bytes) -> None:
     """Writes a file so that a reader never sees half of it, also after a power failure.
 
@@ -17,7 +21,7 @@ def write(path: Path, content: str | bytes) -> None:
       content: of the file; text as UTF-8.
 
     Raises:
-      OSError: names the file, which is then as it was before.
+      WriteError: names the file, which is then as it was before.
     """
     # A name of its own, as another process may write the same file.
     unfinished = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
@@ -30,10 +34,19 @@ def write(path: Path, content: str | bytes) -> None:
         _sync(path.parent)
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else str(error)
-        raise OSError(error.errno, reason, str(path)) from error
+        raise WriteError(error.errno, reason, str(path)) from error
     finally:
         with contextlib.suppress(OSError):
             unfinished.unlink(missing_ok=True)
+
+
+def append(path: Path, line: str) -> None:
+    """Adds a line to a text file; a `WriteError` names the file if it cannot be written."""
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+    except OSError as error:
+        raise WriteError(error.errno, error.strerror, str(path)) from error
 
 
 def _sync(directory: Path) -> None:

@@ -8,6 +8,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxsense import values
 from jaxsense.config import Config
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.networks import Params
@@ -29,6 +30,7 @@ def live_mdp(
     model: Jmvae,
 ) -> MapMdp:
     """The map MDP over scenes of their own, one MJX arena for each environment."""
+    values.require_one_each("trained", trained, model.modalities)
 
     def new_scene(key: Key, classes: jax.Array):
         return worlds.random_scene(key, world, classes)
@@ -42,9 +44,12 @@ def live_mdp(
 
 def bank_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> MapMdp:
     """The map MDP over stored detections; a scene is the `[N]` array of the PoIs' classes."""
+    values.require_one_each("bank", bank, model.modalities)
     for features, size in zip(bank, model.feature_sizes, strict=True):
         shape = (len(config.arena.classes), None, size)
         chex.assert_shape(features, shape, custom_message="bank")
+        values.require_number("looks at each class in the bank", features.shape[1])
+        values.require_finite("bank", features)
 
     def observe(key: Key, classes: jax.Array, poi: jax.Array, modality: int):
         samples = bank[modality]

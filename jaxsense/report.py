@@ -1,5 +1,6 @@
 """The plots of a run: the paper's Fig. 4 and Fig. 5, and what the sensors see."""
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
+from jaxsense import files
 from jaxsense.colours import as_srgb, class_colour
 from jaxsense.config import Config
 from jaxsense.pipeline import RunResult
@@ -30,7 +32,9 @@ def write_plots(path: Path, config: Config, result: RunResult) -> None:
         "scanlines": scanlines(config, result.windows),
     }
     for name, figure in plots.items():
-        figure.savefig(path / f"{name}.png", dpi=120)
+        content = io.BytesIO()
+        figure.savefig(content, format="png", dpi=120)
+        files.write(path / f"{name}.png", content.getvalue())
 
 
 def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:

@@ -14,7 +14,15 @@ import jax
 
 from jaxsense import files, models
 from jaxsense.checkpoints import Checkpoints
-from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain, require_trust
+from jaxsense.config import (
+    PRESETS,
+    Config,
+    ConfigError,
+    as_plain,
+    from_plain,
+    parse_json,
+    require_trust,
+)
 from jaxsense.models import Models
 from jaxsense.version import __version__
 
@@ -117,8 +125,7 @@ class RunDirectory:
 
     def append_metrics(self, **figures: Any) -> None:
         """Adds a line to `metrics.jsonl`."""
-        with (self.path / _METRICS).open("a", encoding="utf-8") as lines:
-            lines.write(json.dumps(figures) + "\n")
+        files.append(self.path / _METRICS, json.dumps(figures))
 
     def _drop_unfinished_line(self) -> None:
         """Cuts what a process that was killed has left of a line of `metrics.jsonl`."""
@@ -225,7 +232,7 @@ def read_settings(file: Path, trust: bool = False) -> Settings:
 def read_summary(path: Path) -> dict[str, Any]:
     """The `summary.json` of a finished run; a `ConfigError` if there is none."""
     try:
-        summary = json.loads((path / "summary.json").read_text())
+        summary = parse_json((path / "summary.json").read_text(encoding="utf-8"))
         parts = {"timing", *BLOCKS}
         if not isinstance(summary, dict) or not parts <= set(summary):
             raise ValueError(f"must be an object with {', '.join(sorted(parts))}")
@@ -289,7 +296,7 @@ def _named(models: Models, config: Config) -> dict[str, Any]:
 def _read_config(file: Path, field: str, value: Path) -> dict[str, Any]:
     """What lies in a `config.json`; a `ConfigError` about `field = value` if it cannot be read."""
     try:
-        content = json.loads(file.read_text())
+        content = parse_json(file.read_text(encoding="utf-8"))
     except OSError as error:
         reason = f"must hold a run's settings ({file.name}: {error.strerror})"
         raise ConfigError(field, str(value), reason) from None

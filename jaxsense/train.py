@@ -22,6 +22,7 @@ from jaxsense import (
     animation,
     cli,
     devices,
+    files,
     page,
     pipeline,
     report,
@@ -30,6 +31,7 @@ from jaxsense import (
     tensorboard,
 )
 from jaxsense.config import PRESETS, Config, ConfigError
+from jaxsense.config.checks import require_types
 from jaxsense.devices import Workers
 from jaxsense.display import Display, say
 from jaxsense.interrupt import on_interrupt
@@ -74,6 +76,12 @@ class Arguments:
     cache: Path | None = Path("~/.cache/jaxsense")
     """Directory in which compiled programs are kept for later runs; `None` to keep none."""
 
+    def __post_init__(self):
+        if isinstance(self.file, str):
+            raise ConfigError("config", self.file, "must be a path of printable characters")
+        require_types(self, bits=64)
+        cli.require_directory("cache", self.cache)
+
     @property
     def settings(self) -> Settings:
         """What the results follow from."""
@@ -98,9 +106,11 @@ def main(
             _train(begin, arguments, run, workers, learners, console)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
-    except OSError as error:
+    except files.WriteError as error:
         # A full disk, mostly. What is there was written as a whole, or not at all.
-        cli.fail(PROGRAM, f"cannot write {error}; what was saved before is still there")
+        cli.fail(PROGRAM, f"cannot write {cli.reason(error)}; what was saved before is still there")
+    except OSError as error:
+        cli.fail(PROGRAM, f"{cli.reason(error)}; what was saved before is still there")
     if not arguments.quiet:
         _print_summary(console, run)
     first = next(path for path in _paths(run) if (path / "report.html").exists())
@@ -283,7 +293,7 @@ def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any], monitor
     film, beliefs = run.path / "mission.svg", result.models.class_beliefs
     animation.write(film, config, result.recording, beliefs, "latent policy")
     summary = {**_header(run, timing), **result.summary}
-    page.write(run.path, summary)
+    page.write(run.path, config, summary)
     monitor.check_stop()
     run.write_json("summary.json", summary)
 

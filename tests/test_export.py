@@ -1,6 +1,8 @@
 """The exported file, run by the example in a process that cannot import jaxsense."""
 
 import dataclasses
+import importlib.metadata
+import io
 import json
 import re
 import subprocess
@@ -25,6 +27,7 @@ from jaxsense.rundir import RunDirectory, Settings
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
 from jaxsense.vae import detectors, fusion, jmvae, metrics
+from jaxsense.version import __version__
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "run_exported.py"
 CONFIG = dataclasses.replace(
@@ -220,3 +223,18 @@ def test_missing_flatbuffers_is_told(run, tmp_path, capsys, monkeypatch):
     assert stop.value.code == 2
     message = "flatbuffers is not installed: pip install 'jaxsense[export]'"
     assert message in capsys.readouterr().err
+
+
+def test_a_package_that_is_not_installed_can_export(models, monkeypatch):
+    version = importlib.metadata.version
+
+    def of_others(name):
+        if name == "jaxsense":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", of_others)
+    monkeypatch.setattr(export, "functions", lambda config, models: {})
+    with zipfile.ZipFile(io.BytesIO(export.archive(CONFIG, models))) as files:
+        contents = json.loads(files.read("contents.json"))
+    assert contents["versions"]["jaxsense"] == __version__

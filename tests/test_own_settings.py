@@ -93,7 +93,7 @@ def test_labels_follow_the_declaration():
         (lambda: Shape("cone"), "shape.primitive = 'cone': must be one of cylinder, box"),  # pyright: ignore
         (lambda: Shape("box", (1.0, 0.1)), "shape.half_sides = (1.0, 0.1): must be two shares"),
         (lambda: Shape("cylinder", (1.0, 0.5)), "for a cylinder is round"),
-        (lambda: Attribute({"hot": float("inf")}), "must be finite numbers"),
+        (lambda: Attribute({"hot": float("inf")}), "from names to finite numbers"),
         (
             lambda: ArenaConfig(attributes={"shape": TEMPERATURE["temperature"]}),
             "arena.attributes = 'shape': is there already",

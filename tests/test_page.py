@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from recordings import CLASS_BELIEFS, CONFIG, recording
 
 from jaxsense import animation, page
+from jaxsense.config import ConfigError
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None)
@@ -51,12 +52,9 @@ SUMMARY = {
 }
 
 
-def write_run(path, summary=SUMMARY, config=CONFIG):
+def write_run(path):
     path.mkdir(exist_ok=True)
-    settings = {"preset": "smoke", "seed": 3, "commit": "0123abc"}
-    settings["config"] = dataclasses.asdict(config)
-    (path / "config.json").write_text(json.dumps(settings))
-    (path / "summary.json").write_text(json.dumps(summary))
+    (path / "config.json").write_text(json.dumps({"commit": "0123abc"}))
     return path
 
 
@@ -66,7 +64,7 @@ def run(tmp_path_factory):
     for name in ("latent_space", "reward"):
         Figure(figsize=(8, 4)).savefig(path / f"{name}.png", dpi=20)
     animation.write(path / "mission.svg", CONFIG, recording(), CLASS_BELIEFS, "latent policy")
-    assert page.write(path) == path / "report.html"
+    assert page.write(path, CONFIG, SUMMARY) == path / "report.html"
     return path
 
 
@@ -142,7 +140,7 @@ def test_what_was_run_is_told_and_escaped(run, read):
 
 def test_changed_settings_are_named(tmp_path):
     config = dataclasses.replace(CONFIG, dqn=dataclasses.replace(CONFIG.dqn, discount=0.9))
-    text = page.write(write_run(tmp_path, config=config)).read_text()
+    text = page.write(write_run(tmp_path), config, SUMMARY).read_text()
     assert f"<code>dqn.discount</code> = 0.9 (preset: {CONFIG.dqn.discount})" in text
     assert "<svg" not in text
 
@@ -150,9 +148,81 @@ def test_changed_settings_are_named(tmp_path):
 def test_with_other_classes_there_is_nothing_to_compare(tmp_path):
     classes = ("blue cylinder", "red cylinder", "red cube")
     arena = dataclasses.replace(CONFIG.arena, classes=classes)
-    path = write_run(tmp_path, config=dataclasses.replace(CONFIG, arena=arena))
-    rows = {row[0]: row[1:] for row in Reader(page.write(path).read_text()).rows if row}
+    path = page.write(write_run(tmp_path), dataclasses.replace(CONFIG, arena=arena), SUMMARY)
+    rows = {row[0]: row[1:] for row in Reader(path.read_text()).rows if row}
     assert rows["blue cylinder"] == ["yes", "no", "yes"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [None, "", "{}", '{"preset": "smoke"}', "[1]", '{"commit": 1', "\udcff"],
+    ids=range(7),
+)
+def test_a_config_of_few_keys_is_enough(tmp_path, content):
+    if content is not None:
+        (tmp_path / "config.json").write_text(content, encoding="utf-8", errors="surrogateescape")
+    text = page.write(tmp_path, CONFIG, SUMMARY).read_text()
+    assert "nothing: all" in text
+    assert "commit" not in text
+
+
+@pytest.mark.parametrize("part", ["timing", "detectors", "jmvae", "dqn", "mission"])
+@pytest.mark.parametrize("value", [None, 3, [], "x", {"x": 3}])
+def test_a_summary_without_its_figures_is_named(tmp_path, part, value):
+    with pytest.raises(ConfigError) as error:
+        page.write(tmp_path, CONFIG, {**SUMMARY, part: value})
+    assert "must hold the summary.json of a finished run" in str(error.value)
+    assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_an_animation_writes_is_shown(run, read):
+    assert len([tag for tag, _ in read.tags if tag == "svg"]) == 2
+    assert ("use", {"href": "#mission-film"}) in read.tags
+    kinds = {tag for tag, _ in read.tags}
+    assert {"animatetransform", "ellipse", "clippath"} <= kinds
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("</svg>", "<script>alert(1)</script></svg>"),
+        ("</svg>", '<image href="https://x.org/x.png"/></svg>'),
+        ("</svg>", '<a href="javascript:alert(1)"><text>x</text></a></svg>'),
+        ("</svg>", '<use href="https://x.org/x.svg#x"/></svg>'),
+        ("</svg>", "<foreignObject><p>x</p></foreignObject></svg>"),
+        ("</svg>", '<x:script xmlns:x="http://www.w3.org/1999/xhtml">alert(1)</x:script></svg>'),
+        ("</svg>", '<set attributeName="href" to="x"/></svg>'),
+        ("</svg>", '<rect onclick="alert(1)"/></svg>'),
+        ("</svg>", '<rect style="fill:red"/></svg>'),
+        ("</svg>", '<rect fill="url(https://x.org/x)"/></svg>'),
+        ("</svg>", '<animate attributeName="href" values="x"/></svg>'),
+        ("</svg>", "<style>@import 'https://x.org/x.css';</style></svg>"),
+        ("</svg>", "<style>rect{background:URL (//x.org/x)}</style></svg>"),
+        ("</svg>", "<style>rect{background:u\\72l(//x.org/x)}</style></svg>"),
+        ("<svg ", '<!DOCTYPE svg [<!ENTITY a "b">]><svg '),
+        ("<svg ", '<svg onload="alert(1)" '),
+        ("</svg>", ""),
+        ('viewBox="', 'viewBox="x '),
+        ('viewBox="0 0', 'viewBox="'),
+    ],
+    ids=range(19),
+)
+def test_what_no_animation_writes_is_left_out(run, tmp_path, before, after):
+    film = (run / "mission.svg").read_text(encoding="utf-8")
+    assert before in film
+    (tmp_path / "mission.svg").write_text(film.replace(before, after, 1), encoding="utf-8")
+    text = page.write(tmp_path, CONFIG, SUMMARY).read_text(encoding="utf-8")
+    assert "<svg" not in text
+    assert "x.org" not in text
+
+
+def test_the_name_of_an_animation_is_escaped(run, tmp_path):
+    name = 'mission"><script>alert(1)<!--'
+    shutil.copy(run / "mission.svg", tmp_path / f"{name}.svg")
+    text = page.write(tmp_path, CONFIG, SUMMARY).read_text(encoding="utf-8")
+    assert "<svg" in text
+    assert "<script>" not in text
 
 
 MEASURE = """

@@ -28,5 +28,6 @@ from jaxsense.config.scene import SensorConfig as SensorConfig
 from jaxsense.config.scene import ViewpointConfig as ViewpointConfig
 from jaxsense.config.stored import as_plain as as_plain
 from jaxsense.config.stored import from_plain as from_plain
+from jaxsense.config.stored import parse_json as parse_json
 from jaxsense.config.stored import require_trust as require_trust
 from jaxsense.config.whole import Config as Config

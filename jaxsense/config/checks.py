@@ -1,52 +1,64 @@
 """What is checked when a section is made, and the error of a check that fails."""
 
-import dataclasses
-import math
-from typing import Any, Literal, get_args, get_origin
+import types
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+_MOST_SHOWN = 200  # characters of a value
+_LEAST, _MOST = 1e-30, 1e30  # a product of two still fits float32
 
 
 class ConfigError(ValueError):
     """A setting that cannot be used: `field = value: what would be right`."""
 
     def __init__(self, field: str, value: object, expected: str):
-        super().__init__(f"{field} = {value!r}: {expected}")
+        super().__init__(f"{field} = {_shown(value)}: {expected}")
 
 
 def require(condition: bool, section: object, field: str, expected: str) -> None:
     """Raises `ConfigError` for a field of a section unless the condition holds."""
     if not condition:
-        name = type(section).__name__.removesuffix("Config").lower()
-        raise ConfigError(f"{name}.{field}", getattr(section, field), expected)
+        # All settings together, and the options of a program, have no name before their fields.
+        name = type(section).__name__.removesuffix("Config").removesuffix("Arguments").lower()
+        raise ConfigError(f"{name}.{field}".lstrip("."), getattr(section, field), expected)
+
+
+def require_types(section: Any, bits: int = 31) -> None:
+    """Raises `ConfigError` unless each field holds what it is declared to hold.
+
+    A whole number where a real one is declared becomes one, as JAX tells them apart.
+
+    Args:
+      section: the dataclass.
+      bits: that a whole number may have; real numbers must be finite and fit 32 bits.
+    """
+    hints = get_type_hints(type(section))
+    for name, kind in hints.items():
+        value = getattr(section, name)
+        require(_is_a(value, kind), section, name, f"must be {_described(kind)}")
+        is_small = kind is not int or abs(value) < 2**bits
+        require(is_small, section, name, f"must be below 2^{bits}")
+        if kind is float:
+            object.__setattr__(section, name, float(value))
 
 
 def require_positive(section: object, *fields: str) -> None:
-    """Raises `ConfigError` unless each field is finite and greater than 0."""
+    """Raises `ConfigError` unless each field is greater than 0."""
     for field in fields:
-        value = getattr(section, field)
-        require(
-            math.isfinite(value) and value > 0, section, field, "must be a number greater than 0"
-        )
+        require(getattr(section, field) > 0, section, field, "must be a number greater than 0")
 
 
 def require_not_negative(section: object, *fields: str) -> None:
-    """Raises `ConfigError` unless each field is finite and at least 0."""
+    """Raises `ConfigError` unless each field is at least 0."""
     for field in fields:
-        value = getattr(section, field)
-        require(
-            math.isfinite(value) and value >= 0,
-            section,
-            field,
-            "must be a number that is not negative",
-        )
+        is_right = getattr(section, field) >= 0
+        require(is_right, section, field, "must be a number that is not negative")
 
 
-def require_choices(section: Any) -> None:
-    """Raises `ConfigError` unless each field of a `Literal` type holds one of its values."""
-    for field in dataclasses.fields(section):
-        if get_origin(field.type) is Literal:
-            choices = get_args(field.type)
-            is_one = getattr(section, field.name) in choices
-            require(is_one, section, field.name, f"must be one of {', '.join(choices)}")
+def require_at_most(section: object, **most: float) -> None:
+    """Raises `ConfigError` for a field that is greater than the number given for it."""
+    for field, limit in most.items():
+        require(getattr(section, field) <= limit, section, field, f"must be at most {limit:,}")
 
 
 def require_sizes(section: object, field: str) -> None:
@@ -63,6 +75,7 @@ def require_sizes(section: object, field: str) -> None:
 def require_window(section, num_rays: int) -> None:
     """Raises `ConfigError` unless a sensor's window fits its rays."""
     require_positive(section, "window", "stride")
+    require_at_most(section, stride=num_rays)
     most = (num_rays - 1) // section.stride + 1
     require(
         section.window <= most,
@@ -70,3 +83,66 @@ def require_window(section, num_rays: int) -> None:
         "window",
         f"at most {most} of {num_rays} rays fit with a stride of {section.stride}",
     )
+
+
+def _is_a(value: Any, kind: Any) -> bool:
+    """Whether a value is of the type that a field is declared with."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return any(type(value) is type(each) and value == each for each in inner)
+    if origin in (Union, types.UnionType):
+        return any(_is_a(value, each) for each in inner)
+    if origin in (tuple, dict):
+        return isinstance(value, origin) and _holds(value, inner)
+    if kind in (int, float):
+        return _is_number(value, kind)
+    return isinstance(value, kind)
+
+
+def _holds(values: Any, kinds: tuple[Any, ...]) -> bool:
+    """Whether a tuple or a dictionary holds what it is declared to hold."""
+    if isinstance(values, dict):
+        return all(_holds(pair, kinds) for pair in values.items())
+    kinds = kinds[:1] * len(values) if ... in kinds else kinds
+    return len(values) == len(kinds) and all(map(_is_a, values, kinds))
+
+
+def _is_number(value: Any, kind: Any) -> bool:
+    """Whether a value is a whole number, or a real one that 32 bits can hold."""
+    if isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
+        return False
+    return kind is int or value == 0 or _LEAST <= abs(value) <= _MOST
+
+
+def _described(kind: Any, *, many: bool = False) -> str:
+    """What a field that is declared with a type must be, in words."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return f"one of {', '.join(map(str, inner))}"
+    if origin in (Union, types.UnionType):
+        return " or ".join(_described(each) for each in inner)
+    if origin is tuple:
+        number = "" if ... in inner else f"{len(inner)} "
+        return f"{'tuples' if many else 'a tuple'} of {number}{_described(inner[0], many=True)}"
+    if origin is dict:
+        return f"a dictionary from names to {_described(inner[1], many=True)}"
+    sizes = f"of a size from {_LEAST} to {_MOST} or 0"
+    one, several = {
+        int: ("a whole number", "whole numbers"),
+        float: (f"a finite number, {sizes}", f"finite numbers, {sizes}"),
+        bool: ("True or False", "True or False"),
+        str: ("text", "texts"),
+        Path: ("a path of printable characters", "paths of printable characters"),
+        types.NoneType: ("None", "None"),
+    }.get(kind, (f"of type {kind.__name__}", f"values of type {kind.__name__}"))
+    return several if many else one
+
+
+def _shown(value: object) -> str:
+    """A value in one line that is not too long."""
+    try:
+        text = repr(value)
+    except (RecursionError, ValueError):  # of more than 4300 digits or a thousand levels
+        return f"a huge {type(value).__name__}"
+    text = " ".join(line.strip() for line in text.splitlines())
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."

@@ -6,13 +6,15 @@ from typing import Literal
 
 from jaxsense.config.checks import (
     require,
-    require_choices,
+    require_at_most,
     require_not_negative,
     require_positive,
     require_sizes,
+    require_types,
 )
 
 _MOST_SHARES = 32
+_MOST_WEIGHT = 1_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,8 +35,10 @@ class DetectorConfig:
     """Highest learning rate of Adam; decays to zero by a cosine."""
 
     def __post_init__(self):
+        require_types(self)
         require_sizes(self, "hidden")
         require_positive(self, "num_scans", "num_held_out", "steps", "batch", "learning_rate")
+        require_at_most(self, learning_rate=1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,17 +71,20 @@ class JmvaeConfig:
     """Highest learning rate of Adam; decays to zero by a cosine."""
 
     def __post_init__(self):
+        require_types(self)
         require_sizes(self, "hidden")
         require_positive(self, "latent_size", "samples_per_class", "steps", "batch")
         require_positive(self, "learning_rate", "restarts")
         require_positive(self, "beta", "initial_beta")
         require_not_negative(self, "alpha")
+        require_at_most(self, latent_size=256, restarts=1000, learning_rate=1)
+        require_at_most(self, alpha=_MOST_WEIGHT, beta=_MOST_WEIGHT, initial_beta=_MOST_WEIGHT)
         require(0 <= self.annealing <= 1, self, "annealing", "must be within 0 and 1")
         require(
-            all(math.isfinite(w) and w >= 0 for w in self.reconstruction_weights),
+            all(0 <= weight <= _MOST_WEIGHT for weight in self.reconstruction_weights),
             self,
             "reconstruction_weights",
-            "must be numbers that are not negative",
+            f"must be numbers within 0 and {_MOST_WEIGHT:,}",
         )
 
 
@@ -95,8 +102,10 @@ class MdpConfig:
     """Leave out the starts in which every PoI has been seen by all modalities, or none by any."""
 
     def __post_init__(self):
+        require_types(self)
         require_positive(self, "unseen_variance", "max_steps")
         require_not_negative(self, "min_increase")
+        require_at_most(self, unseen_variance=_MOST_WEIGHT, max_steps=10_000)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,15 +148,21 @@ class DqnConfig:
     """Epochs between two reports of progress."""
 
     def __post_init__(self):
-        require_choices(self)
+        require_types(self)
         require_sizes(self, "hidden")
         require_positive(self, "num_envs", "epochs", "updates", "batch", "replay_capacity")
         require_positive(self, "learning_rate", "target_period", "num_starts", "chunk")
         require_not_negative(self, "final_learning_rate", "epsilon_start", "epsilon_min")
         require(0 <= self.discount <= 1, self, "discount", "must be within 0 and 1")
         require(0 < self.epsilon_decay <= 1, self, "epsilon_decay", "must be above 0, at most 1")
-        require(self.epsilon_start <= 1, self, "epsilon_start", "must be at most 1")
-        require(self.epsilon_min <= 1, self, "epsilon_min", "must be at most 1")
+        require_at_most(self, learning_rate=1, final_learning_rate=1)
+        require_at_most(self, epsilon_start=1)
+        require(
+            self.epsilon_min <= self.epsilon_start,
+            self,
+            "epsilon_min",
+            f"must be at most epsilon_start = {self.epsilon_start}",
+        )
         require(
             self.replay_capacity % self.num_envs == 0,
             self,
@@ -189,4 +204,5 @@ class EvaluationConfig:
     the naive and the random policy an eighth of them."""
 
     def __post_init__(self):
+        require_types(self)
         require_positive(self, "num_starts", "num_repeats")

@@ -2,8 +2,17 @@
 
 import dataclasses
 
-from jaxsense.config.checks import require, require_not_negative, require_positive
+from jaxsense.config.checks import (
+    require,
+    require_at_most,
+    require_not_negative,
+    require_positive,
+    require_types,
+)
 from jaxsense.config.scene import ROBOT_RADIUS, TIMESTEP
+
+MOST_EPISODES = 100_000
+"""Missions of one policy whose states fit the memory of a computer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,10 +45,12 @@ class NavigationConfig:
     """Seconds for which a robot backs off."""
 
     def __post_init__(self):
+        require_types(self)
         require_positive(self, "horizon", "robot_radius", "goal_distance", "goal_angle")
         require(self.horizon >= 1.0, self, "horizon", "must be at least 1 s")
         require_positive(self, "view_sides", "view_range", "stuck_time", "recovery_time")
         require_not_negative(self, "inflation")
+        require_at_most(self, horizon=60, speed_samples=101, turn_samples=101, view_sides=360)
         require(self.speed_samples >= 3, self, "speed_samples", "must be at least 3")
         odd = self.turn_samples >= 3 and self.turn_samples % 2 == 1
         require(odd, self, "turn_samples", "must be odd and at least 3, so that one goes straight")
@@ -48,10 +59,10 @@ class NavigationConfig:
         )
         require(self.goal_angle <= 10, self, "goal_angle", "must be at most 10 degrees")
         require(
-            len(self.view_distances) > 0 and all(d > 0 for d in self.view_distances),
+            1 <= len(self.view_distances) <= 20 and all(d > 0 for d in self.view_distances),
             self,
             "view_distances",
-            "must be one or more distances, each greater than 0",
+            "must be 1 to 20 distances, each greater than 0",
         )
 
 
@@ -76,7 +87,9 @@ class MissionConfig:
     up."""
 
     def __post_init__(self):
+        require_types(self)
         require_positive(self, "episodes", "time_limit", "control_period", "attempts")
+        require_at_most(self, episodes=MOST_EPISODES, time_limit=3600)
         steps = self.control_period / TIMESTEP
         require(
             abs(steps - round(steps)) < 1e-6 and 5 <= round(steps) <= 20,

@@ -1,15 +1,16 @@
 """What points of interest can look like: names for colours, shapes and attributes of one's own."""
 
 import dataclasses
-import math
 import re
 from collections.abc import Mapping
 from typing import Literal
 
-from jaxsense.config.checks import ConfigError, require, require_choices
+from jaxsense.config.checks import ConfigError, require, require_types
 
 LEAST_SHARE = 0.5
 """Smallest half side of a shape: of a narrower one a sensor may miss what it believes it faces."""
+
+_LONGEST_NAME = 64  # letters; it becomes part of the names of files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,9 +24,9 @@ class Shape:
     from 0.5 to 1."""
 
     def __post_init__(self):
-        require_choices(self)
+        require_types(self)
         require(
-            len(self.half_sides) == 2 and all(LEAST_SHARE <= s <= 1 for s in self.half_sides),
+            all(LEAST_SHARE <= share <= 1 for share in self.half_sides),
             self,
             "half_sides",
             f"must be two shares of poi_radius, each from {LEAST_SHARE} to 1",
@@ -48,9 +49,8 @@ class Attribute:
     """The number of walls and robots."""
 
     def __post_init__(self):
+        require_types(self)
         require_words(self.values, "attribute.values")
-        numbers = (*self.values.values(), self.elsewhere)
-        require(all(map(math.isfinite, numbers)), self, "values", "must be finite numbers")
 
 
 COLOURS: dict[str, tuple[float, float, float]] = {
@@ -68,7 +68,8 @@ SHAPES: dict[str, Shape] = {"cylinder": Shape("cylinder"), "cube": Shape("box")}
 def require_words(named: Mapping[str, object], field: str) -> None:
     """Raises `ConfigError` unless there are names, and each is one word."""
     for name in named:
-        if not re.fullmatch(r"[\w-]+", name):
-            raise ConfigError(field, name, "must be a word of letters, digits, - and _")
+        if not re.fullmatch(rf"[\w-]{{1,{_LONGEST_NAME}}}", name):
+            reason = f"must be a word of 1 to {_LONGEST_NAME} letters, digits, - and _"
+            raise ConfigError(field, name, reason)
     if not named:
         raise ConfigError(field, named, "must name one or more")

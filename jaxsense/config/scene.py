@@ -7,8 +7,10 @@ from typing import Any
 from jaxsense.config.checks import (
     ConfigError,
     require,
+    require_at_most,
     require_not_negative,
     require_positive,
+    require_types,
     require_window,
 )
 from jaxsense.config.objects import COLOURS, SHAPES, Attribute, Shape, require_words
@@ -55,13 +57,15 @@ class ArenaConfig:
     """Attributes beside colour and shape that a sensor of one's own can tell."""
 
     def __post_init__(self):
+        require_types(self)
         require_positive(self, "side", "num_pois", "poi_radius", "poi_height", "poi_gap")
+        require_at_most(self, side=100, num_pois=64, poi_height=10)
         reason = f"must be more than {LIDAR_HEIGHT} m"
         require(self.poi_height > LIDAR_HEIGHT, self, "poi_height", reason)
         require_words(self.colours, "arena.colours")
         require_words(self.shapes, "arena.shapes")
         for name, rgb in self.colours.items():
-            if len(rgb) != 3 or not all(0 <= part <= 1 for part in rgb):
+            if not all(0 <= part <= 1 for part in rgb):
                 field = f"arena.colours.{name}"
                 raise ConfigError(field, rgb, "must be red, green and blue, each within 0 and 1")
         if self.attributes:
@@ -95,6 +99,15 @@ class ArenaConfig:
         require(
             len(set(self.classes)) == len(self.classes), self, "classes", "must name no class twice"
         )
+        for name in self._words:
+            of_words: dict[Any, str] = {}
+            for word in self.labels(name):
+                what = self._words[name][word]
+                # A PoI may be turned any way.
+                look = (what.primitive, *sorted(what.half_sides)) if name == "shape" else what
+                twin = of_words.setdefault(look, word)
+                reason = f"must not use both {twin!r} and {word!r}, which no sensor can tell apart"
+                require(twin == word, self, "classes", reason)
 
     @property
     def poi_extent(self) -> float:
@@ -164,10 +177,12 @@ class LidarConfig:
     """Longest distance that the detector is shown, in metres: what is behind a PoI is cut off."""
 
     def __post_init__(self):
+        require_types(self)
         require_positive(
             self, "num_beams", "field_of_view", "min_range", "max_range", "window_range"
         )
         require_not_negative(self, "range_noise")
+        require_at_most(self, num_beams=100_000, max_range=1000, range_noise=self.max_range)
         require(self.field_of_view <= 360.0, self, "field_of_view", "must be at most 360 degrees")
         require(self.max_range > self.min_range, self, "max_range", "must be above min_range")
         require(self.window_range > self.min_range, self, "window_range", "must be above min_range")
@@ -190,8 +205,10 @@ class CameraConfig:
     """From each pixel that the detector reads to the next, in pixels."""
 
     def __post_init__(self):
+        require_types(self)
         require_positive(self, "num_pixels", "field_of_view")
         require_not_negative(self, "pixel_noise")
+        require_at_most(self, num_pixels=100_000, pixel_noise=1)
         require(self.field_of_view < 180.0, self, "field_of_view", "must be below 180 degrees")
         require_window(self, self.num_pixels)
 
@@ -212,6 +229,7 @@ class ViewpointConfig:
     """Free space around the robot at a viewpoint, in metres."""
 
     def __post_init__(self):
+        require_types(self)
         require_positive(self, "min_distance", "max_distance")
         require_not_negative(self, "max_bearing", "bearing_error", "clearance")
         require(self.max_bearing <= 30, self, "max_bearing", "must be at most 30 degrees")
@@ -235,6 +253,7 @@ class SensorConfig:
     """What it tells apart: `colour`, `shape` or one of `arena.attributes`."""
 
     def __post_init__(self):
+        require_types(self)
         module, _, function = self.make.partition(":")
         is_name = function.isidentifier() and all(p.isidentifier() for p in module.split("."))
         require(is_name, self, "make", "must be package.module:function")

@@ -2,7 +2,8 @@
 
 import dataclasses
 import difflib
-from typing import Any, get_args
+import json
+from typing import Any
 
 import dacite
 
@@ -27,7 +28,8 @@ def from_plain(stored: Any, base: Config | None = None) -> Config:
     """
     if not isinstance(stored, dict):
         raise ConfigError("config", stored, "must be an object with a section for each part")
-    rules = dacite.Config(strict=True, type_hooks={float: _number, int: _whole_number})
+    # Each section checks the types of its fields itself.
+    rules = dacite.Config(strict=True, check_types=False, type_hooks={float: _number})
     try:
         return dacite.from_dict(Config, _with_tuples(_over(base or Config(), stored)), rules)
     except dacite.UnexpectedDataError as error:
@@ -36,15 +38,34 @@ def from_plain(stored: Any, base: Config | None = None) -> Config:
         near = difflib.get_close_matches(unknown, names, 1)
         hint = f"; perhaps {names[near[0]]}" if near else ""
         raise ConfigError(unknown, _find(stored, unknown), f"is no setting{hint}") from None
-    except dacite.WrongTypeError as error:
-        is_plain = isinstance(error.field_type, type) and not get_args(error.field_type)
-        kind = error.field_type.__name__ if is_plain else str(error.field_type)
-        wanted = kind.removeprefix("typing.")
-        raise ConfigError(str(error.field_path), error.value, f"must be of type {wanted}") from None
+    except dacite.MissingValueError as error:
+        raise ConfigError(str(error.field_path), None, "must be given") from None
     except ConfigError:
         raise
-    except (dacite.DaciteError, OverflowError, TypeError, ValueError) as error:
-        raise ConfigError("config", "given", f"cannot be used ({error})") from None
+    except (dacite.DaciteError, AttributeError, RecursionError, TypeError, ValueError) as error:
+        raise ConfigError("config", stored, f"cannot be used ({error})") from None
+
+
+def parse_json(text: str) -> Any:
+    """What a text in JSON stands for.
+
+    Raises:
+      ValueError: if it is no JSON, is nested too deeply, or names a field twice.
+    """
+    try:
+        return json.loads(text, object_pairs_hook=_without_twins)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _without_twins(fields: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON, whose fields must have different names."""
+    found = dict(fields)
+    if len(found) < len(fields):
+        names = [name for name, _ in fields]
+        twin = next(name for name in found if names.count(name) > 1)
+        raise ValueError(f"{twin!r} is given twice")
+    return found
 
 
 def require_trust(config: Config) -> None:
@@ -80,15 +101,10 @@ def _with_tuples(value: Any) -> Any:
     return tuple(map(_with_tuples, value)) if isinstance(value, list | tuple) else value
 
 
-def _whole_number(value: Any) -> Any:
-    """Python takes True for 1; as text it is refused."""
-    return str(value) if isinstance(value, bool) else value
-
-
 def _number(value: Any) -> Any:
     """JSON writes 1 for 1.0."""
-    value = _whole_number(value)
-    return float(value) if isinstance(value, int) else value
+    is_whole = isinstance(value, int) and not isinstance(value, bool)
+    return float(value) if is_whole and abs(value) < 2**1000 else value
 
 
 def _names(section: Any, prefix: str = "") -> list[str]:

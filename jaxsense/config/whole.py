@@ -4,8 +4,11 @@
 # ruff: noqa: RUF009
 
 import dataclasses
+import itertools
+import math
+import operator
 
-from jaxsense.config.checks import ConfigError
+from jaxsense.config.checks import ConfigError, require_types
 from jaxsense.config.learning import (
     DetectorConfig,
     DqnConfig,
@@ -24,6 +27,12 @@ from jaxsense.config.scene import (
     SensorConfig,
     ViewpointConfig,
 )
+
+_MOST_NUMBERS = 2**32
+"""Numbers of 32 bits in an array or a network, 16 GiB."""
+_MOST_MODALITIES = 8  # the JMVAE has an encoder for each set of them
+_PLANNED_AT_ONCE = 384  # missions side by side, see `mission.batch_of`
+_NODES_PER_POI = 10  # of the roadmap
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +56,9 @@ class Config:
     mission: MissionConfig = MissionConfig()
 
     def __post_init__(self):
+        require_types(self)
         self._check_modalities()
+        self._check_classes()
         weights = self.jmvae.reconstruction_weights
         if len(weights) != len(self.modalities):
             raise ConfigError(
@@ -94,6 +105,8 @@ class Config:
                 True,
                 f"needs 2 to 30 pairs of PoI and modality, not {looks}; must be False",
             )
+        self._check_fields_of_view()
+        self._check_memory()
 
     def _check_modalities(self) -> None:
         known = ", ".join([*MODALITIES, *self.sensors])
@@ -109,13 +122,82 @@ class Config:
                     sensor.attribute,
                     f"must be one of {', '.join(attributes)}",
                 )
-        if not self.modalities:
-            raise ConfigError("modalities", self.modalities, f"must name one or more of {known}")
+        if not 1 <= len(self.modalities) <= _MOST_MODALITIES:
+            reason = f"must name 1 to {_MOST_MODALITIES} of {known}"
+            raise ConfigError("modalities", self.modalities, reason)
         for modality in self.modalities:
             if modality not in MODALITIES and modality not in self.sensors:
                 raise ConfigError("modalities", self.modalities, f"must be some of {known}")
         if len(set(self.modalities)) != len(self.modalities):
             raise ConfigError("modalities", self.modalities, "must name no modality twice")
+
+    def _check_classes(self) -> None:
+        """The classes must differ in something that a sensor tells apart."""
+        of_modalities = zip(*map(self.label_of_class, self.modalities), strict=True)
+        seen: dict[tuple[int, ...], str] = {}
+        for name, labels in zip(self.arena.classes, of_modalities, strict=True):
+            if (twin := seen.setdefault(labels, name)) != name:
+                raise ConfigError(
+                    "arena.classes",
+                    self.arena.classes,
+                    f"must not have both {twin!r} and {name!r}, which no sensor of modalities = "
+                    f"{self.modalities} can tell apart",
+                )
+
+    def _check_fields_of_view(self) -> None:
+        """Sensors must have in view what they look at."""
+        viewpoint = self.viewpoint
+        for name, sensor in {"camera": self.camera, "lidar": self.lidar}.items():
+            most = sensor.field_of_view / 2 - viewpoint.bearing_error
+            if name in self.modalities and viewpoint.max_bearing > most:
+                raise ConfigError(
+                    "viewpoint.max_bearing",
+                    viewpoint.max_bearing,
+                    f"must be at most half of {name}.field_of_view less viewpoint.bearing_error, "
+                    f"{most:g} degrees",
+                )
+
+    def _check_memory(self) -> None:
+        """No array may be larger than a computer's memory; those that may become large are here."""
+        arena, jmvae, dqn, ways = self.arena, self.jmvae, self.dqn, self.navigation
+        num_pois, num_classes = arena.num_pois, len(arena.classes)
+        num_labels = sum(len(self.labels(name)) for name in self.modalities)
+        windows = {"camera": 3 * self.camera.window, "lidar": self.lidar.window}
+        window = max(windows.get(name, 1) for name in self.modalities)
+        state, scene = 2 * num_pois * jmvae.latent_size, num_pois * window
+        views = num_pois * ways.view_sides * len(ways.view_distances)
+        trajectories = ways.speed_samples * ways.turn_samples * math.ceil(10 * ways.horizon)
+        encoders = 2 ** len(self.modalities)
+        detector, evaluation = self.detector, self.evaluation
+        numbers = {
+            "detector.hidden": _weights(window, *detector.hidden, num_labels),
+            "detector.num_scans": detector.num_scans * window,
+            "detector.num_held_out": detector.num_held_out * window,
+            "detector.batch detector.steps": detector.batch * max(detector.steps, window),
+            "jmvae.hidden": encoders * _weights(num_labels, *jmvae.hidden, 2 * jmvae.latent_size),
+            "jmvae.samples_per_class": jmvae.samples_per_class * num_classes * window,
+            "jmvae.batch jmvae.steps": jmvae.batch * jmvae.steps * (jmvae.latent_size + num_labels),
+            "dqn.hidden": _weights(state, *dqn.hidden, num_pois + 1),
+            "dqn.replay_capacity": dqn.replay_capacity * (2 * state + 3),
+            "dqn.num_starts": dqn.num_starts * max(state, scene),
+            "dqn.num_envs dqn.chunk": dqn.num_envs * max(5 * dqn.chunk, state, scene),
+            "dqn.batch dqn.updates dqn.chunk": 2 * dqn.batch * max(dqn.chunk * dqn.updates, state),
+            "evaluation.num_starts evaluation.num_repeats": evaluation.num_starts
+            * evaluation.num_repeats
+            * state,
+            "navigation.turn_samples": trajectories * num_pois * _PLANNED_AT_ONCE,
+            "mission.episodes": self.mission.episodes * views * num_pois * _NODES_PER_POI,
+        }
+        for fields, number in numbers.items():
+            if number > _MOST_NUMBERS:
+                values = {field: operator.attrgetter(field)(self) for field in fields.split()}
+                field = max(values, key=lambda field: values[field])
+                raise ConfigError(
+                    field,
+                    values[field],
+                    f"takes {4 * number / 2**30:,.0f} GiB with the other settings; must take at "
+                    f"most {4 * _MOST_NUMBERS / 2**30:.0f} GiB",
+                )
 
     def attribute(self, modality: str) -> str:
         """What a modality tells apart: `colour`, `shape` or one of `arena.attributes`."""
@@ -129,3 +211,8 @@ class Config:
     def label_of_class(self, modality: str) -> tuple[int, ...]:
         """For each class, the index of what a modality detects of it."""
         return self.arena.label_of_class(self.attribute(modality))
+
+
+def _weights(*sizes: int) -> int:
+    """Weights of a dense network with layers of these sizes."""
+    return sum(before * after for before, after in itertools.pairwise(sizes))

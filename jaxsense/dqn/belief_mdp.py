@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxsense import values
 from jaxsense.config import MdpConfig
-from jaxsense.indexing import Index, call, is_static
+from jaxsense.indexing import Index, call
 from jaxsense.types import Belief, Key
 
 Scene = Any
@@ -92,6 +93,7 @@ def information(std: jax.Array) -> jax.Array:
       `[...]` information in inverse latent units; grows without bound as `std` -> 0.
     """
     chex.assert_shape(std, (..., None), custom_message="std")
+    values.require_positive("std", std)
     return 1.0 / jnp.linalg.norm(std, axis=-1)
 
 
@@ -99,6 +101,7 @@ def as_state(belief: Belief) -> jax.Array:
     """`[N * 2D]` the map as a Q-network sees it: mean and standard deviation of each PoI."""
     chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
     chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
+    values.require_positive("belief.std", belief.std)
     return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)
 
 
@@ -130,6 +133,7 @@ def reset(
     classes = random_classes if classes is None else classes
     seen = random_seen if seen is None else seen
     chex.assert_shape(classes, (mdp.num_pois,), custom_message="classes")
+    values.require_index("classes", classes, mdp.num_classes)
     scene = mdp.new_scene(scene_key, classes)
     pois = jnp.arange(mdp.num_pois)
     looks = tuple(
@@ -159,6 +163,8 @@ def begin(
         tell of are not used.
     """
     chex.assert_shape(seen, (mdp.num_pois, mdp.num_modalities), custom_message="seen")
+    if seen.dtype != bool:
+        raise ValueError(f"seen of dtype {seen.dtype}: must be bool")
     first = jax.random.randint(key, (mdp.num_pois,), 0, mdp.num_modalities)
     entries = jax.vmap(lambda *poi: _looked_at(mdp, *poi))(looks, seen, first)
     return MapState(entries, seen, classes, scene, jnp.int32(0))
@@ -184,9 +190,9 @@ def step(
     Raises:
       ValueError: if there is no such modality.
     """
-    if is_static(modality) and not 0 <= modality < mdp.num_modalities:
-        raise ValueError(f"modality = {modality}: must be below {mdp.num_modalities}, not negative")
+    values.require_index("modality", modality, mdp.num_modalities)
     chex.assert_rank(action, 0, custom_message="action")
+    values.require_index("action", action, mdp.num_pois + 1)
     shape = (mdp.num_pois, *mdp.unseen.mean.shape)
     for part in (state.belief.mean, state.belief.std):
         chex.assert_shape(part, shape, custom_message="state.belief")

@@ -7,6 +7,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxsense import values
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.indexing import Index
@@ -39,6 +40,7 @@ def uniform(mdp: MapMdp) -> Policy:
 
 def naive(mdp: MapMdp, modality: Index) -> Policy:
     """Naive exploration: the first PoI that the own sensor has not seen, NOP when all are."""
+    values.require_index("modality", modality, mdp.num_modalities)
 
     def act(key: Key, state: MapState) -> jax.Array:
         del key
@@ -96,6 +98,7 @@ def optimal(mdp: MapMdp, rewards: jax.Array, label_of_class: jax.Array) -> Polic
     shape = (mdp.num_modalities, mdp.num_classes)
     chex.assert_shape(label_of_class, shape, custom_message="label_of_class")
     chex.assert_shape(rewards, (2 ** shape[0], shape[1]), custom_message="rewards")
+    values.require_finite("rewards", rewards)
 
     def of_poi(seen: jax.Array, poi_class: jax.Array) -> jax.Array:
         is_same = label_of_class == label_of_class[:, poi_class][:, None]

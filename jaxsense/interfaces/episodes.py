@@ -2,6 +2,7 @@
 
 import jax
 
+from jaxsense import values
 from jaxsense.dqn import belief_mdp, training
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.types import Key
@@ -9,8 +10,7 @@ from jaxsense.types import Key
 
 def check_modality(mdp: MapMdp, modality: int) -> None:
     """Raises `ValueError` unless the MDP has a sensor of that index."""
-    if not 0 <= modality < mdp.num_modalities:
-        raise ValueError(f"modality = {modality}: must be below {mdp.num_modalities}, not negative")
+    values.require_index("modality", modality, mdp.num_modalities)
 
 
 def num_actions(mdp: MapMdp) -> int:
@@ -29,6 +29,7 @@ def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
     A start takes a look at everything that has been seen in it, which costs several steps; drawn
     from a few thousand that were prepared once, it costs nothing.
     """
+    values.require_number("number", number)
     return jax.jit(lambda key: training.starts(key, mdp, number))(key)
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsense import values
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState, Outcome
 from jaxsense.extras import extra
@@ -48,9 +49,10 @@ class MapVectorEnv(VectorEnv):
           autoreset_mode: what follows the end of an episode, as in `gymnasium.vector`.
 
         Raises:
-          ValueError: if there is no such sensor or mode.
+          ValueError: if there is no such sensor or mode, or no environment.
         """
         episodes.check_modality(mdp, modality)
+        values.require_number("num_envs", num_envs)
         self.num_envs = num_envs
         self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
         size = (episodes.observation_size(mdp),)
@@ -82,7 +84,7 @@ class MapVectorEnv(VectorEnv):
         mask = (options or {}).get("reset_mask")
         if mask is None:
             self._states, mask = None, np.ones(self.num_envs, bool)
-        elif mask.shape != (self.num_envs,) or mask.dtype != bool:
+        elif np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != bool:
             raise ValueError(f"reset_mask = {mask!r}: must be an array of {self.num_envs} booleans")
         return self._restarted(mask), {}
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense import observe
+from jaxsense import observe, values
 from jaxsense.config import Config
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.models import Models, jmvae_shape
@@ -42,6 +42,7 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Bank:
     Returns:
       For each modality `[C, S, D_m]` features.
     """
+    values.require_number("samples", samples)
     num_classes = len(config.arena.classes)
     world = worlds.make_world(config)
     number = -(-samples * num_classes // config.arena.num_pois)

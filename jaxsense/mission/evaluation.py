@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsense import values
 from jaxsense.compilation import Compiler, Program
 from jaxsense.config import Config
 from jaxsense.devices import ALONE, Workers
@@ -85,6 +86,7 @@ def chunks(config: Config) -> tuple[int, int]:
 
 def batch_of(total: int) -> int:
     """How many of all missions to play side by side: fewer than all, as some last long."""
+    values.require_number("total", total)
     return min(_MOST_AT_ONCE, -(-total // 3))
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from jaxsense import values
 from jaxsense.mission import act, decide
 from jaxsense.mission.motion import move
 from jaxsense.mission.state import (
@@ -35,6 +36,7 @@ def rollout(
     Returns:
       The state after the last one, and the `[steps]` records.
     """
+    values.require_number("steps", steps)
 
     def go_on(states: MissionState, key: Key):
         states, records = step(key[None], mission, models, states)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxsense import values as checks
 from jaxsense.config import Config
 from jaxsense.indexing import Index
 from jaxsense.models import jmvae_shape
@@ -235,10 +236,15 @@ def start(
     config = mission.config
     num_robots, num_pois = len(config.modalities), config.arena.num_pois
     chex.assert_shape(classes, (num_pois,), custom_message="classes")
+    checks.require_index("classes", classes, len(config.arena.classes))
+    checks.require_index("policy", policy, len(POLICIES))
     chex.assert_shape(scene.poses, (num_robots, 3), custom_message="scene.poses")
     for name in ("stops_at", "blind_at"):
         shape = (num_robots,)
-        chex.assert_shape(getattr(faults, name), shape, custom_message=f"faults.{name}")
+        times = getattr(faults, name)
+        chex.assert_shape(times, shape, custom_message=f"faults.{name}")
+        is_time = "must be seconds, infinite for never"
+        checks.require(f"faults.{name}", times, lambda x: x >= 0, is_time)
     entry = fusion.unseen(jmvae_shape(config), config.mdp.unseen_variance)
     ways = roadmap.build(config, scene.layout) if ways is None else ways
     number = jnp.zeros(num_robots, jnp.int32)

@@ -1,10 +1,25 @@
 """An animation inside the page: its halves side by side, or one above the other on a phone."""
 
 import dataclasses
+import re
 from pathlib import Path
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from markupsafe import Markup
 
 _NAMESPACE = "http://www.w3.org/2000/svg"
+_ATTRIBUTES = {
+    *("attributeName", "calcMode", "dur", "keyTimes", "repeatCount", "type", "values"),
+    *("aria-labelledby", "class", "clip-path", "id", "role", "transform", "viewBox"),
+    *("cx", "cy", "d", "height", "points", "r", "rx", "ry", "width", "x", "x1", "x2"),
+    *("y", "y1", "y2", "fill", "fill-opacity", "opacity", "stroke", "stroke-dasharray"),
+    *("stroke-dashoffset", "stroke-opacity", "stroke-width"),
+}
+_ELEMENTS = {
+    *("animate", "animateTransform", "circle", "clipPath", "defs", "ellipse", "g", "line"),
+    *("path", "polyline", "rect", "style", "svg", "text", "title"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,20 +31,41 @@ class Film:
       right: its right half, which repeats what the left one shows.
     """
 
-    left: str
-    right: str
+    left: Markup
+    right: Markup
 
 
-def read_film(path: Path) -> Film:
-    """Reads what `animation.write` has written."""
+def read_film(path: Path) -> Film | None:
+    """Reads what `animation.write` has written; None if a file holds anything else.
+
+    A page that shows a file from elsewhere must not run or load what that file names.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        # Entities, which a document type declares, may grow beyond all memory.
+        root = ElementTree.Element("") if "<!" in text else ElementTree.fromstring(text)
+        _, _, width, height = (float(part) for part in root.get("viewBox", "").split())
+    except (ElementTree.ParseError, ValueError):
+        return None
+    if not all(map(_is_ours, root.iter())):
+        return None
     ElementTree.register_namespace("", _NAMESPACE)
-    root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
-    _, _, width, height = (float(part) for part in root.get("viewBox", "").split())
     root.set("viewBox", f"0 0 {width / 2:g} {height:g}")
-    left = ElementTree.tostring(root, encoding="unicode")
-    right = (
-        f'<svg class="film" aria-hidden="true" '
-        f'viewBox="{width / 2:g} 0 {width / 2:g} {height:g}">'
-        f'<use href="#{path.stem}-film"/></svg>'
+    right = Markup(
+        '<svg class="film" aria-hidden="true" viewBox="{} 0 {} {}"><use href="#{}-film"/></svg>'
+    ).format(f"{width / 2:g}", f"{width / 2:g}", f"{height:g}", path.stem)
+    return Film(Markup(ElementTree.tostring(root, encoding="unicode")), right)
+
+
+def _is_ours(element: Element) -> bool:
+    """Whether `animation.write` writes such an element, which loads and runs nothing."""
+    namespace, _, name = element.tag.removeprefix("{").rpartition("}")
+    values = " ".join([*element.attrib.values(), element.text or ""])
+    return (
+        namespace == _NAMESPACE
+        and name in _ELEMENTS
+        and set(element.attrib) <= _ATTRIBUTES
+        and element.get("attributeName", "x") in _ATTRIBUTES
+        # Styles, too, can load something: by `url`, `@import` or a letter written as a number.
+        and not re.search(r"url\s*\((?!#[\w-]+\))|@import|\\", values, re.IGNORECASE)
     )
-    return Film(left, right)

@@ -1,6 +1,7 @@
 """Reads a run directory, and writes its `report.html`."""
 
 import base64
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 import jinja2
 
 from jaxsense import files
-from jaxsense.config import PRESETS
+from jaxsense.config import PRESETS, Config, ConfigError, as_plain, parse_json
 from jaxsense.page import tables
 from jaxsense.page.film import Film, read_film
 
@@ -34,25 +35,37 @@ PLOTS = {
 """The plots of a run: alternative text and caption."""
 
 
-def write(run: Path, summary: dict[str, Any] | None = None) -> Path:
-    """Writes `report.html` from the files that lie in a run directory; again, if they change.
+def write(run: Path, config: Config, summary: dict[str, Any]) -> Path:
+    """Writes `report.html` of a run.
 
     Args:
-      run: directory with `config.json` and `summary.json`; plots `NAME.png` and animations
-        `mission*.svg` are shown if they are there.
-      summary: what is to be in `summary.json`, if it is not there yet.
+      run: its directory; plots `NAME.png` and animations `mission*.svg` are shown if they are there
+        and are what a run writes.
+      config: its settings.
+      summary: what is in its `summary.json`, or will be.
 
     Returns:
       The page's path.
 
     Raises:
+      ConfigError: if the summary lacks something or holds what is no figure.
       OSError: if a file cannot be read or written.
     """
-    settings = json.loads((run / "config.json").read_text())
-    if summary is None:
-        summary = json.loads((run / "summary.json").read_text())
-    assert summary is not None
-    classes = settings["config"]["arena"]["classes"]
+    try:
+        text = _render(run, config, summary)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        reason = f"must hold the summary.json of a finished run ({error!r})"
+        raise ConfigError("run", str(run), reason) from None
+    except jinja2.UndefinedError as error:
+        reason = f"must hold the summary.json of a finished run ({error})"
+        raise ConfigError("run", str(run), reason) from None
+    path = run / "report.html"
+    files.write(path, text)
+    return path
+
+
+def _render(run: Path, config: Config, summary: dict[str, Any]) -> str:
+    """The page."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("jaxsense.page", "."),
         autoescape=True,
@@ -60,17 +73,17 @@ def write(run: Path, summary: dict[str, Any] | None = None) -> Path:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    columns, table = tables.unambiguous(summary, classes)
+    columns, table = tables.unambiguous(summary, list(config.arena.classes))
     mission_columns, missions = tables.missions(summary)
-    text = environment.get_template("report.html.jinja").render(
+    return environment.get_template("report.html.jinja").render(
         run=run,
         summary=summary,
-        modalities=list(summary["dqn"]),
+        modalities=[modality for modality, _ in summary["dqn"].items()],
         num_devices=len(summary["devices"]),
         devices=sorted(set(summary["devices"])),
-        commit=settings.get("commit"),
-        changed=_changed(settings),
-        config=json.dumps(settings["config"], indent=2),
+        commit=_commit(run),
+        changed=_changed(config, summary["preset"]),
+        config=json.dumps(as_plain(config), indent=2),
         policies=tables.policies(summary),
         latent_space=tables.latent_space(summary),
         table_columns=columns,
@@ -81,9 +94,6 @@ def write(run: Path, summary: dict[str, Any] | None = None) -> Path:
         plots=_plots(run),
         films=_films(run),
     )
-    path = run / "report.html"
-    files.write(path, text)
-    return path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,18 +116,27 @@ def _plots(run: Path) -> list[Plot]:
 
 def _films(run: Path) -> list[Film]:
     """Animations, that of the run first."""
-    return [read_film(path) for path in sorted(run.glob("mission*.svg"), key=lambda p: p.stem)]
+    found = map(read_film, sorted(run.glob("mission*.svg"), key=lambda path: path.stem))
+    return [film for film in found if film is not None]
 
 
-def _changed(settings: dict[str, Any]) -> dict[str, tuple[str, str]]:
+def _commit(run: Path) -> str | None:
+    """The commit that a run's `config.json` tells, if it does."""
+    with contextlib.suppress(OSError, ValueError):
+        content = parse_json((run / "config.json").read_text(encoding="utf-8"))
+        return content.get("commit") if isinstance(content, dict) else None
+    return None
+
+
+def _changed(config: Config, preset: str) -> dict[str, tuple[str, str]]:
     """Settings that are not the preset's: what they are, and what the preset has."""
-    if settings["preset"] not in PRESETS:
+    if preset not in PRESETS:
         return {}
-    preset = _flat(json.loads(json.dumps(dataclasses.asdict(PRESETS[settings["preset"]]))))
+    before = _flat(as_plain(PRESETS[preset]))
     return {
-        name: (json.dumps(value), json.dumps(preset.get(name)))
-        for name, value in _flat(settings["config"]).items()
-        if value != preset.get(name)
+        name: (json.dumps(value), json.dumps(before.get(name)))
+        for name, value in _flat(as_plain(config)).items()
+        if value != before.get(name)
     }
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
+from jaxsense import values as checks
 from jaxsense.config import TIMESTEP, ArenaConfig, Shape
 from jaxsense.sim import amiro
 from jaxsense.types import Key
@@ -166,6 +167,9 @@ def make_layout(
     """The layout in which PoI n is of class `classes[n]`, an `[N]` index into `config.classes`."""
     chex.assert_shape(position, (config.num_pois, 2), custom_message="position")
     chex.assert_shape([yaw, classes], (config.num_pois,), custom_message="yaw, classes")
+    checks.require_finite("position", position)
+    checks.require_finite("yaw", yaw)
+    checks.require_index("classes", classes, len(config.classes))
     shapes = jnp.array([list(config.shapes.values()).index(s) for s in config.values("shape")])
     colours = jnp.array(config.values("colour"))
     values = {name: jnp.array(config.values(name)) for name in config.attributes}

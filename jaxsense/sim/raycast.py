@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from mujoco import mjx
 
+from jaxsense import values
 from jaxsense.sim.arena import Arena
 
 _VISIBLE_GROUP = 0
@@ -75,6 +76,7 @@ def cross_section(arena: Arena, data: mjx.Data, height: float, robot: int) -> Cr
     """
     if not -1 <= robot < arena.num_robots:
         raise ValueError(f"robot = {robot}: must be -1 or one of the {arena.num_robots} robots")
+    values.require_finite("height", height)
     kinds = arena.mj_model.geom_type
     seen = [
         g
@@ -124,6 +126,9 @@ def cast_along(section: CrossSection, origin: jax.Array, direction: Direction) -
     """`cast` along unit vectors: twice as fast, where they need not be worked out for every ray."""
     chex.assert_shape(origin, (2,), custom_message="origin")
     chex.assert_equal_shape(direction, custom_message="direction")
+    values.require_finite("origin", origin)
+    for part in direction:
+        values.require_finite("direction", part)
     # Chosen here and not by `platform_dependent`, which is traced and batched twice as long.
     on_cpu = jax.default_backend() == "cpu"
     nearest = _nearest_by_two_loops if on_cpu else _nearest_by_one_loop

@@ -16,6 +16,7 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
+from jaxsense import values as checks
 from jaxsense.config import (
     LIDAR_HEIGHT,
     ArenaConfig,
@@ -94,6 +95,11 @@ class Sensor:
     blind: float = 0.0
     ray_bytes: int = 4  # float32
 
+    def __post_init__(self):
+        for field in ("window", "channels", "stride"):
+            checks.require_number(field, getattr(self, field))
+        checks.require_positive("height", self.height)
+
     @property
     def scan_bytes(self) -> int:
         """Size of a whole scan as ROS sends it."""
@@ -125,6 +131,9 @@ def fan(num_rays: int, field_of_view: float) -> tuple[np.ndarray, Callable]:
     Returns:
       A `Sensor`'s `angles` and `centre`.
     """
+    checks.require_number("num_rays", num_rays)
+    is_angle = "must be above 0 and at most 360 degrees"
+    checks.require("field_of_view", field_of_view, lambda x: (x > 0) & (x <= 360), is_angle)
     half = np.radians(field_of_view) / 2
     angles = np.linspace(-half, half, num_rays, dtype=np.float32)
     step = 2 * half / max(num_rays - 1, 1)
@@ -347,6 +356,14 @@ def cut_out(sensor: Sensor, readings: jax.Array | np.ndarray, bearing: jax.Array
     channels = () if sensor.channels == 1 else (sensor.channels,)
     shape = (len(sensor.angles), *channels)
     chex.assert_shape(readings, shape, custom_message=f"readings of {sensor.name}")
+    is_turn = "must be within -pi and pi: it is in radians"
+    checks.require("bearing", bearing, lambda x: np.abs(x) <= np.pi, is_turn)
+    dtype = jnp.result_type(readings)
+    if jnp.issubdtype(dtype, jnp.integer):
+        reason = "must be real numbers, in metres or from 0 to 1"
+        raise ValueError(f"readings of dtype {dtype}: {reason}")
+    at_least = "must be a number that is not negative"
+    checks.require(f"readings of {sensor.name}", readings, lambda x: x >= 0, at_least)
     bearing = jnp.asarray(bearing, jnp.float32)
     rays = _first_ray(sensor, bearing) + sensor.stride * jnp.arange(sensor.window)
     return as_window(sensor, jnp.asarray(readings, jnp.float32)[rays])

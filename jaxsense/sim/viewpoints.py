@@ -67,6 +67,8 @@ def bearing(pose: jax.Array | np.ndarray, place: jax.Array | np.ndarray) -> jax.
     Returns:
       `[]` angle from its heading, positive to the left, in radians within -pi and pi.
     """
+    chex.assert_shape(pose, (3,), custom_message="pose")
+    chex.assert_shape(place, (2,), custom_message="place")
     to_place = place - pose[:2]
     angle = jnp.arctan2(to_place[1], to_place[0]) - pose[2]
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 from mujoco import mjx
 
+from jaxsense import values
 from jaxsense.config import Config
 from jaxsense.indexing import others
 from jaxsense.sim import arena as arenas
@@ -94,6 +95,7 @@ def look(
     if not 0 <= robot < len(world.sensors):
         raise ValueError(f"robot = {robot}: must be one of the {len(world.sensors)} robots")
     chex.assert_rank(poi, 0, custom_message="poi")
+    values.require_index("poi", poi, world.config.arena.num_pois)
     viewpoint_key, noise_key = jax.random.split(key)
     others = jnp.delete(scene.poses, robot, axis=0)
     pose, bearing = _viewpoint(viewpoint_key, world, scene.layout, others, poi)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsense import values
 from jaxsense.networks import Params
 from jaxsense.types import Belief, Features
 from jaxsense.vae import jmvae
@@ -45,6 +46,7 @@ def fuse(
     chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
     chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
     chex.assert_shape(seen, (len(model.modalities),), custom_message="seen")
+    values.require_positive("belief.std", belief.std)
     jmvae.check_features(model, features)
     generated = jmvae.decode(params, model, belief.mean)
     others = [m for m, new in enumerate(features) if new is None]
@@ -81,6 +83,7 @@ def write(
 
 def unseen(model: Jmvae, variance: float) -> Belief:
     """The entry of a PoI that nobody has seen: mean 0 and the given variance in each dimension."""
+    values.require_positive("variance", variance)
     return Belief(
         jnp.zeros(model.latent_size), jnp.full(model.latent_size, jnp.sqrt(jnp.float32(variance)))
     )

@@ -4,6 +4,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxsense import values
+
 
 def kl_divergence(
     mean_p: jax.Array, log_var_p: jax.Array, mean_q: jax.Array, log_var_q: jax.Array
@@ -61,5 +63,7 @@ def moment_match(mean: jax.Array, std: jax.Array) -> tuple[jax.Array, jax.Array]
     """
     chex.assert_rank(mean, 2, custom_message="mean")
     chex.assert_shape(std, mean.shape, custom_message="std")
+    values.require_number("number of components", len(mean))
+    values.require_positive("std", std)
     variance = jnp.mean(std**2, axis=0) + jnp.var(mean, axis=0)
     return jnp.mean(mean, axis=0), jnp.sqrt(variance)

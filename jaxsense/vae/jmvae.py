@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsense import training
+from jaxsense import training, values
 from jaxsense.config import JmvaeConfig
 from jaxsense.networks import MLP, Params, apply_to_columns
 from jaxsense.training import FitState
@@ -46,6 +46,12 @@ class Jmvae:
                 f"feature_sizes = {self.feature_sizes}: must hold one size for each of "
                 f"{self.modalities}"
             )
+        if len(set(self.modalities)) < len(self.modalities):
+            raise ValueError(f"modalities = {self.modalities}: must name none twice")
+        values.require_number("latent_size", self.latent_size)
+        for name in ("feature_sizes", "hidden"):
+            for size in getattr(self, name):
+                values.require_number(name, size)
 
     @property
     def subsets(self) -> tuple[tuple[int, ...], ...]:
@@ -163,6 +169,7 @@ def loss(
     Raises:
       ValueError: if a modality's features or its weight is missing.
     """
+    values.require_one_each("features", features, model.modalities)
     if any(x is None for x in features):
         raise ValueError(f"features = {features}: must hold every one of {model.modalities}")
     noise = jax.random.normal(key, (model.latent_size, 1))
@@ -261,6 +268,8 @@ def train(
     Returns:
       The next state and the `[steps]` losses.
     """
+    values.require_number("steps", steps)
+    values.require_one_each("bank", bank, model.modalities)
     for features, size in zip(bank, model.feature_sizes, strict=True):
         chex.assert_shape(features, (bank[0].shape[0], None, size), custom_message="bank")
     num_classes = bank[0].shape[0]

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsense import values
 from jaxsense.types import Belief
 from jaxsense.vae.gaussian import moment_match
 
@@ -15,6 +16,7 @@ PLAUSIBLE_DISTANCE = 2.0
 def sigma_norm(std: jax.Array) -> jax.Array:
     """`||sigma||_2` of `[..., D]` standard deviations: what the paper's Fig. 4 shows as colour."""
     chex.assert_shape(std, (..., None), custom_message="std")
+    values.require_positive("std", std)
     return jnp.linalg.norm(std, axis=-1)
 
 
@@ -54,6 +56,9 @@ def _check_belief(belief: Belief, class_means: jax.Array) -> None:
     chex.assert_rank(belief.mean, 1, custom_message="belief.mean")
     chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
     chex.assert_shape(class_means, (None, *belief.mean.shape), custom_message="class_means")
+    values.require_finite("belief.mean", belief.mean)
+    values.require_finite("class_means", class_means)
+    values.require_positive("belief.std", belief.std)
 
 
 def unambiguous(belief: Belief, class_means: jax.Array, true_class: jax.Array) -> jax.Array:

@@ -153,7 +153,7 @@ def test_wrappers_of_gymnasium_take_it(starts):
 
 def test_what_cannot_be_is_told(starts):
     mdp = small.small_mdp()
-    with pytest.raises(ValueError, match="modality = 2: must be below 2"):
+    with pytest.raises(ValueError, match="modality = 2: must be a whole number from 0 to 1"):
         MapVectorEnv(mdp, 2, 2)
     with pytest.raises(ValueError, match="Sometimes"):
         MapVectorEnv(mdp, 0, 2, autoreset_mode="Sometimes")

@@ -124,5 +124,5 @@ def test_live_observations_trace():
 
 @pytest.mark.parametrize("modality", [-1, 2])
 def test_a_sensor_that_is_not_there_is_named(modality):
-    with pytest.raises(ValueError, match=f"modality = {modality}: must be below 2"):
+    with pytest.raises(ValueError, match=f"modality = {modality}: must be a whole number"):
         MapEnv(small.small_mdp(), modality)
