@@ -9,9 +9,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import NamedSharding, PartitionSpec
 
 from jaxsense import devices
+from jaxsense.devices import Workers
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
 
@@ -141,20 +142,27 @@ def compiled(
     *args: Any,
     work: float,
     batch: int,
-    mesh: Mesh | None = None,
+    workers: Workers = devices.ALONE,
 ) -> Side:
     """Compiles a function for its arguments; the side runs it on them and blocks on the outputs.
 
-    With a mesh, arguments and outputs are split over its devices along their first axis.
+    With workers, arguments and outputs are split among them along their first axis; of threads, the
+    side gives the outputs of each.
     """
-    if mesh is not None:
-        function = devices.spread(function, mesh)
-        args = jax.device_put(args, NamedSharding(mesh, PartitionSpec(devices.AXIS)))
+    function = devices.spread(function, workers.mesh)
+    if workers.mesh is not None:
+        args = jax.device_put(args, NamedSharding(workers.mesh, PartitionSpec(devices.AXIS)))
+    threads = workers.threads
+    parts = [devices.part(args, i, threads) for i in range(threads)]
     begin = time.perf_counter()
-    program = jax.jit(function).lower(*args).compile(devices.compiler_options(runs_long=True))
+    program = jax.jit(function).lower(*parts[0]).compile(devices.compiler_options(runs_long=True))
     compile_s = time.perf_counter() - begin
-    number = 1 if mesh is None else mesh.size
-    return Side(lambda: jax.block_until_ready(program(*args)), work, batch, compile_s, number)
+
+    def run() -> list[Any]:
+        work_on = lambda i: jax.block_until_ready(program(*parts[i]))  # noqa: E731
+        return devices.side_by_side(work_on, threads)
+
+    return Side(run, work, batch, compile_s, workers.number)
 
 
 def compare(

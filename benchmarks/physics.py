@@ -66,7 +66,7 @@ def physics(options: Options) -> Row:
         ours.append(_drive_side(arena, drives))
         if options.peers and batch == batches[0]:
             theirs = _native_sides(arena, drives)
-            _check(ours[-1].run(), theirs[0].run(), _FREE_TOLERANCE, share=1.0)
+            _check(devices.joined(ours[-1].run()), theirs[0].run(), _FREE_TOLERANCE, share=1.0)
     return measure.compare("physics", _UNIT, ours, theirs, options, **_PEER)
 
 
@@ -78,7 +78,7 @@ def physics_contacts(options: Options) -> Row:
     theirs = []
     if options.peers:
         theirs = _native_sides(team.world.arena, _as_drives(states))
-        _check(ours[-1].run(), theirs[0].run(), _CONTACT_TOLERANCE, share=0.99)
+        _check(devices.joined(ours[-1].run()), theirs[0].run(), _CONTACT_TOLERANCE, share=0.99)
     return measure.compare("physics_contacts", _UNIT, ours, theirs, options, **_PEER)
 
 
@@ -194,8 +194,9 @@ def _drive_side(arena: Arena, drives: Drives) -> Side:
         return qpos, qvel
 
     batch, steps = drives.wheel_speeds.shape[:2]
+    workers, _ = devices.start(None)
     return measure.compiled(
-        jax.vmap(drive), drives, work=batch * steps, batch=batch, mesh=devices.make_mesh()
+        jax.vmap(drive), drives, work=batch * steps, batch=batch, workers=workers
     )
 
 
@@ -211,7 +212,8 @@ def _move_side(team: Mission, states: MissionState) -> Side:
     batch, number = states.steps.shape
     substeps = round(team.config.mission.control_period / arenas.TIMESTEP)
     work = batch * number * substeps
-    return measure.compiled(periods, states, work=work, batch=batch, mesh=devices.make_mesh())
+    workers, _ = devices.start(None)
+    return measure.compiled(periods, states, work=work, batch=batch, workers=workers)
 
 
 def _native_sides(arena: Arena, drives: Drives) -> list[Side]:

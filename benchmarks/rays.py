@@ -29,17 +29,17 @@ def rays(options: Options) -> Row:
     batches = measure.batches(options, quick=8, cpu=(64, 256, 1024), accelerator=(16384, 65536))
     placed = _random_scenes(jax.random.key(0), world, batches[-1])
     num_rays = sum(len(sensor.angles) for sensor in world.sensors)
-    mesh = devices.make_mesh()
+    workers, _ = devices.start(None)
     cast = jax.vmap(lambda data: _cast(world, data))
 
     def our_side(batch: int) -> Side:
         some = jax.tree.map(lambda x: x[:batch], placed)
-        return measure.compiled(cast, some, work=batch * num_rays, batch=batch, mesh=mesh)
+        return measure.compiled(cast, some, work=batch * num_rays, batch=batch, workers=workers)
 
     ours = [our_side(batch) for batch in batches]
     theirs = _native_sides(world, placed) if options.peers else []
     if theirs:
-        _check(ours[-1].run(), theirs[0].run())
+        _check(devices.joined(ours[-1].run()), theirs[0].run())
     name = "mujoco.mj_multiRay"
     return measure.compare("rays", "rays/s", ours, theirs, options, peer=name, packages=("mujoco",))
 

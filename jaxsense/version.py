@@ -1,3 +1,3 @@
 """The version of jaxsense, for the package, its runs and what is built from it."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
