@@ -224,8 +224,7 @@ def _nearest_by_two_loops(
     recognise as the same.
     """
     distance = functools.reduce(jnp.minimum, _distances(section, origin, direction))
-    inputs = jax.lax.stop_gradient((section, origin, direction))
-    return distance, _nearest_outline(*jax.lax.optimization_barrier(inputs))
+    return distance, _nearest_outline(*jax.lax.optimization_barrier((section, origin, direction)))
 
 
 def _nearest_outline(section: CrossSection, origin: jax.Array, direction: Direction) -> jax.Array:

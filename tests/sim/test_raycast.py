@@ -296,3 +296,12 @@ def test_one_loop_and_two_find_the_same(arena, known_layout, place):
 def test_a_robot_that_is_not_there_is_named(arena, robot):
     with pytest.raises(ValueError, match=f"robot = {robot}: must be -1 or one of the 2 robots"):
         raycast.cross_section(arena, arena.data, 0.1, robot)
+
+
+def test_a_cross_section_holds_everything_that_is_seen_once(arena):
+    section = raycast.cross_section(arena, arena.data, 0.1, 0)
+    names = [arena.mj_model.geom(g).name for g in section.geom]
+    pois = [f"poi{n}_{shape}" for shape in ("cylinder", "cube") for n in range(3)]
+    walls = [f"wall{w}" for w in range(4)]
+    assert sorted(names) == sorted([*pois, *walls, "robot1_body", "robot1_lidar"])
+    assert section.num_circles == 4
