@@ -68,3 +68,10 @@ def test_hits_are_those_of_plane_geometry(by):
             normal = np.array([part[r] for part in hits.normal])
             np.testing.assert_allclose(normal, expected[2], atol=1e-3)
     assert met == {5, 2, 4, 11, 7, -1}
+
+
+def test_a_ray_that_starts_on_a_side_meets_it_at_once(by):
+    one = [np.float32([x]) for x in ([0.0, 0.0], [1.0, 0.0], [0.25, 0.25])]
+    section = raycast.CrossSection(*one, geom=(3,), num_circles=0)
+    hit = raycast.cast(section, np.float32([-0.25, 0.0]), np.float32(0.0))
+    assert (float(hit.distance), int(hit.geom)) == (0.0, 3)
