@@ -20,7 +20,7 @@ from cosmic_ray.work_db import use_db  # pyright: ignore[reportMissingImports]
 from cosmic_ray.work_item import WorkerOutcome, WorkResult  # pyright: ignore[reportMissingImports]
 
 ROOT = Path(__file__).parents[1]
-NUMBER, SEED = 25, 0
+NUMBER, SEED = 20, 0
 TESTS = {
     "jaxsense/dqn/losses.py": "tests/dqn/test_losses.py",
     "jaxsense/dqn/belief_mdp.py": "tests/dqn/test_belief_mdp.py tests/dqn/test_not_finite.py",
@@ -29,12 +29,13 @@ TESTS = {
     "jaxsense/dqn/training.py": "tests/dqn/test_not_finite.py tests/dqn/test_dqn_training.py",
     "jaxsense/vae/gaussian.py": "tests/vae/test_gaussian.py",
     "jaxsense/vae/fusion.py": "tests/vae/test_fusion.py",
-    "jaxsense/vae/jmvae.py": "tests/vae/test_jmvae_equation.py tests/vae/test_jmvae.py",
+    "jaxsense/vae/jmvae.py": "tests/vae/test_jmvae_equation.py tests/vae/test_jmvae.py"
+    " -k 'not trained and not lowers'",
 }
 CONFIG = """
 [cosmic-ray]
 module-path = "{module}"
-timeout = 120.0
+timeout = 300.0
 excluded-modules = []
 test-command = "{python} -m pytest -o addopts= -p no:cacheprovider -q -x {tests}"
 

@@ -72,8 +72,8 @@ def sample(draws: jax.Array, replay: Replay) -> Transition:
     rounds, blocks, rows, width = replay.columns.shape
     filled = jnp.minimum(replay.count, rounds)
     size = draws.shape[0]
-    # Rounding may lift a product to the end of its range.
-    row = jnp.minimum((draws[:, 0] * filled).astype(jnp.int32), filled - 1)
+    row = (draws[:, 0] * filled).astype(jnp.int32)
+    # Rounding may lift a sum, though not a product, to the end of its range.
     share = (jnp.arange(size) + draws[:, 1]) * (blocks / size)
     block = jnp.minimum(share.astype(jnp.int32), blocks - 1)
     drawn = replay.columns[row, block]

@@ -82,8 +82,13 @@ def test_draws_are_tied_to_blocks_in_order():
 
 def test_the_largest_number_below_one_draws_what_is_there():
     ring = replay.add(replay.init(2, ROUNDS, 512, 1), transitions(np.arange(512)))
-    last = replay.sample(jnp.full((512, 2), np.nextafter(np.float32(1), np.float32(0))), ring)
+    below = np.nextafter(np.float32(1), np.float32(0))
+    last = replay.sample(jnp.full((512, 2), below), ring)
     assert last.a_tm1[-1] == 511
+    # Of any number of rounds that are there, the last one: products round to below it.
+    assert replay.sample(jnp.array([[below, 0.0]]), ring).a_tm1[0] == 0
+    counts = np.arange(1, 2**20, dtype=np.float32)
+    assert np.all((below * counts).astype(np.int32) == counts - 1)
 
 
 def test_what_does_not_fit_raises():
