@@ -152,7 +152,13 @@ TURNED = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "board": Shape("box", (0.5
 CHANGES = [
     ({"modalities": ["lidar"]}, "modalities = ['lidar']: must be a tuple of texts"),
     ({"modalities": ("lidar", "lidar")}, "must name no modality twice"),
-    ({"modalities": ("camera",)}, "arena.classes = "),
+    (
+        {
+            "arena.attributes": {"heat": Attribute({"hot": 1.0, "cold": 0.0})},
+            "arena.classes": ("red cube hot", "red cube cold"),
+        },
+        "must not have both 'red cube hot' and 'red cube cold', which no sensor can tell apart",
+    ),
     ({"modalities": ("lidar", "")}, "must be some of"),
     ({"modalities": ("lidar\n",)}, "must be some of"),
     ({"arena": 3}, "arena = 3: must be of type ArenaConfig"),

@@ -132,16 +132,15 @@ class Config:
             raise ConfigError("modalities", self.modalities, "must name no modality twice")
 
     def _check_classes(self) -> None:
-        """The classes must differ in something that a sensor tells apart."""
-        of_modalities = zip(*map(self.label_of_class, self.modalities), strict=True)
+        """The classes must differ in something that a sensor, of this team or not, tells apart."""
+        of_sensors = zip(*map(self.label_of_class, [*MODALITIES, *self.sensors]), strict=True)
         seen: dict[tuple[int, ...], str] = {}
-        for name, labels in zip(self.arena.classes, of_modalities, strict=True):
+        for name, labels in zip(self.arena.classes, of_sensors, strict=True):
             if (twin := seen.setdefault(labels, name)) != name:
                 raise ConfigError(
                     "arena.classes",
                     self.arena.classes,
-                    f"must not have both {twin!r} and {name!r}, which no sensor of modalities = "
-                    f"{self.modalities} can tell apart",
+                    f"must not have both {twin!r} and {name!r}, which no sensor can tell apart",
                 )
 
     def _check_fields_of_view(self) -> None:

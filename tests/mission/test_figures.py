@@ -153,8 +153,7 @@ def test_cases_are_the_policies_and_every_failure_of_every_robot():
     np.testing.assert_array_equal(cases["lidar_blind"].faults.blind_at, [np.inf, 6.0])
     np.testing.assert_array_equal(cases["naive"].faults.stops_at, [np.inf, np.inf])
     settings = replace(CONFIG.jmvae, reconstruction_weights=(1.0,))
-    arena = replace(CONFIG.arena, classes=("red cube", "green cube"))
-    single = replace(CONFIG, modalities=("camera",), jmvae=settings, arena=arena)
+    single = replace(CONFIG, modalities=("camera",), jmvae=settings)
     assert list(mission.cases(single)) == ["latent", "naive", "random"]
 
 
