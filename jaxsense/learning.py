@@ -116,11 +116,11 @@ def learn(key: Key, config: Config, world: World) -> Learned:
         info = jax.tree.map(lambda x: x.reshape(-1), infos)
         examined = modality, state.params, params, perception.held_out, config
         reward = jnp.where(info.episodes > 0, info.episode_return, jnp.nan)
-        return state.params, info.loss, reward, *examine.play(examine_key, *examined)
+        return state.params, info.is_finite, reward, *examine.play(examine_key, *examined)
 
     # One after the other: compiled once, and no slower than side by side.
     modalities = jnp.arange(len(config.modalities)), jnp.stack(dqn_keys)
-    q_networks, losses, reward, totals, firsts = jax.lax.map(learn_policy, modalities)
+    q_networks, is_finite, reward, totals, firsts = jax.lax.map(learn_policy, modalities)
     return Learned(
         perception=perception,
         models=Models(
@@ -137,7 +137,7 @@ def learn(key: Key, config: Config, world: World) -> Learned:
         reward=reward,
         totals=totals,
         firsts=firsts,
-        is_finite=perception.is_finite & jnp.isfinite(losses).all(),
+        is_finite=perception.is_finite & is_finite.all(),
     )
 
 

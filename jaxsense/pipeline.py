@@ -305,7 +305,7 @@ class Stages:
                 stage,
                 (i + 1) * settings.chunk,
                 settings.epochs,
-                np.asarray(info.loss),
+                np.where(info.is_finite, info.loss, np.nan),
                 state.params,
                 reward=float(np.average(ended, weights=np.maximum(episodes, 1e-9))),
                 epsilon=float(info.epsilon[-1]),

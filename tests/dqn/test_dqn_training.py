@@ -237,3 +237,21 @@ def test_values_after_an_action_are_those_of_the_target_network():
     # copy on, after two epochs, -1 + .5 x max(1, 0) - 1 = -1.5: sqrt(1 + e^2) - 1.
     losses = np.sqrt(1 + np.array([0.5, 0.5, 1.5, 1.5]) ** 2) - 1
     np.testing.assert_allclose([*first.loss, *second.loss], losses, rtol=1e-5)
+
+
+def test_the_replay_holds_as_many_transitions_as_the_settings_say():
+    key = jax.random.key(0)
+    prepared = jax.eval_shape(lambda key: training.starts(key, MDP, SMALL.num_starts), key)
+    state = jax.eval_shape(lambda key: training.init(key, MDP, SMALL, prepared), key)
+    rounds, blocks, _, width = state.replay.columns.shape
+    assert rounds * blocks * width == SMALL.replay_capacity
+    assert blocks * width == SMALL.num_envs
+
+
+def test_every_start_of_a_share_and_every_action_is_drawn():
+    config = replace(SMALL, epochs=200, chunk=200, num_starts=4 * SMALL.num_envs)
+    draws = training._draw(jax.random.key(0), MDP, config)
+    assert set(np.unique(draws.start)) == {0, 1, 2, 3}
+    assert set(np.unique(draws.action)) == set(range(MDP.num_pois + 1))
+    assert draws.start.shape == draws.coin.shape == (200, config.num_envs)
+    assert 0 <= draws.coin.min() < 0.05 < 0.95 < draws.coin.max() < 1
