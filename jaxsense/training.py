@@ -42,7 +42,7 @@ def fit(
     loss: Callable[[Params, Any, jax.Array], jax.Array],
     drawn: Any,
     optimiser: optax.GradientTransformation,
-    total: int,
+    total: int | None = None,
 ) -> tuple[FitState, jax.Array]:
     """Makes gradient steps, but none beyond the last one of the whole training.
 
@@ -52,7 +52,7 @@ def fit(
       drawn: pytree of `[steps, ...]` arrays, all that is random in each step. Drawn for all steps
         at once, random numbers cost a small part of what they would in the loop.
       optimiser: of optax.
-      total: steps of the whole training.
+      total: steps of the whole training; without, there are at least those that are drawn.
 
     Returns:
       The state after the last step and the `[steps]` losses; those beyond `total` mean nothing.
@@ -66,7 +66,7 @@ def fit(
         update, optimiser_state = optimiser.update(gradient, state.optimiser, state.params)
         params = optax.apply_updates(state.params, update)
         after = FitState(params, optimiser_state, state.step + 1)
-        if total % steps:
+        if total is not None and total % steps:
             goes_on = state.step < total
             after = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), after, state)
         return after, value

@@ -297,7 +297,8 @@ def run(tmp_path_factory):
     """The directory of a run that trained nothing, without a summary."""
     path = tmp_path_factory.mktemp("runs") / "run"
     models = jaxsense.untrained(jax.random.key(0), SMOKE)
-    RunDirectory.create(path, Settings("smoke", 0, SMOKE)).save_models(models)
+    with RunDirectory.create(path, Settings("smoke", 0, SMOKE)) as created:
+        created.save_models(models)
     return path
 
 

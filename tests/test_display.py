@@ -14,7 +14,6 @@ def show(display):
         display.show("dqn", 0, 0, {})
         display.show("dqn_camera", 100, 800, {"loss": 0.5, "reward": 1.0})
         display.show("dqn_camera", 200, 800, {"loss": 0.25, "reward": 1.0})
-        display.note("a note")
 
 
 @pytest.mark.parametrize("width", [80, 120])
@@ -38,7 +37,6 @@ def test_without_a_terminal_there_are_plain_lines_now_and_then(capsys):
     assert [re.sub(r"^ *[\d.]+ s  ", "", line) for line in lines] == [
         "dqn: compiling",
         "dqn_camera: 100 of 800  loss 0.5  reward 1",
-        "a note",
     ]
     assert [record["step"] for record in records] == [100, 200]
 

@@ -58,7 +58,8 @@ def runs(learned, tmp_path_factory):
         class_beliefs=jax.tree.map(lambda x: x.mean(axis=1), posteriors["joint"]),
     )
     path = tmp_path_factory.mktemp("runs")
-    RunDirectory.create(path / "thermal", Settings("smoke", 0, config)).save_models(models)
+    with RunDirectory.create(path / "thermal", Settings("smoke", 0, config)) as created:
+        created.save_models(models)
     return path
 
 

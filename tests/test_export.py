@@ -74,7 +74,8 @@ def models():
 def run(models, tmp_path_factory):
     """The directory of a run that trained nothing."""
     path = tmp_path_factory.mktemp("runs") / "run"
-    RunDirectory.create(path, Settings("smoke", 0, CONFIG)).save_models(models)
+    with RunDirectory.create(path, Settings("smoke", 0, CONFIG)) as created:
+        created.save_models(models)
     return path
 
 

@@ -14,8 +14,9 @@ from jaxsense.checkpoints import Checkpoints
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
 from jaxsense.detections import detect
 from jaxsense.monitor import Monitor
+from jaxsense.vae import detectors
 
-SMOKE = PRESETS["smoke"]
+SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
 CONFIG = dataclasses.replace(
     SMOKE,
     detector=DetectorConfig(num_scans=31, num_held_out=25, steps=1),
@@ -41,10 +42,14 @@ def used(arrays):
     return set(np.concatenate([np.ravel(x) for x in jax.tree.leaves(arrays)]).tolist())
 
 
+def survey_all():
+    rows, world = programs.survey_rows(CONFIG), SimpleNamespace()
+    found = programs.survey_scenes(jax.random.key(0), rows, CONFIG, world)  # pyright: ignore
+    return jax.tree.map(np.asarray, found)
+
+
 def test_a_run_measures_on_scenes_that_it_did_not_train_on(surveys):
-    found = jax.tree.map(
-        np.asarray, programs._simulate(jax.random.key(0), CONFIG, SimpleNamespace(), None)
-    )
+    found = survey_all()
     assert len(used(found.scenes)) == sum(programs.num_scenes(CONFIG))  # no key twice
 
     trained_on = []
@@ -64,20 +69,31 @@ def test_a_run_measures_on_scenes_that_it_did_not_train_on(surveys):
     stages.train_detectors(jax.random.key(1), found)
     looks = detect(stand_in, (), found, CONFIG)
 
-    detectors, bank, held_out = used(trained_on), used(looks.train), used(looks.held_out)
+    seen, bank, held_out = used(trained_on), used(looks.train), used(looks.held_out)
     starts, classes = used(looks.starts[1]), used(looks.windows)
-    assert detectors.isdisjoint(bank)
-    assert held_out.isdisjoint(detectors | bank | starts)
-    assert starts.isdisjoint(detectors)
+    assert seen.isdisjoint(bank)
+    assert held_out.isdisjoint(seen | bank | starts)
+    assert starts.isdisjoint(seen)
     assert classes <= held_out
     # All of them were looked at.
-    assert len(detectors) >= 31 / 3
+    assert len(seen) >= 31 / 3
     assert [x.shape[:2] for x in looks.held_out] == [(3, 9), (3, 9)]
 
 
-def test_the_pure_training_measures_on_scenes_that_it_did_not_train_on(surveys):
-    classes, windows = learning._survey(jax.random.key(0), CONFIG, SimpleNamespace())  # pyright: ignore
-    for of_modality in windows:
-        detectors, bank, held_out = map(used, of_modality)
-        assert len(detectors | bank | held_out) == sum(map(len, (detectors, bank, held_out)))
-        assert [len(x) for x in (detectors, bank, held_out)] == [len(c) for c in classes]
+def test_the_pure_training_measures_on_the_same_scenes(surveys, monkeypatch):
+    trained_on = []
+
+    def train(key, windows, labels, num_labels, config):
+        trained_on.append(windows)
+        return SimpleNamespace(), jnp.zeros(1)
+
+    monkeypatch.setattr(learning, "_train_detector", train)
+    monkeypatch.setattr(learning, "_train_jmvae", lambda key, bank, config: ({}, jnp.zeros(1)))
+    monkeypatch.setattr(detectors, "detect", lambda detector, window: window)
+    found = learning.learn_perception(KEY, CONFIG, SimpleNamespace())  # pyright: ignore
+    seen, bank, held_out = used(trained_on), used(found.bank), used(found.held_out)
+    starts, shown = used(found.starts[1]), used(found.windows)
+    assert seen.isdisjoint(bank)
+    assert held_out.isdisjoint(seen | bank | starts)
+    assert starts.isdisjoint(seen)
+    assert shown <= held_out

@@ -105,7 +105,7 @@ ARENAS = {
         ),
     ),
     "two names of black": ArenaConfig(
-        colours={"black": (0.0, 0.0, 0.0), "jet": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)},
+        colours={"black": (0.0, 0.0, 0.0), "jet": (0.001, 0.0, 0.0), "white": (1.0, 1.0, 1.0)},
         classes=("black cube", "jet cube", "black cylinder", "white cube", "white cylinder"),
     ),
 }

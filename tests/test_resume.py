@@ -150,8 +150,8 @@ def test_a_config_reproduces_its_run(smoke_run, cache, tmp_path, capsys):
     assert without_times(path) == without_times(smoke_run)
     (events,) = (path / "tensorboard").iterdir()
     assert b"dqn_camera/reward" in events.read_bytes()
-    assert (path / "config.json").read_text() == file.read_text()
-    content = json.loads(file.read_text())
+    content = json.loads(file.read_text(encoding="utf-8"))
+    assert json.loads((path / "config.json").read_text(encoding="utf-8")) == content
     assert content["seed"] == 5
     assert content["versions"]["jaxsense"] == jaxsense.__version__
     assert "give no --preset" in error_line(["--config", str(file), "--preset", "paper"], capsys)

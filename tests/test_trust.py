@@ -37,13 +37,14 @@ def change(config):
 def run(tmp_path):
     """The directory of a run that names the trap."""
     settings = Settings("smoke", 0, change(PRESETS["smoke"]))
-    return RunDirectory.create(tmp_path / "run", settings).path
+    with RunDirectory.create(tmp_path / "run", settings) as created:
+        return created.path
 
 
 READERS = {
     "load": jaxsense.load,
     "read_settings": lambda run, **trust: rundir.read_settings(run / "config.json", **trust),
-    "resume": RunDirectory.resume,
+    "resume": rundir.resumable,
 }
 
 
@@ -60,8 +61,7 @@ def test_with_trust_it_is_read(run):
         READERS["load"](run, trust=True)
     for name in ("read_settings", "resume"):
         found = READERS[name](run, trust=True)
-        config = getattr(found, "settings", found).config
-        assert config.sensors["thermal"].make == "trap:make"
+        assert found.config.sensors["thermal"].make == "trap:make"
 
 
 COMMANDS = {
@@ -93,5 +93,6 @@ def test_what_the_users_own_program_names_needs_none(run, tmp_path):
 
 def test_a_run_that_names_no_code_needs_none(tmp_path):
     settings = Settings("smoke", 0, PRESETS["smoke"])
-    path = RunDirectory.create(tmp_path / "plain", settings).path
+    with RunDirectory.create(tmp_path / "plain", settings) as created:
+        path = created.path
     assert rundir.read_settings(path / "config.json") == settings

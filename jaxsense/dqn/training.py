@@ -7,6 +7,7 @@ rounding.
 """
 
 import functools
+import math
 from typing import Any
 
 import chex
@@ -99,7 +100,7 @@ def init(key: Key, mdp: MapMdp, config: DqnConfig, prepared: MapState) -> DqnSta
       prepared: from `starts`, for the shapes alone.
     """
     envs = jax.tree.map(lambda x: jnp.zeros((config.num_envs, *x.shape[1:]), x.dtype), prepared)
-    s = belief_mdp.as_state(jax.tree.map(lambda x: x[0], envs.belief))
+    s = jnp.zeros(2 * math.prod(prepared.belief.mean.shape[1:]))
     params = q_network(mdp, config.hidden).init(key, s)
     rounds, blocks = config.replay_capacity // config.num_envs, config.num_envs // config.block
     return DqnState(

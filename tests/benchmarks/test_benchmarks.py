@@ -81,6 +81,8 @@ def check_printed(rows, output, errors):
     for name in rows:
         assert name in output
     for name, package in PEERS.items():
+        if name not in rows:
+            continue
         adapter = name.split("_")[-1] if name != "jmvae" else "multivae"
         assert has_package(package) or f"peer {adapter} is left out" in errors
 

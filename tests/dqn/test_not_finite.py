@@ -23,17 +23,20 @@ def start(mdp=MDP):
 
 @pytest.mark.parametrize("action", [-1, NOP + 1])
 def test_an_action_that_is_none_pays_nan(action):
-    _, outcome = belief_mdp.step(KEY, MDP, start(), jnp.int32(action), 0)
+    # Traced, it cannot be refused; known before, it is.
+    step = jax.jit(lambda action: belief_mdp.step(KEY, MDP, start(), action, 0)[1])
+    outcome = step(jnp.int32(action))
     assert np.isnan(outcome.reward)
     assert not outcome.is_over
 
 
 def test_a_belief_that_is_not_a_number_pays_nan_and_not_a_look_in_vain():
     mdp = replace(MDP, write=lambda *look: Belief(jnp.zeros(2), jnp.full(2, jnp.nan)))
-    after, outcome = belief_mdp.step(KEY, mdp, start(), jnp.int32(0), 0)
+    step = jax.jit(lambda state, action: belief_mdp.step(KEY, mdp, state, action, 0))
+    after, outcome = step(start(), jnp.int32(0))
     assert np.isnan(outcome.reward)
     # Nothing is looked at: nothing is wrong.
-    assert belief_mdp.step(KEY, mdp, after, jnp.int32(NOP), 0)[1].reward == 0.0
+    assert step(after, jnp.int32(NOP))[1].reward == 0.0
 
 
 @pytest.mark.parametrize("worst", [0, 2, 3])
@@ -52,8 +55,9 @@ def test_values_that_are_not_numbers_choose_no_action_and_total_nan(worst):
 def test_rewards_that_are_not_numbers_choose_no_action():
     labels = jnp.array([[1, 0, 0], [0, 0, 1]])
     rewards = jnp.ones((4, 3)).at[2, 1].set(jnp.nan)  # of class 1, after the LiDAR
-    act = policies.optimal(MDP, rewards, labels)
-    assert act(KEY, replace(start(), seen=jnp.zeros((3, 2), bool).at[1, 1].set(True))) == -1
+    state = replace(start(), seen=jnp.zeros((3, 2), bool).at[1, 1].set(True))
+    act = jax.jit(lambda rewards: policies.optimal(MDP, rewards, labels)(KEY, state))
+    assert act(rewards) == -1
 
 
 CONFIG = DqnConfig(

@@ -11,6 +11,7 @@ from teams import CONFIG
 
 from jaxsense import devices, mission
 from jaxsense.compilation import Compiler
+from jaxsense.devices import Workers
 from jaxsense.mission import evaluation
 from jaxsense.mission.state import Record
 from jaxsense.models import untrained
@@ -34,7 +35,14 @@ def fake_step(keys, team, models, states):
     return states, Record(**{**fields, "poses": scene.poses})
 
 
-@pytest.mark.parametrize("split", ["one device", "cpu", "gpu"])
+WORKERS = {
+    "one device": Workers,
+    "threads": lambda: Workers(threads=2),
+    "mesh": lambda: Workers(mesh=devices.make_mesh(2)),
+}
+
+
+@pytest.mark.parametrize("split", WORKERS)
 def test_the_whole_first_mission_is_recorded(split, team, monkeypatch):
     state = jax.jit(lambda: mission.reset(KEY, team, mission.NAIVE))()
 
@@ -45,12 +53,8 @@ def test_the_whole_first_mission_is_recorded(split, team, monkeypatch):
     monkeypatch.setattr(ROLLOUT, "step", fake_step)
     monkeypatch.setattr(evaluation, "reset", fake_reset)
     monkeypatch.setattr(evaluation, "figures", lambda team, models, s: {"steps": s.steps})
-    if split != "one device":
-        # Threads of a CPU, which may be asked to split the work as accelerators do.
-        monkeypatch.setattr(jax, "default_backend", lambda: split)
-    mesh = None if split == "one device" else devices.make_mesh(2)
     with Compiler(Monitor()) as compiler:
-        player = mission.Player(team, compiler, 4, mesh)
+        player = mission.Player(team, compiler, 4, WORKERS[split]())
         assert player.recording is None
         models = untrained(jax.random.key(0), CONFIG)
         found = player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, 9)
