@@ -72,6 +72,7 @@ def initial():
     return observe.bank_mdp(config, bank, params, models.jmvae_shape(config)), 0, settings
 
 
+@pytest.mark.slow  # compiles the same training three times
 def test_two_processes_train_together_and_stop(alone):
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -159,7 +160,12 @@ def test_workers_share_the_rows_of_a_program(workers):
 
 
 def test_options_that_the_compiler_does_not_know_are_left_out():
-    known = devices.compiler_options(runs_long=True)
+    assert devices.compiler_options() == {}  # tests compile without optimisation
+    jax.config.update("jax_disable_most_optimizations", False)
+    try:
+        known = devices.compiler_options(runs_long=True)
+    finally:
+        jax.config.update("jax_disable_most_optimizations", True)
     assert known["xla_backend_optimization_level"] == 1
     assert not devices._is_known("xla_no_such_option", 1)
     jax.jit(lambda x: x).lower(1.0).compile(compiler_options=known)

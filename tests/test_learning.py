@@ -42,6 +42,7 @@ def both(request):
         return learned, pipeline.run(key, config, compiled, monitor)
 
 
+@pytest.mark.slow  # compiles everything twice
 def test_both_come_to_the_same_models(both):
     learned, run = both
     assert bool(learned.is_finite)
@@ -52,6 +53,7 @@ def test_both_come_to_the_same_models(both):
     )
 
 
+@pytest.mark.slow
 def test_both_come_to_the_same_figures(both):
     learned, run = both
     accuracy = [block["accuracy"] for block in run.summary["detectors"].values()]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import examine, pipeline
+from jaxsense import examine, pipeline, programs
 from jaxsense.checkpoints import Checkpoints
 from jaxsense.chunks import run_chunks
 from jaxsense.config import PRESETS, JmvaeConfig
@@ -21,12 +21,14 @@ def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(monkeypatch
         raise ArithmeticError("no such policy")
 
     monkeypatch.setattr(examine, "latent_space", broken)
+    # What compiles longest is traced after the error then.
+    monkeypatch.setattr(programs, "_on_cpu", lambda: False)
     config, monitor = PRESETS["smoke"], Monitor()
     with (
         pytest.raises(ArithmeticError, match="no such policy"),
-        pipeline.compiled(config, monitor) as programs,
+        pipeline.compiled(config, monitor) as compiled,
     ):
-        pipeline.run(jax.random.key(0), config, programs, monitor)
+        pipeline.run(jax.random.key(0), config, compiled, monitor)
 
 
 @pytest.mark.parametrize(

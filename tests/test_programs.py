@@ -4,18 +4,21 @@ import contextlib
 import io
 import json
 import shutil
+from pathlib import Path
 from xml.etree import ElementTree
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from smoke import SMOKE, error_line
 
 import jaxsense
-from jaxsense import evaluate, mission, train
-from jaxsense.compilation import Compiler
+from jaxsense import devices, evaluate, mission, train
+from jaxsense.compilation import Compiler, Kept, Program
 from jaxsense.config import PRESETS, Config
 from jaxsense.monitor import Monitor
+from jaxsense.sim import sensors
 
 MISSION_KEYS = {
     "accuracy", "observations_per_poi", "time_s", "collisions", "goals_reached_fraction",
@@ -96,11 +99,22 @@ def test_another_run_is_never_overwritten(smoke_run, capsys):
     assert {path: path.stat().st_mtime_ns for path in smoke_run.rglob("*")} == before
 
 
-def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(tmp_path, capsys):
+def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
+    cache, tmp_path, capsys, monkeypatch
+):
+    run = Program.__call__
+
+    def poisoned(self, *args):
+        output = run(self, *args)
+        if (self._stage, self._name) != ("jmvae", "train"):
+            return output
+        state, losses = output
+        return state, losses.at[4].set(jnp.nan)
+
+    monkeypatch.setattr(Program, "__call__", poisoned)
     out = tmp_path / "broken"
-    options = [*SMOKE, "--cache", "None", "--jmvae.learning-rate", "1e30"]
-    line = error_line([*options, "--out", str(out)], capsys)
-    assert "jmvae: loss = nan at step" in line or "jmvae: loss = inf at step" in line
+    line = error_line([*SMOKE, *cache, "--out", str(out)], capsys)
+    assert "jmvae: loss = nan at step 5 of 300" in line
     assert str(out) in line
     assert (out / "checkpoints" / "detectors.msgpack").exists()
     assert (out / "config.json").exists()
@@ -111,7 +125,7 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(tmp_pat
     ("argv", "expected"),
     [
         (["--preset", "best"], "preset = 'best': must be one of default, paper, smoke"),
-        (["--taste", "sweet"], "train: option = '--taste': must be one of the program (--help"),
+        (["--taste", "sweet"], "train: option = '--taste': must be one of the program"),
         (["--jmvae.hiden", "3"], "of the program; perhaps --jmvae.hidden (--help"),
         (["--arena.side", "x"], "arena.side = 'x': must be a finite number"),
         (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
@@ -222,12 +236,18 @@ def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(smoke_run
         assert f"<td>{episodes}</td>" in text
 
 
-def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated):
+def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cache):
     path, _, _ = evaluated
     config, models = jaxsense.load(path)
     case = mission.cases(config)["latent"]
-    with Compiler(Monitor()) as compiler:
-        player = mission.Player(mission.make_mission(config), compiler, batch=1)
+    # The programs with which it was evaluated.
+    kept, workers = (
+        Kept(Path(cache[1]), config, sensors.fingerprints(config)),
+        devices.start(None)[0],
+    )
+    with Compiler(Monitor(), kept) as compiler:
+        team, batch = mission.make_mission(config), mission.batch_of(9)
+        player = mission.Player(team, compiler, batch, workers)
         found = player.play(jax.random.key(0), models, {"latent": case}, 1)["latent"]
     recording = player.recording
     np.testing.assert_array_equal(found["detections"][0], recording.records.detected.sum(axis=0))

@@ -22,6 +22,7 @@ TINY = dataclasses.replace(
 )
 
 
+@pytest.mark.slow  # with simulated scans; `test_sweep_variables.py` has all settings
 def test_settings_vary_in_one_program_as_they_do_in_several():
     world = make_world(TINY)
 

@@ -1,0 +1,64 @@
+"""Run directories: nobody writes into that of another."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from jaxsense import rundir
+from jaxsense.config import PRESETS, ConfigError
+from jaxsense.rundir import RunDirectory, Settings
+
+SETTINGS = Settings("smoke", 3, PRESETS["smoke"])
+
+
+def test_runs_of_one_second_get_directories_of_their_own(tmp_path):
+    with ThreadPoolExecutor(8) as executor:
+        made = list(executor.map(lambda _: rundir.unused(tmp_path / "runs" / "now"), range(8)))
+    assert sorted(path.name for path in made) == ["now", *(f"now-{i}" for i in range(2, 9))]
+
+
+def test_a_directory_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "runs").write_text("a file", encoding="utf-8")
+    with pytest.raises(ConfigError, match="runs/now': cannot be made"):
+        rundir.unused(tmp_path / "runs" / "now")
+
+
+def test_of_two_that_want_one_directory_the_second_is_refused(tmp_path):
+    path = tmp_path / "run"
+    with RunDirectory.create(path, SETTINGS) as run:
+        assert rundir.read_settings(run.path / "config.json") == SETTINGS
+        (path / "config.json").unlink()  # as if the first one had not yet come so far
+        with (
+            pytest.raises(ConfigError, match="is being written by another process"),
+            RunDirectory.create(path, SETTINGS),
+        ):
+            pass
+        assert not (path / "config.json").exists()
+    # A process that was killed before it wrote anything leaves the lock.
+    with RunDirectory.create(path, SETTINGS):
+        pass
+    with (
+        pytest.raises(ConfigError, match="is not empty; must be a new directory"),
+        RunDirectory.create(path, SETTINGS),
+    ):
+        pass
+
+
+def test_a_directory_of_somebody_gets_no_lock(tmp_path):
+    (tmp_path / "thesis.txt").write_text("precious", encoding="utf-8")
+    with pytest.raises(ConfigError, match="is not empty"), RunDirectory.create(tmp_path, SETTINGS):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_line_that_a_killed_process_has_left_is_cut(tmp_path):
+    path = tmp_path / "run"
+    with RunDirectory.create(path, SETTINGS) as run:
+        run.append_metrics(stage="jmvae", step=1)
+    with (path / "metrics.jsonl").open("a", encoding="utf-8") as metrics:
+        metrics.write('{"stage": "jm')
+    with RunDirectory.resume(path) as run:
+        run.append_metrics(stage="jmvae", step=2)
+    lines = (path / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["step"] for line in lines] == [1, 2]
