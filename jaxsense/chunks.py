@@ -50,8 +50,9 @@ def run_chunks(
         for name, values in figures.items():
             curves.setdefault(name, []).extend(values)
         is_late = time.monotonic() - saved > _SAVE_PERIOD
-        if chunk + 1 < number and (is_late or monitor.is_stopping):
+        if is_late or monitor.is_stopping:
             checkpoints.save_unfinished(stage, Unfinished(chunk + 1, state, curves))
             saved = time.monotonic()
+        if chunk + 1 < number:
             monitor.check_stop()
     return state, curves

@@ -63,14 +63,29 @@ def run(main: Callable[[], None]) -> None:
     try:
         main()
     except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr, flush=True)
-        # Threads that compile would hold up any other way out.
-        os._exit(130)
+        complain("Interrupted.")
+        _exit(130)
+    except SystemExit as stop:
+        _exit(stop.code if isinstance(stop.code, int) else int(stop.code is not None))
+
+
+def _exit(status: int) -> NoReturn:
+    """Ends the process at once: threads that compile would hold up any other way out."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):
+            stream.flush()
+    os._exit(status)
+
+
+def complain(text: str) -> None:
+    """Prints a line about something that went wrong, if anybody still reads."""
+    with contextlib.suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
 
 
 def fail(program: str, message: str) -> NoReturn:
     """Ends a program for a reason that is the user's to mend."""
-    print(f"{program}: {' '.join(message.splitlines())}", file=sys.stderr)
+    complain(f"{program}: {' '.join(message.splitlines())}")
     sys.exit(2)
 
 
@@ -80,8 +95,12 @@ def reason(error: OSError) -> str:
 
 
 def require_directory(field: str, path: Path | None) -> None:
-    """Raises `ConfigError` if something else than a directory lies at a path."""
-    if path is not None and path.exists() and not path.is_dir():
+    """Raises `ConfigError` if something else than a directory lies at a path, or nothing can."""
+    try:
+        is_other = path is not None and path.exists() and not path.is_dir()
+    except OSError as error:
+        raise ConfigError(field, str(path), f"cannot be used ({error.strerror})") from None
+    if is_other:
         raise ConfigError(field, str(path), "must be a directory")
 
 
@@ -103,7 +122,7 @@ def keep_programs(program: str, directory: Path | None, config: Config) -> Kept 
         directory = directory.expanduser()
         kept = Kept(directory, config, sensors.fingerprints(config))
     except (OSError, RuntimeError) as error:
-        print(f"{program}: programs cannot be kept in {directory} ({error})", file=sys.stderr)
+        complain(f"{program}: programs cannot be kept in {directory} ({error})")
         return None
     return kept
 

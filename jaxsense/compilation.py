@@ -69,7 +69,11 @@ class Kept:
 
     def _forget_oldest(self) -> None:
         """Removes programs of settings that were not used for longest, and nothing else."""
-        others = [path for path in self.path.parent.iterdir() if _FOLDER.fullmatch(path.name)]
+        others = [
+            path
+            for path in self.path.parent.iterdir()
+            if _FOLDER.fullmatch(path.name) and path.is_dir() and not path.is_symlink()
+        ]
         others.sort(key=lambda path: path.lstat().st_mtime)
         for folder in others[:-_MOST_KEPT]:
             for path in folder.iterdir():

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import filelock
 
+_UNFINISHED = ".unfinished"
+"""How the names of files end that are not yet whole."""
+
 
 class WriteError(OSError):
     """A file that cannot be written."""
@@ -24,7 +27,7 @@ def write(path: Path, content: str | bytes) -> None:
       WriteError: names the file, which is then as it was before.
     """
     # A name of its own, as another process may write the same file.
-    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_UNFINISHED}")
     try:
         with unfinished.open("xb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
@@ -38,6 +41,13 @@ def write(path: Path, content: str | bytes) -> None:
     finally:
         with contextlib.suppress(OSError):
             unfinished.unlink(missing_ok=True)
+
+
+def remove_unfinished(directory: Path) -> None:
+    """Removes what processes that were killed have left of files in and below a directory."""
+    for path in directory.rglob(f".*{_UNFINISHED}"):
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 def append(path: Path, line: str) -> None:

@@ -24,7 +24,10 @@ def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
 
     def end(number: int, frame: FrameType | None) -> None:
         # Threads that compile or save would hold up any other way out.
-        print("Stopped at once; what was saved before is still there.", file=sys.stderr)
+        with contextlib.suppress(OSError):
+            os.write(
+                sys.stderr.fileno(), b"Stopped at once; what was saved before is still there.\n"
+            )
         os._exit(128 + number)
 
     def handle(number: int, frame: FrameType | None) -> None:

@@ -161,6 +161,8 @@ class Stages:
         posteriors, jmvae_figures = programs.examine_jmvae(params, detections.held_out)
         class_beliefs = jax.tree.map(lambda x: np.asarray(x).mean(axis=1), posteriors["joint"])
         self._monitor.check_finite("evaluate_jmvae", "class beliefs", class_beliefs)
+        self._monitor.check_finite("evaluate_jmvae", "posteriors", posteriors)
+        self._monitor.check_finite("evaluate_jmvae", "figures", jmvae_figures)
         self._save("class_beliefs", class_beliefs)
 
         def train_and_examine(modality: int):

@@ -94,6 +94,7 @@ class RunDirectory:
                 # Also before the lock, which would be one file more in somebody's directory.
                 _check_empty(path)
                 kept.enter_context(_locked(path, "out"))
+                files.remove_unfinished(path)
                 _check_empty(path)
                 write_json(path / "config.json", content)
             except OSError as error:
@@ -111,6 +112,7 @@ class RunDirectory:
         settings = resumable(path, trust)
         with _locked(path, "resume"):
             run = cls(path, settings)
+            files.remove_unfinished(path)
             run._drop_unfinished_line()
             yield run
 
@@ -158,7 +160,9 @@ def unused(path: Path) -> Path:
 
 def _check_empty(path: Path) -> None:
     """Raises a `ConfigError` if a directory holds more than a lock."""
-    if {file.name for file in path.iterdir()} - {".lock"}:
+    names = {file.name for file in path.iterdir()}
+    # What a process leaves that was killed before it had written anything.
+    if {name for name in names if not name.startswith(".config.json.")} - {".lock"}:
         raise ConfigError("out", str(path), "is not empty; must be a new directory")
 
 

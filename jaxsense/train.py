@@ -42,6 +42,7 @@ from jaxsense.rundir import RunDirectory, Settings
 from jaxsense.sim import sensors
 
 PROGRAM = "jaxsense.train"
+_MOST_SEEDS = 10_000
 _INTERRUPTED = 130  # exit status, as shells give it
 
 
@@ -136,8 +137,9 @@ def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: c
             raise ConfigError("seed", arguments.seed, "must be within 0 and 2^32 - 1")
         if arguments.seed + arguments.num_seeds > 2**32:
             raise ConfigError("num_seeds", arguments.num_seeds, "leads beyond seed 2^32 - 1")
-        if arguments.num_seeds < 1:
-            raise ConfigError("num_seeds", arguments.num_seeds, "must be greater than 0")
+        if not 1 <= arguments.num_seeds <= _MOST_SEEDS:
+            reason = f"must be within 1 and {_MOST_SEEDS:,}"
+            raise ConfigError("num_seeds", arguments.num_seeds, reason)
         if arguments.file is not None and _option(argv, "preset"):
             raise ConfigError("config", str(arguments.file), "holds a preset; give no --preset")
         if arguments.resume is not None:
@@ -217,7 +219,7 @@ def _train(
     except Stopped:
         trust = " --trust" if settings.config.sensors else ""
         go_on = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}{trust}"
-        print(f"Stopped; all that was trained is saved. To go on: {go_on}", file=sys.stderr)
+        cli.complain(f"Stopped; all that was trained is saved. To go on: {go_on}")
         sys.exit(_INTERRUPTED)
     if len(failed) == settings.num_seeds:
         sys.exit(2)
@@ -257,9 +259,14 @@ def _of_seed(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager
     """The run directory of one seed: of several, one of its own, as of a run of that seed alone."""
     if path == run.path:
         return contextlib.nullcontext(run)
+    settings = dataclasses.replace(run.settings, seed=seed, num_seeds=1)
     if (path / "config.json").exists():
+        # Its settings are compared before anything that they name is made.
+        if rundir.read_settings(path / "config.json", trust=True) != settings:
+            reason = f"must have the settings of {run.path / 'config.json'}, with seed {seed}"
+            raise ConfigError("resume", str(path), reason)
         return RunDirectory.resume(path, trust=True)
-    return RunDirectory.create(path, dataclasses.replace(run.settings, seed=seed, num_seeds=1))
+    return RunDirectory.create(path, settings)
 
 
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
@@ -282,7 +289,7 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
 
 def _warn(text: str) -> None:
     """A line about something that went wrong."""
-    print(f"{PROGRAM}: {text}", file=sys.stderr)
+    cli.complain(f"{PROGRAM}: {text}")
 
 
 def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any], monitor: Monitor) -> None:

@@ -183,6 +183,11 @@ def test_nothing_of_the_user_is_ever_removed(tmp_path):
         (tmp_path / name).write_text("precious", encoding="utf-8")
         os.utime((tmp_path / name).parent, (1, 1))
     (tmp_path / "executables").chmod(0o700)
+    (tmp_path / "executables" / (32 * "b")).symlink_to(tmp_path / "programs" / "mine")
+    (tmp_path / "executables" / (32 * "c")).write_text("precious", encoding="utf-8")
+    program = tmp_path / "programs" / "mine" / f"stage-{16 * '0'}.pickle"
+    program.write_text("precious", encoding="utf-8")
+    theirs += [str(program), f"executables/{32 * 'c'}"]
     for settings in range(10):
         Kept(tmp_path, settings)
     assert all((tmp_path / name).read_text(encoding="utf-8") == "precious" for name in theirs)

@@ -104,3 +104,18 @@ def test_a_stop_is_heard_after_every_chunk(tmp_path):
     with pytest.raises(Stopped):
         run_chunks("jmvae", np.float32(0), 4, run, monitor, checkpoints)
     assert checkpoints.load_unfinished("jmvae", np.float32(0))[:2] == (2, 2.0)
+
+
+def test_a_training_that_is_over_is_saved_when_another_one_stops(tmp_path):
+    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
+    monitor.stop()
+    state, curves = run_chunks(
+        "camera", np.float32(0), 1, lambda i, x: (x + 1, {"i": [i]}), monitor, checkpoints
+    )
+    assert (state, curves) == (1, {"i": [0]})
+
+    def never(chunk, state):
+        raise AssertionError("trained again")
+
+    again = run_chunks("camera", np.float32(0), 1, never, Monitor(), checkpoints)
+    assert again == (1, {"i": [0]})

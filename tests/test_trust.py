@@ -96,3 +96,16 @@ def test_a_run_that_names_no_code_needs_none(tmp_path):
     with RunDirectory.create(tmp_path / "plain", settings) as created:
         path = created.path
     assert rundir.read_settings(path / "config.json") == settings
+
+
+def test_a_seed_of_several_must_have_the_settings_of_all(tmp_path, capsys):
+    settings = Settings("smoke", 3, PRESETS["smoke"], num_seeds=2)
+    with RunDirectory.create(tmp_path / "sweep", settings) as created:
+        path = created.path
+    of_seed = dataclasses.replace(settings, seed=3, num_seeds=1, config=change(settings.config))
+    with RunDirectory.create(path / "seed-3", of_seed):
+        pass
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--resume", str(path), "--cache", "None", "--quiet"])
+    assert stop.value.code == 2
+    assert "must have the settings of" in capsys.readouterr().err
