@@ -3,7 +3,6 @@
 import contextlib
 import os
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from types import FrameType
 
@@ -25,9 +24,7 @@ def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         # Threads that compile or save would hold up any other way out.
         with contextlib.suppress(OSError):
-            os.write(
-                sys.stderr.fileno(), b"Stopped at once; what was saved before is still there.\n"
-            )
+            os.write(2, b"Stopped at once; what was saved before is still there.\n")
         os._exit(128 + number)
 
     def handle(number: int, frame: FrameType | None) -> None:

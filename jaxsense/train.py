@@ -193,6 +193,7 @@ def _train(
 ) -> None:
     """Trains one seed after the other with the same programs, and writes what they leave."""
     settings, failed = run.settings, dict[int, str]()
+    _check_seeds(run)
     kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config)
     monitor = Monitor(warn=_warn)
 
@@ -255,18 +256,29 @@ def _paths(run: RunDirectory) -> list[Path]:
     return [run.path / f"seed-{seed}" for seed in run.settings.seeds]
 
 
+def _check_seeds(run: RunDirectory) -> None:
+    """Raises `ConfigError` if the directory of one of several seeds holds another run."""
+    for seed, path in zip(run.settings.seeds, _paths(run), strict=True):
+        if path == run.path or not (path / "config.json").exists():
+            continue
+        # Compared, and nothing that they name is made.
+        if rundir.read_settings(path / "config.json", trust=True) != _settings_of(run, seed):
+            reason = f"must have the settings of {run.path / 'config.json'}, with seed {seed}"
+            raise ConfigError("resume", str(path), reason)
+
+
+def _settings_of(run: RunDirectory, seed: int) -> Settings:
+    """The settings of one of several seeds."""
+    return dataclasses.replace(run.settings, seed=seed, num_seeds=1)
+
+
 def _of_seed(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager[RunDirectory]:
     """The run directory of one seed: of several, one of its own, as of a run of that seed alone."""
     if path == run.path:
         return contextlib.nullcontext(run)
-    settings = dataclasses.replace(run.settings, seed=seed, num_seeds=1)
     if (path / "config.json").exists():
-        # Its settings are compared before anything that they name is made.
-        if rundir.read_settings(path / "config.json", trust=True) != settings:
-            reason = f"must have the settings of {run.path / 'config.json'}, with seed {seed}"
-            raise ConfigError("resume", str(path), reason)
         return RunDirectory.resume(path, trust=True)
-    return RunDirectory.create(path, settings)
+    return RunDirectory.create(path, _settings_of(run, seed))
 
 
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
