@@ -4,7 +4,6 @@ A checkpoint is one file: a digest of SHA-256, and what `flax.serialization` mak
 """
 
 import hashlib
-import json
 import shutil
 import sys
 import threading
@@ -23,7 +22,8 @@ T = TypeVar("T")
 
 _DIGEST = hashlib.sha256().digest_size
 _SUFFIX = ".msgpack"
-_LIST = "saved.json"
+_LIST = "saved"
+"""The checkpoint that lists the names of all others, so that a missing file is noticed."""
 
 Curves = dict[str, list[float]]
 """Figures of a training so far, by their names."""
@@ -71,8 +71,10 @@ class Checkpoints:
         if self.path is None:
             return
         self._file(name).parent.mkdir(parents=True, exist_ok=True)
-        content = serialization.to_bytes(jax.tree.map(np.asarray, tree))
-        files.write(self._file(name), hashlib.sha256(content).digest() + content)
+        with self._lock:
+            if not self._file(_LIST).exists():
+                self._write(_LIST, [])
+        self._write(name, serialization.to_state_dict(jax.tree.map(np.asarray, tree)))
         with self._lock:
             self._list(self._listed() | {name})
 
@@ -127,18 +129,44 @@ class Checkpoints:
                     {name for name in self._listed() if not name.startswith(_unfinished(""))}
                 )
 
-    def _listed(self) -> set[str]:
-        """Names of all that was saved, so that a missing file is noticed."""
-        assert self.path is not None
+    def check_list(self) -> None:
+        """Makes the list of all that was saved anew, with a warning, if it cannot be used."""
+        if self.path is None or not (there := self._there()):
+            return
         try:
-            return set(json.loads((self.path / _LIST).read_text(encoding="utf-8")))
+            _read(self._file(_LIST))
         except (OSError, ValueError):
-            return set()
+            reason = "is damaged" if self._file(_LIST).exists() else "is missing"
+            self._put_aside(_LIST)
+            self._write(_LIST, sorted(there))
+            error = ConfigError("checkpoint", str(self._file(_LIST)), reason)
+            self._warn(f"{error}; the run goes on from all that is there")
+
+    def _there(self) -> set[str]:
+        """Names of all that is there, but for the list of them."""
+        assert self.path is not None
+        found = (file.relative_to(self.path).as_posix() for file in self.path.rglob(f"*{_SUFFIX}"))
+        return {name.removesuffix(_SUFFIX) for name in found} - {_LIST}
+
+    def _listed(self) -> set[str]:
+        """Names of all that was saved; of all that is there, if that is not known."""
+        try:
+            return set(_read(self._file(_LIST)))
+        except (OSError, ValueError):
+            return self._there()
 
     def _list(self, names: set[str]) -> None:
-        assert self.path is not None
         if names != self._listed():
-            files.write(self.path / _LIST, json.dumps(sorted(names)) + "\n")
+            self._write(_LIST, sorted(names))
+
+    def _write(self, name: str, content: Any) -> None:
+        packed = serialization.msgpack_serialize(content)
+        files.write(self._file(name), hashlib.sha256(packed).digest() + packed)
+
+    def _put_aside(self, name: str) -> None:
+        file = self._file(name)
+        if file.exists():
+            file.replace(file.with_name(f"{file.name}.damaged"))
 
     def _load(self, name: str, restore: Callable[[Any], T]) -> T | None:
         """What `restore` makes of what was saved; see `load`."""
@@ -158,10 +186,7 @@ class Checkpoints:
         try:
             return self._load(name, restore)
         except ConfigError as error:
-            file = self._file(name)
-            aside = file.with_name(f"{file.name}.damaged")
-            if file.exists():
-                file.replace(aside)
+            self._put_aside(name)
             self._warn(f"{error}; what it held is trained again")
             return None
 

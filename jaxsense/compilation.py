@@ -11,7 +11,7 @@ import re
 import stat
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -162,13 +162,20 @@ class Compiler:
     def __init__(self, monitor: Monitor, kept: Kept | None = None):
         self.monitor, self.kept = monitor, kept
         self._threads = ThreadPoolExecutor(_THREADS)
+        self._is_closed = False
 
     def __enter__(self) -> "Compiler":
         return self
 
     def __exit__(self, *error: Any) -> None:
         """Gives up what is still waiting, or else the process would go on with it."""
+        self._is_closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)
+
+    def check_open(self) -> None:
+        """Raises `CancelledError` if the run is over."""
+        if self._is_closed:
+            raise CancelledError
 
     def submit(self, work: Callable[[], None]) -> None:
         """Runs something in one of the threads."""
@@ -217,6 +224,7 @@ class Program:
         Returns:
           Shapes and dtypes of the results, as a pytree.
         """
+        self._compiler.check_open()
         begin = time.perf_counter()
         self._workers, self._whole = workers, whole
         function = devices.spread(function, workers.mesh, whole)

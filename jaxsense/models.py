@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxsense import networks
 from jaxsense.config import Config
 from jaxsense.networks import MLP, Params
 from jaxsense.sim import sensors
@@ -45,7 +46,7 @@ def untrained(key: Key, config: Config) -> Models:
         detectors.init(k, jnp.zeros((2, s.window * s.channels)), size, config.detector)
         for k, s, size in zip(keys, sensors.make(config), num_labels, strict=True)
     )
-    state = jnp.zeros(2 * config.jmvae.latent_size * config.arena.num_pois)
+    size = 2 * config.jmvae.latent_size * config.arena.num_pois
     q_network = MLP(config.dqn.hidden, config.arena.num_pois + 1)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
     shape = (len(config.arena.classes), config.jmvae.latent_size)
@@ -53,5 +54,5 @@ def untrained(key: Key, config: Config) -> Models:
         detectors=trained,
         jmvae=jmvae.init(jmvae_key, jmvae_shape(config)),
         class_beliefs=Belief(jnp.zeros(shape), jnp.ones(shape)),
-        q_networks=tuple(q_network.init(k, state) for k in dqn_keys),
+        q_networks=tuple(networks.init(k, q_network, size) for k in dqn_keys),
     )

@@ -32,6 +32,12 @@ class MLP(nn.Module):
         return dense(self.outputs)(x)
 
 
+@functools.partial(jax.jit, static_argnames=("network", "inputs"))
+def init(key: jax.Array, network: MLP, inputs: int) -> Params:
+    """Random parameters of a network for `[..., inputs]`, by one program for each of its shapes."""
+    return network.init(key, jnp.zeros(inputs))
+
+
 def apply_to_columns(params: Params, x: jax.Array) -> jax.Array:
     """What `MLP` gives for every column of `[F, B]`: `[outputs, B]`.
 

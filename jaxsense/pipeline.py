@@ -287,7 +287,7 @@ class Stages:
             "seconds": np.zeros(number, np.float32),
         }
         q_network = self._checkpoints.load_or_forget(stage, self._shapes.q_networks[modality])
-        curves = self._checkpoints.load_or_forget(f"{stage}_curves", curves_shape)
+        curves = self._checkpoints.load_or_forget(f"curves_{name}", curves_shape)
         if q_network is not None and curves is not None:
             return q_network, {name: curve.tolist() for name, curve in curves.items()}
         start_key, init_key, *chunk_keys = keys_of(key, 2 + number)
@@ -320,7 +320,7 @@ class Stages:
         q_network = jax.tree.map(np.asarray, state.params)
         self._save(stage, q_network)
         self._save(
-            f"{stage}_curves", {n: np.asarray(curve, np.float32) for n, curve in curves.items()}
+            f"curves_{name}", {n: np.asarray(curve, np.float32) for n, curve in curves.items()}
         )
         return q_network, curves
 

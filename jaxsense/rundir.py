@@ -113,6 +113,7 @@ class RunDirectory:
         with _locked(path, "resume"):
             run = cls(path, settings)
             files.remove_unfinished(path)
+            run.checkpoints.check_list()
             run._drop_unfinished_line()
             yield run
 

@@ -26,15 +26,13 @@ TESTS = {
     "jaxsense/dqn/belief_mdp.py": "tests/dqn/test_belief_mdp.py tests/dqn/test_not_finite.py",
     "jaxsense/dqn/policies.py": "tests/dqn/test_policies.py tests/dqn/test_not_finite.py",
     "jaxsense/dqn/replay.py": "tests/dqn/test_replay.py",
-    # Without those that train for long.
-    "jaxsense/dqn/training.py": "tests/dqn/test_dqn_training.py tests/dqn/test_not_finite.py"
-    " -k 'not worked and not after_training and not falls_and and not exploring'",
+    "jaxsense/dqn/training.py": "tests/dqn/test_not_finite.py tests/dqn/test_dqn_training.py",
     "jaxsense/sim/raycast.py": "tests/sim/test_raycast_plane.py"
     " tests/sim/test_raycast_gradients.py tests/sim/test_raycast.py",
     "jaxsense/vae/gaussian.py": "tests/vae/test_gaussian.py",
     "jaxsense/vae/fusion.py": "tests/vae/test_fusion.py",
-    "jaxsense/vae/jmvae.py": "tests/vae/test_jmvae_equation.py tests/vae/test_jmvae.py"
-    " -k 'not trained and not lowers'",
+    "jaxsense/vae/jmvae.py": "tests/vae/test_jmvae_draws.py"
+    " tests/vae/test_jmvae_equation.py tests/vae/test_jmvae.py -k 'not trained and not lowers'",
 }
 CONFIG = """
 [cosmic-ray]

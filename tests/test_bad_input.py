@@ -570,6 +570,7 @@ def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsy
     def fails(*_):
         raise error
 
+    monkeypatch.setattr(pipeline, "compiled", lambda *_: contextlib.nullcontext())
     monkeypatch.setattr(pipeline, "run", fails)
     argv = ["--preset", "smoke", "--quiet", "--cache", "None", "--out", str(tmp_path / "run")]
     with pytest.raises(SystemExit) as stop:

@@ -1,7 +1,10 @@
 """Files that are written as a whole, directories that are kept, and checkpoints."""
 
+import errno
 import os
 import stat
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,7 +15,8 @@ import pytest
 
 from jaxsense import files
 from jaxsense.checkpoints import Checkpoints, Unfinished
-from jaxsense.config import ConfigError
+from jaxsense.config import PRESETS, ConfigError
+from jaxsense.rundir import RunDirectory, Settings
 from jaxsense.training import FitState
 
 TREE = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": (np.int32(4), np.array([True]))}
@@ -68,6 +72,44 @@ def test_a_directory_is_kept_for_one_at_a_time(tmp_path):
         order.append("first")
     waiting.join()
     assert order == ["first", "second"]
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+@pytest.mark.skipif(sys.platform == "win32", reason="has no flock")
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, number):
+    import fcntl
+
+    def flock(descriptor, operation):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.raises(OSError, match=os.strerror(number)), files.locked(tmp_path, waits=False):
+        pass
+    settings = Settings("smoke", 0, PRESETS["smoke"])
+    with (
+        pytest.raises(ConfigError, match=r"out = '.*run': cannot be written \(.+\)"),
+        RunDirectory.create(tmp_path / "run", settings),
+    ):
+        pass
+
+
+def test_a_system_without_fcntl_can_lock():
+    program = """
+import sys, tempfile
+from pathlib import Path
+sys.modules["fcntl"] = None
+import jaxsense.train, jaxsense.evaluate
+from jaxsense import files
+with tempfile.TemporaryDirectory() as folder, files.locked(Path(folder), waits=False):
+    try:
+        with files.locked(Path(folder), waits=False):
+            print("twice")
+    except BlockingIOError:
+        print("once")
+"""
+    command = [sys.executable, "-c", program]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (0, "once\n"), ended.stderr
 
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):
@@ -128,6 +170,35 @@ def test_a_missing_checkpoint_is_noticed(tmp_path):
         Checkpoints(tmp_path).load("tree", SHAPES)
     assert checkpoints.load_or_forget("tree", SHAPES) is None
     assert "tree.msgpack': is missing" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("damage", "expected"),
+    [
+        (lambda file: file.write_bytes(file.read_bytes()[:-1]), "saved.msgpack': is damaged"),
+        (lambda file: file.write_bytes(b"x" + file.read_bytes()), "saved.msgpack': is damaged"),
+        (lambda file: file.unlink(), "saved.msgpack': is missing"),
+    ],
+)
+def test_a_list_of_checkpoints_that_is_damaged_is_noticed_and_made_anew(tmp_path, damage, expected):
+    said = []
+    checkpoints = Checkpoints(tmp_path, said.append)
+    checkpoints.check_list()  # nothing was saved, and nothing is missing
+    checkpoints.save("tree", TREE)
+    checkpoints.save("unfinished/jmvae", TREE)
+    checkpoints.check_list()
+    assert not said
+    damage(tmp_path / "saved.msgpack")
+    checkpoints.check_list()
+    (line,) = said
+    assert expected in line
+    checkpoints.check_list()
+    assert len(said) == 1
+    # The new list holds what was there.
+    for name in ("tree", "unfinished/jmvae"):
+        (tmp_path / f"{name}.msgpack").unlink()
+        assert checkpoints.load_or_forget(name, SHAPES) is None
+    assert ["is missing" in line for line in said[1:]] == [True, True]
 
 
 @pytest.mark.parametrize(

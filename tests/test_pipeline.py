@@ -1,6 +1,8 @@
 """How the stages of a run hang together."""
 
 import dataclasses
+import types
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ from jaxsense.chunks import run_chunks
 from jaxsense.config import PRESETS, JmvaeConfig
 from jaxsense.monitor import Monitor, StageError, Stopped
 from jaxsense.programs import best_restart, chunks_of
+from jaxsense.training import FitState
 from jaxsense.vae import detectors
 
 
@@ -119,3 +122,45 @@ def test_a_training_that_is_over_is_saved_when_another_one_stops(tmp_path):
 
     again = run_chunks("camera", np.float32(0), 1, never, Monitor(), checkpoints)
     assert again == (1, {"i": [0]})
+
+
+@pytest.fixture
+def two_restarts(tmp_path):
+    """Trains two JMVAEs whose losses fall with every chunk; `bad` are NaN from the third one on."""
+
+    def train(bad):
+        settings = dataclasses.replace(PRESETS["smoke"].jmvae, restarts=2, steps=40)
+        config = dataclasses.replace(PRESETS["smoke"], jmvae=settings)
+        begun = iter(range(2))
+
+        def begin(key):
+            return FitState({"w": np.full(2, next(begun), np.float32)}, (), np.int32(0))
+
+        def step(key, state, bank):
+            restart, after = int(state.params["w"][0]), state.step + 2
+            value = np.nan if restart in bad and after > 4 else 100.0 - restart - after
+            params = {"w": np.array([restart, value], np.float32)}
+            return FitState(params, (), np.int32(after)), np.full(2, value)
+
+        warned, monitor = [], Monitor()
+        monitor.warn = warned.append
+        programs = types.SimpleNamespace(begin_jmvae=begin, train_jmvae=step)
+        with ThreadPoolExecutor(1) as saver:
+            stages = pipeline.Stages(config, programs, monitor, Checkpoints(tmp_path), saver)
+            return stages.train_jmvae(jax.random.key(0), ()), warned
+
+    return train
+
+
+@pytest.mark.parametrize("bad", [(), (0,), (1,)])
+def test_a_restart_that_is_not_finite_is_left_out_and_named(two_restarts, bad):
+    params, warned = two_restarts(bad)
+    best = 0 if bad == (1,) else 1  # the second one has lower losses
+    assert params["w"][0] == best
+    assert np.isfinite(params["w"]).all()
+    assert warned == [f"jmvae: restart {r} is not finite by step 6: left out" for r in bad]
+
+
+def test_a_training_ends_if_no_restart_is_finite(two_restarts):
+    with pytest.raises(StageError, match="jmvae: loss = nan at step 5 of 40"):
+        two_restarts((0, 1))

@@ -213,6 +213,28 @@ def test_evaluate_writes_the_mission_block_of_the_summary_and_no_other(evaluated
         assert (blocks[policy]["episodes"], blocks[policy]["seed"]) == (3, 0)
 
 
+def test_an_evaluation_keeps_what_another_one_has_written_meanwhile(
+    evaluated, tmp_path, cache, monkeypatch
+):
+    path, summary, is_first = tmp_path / "run", mission.summary, [True]
+    shutil.copytree(evaluated[0], path)
+    begin = ["--episodes", "9", *cache]  # a batch whose programs are there
+
+    def meanwhile(*args):
+        if is_first.pop() if is_first else False:
+            evaluate.main([str(path), "--policy", "naive", "--seed", "3", *begin])
+        return summary(*args)
+
+    monkeypatch.setattr(mission, "summary", meanwhile)
+    evaluate.main([str(path), "--policy", "latent", "--seed", "4", *begin])
+    blocks = json.loads((path / "summary.json").read_text(encoding="utf-8"))["mission"]
+    assert {n: blocks[n]["seed"] for n in mission.POLICIES} == {
+        "latent": 4,
+        "naive": 3,
+        "random": 0,
+    }
+
+
 def test_evaluate_prints_the_comparison(evaluated):
     _, _, printed = evaluated
     for words in (

@@ -3,34 +3,33 @@
 import json
 from pathlib import Path
 
-import pytest
+from same_figures import different, numbers
 from smoke import without_times
 
 REFERENCE = Path(__file__).parent / "smoke_figures.json"
-# Measured between jax 0.10.2 and 0.11.2 on one machine: 3e-7 in all figures. Other processors add
-# and multiply in another order, which 300 steps of learning amplify.
-TOLERANCE = 2e-3
-
-
-def numbers(figures, name=""):
-    """Every number of nested figures, by its name."""
-    if isinstance(figures, dict):
-        pairs = figures.items()
-    elif isinstance(figures, list):
-        pairs = enumerate(figures)
-    else:
-        return {name: figures} if isinstance(figures, int | float) else {}
-    return {n: x for key, value in pairs for n, x in numbers(value, f"{name}/{key}").items()}
+# Other processors and compilers add and multiply in another order, which learning amplifies: in 300
+# steps another code generator changed figures of the JMVAE by .6 %. What follows from them is
+# compared in `.ci/run`, between the two lines of JAX on one machine.
+TOLERANCES = {"detectors": 1e-3, "jmvae": 2e-2}
 
 
 def test_figures_are_those_of_every_machine(smoke_run):
     reference = json.loads(REFERENCE.read_text(encoding="utf-8"))
     found = without_times(smoke_run)
-    for block, learned in (("detectors", 1e-3), ("jmvae", TOLERANCE)):
-        here, there = numbers(found[block]), numbers(reference[block])
-        assert set(here) == set(there)
-        for name, value in here.items():
-            assert value == pytest.approx(there[name], rel=learned, abs=learned), block + name
+    for block, tolerance in TOLERANCES.items():
+        assert not different(numbers(found[block]), numbers(reference[block]), tolerance)
     for modality, block in reference["dqn"].items():
         for name in ("optimal", "naive", "random"):
-            assert found["dqn"][modality][name] == pytest.approx(block[name], rel=TOLERANCE), name
+            pair = (
+                numbers({name: figures[modality][name]})
+                for figures in (found["dqn"], reference["dqn"])
+            )
+            assert not different(*pair, TOLERANCES["jmvae"]), modality
+        assert set(found["dqn"][modality]) == set(block)
+
+
+def test_other_figures_are_found():
+    found = different({"a": 1.0, "b": 2.0, "c": 0}, {"a": 1.001, "b": 2.0, "d": 0}, 1e-4)
+    assert set(found) == {"a", "c", "d"}
+    assert not different({"a": 1.0}, {"a": 1.001}, 1e-2)
+    assert set(numbers({"a": [1, {"b": True}], "c": "x"})) == {"/a/0", "/a/1/b"}

@@ -17,6 +17,7 @@ import optax
 from flax import struct
 from jax.sharding import Mesh, PartitionSpec
 
+from jaxsense import networks
 from jaxsense.config import DqnConfig
 from jaxsense.devices import AXIS
 from jaxsense.dqn import belief_mdp, losses, replay
@@ -100,14 +101,14 @@ def init(key: Key, mdp: MapMdp, config: DqnConfig, prepared: MapState) -> DqnSta
       prepared: from `starts`, for the shapes alone.
     """
     envs = jax.tree.map(lambda x: jnp.zeros((config.num_envs, *x.shape[1:]), x.dtype), prepared)
-    s = jnp.zeros(2 * math.prod(prepared.belief.mean.shape[1:]))
-    params = q_network(mdp, config.hidden).init(key, s)
+    size = 2 * math.prod(prepared.belief.mean.shape[1:])
+    params = networks.init(key, q_network(mdp, config.hidden), size)
     rounds, blocks = config.replay_capacity // config.num_envs, config.num_envs // config.block
     return DqnState(
         params=params,
         target=params,
         optimiser=_optimiser(config).init(params),
-        replay=replay.init(s.size, rounds, blocks, config.block),
+        replay=replay.init(size, rounds, blocks, config.block),
         envs=envs,
         needs_start=jnp.ones(config.num_envs, bool),
         total_reward=jnp.zeros(config.num_envs),

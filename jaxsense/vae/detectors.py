@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxsense import training
+from jaxsense import networks, training
 from jaxsense.config import DetectorConfig
 from jaxsense.networks import MLP, Params, apply_to_columns
 from jaxsense.training import FitState
@@ -35,7 +35,7 @@ class Detector:
 def init(key: Key, windows: jax.Array, num_labels: int, config: DetectorConfig) -> Detector:
     """An untrained detector, standardised to the `[S, F]` windows that it will be trained on."""
     chex.assert_rank(windows, 2, custom_message="windows")
-    params = MLP(config.hidden, num_labels).init(key, windows[0])
+    params = networks.init(key, MLP(config.hidden, num_labels), windows.shape[1])
     offset = jnp.mean(windows, axis=0)
     scale = jnp.std(windows - offset[None]) + 1e-6
     return Detector(params, offset, scale, config.hidden, num_labels)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsense import training, values
+from jaxsense import networks, training, values
 from jaxsense.config import JmvaeConfig
 from jaxsense.networks import MLP, Params, apply_to_columns
 from jaxsense.training import FitState
@@ -71,13 +71,15 @@ def init(key: Key, model: Jmvae) -> Params:
     encoder_keys = jax.random.split(encoder_key, len(model.subsets))
     decoder_keys = jax.random.split(decoder_key, len(model.modalities))
     encoders = {
-        model.encoder_name(subset): MLP(model.hidden, 2 * model.latent_size).init(
-            k, jnp.zeros(sum(model.feature_sizes[m] for m in subset))
+        model.encoder_name(subset): networks.init(
+            k,
+            MLP(model.hidden, 2 * model.latent_size),
+            sum(model.feature_sizes[m] for m in subset),
         )
         for k, subset in zip(encoder_keys, model.subsets, strict=True)
     }
     decoders = {
-        name: MLP(model.hidden, size).init(k, jnp.zeros(model.latent_size))
+        name: networks.init(k, MLP(model.hidden, size), model.latent_size)
         for k, name, size in zip(decoder_keys, model.modalities, model.feature_sizes, strict=True)
     }
     return {"encoders": encoders, "decoders": decoders}

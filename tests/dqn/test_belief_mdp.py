@@ -108,6 +108,12 @@ def test_a_gain_below_the_threshold_costs_one(min_increase, pays):
     np.testing.assert_allclose(outcome.reward, 0.8 if pays else -1.0, rtol=1e-5)
 
 
+def test_no_gain_costs_one_even_without_a_threshold():
+    mdp = classes_mdp(min_increase=0.0)
+    _, outcome = belief_mdp.step(jax.random.key(0), mdp, start(), jnp.int32(2), 1)
+    assert outcome.reward == -1.0
+
+
 def test_a_look_changes_the_entry_and_the_seen_bit_of_its_poi_alone():
     before = start(seen=jnp.zeros((3, 2), bool))
     for poi in range(3):

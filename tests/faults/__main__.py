@@ -1,9 +1,11 @@
 """`python -m tests.faults`: makes runs go wrong in many ways, and prints what became of them."""
 
 import argparse
+import itertools
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -16,24 +18,25 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from tests.faults.child import SIGNALS
+from tests.faults.child import NAN_STEP, SIGNALS, TRAININGS
 
 STAGES = (
     "simulate", "detector_camera-train", "detect-", "jmvae-train", "evaluate_jmvae", "dqn-train",
     "evaluate_dqn", "mission-go_on", "write",
 )  # fmt: skip
 """Where faults strike: the programs of `jaxsense.programs`, and the plots."""
+STOPPED = "jmvae-train", "dqn-train", "mission-go_on"
+"""Where a run is stopped whose checkpoints are then damaged."""
 POISONED = {
     "simulate": "scans",
     "detect-": "features",
-    "detector_camera-train": "gradients of a detector",
-    "jmvae-train": "gradients of the JMVAE",
-    "dqn-train": "gradients of a Q-network",
+    "detector_camera-train": "parameters of a detector",
+    "jmvae-train": "parameters of the JMVAE",
+    "dqn-train": "parameters of a Q-network, and so Q-values",
     "evaluate_jmvae": "class beliefs",
-    "evaluate_dqn": "Q-values",
-    "mission-go_on": "beliefs in missions",
 }
 SMOKE = ["--preset", "smoke", "--quiet"]
+IN_ONE_SECOND = ["20250101-000000-smoke", "20250101-000000-smoke-2"]
 
 
 class BrokenError(AssertionError):
@@ -51,6 +54,7 @@ class Runs:
 
     def __init__(self, folder: Path):
         self.folder, self._whole, self._lock = folder, dict[str, Any](), threading.Lock()
+        self._seconds = dict[str, float]()
 
     def path(self, name: str) -> Path:
         """A new directory's name."""
@@ -78,6 +82,20 @@ class Runs:
                 require(ended.returncode == 0, ended.stderr)
                 self._whole[name] = summary(path)
             return self._whole[name]
+
+    def seconds(self, *arguments: str) -> float:
+        """How long a run takes whose programs are kept, beside another one."""
+        self.whole(*arguments)
+        with self._lock:
+            name = "-".join(arguments)
+            if name not in self._seconds:
+                begin = time.monotonic()
+                paths = [self.path(f"timed {name} {i}") for i in range(2)]
+                both = [self.start(*arguments, "--out", str(path)) for path in paths]
+                for process in both:
+                    require(process.finish().returncode == 0, "a plain run")
+                self._seconds[name] = time.monotonic() - begin
+            return self._seconds[name]
 
     def check_resumed(self, path: Path, *arguments: str) -> None:
         """Goes on with a run, which must end as if nothing had gone wrong."""
@@ -138,13 +156,17 @@ def lines(text: str) -> list[str]:
     return [line for line in text.splitlines() if line.strip()]
 
 
-def killed(runs: Runs, name: str, arguments: list[str], latest: float, seed: int) -> None:
-    """`kill -9` at a random moment."""
-    path = runs.path(name)
-    process = runs.start(*arguments, "--out", str(path))
-    time.sleep(random.Random(seed).uniform(0.0, latest))
-    process.kill()
-    process.finish()
+def killed(runs: Runs, name: str, arguments: list[str], seed: int) -> None:
+    """`kill -9` at a random moment of a run, which has not ended by then."""
+    path, moment = runs.path(name), random.Random(seed).uniform(0.0, runs.seconds(*arguments))
+    while True:
+        process = runs.start(*arguments, "--out", str(path))
+        time.sleep(moment)
+        process.kill()
+        if process.finish().returncode == -signal.SIGKILL:
+            break
+        shutil.rmtree(path)
+        moment *= 0.9
     runs.check_resumed(path, *arguments)
 
 
@@ -167,13 +189,31 @@ def disk_full(runs: Runs, stage: str) -> None:
     runs.check_resumed(path, *SMOKE)
 
 
-def not_finite(runs: Runs, stage: str) -> None:
-    """NaN: caught, with its stage named, and the run goes on from what was sound."""
-    path = runs.path(f"nan {stage}")
-    ended = runs.train(*SMOKE, "--out", str(path), child=("nan", stage))
+def not_finite(runs: Runs, stage: str, number: int) -> None:
+    """NaN in one array: caught, with its stage named, and the run goes on from what was sound."""
+    path = runs.path(f"nan {stage} {number}")
+    ended = runs.train(*SMOKE, "--out", str(path), child=(f"nan{number}", stage))
     require(ended.returncode == 2, f"NaN in {stage}: status {ended.returncode}")
     (line,) = lines(ended.stderr)
-    require("not finite" in line and stage.replace("_", "-").partition("-")[0] in line, line)
+    require("not finite" in line and stage.partition("-")[0] in line, line)
+    runs.check_resumed(path, *SMOKE)
+
+
+def gradient(runs: Runs, stage: str, number: int) -> None:
+    """NaN in one array of gradients: caught within a chunk, with stage and step."""
+    path = runs.path(f"gradient {stage} {number}")
+    # Other programs than those that are kept.
+    options = ["--out", str(path), "--cache", "None"]
+    ended = runs.train(*SMOKE, *options, child=(f"gradient{number}", stage))
+    require(ended.returncode == 2, f"NaN in {stage}: status {ended.returncode} {ended.stderr}")
+    (line,) = lines(ended.stderr)
+    found = re.search(rf"{stage}.* (\d+) of (\d+)", line)
+    require(found and "nan" in line, line)
+    # In the chunk of that step, or the next one if it was the last of its chunk.
+    late = int(found[1]) - NAN_STEP if found else -1
+    require(0 <= late <= int(found[2]) // 20 if found else False, line)
+    saved = {file.name for file in (path / "checkpoints").rglob("*.msgpack")}
+    require(any(name.startswith(stage) for name in saved), f"{stage} is not in {saved}")
     runs.check_resumed(path, *SMOKE)
 
 
@@ -242,13 +282,27 @@ def two_in_one_second(runs: Runs) -> None:
     """Two runs that would have one name."""
     place = runs.path("same second")
     place.mkdir()
-    processes = [runs.start(*SMOKE, cwd=place) for _ in range(2)]
+    processes = [runs.start(*SMOKE, cwd=place, child=("clock", "")) for _ in range(2)]
     ended = [process.finish() for process in processes]
     require([e.returncode for e in ended] == [0, 0], ended[0].stderr + ended[1].stderr)
     found = sorted((place / "runs").iterdir())
-    require(len(found) == 2, f"{len(found)} directories")
+    require([path.name for path in found] == IN_ONE_SECOND, f"{found}")
     for path in found:
         require(summary(path) == runs.whole(*SMOKE), "another summary")
+
+
+def disk_full_after(runs: Runs, program: str) -> None:
+    """No room for what `evaluate` or `export` write: one line, and the run is as it was."""
+    path = runs.path(f"disk {program}")
+    require(runs.train(*SMOKE, "--out", str(path)).returncode == 0, "a plain run")
+    before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    command = [sys.executable, "-m", "tests.faults.child", "disk", program, str(path)]
+    ended = Process(command).finish()
+    require(ended.returncode == 2, f"{program}: {ended.returncode} {ended.stderr}")
+    (line,) = lines(ended.stderr)
+    require("File too large" in line, line)
+    after = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    require(after == before, f"{program} has changed {set(after) ^ set(before)}")
 
 
 def two_evaluations(runs: Runs) -> None:
@@ -285,26 +339,30 @@ Trial = tuple[str, Callable[[], None]]
 
 def trials(runs: Runs, is_quick: bool) -> Iterator[Trial]:
     """All trials, each with the row that it belongs to."""
-    number, several = 2 if is_quick else 30, ("--num-seeds", "2")
-    stages = ("simulate", "dqn-train") if is_quick else STAGES
 
     def trial(row: str, function: Callable[..., None], *args: Any) -> Trial:
         return row, lambda: function(runs, *args)
 
-    for i in range(number):
-        yield trial("kill -9 at a random moment, `smoke`", killed, f"killed {i}", SMOKE, 12.0, i)
-    for fault in SIGNALS:
-        for stage in stages:
-            yield trial(f"{fault} in a stage, one seed", stopped, fault, stage)
-            yield trial(f"{fault} in a stage, two seeds", stopped, fault, stage, *several)
-    for how in ("truncated", "flipped", "missing"):
-        for name in ("jmvae-train", "mission-go_on"):
-            yield trial(f"each checkpoint {how}", damaged, how, name)
+    stages = ("simulate", "dqn-train") if is_quick else STAGES
+    for i in range(2 if is_quick else 30):
+        yield trial("kill -9 at a random moment, `smoke`", killed, f"killed {i}", SMOKE, i)
+    for i in range(0 if is_quick else 5):
+        row = "kill -9 at a random moment, `default`"
+        yield trial(row, killed, f"killed default {i}", ["--quiet"], i)
+    for fault, stage in itertools.product(SIGNALS, stages):
+        yield trial(f"{fault} in a stage, one seed", stopped, fault, stage)
+        yield trial(f"{fault} in a stage, two seeds", stopped, fault, stage, "--num-seeds", "2")
+    for how, stage in itertools.product(("truncated", "flipped", "missing"), STOPPED):
+        yield trial(f"each checkpoint {how}", damaged, how, stage)
     for stage in stages:
         yield trial("disk full in a stage", disk_full, stage)
-    for stage, name in POISONED.items():
-        if not is_quick or stage in stages:
-            yield trial(f"NaN in {name}", not_finite, stage)
+    arrays = range(1 if is_quick else 3)
+    for (stage, name), i in itertools.product(POISONED.items(), arrays):
+        yield trial(f"NaN in {name}", not_finite, stage, i)
+    for stage, i in itertools.product(TRAININGS, arrays):
+        yield trial(f"NaN in gradients of {stage}", gradient, stage, i)
+    for program in ("evaluate", "export"):
+        yield trial(f"disk full in `{program}`", disk_full_after, program)
     yield trial("a directory that is read-only", read_only)
     yield trial("HOME that cannot be", surroundings, "home", {"HOME": "/dev/null/home"}, False)
     yield trial("HOME that is read-only", surroundings, "ro-home", {"HOME": "/proc"}, False)
@@ -314,10 +372,6 @@ def trials(runs: Runs, is_quick: bool) -> Iterator[Trial]:
     yield trial("two runs in one second", two_in_one_second)
     yield trial("two evaluations of one run", two_evaluations)
     yield trial("two writers of a cache with files of the user", shared_cache)
-    if not is_quick:
-        for i in range(5):
-            row = "kill -9 at a random moment, `default`"
-            yield trial(row, killed, f"killed default {i}", ["--quiet"], 45.0, i)
 
 
 def main(argv: list[str] | None = None) -> bool:

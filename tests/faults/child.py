@@ -1,10 +1,15 @@
 """`python -m tests.faults.child FAULT STAGE ARGUMENTS...`: a training that meets a fault.
 
 The fault strikes in this process, at the first program of a stage that has run; in the stage
-`write` when the first plot is about to be written.
+`write` when the first plot is about to be written. `gradient` makes one array of a training's
+gradients NaN, within its compiled program, in step `NAN_STEP`.
+
+`clock` lets all runs begin in the same second. `evaluate` and `export` as STAGE begin that program
+in place of a training, with a disk that is full.
 """
 
 import dataclasses
+import datetime
 import os
 import resource
 import signal
@@ -13,10 +18,22 @@ import time
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 
-from jaxsense import cli, report, train
+from jaxsense import cli, evaluate, export, report, train
 from jaxsense.compilation import Program
+from jaxsense.dqn import training as dqn_training
+from jaxsense.vae import detectors, jmvae
+
+NAN_STEP = 17
+TRAININGS = {
+    "detector_camera": detectors,
+    "jmvae": jmvae,
+    "dqn": dqn_training,
+}
+OTHERS = {"evaluate": evaluate, "export": export}
 
 SIGNALS = {
     "ctrl-c": [signal.SIGINT],
@@ -25,7 +42,7 @@ SIGNALS = {
 }
 
 
-def press(numbers: list[int]) -> None:
+def press(numbers: list[signal.Signals]) -> None:
     """Sends signals to this process, each after the one before was heard by the main thread."""
     for number in numbers:
         waiting = signal.getsignal(number)
@@ -39,24 +56,53 @@ def fill_disk() -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
 
 
-def poisoned(tree: Any) -> Any:
-    """NaN in place of the first number of every array of floats."""
-
-    def poison(x: Any) -> Any:
-        if not jax.numpy.issubdtype(x.dtype, np.floating):
-            return x
-        values = np.array(x)
-        values.reshape(-1)[:1] = np.nan
-        return values
-
-    return jax.tree.map(poison, tree)
+def poisoned(tree: Any, number: int) -> Any:
+    """NaN in place of the last number of one array of floats, for any `number` one of them."""
+    leaves, structure = jax.tree.flatten(tree)
+    floats = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, np.floating)]
+    chosen = floats[number % len(floats)]
+    leaves[chosen] = np.array(leaves[chosen])
+    leaves[chosen].reshape(-1)[-1] = np.nan
+    return jax.tree.unflatten(structure, leaves)
 
 
-def with_nan(output: Any) -> Any:
+def with_nan(output: Any, number: int) -> Any:
     """A program's results with NaN in what was simulated, detected or learnt."""
     if isinstance(output, tuple) and hasattr(output[0], "params"):
-        return dataclasses.replace(output[0], params=poisoned(output[0].params)), *output[1:]
-    return poisoned(output)
+        params = poisoned(output[0].params, number)
+        return dataclasses.replace(output[0], params=params), *output[1:]
+    return poisoned(output, number)
+
+
+def poison_gradients(stage: str, number: int) -> None:
+    """Lets one array of the gradients of a training be NaN in step `NAN_STEP`."""
+    module: Any = TRAININGS[stage]
+    make = module._optimiser
+
+    def make_poisoned(*args: Any) -> optax.GradientTransformation:
+        optimiser = make(*args)
+
+        def update(updates: Any, state: Any, params: Any = None) -> Any:
+            # Adam and its schedule count alike, from zero.
+            count = jax.tree.leaves(optax.tree_utils.tree_get_all_with_path(state, "count"))[-1]
+            leaves, structure = jax.tree.flatten(updates)
+            chosen = number % len(leaves)
+            factor = jnp.where(count == NAN_STEP - 1, jnp.nan, 1.0)
+            leaves[chosen] = leaves[chosen] * factor
+            return optimiser.update(jax.tree.unflatten(structure, leaves), state, params)
+
+        return optax.GradientTransformation(optimiser.init, update)
+
+    module._optimiser = make_poisoned
+
+
+class StoppedClock(datetime.datetime):
+    """It is always the same second."""
+
+    @classmethod
+    def now(cls, tz: Any = None) -> "StoppedClock":
+        """That second."""
+        return cls(2025, 1, 1, tzinfo=tz)
 
 
 def strike_at(stage: str, fault: str) -> None:
@@ -72,9 +118,9 @@ def strike_at(stage: str, fault: str) -> None:
         output = run(self, *args)
         if not f"{self._stage}-{self._name}".startswith(stage) or struck:
             return output
-        if fault == "nan":
+        if fault.startswith("nan"):
             struck.append(fault)
-            return with_nan(output)
+            return with_nan(output, int(fault.removeprefix("nan")))
         strike()
         return output
 
@@ -90,5 +136,15 @@ def strike_at(stage: str, fault: str) -> None:
 
 if __name__ == "__main__":
     fault, stage, *argv = sys.argv[1:]
-    strike_at(stage, fault)
-    cli.run(lambda: train.main(argv))
+    if stage in OTHERS:
+        fill_disk()
+        cli.run(lambda: OTHERS[stage].main(argv))
+    elif fault.startswith("gradient"):
+        poison_gradients(stage, int(fault.removeprefix("gradient")))
+        cli.run(lambda: train.main(argv))
+    elif fault == "clock":
+        train.datetime = StoppedClock
+        cli.run(lambda: train.main(argv))
+    else:
+        strike_at(stage, fault)
+        cli.run(lambda: train.main(argv))

@@ -104,16 +104,24 @@ def test_a_poi_that_is_not_where_it_is_expected_is_not_shown(facing, robot, team
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
 def test_an_unsure_detector_writes_nothing(models, facing, robot):
-    # All parameters zero: every label has a probability of one half.
-    unsure = jax.tree.map(jnp.zeros_like, models.detectors[robot].params)
-    detectors = list(models.detectors)
-    detectors[robot] = replace(detectors[robot], params=unsure)
-    models = replace(models, detectors=tuple(detectors))
-    for least, detections in ((0.4, 1), (0.6, 0)):
-        settings = replace(CONFIG.mission, least_confidence=least)
-        strict = mission.make_mission(replace(CONFIG, mission=settings), contacts=False)
-        scan = jax.jit(alone(lambda key, state, m=strict: act.scan(key, m, models, state, robot)))
-        after = scan(jax.random.key(0), facing(robot))
+    settings = replace(CONFIG.mission, least_confidence=0.6)
+    strict = mission.make_mission(replace(CONFIG, mission=settings), contacts=False)
+
+    @jax.jit
+    @alone
+    def scan(key, state, logit):
+        # All weights are zero: of two labels one has the probability 1 / (1 + exp(-logit)).
+        detector = models.detectors[robot]
+        params = jax.tree.map(jnp.zeros_like, detector.params)
+        layer = f"Dense_{len(detector.hidden)}"
+        params["params"][layer]["bias"] = jnp.stack([logit[0], 0.0])
+        detectors = list(models.detectors)
+        detectors[robot] = replace(detector, params=params)
+        return act.scan(key, strict, replace(models, detectors=tuple(detectors)), state, robot)
+
+    for confidence, detections in ((0.59, 0), (0.61, 1)):
+        logit = jnp.float32(np.log(confidence / (1 - confidence)))
+        after = scan(jax.random.key(0), facing(robot), logit)
         assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, detections)
 
 
