@@ -46,3 +46,13 @@ def test_a_bank_of_the_wrong_shape_is_named():
     for bank in ((CAMERA, LIDAR[:3]), (CAMERA, LIDAR[..., :1]), (CAMERA[0], LIDAR)):
         with pytest.raises(AssertionError, match="bank"):
             jmvae.train(jax.random.key(0), None, MODEL, bank, SETTINGS, 1)
+
+
+def test_three_modalities_are_drawn_independently(monkeypatch):
+    monkeypatch.setattr(training, "fit", lambda state, loss, drawn, optimiser, total: drawn)
+    model = jmvae.Jmvae(("camera", "lidar", "thermal"), (1, 2, 2), 2, (3,))
+    _, features = jmvae.train(jax.random.key(0), None, model, (CAMERA, LIDAR, LIDAR), SETTINGS, 20)
+    _, lidar, thermal = (np.asarray(x[:, 0]) for x in features)
+    np.testing.assert_array_equal(lidar // 10, thermal // 10)
+    pairs = set(zip((lidar % 10).ravel().tolist(), (thermal % 10).ravel().tolist(), strict=True))
+    assert len(pairs) == 5 * 5
