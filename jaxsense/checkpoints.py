@@ -129,18 +129,40 @@ class Checkpoints:
                     {name for name in self._listed() if not name.startswith(_unfinished(""))}
                 )
 
-    def check_list(self) -> None:
-        """Makes the list of all that was saved anew, with a warning, if it cannot be used."""
-        if self.path is None or not (there := self._there()):
+    def check(self, is_begun: bool = False) -> None:
+        """Names whatever is damaged or missing, and puts it aside.
+
+        Args:
+          is_begun: whether something has been trained, and is missing if nothing was saved.
+        """
+        if self.path is None:
             return
+        if not self.path.exists():
+            if is_begun:
+                error = ConfigError("checkpoints", str(self.path), "is missing")
+                self._warn(f"{error}; everything is trained again")
+            return
+        there = self._there()
+        if there or self._file(_LIST).exists():
+            self._check(_LIST, "the run goes on from all that is there")
+        expected = self._listed() | there
+        sound = {name for name in expected if self._check(name, "what it held is trained again")}
+        self._write(_LIST, sorted(sound))
+
+    def _check(self, name: str, consequence: str) -> bool:
+        """Whether a checkpoint is as it was saved; if not, it is named and put aside."""
         try:
-            _read(self._file(_LIST))
-        except (OSError, ValueError):
-            reason = "is damaged" if self._file(_LIST).exists() else "is missing"
-            self._put_aside(_LIST)
-            self._write(_LIST, sorted(there))
-            error = ConfigError("checkpoint", str(self._file(_LIST)), reason)
-            self._warn(f"{error}; the run goes on from all that is there")
+            _read(self._file(name))
+        except (OSError, ValueError) as error:
+            self._forget(name, _what_is_wrong(error), consequence)
+            return False
+        return True
+
+    def directories(self) -> list[Path]:
+        """Where checkpoints lie, as far as that is there."""
+        if self.path is None:
+            return []
+        return [p for p in (self.path, self.path / _unfinished("")) if p.is_dir()]
 
     def _there(self) -> set[str]:
         """Names of all that is there, but for the list of them."""
@@ -163,32 +185,35 @@ class Checkpoints:
         packed = serialization.msgpack_serialize(content)
         files.write(self._file(name), hashlib.sha256(packed).digest() + packed)
 
-    def _put_aside(self, name: str) -> None:
-        file = self._file(name)
-        if file.exists():
-            file.replace(file.with_name(f"{file.name}.damaged"))
-
     def _load(self, name: str, restore: Callable[[Any], T]) -> T | None:
         """What `restore` makes of what was saved; see `load`."""
         if self.path is None:
             return None
         if not self._file(name).exists():
             if name in self._listed():
-                raise ConfigError("checkpoint", str(self._file(name)), "is missing")
+                raise self._error(name, "is missing")
             return None
         try:
             return restore(_read(self._file(name)))
-        except (ValueError, KeyError) as error:
-            reason = f"is damaged or of other settings ({str(error).splitlines()[0]})"
-            raise ConfigError("checkpoint", str(self._file(name)), reason) from None
+        except (OSError, ValueError, KeyError) as error:
+            raise self._error(name, _what_is_wrong(error)) from None
 
     def _or_forget(self, name: str, restore: Callable[[Any], T]) -> T | None:
         try:
             return self._load(name, restore)
         except ConfigError as error:
-            self._put_aside(name)
-            self._warn(f"{error}; what it held is trained again")
+            self._forget(name, error.expected, "what it held is trained again")
             return None
+
+    def _forget(self, name: str, reason: str, consequence: str) -> None:
+        """Puts a checkpoint aside, and says so."""
+        file = self._file(name)
+        if file.exists():
+            file.replace(file.with_name(f"{file.name}.damaged"))
+        self._warn(f"{self._error(name, reason)}; {consequence}")
+
+    def _error(self, name: str, reason: str) -> ConfigError:
+        return ConfigError("checkpoint", str(self._file(name)), reason)
 
     def _file(self, name: str) -> Path:
         assert self.path is not None
@@ -207,6 +232,15 @@ def _read(file: Path) -> Any:
     if hashlib.sha256(content).digest() != whole[:_DIGEST]:
         raise ValueError("its content does not have its digest")
     return serialization.msgpack_restore(content)
+
+
+def _what_is_wrong(error: Exception) -> str:
+    """What keeps a checkpoint from being used."""
+    if isinstance(error, FileNotFoundError):
+        return "is missing"
+    if isinstance(error, OSError):
+        return f"cannot be read ({error.strerror})"
+    return f"is damaged or of other settings ({str(error).splitlines()[0]})"
 
 
 def _like(shapes: Any, found: Any) -> Any:

@@ -43,8 +43,11 @@ def run_chunks(
     for chunk in range(done, number):
         try:
             after, figures = run(chunk, state)
-        except StageError:
-            checkpoints.save_unfinished(stage, Unfinished(chunk, state, curves))
+        except StageError as error:
+            try:
+                checkpoints.save_unfinished(stage, Unfinished(chunk, state, curves))
+            except OSError as lost:
+                raise StageError(f"{error}; what was sound cannot be saved ({lost})") from error
             raise
         state = after
         for name, values in figures.items():

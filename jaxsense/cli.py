@@ -60,6 +60,9 @@ def parse(program: str, arguments: type[T], argv: list[str], default: T | None =
 
 def run(main: Callable[[], None]) -> None:
     """Runs a program, which Ctrl-C ends without many words."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # The name of a directory may be none that the terminal can show.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         main()
     except KeyboardInterrupt:

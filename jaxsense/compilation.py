@@ -95,7 +95,10 @@ class Kept:
         """
         # Whatever is wrong with a file, compiling again mends it.
         with contextlib.suppress(Exception):
-            content = self._file(name, args).read_bytes()
+            with self._file(name, args).open("rb") as file:
+                if not _is_private(os.fstat(file.fileno()), 0o022):
+                    return None
+                content = file.read()
             digest, program = content[:_DIGEST], content[_DIGEST:]
             # A single wrong bit could end the process.
             if hashlib.sha256(program).digest() == digest:
@@ -296,9 +299,14 @@ def _make_private(path: Path) -> None:
     with contextlib.suppress(FileExistsError):
         path.mkdir(mode=0o700, parents=True)
     found = path.lstat()
-    is_own = not hasattr(os, "getuid") or found.st_uid == os.getuid()
-    if not (stat.S_ISDIR(found.st_mode) and is_own and found.st_mode & 0o077 == 0):
+    if not (stat.S_ISDIR(found.st_mode) and _is_private(found, 0o077)):
         raise PermissionError(f"{path} must be a directory of yours alone, with mode 0700")
+
+
+def _is_private(found: os.stat_result, others: int) -> bool:
+    """Whether something is this user's, and gives others none of these rights."""
+    is_own = not hasattr(os, "getuid") or found.st_uid == os.getuid()
+    return is_own and found.st_mode & others == 0
 
 
 def _surroundings() -> list[Any]:

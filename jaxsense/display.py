@@ -116,6 +116,6 @@ class Display:
 
 
 def say(text: str) -> None:
-    """Prints a line, if anybody still reads: a run must not be lost with what shows it."""
-    with contextlib.suppress(BrokenPipeError):
+    """Prints a line, if it can be: a run must not be lost with what shows it."""
+    with contextlib.suppress(OSError):
         print(text, flush=True)

@@ -1,5 +1,6 @@
 """`python -m jaxsense.evaluate RUN_DIR`: missions with the policies of a finished run."""
 
+import contextlib
 import dataclasses
 import sys
 import time
@@ -89,43 +90,49 @@ def main(argv: list[str] | None = None) -> None:
             cli.fail(PROGRAM, str(error))
         seconds = time.perf_counter() - begin
         compiling = compiler.monitor.seconds["mission"]["compile_s"]
-    _print_table(console, found)
-    rate = player.control_steps / seconds
-    console.print(
-        f"{number} missions in {seconds:.1f} s after {compiling:.0f} s of compilation: "
-        f"{rate:.0f} control steps/s, "
-        f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
-    )
     try:
-        _write(console, arguments, config, models.class_beliefs, found, player.recording)
+        written = _write(arguments, config, models.class_beliefs, found, player.recording)
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({cli.reason(error)})")
+    rate = player.control_steps / seconds
+    with contextlib.suppress(OSError):  # as in `display.say`
+        _print_table(console, found)
+        console.print(
+            f"{number} missions in {seconds:.1f} s after {compiling:.0f} s of compilation: "
+            f"{rate:.0f} control steps/s, "
+            f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
+        )
+        for line in written:
+            console.print(line)
 
 
 def _write(
-    console: rich.console.Console,
     arguments: Arguments,
     config: Config,
     class_beliefs: Belief,
     found: dict[str, Any],
     recording: mission.Recording | None,
-) -> None:
-    """Writes the figures into the run's summary and its page, and the animation if asked for."""
-    path = arguments.run / "summary.json"
+) -> list[str]:
+    """Writes the figures into the run's summary and its page, and the animation if asked for.
+
+    Returns:
+      Lines that say where they are.
+    """
+    path, written = arguments.run / "summary.json", []
     if arguments.animate:
         assert recording is not None
         name = next(name for name in found if name != "bytes_per_detection")
         film = arguments.run / f"mission-{name}-{arguments.seed}.svg"
         title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
         animation.write(film, config, recording, class_beliefs, title)
-        console.print(f"The first mission of {name} is in {film}.")
+        written.append(f"The first mission of {name} is in {film}.")
     # Another evaluation may have written its own figures since this one began.
     with files.locked(arguments.run, waits=True):
         summary = rundir.read_summary(arguments.run)
         summary["mission"] = _merge(summary["mission"], found, arguments)
         rundir.write_json(path, summary)
         report = page.write(arguments.run, config, summary)
-    console.print(f"The figures are in {path}, and with all others in {report}.")
+    return [*written, f"The figures are in {path}, and with all others in {report}."]
 
 
 def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) -> dict[str, Any]:

@@ -112,10 +112,11 @@ def main(argv: list[str] | None = None) -> None:
     path = arguments.out or arguments.run / "exported.zip"
     try:
         config, models = rundir.load(arguments.run, arguments.trust)
-        if path.exists():
-            raise ConfigError("out", str(path), "exists already; must be a new file")
-        content = archive(config, models)
-        files.write(path, content)
+        with files.reserved(path):
+            content = archive(config, models)
+            files.write(path, content)
+    except FileExistsError:
+        cli.fail(PROGRAM, str(ConfigError("out", str(path), "exists already; must be a new file")))
     except (ConfigError, ModuleNotFoundError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
@@ -124,4 +125,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    cli.run(main)

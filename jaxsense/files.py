@@ -2,14 +2,15 @@
 
 import contextlib
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
 import filelock
 
-_UNFINISHED = ".unfinished"
-"""How the names of files end that are not yet whole."""
+_UNFINISHED_NAME = re.compile(r"\.(.+)\.[0-9a-f]{16}\.unfinished")
+"""The names of files that are not yet whole."""
 
 
 class WriteError(OSError):
@@ -27,7 +28,7 @@ def write(path: Path, content: str | bytes) -> None:
       WriteError: names the file, which is then as it was before.
     """
     # A name of its own, as another process may write the same file.
-    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_UNFINISHED}")
+    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(8)}.unfinished")
     try:
         with unfinished.open("xb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
@@ -43,11 +44,36 @@ def write(path: Path, content: str | bytes) -> None:
             unfinished.unlink(missing_ok=True)
 
 
+def is_unfinished(path: Path, name: str | None = None) -> bool:
+    """Whether `write` was killed while it wrote this, in place of the file `name` if given."""
+    found = _UNFINISHED_NAME.fullmatch(path.name)
+    is_ours = found is not None and name in (None, found[1])
+    return is_ours and path.is_file() and not path.is_symlink()
+
+
 def remove_unfinished(directory: Path) -> None:
-    """Removes what processes that were killed have left of files in and below a directory."""
-    for path in directory.rglob(f".*{_UNFINISHED}"):
+    """Removes what a `write` that was killed has left in a directory."""
+    for path in filter(is_unfinished, directory.iterdir()):
         with contextlib.suppress(OSError):
             path.unlink()
+
+
+@contextlib.contextmanager
+def reserved(path: Path) -> Iterator[None]:
+    """Makes an empty file for what is about to be written, so that nobody else takes its name.
+
+    It is removed if that fails.
+
+    Raises:
+      FileExistsError: if there is something already.
+      OSError: if nothing can be written there.
+    """
+    path.open("xb").close()
+    try:
+        yield
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def append(path: Path, line: str) -> None:

@@ -15,7 +15,12 @@ def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
 
     To be used in the main thread, where Python handles signals.
     """
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    # What started this process may have set signals aside that are meant for another one.
+    before = {
+        number: handler
+        for number in _SIGNALS
+        if (handler := signal.getsignal(number)) is not signal.SIG_IGN
+    }
 
     def restore() -> None:
         for number, handler in before.items():
@@ -28,11 +33,11 @@ def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
         os._exit(128 + number)
 
     def handle(number: int, frame: FrameType | None) -> None:
-        for each in _SIGNALS:
+        for each in before:
             signal.signal(each, end)
         stop()
 
-    for number in _SIGNALS:
+    for number in before:
         signal.signal(number, handle)
     try:
         yield

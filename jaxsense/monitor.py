@@ -50,6 +50,7 @@ class Monitor:
     def begin(self, listener: Listener) -> None:
         """Begins another run, with other times and another listener."""
         self.seconds: dict[str, dict[str, float]] = {}
+        self._failure: StageError | None = None
         self._one_listener = listener
 
     def _listener(self, stage: str, done: int, total: int, figures: dict[str, float]) -> None:
@@ -61,13 +62,19 @@ class Monitor:
         """Asks the stages to save what they have and to stop."""
         self._stop.set()
 
+    def fail(self, failure: StageError) -> None:
+        """Ends what goes on side by side with a stage that has failed."""
+        self._failure = failure
+
     @property
     def is_stopping(self) -> bool:
         """Whether the stages are to stop."""
-        return self._stop.is_set()
+        return self._stop.is_set() or self._failure is not None
 
     def check_stop(self) -> None:
-        """Raises `Stopped` if the stages are to stop."""
+        """Raises `Stopped` if the stages are to stop; the failure, if another one has failed."""
+        if self._failure is not None:
+            raise self._failure
         if self.is_stopping:
             raise Stopped
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import errno
 import importlib.metadata
 import itertools
 import json
@@ -94,12 +95,13 @@ class RunDirectory:
                 # Also before the lock, which would be one file more in somebody's directory.
                 _check_empty(path)
                 kept.enter_context(_locked(path, "out"))
-                files.remove_unfinished(path)
+                run = cls(path, settings)
+                run._remove_unfinished()
                 _check_empty(path)
                 write_json(path / "config.json", content)
             except OSError as error:
                 raise ConfigError("out", str(path), reason.format(error.strerror)) from None
-            yield cls(path, settings)
+            yield run
 
     @classmethod
     @contextlib.contextmanager
@@ -112,8 +114,8 @@ class RunDirectory:
         settings = resumable(path, trust)
         with _locked(path, "resume"):
             run = cls(path, settings)
-            files.remove_unfinished(path)
-            run.checkpoints.check_list()
+            run._remove_unfinished()
+            run.checkpoints.check(is_begun=(path / _METRICS).exists())
             run._drop_unfinished_line()
             yield run
 
@@ -129,6 +131,11 @@ class RunDirectory:
     def append_metrics(self, **figures: Any) -> None:
         """Adds a line to `metrics.jsonl`."""
         files.append(self.path / _METRICS, json.dumps(figures))
+
+    def _remove_unfinished(self) -> None:
+        """Removes what a process that was killed has left of files of this run."""
+        for place in (self.path, *self.checkpoints.directories()):
+            files.remove_unfinished(place)
 
     def _drop_unfinished_line(self) -> None:
         """Cuts what a process that was killed has left of a line of `metrics.jsonl`."""
@@ -147,23 +154,23 @@ def unused(path: Path) -> Path:
       ConfigError: if it cannot be made.
     """
     first = path
-    for number in itertools.count(2):
-        try:
-            path.mkdir(parents=True)
-        except FileExistsError:
-            path = first.with_name(f"{first.name}-{number}")
-        except OSError as error:
-            raise ConfigError("out", str(path), f"cannot be made ({error.strerror})") from None
-        else:
-            break
+    try:
+        first.parent.mkdir(parents=True, exist_ok=True)
+        for number in itertools.count(2):
+            try:
+                path.mkdir()
+                break
+            except FileExistsError:
+                path = first.with_name(f"{first.name}-{number}")
+    except OSError as error:
+        raise ConfigError("out", str(path), f"cannot be made ({error.strerror})") from None
     return path
 
 
 def _check_empty(path: Path) -> None:
     """Raises a `ConfigError` if a directory holds more than a lock."""
-    names = {file.name for file in path.iterdir()}
-    # What a process leaves that was killed before it had written anything.
-    if {name for name in names if not name.startswith(".config.json.")} - {".lock"}:
+    # A lock and the beginning of a file are left by a process that was killed at once.
+    if any(f.name != ".lock" and not files.is_unfinished(f, "config.json") for f in path.iterdir()):
         raise ConfigError("out", str(path), "is not empty; must be a new directory")
 
 
@@ -301,6 +308,8 @@ def _named(models: Models, config: Config) -> dict[str, Any]:
 def _read_config(file: Path, field: str, value: Path) -> dict[str, Any]:
     """What lies in a `config.json`; a `ConfigError` about `field = value` if it cannot be read."""
     try:
+        if file.exists() and not (file.is_file() or file.is_dir()):
+            raise OSError(errno.EINVAL, "Not a regular file")  # it may never end
         content = parse_json(file.read_text(encoding="utf-8"))
     except OSError as error:
         reason = f"must hold a run's settings ({file.name}: {error.strerror})"

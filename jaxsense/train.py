@@ -113,12 +113,13 @@ def main(
     except OSError as error:
         cli.fail(PROGRAM, f"{cli.reason(error)}; what was saved before is still there")
     if not arguments.quiet:
-        _print_summary(console, run)
+        with contextlib.suppress(OSError):  # as in `display.say`
+            _print_summary(console, run)
     first = next(path for path in _paths(run) if (path / "report.html").exists())
     # The one thing that a quiet run says.
-    print(f"Everything is in {run.path}; open {first / 'report.html'} first.")
+    say(f"Everything is in {run.path}; open {first / 'report.html'} first.")
     trust = " --trust" if arguments.config.sensors else ""
-    print(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
+    say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
 
 
 def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: config) -> Arguments:

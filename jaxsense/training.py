@@ -56,8 +56,8 @@ def fit(
 
     Returns:
       The state after the last step and the `[steps]` losses; those beyond `total` mean nothing.
-      Nothing that is not finite is caught here: look at the losses, of which the last is NaN if the
-      parameters after it are not finite.
+      Nothing that is not finite is caught here: look at the losses, of which the last that means
+      something is NaN if the parameters after it are not finite.
     """
     steps = jax.tree.leaves(drawn)[0].shape[0]
 
@@ -71,7 +71,8 @@ def fit(
             after = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), after, state)
         return after, value
 
-    state, losses = jax.lax.scan(make_step, state, drawn)
+    after, losses = jax.lax.scan(make_step, state, drawn)
     # Parameters of the steps before show in the loss of the next one.
-    is_finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(state.params)]).all()
-    return state, jnp.asarray(losses).at[-1].mul(jnp.where(is_finite, 1.0, jnp.nan))
+    is_finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(after.params)]).all()
+    last = jnp.maximum(after.step - state.step - 1, 0)
+    return after, jnp.asarray(losses).at[last].mul(jnp.where(is_finite, 1.0, jnp.nan))

@@ -183,22 +183,78 @@ def test_a_missing_checkpoint_is_noticed(tmp_path):
 def test_a_list_of_checkpoints_that_is_damaged_is_noticed_and_made_anew(tmp_path, damage, expected):
     said = []
     checkpoints = Checkpoints(tmp_path, said.append)
-    checkpoints.check_list()  # nothing was saved, and nothing is missing
+    checkpoints.check()  # nothing was saved, and nothing is missing
     checkpoints.save("tree", TREE)
     checkpoints.save("unfinished/jmvae", TREE)
-    checkpoints.check_list()
+    checkpoints.check()
     assert not said
     damage(tmp_path / "saved.msgpack")
-    checkpoints.check_list()
+    checkpoints.check()
     (line,) = said
     assert expected in line
-    checkpoints.check_list()
+    checkpoints.check()
     assert len(said) == 1
     # The new list holds what was there.
     for name in ("tree", "unfinished/jmvae"):
         (tmp_path / f"{name}.msgpack").unlink()
-        assert checkpoints.load_or_forget(name, SHAPES) is None
+    checkpoints.check()
     assert ["is missing" in line for line in said[1:]] == [True, True]
+    assert checkpoints.load_or_forget("tree", SHAPES) is None
+    assert len(said) == 3
+
+
+def test_all_that_is_damaged_is_named_once_also_what_nobody_loads(tmp_path):
+    said = []
+    checkpoints = Checkpoints(tmp_path / "checkpoints", said.append)
+    checkpoints.check(is_begun=False)
+    assert not said
+    checkpoints.check(is_begun=True)
+    assert "checkpoints': is missing; everything is trained again" in said.pop()
+    for name in ("jmvae", "class_beliefs", "detectors"):
+        checkpoints.save(name, TREE)
+    file = tmp_path / "checkpoints" / "class_beliefs.msgpack"
+    file.write_bytes(file.read_bytes()[:-1])
+    (tmp_path / "checkpoints" / "jmvae.msgpack").unlink()
+    (tmp_path / "checkpoints" / "jmvae.msgpack").mkdir()  # cannot be read
+    checkpoints.check()
+    assert "class_beliefs.msgpack': is damaged" in said[0]
+    assert "jmvae.msgpack': cannot be read (Is a directory)" in said[1]
+    checkpoints.check()
+    for name in ("jmvae", "class_beliefs"):
+        assert checkpoints.load_or_forget(name, SHAPES) is None
+    assert checkpoints.load_or_forget("detectors", SHAPES) is not None
+    assert len(said) == 2
+
+
+def test_only_what_a_write_has_left_is_removed(tmp_path):
+    kept = [".thesis.unfinished", "a.0123456789abcdef.unfinished", ".a.0123.unfinished"]
+    for name in kept:
+        (tmp_path / name).write_text("precious")
+    folder = tmp_path / ".b.0123456789abcdef.unfinished"
+    folder.mkdir()
+    left = tmp_path / ".summary.json.0123456789abcdef.unfinished"
+    left.write_text("{")
+    (tmp_path / "seed-1").mkdir()
+    others = tmp_path / "seed-1" / left.name  # of a process that may be writing it
+    others.write_text("{")
+    files.remove_unfinished(tmp_path)
+    assert not left.exists()
+    assert others.exists()
+    assert folder.exists()
+    assert all((tmp_path / name).exists() for name in kept)
+
+
+def test_a_reserved_file_is_nobody_elses_and_goes_if_writing_fails(tmp_path):
+    path = tmp_path / "file"
+    with files.reserved(path):
+        assert path.read_bytes() == b""
+        with pytest.raises(FileExistsError), files.reserved(path):
+            pass
+        files.write(path, "new")
+    assert path.read_text(encoding="utf-8") == "new"
+    with pytest.raises(ZeroDivisionError), files.reserved(tmp_path / "other"):
+        1 / 0  # noqa: B018
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize(

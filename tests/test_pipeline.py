@@ -164,3 +164,32 @@ def test_a_restart_that_is_not_finite_is_left_out_and_named(two_restarts, bad):
 def test_a_training_ends_if_no_restart_is_finite(two_restarts):
     with pytest.raises(StageError, match="jmvae: loss = nan at step 5 of 40"):
         two_restarts((0, 1))
+
+
+def test_a_stage_that_fails_ends_what_goes_on_beside_it(tmp_path):
+    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
+    failure = StageError("dqn_lidar: loss = nan at step 7 of 40")
+
+    def run(chunk, state):
+        monitor.fail(failure)
+        return state + 1, {}
+
+    with pytest.raises(StageError, match="dqn_lidar"):
+        run_chunks("dqn_camera", np.float32(0), 9, run, monitor, checkpoints)
+    assert checkpoints.load_unfinished("dqn_camera", np.float32(0))[:2] == (1, 1.0)
+    monitor.begin(lambda *_: None)  # the next seed
+    monitor.check_stop()
+
+
+def test_nan_on_a_full_disk_tells_of_both(monkeypatch, tmp_path):
+    def full(*_):
+        raise OSError(28, "No space left on device", "jmvae.msgpack")
+
+    checkpoints = Checkpoints(tmp_path)
+    monkeypatch.setattr(checkpoints, "save_unfinished", full)
+
+    def run(chunk, state):
+        raise StageError("jmvae: loss = nan at step 1 of 4")
+
+    with pytest.raises(StageError, match=r"nan at step 1 of 4; .* No space left on device"):
+        run_chunks("jmvae", np.float32(0), 4, run, Monitor(), checkpoints)

@@ -3,7 +3,11 @@
 import contextlib
 import io
 import json
+import os
 import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,7 +18,7 @@ import pytest
 from smoke import SMOKE, error_line
 
 import jaxsense
-from jaxsense import devices, evaluate, mission, train
+from jaxsense import devices, evaluate, files, mission, train
 from jaxsense.compilation import Compiler, Kept, Program
 from jaxsense.config import PRESETS, Config
 from jaxsense.monitor import Monitor
@@ -233,6 +237,50 @@ def test_an_evaluation_keeps_what_another_one_has_written_meanwhile(
         "naive": 3,
         "random": 0,
     }
+
+
+def test_an_evaluation_waits_for_another_one_that_writes(evaluated, tmp_path):
+    path = tmp_path / "run"
+    shutil.copytree(evaluated[0], path)
+    config, models = jaxsense.load(path)
+    summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    found = {"latent": summary["mission"]["latent"]}
+    arguments = evaluate.Arguments(path, seed=7)
+
+    def write():
+        evaluate._write(arguments, config, models.class_beliefs, found, None)
+
+    with ThreadPoolExecutor(1) as executor:
+        with files.locked(path, waits=False):
+            writing = executor.submit(write)
+            assert not wait((writing,), timeout=0.5).done
+            summary["mission"]["naive"]["seed"] = 8
+            (path / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+        writing.result()
+    blocks = json.loads((path / "summary.json").read_text(encoding="utf-8"))["mission"]
+    assert (blocks["latent"]["seed"], blocks["naive"]["seed"]) == (7, 8)
+
+
+def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):
+    path = tmp_path / "röm"
+    shutil.copytree(smoke_run, path)
+    (path / "summary.json").unlink()
+    program = """
+import sys
+from jaxsense import cli, train
+train._train = lambda begin, arguments, run, *more: (run.path / "summary.json").write_text(
+    open(sys.argv[1], encoding="utf-8").read(), encoding="utf-8")
+cli.run(lambda: train.main(["--resume", sys.argv[2]]))
+"""
+    command = [sys.executable, "-c", program, str(smoke_run / "summary.json"), str(path)]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert "r\\xf6m" in ended.stdout
+    (path / "summary.json").unlink()
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")
 
 
 def test_evaluate_prints_the_comparison(evaluated):

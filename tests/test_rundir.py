@@ -1,6 +1,8 @@
 """Run directories: nobody writes into that of another."""
 
 import json
+import os
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -63,3 +65,28 @@ def test_a_line_that_a_killed_process_has_left_is_cut(tmp_path):
         run.append_metrics(stage="jmvae", step=2)
     lines = (path / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["step"] for line in lines] == [1, 2]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no symbolic links for everybody")
+def test_a_place_that_is_not_there_any_more_is_named(tmp_path):
+    (tmp_path / "runs").symlink_to(tmp_path / "unmounted")
+    with pytest.raises(ConfigError, match=r"out = '.*run': cannot be made"):
+        rundir.unused(tmp_path / "runs" / "run")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no FIFO")
+def test_a_config_that_is_no_file_is_not_read(tmp_path):
+    os.mkfifo(tmp_path / "config.json")
+    with pytest.raises(ConfigError, match="Not a regular file"):
+        rundir.read_settings(tmp_path / "config.json")
+
+
+def test_a_directory_with_something_like_an_unfinished_file_is_somebodys(tmp_path):
+    (tmp_path / ".config.json.d").mkdir()
+    (tmp_path / ".config.json.d" / ".notes.unfinished").write_text("precious")
+    with (
+        pytest.raises(ConfigError, match="is not empty"),
+        RunDirectory.create(tmp_path, Settings("smoke", 0, PRESETS["smoke"])),
+    ):
+        pass
+    assert (tmp_path / ".config.json.d" / ".notes.unfinished").exists()

@@ -72,3 +72,18 @@ def test_the_last_loss_tells_of_parameters_that_are_not_finite():
     for is_finite in ([False], [True, False]):
         _, losses = training.fit(start, loss, jnp.zeros(len(is_finite)), optimiser)
         np.testing.assert_array_equal(np.isfinite(losses), is_finite)
+
+
+def test_the_last_step_tells_of_it_also_where_a_chunk_has_more_steps_than_are_left():
+    def loss(params, batch, step):
+        # The value is finite, the slope of a root of zero is not.
+        return batch + 0.0 * jnp.sqrt(jnp.where(step == 4, 0.0 * params, 1.0))
+
+    optimiser = optax.sgd(0.1)
+    state, told = training.start(jnp.float32(1), optimiser), []
+    for _ in range(2):
+        state, losses = training.fit(state, loss, jnp.ones(3), optimiser, total=5)
+        told.append(losses)
+    assert state.step == 5
+    assert np.isnan(state.params)
+    np.testing.assert_array_equal(jnp.concatenate(told)[:5], [1, 1, 1, 1, np.nan])

@@ -13,6 +13,7 @@ class ConfigError(ValueError):
 
     def __init__(self, field: str, value: object, expected: str):
         super().__init__(f"{field} = {_shown(value)}: {expected}")
+        self.expected = expected
 
 
 def require(condition: bool, section: object, field: str, expected: str) -> None:

@@ -111,7 +111,8 @@ class MapVectorEnv(VectorEnv):
         if mode is AutoresetMode.DISABLED and ended.any():
             raise error.ResetNeeded(f"environments {np.flatnonzero(ended)} have ended")
         actions = np.asarray(actions)
-        if not self.action_space.contains(actions):
+        is_whole = np.issubdtype(actions.dtype, np.integer)
+        if not (is_whole and self.action_space.contains(actions)):
             raise ValueError(f"actions = {actions!r}: must be in {self.action_space}")
         self._key, observations, self._states, outcome = self._step(
             self._key, self._states, actions.astype(np.int32)

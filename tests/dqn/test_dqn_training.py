@@ -256,3 +256,18 @@ def test_every_start_of_a_share_and_every_action_is_drawn():
     assert draws.start.shape == draws.coin.shape == (200, config.num_envs)
     assert 0 <= draws.coin.min() < 0.05
     assert 0.95 < draws.coin.max() < 1
+
+
+def test_the_learning_rate_falls_to_its_last_value_over_all_gradient_steps():
+    # With a gradient that is always the same, a step of Adam is as long as the learning rate.
+    optimiser = training._optimiser(PROBE)
+    steps = PROBE.epochs * PROBE.updates
+
+    def step(state, _):
+        change, state = optimiser.update(jnp.float32(1), state)
+        return state, -change
+
+    _, rates = jax.jit(lambda: jax.lax.scan(step, optimiser.init(jnp.float32(0)), length=steps))()
+    middle = (PROBE.learning_rate + PROBE.final_learning_rate) / 2
+    expected = [PROBE.learning_rate, middle, PROBE.final_learning_rate]
+    np.testing.assert_allclose(rates[jnp.array([0, steps // 2, -1])], expected, rtol=2e-3)

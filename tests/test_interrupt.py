@@ -1,0 +1,45 @@
+"""Ctrl-C and SIGTERM: the first one stops in order, the second one at once."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from jaxsense.interrupt import on_interrupt
+
+PROGRAM = """
+import signal, sys
+from jaxsense.interrupt import on_interrupt
+first, second = map(int, sys.argv[1:])
+with on_interrupt(lambda: print("stopping", flush=True)):
+    signal.raise_signal(first)
+    print("still here", flush=True)
+    signal.raise_signal(second)
+    print("never")
+"""
+
+
+@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_stops_in_order_and_the_second_one_at_once(first, second):
+    command = [sys.executable, "-c", PROGRAM, str(int(first)), str(int(second))]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 128 + second
+    assert ended.stdout == "stopping\nstill here\n"
+    assert ended.stderr == "Stopped at once; what was saved before is still there.\n"
+
+
+def test_what_was_there_before_comes_back_and_what_is_ignored_stays_so():
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        interrupt, stopped = signal.getsignal(signal.SIGINT), []
+        with on_interrupt(lambda: stopped.append(True)):
+            signal.raise_signal(signal.SIGTERM)
+            assert not stopped
+            signal.raise_signal(signal.SIGINT)
+            assert stopped == [True]
+        assert signal.getsignal(signal.SIGINT) is interrupt
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGTERM, before)
