@@ -71,6 +71,8 @@ def with_nan(output: Any, number: int) -> Any:
     if isinstance(output, tuple) and hasattr(output[0], "params"):
         params = poisoned(output[0].params, number)
         return dataclasses.replace(output[0], params=params), *output[1:]
+    if hasattr(output, "windows"):
+        return dataclasses.replace(output, windows=poisoned(output.windows, number))
     return poisoned(output, number)
 
 
