@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from jaxsense.config import PRESETS
 from tests.faults.child import NAN_STEP, SIGNALS, TRAININGS
 
 STAGES = (
@@ -220,8 +221,9 @@ def gradient(runs: Runs, stage: str, number: int) -> None:
     (line,) = lines(ended.stderr)
     found = re.search(rf"{stage}.* (\d+) of (\d+)", line)
     require(found and "nan" in line, line)
-    # In the chunk of that step, or the next one if it was the last of its chunk.
-    late = int(found[1]) - NAN_STEP if found else -1
+    # Of Q-learning epochs are told. In the chunk of that step, or the next one if it was its last.
+    step = -(-NAN_STEP // PRESETS["smoke"].dqn.updates) if stage == "dqn" else NAN_STEP
+    late = int(found[1]) - step if found else -1
     require(0 <= late <= int(found[2]) // 20 if found else False, line)
     saved = {file.name for file in (path / "checkpoints").rglob("*.msgpack")}
     require(any(name.startswith(stage) for name in saved), f"{stage} is not in {saved}")
