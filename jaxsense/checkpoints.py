@@ -145,7 +145,7 @@ class Checkpoints:
         there = self._there()
         if there or self._file(_LIST).exists():
             self._check(_LIST, "the run goes on from all that is there")
-        expected = self._listed() | there
+        expected = sorted(self._listed() | there)
         sound = {name for name in expected if self._check(name, "what it held is trained again")}
         self._write(_LIST, sorted(sound))
 
