@@ -115,10 +115,9 @@ class Process:
 
     def __init__(self, command: list[str], cwd: Path | None = None, **options: Any):
         root = Path(__file__).parents[2]
-        environment = options.pop("env", os.environ) | {
-            "JAX_PLATFORMS": "cpu",
-            "PYTHONPATH": str(root),
-        }
+        environment = dict(options.pop("env", os.environ), JAX_PLATFORMS="cpu")
+        paths = [str(root), *filter(None, [environment.get("PYTHONPATH")])]
+        environment["PYTHONPATH"] = os.pathsep.join(paths)
         self._command = command
         self._process = subprocess.Popen(
             command,
@@ -387,10 +386,11 @@ def trials(runs: Runs, is_quick: bool) -> Iterator[Trial]:
 
 
 def main(argv: list[str] | None = None) -> bool:
-    """Runs all trials, two at a time, and prints a table; returns whether all have passed."""
+    """Runs all trials and prints a table; returns whether all have passed."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a few of each kind")
     parser.add_argument("--only", default="", help="rows that hold this text")
+    parser.add_argument("--jobs", type=int, default=2, help="trials at a time")
     arguments = parser.parse_args(argv)
     failures, table = list[str](), dict[str, list[bool]]()
     with tempfile.TemporaryDirectory() as folder:
@@ -405,7 +405,7 @@ def main(argv: list[str] | None = None) -> bool:
                 return trial[0], f"{type(error).__name__}: {error}"
             return trial[0], ""
 
-        with ThreadPoolExecutor(2) as executor:
+        with ThreadPoolExecutor(arguments.jobs) as executor:
             for row, failure in executor.map(attempt, chosen):
                 table.setdefault(row, []).append(not failure)
                 if failure:
