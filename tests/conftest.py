@@ -1,4 +1,5 @@
 import os
+import signal
 from pathlib import Path
 
 # In the environment, so that processes which tests start have them too.
@@ -7,6 +8,9 @@ os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 # Compiling takes most of the time of the tests, and with the newer code generator twice as long.
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
 os.environ["XLA_FLAGS"] = "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
+
+# A script may have started this in the background, where Ctrl-C is not for it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import filelock
 import jax

@@ -12,6 +12,7 @@ PROGRAM = """
 import signal, sys
 from jaxsense.interrupt import on_interrupt
 first, second = map(int, sys.argv[1:])
+signal.signal(signal.SIGINT, signal.default_int_handler)
 with on_interrupt(lambda: print("stopping", flush=True)):
     signal.raise_signal(first)
     print("still here", flush=True)

@@ -138,6 +138,8 @@ def strike_at(stage: str, fault: str) -> None:
 
 if __name__ == "__main__":
     fault, stage, *argv = sys.argv[1:]
+    # A script may have started this in the background, where Ctrl-C is not for it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if stage in OTHERS:
         fill_disk()
         cli.run(lambda: OTHERS[stage].main(argv))
