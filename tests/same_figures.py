@@ -9,6 +9,10 @@ from pathlib import Path
 
 from smoke import without_times
 
+# Other processors and compilers add and multiply in another order, which learning amplifies: in the
+# 300 steps of the shared run another code generator changed figures of the JMVAE by .6 %.
+TOLERANCES = {"detectors": 1e-3, "jmvae": 2e-2}
+
 
 def numbers(figures, name=""):
     """Every number of nested figures, by its name."""

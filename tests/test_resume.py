@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from same_figures import TOLERANCES, different, numbers
 from smoke import SMOKE, error_line, interrupting, without_times
 
 import jaxsense
@@ -184,7 +185,10 @@ def test_a_config_that_cannot_be_used_is_named(tmp_path, capsys, content, expect
 
 
 @pytest.mark.slow  # other programs, which are compiled for a minute
-def test_a_run_on_one_thread_is_the_same(smoke_run, tmp_path):
+def test_a_run_on_one_thread_is_the_same_but_for_rounding(smoke_run, tmp_path):
     path = tmp_path / "run"
     train.main([*SMOKE, "--cache", "None", "--devices", "1", "--out", str(path)])
-    assert without_times(path) == without_times(smoke_run)
+    # To the last bit with two threads here; eight, each with fewer rows, rounded differently.
+    runs = [without_times(each) for each in (path, smoke_run)]
+    for block, tolerance in TOLERANCES.items():
+        assert not different(*(numbers(run[block]) for run in runs), tolerance)

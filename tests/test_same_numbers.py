@@ -3,14 +3,10 @@
 import json
 from pathlib import Path
 
-from same_figures import different, numbers
+from same_figures import TOLERANCES, different, numbers
 from smoke import without_times
 
 REFERENCE = Path(__file__).parent / "smoke_figures.json"
-# Other processors and compilers add and multiply in another order, which learning amplifies: in 300
-# steps another code generator changed figures of the JMVAE by .6 %. What follows from them is
-# compared in `.ci/run`, between the two lines of JAX on one machine.
-TOLERANCES = {"detectors": 1e-3, "jmvae": 2e-2}
 
 
 def test_figures_are_those_of_every_machine(smoke_run):

@@ -19,13 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from jaxsense.config import PRESETS
-from tests.faults.child import NAN_STEP, SIGNALS, TRAININGS
+from tests.faults.child import NAN_STEP, TRAININGS
 
 STAGES = (
     "simulate", "detector_camera-train", "detect-", "jmvae-train", "evaluate_jmvae", "dqn-train",
     "evaluate_dqn", "mission-go_on", "write",
 )  # fmt: skip
 """Where faults strike: the programs of `jaxsense.programs`, and the plots."""
+PRESSED = {"ctrl-c": "Ctrl-C", "ctrl-c-twice": "two Ctrl-C", "sigterm": "SIGTERM"}
 STOPPED = "jmvae-train", "dqn-train", "mission-go_on"
 """Where a run is stopped whose checkpoints are then damaged."""
 POISONED = {
@@ -360,9 +361,9 @@ def trials(runs: Runs, is_quick: bool) -> Iterator[Trial]:
     for i in range(0 if is_quick else 5):
         row = "kill -9 at a random moment, `default`"
         yield trial(row, killed, f"killed default {i}", ["--quiet"], i)
-    for fault, stage in itertools.product(SIGNALS, stages):
-        yield trial(f"{fault} in a stage, one seed", stopped, fault, stage)
-        yield trial(f"{fault} in a stage, two seeds", stopped, fault, stage, "--num-seeds", "2")
+    for (fault, name), stage in itertools.product(PRESSED.items(), stages):
+        yield trial(f"{name} in a stage, one seed", stopped, fault, stage)
+        yield trial(f"{name} in a stage, two seeds", stopped, fault, stage, "--num-seeds", "2")
     for how, stage in itertools.product(("truncated", "flipped", "missing"), STOPPED):
         yield trial(f"each checkpoint {how}", damaged, how, stage)
     for stage in stages:
@@ -375,7 +376,7 @@ def trials(runs: Runs, is_quick: bool) -> Iterator[Trial]:
     for program in ("evaluate", "export"):
         yield trial(f"disk full in `{program}`", disk_full_after, program)
     yield trial("a directory that is read-only", read_only)
-    yield trial("HOME that cannot be", surroundings, "home", {"HOME": "/dev/null/home"}, False)
+    yield trial("HOME that cannot be made", surroundings, "home", {"HOME": "/dev/null/home"}, False)
     yield trial("HOME that is read-only", surroundings, "ro-home", {"HOME": "/proc"}, False)
     yield trial("no HOME, no TERM", surroundings, "bare", {"HOME": None, "TERM": None}, False)
     ascii_locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
