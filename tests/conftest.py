@@ -9,9 +9,6 @@ os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
 os.environ["XLA_FLAGS"] = "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
 
-# A script may have started this in the background, where Ctrl-C is not for it.
-signal.signal(signal.SIGINT, signal.default_int_handler)
-
 import filelock
 import jax
 import pytest
@@ -21,6 +18,8 @@ from smoke import SMOKE
 from jaxsense import train
 
 jax.config.update("jax_num_cpu_devices", 2)
+# A script may have started this in the background, where Ctrl-C is not for it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SLOW = 1800  # s
 
