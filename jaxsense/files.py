@@ -107,14 +107,11 @@ def locked(directory: Path, *, waits: bool) -> Iterator[None]:
       BlockingIOError: if another process keeps the directory, and `waits` is False.
       OSError: if the lock cannot be taken.
     """
-    path = directory / ".lock"
-    lock = filelock.FileLock(path, timeout=-1 if waits else 0)
+    lock = filelock.FileLock(directory / ".lock", timeout=-1 if waits else 0)
     try:
         lock.acquire()
     except filelock.Timeout:
         raise BlockingIOError(f"{directory} is kept by another process") from None
-    except NotImplementedError as error:  # from some network file systems
-        raise OSError(None, str(error), str(path)) from error
     try:
         yield
     finally:
