@@ -1,0 +1,344 @@
+"""Options and files that cannot be used: one line, status 2, and nothing is changed."""
+
+import ast
+import contextlib
+import json
+import subprocess
+import sys
+import time
+from itertools import count
+from pathlib import Path
+
+import jax
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refusals import ANYTHING, NUMBERS, SMOKE, check_message
+
+import jaxsense
+from benchmarks import __main__ as benchmarks
+from jaxsense import (
+    ConfigError,
+    evaluate,
+    export,
+    pipeline,
+    train,
+)
+from jaxsense.files import WriteError
+from jaxsense.monitor import StageError
+from jaxsense.rundir import RunDirectory, Settings, read_settings
+
+SECONDS = 10.0
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The directory of a run that trained nothing, without a summary."""
+    path = tmp_path_factory.mktemp("runs") / "run"
+    models = jaxsense.untrained(jax.random.key(0), SMOKE)
+    with RunDirectory.create(path, Settings("smoke", 0, SMOKE)) as created:
+        created.save_models(models)
+    return path
+
+
+def contents(path):
+    """Every file below a directory, with what is in it."""
+    return {p: p.read_bytes() if p.is_file() else None for p in path.rglob("*")}
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """The working directory, with things in it that are not to be touched."""
+    (tmp_path / "file").write_text("precious")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "kept").write_text("precious")
+    texts = {
+        "utf16": '{"seed": 1}'.encode("utf-16"),
+        "binary": bytes(range(256)),
+        "deep": b"[" * 100_000,
+        "deep_object": b'{"config":' * 100_000,
+        "twice": b'{"seed": 1, "seed": 2}',
+        "digits": b'{"seed": 1' + b"0" * 10_000 + b"}",
+        "empty": b"",
+        "null": b"null",
+        "list": b"[]",
+        "nan": b'{"config": {"jmvae": {"beta": NaN}}}',
+        "inf": b'{"config": {"jmvae": {"beta": 1e999}}}',
+        "float": b'{"seed": 1.0}',
+        "bool": b'{"seed": true}',
+        "negative": b'{"seed": -1}',
+        "large": b'{"seed": 4294967296}',
+        "seeds": b'{"num_seeds": 0}',
+        "preset": b'{"preset": ["smoke"]}',
+        "section": b'{"config": {"dqn": [1]}}',
+        "sections": b'{"config": [1]}',
+        "field": b'{"config": {"dqn": {"epoch": 3}}}',
+        "unknown": b'{"colour": 3}',
+        "text": b'{"config": {"dqn": {"epochs": "3"}}}',
+        "whole": b'{"config": {"dqn": {"epochs": 60.0}}}',
+        "sensor": b'{"config": {"sensors": {"x": {"make": "a:b"}}}}',
+        "shape": b'{"config": {"arena": {"shapes": {"cube": {"half_sides": [1, 1, 1]}}}}}',
+        "memory": b'{"config": {"detector": {"hidden": [10000000, 10000000]}}}',
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.json").write_bytes(text)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def refusal(main, argv, place, capsys) -> str:
+    """What a command says that refuses its options: status 2, one line, and nothing changed."""
+    before, begin = contents(place), time.perf_counter()
+    with pytest.raises(SystemExit) as stop:
+        main(argv)
+    assert time.perf_counter() - begin < SECONDS
+    assert stop.value.code == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.count("\n") == 1
+    assert "Traceback" not in told.err
+    assert contents(place) == before
+    check_message(told.err.strip())
+    return told.err
+
+
+TRAIN = [
+    (["--seed", "1.5"], "seed = '1.5': must be a whole number"),
+    (["--seed", ""], "seed = '': must be a whole number"),
+    (["--seed"], "seed = '': must have a value"),
+    (["--seed", "nan"], "seed = 'nan': must be a whole number"),
+    (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
+    (["--seed", "4294967296"], "seed = 4294967296: must be within"),
+    (["--seed", "9" * 5000], "seed = '999"),
+    (["--cache", 300 * "x"], "cache = 'xxx"),
+    (["--num-seeds", "1000000000"], "num_seeds = 1000000000: must be within 1 and 10,000"),
+    (["--num-seeds", "0"], "num_seeds = 0: must be within 1 and 10,000"),
+    (["--num-seeds", "2", "--seed", "4294967295"], "leads beyond seed"),
+    (["--devices", "0"], "devices = 0: must be within 1 and"),
+    (["--devices", "-1"], "devices = -1: must be within 1 and"),
+    (["--devices", "1000000000"], "devices = 1000000000: must be within 1 and"),
+    (["--devices", "1e9"], "devices = '1e9': must be a whole number or None"),
+    (["--preset", ""], "preset = '': must be one of default, paper, smoke"),
+    (["--preset", "Smoke"], "preset = 'Smoke': must be one of"),
+    (["--preset"], "preset = '': must have a value"),
+    (["--out", ""], "out = '': must be a path"),
+    (["--out", "a\nb"], "out = 'a\\nb': must be a path of printable characters"),
+    (["--out", "a\0b"], "out = 'a\\x00b': must be a path of printable characters"),
+    (["--out", "\udc80"], "must be a path of printable characters"),
+    (["--out", "file"], "out = 'file': cannot be written"),
+    (["--out", "file/run"], "out = 'file/run': cannot be written"),
+    (["--out", "full"], "out = 'full': is not empty; must be a new directory"),
+    (["--out", "x" * 300], "cannot be written (File name too long)"),
+    (["--out", "/proc/run"], "out = '/proc/run': cannot be written"),
+    (["--cache", "file"], "cache = 'file': must be a directory"),
+    (["--cache", ""], "cache = '': must be a path"),
+    (["--config", ""], "config = '': must be a path"),
+    (["--config", "full"], "config = 'full': must hold a run's settings"),
+    (["--config", "none"], "config = 'none': must hold a run's settings (none: No such file"),
+    (["--config", "binary.json"], "binary.json is no JSON"),
+    (["--config", "utf16.json"], "utf16.json is no JSON"),
+    (["--config", "deep.json"], "deep.json is no JSON: nested too deeply"),
+    (["--config", "deep_object.json"], "deep_object.json is no JSON: nested too deeply"),
+    (["--config", "twice.json"], "twice.json is no JSON: 'seed' is given twice"),
+    (["--config", "digits.json"], "digits.json is no JSON"),
+    (["--config", "empty.json"], "empty.json is no JSON"),
+    (["--config", "null.json"], "null.json must hold an object"),
+    (["--config", "list.json"], "list.json must hold an object"),
+    (["--config", "nan.json"], "jmvae.beta = nan: must be a finite number"),
+    (["--config", "inf.json"], "jmvae.beta = inf: must be a finite number"),
+    (["--config", "float.json"], "seed = 1.0: must be a whole number"),
+    (["--config", "bool.json"], "seed = True: must be a whole number"),
+    (["--config", "negative.json"], "seed = -1: must be within 0 and 2^32 - 1"),
+    (["--config", "large.json"], "seed = 4294967296: must be within 0 and 2^32 - 1"),
+    (["--config", "seeds.json"], "num_seeds = 0: must be within 1 and 10,000"),
+    (["--config", "preset.json"], "preset = ['smoke']: must be one of"),
+    (["--config", "section.json"], "dqn = (1,): must be of type DqnConfig"),
+    (["--config", "sections.json"], "config = [1]: must be an object with a section"),
+    (["--config", "field.json"], "epoch = 3: is no setting; perhaps dqn.epochs"),
+    (["--config", "unknown.json"], "colour = 3: is no field of a run's config.json"),
+    (["--config", "text.json"], "dqn.epochs = '3': must be a whole number"),
+    (["--config", "whole.json"], "dqn.epochs = 60.0: must be a whole number"),
+    (["--config", "sensor.json"], "sensors.attribute = None: must be given"),
+    (["--config", "shape.json"], "must be"),
+    (["--config", "memory.json"], "detector.hidden = (10000000, 10000000): takes"),
+    (["--config", "twice.json", "--preset", "smoke"], "is no JSON"),
+    (["--resume", ""], "resume = '': must be a path"),
+    (["--resume", "file"], "resume = 'file': must hold a run's settings"),
+    (["--resume", "full"], "resume = 'full': must hold a run's settings"),
+    (["--resume", "none"], "resume = 'none': must hold a run's settings"),
+    (["--dqn.epochs", "1e3"], "dqn.epochs = '1e3': must be a whole number"),
+    (["--dqn.epochs", "déux"], "dqn.epochs = 'déux': must be a whole number"),
+    (["--dqn.hidden"], "dqn.hidden = (): must be one or more layer sizes"),
+    (["--dqn.hidden", "a"], "dqn.hidden = ('a',): must be a tuple of whole numbers"),
+    (["--dqn.observe", "LIVE"], "dqn.observe = 'LIVE': must be one of live, bank"),
+    (["--arena.side", "3m"], "arena.side = '3m': must be a finite number"),
+    (["--arena.side", "1_000_000"], "arena.side = 1000000.0: must be at most 100"),
+    (["--arena.colours.red", "1"], "arena.colours = "),
+    (["--arena.colours.red", "1", "2", "x"], "arena.colours = "),
+    (["--arena.shapes.cube.half-sides", "1"], "must have as many values as each option takes"),
+    (["--mdp.partly-seen-starts", "maybe"], "option = 'maybe': must be one of the program"),
+    (["--quiet=3"], "option = '3': must be one of the program"),
+    (["--taste", "sweet"], "option = '--taste': must be one of the program"),
+    (["--dqn.epoch", "3"], "option = '--dqn.epoch': must be one of the program; perhaps --dqn.epo"),
+    (["smoke"], "option = 'smoke': must be one of the program"),
+    (["--jmvae.hidden", "10000000", "10000000"], "jmvae.hidden = (10000000, 10000000): takes"),
+]
+
+
+@pytest.mark.parametrize(("argv", "expected"), TRAIN, ids=count())
+def test_train_refuses(argv, expected, place, capsys):
+    base = [] if {"--config", "--resume", "--preset"} & set(argv) else ["--preset", "smoke"]
+    out = [] if {"--out", "--resume"} & set(argv) else ["--out", "run"]
+    assert expected in refusal(train.main, [*base, *out, *argv], place, capsys)
+
+
+@pytest.mark.parametrize(("section", "name"), NUMBERS[::5])
+@pytest.mark.parametrize("text", ["nan", "-1", "x"])
+def test_train_refuses_numbers(section, name, text, place, capsys):
+    option = f"--{section}.{name.replace('_', '-')}"
+    line = refusal(train.main, ["--preset", "smoke", "--out", "run", option, text], place, capsys)
+    assert line.startswith(f"jaxsense.train: {section}.{name} = ")
+
+
+@settings(max_examples=12, deadline=None, derandomize=True, database=None)
+@given(st.lists(st.one_of(st.sampled_from(["--seed", "--out", "--dqn.epochs", "--config", "--"]),
+                          st.text(max_size=4)), min_size=1, max_size=4))  # fmt: skip
+def test_train_reads_or_refuses_any_words(argv):
+    with contextlib.suppress(SystemExit):
+        train.parse(argv)
+
+
+OTHERS = [
+    (evaluate, [], "run = '': must be given"),
+    (evaluate, [""], "run = '': must be a path"),
+    (evaluate, ["none"], "run = 'none': must hold a run's settings"),
+    (evaluate, ["file"], "run = 'file': must hold a run's settings"),
+    (evaluate, ["full"], "run = 'full': must hold a run's settings"),
+    (evaluate, ["none", "more"], "option = 'more': must be one of the program"),
+    (evaluate, ["RUN"], "must hold the summary.json of a finished run"),
+    (evaluate, ["RUN", "--episodes", "0"], "episodes = 0: must be within 1 and 100,000"),
+    (evaluate, ["RUN", "--episodes", "-1"], "episodes = -1: must be within"),
+    (evaluate, ["RUN", "--episodes", "1e9"], "episodes = '1e9': must be a whole number"),
+    (evaluate, ["RUN", "--episodes", "1000000000"], "episodes = 1000000000: must be within"),
+    (evaluate, ["RUN", "--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
+    (evaluate, ["RUN", "--seed", "x"], "seed = 'x': must be a whole number"),
+    (evaluate, ["RUN", "--policy", ""], "policy = '': must be one of all, policies, latent"),
+    (evaluate, ["RUN", "--policy", "sonar_alone"], "policy = 'sonar_alone': must be one of"),
+    (evaluate, ["RUN", "--policy"], "policy = '': must have a value"),
+    (evaluate, ["RUN", "--devices", "0"], "devices = 0: must be within 1 and"),
+    (evaluate, ["RUN", "--cache", "file"], "cache = 'file': must be a directory"),
+    (export, [], "run = '': must be given"),
+    (export, ["none"], "run = 'none': must hold a run's settings"),
+    (export, ["a\nb"], "run = 'a\\nb': must be a path of printable characters"),
+    (export, ["RUN", "--out", "full"], "out = 'full': exists already; must be a new file"),
+    (export, ["RUN", "--out", "file"], "out = 'file': exists already; must be a new file"),
+    (export, ["RUN", "--out", "file/x"], "out = 'file/x': cannot be written"),
+    (export, ["RUN", "--out", ""], "out = '': must be a path"),
+    (export, ["RUN", "--out"], "out = '': must have a value"),
+    (benchmarks, ["x"], "name = 'x': must be one of physics"),
+    (benchmarks, [""], "name = '': must be one of physics"),
+    (benchmarks, ["--json", ""], "json = '': must be a path"),
+    (benchmarks, ["--json", "file"], "json = 'file': exists already; must be new"),
+    (benchmarks, ["--json", "full"], "json = 'full': exists already; must be new"),
+    (benchmarks, ["--json", "none/x"], "json = 'none/x': cannot be written"),
+    (benchmarks, ["--json"], "json = '': must have a value"),
+    (benchmarks, ["--peer"], "option = '--peer': must be one of the program; perhaps --peers"),
+]
+
+
+@pytest.mark.parametrize(("program", "argv", "expected"), OTHERS, ids=count())
+def test_other_commands_refuse(program, argv, expected, run, place, capsys):
+    argv = [str(run) if word == "RUN" else word for word in argv]
+    before = contents(run)
+    assert expected in refusal(program.main, argv, place, capsys)
+    assert contents(run) == before
+
+
+PARTS = {part: {} for part in ("timing", "detectors", "jmvae", "dqn", "mission")}
+SUMMARIES = [
+    (b"{}", "must be an object with detectors"),
+    (b"[]", "must be an object with detectors"),
+    (b"\xff", "must hold the summary.json of a finished run"),
+    (b"[" * 100_000, "nested too deeply"),
+    (json.dumps(PARTS).encode(), "must hold the summary.json of a finished run"),
+    (json.dumps({**PARTS, "dqn": 3}).encode(), "must hold the summary.json of a finished run"),
+    (json.dumps({**PARTS, "jmvae": {"unambiguous": []}}).encode(), "must hold the summary.json"),
+]
+
+
+@pytest.mark.parametrize(("summary", "expected"), SUMMARIES, ids=count())
+def test_evaluate_refuses_a_broken_summary(summary, expected, run, capsys):
+    (run / "summary.json").write_bytes(summary)
+    try:
+        assert expected in refusal(evaluate.main, [str(run)], run, capsys)
+    finally:
+        (run / "summary.json").unlink()
+
+
+@pytest.mark.parametrize(
+    ("module", "argv"),
+    [
+        ("jaxsense.train", ["--dqn.epochs", "x"]),
+        ("jaxsense.evaluate", ["--seed", "x"]),
+        ("benchmarks", ["--json"]),
+    ],
+)
+def test_a_process_ends_with_one_line(module, argv, tmp_path):
+    begin = time.perf_counter()
+    command = [sys.executable, "-m", module, *argv]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert time.perf_counter() - begin < 3 * SECONDS  # another process may have most of the cores
+    assert done.returncode == 2
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    check_message(line)
+    assert line.startswith(f"{module}: ")
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (StageError("jmvae: the loss of step 3 is not finite"), "jmvae: the loss of step 3 is not"),
+        (WriteError(28, "No space left on device", "x"), "cannot write x: No space left on device"),
+        (PermissionError(13, "Permission denied", "x"), "train: x: Permission denied; what was"),
+        (OSError("Orbax, in\ntwo lines"), "train: Orbax, in two lines; what was saved"),
+        (ConfigError("checkpoint", "x", "is damaged"), "train: checkpoint = 'x': is damaged\n"),
+    ],
+)
+def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsys, monkeypatch):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr(pipeline, "compiled", lambda *_: contextlib.nullcontext())
+    monkeypatch.setattr(pipeline, "run", fails)
+    argv = ["--preset", "smoke", "--quiet", "--cache", "None", "--out", str(tmp_path / "run")]
+    with pytest.raises(SystemExit) as stop:
+        train.main(argv)
+    assert stop.value.code == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert expected in line
+    assert "--help" not in line
+
+
+def test_text_is_read_and_written_as_utf_8():
+    """What a file holds must not depend on the locale."""
+    for file in sorted(Path(jaxsense.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+                continue
+            if node.func.attr in ("read_text", "write_text", "open"):
+                named = {keyword.arg for keyword in node.keywords}
+                is_binary = any("b" in str(getattr(arg, "value", "")) for arg in node.args)
+                assert "encoding" in named or is_binary, f"{file}:{node.lineno}"
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@given(st.dictionaries(st.sampled_from(["preset", "seed", "config", "x"]), ANYTHING))
+def test_any_config_file_is_read_or_refused(tmp_path_factory, content):
+    file = tmp_path_factory.getbasetemp() / "any.json"
+    file.write_text(json.dumps(content))
+    try:
+        assert isinstance(read_settings(file), Settings)
+    except ConfigError as error:
+        check_message(str(error))

@@ -1,0 +1,318 @@
+"""Arguments that public functions refuse, with the words of the commands."""
+
+import dataclasses
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from refusals import INF, NAN, SMOKE
+
+import jaxsense
+from jaxsense import (
+    Belief,
+    dqn,
+    interfaces,
+    mission,
+    sim,
+    vae,
+)
+
+
+class World:
+    """What the functions are called with, made once."""
+
+    def __init__(self):
+        self.key = jax.random.key(0)
+        self.models = jaxsense.untrained(self.key, SMOKE)
+        self.params, self.model = self.models.jmvae, jaxsense.jmvae_shape(SMOKE)
+        self.world = sim.make_world(SMOKE)
+        self.camera, self.lidar = self.world.sensors
+        self.classes = jnp.array([0, 1, 2])
+        layout = sim.random_layout(self.key, SMOKE.arena, self.classes)
+        light = sim.random_light(self.key)
+        self.scene = sim.Scene(layout, light, jnp.zeros((2, 3)))
+        self.bank = tuple(jnp.full((3, 4, 2), 0.5) for _ in range(2))
+        self.mdp = jaxsense.bank_mdp(SMOKE, self.bank, self.params, self.model)
+        beliefs = Belief(jnp.zeros((3, 2)), jnp.ones((3, 2)))
+        seen = jnp.zeros((3, 2), bool)
+        self.state = dqn.MapState(beliefs, seen, self.classes, self.classes, jnp.int32(0))
+        self.belief, self.means = Belief(jnp.zeros(2), jnp.ones(2)), jnp.zeros((3, 2))
+        self.seen, self.x = jnp.zeros(2, bool), jnp.zeros(2)
+
+    def belief_of(self, **parts):
+        return dataclasses.replace(self.belief, **parts)
+
+
+@pytest.fixture(scope="module")
+def given_world():
+    return World()
+
+
+BAD = jnp.array([0, 1, 7])
+FUNCTIONS = {
+    "load": (lambda w: jaxsense.load(""), "run = '.': must hold"),
+    "load nul": (lambda w: jaxsense.load("\0"), "run = "),
+    "bank_mdp few": (
+        lambda w: jaxsense.bank_mdp(SMOKE, w.bank[:1], w.params, w.model),
+        "bank has 1 entries: must be 2",
+    ),
+    "bank_mdp rank": (
+        lambda w: jaxsense.bank_mdp(SMOKE, (w.bank[0][0],) * 2, w.params, w.model),
+        "bank",
+    ),
+    "bank_mdp empty": (
+        lambda w: jaxsense.bank_mdp(SMOKE, (w.bank[0][:, :0],) * 2, w.params, w.model),
+        "bank = 0: must be",
+    ),
+    "bank_mdp nan": (
+        lambda w: jaxsense.bank_mdp(SMOKE, (w.bank[0] * NAN,) * 2, w.params, w.model),
+        "bank = nan: must be finite",
+    ),
+    "live_mdp few": (
+        lambda w: jaxsense.live_mdp(SMOKE, w.world, w.models.detectors[:1], w.params, w.model),
+        "trained has 1 entries",
+    ),
+    "make_layout classes": (
+        lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD),
+        "classes = 7: must be a whole number from 0 to 2",
+    ),
+    "make_layout dtype": (
+        lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD * 1.0),
+        "classes of dtype float32: must be a whole number",
+    ),
+    "make_layout position": (
+        lambda w: sim.make_layout(SMOKE.arena, jnp.full((3, 2), NAN), jnp.zeros(3), w.classes),
+        "position = nan",
+    ),
+    "make_layout yaw": (
+        lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.full(3, INF), w.classes),
+        "yaw = inf",
+    ),
+    "random_layout": (
+        lambda w: sim.random_layout(w.key, SMOKE.arena, w.classes - 1),
+        "classes = -1",
+    ),
+    "random_scene": (lambda w: sim.random_scene(w.key, w.world, BAD), "classes = 7"),
+    "survey": (lambda w: sim.survey(w.key, w.world, BAD), "classes = 7"),
+    "look robot": (
+        lambda w: sim.look(w.key, w.world, w.scene, 2, jnp.int32(0)),
+        "robot = 2: must be one of",
+    ),
+    "look poi": (
+        lambda w: sim.look(w.key, w.world, w.scene, 0, jnp.int32(3)),
+        "poi = 3: must be a whole number from 0 to 2",
+    ),
+    "place": (lambda w: sim.place(w.world.arena, w.scene.layout, jnp.zeros(3)), "poses"),
+    "drive": (
+        lambda w: sim.drive(w.world.arena, w.world.arena.data, jnp.zeros((3, 2))),
+        "wheel_speeds",
+    ),
+    "cross_section robot": (
+        lambda w: sim.cross_section(w.world.arena, w.world.arena.data, 0.1, 5),
+        "robot = 5",
+    ),
+    "cross_section height": (
+        lambda w: sim.cross_section(w.world.arena, w.world.arena.data, NAN, 0),
+        "height = nan",
+    ),
+    "cast": (
+        lambda w: sim.cast(
+            sim.cross_section(w.world.arena, w.world.arena.data, 0.1, 0), w.x * NAN, w.x
+        ),
+        "origin = nan: must be finite",
+    ),
+    "cast_along": (
+        lambda w: sim.cast_along(
+            sim.cross_section(w.world.arena, w.world.arena.data, 0.1, 0), w.x, (w.x, w.x * NAN)
+        ),
+        "direction = nan: must be finite",
+    ),
+    "fan": (lambda w: sim.fan(0, 90.0), "num_rays = 0: must be a whole number greater than 0"),
+    "fan real": (lambda w: sim.fan(1.5, 90.0), "num_rays = 1.5"),
+    "fan bool": (lambda w: sim.fan(True, 90.0), "num_rays = True"),
+    "fan angle": (lambda w: sim.fan(3, 400.0), "field_of_view = 400.0: must be above 0"),
+    "fan nan": (lambda w: sim.fan(3, NAN), "field_of_view = nan"),
+    "fan negative": (lambda w: sim.fan(3, -90.0), "field_of_view = -90.0"),
+    "cut_out nan": (lambda w: sim.cut_out(w.lidar, np.full(683, NAN), 0.0), "readings of lidar ="),
+    "cut_out negative": (lambda w: sim.cut_out(w.lidar, np.full(683, -1.0), 0.0), "= -1.0: must"),
+    "cut_out length": (lambda w: sim.cut_out(w.lidar, np.zeros(5), 0.0), "readings of lidar"),
+    "cut_out dtype": (
+        lambda w: sim.cut_out(w.camera, np.full((640, 3), 255, np.uint8), 0.0),
+        "readings of dtype uint8: must be real numbers",
+    ),
+    "cut_out degrees": (lambda w: sim.cut_out(w.lidar, np.zeros(683), 90.0), "bearing = 90.0"),
+    "cut_out bearing": (lambda w: sim.cut_out(w.lidar, np.zeros(683), NAN), "bearing = nan"),
+    "bearing pose": (lambda w: sim.bearing(w.x, w.x), "pose"),
+    "bearing place": (lambda w: sim.bearing(jnp.zeros(3), jnp.zeros(3)), "place"),
+    "Sensor stride": (lambda w: dataclasses.replace(w.lidar, stride=0), "stride = 0"),
+    "Sensor window": (lambda w: dataclasses.replace(w.lidar, window=1.5), "window = 1.5"),
+    "Sensor channels": (lambda w: dataclasses.replace(w.lidar, channels=-1), "channels = -1"),
+    "Sensor height": (lambda w: dataclasses.replace(w.lidar, height=NAN), "height = nan"),
+    "Jmvae names": (lambda w: vae.Jmvae((), (), 2, (8,)), "modalities = ()"),
+    "Jmvae twice": (lambda w: vae.Jmvae(("a", "a"), (2, 2), 2, (8,)), "must name none twice"),
+    "Jmvae sizes": (lambda w: vae.Jmvae(("a",), (0,), 2, (8,)), "feature_sizes = 0"),
+    "Jmvae latent": (lambda w: vae.Jmvae(("a",), (2,), 0.5, (8,)), "latent_size = 0.5"),
+    "Jmvae hidden": (lambda w: vae.Jmvae(("a",), (2,), 2, (-8,)), "hidden = -8"),
+    "encode none": (lambda w: vae.encode(w.params, w.model, (None, None)), "must hold one mod"),
+    "encode shape": (
+        lambda w: vae.encode(w.params, w.model, (jnp.zeros(3), None)),
+        "features of camera",
+    ),
+    "decode": (lambda w: vae.decode(w.params, w.model, jnp.zeros(3)), "z"),
+    "posterior": (lambda w: vae.posterior(w.params, w.model, (w.x,)), "features has 1 entries"),
+    "detect": (lambda w: vae.detect(w.models.detectors[0], jnp.zeros(3)), "window"),
+    "fuse std": (
+        lambda w: vae.fuse(w.params, w.model, w.belief_of(std=-w.belief.std), w.seen, (w.x, None)),
+        "belief.std = -1.0: must be greater than 0",
+    ),
+    "fuse seen": (
+        lambda w: vae.fuse(w.params, w.model, w.belief, jnp.zeros(3, bool), (w.x, None)),
+        "seen",
+    ),
+    "write": (
+        lambda w: vae.write(w.params, w.model, w.belief, w.seen, w.x, 2),
+        "modality = 2: must be an index",
+    ),
+    "unseen": (lambda w: vae.unseen(w.model, -1.0), "variance = -1.0: must be greater than 0"),
+    "unseen nan": (lambda w: vae.unseen(w.model, NAN), "variance = nan"),
+    "unseen text": (lambda w: vae.unseen(w.model, "x"), "variance = 'x'"),
+    "kl": (lambda w: vae.kl_divergence(w.x[None], w.x, w.x, w.x), "mean_p"),
+    "moment_match": (lambda w: vae.moment_match(w.means, w.means - 1), "std = -1.0"),
+    "moment_match none": (
+        lambda w: vae.moment_match(w.means[:0], w.means[:0]),
+        "number of components = 0",
+    ),
+    "sigma_norm": (lambda w: vae.sigma_norm(-w.belief.std), "std = -1.0: must be greater than 0"),
+    "nearest_class": (
+        lambda w: vae.nearest_class(w.belief_of(mean=w.x * NAN), w.means),
+        "belief.mean = nan: must be finite",
+    ),
+    "nearest_class means": (
+        lambda w: vae.nearest_class(w.belief, w.means * NAN),
+        "class_means = nan",
+    ),
+    "plausible_classes": (
+        lambda w: vae.plausible_classes(w.belief_of(std=w.x), w.means),
+        "belief.std = 0.0: must be greater than 0",
+    ),
+    "loss": (
+        lambda w: vae.loss(
+            w.key, w.params, w.model, (w.x,), alpha=1, beta=1, reconstruction_weights=(1, 1)
+        ),
+        "features has 1 entries",
+    ),
+    "loss weights": (
+        lambda w: vae.loss(
+            w.key, w.params, w.model, (w.x, w.x), alpha=1, beta=1, reconstruction_weights=(1,)
+        ),
+        "reconstruction_weights = (1,)",
+    ),
+    "train steps": (
+        lambda w: vae.train(w.key, None, w.model, w.bank, SMOKE.jmvae, 0),
+        "steps = 0",
+    ),
+    "train bank": (
+        lambda w: vae.train(w.key, None, w.model, w.bank[:1], SMOKE.jmvae, 1),
+        "bank has 1 entries",
+    ),
+    "information": (lambda w: dqn.information(-w.belief.std), "std = -1.0: must be greater"),
+    "information zero": (lambda w: dqn.information(w.x), "std = 0.0: must be greater than 0"),
+    "information nan": (lambda w: dqn.information(w.x * NAN), "std = nan"),
+    "information rank": (lambda w: dqn.information(jnp.float32(1)), "std"),
+    "as_state rank": (lambda w: dqn.as_state(w.belief), "belief.mean"),
+    "as_state std": (lambda w: dqn.as_state(Belief(w.means, w.means)), "belief.std = 0.0"),
+    "reset classes": (lambda w: dqn.reset(w.key, w.mdp, BAD), "classes = 7"),
+    "reset number": (lambda w: dqn.reset(w.key, w.mdp, w.classes[:2]), "classes"),
+    "reset seen": (
+        lambda w: dqn.reset(w.key, w.mdp, w.classes, jnp.zeros((2, 3), bool)),
+        "seen",
+    ),
+    "reset seen dtype": (lambda w: dqn.reset(w.key, w.mdp, w.classes, jnp.zeros((3, 2))), "seen"),
+    "step action": (
+        lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(4), 0),
+        "action = 4: must be a whole number from 0 to 3",
+    ),
+    "step negative": (lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(-1), 0), "action = -1"),
+    "step dtype": (
+        lambda w: dqn.step(w.key, w.mdp, w.state, jnp.float32(1), 0),
+        "action of dtype float32",
+    ),
+    "step rank": (lambda w: dqn.step(w.key, w.mdp, w.state, jnp.zeros(2, int), 0), "action"),
+    "step modality": (
+        lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(0), 2),
+        "modality = 2: must be a whole number from 0 to 1",
+    ),
+    "naive": (lambda w: dqn.naive(w.mdp, -1), "modality = -1"),
+    "optimal": (
+        lambda w: dqn.optimal(w.mdp, jnp.full((4, 3), NAN), jnp.zeros((2, 3), int)),
+        "rewards = nan",
+    ),
+    "optimal shape": (
+        lambda w: dqn.optimal(w.mdp, jnp.zeros((4, 3)), jnp.zeros((3, 3), int)),
+        "label_of_class",
+    ),
+    "dqn.train": (
+        lambda w: jax.eval_shape(lambda: dqn.train(w.key, w.mdp, 5, SMOKE.dqn)),
+        "modality = 5",
+    ),
+    "mission.batch_of": (lambda w: mission.batch_of(0), "total = 0"),
+    "mission.rollout": (lambda w: mission.rollout(w.key, None, None, None, 0), "steps = 0"),
+    "map_mdp": (lambda w: interfaces.map_mdp(SMOKE, w.models, w.bank[:1]), "bank has 1 entries"),
+    "prepared_starts": (lambda w: interfaces.prepared_starts(w.key, w.mdp, 0), "number = 0"),
+    "prepared_starts real": (lambda w: interfaces.prepared_starts(w.key, w.mdp, 1.5), "number ="),
+    "detections": (lambda w: interfaces.detections(w.key, SMOKE, w.models, 0), "samples = 0"),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_functions_refuse(given_world, name):
+    call, expected = FUNCTIONS[name]
+    with pytest.raises((ValueError, AssertionError)) as error:
+        call(given_world)
+    assert expected in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "expected"),
+    [
+        ({"policy": 5}, "policy = 5: must be a whole number from 0 to 2"),
+        ({"policy": -1}, "policy = -1"),
+        ({"classes": BAD}, "classes = 7"),
+        ({"faults": mission.Faults(jnp.full(2, NAN), jnp.zeros(2))}, "faults.stops_at = nan"),
+        ({"faults": mission.Faults(jnp.zeros(2), -jnp.ones(2))}, "faults.blind_at = -1.0"),
+    ],
+)
+def test_a_mission_refuses(given_world, inputs, expected):
+    team = mission.Mission(given_world.world, given_world.world.arena)
+    base = {"classes": given_world.classes, "policy": 0, "faults": mission.no_faults(SMOKE)}
+    with pytest.raises(ValueError, match=re.escape(expected)):
+        mission.start(team, given_world.scene, **{**base, **inputs})
+
+
+def test_environments_refuse(given_world):
+    from jaxsense.interfaces import gymnasium, gymnax
+
+    mdp = given_world.mdp
+    for number in (0, -1, 1.5, True, "2"):
+        with pytest.raises(ValueError, match=r"num_envs = .*: must be a whole number greater"):
+            gymnasium.MapVectorEnv(mdp, 0, number)
+    for modality in (2, -1):
+        with pytest.raises(ValueError, match=r"modality = .*: must be a whole number from 0 to 1"):
+            gymnasium.MapVectorEnv(mdp, modality, 2)
+        with pytest.raises(ValueError, match=r"modality = .*: must be a whole number from 0 to 1"):
+            gymnax.MapEnv(mdp, modality)
+    with pytest.raises(ValueError, match="Later"):
+        gymnasium.MapVectorEnv(mdp, 0, 2, autoreset_mode="Later")
+    env = gymnasium.MapVectorEnv(mdp, 0, 2)
+    for mask in ([True], [1, 0], "x", np.ones(3, bool)):
+        with pytest.raises(ValueError, match=r"reset_mask = .*: must be an array of 2 booleans"):
+            env.reset(options={"reset_mask": mask})
+    env._states = given_world.state  # as after a reset, which takes long to compile
+    for actions in ([0, 4], [-1, 0], [0.5, 1.0], [0], [[0, 1]], "x"):
+        with pytest.raises(ValueError, match=r"actions = .*: must be in"):
+            env.step(actions)
+    start = gymnax.MapEnvState(time=0, map=given_world.state, is_over=jnp.bool_(False))
+    with pytest.raises(ValueError, match="action = 4: must be a whole number from 0 to 3"):
+        gymnax.MapEnv(mdp, 0).step_env(given_world.key, start, 4, gymnax.MapEnvParams())
