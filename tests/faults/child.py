@@ -25,6 +25,7 @@ import optax
 from jaxsense import cli, evaluate, export, report, train
 from jaxsense.compilation import Program
 from jaxsense.dqn import training as dqn_training
+from jaxsense.programs import Surveys
 from jaxsense.vae import detectors, jmvae
 
 NAN_STEP = 17
@@ -71,7 +72,7 @@ def with_nan(output: Any, number: int) -> Any:
     if isinstance(output, tuple) and hasattr(output[0], "params"):
         params = poisoned(output[0].params, number)
         return dataclasses.replace(output[0], params=params), *output[1:]
-    if hasattr(output, "windows"):
+    if isinstance(output, Surveys):
         return dataclasses.replace(output, windows=poisoned(output.windows, number))
     return poisoned(output, number)
 
