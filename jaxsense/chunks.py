@@ -33,7 +33,8 @@ def run_chunks(
 
     Raises:
       Stopped: if the run is to stop before the training is over; it has been saved.
-      StageError: from `run`; what was there before the chunk has been saved.
+      StageError: from `run`; what was there before the chunk has been saved, and trainings side by
+        side with this one end with the same error after their chunk.
     """
     done, curves = 0, Curves()
     found = checkpoints.load_unfinished(stage, state)
@@ -44,6 +45,7 @@ def run_chunks(
         try:
             after, figures = run(chunk, state)
         except StageError as error:
+            monitor.fail(error)
             try:
                 checkpoints.save_unfinished(stage, Unfinished(chunk, state, curves))
             except OSError as lost:

@@ -116,6 +116,7 @@ class Kept:
             number = len(jax.tree.leaves(program.input_shardings)[0].device_set)
             parts = serialize_executable.serialize(program)
             content = pickle.dumps((results, number, parts))
+            unfinished.touch(mode=0o600)  # whatever the umask, see `find`
             unfinished.write_bytes(hashlib.sha256(content).digest() + content)
             unfinished.replace(path)
         except Exception:

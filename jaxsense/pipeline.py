@@ -23,7 +23,7 @@ from jaxsense.config import Config
 from jaxsense.detections import Detections, detect, labels_of_classes
 from jaxsense.devices import ALONE, Workers, side_by_side
 from jaxsense.models import Models, untrained
-from jaxsense.monitor import Monitor, StageError, Stopped, is_finite
+from jaxsense.monitor import Monitor, Stopped, is_finite
 from jaxsense.networks import Params
 from jaxsense.programs import (
     Programs,
@@ -167,12 +167,7 @@ class Stages:
 
         def train_and_examine(modality: int):
             train_key, examine_key = keys_of(dqn_keys[modality], 2)
-            try:
-                found = self.train_dqn(train_key, modality, trained, params, detections)
-            except StageError as failure:
-                self._monitor.fail(failure)
-                raise
-            q_network, curves = found
+            q_network, curves = self.train_dqn(train_key, modality, trained, params, detections)
             figures = self.examine_dqn(examine_key, modality, q_network, params, detections)
             return q_network, curves, {**figures, **_speed(config, curves)}
 

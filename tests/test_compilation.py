@@ -7,7 +7,7 @@ import stat
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +53,13 @@ def test_whoever_waits_for_a_program_hears_why_it_cannot_come():
     assert broken(jnp.float32(1)) == 1
     broken.fail(RuntimeError("too late"))
     assert broken(jnp.float32(1)) == 1
+
+
+def test_nothing_is_traced_any_more_when_a_run_is_over():
+    with Compiler(Monitor()) as compiler:
+        program = Program(compiler, "stage", "run")
+    with pytest.raises(CancelledError):
+        program.compile(lambda x: pytest.fail("was traced"), jnp.float32(0))
 
 
 def call(kept, function, *args):
@@ -105,6 +112,20 @@ def test_a_damaged_file_is_compiled_anew(tmp_path, damage):
     while kept.find("stage-run-1", (jnp.float32(3),)) is None:
         time.sleep(0.01)
     assert call(kept, never, jnp.float32(3)) == 6
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no modes of files")
+def test_a_file_that_others_may_have_written_is_compiled_anew(tmp_path):
+    kept, mask = Kept(tmp_path), os.umask(0)  # as if others might write every file
+    try:
+        call(kept, lambda x: 2 * x, jnp.float32(3))
+    finally:
+        os.umask(mask)
+    (file,) = kept.path.glob("*.pickle")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    for mode, is_found in ((0o644, True), (0o664, False), (0o646, False)):
+        file.chmod(mode)
+        assert (kept.find("stage-run-1", (jnp.float32(3),)) is not None) == is_found
 
 
 def test_a_single_wrong_bit_is_compiled_anew(tmp_path):

@@ -217,6 +217,20 @@ def test_bad_input_is_one_line_and_overwrites_nothing(run, tmp_path, capsys, pro
     assert list(tmp_path.iterdir()) == [existing]
 
 
+def test_a_file_that_appears_meanwhile_is_not_replaced(run, tmp_path, monkeypatch):
+    path = tmp_path / "x.zip"
+
+    def meanwhile(*_):
+        with pytest.raises(FileExistsError):  # the name is taken
+            path.open("x")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(export, "archive", meanwhile)
+    with pytest.raises(KeyboardInterrupt):
+        export.main([str(run), "--out", str(path)])
+    assert not path.exists()
+
+
 def test_missing_flatbuffers_is_told(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "flatbuffers", None)
     with pytest.raises(SystemExit) as stop:

@@ -166,12 +166,15 @@ def test_a_training_ends_if_no_restart_is_finite(two_restarts):
         two_restarts((0, 1))
 
 
-def test_a_stage_that_fails_ends_what_goes_on_beside_it(tmp_path):
+def test_a_training_that_fails_ends_what_goes_on_beside_it(tmp_path):
     checkpoints, monitor = Checkpoints(tmp_path), Monitor()
-    failure = StageError("dqn_lidar: loss = nan at step 7 of 40")
+
+    def fail(chunk, state):
+        raise StageError("dqn_lidar: loss = nan at step 7 of 40")
 
     def run(chunk, state):
-        monitor.fail(failure)
+        with pytest.raises(StageError):
+            run_chunks("dqn_lidar", np.float32(0), 9, fail, monitor, checkpoints)
         return state + 1, {}
 
     with pytest.raises(StageError, match="dqn_lidar"):
