@@ -55,7 +55,7 @@ def parse(program: str, arguments: type[T], argv: list[str], default: T | None =
         if stop.code == 0:
             raise
         wrong = _cause(stop) or _lacking(arguments, argv)
-    fail(program, f"{wrong} (--help tells every option)")
+    fail(program, f"{wrong} (--help lists every option)")
 
 
 def run(main: Callable[[], None]) -> None:
