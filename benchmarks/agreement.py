@@ -11,9 +11,10 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import devices, mission, observe
+from jaxsense import mission, observe
 from jaxsense.config import PRESETS
 from jaxsense.models import jmvae_shape, untrained
+from jaxsense.run import devices
 from jaxsense.vae import detectors, jmvae
 
 _SCENES = 256

@@ -6,12 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh
 
 from benchmarks import measure, peers
 from benchmarks.maps import MODALITY, Task, untrained_task
 from benchmarks.measure import Options, Row, Side
-from jaxsense import devices, models, observe
+from jaxsense import models, observe
 from jaxsense.config import PRESETS, DqnConfig
 from jaxsense.dqn import training
 from jaxsense.dqn.belief_mdp import MapMdp
@@ -28,7 +27,7 @@ def dqn_rejax(options: Options) -> Row:
     return measure.compare(
         "dqn_rejax",
         _UNIT,
-        _our_sides(task, options),
+        [_our_side(task)],
         theirs,
         options,
         peer="rejax DQN",
@@ -44,7 +43,7 @@ def dqn_sb3(options: Options) -> Row:
     return measure.compare(
         "dqn_sb3",
         _UNIT,
-        _our_sides(task, options),
+        [_our_side(task)],
         theirs,
         options,
         peer="Stable-Baselines3 DQN",
@@ -62,8 +61,8 @@ def dqn_live(options: Options) -> Row:
         return observe.live_mdp(task.config, world, detectors, params, shape)
 
     inputs = make_mdp, networks.detectors, task.params
-    ours = [_train_side(task, mesh, *inputs) for mesh in _meshes(options)]
-    return measure.compare("dqn_live", _UNIT, ours, [], options)
+    ours = _train_side(task, *inputs)
+    return measure.compare("dqn_live", _UNIT, [ours], [], options)
 
 
 def dqn_seeds(options: Options) -> Row:
@@ -117,31 +116,19 @@ def _settings(options: Options, epochs: int = 400) -> DqnConfig:
     )
 
 
-def _our_sides(task: Task, options: Options) -> list[Side]:
-    """On one device, and with the environments split over all."""
-
+def _our_side(task: Task) -> Side:
     def make_mdp(params: Any, bank: Any) -> MapMdp:
         return task.mdp_of(params, bank)
 
-    return [_train_side(task, mesh, make_mdp, task.params, task.bank) for mesh in _meshes(options)]
+    return _train_side(task, make_mdp, task.params, task.bank)
 
 
-def _meshes(options: Options) -> list[Mesh | None]:
-    mesh = devices.make_mesh()
-    if mesh.size == 1:
-        return [None]
-    return [mesh] if options.quick else [None, mesh]
-
-
-def _train_side(
-    task: Task, mesh: Mesh | None, make_mdp: Callable[..., MapMdp], *networks: Any
-) -> Side:
+def _train_side(task: Task, make_mdp: Callable[..., MapMdp], *networks: Any) -> Side:
     settings = task.config.dqn
 
     def train(key: jax.Array, *networks: Any):
-        return training.train(key, make_mdp(*networks), MODALITY, settings, mesh)
+        return training.train(key, make_mdp(*networks), MODALITY, settings)
 
     work = settings.epochs * settings.num_envs
     inputs, batch = (jax.random.key(2), *networks), settings.num_envs
-    side = measure.compiled(train, *inputs, work=work, batch=batch)
-    return dataclasses.replace(side, num_devices=1 if mesh is None else mesh.size)
+    return measure.compiled(train, *inputs, work=work, batch=batch)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from benchmarks.jmvae import random_bank
 from jaxsense import models, observe
 from jaxsense.config import PRESETS, Config, DqnConfig
-from jaxsense.dqn import belief_mdp, evaluation, policies
+from jaxsense.dqn import belief_mdp, episodes, policies
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.models import Models
 from jaxsense.networks import Params
@@ -90,7 +90,7 @@ class Examiner:
 
         def mean_return(policy: policies.Policy, starts: belief_mdp.MapState) -> jax.Array:
             def play(key: jax.Array, start: belief_mdp.MapState) -> jax.Array:
-                return evaluation.play(key, mdp, policy, start, MODALITY)[0]
+                return episodes.play(key, mdp, policy, start, MODALITY)[0]
 
             return jnp.mean(jax.vmap(play)(play_keys, starts))
 

@@ -11,8 +11,8 @@ from typing import Any
 import jax
 from jax.sharding import NamedSharding, PartitionSpec
 
-from jaxsense import devices
-from jaxsense.devices import Workers
+from jaxsense.run import devices
+from jaxsense.run.devices import Workers
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
 

@@ -14,11 +14,12 @@ from mujoco import mjx
 from benchmarks import measure
 from benchmarks.measure import Options, Row, Side
 from benchmarks.peers import native
-from jaxsense import devices, mission, models
+from jaxsense import mission, models
 from jaxsense.config import PRESETS, Config
 from jaxsense.mission import Mission, MissionState
 from jaxsense.mission.motion import move
 from jaxsense.mission.rollout import step as mission_step
+from jaxsense.run import devices
 from jaxsense.sim import amiro, navigation
 from jaxsense.sim import arena as arenas
 from jaxsense.sim.arena import Arena, Layout
@@ -194,7 +195,7 @@ def _drive_side(arena: Arena, drives: Drives) -> Side:
         return qpos, qvel
 
     batch, steps = drives.wheel_speeds.shape[:2]
-    workers, _ = devices.start(None)
+    workers = devices.start(None)
     return measure.compiled(
         jax.vmap(drive), drives, work=batch * steps, batch=batch, workers=workers
     )
@@ -212,7 +213,7 @@ def _move_side(team: Mission, states: MissionState) -> Side:
     batch, number = states.steps.shape
     substeps = round(team.config.mission.control_period / arenas.TIMESTEP)
     work = batch * number * substeps
-    workers, _ = devices.start(None)
+    workers = devices.start(None)
     return measure.compiled(periods, states, work=work, batch=batch, workers=workers)
 
 

@@ -11,8 +11,8 @@ from mujoco import mjx
 from benchmarks import measure
 from benchmarks.measure import Options, Row, Side
 from benchmarks.peers import native
-from jaxsense import devices
 from jaxsense.config import PRESETS
+from jaxsense.run import devices
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import raycast
 from jaxsense.sim import world as worlds
@@ -29,7 +29,7 @@ def rays(options: Options) -> Row:
     batches = measure.batches(options, quick=8, cpu=(64, 256, 1024), accelerator=(16384, 65536))
     placed = _random_scenes(jax.random.key(0), world, batches[-1])
     num_rays = sum(len(sensor.angles) for sensor in world.sensors)
-    workers, _ = devices.start(None)
+    workers = devices.start(None)
     cast = jax.vmap(lambda data: _cast(world, data))
 
     def our_side(batch: int) -> Side:

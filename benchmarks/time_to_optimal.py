@@ -12,8 +12,8 @@ from benchmarks import measure, peers
 from benchmarks.maps import MODALITY, Examiner, Learner, Task
 from benchmarks.measure import Options, Row
 from benchmarks.trained import trained_task
-from jaxsense import devices
 from jaxsense.dqn import training
+from jaxsense.run import devices
 
 _LONGEST = 60.0  # s that we may take
 _MOST_TIMES = 20  # our time, after which a peer is stopped

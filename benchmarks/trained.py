@@ -7,8 +7,8 @@ import jax
 
 from benchmarks.maps import Examiner, Task
 from jaxsense.config import PRESETS, DetectorConfig, DqnConfig, JmvaeConfig
-from jaxsense.learning import learn_perception
 from jaxsense.sim import world as worlds
+from jaxsense.stages import learn
 
 _CONFIG = dataclasses.replace(
     PRESETS["default"],
@@ -40,6 +40,8 @@ def trained_task(quick: bool) -> tuple[Task, Examiner]:
     """
     config = _QUICK if quick else _CONFIG
     world = worlds.make_world(config)
-    found = jax.jit(lambda key: learn_perception(key, config, world))(jax.random.key(6))
-    examined = Task(config, found.params, found.held_out)
-    return Task(config, found.params, found.bank), Examiner(examined, 32 if quick else 4096)
+    train = jax.jit(lambda key: learn(key, config, world, until="jmvae").outputs)
+    outputs = train(jax.random.key(6))
+    params, detections = outputs["jmvae"], outputs["detections"]
+    examined = Task(config, params, detections.held_out)
+    return Task(config, params, detections.bank), Examiner(examined, 32 if quick else 4096)

@@ -6,10 +6,9 @@ After Korthals, Leitner and Rueckert, "Coordinated Heterogeneous Distributed Per
 Latent Space Representation", 2018.
 
 The parts are `jaxsense.sim` (arena, ray-caster, sensors), `jaxsense.vae` (detectors, JMVAE, fusion)
-and `jaxsense.dqn` (map MDP, Q-learning); `jaxsense.observe` joins them, and `jaxsense.pipeline`
-trains them one after the other; `jaxsense.mission` plays
-all robots in closed loop. Every function is pure, takes its random key first, and works on
-one example: `vmap` and `jit` are yours.
+and `jaxsense.dqn` (map MDP, Q-learning). `jaxsense.observe` joins them, `jaxsense.stages` trains
+them, and `jaxsense.mission` drives all robots in closed loop. Every function is pure, takes its
+random key first, and works on one example: `vmap` and `jit` are yours.
 """
 
 from jaxsense import dqn as dqn
@@ -27,7 +26,8 @@ from jaxsense.models import jmvae_shape as jmvae_shape
 from jaxsense.models import untrained as untrained
 from jaxsense.observe import bank_mdp as bank_mdp
 from jaxsense.observe import live_mdp as live_mdp
-from jaxsense.rundir import load as load
+from jaxsense.run.rundir import load as load
+from jaxsense.run.version import __version__ as __version__
+from jaxsense.stages import learn as learn
 from jaxsense.types import Belief as Belief
 from jaxsense.types import Transition as Transition
-from jaxsense.version import __version__ as __version__

@@ -16,8 +16,8 @@ import jax
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from jaxsense.compilation import Kept
 from jaxsense.config import Config, ConfigError
+from jaxsense.run.compilation import Kept
 from jaxsense.sim import sensors
 
 T = TypeVar("T")
@@ -123,7 +123,7 @@ def keep_programs(program: str, directory: Path | None, config: Config) -> Kept 
         return None
     try:
         directory = directory.expanduser()
-        kept = Kept(directory, config, sensors.fingerprints(config))
+        kept = Kept(directory, jax.tree.structure(config), sensors.fingerprints(config))
     except (OSError, RuntimeError) as error:
         complain(f"{program}: programs cannot be kept in {directory} ({error})")
         return None

@@ -13,13 +13,15 @@ import rich.console
 import rich.table
 import tyro
 
-from jaxsense import animation, cli, devices, files, mission, page, rundir
-from jaxsense.compilation import Compiler
+from jaxsense import cli, mission
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import require, require_types
 from jaxsense.config.mission import MOST_EPISODES
-from jaxsense.display import Display
-from jaxsense.monitor import Monitor, StageError
+from jaxsense.run import devices, files, missions, rundir
+from jaxsense.run.compilation import Compiler
+from jaxsense.run.monitor import Monitor, StageError
+from jaxsense.show import animation, page
+from jaxsense.show.terminal import Display
 from jaxsense.sim.arena import TIMESTEP
 from jaxsense.types import Belief
 
@@ -62,7 +64,7 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
-        workers, _ = devices.start(arguments.devices)
+        workers = devices.start(arguments.devices)
         config, models = rundir.load(arguments.run, arguments.trust)
         played = _cases(arguments, config)
         path = arguments.run / "summary.json"
@@ -81,22 +83,23 @@ def main(argv: list[str] | None = None) -> None:
     team = mission.make_mission(config)
     with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
         number = arguments.episodes * len(played)
-        player = mission.Player(team, compiler, mission.batch_of(number), workers)
+        player = missions.Player(team, compiler, missions.batch_of(number), workers)
         player.wait()
         begin = time.perf_counter()
         try:
-            found = mission.summary(key, player, models, played, arguments.episodes)
+            found = player.play(key, models, played, arguments.episodes)
         except StageError as error:
             cli.fail(PROGRAM, str(error))
         seconds = time.perf_counter() - begin
         compiling = compiler.monitor.seconds["mission"]["compile_s"]
+    block = missions.summary(team, found)
     try:
-        written = _write(arguments, config, models.class_beliefs, found, player.recording)
+        written = _write(arguments, config, models.class_beliefs, block, found.recording)
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({cli.reason(error)})")
-    rate = player.control_steps / seconds
+    rate = found.control_steps / seconds
     with contextlib.suppress(OSError):  # as in `display.say`
-        _print_table(console, found)
+        _print_table(console, block)
         console.print(
             f"{number} missions in {seconds:.1f} s after {compiling:.0f} s of compilation: "
             f"{rate:.0f} control steps/s, "
@@ -111,7 +114,7 @@ def _write(
     config: Config,
     class_beliefs: Belief,
     found: dict[str, Any],
-    recording: mission.Recording | None,
+    recording: missions.Recording,
 ) -> list[str]:
     """Writes the figures into the run's summary and its page, and the animation if asked for.
 
@@ -120,7 +123,6 @@ def _write(
     """
     path, written = arguments.run / "summary.json", []
     if arguments.animate:
-        assert recording is not None
         name = next(name for name in found if name != "bytes_per_detection")
         film = arguments.run / f"mission-{name}-{arguments.seed}.svg"
         title = f"{name} policy, seed {arguments.seed}".replace("_", " ")

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxsense import observe
 from jaxsense.config import Config
-from jaxsense.dqn import evaluation, policies
+from jaxsense.dqn import episodes, policies
 from jaxsense.dqn.belief_mdp import MapState, random_start, reset
 from jaxsense.models import jmvae_shape
 from jaxsense.networks import Params
@@ -115,7 +115,7 @@ def play(
     Returns:
       `[P, S]` total reward and reward of the first action, means over the noise of detections; NaN
       where a value or a reward was. The starts are every state of the map, then
-      `evaluation.num_starts` random ones.
+      `episodes.num_starts` random ones.
     """
     settings = config.evaluation
     mdp = observe.bank_mdp(config, bank, params, jmvae_shape(config))
@@ -125,7 +125,7 @@ def play(
     random_starts = jax.vmap(lambda key: random_start(key, mdp))(start_keys)
     classes, seen = (
         jnp.concatenate([jnp.asarray(every), drawn])
-        for every, drawn in zip(evaluation.every_state(mdp), random_starts, strict=True)
+        for every, drawn in zip(episodes.every_state(mdp), random_starts, strict=True)
     )
     expected = policies.expected_rewards(table_key, mdp, modality, _EXPECTATION_DRAWS)
     compared = (
@@ -144,7 +144,7 @@ def play(
         def episode(key: Key, classes: jax.Array, seen: jax.Array):
             reset_key, episode_key = jax.random.split(key)
             start = reset(reset_key, mdp, classes, seen)
-            return evaluation.play(episode_key, mdp, act, start, modality)
+            return episodes.play(episode_key, mdp, act, start, modality)
 
         def repeat(i: jax.Array, sums: tuple[jax.Array, jax.Array]):
             keys = jax.random.split(jax.random.fold_in(play_key, i), len(classes))

@@ -19,14 +19,14 @@ import numpy as np
 import tyro
 from jax import export
 
-from jaxsense import cli, files, rundir
+from jaxsense import cli
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import require_types
-from jaxsense.extras import extra
+from jaxsense.interfaces.onboard import Function, functions
 from jaxsense.models import Models, jmvae_shape
-from jaxsense.onboard import Function, functions
+from jaxsense.run import files, rundir
+from jaxsense.run.version import __version__
 from jaxsense.vae import fusion
-from jaxsense.version import __version__
 
 PROGRAM = "jaxsense.export"
 PLATFORMS = ("cpu", "cuda", "tpu")
@@ -41,13 +41,7 @@ def exported(function: Function) -> export.Exported:
 
 
 def archive(config: Config, models: Models) -> bytes:
-    """The whole file.
-
-    Raises:
-      ModuleNotFoundError: if flatbuffers, which JAX needs for it, is not installed.
-    """
-    with extra("export"):
-        importlib.import_module("flatbuffers")
+    """The whole file."""
     content, programs = io.BytesIO(), {}
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as files:
         for name, function in functions(config, models).items():
@@ -117,7 +111,7 @@ def main(argv: list[str] | None = None) -> None:
             files.write(path, content)
     except FileExistsError:
         cli.fail(PROGRAM, str(ConfigError("out", str(path), "exists already; must be a new file")))
-    except (ConfigError, ModuleNotFoundError) as error:
+    except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"out = {str(path)!r}: cannot be written ({cli.reason(error)})")

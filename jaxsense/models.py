@@ -2,19 +2,18 @@
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 
 from jaxsense import networks
 from jaxsense.config import Config
 from jaxsense.networks import MLP, Params
 from jaxsense.sim import sensors
-from jaxsense.types import Belief, Key
+from jaxsense.types import Belief, Key, pytree
 from jaxsense.vae import detectors, jmvae
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.jmvae import Jmvae
 
 
-@struct.dataclass
+@pytree
 class Models:
     """Everything that a run trains.
 

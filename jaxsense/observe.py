@@ -8,8 +8,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense import values
-from jaxsense.config import Config
+from jaxsense.config import Config, values
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.networks import Params
 from jaxsense.sim import world as worlds

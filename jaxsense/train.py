@@ -5,6 +5,7 @@ import dataclasses
 import re
 import shlex
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -16,33 +17,24 @@ import jax
 import rich.console
 import rich.table
 import tyro
-from jax.sharding import Mesh
 
-from jaxsense import (
-    animation,
-    cli,
-    devices,
-    files,
-    page,
-    pipeline,
-    report,
-    rundir,
-    sweep,
-    tensorboard,
-)
+from jaxsense import cli
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.config.checks import require_types
-from jaxsense.devices import Workers
-from jaxsense.display import Display, say
-from jaxsense.interrupt import on_interrupt
-from jaxsense.monitor import Monitor, StageError, Stopped
-from jaxsense.pipeline import RunResult
-from jaxsense.programs import Programs
-from jaxsense.rundir import RunDirectory, Settings
+from jaxsense.run import devices, files, pipeline, rundir, seeds
+from jaxsense.run.devices import Workers
+from jaxsense.run.interrupt import on_interrupt
+from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.run.pipeline import RunResult
+from jaxsense.run.programs import Programs
+from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.show import animation, page, plots, tensorboard
+from jaxsense.show.terminal import Display, say
 from jaxsense.sim import sensors
 
 PROGRAM = "jaxsense.train"
 _MOST_SEEDS = 10_000
+_MOST_TOGETHER = 16  # seeds in one program on an accelerator
 _INTERRUPTED = 130  # exit status, as shells give it
 
 
@@ -72,8 +64,15 @@ class Arguments:
     tensorboard: bool = False
     """Also write event files for TensorBoard, into `tensorboard/` of the run."""
     devices: int | None = None
-    """Accelerators that environments are split over, by default all there are; on a CPU, threads
-    that share simulations, by default as many as cores, at most 8."""
+    """Accelerators that scenes and missions are split over, by default all there are; on a CPU,
+    threads that share them, by default as many as cores, at most 8."""
+    coordinator: str | None = None
+    """`HOST:PORT` of the first of several processes that share scenes and missions, each started
+    with the same options but `--process-index`. The first one writes the run."""
+    num_processes: int | None = None
+    """How many processes share the run."""
+    process_index: int | None = None
+    """Which of them this is, from 0."""
     cache: Path | None = Path("~/.cache/jaxsense")
     """Directory in which compiled programs are kept for later runs; `None` to keep none."""
 
@@ -102,9 +101,14 @@ def main(
     arguments = parse(sys.argv[1:] if argv is None else argv, change)
     console = rich.console.Console(quiet=arguments.quiet)
     try:
-        workers, learners = devices.start(arguments.devices, arguments.config.dqn)
+        devices.join(arguments.coordinator, arguments.num_processes, arguments.process_index)
+        workers = devices.start(arguments.devices)
+        if jax.process_index() > 0:
+            _help(begin, arguments, workers)
+            return
         with _open(arguments) as run:
-            _train(begin, arguments, run, workers, learners, console)
+            _train(begin, arguments, run, workers, console)
+        devices.leave()
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except files.WriteError as error:
@@ -120,6 +124,16 @@ def main(
     say(f"Everything is in {run.path}; open {first / 'report.html'} first.")
     trust = " --trust" if arguments.config.sensors else ""
     say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
+
+
+def _help(begin: float, arguments: Arguments, workers: Workers) -> None:
+    """Runs what the first process runs, whose files are those that stay."""
+    quiet = dataclasses.replace(arguments, quiet=True, tensorboard=False)
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "run"
+        with RunDirectory.create(place, arguments.settings) as run:
+            _train(begin, quiet, run, workers, rich.console.Console(quiet=True))
+    devices.leave()
 
 
 def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: config) -> Arguments:
@@ -189,10 +203,9 @@ def _train(
     arguments: Arguments,
     run: RunDirectory,
     workers: Workers,
-    learners: Mesh | None,
     console: rich.console.Console,
 ) -> None:
-    """Trains one seed after the other with the same programs, and writes what they leave."""
+    """Trains all seeds with the same programs, and writes what they leave."""
     settings, failed = run.settings, dict[int, str]()
     _check_seeds(run)
     kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config)
@@ -203,20 +216,24 @@ def _train(
         if not arguments.quiet:
             say("Stopping as soon as all is saved; Ctrl-C again does not wait for that.")
 
+    left = [
+        (seed, path)
+        for seed, path in zip(settings.seeds, _paths(run), strict=True)
+        if not (path / "summary.json").exists()
+    ]
+    size = min(len(left), 1 if jax.default_backend() == "cpu" else _MOST_TOGETHER)
     try:
         with (
             on_interrupt(stop),
-            pipeline.compiled(settings.config, monitor, workers, learners, kept) as programs,
+            pipeline.compiled(settings.config, monitor, workers, kept, size) as programs,
         ):
-            for seed, path in zip(settings.seeds, _paths(run), strict=True):
-                if (path / "summary.json").exists():
-                    continue
-                with _of_seed(run, seed, path) as of_seed:
-                    try:
-                        _train_one(begin, arguments, of_seed, programs, monitor, console)
-                    except StageError as error:
-                        failed[seed] = str(error)
-                        _warn(f"{error}; what was saved before is in {path}")
+            for first in range(0, len(left), size):
+                with contextlib.ExitStack() as opened:
+                    runs = [
+                        opened.enter_context(_of_seed(run, seed, path))
+                        for seed, path in left[first : first + size]
+                    ]
+                    failed |= _train_together(begin, arguments, runs, programs, monitor, console)
                 begin = time.perf_counter()
     except Stopped:
         trust = " --trust" if settings.config.sensors else ""
@@ -229,25 +246,56 @@ def _train(
         _summarise_seeds(run, failed)
 
 
-def _train_one(
+def _train_together(
     begin: float,
     arguments: Arguments,
-    run: RunDirectory,
+    runs: list[RunDirectory],
     programs: Programs,
     monitor: Monitor,
     console: rich.console.Console,
-) -> None:
-    """Trains one seed and writes its run directory; raises what `pipeline.run` raises."""
+) -> dict[int, str]:
+    """Trains some seeds side by side and writes their run directories.
+
+    Returns:
+      The seeds that have failed, and why.
+    """
+    displays = [_display(arguments, run, console, is_shown=run is runs[0]) for run in runs]
+    programs.team.begin(len(runs))
+
+    def train(i: int) -> RunResult | StageError:
+        key = jax.random.key(runs[i].settings.seed)
+        of_seed = monitor if len(runs) == 1 else monitor.beside(displays[i].show)
+        try:
+            return pipeline.run(key, programs, of_seed, runs[i].checkpoints)
+        except StageError as error:
+            return error
+        finally:
+            programs.team.leave()
+
+    with displays[0]:
+        monitor.begin(displays[0].show)
+        results = devices.side_by_side(train, len(runs))
+        timing = {"total_s": time.perf_counter() - begin, "stages": monitor.seconds}
+        failed: dict[int, str] = {}
+        for run, result in zip(runs, results, strict=True):
+            try:
+                if isinstance(result, StageError):
+                    raise result
+                _write(run, result, timing, monitor)
+            except StageError as error:
+                failed[run.settings.seed] = str(error)
+                _warn(f"{error}; what was saved before is in {run.path}")
+    return failed
+
+
+def _display(
+    arguments: Arguments, run: RunDirectory, console: rich.console.Console, *, is_shown: bool
+) -> Display:
+    """Records the progress of a run, and shows it unless another one is shown."""
     records = [run.append_metrics]
     if arguments.tensorboard:
         records.append(tensorboard.make_writer(run.path / "tensorboard"))
-    settings = run.settings
-    with Display(console, *records, quiet=arguments.quiet) as display:
-        monitor.begin(display.show)
-        key = jax.random.key(settings.seed)
-        result = pipeline.run(key, settings.config, programs, monitor, run.checkpoints)
-        timing = {"total_s": time.perf_counter() - begin, "stages": monitor.seconds}
-        _write(run, result, timing, monitor)
+    return Display(console, *records, quiet=arguments.quiet or not is_shown)
 
 
 def _paths(run: RunDirectory) -> list[Path]:
@@ -292,12 +340,12 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     blocks = [{name: one[name] for name in rundir.BLOCKS} for one in found.values()]
     timing = {
         "total_s": sum(one["timing"]["total_s"] for one in found.values()),
-        "stages": sweep.totals([one["timing"]["stages"] for one in found.values()]),
+        "stages": seeds.totals([one["timing"]["stages"] for one in found.values()]),
     }
     summary = {**_header(run, timing), "seeds": dict(zip(found, blocks, strict=True))}
     if failed:
         summary["failed"] = {str(seed): reason for seed, reason in failed.items()}
-    run.write_json("summary.json", {**summary, **sweep.statistics(blocks)})
+    run.write_json("summary.json", {**summary, **seeds.statistics(blocks)})
 
 
 def _warn(text: str) -> None:
@@ -309,7 +357,7 @@ def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any], monitor
     """Plots, the report and at last the summary, which says that the run is finished."""
     config = run.settings.config
     monitor.check_stop()
-    report.write_plots(run.path, config, result)
+    plots.write_plots(run.path, config, result)
     film, beliefs = run.path / "mission.svg", result.models.class_beliefs
     animation.write(film, config, result.recording, beliefs, "latent policy")
     summary = {**_header(run, timing), **result.summary}

@@ -1,16 +1,47 @@
-"""What crosses the border between `sim`, `vae`, `dqn` and the programs that join them."""
+"""What crosses the borders between `sim`, `vae`, `dqn` and what joins them."""
+
+import functools
+import json
+from collections.abc import Callable
+from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from flax import struct
+from jax import export
+
+T = TypeVar("T")
 
 Key = jax.Array
 """A typed or legacy JAX random key; consumed exactly once by the function that takes it."""
+
+Index = int | jax.Array
+"""A Python integer, or a `[]` int32 array."""
 
 Features = tuple[jax.Array | None, ...]
 """For each modality its `[D_m]` features, or None where it is missing."""
 
 
-@struct.dataclass
+@dataclass_transform(frozen_default=True, field_specifiers=(struct.field,))
+def pytree(cls: type[T]) -> type[T]:
+    """Makes a frozen dataclass a pytree, which `jax.export` can write and read as well."""
+    made: Any = struct.dataclass(cls)
+
+    def as_tuples(value: Any) -> Any:
+        return tuple(map(as_tuples, value)) if isinstance(value, list) else value
+
+    # What is no array is a number, a text, or tuples of them.
+    export.register_pytree_node_serialization(
+        made,
+        serialized_name=f"{made.__module__}.{made.__qualname__}",
+        serialize_auxdata=lambda fixed: json.dumps(fixed).encode(),
+        deserialize_auxdata=lambda content: as_tuples(json.loads(content)),
+    )
+    return made
+
+
+@pytree
 class Belief:
     """What is known of a point of interest: a diagonal Gaussian in the latent space.
 
@@ -25,7 +56,7 @@ class Belief:
     std: jax.Array
 
 
-@struct.dataclass
+@pytree
 class Transition:
     """One step of the map MDP as a Q-network learns from it, or a batch of them as columns.
 
@@ -42,3 +73,27 @@ class Transition:
     r_t: jax.Array
     discount_t: jax.Array
     s_t: jax.Array
+
+
+def is_static(index: Index) -> bool:
+    """Whether an index is fixed while tracing."""
+    return isinstance(index, int | np.integer)
+
+
+def call(function: Callable[[int], T], index: Index, number: int) -> T:
+    """`function(index)` of a function that can take a static index only.
+
+    Args:
+      function: gives results of the same shapes for every index.
+      index: which; if it is an array, the program switches between all that there are.
+      number: how many there are.
+    """
+    if is_static(index):
+        return function(int(index))
+    return jax.lax.switch(index, [functools.partial(function, i) for i in range(number)])
+
+
+def others(rows: jax.Array, index: Index) -> jax.Array:
+    """`[R - 1, ...]` all of `[R, ...]` rows but one, beginning with the one after it."""
+    number = len(rows)
+    return rows[(index + 1 + jnp.arange(number - 1)) % number]

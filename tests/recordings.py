@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from jaxsense.config import PRESETS
-from jaxsense.mission import Recording
 from jaxsense.mission.state import DRIVING, ENDED, FACING, Record
+from jaxsense.run.missions import Recording
 from jaxsense.types import Belief
 
 CONFIG = PRESETS["smoke"]

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from jaxsense import train
-from jaxsense.rundir import RunDirectory
+from jaxsense.run.rundir import RunDirectory
 
 SMOKE = ("--preset", "smoke", "--seed", "5", "--quiet")
 

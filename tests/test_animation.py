@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recordings import CLASS_BELIEFS, CONFIG, recording
 
-from jaxsense import animation
+from jaxsense.show import animation
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -1,8 +1,7 @@
 """Programs that compile in the background, and those that are kept."""
 
-import hashlib
+import dataclasses
 import os
-import pickle
 import stat
 import subprocess
 import sys
@@ -14,8 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.compilation import Compiler, Kept, Program
-from jaxsense.monitor import Monitor
+from jaxsense.config import PRESETS
+from jaxsense.run import compilation, files
+from jaxsense.run.compilation import Compiler, Kept, Program
+from jaxsense.run.monitor import Monitor
+from jaxsense.types import Belief
+from jaxsense.vae.detectors import Detector
 
 
 def test_compiling_and_running_are_timed_apart_and_reported():
@@ -67,10 +70,7 @@ def call(kept, function, *args):
     with Compiler(Monitor(), kept) as compiler:
         program = Program(compiler, "stage", "run")
         program.compile(function, *args)
-        result = program(*args)
-    while kept is not None and not list(kept.path.glob("*.pickle")):
-        time.sleep(0.01)
-    return result
+        return program(*args)
 
 
 def never(*_):
@@ -78,18 +78,25 @@ def never(*_):
 
 
 def test_a_program_that_was_kept_is_not_traced_again(tmp_path):
-    key, pair = jax.random.key(0), {"a": jnp.arange(3.0), "b": jnp.float32(2)}
+    key, pair = jax.random.key(0), {"a": jnp.arange(3.0), "b": 2.0}
 
     def function(key, pair):
-        return jax.random.normal(key, 3) + pair["a"] * pair["b"], key
+        return Belief(jax.random.normal(key, 3) + pair["a"] * pair["b"], pair["a"]), key
 
     first, first_key = call(Kept(tmp_path, "settings"), function, key, pair)
     again, again_key = call(Kept(tmp_path, "settings"), never, key, pair)
-    np.testing.assert_array_equal(first, again)
+    assert isinstance(again, Belief)
+    np.testing.assert_array_equal(first.mean, again.mean)
     assert first_key == again_key
     other = jax.tree.map(lambda x: x + 1, pair)
     values, _ = call(Kept(tmp_path, "settings"), never, key, other)
-    np.testing.assert_array_equal(values, function(key, other)[0])
+    np.testing.assert_array_equal(values.mean, function(key, other)[0].mean)
+
+
+def test_what_is_no_array_is_kept_as_well(tmp_path):
+    detector = Detector({"w": jnp.ones(2)}, jnp.zeros(3), jnp.float32(1), (4, 5), 2)
+    call(Kept(tmp_path), lambda x: x, detector)
+    assert call(Kept(tmp_path), never, detector).hidden == (4, 5)
 
 
 def test_other_settings_shapes_and_names_are_other_programs(tmp_path):
@@ -97,20 +104,32 @@ def test_other_settings_shapes_and_names_are_other_programs(tmp_path):
     assert call(kept, lambda x: x + 1, jnp.float32(1)) == 2
     assert call(Kept(tmp_path, "settings", 2), lambda x: x + 2, jnp.float32(1)) == 3
     for args in (jnp.ones(1),), (jnp.int32(1),), (jnp.float32(1), jnp.float32(1)):
-        assert kept.find("stage-run-1", args) is None
-    assert kept.find("stage-other-1", (jnp.float32(1),)) is None
-    assert kept.find("stage-run-1", (jnp.float32(1),)) is not None
+        assert kept.find("stage-run", args) is None
+    assert kept.find("stage-other", (jnp.float32(1),)) is None
+    assert kept.find("stage-run", (jnp.float32(1),)) is not None
+
+
+def test_the_numbers_of_settings_are_no_other_program(tmp_path):
+    config = PRESETS["smoke"]
+    settings = dataclasses.replace(config.jmvae, alpha=3.0)
+
+    def alpha(config):
+        return 2 * config.jmvae.alpha
+
+    assert call(Kept(tmp_path), alpha, config) == pytest.approx(2 * config.jmvae.alpha)
+    assert call(Kept(tmp_path), never, dataclasses.replace(config, jmvae=settings)) == 6
+    sizes = dataclasses.replace(config.jmvae, latent_size=3)
+    with pytest.raises(AssertionError, match="traced"):
+        call(Kept(tmp_path), never, dataclasses.replace(config, jmvae=sizes))
 
 
 @pytest.mark.parametrize("damage", [b"", b"no program", None])
-def test_a_damaged_file_is_compiled_anew(tmp_path, damage):
+def test_a_damaged_file_is_traced_anew(tmp_path, damage):
     kept = Kept(tmp_path)
     assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
-    (file,) = kept.path.glob("*.pickle")
+    (file,) = kept.path.glob("*.stablehlo")
     file.write_bytes(file.read_bytes()[:-100] if damage is None else damage)
     assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
-    while kept.find("stage-run-1", (jnp.float32(3),)) is None:
-        time.sleep(0.01)
     assert call(kept, never, jnp.float32(3)) == 6
 
 
@@ -121,50 +140,61 @@ def test_a_file_that_others_may_have_written_is_compiled_anew(tmp_path):
         call(kept, lambda x: 2 * x, jnp.float32(3))
     finally:
         os.umask(mask)
-    (file,) = kept.path.glob("*.pickle")
+    (file,) = kept.path.glob("*.stablehlo")
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     for mode, is_found in ((0o644, True), (0o664, False), (0o646, False)):
         file.chmod(mode)
-        assert (kept.find("stage-run-1", (jnp.float32(3),)) is not None) == is_found
+        assert (kept.find("stage-run", (jnp.float32(3),)) is not None) == is_found
 
 
 def test_a_single_wrong_bit_is_compiled_anew(tmp_path):
     kept = Kept(tmp_path)
     call(kept, lambda x: 2 * x, jnp.float32(3))
-    (file,) = kept.path.glob("*.pickle")
+    (file,) = kept.path.glob("*.stablehlo")
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
     assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
 
 
-def test_what_jax_cannot_load_is_compiled_anew(tmp_path):
+def test_what_jax_cannot_write_is_traced_every_time(tmp_path):
     kept = Kept(tmp_path)
-    call(kept, lambda x: 2 * x, jnp.float32(3))
-    (file,) = kept.path.glob("*.pickle")
-    results, number, (payload, *trees) = pickle.loads(file.read_bytes()[32:])
-    content = pickle.dumps((results, number, (payload[:100], *trees)))
-    file.write_bytes(hashlib.sha256(content).digest() + content)
-    assert kept.find("stage-run-1", (jnp.float32(3),)) is not None
-    assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
+
+    def function(x):
+        return jax.pure_callback(lambda x: 2 * x, x, x)
+
+    for _ in range(2):
+        assert call(kept, function, jnp.float32(3)) == 6
+    assert not list(kept.path.glob("*.stablehlo"))
+
+
+def test_a_full_disk_ends_nothing(tmp_path, monkeypatch):
+    def full(*args, **options):
+        raise files.WriteError(28, "No space left on device")
+
+    monkeypatch.setattr(files, "write", full)
+    assert call(Kept(tmp_path), lambda x: 2 * x, jnp.float32(3)) == 6
 
 
 def test_options_of_jax_are_other_settings(tmp_path):
-    before = Kept(tmp_path).path
+    def is_there():
+        return Kept(tmp_path).find("stage-run", (jnp.float32(3),)) is not None
+
+    call(Kept(tmp_path), lambda x: 2 * x, jnp.float32(3))
     jax.config.update("jax_threefry_partitionable", False)
     try:
-        assert Kept(tmp_path).path != before
+        assert not is_there()
     finally:
         jax.config.update("jax_threefry_partitionable", True)
-    assert Kept(tmp_path).path == before
+    assert is_there()
 
 
 def test_a_kept_program_finds_the_functions_that_it_calls(tmp_path):
     # Only a new process has not bound them yet.
     code = """if True:
         import sys, jax, jax.numpy as jnp
-        from jaxsense.compilation import Compiler, Kept, Program
-        from jaxsense.monitor import Monitor
+        from jaxsense.run.compilation import Compiler, Kept, Program
+        from jaxsense.run.monitor import Monitor
         from pathlib import Path
         kept = Kept(Path(sys.argv[1]))
         print("kept" if list(kept.path.iterdir()) else "new")
@@ -185,72 +215,62 @@ def test_a_kept_program_finds_the_functions_that_it_calls(tmp_path):
     assert outputs == ["new\n[[2.0, 0.0], [1.0, 2.0]]\n", "kept\n[[2.0, 0.0], [1.0, 2.0]]\n"]
 
 
-def test_programs_of_the_oldest_settings_are_forgotten(tmp_path):
-    first = Kept(tmp_path, 0)
-    call(first, lambda x: 2 * x, jnp.float32(3))
-    os.utime(first.path, (1, 1))
-    second = Kept(tmp_path, 1)
-    for settings in range(2, 9):
-        Kept(tmp_path, settings)
-    assert not first.path.exists()
-    assert second.path.exists()
-    assert len(list(second.path.parent.iterdir())) == 8
-
-
-def test_nothing_of_the_user_is_ever_removed(tmp_path):
-    theirs = ["programs/mine/a.py", "executables/mine/a.py", f"executables/{32 * 'a'}/a.py"]
-    for name in theirs:
-        (tmp_path / name).parent.mkdir(parents=True)
-        (tmp_path / name).write_text("precious", encoding="utf-8")
-        os.utime((tmp_path / name).parent, (1, 1))
-    (tmp_path / "executables").chmod(0o700)
-    (tmp_path / "executables" / (32 * "b")).symlink_to(tmp_path / "programs" / "mine")
-    (tmp_path / "executables" / (32 * "c")).write_text("precious", encoding="utf-8")
-    program = tmp_path / "programs" / "mine" / f"stage-{16 * '0'}.pickle"
-    program.write_text("precious", encoding="utf-8")
-    theirs += [str(program), f"executables/{32 * 'c'}"]
-    for settings in range(10):
-        Kept(tmp_path, settings)
-    assert all((tmp_path / name).read_text(encoding="utf-8") == "precious" for name in theirs)
-
-
-def test_programs_lie_in_a_directory_of_the_user_alone(tmp_path, monkeypatch):
+def test_the_oldest_programs_are_forgotten(tmp_path, monkeypatch):
     kept = Kept(tmp_path)
-    for path in (kept.path, kept.path.parent):
-        assert stat.S_IMODE(path.stat().st_mode) == 0o700
-    kept.path.parent.chmod(0o770)
-    with pytest.raises(PermissionError, match="must be a directory of yours alone, with mode 0700"):
-        Kept(tmp_path)
-    kept.path.parent.chmod(0o700)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "getuid", lambda: os.geteuid() + 1)
-        with pytest.raises(PermissionError, match="must be a directory of yours alone"):
+    for size in range(4):
+        call(kept, lambda x: 2 * x, jnp.ones(size))
+    paths = [kept._file("stage-run", (jnp.ones(size),)) for size in range(4)]
+    for age, path in enumerate(paths):
+        os.utime(path, (age, age))
+    assert kept.find("stage-run", (jnp.ones(0),)) is not None  # used just now
+    monkeypatch.setattr(compilation, "_MOST_KEPT", 2)
+    Kept(tmp_path)
+    assert [path.exists() for path in paths] == [True, False, False, True]
+
+
+def test_nothing_of_the_user_is_ever_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(compilation, "_MOST_KEPT", 0)
+    kept = Kept(tmp_path)
+    name = f"stage-run-{32 * '0'}.stablehlo"
+    theirs = [tmp_path / "mine" / name, kept.path / "mine" / name, kept.path / f"{name}.txt"]
+    for path in theirs:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("precious", encoding="utf-8")
+    (kept.path / f"stage-run-{32 * '1'}.stablehlo").symlink_to(theirs[0])
+    (kept.path / f"stage-run-{32 * '2'}.stablehlo").mkdir()
+    Kept(tmp_path)
+    assert all(path.read_text(encoding="utf-8") == "precious" for path in theirs)
+    assert len(list(kept.path.iterdir())) == 4
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no modes of files")
+def test_a_directory_that_others_may_write_is_refused(tmp_path):
+    Kept(tmp_path)
+    for name in ("traced", "compiled"):
+        (tmp_path / name).chmod(0o770)
+        with pytest.raises(PermissionError, match=f"{name} must be a directory of yours alone"):
             Kept(tmp_path)
-    (tmp_path / "link").mkdir()
-    (tmp_path / "link" / "executables").symlink_to(kept.path.parent)
-    with pytest.raises(PermissionError, match="must be a directory of yours alone"):
-        Kept(tmp_path / "link")
+        (tmp_path / name).chmod(0o700)
 
 
-def test_without_room_nothing_is_kept_and_nothing_fails(tmp_path):
-    kept = Kept(tmp_path)
-    kept.path.rmdir()
-    kept.path.write_text("in the way")
-    with Compiler(Monitor(), kept) as compiler:
-        program = Program(compiler, "stage", "run")
-        program.compile(lambda x: 2 * x, jnp.float32(3))
-        assert program(jnp.float32(3)) == 6
-    assert kept.path.read_text() == "in the way"
-
-
-def test_nothing_is_kept_beside_a_cache_of_jax(tmp_path):
-    compiled = jax.jit(lambda x: 2 * x).lower(1.0).compile()
-    kept = Kept(tmp_path)
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "jax"))
-    try:
-        kept.save("stage-run", (1.0,), None, compiled)
-    finally:
-        jax.config.update("jax_compilation_cache_dir", None)
-    assert not list(kept.path.iterdir())
-    kept.save("stage-run", (1.0,), None, compiled)
-    assert list(kept.path.iterdir())
+def test_jax_keeps_what_it_compiles_beside_it(tmp_path):
+    # Only a new process has not been told where.
+    code = """if True:
+        import sys, jax, jax.numpy as jnp
+        from pathlib import Path
+        from jaxsense.run.compilation import Kept
+        Kept(Path(sys.argv[1]))
+        jax.jit(lambda x: 2 * x)(jnp.arange(3))
+        print(len(list(Path(sys.argv[1], "compiled").glob("*-cache"))) > 0)
+    """
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    for elsewhere, expected in ((None, "True"), (str(tmp_path / "theirs"), "False")):
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        if elsewhere is not None:
+            environment["JAX_COMPILATION_CACHE_DIR"] = elsewhere
+        own = tmp_path / expected
+        told = subprocess.run(
+            [sys.executable, "-c", code, str(own)],
+            check=True, capture_output=True, text=True, env=environment,
+        )  # fmt: skip
+        assert told.stdout == f"{expected}\n"

@@ -6,7 +6,7 @@ import re
 import pytest
 import rich.console
 
-from jaxsense.display import Display
+from jaxsense.show.terminal import Display
 
 
 def show(display):

@@ -1,6 +1,5 @@
 """The examples, as a user runs them; small, for most of their time is spent compiling."""
 
-import dataclasses
 import importlib.util
 import json
 import sys
@@ -11,10 +10,10 @@ import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import evaluate, examine, sim, train
+from jaxsense import evaluate, sim, stages, train
 from jaxsense.config import PRESETS
-from jaxsense.learning import learn_perception
-from jaxsense.rundir import RunDirectory, Settings
+from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.stages import learn
 
 SMALL = ("--preset", "smoke", "--mission.episodes", "1")
 THERMAL = (
@@ -40,23 +39,17 @@ def learned():
         config = train.parse([*SMALL, *THERMAL], change).config
         world = sim.make_world(config)
 
-    def learn(key):
-        found = learn_perception(key, config, world)
-        return found, *examine.latent_space(found.params, found.held_out, config)
-
-    return config, *jax.jit(learn)(jax.random.key(0))
+    perceive = jax.jit(lambda key: learn(key, config, world, until="class_beliefs").outputs)
+    return config, perceive(jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
 def runs(learned, tmp_path_factory):
     """A directory with a run `thermal`, whose Q-networks are not trained."""
-    config, found, posteriors, _ = learned
-    models = dataclasses.replace(
-        jaxsense.untrained(jax.random.key(0), config),
-        detectors=found.trained,
-        jmvae=found.params,
-        class_beliefs=jax.tree.map(lambda x: x.mean(axis=1), posteriors["joint"]),
-    )
+    config, outputs = learned
+    untrained = jaxsense.untrained(jax.random.key(0), config)
+    q_networks = zip(config.modalities, untrained.q_networks, strict=True)
+    models = stages.models(outputs | {f"dqn_{name}": q for name, q in q_networks}, config)
     path = tmp_path_factory.mktemp("runs")
     with RunDirectory.create(path / "thermal", Settings("smoke", 0, config)) as created:
         created.save_models(models)
@@ -89,8 +82,9 @@ def test_new_modality(example, tmp_path):
 
 
 def test_the_thermal_camera_tells_what_is_hot(learned):
-    _, found, _, latent = learned
-    assert found.accuracy[1] >= 0.95
+    _, outputs = learned
+    assert outputs["detections"].accuracy[1] >= 0.95
+    _, latent = outputs["latent_space"]
     # Only what is hot is told by the thermal camera alone.
     thermal = np.asarray(latent["sigma_norm"]["thermal"])
     assert thermal[3] < 0.7 * min(thermal[:3])

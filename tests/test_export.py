@@ -15,19 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-pytest.importorskip("flatbuffers", reason="needs the extra jaxsense[export]")
-
 from jaxsense import export
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
 from jaxsense.dqn import as_state
+from jaxsense.interfaces.onboard import functions
 from jaxsense.models import jmvae_shape, untrained
 from jaxsense.networks import MLP
-from jaxsense.onboard import functions
-from jaxsense.rundir import RunDirectory, Settings
+from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
 from jaxsense.vae import detectors, fusion, jmvae, metrics
-from jaxsense.version import __version__
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "run_exported.py"
 CONFIG = dataclasses.replace(
@@ -229,15 +227,6 @@ def test_a_file_that_appears_meanwhile_is_not_replaced(run, tmp_path, monkeypatc
     with pytest.raises(KeyboardInterrupt):
         export.main([str(run), "--out", str(path)])
     assert not path.exists()
-
-
-def test_missing_flatbuffers_is_told(run, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "flatbuffers", None)
-    with pytest.raises(SystemExit) as stop:
-        export.main([str(run), "--out", str(tmp_path / "x.zip")])
-    assert stop.value.code == 2
-    message = "flatbuffers is not installed: pip install 'jaxsense[export]'"
-    assert message in capsys.readouterr().err
 
 
 def test_a_package_that_is_not_installed_can_export(models, monkeypatch):

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import files
-from jaxsense.checkpoints import Checkpoints, Unfinished
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.rundir import RunDirectory, Settings
-from jaxsense.training import FitState
+from jaxsense.run import files
+from jaxsense.run.checkpoints import Checkpoints, Unfinished
+from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.vae.minibatch import FitState
 
 TREE = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": (np.int32(4), np.array([True]))}
 SHAPES = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, TREE))
@@ -99,7 +99,7 @@ import sys, tempfile
 from pathlib import Path
 sys.modules["fcntl"] = None
 import jaxsense.train, jaxsense.evaluate
-from jaxsense import files
+from jaxsense.run import files
 with tempfile.TemporaryDirectory() as folder, files.locked(Path(folder), waits=False):
     try:
         with files.locked(Path(folder), waits=False):

@@ -6,11 +6,11 @@ import sys
 
 import pytest
 
-from jaxsense.interrupt import on_interrupt
+from jaxsense.run.interrupt import on_interrupt
 
 PROGRAM = """
 import signal, sys
-from jaxsense.interrupt import on_interrupt
+from jaxsense.run.interrupt import on_interrupt
 first, second = map(int, sys.argv[1:])
 signal.signal(signal.SIGINT, signal.default_int_handler)
 with on_interrupt(lambda: print("stopping", flush=True)):

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.monitor import Monitor, StageError
+from jaxsense.run.monitor import Monitor, StageError
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

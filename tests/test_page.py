@@ -12,8 +12,8 @@ import pytest
 from matplotlib.figure import Figure
 from recordings import CLASS_BELIEFS, CONFIG, recording
 
-from jaxsense import animation, page
 from jaxsense.config import ConfigError
+from jaxsense.show import animation, page
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None)

@@ -1,6 +1,7 @@
 """The command lines, run as a user runs them: in-process, with the smoke preset."""
 
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -18,11 +19,11 @@ import pytest
 from smoke import SMOKE, error_line
 
 import jaxsense
-from jaxsense import devices, evaluate, files, mission, train
-from jaxsense.compilation import Compiler, Kept, Program
+from jaxsense import cli, evaluate, mission, train
 from jaxsense.config import PRESETS, Config
-from jaxsense.monitor import Monitor
-from jaxsense.sim import sensors
+from jaxsense.run import devices, files, missions
+from jaxsense.run.compilation import Compiler, Program
+from jaxsense.run.monitor import Monitor
 
 MISSION_KEYS = {
     "accuracy", "observations_per_poi", "time_s", "collisions", "goals_reached_fraction",
@@ -38,7 +39,7 @@ def test_run_directory_holds_everything(smoke_run):
     for plot in plots:
         assert (smoke_run / plot).read_bytes()[:4] == b"\x89PNG"
     stages = {json.loads(line)["stage"] for line in (smoke_run / "metrics.jsonl").open()}
-    assert {"detector_camera", "detector_lidar", "jmvae", "dqn_camera", "dqn_lidar"} <= stages
+    assert {"detector_camera", "detector_lidar", "jmvae_1", "dqn_camera", "dqn_lidar"} <= stages
 
 
 def test_summary_keeps_its_contract(smoke_run):
@@ -110,17 +111,17 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
 
     def poisoned(self, *args):
         output = run(self, *args)
-        if (self._stage, self._name) != ("jmvae", "train"):
+        if (self._stage, self._name) != ("jmvae", "advance"):
             return output
-        state, losses = output
-        return state, losses.at[4].set(jnp.nan)
+        state, progress = output
+        return state, dataclasses.replace(progress, loss=progress.loss.at[4].set(jnp.nan))
 
     monkeypatch.setattr(Program, "__call__", poisoned)
     out = tmp_path / "broken"
     line = error_line([*SMOKE, *cache, "--out", str(out)], capsys)
-    assert "jmvae: loss = nan at step 5 of 300" in line
+    assert "jmvae_1: loss = nan at step 5 of 300" in line
     assert str(out) in line
-    assert (out / "checkpoints" / "detectors.msgpack").exists()
+    assert (out / "checkpoints" / "detector_camera.msgpack").exists()
     assert (out / "config.json").exists()
     assert not (out / "summary.json").exists()
 
@@ -220,16 +221,16 @@ def test_evaluate_writes_the_mission_block_of_the_summary_and_no_other(evaluated
 def test_an_evaluation_keeps_what_another_one_has_written_meanwhile(
     evaluated, tmp_path, cache, monkeypatch
 ):
-    path, summary, is_first = tmp_path / "run", mission.summary, [True]
+    path, play, is_first = tmp_path / "run", missions.Player.play, [True]
     shutil.copytree(evaluated[0], path)
     begin = ["--episodes", "9", *cache]  # a batch whose programs are there
 
     def meanwhile(*args):
         if is_first.pop() if is_first else False:
             evaluate.main([str(path), "--policy", "naive", "--seed", "3", *begin])
-        return summary(*args)
+        return play(*args)
 
-    monkeypatch.setattr(mission, "summary", meanwhile)
+    monkeypatch.setattr(missions.Player, "play", meanwhile)
     evaluate.main([str(path), "--policy", "latent", "--seed", "4", *begin])
     blocks = json.loads((path / "summary.json").read_text(encoding="utf-8"))["mission"]
     assert {n: blocks[n]["seed"] for n in mission.POLICIES} == {
@@ -312,14 +313,14 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
     case = mission.cases(config)["latent"]
     # The programs with which it was evaluated.
     kept, workers = (
-        Kept(Path(cache[1]), config, sensors.fingerprints(config)),
-        devices.start(None)[0],
+        cli.keep_programs("jaxsense.evaluate", Path(cache[1]), config),
+        devices.start(None),
     )
     with Compiler(Monitor(), kept) as compiler:
-        team, batch = mission.make_mission(config), mission.batch_of(9)
-        player = mission.Player(team, compiler, batch, workers)
-        found = player.play(jax.random.key(0), models, {"latent": case}, 1)["latent"]
-    recording = player.recording
+        team, batch = mission.make_mission(config), missions.batch_of(9)
+        player = missions.Player(team, compiler, batch, workers)
+        played = player.play(jax.random.key(0), models, {"latent": case}, 1)
+    found, recording = played.metrics["latent"], played.recording
     np.testing.assert_array_equal(found["detections"][0], recording.records.detected.sum(axis=0))
     seconds = recording.end.steps * config.mission.control_period
     assert found["time_s"][0] == pytest.approx(seconds)
@@ -352,4 +353,4 @@ def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
     assert "colour = 1: is no setting" in error_line([str(tmp_path)], capsys, evaluate)
     (tmp_path / "config.json").write_text(json.dumps({"versions": versions}))
     line = error_line([str(tmp_path)], capsys, evaluate)
-    assert "must be a finished run (there is no checkpoint 'detectors')" in line
+    assert "must be a finished run (there is no checkpoint 'detector_camera')" in line

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxsense import colours, report
 from jaxsense.config import PRESETS, SHAPES, ArenaConfig, Attribute, Shape
+from jaxsense.show import colours, plots
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
 
@@ -24,7 +24,7 @@ def posteriors(outlier=None):
 
 
 def drawn(outlier=None):
-    figure = report.latent_space(CONFIG, posteriors(outlier))
+    figure = plots.latent_space(CONFIG, posteriors(outlier))
     figure.draw_without_rendering()
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     return figure.axes[0], labels
@@ -51,7 +51,7 @@ def test_outliers_are_counted_and_crossed(outlier, number):
 
 def test_a_latent_space_of_one_dimension_is_drawn():
     flat = {n: Belief(b.mean[..., :1], b.std[..., :1]) for n, b in posteriors().items()}
-    report.latent_space(CONFIG, flat).draw_without_rendering()
+    plots.latent_space(CONFIG, flat).draw_without_rendering()
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def scanlines():
         readings = np.where(is_left > np.median(is_left), 0.8, 0.4)[:, None]
         readings = np.repeat(readings, sensor.channels, axis=1).reshape(1, 1, -1)
         windows[sensor.name] = np.repeat(readings, 3, axis=0)
-    figure = report.scanlines(CONFIG, windows)
+    figure = plots.scanlines(CONFIG, windows)
     figure.draw_without_rendering()
     return np.reshape(figure.axes[:6], (2, 3))
 

@@ -13,7 +13,7 @@ from smoke import SMOKE, error_line, interrupting, without_times
 
 import jaxsense
 from jaxsense import train
-from jaxsense.rundir import RunDirectory
+from jaxsense.run.rundir import RunDirectory
 
 INTERRUPTIONS = [("detector_", 30), ("jmvae", 150), ("dqn_", 20), ("dqn_", 40)]
 
@@ -53,7 +53,7 @@ def test_a_stopped_run_goes_on_and_ends_the_same(stopped, smoke_run, cache, tmp_
     assert (path / "reward.png").read_bytes() == (smoke_run / "reward.png").read_bytes()
     assert not (path / "checkpoints" / "unfinished").exists()
     # Nothing was trained twice.
-    for stage in ("detector_camera", "detector_lidar", "jmvae", "dqn_camera", "dqn_lidar"):
+    for stage in ("detector_camera", "detector_lidar", "jmvae_1", "dqn_camera", "dqn_lidar"):
         assert steps(path, stage) == steps(smoke_run, stage), stage
     assert capsys.readouterr().out.splitlines() == [
         f"Everything is in {path}; open {path / 'report.html'} first.",
@@ -101,7 +101,7 @@ def test_a_run_goes_on_from_what_is_sound(stopped, smoke_run, cache, tmp_path, c
     assert "jmvae.msgpack': is damaged" in said
     assert "dqn_camera.msgpack': is damaged" in said
     assert without_times(path) == without_times(smoke_run)
-    assert steps(path, "jmvae")[-1] == 300  # every line can be read
+    assert steps(path, "jmvae_1")[-1] == 300  # every line can be read
 
 
 def test_a_run_goes_on_with_its_own_settings(stopped, tmp_path, capsys):

@@ -7,9 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from jaxsense import rundir
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.rundir import RunDirectory, Settings
+from jaxsense.run import rundir
+from jaxsense.run.rundir import RunDirectory, Settings
 
 SETTINGS = Settings("smoke", 3, PRESETS["smoke"])
 

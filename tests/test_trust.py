@@ -6,9 +6,10 @@ import sys
 import pytest
 
 import jaxsense
-from jaxsense import evaluate, export, rundir, train
+from jaxsense import evaluate, export, train
 from jaxsense.config import PRESETS, ConfigError, SensorConfig
-from jaxsense.rundir import RunDirectory, Settings
+from jaxsense.run import rundir
+from jaxsense.run.rundir import RunDirectory, Settings
 
 REFUSED = (
     "sensors.thermal.make = 'trap:make': names code that would be run; "

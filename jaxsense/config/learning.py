@@ -1,6 +1,5 @@
 """What is learned and how: detectors, the JMVAE, the map MDP and its Q-networks."""
 
-import dataclasses
 import math
 from typing import Literal
 
@@ -12,12 +11,13 @@ from jaxsense.config.checks import (
     require_sizes,
     require_types,
 )
+from jaxsense.config.section import Traced, section
 
-_MOST_SHARES = 32
+_MOST_BLOCKS = 32
 _MOST_WEIGHT = 1_000_000
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class DetectorConfig:
     """The scanline detectors f_x and f_w."""
 
@@ -31,17 +31,18 @@ class DetectorConfig:
     """Gradient steps."""
     batch: int = 512
     """Scans of one gradient step."""
-    learning_rate: float = 2e-3
+    learning_rate: Traced[float] = 2e-3
     """Highest learning rate of Adam; decays to zero by a cosine."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_sizes(self, "hidden")
         require_positive(self, "num_scans", "num_held_out", "steps", "batch", "learning_rate")
         require_at_most(self, learning_rate=1)
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class JmvaeConfig:
     """The joint multi-modal VAE."""
 
@@ -49,15 +50,15 @@ class JmvaeConfig:
     """Dimensions of the latent space, D_z."""
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers of every encoder and decoder."""
-    alpha: float = 0.1
+    alpha: Traced[float] = 0.1
     """Weight of the divergence from the joint posterior to each uni-modal one."""
-    beta: float = 0.001
+    beta: Traced[float] = 0.001
     """Weight of the divergence from the joint posterior to the prior."""
-    initial_beta: float = 0.7
+    initial_beta: Traced[float] = 0.7
     """Where beta starts: from far above, one latent dimension after the other comes into use."""
-    annealing: float = 0.5
+    annealing: Traced[float] = 0.5
     """Share of the training in which beta falls from initial_beta to beta."""
-    reconstruction_weights: tuple[float, ...] = (10.0, 10.0)
+    reconstruction_weights: Traced[tuple[float, ...]] = (10.0, 10.0)
     """Weight of each modality's reconstruction, in the order of `modalities`."""
     restarts: int = 3
     """Trainings from different random parameters, of which the one with the lowest loss is kept."""
@@ -67,10 +68,11 @@ class JmvaeConfig:
     """Gradient steps."""
     batch: int = 256
     """Pairs of detections in one gradient step."""
-    learning_rate: float = 2e-3
+    learning_rate: Traced[float] = 2e-3
     """Highest learning rate of Adam; decays to zero by a cosine."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_sizes(self, "hidden")
         require_positive(self, "latent_size", "samples_per_class", "steps", "batch")
@@ -88,27 +90,28 @@ class JmvaeConfig:
         )
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class MdpConfig:
     """The map of beliefs as a Markov decision process."""
 
-    unseen_variance: float = 20.0
+    unseen_variance: Traced[float] = 20.0
     """Variance of each latent dimension of a PoI that nobody has seen."""
-    min_increase: float = 0.05
+    min_increase: Traced[float] = 0.05
     """Information that a look must gain, in inverse latent units, or its reward is -1."""
-    max_steps: int = 20
+    max_steps: Traced[int] = 20
     """Actions after which an episode is cut off."""
     partly_seen_starts: bool = False
     """Leave out the starts in which every PoI has been seen by all modalities, or none by any."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_positive(self, "unseen_variance", "max_steps")
         require_not_negative(self, "min_increase")
         require_at_most(self, unseen_variance=_MOST_WEIGHT, max_steps=10_000)
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class DqnConfig:
     """The deep Q-network of each modality."""
 
@@ -127,19 +130,19 @@ class DqnConfig:
     """Transitions of one gradient step."""
     replay_capacity: int = 512000
     """Transitions that the replay holds; a multiple of num_envs."""
-    discount: float = 0.5
+    discount: Traced[float] = 0.5
     """Discount factor, gamma."""
-    learning_rate: float = 1e-3
+    learning_rate: Traced[float] = 1e-3
     """Learning rate of Adam."""
-    final_learning_rate: float = 1e-5
+    final_learning_rate: Traced[float] = 1e-5
     """Learning rate of the last epoch; the way there is a cosine."""
-    epsilon_start: float = 1.0
+    epsilon_start: Traced[float] = 1.0
     """Chance of a random action in the first epoch."""
-    epsilon_min: float = 0.01
+    epsilon_min: Traced[float] = 0.01
     """Lowest chance of a random action."""
-    epsilon_decay: float = 0.99
+    epsilon_decay: Traced[float] = 0.99
     """Factor on epsilon for each epoch."""
-    target_period: int = 50
+    target_period: Traced[int] = 50
     """Epochs between two copies of the network to the target network."""
     num_starts: int = 8192
     """Start states that are prepared; each environment has a share of them, from which its episodes
@@ -147,7 +150,8 @@ class DqnConfig:
     chunk: int = 100
     """Epochs between two reports of progress."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_sizes(self, "hidden")
         require_positive(self, "num_envs", "epochs", "updates", "batch", "replay_capacity")
@@ -183,26 +187,24 @@ class DqnConfig:
         )
 
     @property
-    def shares(self) -> int:
-        """Shares that environments and batch can be cut into, for example for several devices."""
-        return math.gcd(self.num_envs, self.batch, _MOST_SHARES)
-
-    @property
     def block(self) -> int:
         """Neighbouring environments whose transitions are drawn together, see `dqn.replay`."""
-        return math.gcd(self.num_envs, self.batch) // self.shares
+        return math.gcd(self.num_envs, self.batch) // math.gcd(
+            self.num_envs, self.batch, _MOST_BLOCKS
+        )
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class EvaluationConfig:
     """How the trained policies are examined."""
 
     num_starts: int = 512
     """Start states from which whole episodes are played."""
-    num_repeats: int = 192
+    num_repeats: Traced[int] = 192
     """Episodes from each start state, over which the noise of detections is averaged; for
     the naive and the random policy an eighth of them."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_positive(self, "num_starts", "num_repeats")

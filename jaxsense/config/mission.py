@@ -1,7 +1,5 @@
 """How robots drive, and the missions that they drive in."""
 
-import dataclasses
-
 from jaxsense.config.checks import (
     require,
     require_at_most,
@@ -10,41 +8,43 @@ from jaxsense.config.checks import (
     require_types,
 )
 from jaxsense.config.scene import ROBOT_RADIUS, TIMESTEP
+from jaxsense.config.section import Traced, section
 
 MOST_EPISODES = 100_000
 """Missions of one policy whose states fit the memory of a computer."""
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class NavigationConfig:
     """How a robot finds its way: the paper's move_base, with the AMiRo's numbers."""
 
-    horizon: float = 2.0
+    horizon: Traced[float] = 2.0
     """How far ahead a trajectory is rolled out, in seconds."""
     speed_samples: int = 6
     """Forward speeds that are tried, one of them backwards."""
     turn_samples: int = 21
     """Turn rates that are tried."""
-    robot_radius: float = 0.1
+    robot_radius: Traced[float] = 0.1
     """Radius that a robot is given in planning, in metres; it measures 0.05."""
-    inflation: float = 0.1
+    inflation: Traced[float] = 0.1
     """Distance to obstacles below which a way is held to be worse, in metres."""
-    goal_distance: float = 0.2
+    goal_distance: Traced[float] = 0.2
     """How near a viewpoint counts as reached if the PoI is in view, in metres."""
-    goal_angle: float = 6.0
+    goal_angle: Traced[float] = 6.0
     """Largest angle to the PoI at which a robot scans it, in degrees."""
-    view_distances: tuple[float, ...] = (0.5, 0.9)
+    view_distances: Traced[tuple[float, ...]] = (0.5, 0.9)
     """Distances of viewpoints from a PoI's centre, in metres."""
     view_sides: int = 16
     """Directions of viewpoints around a PoI."""
-    view_range: float = 1.0
+    view_range: Traced[float] = 1.0
     """Longest distance from which a robot scans a PoI, in metres."""
-    stuck_time: float = 6.0
+    stuck_time: Traced[float] = 6.0
     """Seconds without progress after which a robot backs off and tries another viewpoint."""
-    recovery_time: float = 1.0
+    recovery_time: Traced[float] = 1.0
     """Seconds for which a robot backs off."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_positive(self, "horizon", "robot_radius", "goal_distance", "goal_angle")
         require(self.horizon >= 1.0, self, "horizon", "must be at least 1 s")
@@ -66,27 +66,28 @@ class NavigationConfig:
         )
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class MissionConfig:
     """The closed loop of all robots in one arena."""
 
     episodes: int = 128
     """Missions that are played with each policy at the end of a run."""
-    time_limit: float = 120.0
+    time_limit: Traced[float] = 120.0
     """Seconds after which a mission ends in any case."""
     control_period: float = 0.1
     """Seconds between two decisions of a robot; also between two scans."""
-    equal_values: float = 0.1
+    equal_values: Traced[float] = 0.1
     """Actions whose values differ by less than this from the best count as equally good, in inverse
     latent units; the robot takes the PoI that no other robot is heading for, and of these the
     nearest."""
-    least_confidence: float = 0.98
+    least_confidence: Traced[float] = 0.98
     """Probability that a detector must give to its answer for it to be written into the map."""
-    attempts: int = 3
+    attempts: Traced[int] = 3
     """Looks that detect nothing, or goals that are not reached, after which a robot gives a PoI
     up."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_positive(self, "episodes", "time_limit", "control_period", "attempts")
         require_at_most(self, episodes=MOST_EPISODES, time_limit=3600)

@@ -14,6 +14,7 @@ from jaxsense.config.checks import (
     require_window,
 )
 from jaxsense.config.objects import COLOURS, SHAPES, Attribute, Shape, require_words
+from jaxsense.config.section import Traced, section
 
 ROBOT_RADIUS = 0.0495
 """Radius of an AMiRo, in metres."""
@@ -28,7 +29,7 @@ MODALITIES: dict[str, str] = {"camera": "colour", "lidar": "shape"}
 """The sensors that `sim` knows, and the attribute of a PoI that each one tells apart."""
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class ArenaConfig:
     """The square arena, its points of interest (PoIs) and the classes they are drawn from."""
 
@@ -56,7 +57,8 @@ class ArenaConfig:
     attributes: dict[str, Attribute] = dataclasses.field(default_factory=dict, hash=False)
     """Attributes beside colour and shape that a sensor of one's own can tell."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_positive(self, "side", "num_pois", "poi_radius", "poi_height", "poi_gap")
         require_at_most(self, side=100, num_pois=64, poi_height=10)
@@ -155,7 +157,7 @@ class ArenaConfig:
         return [name.split(" ")[position] for name in self.classes]
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class LidarConfig:
     """The Hokuyo URG-04LX on the AMiRo."""
 
@@ -163,20 +165,21 @@ class LidarConfig:
     """Beams of one scan."""
     field_of_view: float = 240.0
     """Angle between the first and the last beam, in degrees."""
-    min_range: float = 0.08
+    min_range: Traced[float] = 0.08
     """Shortest distance that is measured, in metres."""
-    max_range: float = 5.0
+    max_range: Traced[float] = 5.0
     """Longest distance that is measured, in metres; also what a beam without a return reads."""
-    range_noise: float = 0.01
+    range_noise: Traced[float] = 0.01
     """Standard deviation of a distance, in metres."""
     window: int = 128
     """Beams around the PoI's bearing that the detector reads."""
     stride: int = 1
     """From each beam that the detector reads to the next, in beams."""
-    window_range: float = 1.5
+    window_range: Traced[float] = 1.5
     """Longest distance that the detector is shown, in metres: what is behind a PoI is cut off."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_positive(
             self, "num_beams", "field_of_view", "min_range", "max_range", "window_range"
@@ -189,7 +192,7 @@ class LidarConfig:
         require_window(self, self.num_beams)
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class CameraConfig:
     """The camera on the AMiRo, of which one line of pixels is used."""
 
@@ -197,14 +200,15 @@ class CameraConfig:
     """Pixels of the scanline."""
     field_of_view: float = 80.0
     """Horizontal field of view, in degrees."""
-    pixel_noise: float = 0.007
+    pixel_noise: Traced[float] = 0.007
     """Standard deviation of a pixel's value, where 1 is full scale."""
     window: int = 80
     """Pixels around the PoI's bearing that the detector reads."""
     stride: int = 4
     """From each pixel that the detector reads to the next, in pixels."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_positive(self, "num_pixels", "field_of_view")
         require_not_negative(self, "pixel_noise")
@@ -213,22 +217,23 @@ class CameraConfig:
         require_window(self, self.num_pixels)
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class ViewpointConfig:
     """Where a robot stands when it looks at a PoI."""
 
-    min_distance: float = 0.3
+    min_distance: Traced[float] = 0.3
     """Shortest distance from the sensor to the PoI's centre, in metres."""
-    max_distance: float = 1.2
+    max_distance: Traced[float] = 1.2
     """Longest distance from the sensor to the PoI's centre, in metres."""
-    max_bearing: float = 20.0
+    max_bearing: Traced[float] = 20.0
     """Largest angle between the robot's heading and the PoI, to either side, in degrees."""
-    bearing_error: float = 1.0
+    bearing_error: Traced[float] = 1.0
     """Largest error of the bearing at which the detector's window is centred, in degrees."""
-    clearance: float = 0.03
+    clearance: Traced[float] = 0.03
     """Free space around the robot at a viewpoint, in metres."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         require_positive(self, "min_distance", "max_distance")
         require_not_negative(self, "max_bearing", "bearing_error", "clearance")

@@ -1,7 +1,6 @@
 """All sections together, and what must hold between them."""
 
 # The defaults are frozen, which ruff does not see in another file.
-# ruff: noqa: RUF009
 
 import dataclasses
 import itertools
@@ -27,15 +26,16 @@ from jaxsense.config.scene import (
     SensorConfig,
     ViewpointConfig,
 )
+from jaxsense.config.section import section
 
 _MOST_NUMBERS = 2**32
 """Numbers of 32 bits in an array or a network, 16 GiB."""
 _MOST_MODALITIES = 8  # the JMVAE has an encoder for each set of them
-_PLANNED_AT_ONCE = 384  # missions side by side, see `mission.batch_of`
+_PLANNED_AT_ONCE = 384  # missions side by side, see `run.missions`
 _NODES_PER_POI = 10  # of the roadmap
 
 
-@dataclasses.dataclass(frozen=True)
+@section
 class Config:
     """All settings of a run but its seed."""
 
@@ -55,7 +55,8 @@ class Config:
     navigation: NavigationConfig = NavigationConfig()
     mission: MissionConfig = MissionConfig()
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises `ConfigError` for a field that cannot be used."""
         require_types(self)
         self._check_modalities()
         self._check_classes()

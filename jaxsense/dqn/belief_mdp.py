@@ -13,12 +13,9 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
 
-from jaxsense import values
-from jaxsense.config import MdpConfig
-from jaxsense.indexing import Index, call
-from jaxsense.types import Belief, Key
+from jaxsense.config import MdpConfig, values
+from jaxsense.types import Belief, Index, Key, call, pytree
 
 Scene = Any
 """A pytree that `observe` looks at; the MDP only carries it."""
@@ -49,7 +46,7 @@ class MapMdp:
     write: Callable[[Belief, jax.Array, jax.Array, int], Belief]
 
 
-@struct.dataclass
+@pytree
 class MapState:
     """The map, and what it is a map of.
 
@@ -68,7 +65,7 @@ class MapState:
     steps: jax.Array
 
 
-@struct.dataclass
+@pytree
 class Outcome:
     """What an action led to.
 

@@ -7,12 +7,11 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense import values
+from jaxsense.config import values
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
-from jaxsense.indexing import Index
 from jaxsense.networks import MLP, Params
-from jaxsense.types import Key
+from jaxsense.types import Index, Key
 
 Policy = Callable[[Key, MapState], jax.Array]
 

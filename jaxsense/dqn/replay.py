@@ -1,19 +1,17 @@
 """A replay memory as pure functions: a ring of rounds, with one transition of each environment.
 
 Transitions are columns of numbers, and what is drawn is drawn in blocks of neighbouring
-environments. So a memory can be split over devices, with what a device draws lying on that device;
-and drawing copies a few pieces of memory, which is many times as fast as picking single numbers.
+environments: that copies a few pieces of memory, many times as fast as picking single numbers.
 """
 
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
 
-from jaxsense.types import Transition
+from jaxsense.types import Transition, pytree
 
 
-@struct.dataclass
+@pytree
 class Replay:
     """The memory.
 

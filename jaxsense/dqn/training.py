@@ -1,34 +1,27 @@
 """Deep Q-learning over many environments at once (Mnih et al. 2015), as pure functions.
 
-Environments may be split over devices: each device steps its own, remembers what they saw and draws
-from that; gradients are averaged over the devices. All random numbers are drawn for a whole chunk
-of epochs at once and for all environments, so that the number of devices changes nothing but
-rounding.
+All random numbers are drawn for a whole chunk of epochs at once: in the loop they would cost more
+than all the rest.
 """
 
 import functools
 import math
-from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
-from jax.sharding import Mesh, PartitionSpec
 
 from jaxsense import networks
 from jaxsense.config import DqnConfig
-from jaxsense.devices import AXIS
 from jaxsense.dqn import belief_mdp, losses, replay
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.policies import q_network
-from jaxsense.indexing import Index
 from jaxsense.networks import Params, apply_to_columns
-from jaxsense.types import Key, Transition
+from jaxsense.types import Index, Key, Transition, pytree
 
 
-@struct.dataclass
+@pytree
 class DqnState:
     """Everything that training carries from one chunk of epochs to the next.
 
@@ -53,7 +46,7 @@ class DqnState:
     epoch: jax.Array
 
 
-@struct.dataclass
+@pytree
 class EpochInfo:
     """What happened in one epoch.
 
@@ -72,7 +65,7 @@ class EpochInfo:
     is_finite: jax.Array
 
 
-@struct.dataclass
+@pytree
 class _Draws:
     """The random numbers of one epoch: uniform in [0, 1), but for the keys.
 
@@ -126,9 +119,7 @@ def starts(key: Key, mdp: MapMdp, number: int) -> MapState:
     return jax.vmap(lambda key: belief_mdp.reset(key, mdp))(keys)
 
 
-def train(
-    key: Key, mdp: MapMdp, modality: Index, config: DqnConfig, mesh: Mesh | None = None
-) -> tuple[DqnState, EpochInfo]:
+def train(key: Key, mdp: MapMdp, modality: Index, config: DqnConfig) -> tuple[DqnState, EpochInfo]:
     """A whole training; `vmap` over `key` for several seeds, over `modality` for several agents.
 
     Args:
@@ -136,7 +127,6 @@ def train(
       mdp: the MDP.
       modality: index of the agent's own sensor, see `belief_mdp.step`.
       config: the settings.
-      mesh: devices that the environments are split over, see `train_chunk`.
 
     Returns:
       The last state and the `[epochs]` infos.
@@ -146,7 +136,7 @@ def train(
     state = init(init_key, mdp, config, prepared)
     keys = jax.random.split(chunk_key, config.epochs // config.chunk)
     state, infos = jax.lax.scan(
-        lambda state, key: train_chunk(key, mdp, modality, config, state, prepared, mesh),
+        lambda state, key: train_chunk(key, mdp, modality, config, state, prepared),
         state,
         keys,
     )
@@ -160,7 +150,6 @@ def train_chunk(
     config: DqnConfig,
     state: DqnState,
     prepared: MapState,
-    mesh: Mesh | None = None,
 ) -> tuple[DqnState, EpochInfo]:
     """`config.chunk` epochs.
 
@@ -172,8 +161,6 @@ def train_chunk(
       state: the present state.
       prepared: `[num_starts]` from `starts`. Each environment has a share of them, and every
         episode starts from a random one of the share.
-      mesh: devices that the environments are split over; their number must divide `num_envs` and
-        `batch`. On one device if not given.
 
     Returns:
       The next state and the `[chunk]` infos.
@@ -181,41 +168,8 @@ def train_chunk(
     chex.assert_axis_dimension(prepared.steps, 0, config.num_starts, custom_message="prepared")
     shares = jax.tree.map(lambda x: x.reshape(config.num_envs, -1, *x.shape[1:]), prepared)
     draws = _draw(key, mdp, config)
-    if mesh is None:
-        epoch = functools.partial(_epoch, mdp, modality, config, None)
-        return jax.lax.scan(lambda state, draws: epoch(shares, state, draws), state, draws)
-
-    one, split = PartitionSpec(), PartitionSpec(AXIS)
-    later, batch = PartitionSpec(None, AXIS), PartitionSpec(None, None, AXIS)
-    draws_specs = _Draws(later, later, later, later, batch)  # pyright: ignore[reportArgumentType]
-
-    def chunk(modality, shares: MapState, state: DqnState, draws: _Draws):
-        epoch = functools.partial(_epoch, mdp, modality, config, AXIS)
-        return jax.lax.scan(lambda state, draws: epoch(shares, state, draws), state, draws)
-
-    return jax.shard_map(
-        chunk,
-        mesh=mesh,
-        in_specs=(one, split, state_specs(), draws_specs),
-        out_specs=(state_specs(), one),
-        check_vma=False,
-    )(jnp.asarray(modality), shares, state, draws)
-
-
-def state_specs() -> DqnState:
-    """Which parts of a `DqnState` are split over devices, as a prefix of its tree."""
-    one, split = PartitionSpec(), PartitionSpec(AXIS)
-    specs: Any = {
-        "params": one,
-        "target": one,
-        "optimiser": one,
-        "replay": replay.Replay(PartitionSpec(None, AXIS), one),  # pyright: ignore
-        "envs": split,
-        "needs_start": split,
-        "total_reward": split,
-        "epoch": one,
-    }
-    return DqnState(**specs)
+    epoch = functools.partial(_epoch, mdp, modality, config, shares)
+    return jax.lax.scan(epoch, state, draws)
 
 
 def _draw(key: Key, mdp: MapMdp, config: DqnConfig) -> _Draws:
@@ -236,12 +190,11 @@ def _epoch(
     mdp: MapMdp,
     modality: Index,
     config: DqnConfig,
-    axis: str | None,
     shares: MapState,
     state: DqnState,
     draws: _Draws,
 ) -> tuple[DqnState, EpochInfo]:
-    """One step of each environment of a device and `config.updates` gradient steps."""
+    """One step of each environment and `config.updates` gradient steps."""
     epsilon = jnp.maximum(
         config.epsilon_min, config.epsilon_start * config.epsilon_decay**state.epoch
     )
@@ -262,22 +215,20 @@ def _epoch(
 
     has_ended = outcome.is_over | outcome.is_cut
     total_reward = state.total_reward + outcome.reward
-    ended = jnp.sum(has_ended), jnp.sum(jnp.where(has_ended, total_reward, 0.0))
-    episodes, ended_reward = ended if axis is None else jax.lax.psum(ended, axis)
+    episodes = jnp.sum(has_ended)
+    ended_reward = jnp.sum(jnp.where(has_ended, total_reward, 0.0))
 
-    params, optimiser, loss = _learn(config, axis, state, memory, draws.replay)
+    params, optimiser, loss = _learn(config, state, memory, draws.replay)
     is_copied = (state.epoch + 1) % config.target_period == 0
     target = jax.tree.map(lambda new, old: jnp.where(is_copied, new, old), params, state.target)
-    # What one device sees may be finite where what another sees is not.
-    seen = jnp.isfinite(values).all() & jnp.isfinite(outcome.reward).all()
-    seen = seen if axis is None else jax.lax.pmin(seen.astype(jnp.int32), axis) > 0
-    learnt = [jnp.isfinite(x).all() for x in (loss, *jax.tree.leaves(params))]
+    checked = values, outcome.reward, loss, params
+    is_finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(checked)]).all()
     info = EpochInfo(
         loss=loss,
         episode_return=ended_reward / jnp.maximum(episodes, 1),
         episodes=episodes,
         epsilon=epsilon,
-        is_finite=seen & jnp.stack(learnt).all(),
+        is_finite=is_finite,
     )
     state = DqnState(
         params=params,
@@ -294,7 +245,6 @@ def _epoch(
 
 def _learn(
     config: DqnConfig,
-    axis: str | None,
     state: DqnState,
     memory: replay.Replay,
     draws: jax.Array,
@@ -312,8 +262,7 @@ def _learn(
     def update(carry, draws: jax.Array):
         params, optimiser_state = carry
         batch = replay.sample(draws, memory)
-        result = jax.value_and_grad(loss)(params, batch)
-        value, gradient = result if axis is None else jax.lax.pmean(result, axis)
+        value, gradient = jax.value_and_grad(loss)(params, batch)
         change, optimiser_state = optimiser.update(gradient, optimiser_state, params)
         return (optax.apply_updates(params, change), optimiser_state), value
 

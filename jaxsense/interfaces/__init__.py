@@ -4,6 +4,6 @@
 so that only the one that is used has to be installed.
 """
 
-from jaxsense.interfaces.episodes import prepared_starts as prepared_starts
+from jaxsense.interfaces.common import prepared_starts as prepared_starts
 from jaxsense.interfaces.mdps import detections as detections
 from jaxsense.interfaces.mdps import map_mdp as map_mdp

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense import values
+from jaxsense.config import values
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState, Outcome
-from jaxsense.extras import extra
-from jaxsense.interfaces import episodes
+from jaxsense.interfaces import common
+from jaxsense.interfaces.extras import extra
 from jaxsense.types import Key
 
 with extra("gymnasium"):
@@ -51,13 +51,13 @@ class MapVectorEnv(VectorEnv):
         Raises:
           ValueError: if there is no such sensor or mode, or no environment.
         """
-        episodes.check_modality(mdp, modality)
+        common.check_modality(mdp, modality)
         values.require_number("num_envs", num_envs)
         self.num_envs = num_envs
         self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
-        size = (episodes.observation_size(mdp),)
+        size = (common.observation_size(mdp),)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, size, np.float32)
-        self.single_action_space = spaces.Discrete(episodes.num_actions(mdp))
+        self.single_action_space = spaces.Discrete(common.num_actions(mdp))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._states: MapState | None = None
@@ -169,7 +169,7 @@ def _start(
     """Next key, observations and states, with new starts where `mask` is True or all are new."""
     next_key, key = jax.random.split(key)
     keys = jax.random.split(key, num_envs)
-    fresh = jax.vmap(lambda key: episodes.start(key, mdp, starts))(keys)
+    fresh = jax.vmap(lambda key: common.start(key, mdp, starts))(keys)
 
     def pick(new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -8,8 +8,8 @@ from flax import struct
 
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
-from jaxsense.extras import extra
-from jaxsense.interfaces import episodes
+from jaxsense.interfaces import common
+from jaxsense.interfaces.extras import extra
 from jaxsense.types import Key
 
 with extra("gymnax"):
@@ -57,7 +57,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         Raises:
           ValueError: if there is no such sensor.
         """
-        episodes.check_modality(mdp, modality)
+        common.check_modality(mdp, modality)
         self.mdp = mdp
         self.modality = modality
 
@@ -68,12 +68,12 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
 
     def prepared_params(self, key: Key, number: int) -> MapEnvParams:
         """The default with `number` prepared starts, which make training many times faster."""
-        starts = episodes.prepared_starts(key, self.mdp, number)
+        starts = common.prepared_starts(key, self.mdp, number)
         return self.default_params.replace(starts=starts)  # pyright: ignore
 
     def reset_env(self, key: Key, params: MapEnvParams) -> tuple[jax.Array, MapEnvState]:
         """A random start."""
-        start = episodes.start(key, self.mdp, params.starts)
+        start = common.start(key, self.mdp, params.starts)
         state = MapEnvState(time=start.steps, map=start, is_over=jnp.bool_(False))  # pyright: ignore
         return self.observe(key, state, None, params), state
 
@@ -110,7 +110,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     @property
     def num_actions(self) -> int:
         """A look at each PoI, and NOP."""
-        return episodes.num_actions(self.mdp)
+        return common.num_actions(self.mdp)
 
     def action_space(self, params: MapEnvParams | None = None) -> spaces.Discrete:
         """A look at each PoI, and NOP."""
@@ -120,4 +120,4 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     def observation_space(self, params: MapEnvParams | None = None) -> spaces.Box:
         """The map."""
         del params
-        return spaces.Box(-jnp.inf, jnp.inf, (episodes.observation_size(self.mdp),), jnp.float32)
+        return spaces.Box(-jnp.inf, jnp.inf, (common.observation_size(self.mdp),), jnp.float32)

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense import observe, values
-from jaxsense.config import Config
+from jaxsense import observe
+from jaxsense.config import Config, values
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.models import Models, jmvae_shape
 from jaxsense.observe import Bank

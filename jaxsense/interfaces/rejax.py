@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 
-from jaxsense.extras import extra
+from jaxsense.interfaces.extras import extra
 from jaxsense.types import Key
 
 with extra("rejax"):

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsense.extras import extra
+from jaxsense.interfaces.extras import extra
 
 with extra("sb3"):
     from gymnasium.vector import (  # pyright: ignore[reportMissingImports]

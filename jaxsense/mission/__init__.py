@@ -6,15 +6,11 @@ says NOP. Robots decide each at its own time; one whose policy reads the map dec
 map has changed under way. Everything is a pure function of one episode: `vmap` over episodes.
 """
 
-from jaxsense.mission.evaluation import Case as Case
-from jaxsense.mission.evaluation import Player as Player
-from jaxsense.mission.evaluation import Recording as Recording
-from jaxsense.mission.evaluation import batch_of as batch_of
-from jaxsense.mission.evaluation import cases as cases
-from jaxsense.mission.evaluation import summary as summary
-from jaxsense.mission.figures import REASONS as REASONS
-from jaxsense.mission.figures import figures as figures
-from jaxsense.mission.figures import reason as reason
+from jaxsense.mission.cases import Case as Case
+from jaxsense.mission.cases import cases as cases
+from jaxsense.mission.outcome import REASONS as REASONS
+from jaxsense.mission.outcome import figures as figures
+from jaxsense.mission.outcome import reason as reason
 from jaxsense.mission.rollout import play as play
 from jaxsense.mission.rollout import rollout as rollout
 from jaxsense.mission.rollout import step as step

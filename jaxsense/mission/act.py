@@ -4,9 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 
-from jaxsense.indexing import Index, call, others
 from jaxsense.mission.decide import planning_margin, sees, standing_robots
 from jaxsense.mission.state import (
     BACKING,
@@ -24,7 +22,7 @@ from jaxsense.sim import arena as arenas
 from jaxsense.sim import navigation, roadmap, sensors, viewpoints
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene
-from jaxsense.types import Belief, Key
+from jaxsense.types import Belief, Index, Key, call, others, pytree
 from jaxsense.vae import detectors, fusion
 
 _PROGRESS = 0.02  # m, by which a way must become shorter to count as progress
@@ -137,7 +135,7 @@ def _fail(
     )
 
 
-@struct.dataclass
+@pytree
 class _Aim:
     """What a robot is about to scan.
 

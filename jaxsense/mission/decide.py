@@ -5,7 +5,6 @@ import jax.numpy as jnp
 
 from jaxsense.config import ROBOT_RADIUS, Config
 from jaxsense.dqn import belief_mdp
-from jaxsense.indexing import Index, others
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
@@ -21,7 +20,7 @@ from jaxsense.mission.state import (
 from jaxsense.models import Models
 from jaxsense.networks import MLP
 from jaxsense.sim import roadmap, viewpoints
-from jaxsense.types import Belief, Key
+from jaxsense.types import Belief, Index, Key, others
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, in place of a distance: more than any that there is
 _DETOUR = 2.0  # m, that a robot would go to avoid a viewpoint on which another robot stands

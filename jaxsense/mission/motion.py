@@ -6,7 +6,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from mujoco import mjx
 
 from jaxsense.config import ArenaConfig
@@ -14,9 +13,10 @@ from jaxsense.mission.state import Mission, MissionState
 from jaxsense.sim import amiro, navigation
 from jaxsense.sim import arena as arenas
 from jaxsense.sim.arena import Arena, Layout
+from jaxsense.types import pytree
 
 
-@struct.dataclass
+@pytree
 class _Motion:
     """What the physics carries, for each of B missions.
 

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from jaxsense import values
+from jaxsense.config import values
 from jaxsense.mission import act, decide
 from jaxsense.mission.motion import move
 from jaxsense.mission.state import (

@@ -6,11 +6,9 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
 
-from jaxsense import values as checks
 from jaxsense.config import Config
-from jaxsense.indexing import Index
+from jaxsense.config import values as checks
 from jaxsense.models import jmvae_shape
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import roadmap, sensors
@@ -18,7 +16,7 @@ from jaxsense.sim import world as worlds
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.roadmap import Roadmap
 from jaxsense.sim.world import Scene, World
-from jaxsense.types import Belief, Key
+from jaxsense.types import Belief, Index, Key, pytree
 from jaxsense.vae import fusion
 
 POLICIES = ("latent", "naive", "random")
@@ -51,7 +49,7 @@ class Mission:
         return self.world.config
 
 
-@struct.dataclass
+@pytree
 class Faults:
     """When robots fail, in seconds from the start; infinite for never.
 
@@ -64,7 +62,7 @@ class Faults:
     blind_at: jax.Array
 
 
-@struct.dataclass
+@pytree
 class Robots:
     """What the robots are up to, `[R]` each unless said otherwise.
 
@@ -109,7 +107,7 @@ class Robots:
     detections: jax.Array
 
 
-@struct.dataclass
+@pytree
 class MissionState:
     """One mission at one moment.
 
@@ -148,7 +146,7 @@ class MissionState:
     is_over: jax.Array
 
 
-@struct.dataclass
+@pytree
 class Record:
     """What is kept of one control period, for plots and tests.
 
@@ -184,6 +182,11 @@ def make_mission(config: Config, *, contacts: bool = True) -> Mission:
     carries_lidar = tuple(modality == "lidar" for modality in config.modalities)
     free = arenas.build(config.arena, carries_lidar, obstacles=False)
     return Mission(worlds.make_world(config, contacts=contacts), free)
+
+
+def with_config(mission: Mission, config: Config) -> Mission:
+    """The same mission with other numbers, which may be traced; the arena stays as it is."""
+    return dataclasses.replace(mission, world=worlds.with_config(mission.world, config))
 
 
 def no_faults(config: Config) -> Faults:

@@ -16,10 +16,10 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
-from jaxsense import values as checks
 from jaxsense.config import TIMESTEP, ArenaConfig, Shape
+from jaxsense.config import values as checks
 from jaxsense.sim import amiro
-from jaxsense.types import Key
+from jaxsense.types import Key, pytree
 
 WALL_HEIGHT = 0.3  # m
 WALL_THICKNESS = 0.05  # m
@@ -27,7 +27,7 @@ _STORE = -2.0  # m, height at which the shapes that are not shown wait below the
 _WALL_COLOUR = (0.6, 0.6, 0.6)
 
 
-@struct.dataclass
+@pytree
 class Layout:
     """What stands where in one arena; all of it data, so that nothing recompiles.
 
@@ -141,8 +141,10 @@ def build(
       <actuator>{"".join(map(amiro.actuators, robots))}</actuator>
     </mujoco>"""
     )
-    model = mjx.put_model(mj_model, impl="jax")
-    return Arena(config, mj_model, model, mjx.make_data(model), len(robots))
+    # By itself MJX takes the first device of all processes.
+    device = jax.local_devices()[0]
+    model = mjx.put_model(mj_model, device=device, impl="jax")
+    return Arena(config, mj_model, model, mjx.make_data(model, device=device), len(robots))
 
 
 def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense.config import ArenaConfig, NavigationConfig
-from jaxsense.indexing import Index, others
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
+from jaxsense.types import Index, others
 
 BACKWARD_SPEED = 0.1  # m/s
 _SAMPLE_TIMES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0)  # shares of the horizon
@@ -168,7 +168,8 @@ def drive_to(
     turn = jnp.abs((turn + jnp.pi) % (2 * jnp.pi) - jnp.pi)
     # Near the waypoint its direction means nothing.
     turn *= jnp.clip(distance / 0.08 - 0.25, 0.0, 1.0)
-    cost = _INFLATION_COST * jnp.clip(1.0 - room_of_map / max(settings.inflation, 1e-6), 0.0, 1.0)
+    inflation = jnp.maximum(settings.inflation, 1e-6)
+    cost = _INFLATION_COST * jnp.clip(1.0 - room_of_map / inflation, 0.0, 1.0)
     arrival = times[None] + turn / amiro.MAX_TURN_RATE + distance / amiro.MAX_SPEED + cost
     is_safe = least >= jnp.minimum(room_now - 1e-4, -_GRAZE)
     value = jnp.min(jnp.where(is_safe, arrival, jnp.inf)[:, _MAY_LEAVE:], axis=1)
@@ -238,10 +239,11 @@ def _arcs(settings: NavigationConfig):
     turns = np.linspace(-amiro.MAX_TURN_RATE, amiro.MAX_TURN_RATE, settings.turn_samples)
     speeds = np.concatenate([[-BACKWARD_SPEED], forward])
     samples = np.stack(np.meshgrid(speeds, turns, indexing="ij"), axis=-1).reshape(-1, 2)
-    times = settings.horizon * np.array(_SAMPLE_TIMES)
+    samples = samples.astype(np.float32)
+    times = settings.horizon * jnp.array(_SAMPLE_TIMES, jnp.float32)
     v, w = samples[:, :1], samples[:, 1:]
-    heading = w * times
+    heading = w * times[None]
     # sin(h) / w and (1 - cos(h)) / w, also where w is 0.
-    x = v * times * np.sinc(heading / np.pi)
-    y = v * times * np.sin(heading / 2) * np.sinc(heading / (2 * np.pi))
-    return tuple(np.asarray(a, np.float32) for a in (samples, times, x, y, heading))
+    x = v * times[None] * jnp.sinc(heading / np.pi)
+    y = v * times[None] * jnp.sin(heading / 2) * jnp.sinc(heading / (2 * np.pi))
+    return samples, times, x, y, heading

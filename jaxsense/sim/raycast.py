@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from flax import struct
 from mujoco import mjx
 
-from jaxsense import values
+from jaxsense.config import values
 from jaxsense.sim.arena import Arena
+from jaxsense.types import pytree
 
 _VISIBLE_GROUP = 0
 
@@ -22,7 +23,7 @@ Direction = tuple[jax.Array, jax.Array]
 """x and y part, `[...]` each, of unit vectors."""
 
 
-@struct.dataclass
+@pytree
 class CrossSection:
     """The scene cut at one height: O outlines, first all circles, then all rectangles.
 
@@ -42,7 +43,7 @@ class CrossSection:
     num_circles: int = struct.field(pytree_node=False)
 
 
-@struct.dataclass
+@pytree
 class Hit:
     """What a ray met first.
 

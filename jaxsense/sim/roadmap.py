@@ -11,11 +11,11 @@ import math
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
 
 from jaxsense.config import Config
 from jaxsense.sim import amiro, viewpoints
 from jaxsense.sim.arena import Layout
+from jaxsense.types import pytree
 
 NODES_PER_POI = 10
 _LEEWAY = 0.035  # m, within which of a node the next one is still in view
@@ -23,7 +23,7 @@ _MARGIN = 0.02  # m, by which ways between nodes keep farther off than a robot m
 _SLACK = 1e-3  # m, by which a way may cut an obstacle: nodes touch their own circle
 
 
-@struct.dataclass
+@pytree
 class Roadmap:
     """Ways through one layout. K nodes, N PoIs, V viewpoints for each PoI.
 

@@ -13,10 +13,8 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from mujoco import mjx
 
-from jaxsense import values as checks
 from jaxsense.config import (
     LIDAR_HEIGHT,
     ArenaConfig,
@@ -25,9 +23,10 @@ from jaxsense.config import (
     ConfigError,
     LidarConfig,
 )
+from jaxsense.config import values as checks
 from jaxsense.sim import amiro, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
-from jaxsense.types import Key
+from jaxsense.types import Key, pytree
 
 _LEAST_CHROMA = 0.1  # difference of a pixel's channels; walls, robots and the dark have none
 _RANGE_TOLERANCE = 5.0  # standard deviations of the LiDAR's noise
@@ -36,7 +35,7 @@ _SHARE_OF_WIDTH = 0.7  # of a PoI, which is in view however wrong its bearing is
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour where a ray leaves the arena
 
 
-@struct.dataclass
+@pytree
 class Light:
     """One distant light and the light from all around.
 
@@ -143,13 +142,16 @@ def fan(num_rays: int, field_of_view: float) -> tuple[np.ndarray, Callable]:
 def lidar(config: LidarConfig) -> Sensor:
     """The laser scanner: one distance in metres for each beam, from right to left."""
     angles, centre = fan(config.num_beams, config.field_of_view)
-    tolerance = max(_RANGE_TOLERANCE * config.range_noise, _LEAST_RANGE_TOLERANCE)
 
     def read(key, hits, surfaces, light):
         del surfaces, light
         noise = config.range_noise * jax.random.normal(key, hits.distance.shape)
         measured = jnp.clip(hits.distance + noise, config.min_range, config.max_range)
         return jnp.where(hits.distance <= config.max_range, measured, config.max_range)
+
+    def shows(readings, distance, extent):
+        tolerance = jnp.maximum(_RANGE_TOLERANCE * config.range_noise, _LEAST_RANGE_TOLERANCE)
+        return jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + tolerance
 
     return Sensor(
         name="lidar",
@@ -160,9 +162,7 @@ def lidar(config: LidarConfig) -> Sensor:
         read=read,
         stride=config.stride,
         window_limit=config.window_range,
-        shows=lambda readings, distance, extent: (
-            jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + tolerance
-        ),
+        shows=shows,
         blind=config.max_range,
     )
 

@@ -6,15 +6,12 @@ import functools
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
 from mujoco import mjx
 
-from jaxsense import values
-from jaxsense.config import Config
-from jaxsense.indexing import others
+from jaxsense.config import Config, values
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors, viewpoints
-from jaxsense.types import Key
+from jaxsense.types import Key, others, pytree
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,7 +29,7 @@ class World:
     sensors: tuple[sensors.Sensor, ...]
 
 
-@struct.dataclass
+@pytree
 class Scene:
     """One arena at one moment: what its MJX state is made from.
 
@@ -52,6 +49,11 @@ def make_world(config: Config, *, contacts: bool = False) -> World:
     carries_lidar = tuple(modality == "lidar" for modality in config.modalities)
     arena = arenas.build(config.arena, carries_lidar, contacts=contacts)
     return World(config, arena, sensors.make(config))
+
+
+def with_config(world: World, config: Config) -> World:
+    """The same simulation with other numbers, which may be traced; the arena stays as it is."""
+    return dataclasses.replace(world, config=config, sensors=sensors.make(config))
 
 
 def random_scene(key: Key, world: World, classes: jax.Array) -> Scene:

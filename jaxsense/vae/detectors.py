@@ -6,14 +6,15 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxsense import networks, training
+from jaxsense import networks
 from jaxsense.config import DetectorConfig
 from jaxsense.networks import MLP, Params, apply_to_columns
-from jaxsense.training import FitState
-from jaxsense.types import Key
+from jaxsense.types import Key, pytree
+from jaxsense.vae import minibatch
+from jaxsense.vae.minibatch import FitState
 
 
-@struct.dataclass
+@pytree
 class Detector:
     """A trained detector.
 
@@ -63,7 +64,7 @@ def detect(detector: Detector, window: jax.Array) -> jax.Array:
 
 def start(detector: Detector, config: DetectorConfig) -> FitState:
     """The state before the first gradient step."""
-    return training.start(detector.params, _optimiser(config))
+    return minibatch.start(detector.params, _optimiser(config))
 
 
 def train(
@@ -99,8 +100,8 @@ def train(
         predicted = apply_to_columns(params, standard.T)
         return optax.softmax_cross_entropy_with_integer_labels(predicted, labels[rows], 0).mean()
 
-    return training.fit(state, loss, rows, _optimiser(config), config.steps)
+    return minibatch.fit(state, loss, rows, _optimiser(config), config.steps)
 
 
 def _optimiser(config: DetectorConfig) -> optax.GradientTransformation:
-    return training.adam(config.learning_rate, config.steps)
+    return minibatch.adam(config.learning_rate, config.steps)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense import values
+from jaxsense.config import values
 from jaxsense.networks import Params
 from jaxsense.types import Belief, Features
 from jaxsense.vae import jmvae

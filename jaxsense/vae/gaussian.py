@@ -4,7 +4,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense import values
+from jaxsense.config import values
 
 
 def kl_divergence(

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsense import networks, training, values
-from jaxsense.config import JmvaeConfig
+from jaxsense import networks
+from jaxsense.config import JmvaeConfig, values
 from jaxsense.networks import MLP, Params, apply_to_columns
-from jaxsense.training import FitState
 from jaxsense.types import Belief, Features, Key
-from jaxsense.vae import gaussian
+from jaxsense.vae import gaussian, minibatch
+from jaxsense.vae.minibatch import FitState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -245,7 +245,7 @@ def losses(
 
 def start(params: Params, config: JmvaeConfig) -> FitState:
     """The state before the first gradient step."""
-    return training.start(params, _optimiser(config))
+    return minibatch.start(params, _optimiser(config))
 
 
 def train(
@@ -301,7 +301,7 @@ def train(
         )
         return jnp.mean(total)
 
-    return training.fit(state, batch_loss, draw(key), _optimiser(config), config.steps)
+    return minibatch.fit(state, batch_loss, draw(key), _optimiser(config), config.steps)
 
 
 def annealed_beta(step: jax.Array, config: JmvaeConfig) -> jax.Array:
@@ -311,12 +311,11 @@ def annealed_beta(step: jax.Array, config: JmvaeConfig) -> jax.Array:
     soon as it explains enough of the features. Started low, all classes may end up on one line, a
     local optimum that leaves the other dimensions empty.
     """
-    annealing_steps = config.annealing * config.steps
-    if annealing_steps == 0:
-        return jnp.float32(config.beta)
-    remaining = jnp.maximum(1.0 - step / annealing_steps, 0.0)
+    # Without annealing the first step is beyond its end.
+    annealing_steps = jnp.maximum(config.annealing * config.steps, 1e-6)
+    remaining = jnp.where(config.annealing > 0, jnp.maximum(1.0 - step / annealing_steps, 0.0), 0.0)
     return config.beta * (config.initial_beta / config.beta) ** remaining
 
 
 def _optimiser(config: JmvaeConfig) -> optax.GradientTransformation:
-    return training.adam(config.learning_rate, config.steps)
+    return minibatch.adam(config.learning_rate, config.steps)

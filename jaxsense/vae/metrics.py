@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense import values
+from jaxsense.config import values
 from jaxsense.types import Belief
 from jaxsense.vae.gaussian import moment_match
 

@@ -8,6 +8,7 @@ import sys
 import time
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import pytest
@@ -17,16 +18,12 @@ from refusals import ANYTHING, NUMBERS, SMOKE, check_message
 
 import jaxsense
 from benchmarks import __main__ as benchmarks
-from jaxsense import (
-    ConfigError,
-    evaluate,
-    export,
-    pipeline,
-    train,
-)
-from jaxsense.files import WriteError
-from jaxsense.monitor import StageError
-from jaxsense.rundir import RunDirectory, Settings, read_settings
+from jaxsense import ConfigError, evaluate, export, train
+from jaxsense.run import pipeline
+from jaxsense.run.files import WriteError
+from jaxsense.run.monitor import StageError
+from jaxsense.run.rundir import RunDirectory, Settings, read_settings
+from jaxsense.run.together import Team
 
 SECONDS = 10.0
 
@@ -309,7 +306,8 @@ def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsy
     def fails(*_):
         raise error
 
-    monkeypatch.setattr(pipeline, "compiled", lambda *_: contextlib.nullcontext())
+    compiled = SimpleNamespace(team=Team(1))
+    monkeypatch.setattr(pipeline, "compiled", lambda *_: contextlib.nullcontext(compiled))
     monkeypatch.setattr(pipeline, "run", fails)
     argv = ["--preset", "smoke", "--quiet", "--cache", "None", "--out", str(tmp_path / "run")]
     with pytest.raises(SystemExit) as stop:

@@ -10,14 +10,8 @@ import pytest
 from refusals import INF, NAN, SMOKE
 
 import jaxsense
-from jaxsense import (
-    Belief,
-    dqn,
-    interfaces,
-    mission,
-    sim,
-    vae,
-)
+from jaxsense import Belief, dqn, interfaces, mission, sim, vae
+from jaxsense.run import missions
 
 
 class World:
@@ -257,7 +251,7 @@ FUNCTIONS = {
         lambda w: jax.eval_shape(lambda: dqn.train(w.key, w.mdp, 5, SMOKE.dqn)),
         "modality = 5",
     ),
-    "mission.batch_of": (lambda w: mission.batch_of(0), "total = 0"),
+    "missions.batch_of": (lambda w: missions.batch_of(0), "total = 0"),
     "mission.rollout": (lambda w: mission.rollout(w.key, None, None, None, 0), "steps = 0"),
     "map_mdp": (lambda w: interfaces.map_mdp(SMOKE, w.models, w.bank[:1]), "bank has 1 entries"),
     "prepared_starts": (lambda w: interfaces.prepared_starts(w.key, w.mdp, 0), "number = 0"),

@@ -10,13 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import ANYTHING, FIELDS, HUGE, INF, NAN, NUMBERS, SECTIONS, SMOKE, check_message
 
-from jaxsense import (
-    Attribute,
-    Config,
-    ConfigError,
-    SensorConfig,
-    Shape,
-)
+from jaxsense import Attribute, Config, ConfigError, SensorConfig, Shape
 from jaxsense.config import COLOURS, SHAPES, ArenaConfig, as_plain, from_plain
 
 

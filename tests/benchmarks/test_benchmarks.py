@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks import ROWS, __main__, peers
 from benchmarks.measure import Options, Side, compare, make_row
-from jaxsense import devices
+from jaxsense.run import devices
 
 QUICK = ("physics", "rays", "jmvae", "dqn_rejax")
 KEYS = {

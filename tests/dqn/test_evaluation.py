@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from toys import classes_mdp, noisy_mdp
 
-from jaxsense.dqn import belief_mdp, evaluation, policies
+from jaxsense.dqn import belief_mdp, episodes, policies
 
 MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
 
@@ -22,11 +22,11 @@ def scripted(*actions):
 
 def play(mdp, policy, seen, modality=0):
     state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.array(seen, bool))
-    return evaluation.play(KEY, mdp, policy, state, modality)
+    return episodes.play(KEY, mdp, policy, state, modality)
 
 
 def test_every_state_of_the_paper_is_there_once():
-    classes, seen = evaluation.every_state(MDP)
+    classes, seen = episodes.every_state(MDP)
     assert classes.shape == (384, 3)  # 3! x 2^6
     assert seen.shape == (384, 3, 2)
     rows = np.concatenate([classes, seen.reshape(-1, 6)], axis=1)
@@ -36,14 +36,14 @@ def test_every_state_of_the_paper_is_there_once():
 
 @pytest.mark.parametrize(("num_pois", "expected"), [(1, 3 * 4), (2, 6 * 16), (4, 4096)])
 def test_every_state_of_other_maps(num_pois, expected):
-    classes, seen = evaluation.every_state(classes_mdp(num_pois=num_pois))
+    classes, seen = episodes.every_state(classes_mdp(num_pois=num_pois))
     assert seen.shape == (expected, num_pois, 2)
     rows = np.concatenate([classes, seen.reshape(expected, -1)], axis=1)
     assert len(np.unique(rows, axis=0)) == expected
 
 
 def test_of_very_many_states_an_even_sample_is_taken():
-    classes, seen = evaluation.every_state(classes_mdp(num_pois=8))  # of 3^8 x 2^16
+    classes, seen = episodes.every_state(classes_mdp(num_pois=8))  # of 3^8 x 2^16
     assert classes.shape == (4096, 8)
     rows = np.concatenate([classes, seen.reshape(4096, -1)], axis=1)
     assert len(np.unique(rows, axis=0)) == 4096
@@ -99,7 +99,7 @@ def test_policies_draw_anew_at_every_step():
     mdp = classes_mdp(max_steps=20)
     state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.ones((3, 2), bool))
     keys = jax.random.split(KEY, 400)
-    totals, _ = jax.vmap(lambda key: evaluation.play(key, mdp, coin, state, 0))(keys)
+    totals, _ = jax.vmap(lambda key: episodes.play(key, mdp, coin, state, 0))(keys)
     # Looks in vain until the first NOP: geometric, mean 1, variance 2; +- 4 sqrt(2 / 400).
     np.testing.assert_allclose(-totals.mean(), 1.0, atol=0.29)
     assert len(np.unique(totals)) >= 5
@@ -124,7 +124,7 @@ def every_state_by_enumeration(num_pois, num_classes, num_modalities):
 def test_states_come_in_the_order_of_an_enumeration(sizes):
     num_pois, num_classes, num_modalities = sizes
     mdp = replace(classes_mdp(num_pois, num_modalities), num_classes=num_classes)
-    classes, seen = evaluation.every_state(mdp)
+    classes, seen = episodes.every_state(mdp)
     expected = every_state_by_enumeration(*sizes)
     np.testing.assert_array_equal(
         np.concatenate([classes, seen.reshape(len(seen), -1)], axis=1), expected
@@ -137,7 +137,7 @@ def test_states_come_in_the_order_of_an_enumeration(sizes):
 def test_of_more_states_than_an_integer_holds_an_even_sample_is_taken(sizes):
     num_pois, num_classes, num_modalities = sizes
     mdp = replace(classes_mdp(num_pois, num_modalities), num_classes=num_classes)
-    classes, seen = evaluation.every_state(mdp)
+    classes, seen = episodes.every_state(mdp)
     assert seen.shape == (4096, num_pois, num_modalities)
     looks = seen.reshape(4096, -1).astype(int)
     assert len(np.unique(np.concatenate([classes, looks], axis=1), axis=0)) == 4096
@@ -151,6 +151,6 @@ def test_of_more_states_than_an_integer_holds_an_even_sample_is_taken(sizes):
     assert np.max(np.abs(pairs)) < 5 / np.sqrt(4096)
     if num_pois <= num_classes:  # an order holds no class twice
         assert np.all(np.diff(np.sort(classes, axis=1), axis=1) > 0)
-    again = evaluation.every_state(mdp)
+    again = episodes.every_state(mdp)
     np.testing.assert_array_equal(again[0], classes)
     np.testing.assert_array_equal(again[1], seen)

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from toys import classes_mdp, paying_once_mdp
 
-from jaxsense import devices
 from jaxsense.config import DqnConfig
-from jaxsense.dqn import belief_mdp, evaluation, policies, training
+from jaxsense.dqn import belief_mdp, episodes, policies, training
 from jaxsense.types import Belief
 
 MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
@@ -47,7 +46,7 @@ def test_values_that_are_not_numbers_choose_no_action_and_total_nan(worst):
         MDP, {"params": {**params, "Dense_1": {**params["Dense_1"], "bias": bias}}}, (4,)
     )
     assert greedy(KEY, start()) == -1
-    total, first = evaluation.play(KEY, MDP, greedy, start(), 0)
+    total, first = episodes.play(KEY, MDP, greedy, start(), 0)
     assert np.isnan(total)
     assert np.isnan(first)
 
@@ -126,17 +125,3 @@ def test_a_gradient_that_is_not_a_number_is_told_in_its_epoch(chunk):
     _, info = run(replace(state, optimiser=bad), prepared)
     assert np.isfinite(info.loss[0])
     np.testing.assert_array_equal(info.is_finite, [False, False])
-
-
-def test_what_one_of_two_devices_sees_is_told(chunk):
-    _, state, prepared = chunk
-    mesh = devices.make_mesh(2)
-    run = jax.jit(
-        lambda prepared: training.train_chunk(
-            KEY, SCENE_MDP, 0, CONFIG, with_memories(state), prepared, mesh
-        )
-    )
-    for last, is_finite in ((1.0, [True, True]), (jnp.nan, [False, False])):
-        _, info = run(replace(prepared, scene=prepared.scene.at[-1].set(last)))
-        assert np.isfinite(info.loss).all()
-        np.testing.assert_array_equal(info.is_finite, is_finite)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from toys import classes_mdp
 
-from jaxsense.dqn import belief_mdp, evaluation, policies
+from jaxsense.dqn import belief_mdp, episodes, policies
 from jaxsense.types import Belief
 
 # The camera tells class 0 from the others, the LiDAR class 2.
@@ -91,7 +91,7 @@ def test_no_policy_expects_more_than_the_optimal_one(num_pois):
 
         def totals(key, classes, seen):
             start = belief_mdp.reset(KEY, mdp, classes, seen)
-            return [evaluation.play(key, mdp, p, start, modality)[0] for p in compared]
+            return [episodes.play(key, mdp, p, start, modality)[0] for p in compared]
 
         return jax.vmap(totals)(jax.random.split(KEY, len(states)), classes, seen)
 

@@ -20,20 +20,20 @@ from tests.faults.child import NAN_STEP, TRAININGS
 from tests.faults.runs import Process, Runs, lines, require, summary, wait_for
 
 STAGES = (
-    "simulate", "detector_camera-train", "detect-", "jmvae-train", "evaluate_jmvae", "dqn-train",
-    "evaluate_dqn", "mission-go_on", "write",
+    "survey", "detector_camera-advance", "detections", "jmvae-advance", "latent_space",
+    "dqn-advance", "policies", "mission-go_on", "write",
 )  # fmt: skip
-"""Where faults strike: the programs of `jaxsense.programs`, and the plots."""
+"""Where faults strike: the programs of `jaxsense.run.programs`, and the plots."""
 PRESSED = {"ctrl-c": "Ctrl-C", "ctrl-c-twice": "two Ctrl-C", "sigterm": "SIGTERM"}
-STOPPED = "jmvae-train", "dqn-train", "mission-go_on"
+STOPPED = "jmvae-advance", "dqn-advance", "mission-go_on"
 """Where a run is stopped whose checkpoints are then damaged."""
 POISONED = {
-    "simulate": "scans",
-    "detect-": "features",
-    "detector_camera-train": "parameters of a detector",
-    "jmvae-train": "parameters of the JMVAE",
-    "dqn-train": "parameters of a Q-network, and so Q-values",
-    "evaluate_jmvae": "class beliefs",
+    "survey": "scans",
+    "detections": "features",
+    "detector_camera-advance": "parameters of a detector",
+    "jmvae-advance": "parameters of the JMVAE",
+    "dqn-advance": "parameters of a Q-network, and so Q-values",
+    "latent_space": "class beliefs",
 }
 SMOKE = ["--preset", "smoke", "--quiet"]
 IN_ONE_SECOND = ["20250101-000000-smoke", "20250101-000000-smoke-2"]
@@ -205,10 +205,11 @@ def two_evaluations(runs: Runs) -> None:
 def shared_cache(runs: Runs) -> None:
     """Two writers of one cache, in a directory with files of the user."""
     cache = runs.path("their work")
-    for folder in ("programs/mine", "executables/mine", "executables/" + 32 * "a"):
+    for folder in ("programs/mine", "traced/mine", "compiled/mine"):
         (cache / folder).mkdir(parents=True)
         (cache / folder / "thesis.txt").write_text("precious", encoding="utf-8")
-    (cache / "executables").chmod(0o700)
+    for folder in ("traced", "compiled"):
+        (cache / folder).chmod(0o700)
     before = sorted(cache.rglob("*"))
     paths = [runs.path(f"sharing {i}") for i in range(2)]
     processes = [runs.start(*SMOKE, "--out", str(p), "--cache", str(cache)) for p in paths]
@@ -228,7 +229,7 @@ def trials(runs: Runs, is_quick: bool) -> Iterator[Trial]:
     def trial(row: str, function: Callable[..., None], *args: Any) -> Trial:
         return row, lambda: function(runs, *args)
 
-    stages = ("simulate", "dqn-train") if is_quick else STAGES
+    stages = ("survey", "dqn-advance") if is_quick else STAGES
     for i in range(2 if is_quick else 30):
         yield trial("kill -9 at a random moment, `smoke`", killed, f"killed {i}", SMOKE, i)
     for i in range(0 if is_quick else 5):

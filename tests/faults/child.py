@@ -22,11 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxsense import cli, evaluate, export, report, train
-from jaxsense.compilation import Program
+from jaxsense import cli, evaluate, export, train
 from jaxsense.dqn import training as dqn_training
-from jaxsense.programs import Surveys
+from jaxsense.dqn.training import DqnState
+from jaxsense.run.compilation import Program
+from jaxsense.show import plots
+from jaxsense.stages import Progress, Surveys
 from jaxsense.vae import detectors, jmvae
+from jaxsense.vae.minibatch import FitState
 
 NAN_STEP = 17
 TRAININGS = {
@@ -69,12 +72,21 @@ def poisoned(tree: Any, number: int) -> Any:
 
 def with_nan(output: Any, number: int) -> Any:
     """A program's results with NaN in what was simulated, detected or learnt."""
-    if isinstance(output, tuple) and hasattr(output[0], "params"):
-        params = poisoned(output[0].params, number)
-        return dataclasses.replace(output[0], params=params), *output[1:]
+    if isinstance(output, tuple) and isinstance(output[-1], Progress):
+        state, progress = output
+        return with_bad_params(state, number), progress
     if isinstance(output, Surveys):
         return dataclasses.replace(output, windows=poisoned(output.windows, number))
     return poisoned(output, number)
+
+
+def with_bad_params(state: Any, number: int) -> Any:
+    """A state of a training with NaN in the parameters that are trained."""
+    if isinstance(state, FitState | DqnState):
+        return dataclasses.replace(state, params=poisoned(state.params, number))
+    if isinstance(state, tuple):
+        return tuple(with_bad_params(part, number) for part in state)
+    return state
 
 
 def poison_gradients(stage: str, number: int) -> None:
@@ -110,7 +122,7 @@ class StoppedClock(datetime.datetime):
 
 def strike_at(stage: str, fault: str) -> None:
     """Lets a fault happen once."""
-    run, write_plots, struck = Program.__call__, report.write_plots, []
+    run, write_plots, struck = Program.__call__, plots.write_plots, []
 
     def strike() -> None:
         if not struck:
@@ -132,7 +144,7 @@ def strike_at(stage: str, fault: str) -> None:
         write_plots(*args)
 
     if stage == "write":
-        report.write_plots = write
+        plots.write_plots = write
     else:
         Program.__call__ = call
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense.config import MODALITIES, PRESETS, Config, JmvaeConfig
-from jaxsense.dqn import belief_mdp, evaluation, policies
+from jaxsense.dqn import belief_mdp, episodes, policies
 from jaxsense.interfaces import map_mdp
 from jaxsense.models import Models, jmvae_shape, untrained
 from jaxsense.observe import Bank
@@ -66,7 +66,7 @@ def returns(policy: policies.Policy, number: int = 256) -> jax.Array:
     def play(key):
         start_key, play_key = jax.random.split(key)
         start = belief_mdp.reset(start_key, mdp)
-        return evaluation.play(play_key, mdp, policy, start, 0)[0]
+        return episodes.play(play_key, mdp, policy, start, 0)[0]
 
     return jax.jit(jax.vmap(play))(jax.random.split(jax.random.key(3), number))
 

@@ -9,7 +9,7 @@ import pytest
 from teams import CONFIG
 
 from jaxsense import mission
-from jaxsense.mission import evaluation
+from jaxsense.mission import outcome
 from jaxsense.mission.state import DRIVING, ENDED, FAILED
 from jaxsense.types import Belief
 
@@ -107,7 +107,7 @@ def test_summary_of_a_case_as_worked_by_hand():
         "detections": np.array([[2, 3], [2, 3]]),
         "reason": np.array([1, 2]),
     }
-    block = evaluation.summarise(CONFIG, "latent", found)
+    block = outcome.summarise(CONFIG, "latent", found)
     assert block == {
         "accuracy": pytest.approx(5 / 6),
         "observations_per_poi": 1.5,
@@ -120,25 +120,25 @@ def test_summary_of_a_case_as_worked_by_hand():
     }
     # LiDAR alone cannot tell the two cylinders apart: classes 0 and 1, of which one of three is
     # reported as ambiguous.
-    alone = evaluation.summarise(CONFIG, "lidar_alone", found)
+    alone = outcome.summarise(CONFIG, "lidar_alone", found)
     assert alone["told"] == pytest.approx(0.5)
     assert alone["ambiguous_reported"] == pytest.approx(1 / 3)
     # Nothing of nothing is no number.
     nothing = {**found, "goals": np.zeros(2, int), "goals_reached": np.zeros(2, int)}
-    assert evaluation.summarise(CONFIG, "latent", nothing)["goals_reached_fraction"] is None
+    assert outcome.summarise(CONFIG, "latent", nothing)["goals_reached_fraction"] is None
     # The camera cannot tell red ones apart: classes 1 and 2; three of five.
-    assert evaluation.summarise(CONFIG, "camera_alone", found)[
-        "ambiguous_reported"
-    ] == pytest.approx(3 / 5)
+    assert outcome.summarise(CONFIG, "camera_alone", found)["ambiguous_reported"] == pytest.approx(
+        3 / 5
+    )
 
 
 def test_bytes_of_a_detection_as_worked_by_hand(team):
     # Two float32 for each of two latent dimensions; 640 pixels of 3 bytes, 683 beams of 4.
-    size = evaluation.bytes_per_detection(team, np.array([1, 3]))
+    size = outcome.bytes_per_detection(team, np.array([1, 3]))
     assert size["latent"] == 16
     assert size["raw"] == pytest.approx((1 * 1920 + 3 * 2732) / 4)
     # Without any detection, the mean of both.
-    assert evaluation.bytes_per_detection(team, np.zeros(2))["raw"] == (1920 + 2732) / 2
+    assert outcome.bytes_per_detection(team, np.zeros(2))["raw"] == (1920 + 2732) / 2
 
 
 def test_cases_are_the_policies_and_every_failure_of_every_robot():

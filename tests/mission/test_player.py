@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from teams import CONFIG
 
-from jaxsense import devices, mission
-from jaxsense.compilation import Compiler
-from jaxsense.devices import Workers
-from jaxsense.mission import evaluation
+from jaxsense import mission
 from jaxsense.mission.state import Record
 from jaxsense.models import untrained
-from jaxsense.monitor import Monitor
+from jaxsense.run import devices, missions
+from jaxsense.run.compilation import Compiler
+from jaxsense.run.devices import Workers
+from jaxsense.run.monitor import Monitor
 
 # The package gives its function this name.
 ROLLOUT = importlib.import_module("jaxsense.mission.rollout")
 KEY = jax.random.key(5)
-CHUNK, _ = evaluation.chunks(CONFIG)
+CHUNK, _ = missions.chunks(CONFIG)
 LAST = 2 * CHUNK - 3  # control periods, within the second chunk
 
 
@@ -51,16 +51,15 @@ def test_the_whole_first_mission_is_recorded(split, team, monkeypatch):
         return dataclasses.replace(state, scene=dataclasses.replace(state.scene, poses=poses))
 
     monkeypatch.setattr(ROLLOUT, "step", fake_step)
-    monkeypatch.setattr(evaluation, "reset", fake_reset)
-    monkeypatch.setattr(evaluation, "figures", lambda team, models, s: {"steps": s.steps})
+    monkeypatch.setattr(missions, "reset", fake_reset)
+    monkeypatch.setattr(missions, "figures", lambda team, models, s: {"steps": s.steps})
     with Compiler(Monitor()) as compiler:
-        player = mission.Player(team, compiler, 4, WORKERS[split]())
-        assert player.recording is None
+        player = missions.Player(team, compiler, 4, WORKERS[split]())
         models = untrained(jax.random.key(0), CONFIG)
-        found = player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, 9)
-    np.testing.assert_array_equal(found["naive"]["steps"], np.full(9, LAST))
+        played = player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, 9)
+    np.testing.assert_array_equal(played.metrics["naive"]["steps"], np.full(9, LAST))
 
-    arena_key, play_key = evaluation.keys_of_episode(KEY, 0)
+    arena_key, play_key = missions.keys_of_episode(KEY, 0)
     step_keys = [
         key
         for number in range(2)
@@ -69,7 +68,7 @@ def test_the_whole_first_mission_is_recorded(split, team, monkeypatch):
     moves = [jax.random.normal(key, state.scene.poses.shape) for key in step_keys[:LAST]]
     start = np.asarray(jax.random.normal(arena_key, state.scene.poses.shape))
     walk = start + np.cumsum(moves, axis=0)
-    records, end = player.recording.records, player.recording.end
+    records, end = played.recording.records, played.recording.end
     assert len(records.time) == 2 * CHUNK
     np.testing.assert_array_equal(records.time, np.minimum(np.arange(2 * CHUNK) + 1, LAST))
     np.testing.assert_allclose(records.poses[:LAST], walk, atol=1e-4)

@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import training
 from jaxsense.config import JmvaeConfig
-from jaxsense.vae import jmvae
+from jaxsense.vae import jmvae, minibatch
 
 MODEL = jmvae.Jmvae(("camera", "lidar"), (1, 2), 2, (3,))
 SETTINGS = JmvaeConfig(batch=64, steps=40)
@@ -19,7 +18,7 @@ LIDAR = jnp.tile(10.0 * jnp.arange(4)[:, None, None] + jnp.arange(5)[None, :, No
 @pytest.fixture(scope="module")
 def drawn():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "fit", lambda state, loss, drawn, optimiser, total: drawn)
+        patch.setattr(minibatch, "fit", lambda state, loss, drawn, optimiser, total: drawn)
         return jmvae.train(jax.random.key(0), None, MODEL, (CAMERA, LIDAR), SETTINGS, 20)
 
 
@@ -49,7 +48,7 @@ def test_a_bank_of_the_wrong_shape_is_named():
 
 
 def test_three_modalities_are_drawn_independently(monkeypatch):
-    monkeypatch.setattr(training, "fit", lambda state, loss, drawn, optimiser, total: drawn)
+    monkeypatch.setattr(minibatch, "fit", lambda state, loss, drawn, optimiser, total: drawn)
     model = jmvae.Jmvae(("camera", "lidar", "thermal"), (1, 2, 2), 2, (3,))
     _, features = jmvae.train(jax.random.key(0), None, model, (CAMERA, LIDAR, LIDAR), SETTINGS, 20)
     _, lidar, thermal = (np.asarray(x[:, 0]) for x in features)

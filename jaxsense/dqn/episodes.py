@@ -1,0 +1,91 @@
+"""Whole episodes of policies, from random starts and from every state of the map."""
+
+import itertools
+import math
+import random
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsense.dqn import belief_mdp
+from jaxsense.dqn.belief_mdp import MapMdp, MapState
+from jaxsense.dqn.policies import Policy
+from jaxsense.types import Index, Key
+
+MOST_STATES = 4096
+
+
+def play(
+    key: Key, mdp: MapMdp, policy: Policy, start: MapState, modality: Index
+) -> tuple[jax.Array, jax.Array]:
+    """Plays one episode with a policy.
+
+    The k-th look at a PoI sees the same with the same key, whatever has been done before, so that
+    policies are compared on the same detections. Under `vmap` it goes on until the longest of the
+    episodes has ended.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      policy: what to do.
+      start: from `belief_mdp.reset`.
+      modality: index of the agent's own sensor, see `belief_mdp.step`.
+
+    Returns:
+      `[]` total reward, without discount, and `[]` reward of the first action.
+    """
+
+    def goes_on(carry) -> jax.Array:
+        return ~carry[1]
+
+    def act(carry):
+        state, _, total, first, times = carry
+        action = policy(jax.random.fold_in(policy_key, state.steps), state)
+        look_key = jax.random.fold_in(jax.random.fold_in(looks_key, action), times[action])
+        is_first = state.steps == start.steps
+        state, outcome = belief_mdp.step(look_key, mdp, state, action, modality)
+        first = jnp.where(is_first, outcome.reward, first)
+        is_over = outcome.is_over | outcome.is_cut
+        return state, is_over, total + outcome.reward, first, times.at[action].add(1)
+
+    policy_key, looks_key = jax.random.split(key)
+    times = jnp.zeros(mdp.num_pois + 1, jnp.int32)
+    carry = (start, jnp.bool_(False), jnp.float32(0.0), jnp.float32(0.0), times)
+    _, _, total, first, _ = jax.lax.while_loop(goes_on, act, carry)
+    return total, first
+
+
+def every_state(mdp: MapMdp) -> tuple[np.ndarray, np.ndarray]:
+    """The states of the paper's count `N! 2^(N M)`: classes in every order, every set of looks.
+
+    With fewer PoIs than classes, the orders are those of N of the classes; with more, all
+    combinations. Of more than 4096 states that many are taken: cut into 4096 equal parts, each part
+    gives a random one of its states, always the same.
+
+    Returns:
+      `[S, N]` int32 classes and `[S, N, M]` bool looks.
+    """
+    num_pois, num_classes = mdp.num_pois, mdp.num_classes
+    is_order = num_pois <= num_classes
+    # A state is a number: a digit for the class of each PoI, of those that are left in an order,
+    # then a bit for each look.
+    radices = [num_classes - n if is_order else num_classes for n in range(num_pois)]
+    num_bits = num_pois * mdp.num_modalities
+    number = math.prod(radices) << num_bits
+    parts = min(number, MOST_STATES)
+    edges = [i * number // parts for i in range(parts + 1)]
+    draw = random.Random(0)
+    # Of 25 PoIs there are more states than an int64 can count: Python's integers.
+    states = np.array([draw.randrange(*part) for part in itertools.pairwise(edges)], object)
+    bits = states[:, None] >> np.arange(num_bits, dtype=object) & 1
+    states >>= num_bits
+    classes = np.zeros((parts, num_pois), np.int32)
+    for n in reversed(range(num_pois)):
+        classes[:, n] = states % radices[n]
+        states //= radices[n]
+    if is_order:
+        for row in classes:
+            left = list(range(num_classes))
+            row[:] = [left.pop(digit) for digit in row]
+    return classes, bits.astype(bool).reshape(-1, num_pois, mdp.num_modalities)

@@ -1,0 +1,48 @@
+"""What all interfaces have in common: the map MDP as one agent meets it."""
+
+import jax
+
+from jaxsense.config import values
+from jaxsense.dqn import belief_mdp, training
+from jaxsense.dqn.belief_mdp import MapMdp, MapState
+from jaxsense.types import Key
+
+
+def check_modality(mdp: MapMdp, modality: int) -> None:
+    """Raises `ValueError` unless the MDP has a sensor of that index."""
+    values.require_index("modality", modality, mdp.num_modalities)
+
+
+def num_actions(mdp: MapMdp) -> int:
+    """A look at each PoI, and NOP."""
+    return mdp.num_pois + 1
+
+
+def observation_size(mdp: MapMdp) -> int:
+    """Numbers in an observation, `N * 2D`."""
+    return 2 * mdp.num_pois * mdp.unseen.mean.size
+
+
+def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
+    """`[number]` random states for episodes to start from, compiled.
+
+    A start takes a look at everything that has been seen in it, which costs several steps; drawn
+    from a few thousand that were prepared once, it costs nothing.
+    """
+    values.require_number("number", number)
+    return jax.jit(lambda key: training.starts(key, mdp, number))(key)
+
+
+def start(key: Key, mdp: MapMdp, starts: MapState | None) -> MapState:
+    """The start of an episode.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      starts: `[S]` from `prepared_starts`, of which a random one is taken; without, the start is
+        made anew.
+    """
+    if starts is None:
+        return belief_mdp.reset(key, mdp)
+    row = jax.random.randint(key, (), 0, starts.steps.shape[0])
+    return jax.tree.map(lambda x: x[row], starts)

@@ -1,0 +1,42 @@
+"""What missions are played with: policies, and robots that fail."""
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from jaxsense.config import Config
+from jaxsense.mission.state import LATENT, POLICIES, Faults, no_faults
+
+FAULT_TIME = 6.0  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """Something to play missions with.
+
+    Attributes:
+      policy: index into `POLICIES`.
+      faults: which robots fail, and when.
+    """
+
+    policy: int
+    faults: Faults
+
+
+def cases(config: Config) -> dict[str, Case]:
+    """The policies, each robot alone, and each robot failing in mid-mission.
+
+    `latent`, `naive` and `random` are the policies; `MODALITY_alone` has all other robots stand
+    still from the start; in `MODALITY_stops` and `MODALITY_blind` the robot stops or its sensor
+    goes blind after 6 s. Failures are played with the latent policy.
+    """
+    healthy = no_faults(config)
+    found = {name: Case(policy, healthy) for policy, name in enumerate(POLICIES)}
+    for m, modality in enumerate(config.modalities if len(config.modalities) > 1 else ()):
+        own = jnp.arange(len(config.modalities)) == m
+        alone = Faults(jnp.where(own, jnp.inf, 0.0), healthy.blind_at)
+        failing = jnp.where(own, FAULT_TIME, jnp.inf)
+        found[f"{modality}_alone"] = Case(LATENT, alone)
+        found[f"{modality}_stops"] = Case(LATENT, Faults(failing, healthy.blind_at))
+        found[f"{modality}_blind"] = Case(LATENT, Faults(healthy.stops_at, failing))
+    return found

@@ -1,0 +1,144 @@
+"""How a mission has ended and what it has achieved."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsense.config import Config
+from jaxsense.dqn import belief_mdp
+from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
+from jaxsense.models import Models
+from jaxsense.vae import metrics
+
+REASONS = (
+    "running",
+    "finished",
+    "time limit",
+    "unreachable",
+    "undetected",
+    "robot failed",
+    "no robot left",
+)
+"""How a mission has ended. `unreachable`: a robot gave up a PoI to which it found no way or did not
+get; `undetected`: one gave up a PoI after looks that showed nothing; `robot failed`: the others
+finished. The index is the reason's code."""
+
+
+def reason(state: MissionState) -> jax.Array:
+    """`[]` int32 index into `REASONS`."""
+    robots = state.robots
+    working = robots.phase != FAILED
+    ends = [
+        (~state.is_over, "running"),
+        (~jnp.any(working), "no robot left"),
+        (jnp.any(working & (robots.phase != ENDED)), "time limit"),
+        (jnp.any(robots.unreachable), "unreachable"),
+        (jnp.any(robots.undetected), "undetected"),
+        (jnp.any(~working), "robot failed"),
+    ]
+    code = jnp.int32(REASONS.index("finished"))
+    for applies, name in reversed(ends):
+        code = jnp.where(applies, REASONS.index(name), code)
+    return code
+
+
+def figures(mission: Mission, models: Models, state: MissionState) -> dict[str, Any]:
+    """What a mission has achieved.
+
+    Returns:
+      `classes`, the true ones, `seen`, whether the PoI is in the map, `is_right`, whether the map's
+      most likely class is the true one, and `ambiguous`, whether the map leaves more than one open,
+      `[N]` each, PoIs that nobody has seen being neither; `told`, for each modality `[]`
+      the share of the map that is right in what the sensor can tell; `observations_per_poi`;
+      `time_s`; `collisions`, control periods with contact; `goals` and `goals_reached`;
+      `information`, the sum over the map; `detections` `[R]`; and `reason`.
+    """
+    config = mission.config
+    nearest = jax.vmap(lambda b: metrics.nearest_class(b, models.class_beliefs.mean))(state.belief)
+    plausible = jax.vmap(lambda b: metrics.plausible_classes(b, models.class_beliefs.mean))(
+        state.belief
+    )
+    is_seen = jnp.any(state.seen, axis=-1)
+    is_right = is_seen & (nearest == state.classes)
+    told = {}
+    for modality in config.modalities:
+        labels = jnp.array(config.label_of_class(modality))
+        told[modality] = jnp.mean(is_seen & (labels[nearest] == labels[state.classes]))
+    robots = state.robots
+    return {
+        "classes": state.classes,
+        "is_right": is_right,
+        "told": told,
+        "ambiguous": is_seen & (jnp.sum(plausible, axis=-1) > 1),
+        "seen": is_seen,
+        "observations_per_poi": jnp.sum(robots.looks) / config.arena.num_pois,
+        "time_s": state.steps * config.mission.control_period,
+        "collisions": state.contacts,
+        "goals": jnp.sum(robots.goals),
+        "goals_reached": jnp.sum(robots.reached),
+        "information": jnp.sum(belief_mdp.information(state.belief.std)),
+        "detections": robots.detections,
+        "reason": reason(state),
+    }
+
+
+def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any]:
+    """One case's block of `summary.json`.
+
+    Args:
+      config: all settings.
+      name: of the case.
+      found: `[E, ...]` from `Player.play`.
+
+    Returns:
+      Means over the missions, but for `time_s`, which is the median, and `collisions`, the sum.
+      For a robot alone also `told`, the accuracy of what its sensor can tell apart, and
+      `ambiguous_reported`, how many of the PoIs it cannot tell apart the map shows as ambiguous.
+    """
+    block: dict[str, Any] = {
+        "accuracy": float(found["is_right"].mean()),
+        "observations_per_poi": float(found["observations_per_poi"].mean()),
+        "time_s": float(np.median(found["time_s"])),
+        "collisions": int(found["collisions"].sum()),
+        "goals_reached_fraction": _share(found["goals_reached"].sum(), found["goals"].sum()),
+        "information": float(found["information"].mean()),
+        "episodes": len(found["time_s"]),
+        "ended": {
+            reason: int(np.sum(found["reason"] == code))
+            for code, reason in enumerate(REASONS)
+            if np.any(found["reason"] == code)
+        },
+    }
+    modality = name.removesuffix("_alone")
+    if modality != name:
+        labels = np.array(config.label_of_class(modality))
+        shares_label = np.array([np.sum(labels == label) > 1 for label in labels])
+        cannot_tell = shares_label[found["classes"]]
+        block["told"] = float(found["told"][modality].mean())
+        reported = found["ambiguous"][cannot_tell]
+        block["ambiguous_reported"] = _share(reported.sum(), reported.size)
+    return block
+
+
+def _share(part: Any, whole: Any) -> float | None:
+    """A share; None of nothing."""
+    return float(part / whole) if whole else None
+
+
+def bytes_per_detection(mission: Mission, detections: np.ndarray) -> dict[str, float]:
+    """What a detection puts on the network, in bytes.
+
+    Args:
+      mission: the mission.
+      detections: `[R]` how many of each robot.
+
+    Returns:
+      `latent`, the size of an entry of the map, and `raw`, the mean size of the scans that the
+      detections were made of; of the sensors' scans if there were none.
+    """
+    detections = np.maximum(detections, 0 if np.any(detections) else 1)
+    scans = np.array([sensor.scan_bytes for sensor in mission.world.sensors])
+    entry = 2 * mission.config.jmvae.latent_size * np.dtype(np.float32).itemsize
+    return {"latent": float(entry), "raw": float(np.average(scans, weights=detections))}

@@ -1,0 +1,259 @@
+"""What a run saves while it trains: what is finished, and trainings under way.
+
+A checkpoint is one file: a digest of SHA-256, and what `flax.serialization` makes of its arrays.
+"""
+
+import hashlib
+import shutil
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+from flax import serialization
+
+from jaxsense.config import ConfigError
+from jaxsense.run import files
+
+T = TypeVar("T")
+
+_DIGEST = hashlib.sha256().digest_size
+_SUFFIX = ".msgpack"
+_LIST = "saved"
+"""The checkpoint that lists the names of all others, so that a missing file is noticed."""
+
+Curves = dict[str, list[float]]
+"""Figures of a training so far, by their names."""
+
+
+class Unfinished(NamedTuple):
+    """A training under way.
+
+    Attributes:
+      done: chunks so far.
+      state: what the next chunk starts from.
+      curves: figures of the chunks so far.
+    """
+
+    done: int
+    state: Any
+    curves: Curves
+
+
+class Checkpoints:
+    """The checkpoints of a run, in a directory; without one nothing is saved and nothing is there.
+
+    A checkpoint that is damaged is put aside, and what it held is trained again, which comes to the
+    same: a run follows from its seed and settings.
+
+    Attributes:
+      path: the directory.
+    """
+
+    def __init__(
+        self,
+        path: Path | None = None,
+        warn: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
+    ):
+        """Names a directory, and who is told of checkpoints that are damaged."""
+        self.path, self._warn = path, warn
+        self._lock = threading.Lock()
+
+    def exists(self) -> bool:
+        """Whether anything was saved."""
+        return self.path is not None and self.path.exists()
+
+    def save(self, name: str, tree: Any) -> None:
+        """Saves something finished; an `OSError` names the file that cannot be written."""
+        if self.path is None:
+            return
+        self._file(name).parent.mkdir(parents=True, exist_ok=True)
+        with self._lock:
+            if not self._file(_LIST).exists():
+                self._write(_LIST, [])
+        self._write(name, serialization.to_state_dict(jax.tree.map(np.asarray, tree)))
+        with self._lock:
+            self._list(self._listed() | {name})
+
+    def load(self, name: str, shapes: Any) -> Any:
+        """Loads what was saved.
+
+        Args:
+          name: as it was saved.
+          shapes: a tree like it.
+
+        Returns:
+          The tree, of arrays on the host; None if there is none.
+
+        Raises:
+          ConfigError: names the file if it is damaged, missing, or of other shapes.
+        """
+        return self._load(name, lambda found: _like(shapes, found))
+
+    def load_or_forget(self, name: str, shapes: Any) -> Any:
+        """`load`, but a file that cannot be used is named, put aside, and counts as not there."""
+        return self._or_forget(name, lambda found: _like(shapes, found))
+
+    def save_unfinished(self, stage: str, unfinished: Unfinished) -> None:
+        """Saves a training under way, in place of what was saved of it before; see `save`."""
+        curves = {name: np.array(values, np.float64) for name, values in unfinished.curves.items()}
+        saved = {"done": np.int64(unfinished.done), "state": unfinished.state, "curves": curves}
+        self.save(_unfinished(stage), saved)
+
+    def load_unfinished(self, stage: str, state: Any) -> Unfinished | None:
+        """Loads a training under way.
+
+        Args:
+          stage: its name.
+          state: any state of it, for structure and shapes.
+
+        Returns:
+          The training as it was saved last; None if it was not, or if the file is damaged.
+        """
+
+        def restore(found: Any) -> Unfinished:
+            curves = {name: values.tolist() for name, values in found["curves"].items()}
+            return Unfinished(int(found["done"]), _like(state, found["state"]), curves)
+
+        return self._or_forget(_unfinished(stage), restore)
+
+    def forget_unfinished(self) -> None:
+        """Removes all trainings under way: the run is finished."""
+        if self.path is not None:
+            shutil.rmtree(self.path / _unfinished(""), ignore_errors=True)
+            with self._lock:
+                self._list(
+                    {name for name in self._listed() if not name.startswith(_unfinished(""))}
+                )
+
+    def check(self, is_begun: bool = False) -> None:
+        """Names whatever is damaged or missing, and puts it aside.
+
+        Args:
+          is_begun: whether something has been trained, and is missing if nothing was saved.
+        """
+        if self.path is None:
+            return
+        if not self.path.exists():
+            if is_begun:
+                error = ConfigError("checkpoints", str(self.path), "is missing")
+                self._warn(f"{error}; everything is trained again")
+            return
+        there = self._there()
+        if there or self._file(_LIST).exists():
+            self._check(_LIST, "the run goes on from all that is there")
+        expected = sorted(self._listed() | there)
+        sound = {name for name in expected if self._check(name, "what it held is trained again")}
+        self._write(_LIST, sorted(sound))
+
+    def _check(self, name: str, consequence: str) -> bool:
+        """Whether a checkpoint is as it was saved; if not, it is named and put aside."""
+        try:
+            _read(self._file(name))
+        except (OSError, ValueError) as error:
+            self._forget(name, _what_is_wrong(error), consequence)
+            return False
+        return True
+
+    def directories(self) -> list[Path]:
+        """Where checkpoints lie, as far as that is there."""
+        if self.path is None:
+            return []
+        return [p for p in (self.path, self.path / _unfinished("")) if p.is_dir()]
+
+    def _there(self) -> set[str]:
+        """Names of all that is there, but for the list of them."""
+        assert self.path is not None
+        found = (file.relative_to(self.path).as_posix() for file in self.path.rglob(f"*{_SUFFIX}"))
+        return {name.removesuffix(_SUFFIX) for name in found} - {_LIST}
+
+    def _listed(self) -> set[str]:
+        """Names of all that was saved; of all that is there, if that is not known."""
+        try:
+            return set(_read(self._file(_LIST)))
+        except (OSError, ValueError):
+            return self._there()
+
+    def _list(self, names: set[str]) -> None:
+        if names != self._listed():
+            self._write(_LIST, sorted(names))
+
+    def _write(self, name: str, content: Any) -> None:
+        packed = serialization.msgpack_serialize(content)
+        files.write(self._file(name), hashlib.sha256(packed).digest() + packed)
+
+    def _load(self, name: str, restore: Callable[[Any], T]) -> T | None:
+        """What `restore` makes of what was saved; see `load`."""
+        if self.path is None:
+            return None
+        if not self._file(name).exists():
+            if name in self._listed():
+                raise self._error(name, "is missing")
+            return None
+        try:
+            return restore(_read(self._file(name)))
+        except (OSError, ValueError, KeyError) as error:
+            raise self._error(name, _what_is_wrong(error)) from None
+
+    def _or_forget(self, name: str, restore: Callable[[Any], T]) -> T | None:
+        try:
+            return self._load(name, restore)
+        except ConfigError as error:
+            self._forget(name, error.expected, "what it held is trained again")
+            return None
+
+    def _forget(self, name: str, reason: str, consequence: str) -> None:
+        """Puts a checkpoint aside, and says so."""
+        file = self._file(name)
+        if file.exists():
+            file.replace(file.with_name(f"{file.name}.damaged"))
+        self._warn(f"{self._error(name, reason)}; {consequence}")
+
+    def _error(self, name: str, reason: str) -> ConfigError:
+        return ConfigError("checkpoint", str(self._file(name)), reason)
+
+    def _file(self, name: str) -> Path:
+        assert self.path is not None
+        return self.path / f"{name}{_SUFFIX}"
+
+
+def _unfinished(stage: str) -> str:
+    """Under which name a training under way is saved."""
+    return f"unfinished/{stage}"
+
+
+def _read(file: Path) -> Any:
+    """What lies in a checkpoint, as nested dictionaries; a `ValueError` if it is damaged."""
+    whole = file.read_bytes()
+    content = whole[_DIGEST:]
+    if hashlib.sha256(content).digest() != whole[:_DIGEST]:
+        raise ValueError("its content does not have its digest")
+    return serialization.msgpack_restore(content)
+
+
+def _what_is_wrong(error: Exception) -> str:
+    """What keeps a checkpoint from being used."""
+    if isinstance(error, FileNotFoundError):
+        return "is missing"
+    if isinstance(error, OSError):
+        return f"cannot be read ({error.strerror})"
+    return f"is damaged or of other settings ({str(error).splitlines()[0]})"
+
+
+def _like(shapes: Any, found: Any) -> Any:
+    """A tree like `shapes` from nested dictionaries; a `ValueError` if it does not fit."""
+
+    def check(expected: Any, found: Any) -> np.ndarray:
+        found = np.asarray(found)
+        if (found.shape, found.dtype) != (expected.shape, expected.dtype):
+            raise ValueError(
+                f"{found.dtype}{found.shape} in place of {expected.dtype}{expected.shape}"
+            )
+        return found
+
+    if jax.tree.structure(serialization.to_state_dict(shapes)) != jax.tree.structure(found):
+        raise ValueError("it holds other arrays")
+    return jax.tree.map(check, shapes, serialization.from_state_dict(shapes, found))

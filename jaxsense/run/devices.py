@@ -1,0 +1,266 @@
+"""Work spread over the cores of a CPU, over several accelerators, and over several processes."""
+
+import dataclasses
+import functools
+import os
+import re
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxsense.config import ConfigError
+
+T = TypeVar("T")
+
+AXIS = "devices"
+_MOST_THREADS = 8
+_MOST_DEVICES = 256
+
+
+def compiler_options(*, runs_long: bool = False) -> dict[str, Any]:
+    """Options with which compiling and running a program take least together.
+
+    On a CPU, optimisation at level 1 takes a third less time than at level 3, and its programs are
+    as fast. Without the newer code generator it is again a third less, but the program may be a
+    third slower. On an accelerator most of the time would go into trying kernels for products.
+
+    Args:
+      runs_long: far longer than it takes to compile.
+
+    Returns:
+      Those options that the installed compiler knows; none where JAX is told to compile quickly.
+    """
+    if jax.config.values["jax_disable_most_optimizations"]:
+        return {}
+    wanted: dict[str, Any] = {}
+    if jax.default_backend() == "cpu":
+        wanted = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": runs_long}
+    elif jax.default_backend() == "gpu" and not runs_long:
+        wanted = {"xla_backend_optimization_level": 1, "xla_gpu_autotune_level": 0}
+    return {name: value for name, value in wanted.items() if _is_known(name, value)}
+
+
+@functools.cache
+def _is_known(option: str, value: Any) -> bool:
+    """Whether the installed compiler has an option; they come and go with its versions."""
+    try:
+        jax.jit(lambda: 0).lower().compile(compiler_options={option: value})
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
+@dataclasses.dataclass(frozen=True)
+class Workers:
+    """What shares the rows of a batch: threads of a CPU, or the devices of a mesh.
+
+    Attributes:
+      threads: how many, each with a program of its own; 1 beside a mesh.
+      mesh: from `make_mesh`; None for a single device.
+    """
+
+    threads: int = 1
+    mesh: Mesh | None = None
+
+    @property
+    def number(self) -> int:
+        """How many parts a batch is cut into."""
+        return self.threads if self.mesh is None else self.mesh.size
+
+
+ALONE = Workers()
+
+
+def start(number: int | None) -> Workers:
+    """The devices of a program.
+
+    Args:
+      number: of accelerators, or of threads on a CPU. If not given, all accelerators there are; or
+        as many threads as cores, at most 8.
+
+    Returns:
+      Who shares scenes and missions. Nobody shares a training: to agree on a gradient takes devices
+      longer than to work it out.
+
+    Raises:
+      ConfigError: if there are not that many devices.
+    """
+    jax.config.update("jax_default_matmul_precision", "highest")
+    if number is not None and not 1 <= number <= _MOST_DEVICES:
+        raise ConfigError("devices", number, f"must be within 1 and {_MOST_DEVICES}")
+    if jax.default_backend() == "cpu" and jax.process_count() == 1:
+        return Workers(threads=number or min(os.cpu_count() or 1, _MOST_THREADS))
+    there = jax.device_count()
+    number = there if number is None else number
+    if number > there:
+        raise ConfigError("devices", number, f"must be within 1 and {there}")
+    return Workers(mesh=make_mesh(number) if number > 1 else None)
+
+
+def make_mesh(number: int | None = None) -> Mesh:
+    """A row of devices.
+
+    Args:
+      number: how many; all there are if not given. Devices of all processes count.
+
+    Returns:
+      The mesh, with the axis `AXIS`.
+
+    Raises:
+      ValueError: if there are not that many devices.
+    """
+    there = jax.devices()
+    number = len(there) if number is None else number
+    if not 1 <= number <= len(there):
+        raise ValueError(
+            f"devices = {number}: must be within 1 and {len(there)}, as many there are"
+        )
+    return Mesh(np.array(there[:number]), (AXIS,))
+
+
+def join(coordinator: str | None, number: int | None, index: int | None) -> None:
+    """Joins the processes that share a run; does nothing if none of the three is given.
+
+    Args:
+      coordinator: `HOST:PORT` at which the first process listens.
+      number: of processes.
+      index: of this one, from 0.
+
+    Raises:
+      ConfigError: if only some of the three are given, or they cannot be.
+    """
+    given = {"coordinator": coordinator, "num_processes": number, "process_index": index}
+    if set(given.values()) == {None}:
+        return
+    for name, value in given.items():
+        if value is None:
+            raise ConfigError(name, value, f"must be given with {', '.join({*given} - {name})}")
+    assert coordinator is not None
+    assert number is not None
+    assert index is not None
+    if not re.fullmatch(r"\S+:\d+", coordinator):
+        raise ConfigError("coordinator", coordinator, "must be HOST:PORT")
+    if number < 1:
+        raise ConfigError("num_processes", number, "must be greater than 0")
+    if not 0 <= index < number:
+        raise ConfigError("process_index", index, f"must be within 0 and {number - 1}")
+    try:
+        jax.distributed.initialize(coordinator, number, index)
+    except (RuntimeError, ValueError) as error:
+        reason = f"cannot be joined ({str(error).splitlines()[0]})"
+        raise ConfigError("coordinator", coordinator, reason) from None
+
+
+def leave() -> None:
+    """Waits for the processes that share the run, if there are any, and leaves them."""
+    if jax.process_count() > 1:
+        jax.distributed.shutdown()
+
+
+def shardings(mesh: Mesh, number: int, whole: tuple[int, ...]) -> tuple[NamedSharding, ...]:
+    """Where arguments lie: a part of their rows on each device, or all of them if `whole`."""
+    return tuple(
+        NamedSharding(mesh, PartitionSpec() if i in whole else PartitionSpec(AXIS))
+        for i in range(number)
+    )
+
+
+def put(args: tuple[Any, ...], places: tuple[NamedSharding, ...]) -> tuple[Any, ...]:
+    """Arguments that every process has, put where all processes together hold them."""
+
+    def put_one(x: Any, place: NamedSharding) -> jax.Array:
+        if jnp.issubdtype(jnp.result_type(x), jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(put_one(jax.random.key_data(x), place))
+        x = np.asarray(x, jnp.result_type(x))
+        return jax.make_array_from_callback(x.shape, place, lambda index: x[index])
+
+    return tuple(
+        jax.tree.map(lambda x: put_one(x, place), arg)  # noqa: B023
+        for arg, place in zip(args, places, strict=True)
+    )
+
+
+def spread(
+    function: Callable[..., Any], mesh: Mesh | None, whole: tuple[int, ...] = ()
+) -> Callable[..., Any]:
+    """A function whose inputs and outputs are split along their first axis, a part on each device.
+
+    XLA's partitioner finds the split. Under `shard_map`, jaxlib 0.11.2 crashes while it compiles a
+    step of MJX, on a CPU and on accelerators: its Shardy drops inputs that the body does not use
+    (`ManualComputationUnusedInputsPattern`), and MJX closes over a hundred constants.
+
+    Args:
+      function: of arrays, or pytrees of them, with a batch as first axis; rows must not depend on
+        one another.
+      mesh: from `make_mesh`; its size must divide the batch. Without one nothing is split.
+      whole: positions of arguments that every device gets as they are.
+
+    Returns:
+      The same function, to be called under `jit`.
+    """
+    if mesh is None:
+        return function
+
+    def partitioned(*args: Any) -> Any:
+        rows = NamedSharding(mesh, PartitionSpec(AXIS))
+        constrain = jax.lax.with_sharding_constraint
+        args = tuple(x if i in whole else constrain(x, rows) for i, x in enumerate(args))
+        return constrain(function(*args), rows)
+
+    return partitioned
+
+
+def side_by_side(function: Callable[[int], T], number: int) -> list[T]:
+    """`function(0)`, `function(1)` and so on, each in a thread: one alone leaves cores idle."""
+    if number == 1:
+        return [function(0)]
+    with ThreadPoolExecutor(number) as executor:
+        futures = [executor.submit(function, i) for i in range(number)]
+        # A thread that waits for good may not hear of Ctrl-C.
+        while wait(futures, timeout=0.2).not_done:
+            pass
+        return [future.result() for future in futures]
+
+
+def part(
+    args: tuple[Any, ...], i: int, number: int, whole: tuple[int, ...] = ()
+) -> tuple[Any, ...]:
+    """The i-th of `number` equal parts of arguments, along their first axis.
+
+    Args:
+      args: arrays, their shapes, or pytrees of them; `number` divides their first axis.
+      i: which part.
+      number: of parts.
+      whole: positions of arguments that are in every part as they are.
+    """
+    if number == 1:
+        return args
+
+    def cut(x: Any) -> Any:
+        rows = x.shape[0] // number
+        if isinstance(x, jax.ShapeDtypeStruct):
+            return x.update(shape=(rows, *x.shape[1:]))
+        return x[i * rows : (i + 1) * rows]
+
+    return tuple(x if j in whole else jax.tree.map(cut, x) for j, x in enumerate(args))
+
+
+def of_all_parts(shapes: Any, number: int) -> Any:
+    """The shapes of the results of `number` parts together, from those of one."""
+    if number == 1:
+        return shapes
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((number * x.shape[0], *x.shape[1:]), x.dtype), shapes
+    )
+
+
+def joined(parts: list[Any]) -> Any:
+    """The results of parts as one, on the host if there are several."""
+    if len(parts) == 1:
+        return parts[0]
+    return jax.tree.map(lambda *x: np.concatenate([np.asarray(each) for each in x]), *parts)

@@ -1,0 +1,120 @@
+"""Files that are written as a whole or not at all, and directories kept for one process."""
+
+import contextlib
+import os
+import re
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+import filelock
+
+_UNFINISHED_NAME = re.compile(r"\.(.+)\.[0-9a-f]{16}\.unfinished")
+"""The names of files that are not yet whole."""
+
+
+class WriteError(OSError):
+    """A file that cannot be written."""
+
+
+def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
+    """Writes a file so that a reader never sees half of it, also after a power failure.
+
+    Args:
+      path: the file; replaces what was there.
+      content: of the file; text as UTF-8.
+      mode: of the file, less what the umask takes away.
+
+    Raises:
+      WriteError: names the file, which is then as it was before.
+    """
+    # A name of its own, as another process may write the same file.
+    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(8)}.unfinished")
+    try:
+        unfinished.touch(mode, exist_ok=False)
+        with unfinished.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+        _sync(path.parent)
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise WriteError(error.errno, reason, str(path)) from error
+    finally:
+        with contextlib.suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+
+
+def is_unfinished(path: Path, name: str | None = None) -> bool:
+    """Whether `write` was killed while it wrote this, in place of the file `name` if given."""
+    found = _UNFINISHED_NAME.fullmatch(path.name)
+    is_ours = found is not None and name in (None, found[1])
+    return is_ours and path.is_file() and not path.is_symlink()
+
+
+def remove_unfinished(directory: Path) -> None:
+    """Removes what a `write` that was killed has left in a directory."""
+    for path in filter(is_unfinished, directory.iterdir()):
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+@contextlib.contextmanager
+def reserved(path: Path) -> Iterator[None]:
+    """Makes an empty file for what is about to be written, so that nobody else takes its name.
+
+    It is removed if that fails.
+
+    Raises:
+      FileExistsError: if there is something already.
+      OSError: if nothing can be written there.
+    """
+    path.open("xb").close()
+    try:
+        yield
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def append(path: Path, line: str) -> None:
+    """Adds a line to a text file; a `WriteError` names the file if it cannot be written."""
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+    except OSError as error:
+        raise WriteError(error.errno, error.strerror, str(path)) from error
+
+
+def _sync(directory: Path) -> None:
+    """Makes the names in a directory durable, where the system can."""
+    with contextlib.suppress(OSError):
+        number = os.open(directory, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+
+
+@contextlib.contextmanager
+def locked(directory: Path, *, waits: bool) -> Iterator[None]:
+    """Keeps a directory for this process, by a lock on the file `.lock` in it.
+
+    Args:
+      directory: must exist.
+      waits: wait until another process gives the directory up.
+
+    Raises:
+      BlockingIOError: if another process keeps the directory, and `waits` is False.
+      OSError: if the lock cannot be taken.
+    """
+    lock = filelock.FileLock(directory / ".lock", timeout=-1 if waits else 0)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        raise BlockingIOError(f"{directory} is kept by another process") from None
+    try:
+        yield
+    finally:
+        lock.release()

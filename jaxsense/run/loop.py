@@ -1,0 +1,263 @@
+"""The loop that drives a training from the host: stage after stage, chunk after chunk."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
+from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.run.programs import Programs, padded
+from jaxsense.stages import Progress, Stage
+from jaxsense.types import Key
+
+_SAVE_PERIOD = 60.0  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """What a training leaves.
+
+    Attributes:
+      outputs: of every stage, by its name.
+      curves: of every stage with steps: the metrics of its `[steps]`, and `seconds` of each chunk.
+    """
+
+    outputs: dict[str, Any]
+    curves: dict[str, Curves]
+
+
+def train(
+    key: Key, programs: Programs, monitor: Monitor, checkpoints: Checkpoints | None = None
+) -> Trained:
+    """Runs all stages; those that do not need one another run side by side.
+
+    Args:
+      key: the only source of randomness.
+      programs: of the stages.
+      monitor: is told of time and progress.
+      checkpoints: where what is trained is saved, if anywhere; what is there already, from the same
+        key and settings, is not trained again.
+
+    Raises:
+      StageError: if something is not finite; trainings under way have been saved as they were
+        before.
+      Stopped: if the monitor was told to stop; trainings under way have been saved.
+      OSError: if a checkpoint cannot be written.
+    """
+    with ThreadPoolExecutor(1) as saver:
+        loop = _Loop(key, programs, monitor, checkpoints or Checkpoints(), saver)
+        try:
+            return loop.run()
+        except Stopped:
+            # Who is told that all is saved must be told if it is not.
+            loop.wait_for_saving()
+            raise
+
+
+class _Loop:
+    """One training."""
+
+    def __init__(
+        self,
+        key: Key,
+        programs: Programs,
+        monitor: Monitor,
+        checkpoints: Checkpoints,
+        saver: ThreadPoolExecutor,
+    ):
+        self._key, self._programs, self._monitor = key, programs, monitor
+        self._checkpoints, self._saver = checkpoints, saver
+        self._saving: list[Future[None]] = []
+        self._curves: dict[str, Curves] = {}
+
+    def run(self) -> Trained:
+        """All stages."""
+        stages, done = self._programs.stages, dict[str, Future[Any]]()
+        with ThreadPoolExecutor(len(stages)) as threads:
+            for stage in stages:
+                before = {name: done[name] for name in stage.inputs}
+                done[stage.name] = threads.submit(self._run_stage, stage, before)
+            # A thread that waits for good may not hear of Ctrl-C.
+            while wait(done.values(), timeout=0.2).not_done:
+                pass
+        outputs = {name: future.result() for name, future in done.items()}
+        self._monitor.check_stop()
+        self.wait_for_saving()
+        return Trained(outputs, self._curves)
+
+    def wait_for_saving(self) -> None:
+        """Waits until all is saved; raises the first error."""
+        for each in self._saving:
+            each.result()
+
+    def _run_stage(self, stage: Stage, before: dict[str, Future[Any]]) -> Any:
+        """The output of a stage, which is loaded if it was saved."""
+        try:
+            found = self._load(stage) if stage.is_saved else None
+            if found is not None:
+                return found
+            inputs = stage.select({name: future.result() for name, future in before.items()})
+            self._monitor.check_stop()
+            output = self._train(stage, inputs) if stage.steps else self._begin(stage, inputs)
+            if not stage.is_optional:
+                self._monitor.check_finite(stage.name, "results", output)
+            if stage.is_saved:
+                self._save(stage, output)
+            return output
+        except StageError as error:
+            self._monitor.fail(error)
+            raise
+
+    def _begin(self, stage: Stage, inputs: tuple[Any, ...]) -> Any:
+        """What `begin` returns: the state, or the output of a stage without steps."""
+        key, _ = stage.keys(self._key)
+        program, config = self._programs.of(stage).begin, self._programs.config
+        if not stage.has_rows:
+            return program(key, config, *inputs)
+        number = len(jax.tree.leaves(inputs)[0])
+        found = program(key, config, *padded(inputs, self._programs.workers.number))
+        return jax.tree.map(lambda x: x[:number], found)
+
+    def _train(self, stage: Stage, inputs: tuple[Any, ...]) -> Any:
+        """The output of a stage with steps."""
+        programs, config = self._programs.of(stage), self._programs.config
+        _, keys = stage.keys(self._key)
+        # The rate is that of training, without the compilation.
+        programs.advance.wait()
+
+        def advance(chunk: int, state: Any) -> tuple[Any, Curves]:
+            begin = time.perf_counter()
+            state, progress = programs.advance(keys[chunk], config, state, *inputs)
+            seconds = time.perf_counter() - begin
+            curves = self._report(stage, chunk, progress, programs.finish(config, state, *inputs))
+            return state, {**curves, "seconds": [seconds]}
+
+        state = self._begin(stage, inputs)
+        try:
+            state, curves = run_chunks(
+                stage.name, state, stage.chunks, advance, self._monitor, self._checkpoints
+            )
+        except StageError as error:
+            if not stage.is_optional:
+                raise
+            self._monitor.warn(f"{error}: left out")
+            state, curves = _failed(state), self._no_curves(stage)
+        self._curves[stage.name] = curves
+        return programs.finish(config, state, *inputs)
+
+    def _report(self, stage: Stage, chunk: int, progress: Progress, output: Any) -> Curves:
+        """Reports a chunk and what the training would return now; returns the steps' metrics."""
+        size = len(progress.loss)
+        done = min((chunk + 1) * size, stage.steps)
+        losses, metrics = jax.tree.map(
+            lambda x: np.asarray(x)[: done - chunk * size], (progress.loss, progress.metrics)
+        )
+        means = {
+            name: float(np.nanmean(values))
+            for name, values in metrics.items()
+            if np.isfinite(values).any()
+        }
+        self._monitor.report(stage.name, done, stage.steps, losses, output, **means)
+        return {name: values.tolist() for name, values in metrics.items()}
+
+    def _load(self, stage: Stage) -> Any:
+        """What was saved of a stage that has ended; None if it was not."""
+        if stage.steps:
+            shapes = _as_arrays(self._no_curves(stage))
+            curves = self._checkpoints.load_or_forget(f"curves_{stage.name}", shapes)
+            if curves is None:
+                return None
+            self._curves[stage.name] = {name: x.tolist() for name, x in curves.items()}
+        output = self._programs.of(stage).shapes.result().output
+        return self._checkpoints.load_or_forget(stage.name, output)
+
+    def _no_curves(self, stage: Stage) -> Curves:
+        """The curves of a training that has failed."""
+        metrics = self._programs.of(stage).shapes.result().progress.metrics
+        return {**dict.fromkeys(metrics, [np.nan] * stage.steps), "seconds": [0.0] * stage.chunks}
+
+    def _save(self, stage: Stage, output: Any) -> None:
+        """Saves a stage that has ended, while others run; raises if that failed before."""
+        for each in self._saving:
+            if each.done():
+                each.result()
+        if self._checkpoints.path is None:
+            return
+
+        def save() -> None:
+            if stage.steps:
+                curves = _as_arrays(self._curves[stage.name])
+                self._checkpoints.save(f"curves_{stage.name}", curves)
+            self._checkpoints.save(stage.name, output)
+
+        self._saving.append(self._saver.submit(save))
+
+
+def _as_arrays(curves: Curves) -> dict[str, np.ndarray]:
+    return {name: np.array(values, np.float32) for name, values in curves.items()}
+
+
+def _failed(state: Any) -> Any:
+    """A state of a training that has failed: not a number wherever there can be one."""
+
+    def fail(x: Any) -> np.ndarray:
+        x = np.asarray(x)
+        return np.full_like(x, np.nan) if np.issubdtype(x.dtype, np.floating) else x
+
+    return jax.tree.map(fail, state)
+
+
+def run_chunks(
+    stage: str,
+    state: Any,
+    number: int,
+    run: Callable[[int, Any], tuple[Any, Curves]],
+    monitor: Monitor,
+    checkpoints: Checkpoints,
+) -> tuple[Any, Curves]:
+    """Runs a training, from where it was when it was saved last.
+
+    Args:
+      stage: its name.
+      state: what it starts from.
+      number: of chunks.
+      run: `(chunk, state) -> (state, metrics)`; the same for the same chunk and state.
+      monitor: knows whether to stop.
+      checkpoints: where the training is saved once a minute, and when it stops.
+
+    Returns:
+      The last state and the metrics of all chunks.
+
+    Raises:
+      Stopped: if the run is to stop before the training is over; it has been saved.
+      StageError: from `run`; what was there before the chunk has been saved.
+    """
+    done, curves = 0, Curves()
+    found = checkpoints.load_unfinished(stage, state)
+    if found is not None:
+        done, state, curves = found
+    saved = time.monotonic()
+    for chunk in range(done, number):
+        try:
+            after, metrics = run(chunk, state)
+        except StageError as error:
+            try:
+                checkpoints.save_unfinished(stage, Unfinished(chunk, state, curves))
+            except OSError as lost:
+                raise StageError(f"{error}; what was sound cannot be saved ({lost})") from error
+            raise
+        state = after
+        for name, values in metrics.items():
+            curves.setdefault(name, []).extend(values)
+        is_late = time.monotonic() - saved > _SAVE_PERIOD
+        if is_late or monitor.is_stopping:
+            checkpoints.save_unfinished(stage, Unfinished(chunk + 1, state, curves))
+            saved = time.monotonic()
+        if chunk + 1 < number:
+            monitor.check_stop()
+    return state, curves

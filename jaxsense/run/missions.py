@@ -1,0 +1,226 @@
+"""Many missions in batches, to compare policies and to see what failures do."""
+
+import dataclasses
+import math
+import threading
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsense.config import Config, values
+from jaxsense.mission.cases import Case
+from jaxsense.mission.outcome import bytes_per_detection, figures, summarise
+from jaxsense.mission.rollout import play
+from jaxsense.mission.state import (
+    Faults,
+    Mission,
+    MissionState,
+    Record,
+    no_faults,
+    reset,
+    with_config,
+)
+from jaxsense.models import Models, untrained
+from jaxsense.run.compilation import Compiler, Program
+from jaxsense.run.devices import ALONE, Workers
+from jaxsense.types import Key
+
+_CHUNK_TIME = 2.5  # s
+_MOST_AT_ONCE = 384
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """A whole mission.
+
+    Attributes:
+      end: the state in which it ended.
+      records: `[steps]` of all control periods, and of some after its end that are like the last.
+    """
+
+    end: MissionState
+    records: Record
+
+
+@dataclasses.dataclass(frozen=True)
+class Played:
+    """What many missions have come to.
+
+    Attributes:
+      metrics: for each case the `[episodes, ...]` figures of `mission.figures`.
+      recording: the first mission of the first case.
+      control_steps: control periods of all missions, until they were over.
+    """
+
+    metrics: dict[str, dict[str, Any]]
+    recording: Recording
+    control_steps: int
+
+
+def chunks(config: Config) -> tuple[int, int]:
+    """Control periods of a chunk, after which the host looks on, and the most chunks there are."""
+    settings = config.mission
+    chunk = math.ceil(min(_CHUNK_TIME, settings.time_limit) / settings.control_period)
+    return chunk, math.ceil(settings.time_limit / settings.control_period / chunk)
+
+
+def batch_of(total: int) -> int:
+    """How many of all missions to play side by side: fewer than all, as some last long."""
+    values.require_number("total", total)
+    return min(_MOST_AT_ONCE, -(-total // 3))
+
+
+def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
+    """Keys of an episode's arena, and of what happens in it; fold the number of a chunk into it."""
+    arena_key, play_key = jax.random.split(key)
+    return jax.random.fold_in(arena_key, episode), jax.random.fold_in(play_key, episode)
+
+
+class Player:
+    """Plays missions in batches, with programs that are compiled once, before there are models.
+
+    Episode i has the same arena in every case, and in every batch.
+
+    Attributes:
+      mission: the mission.
+    """
+
+    def __init__(self, mission: Mission, compiler: Compiler, batch: int, workers: Workers = ALONE):
+        """Compiles for about `batch` missions side by side, which the workers share."""
+        batch = -(-batch // workers.number) * workers.number
+        self.mission, self._monitor, self._batch = mission, compiler.monitor, batch
+        config, share = mission.config, batch // workers.number
+        chunk, _ = chunks(config)
+        self._lock = threading.Lock()
+
+        def begin(
+            key: Key, config: Config, episode: jax.Array, policies: jax.Array, faults: Faults
+        ):
+            team = with_config(mission, config)
+
+            def begin_one(episode: jax.Array, policy: jax.Array, faults: Faults):
+                return reset(keys_of_episode(key, episode)[0], team, policy, faults)
+
+            return jax.vmap(begin_one)(episode, policies, faults)
+
+        def go_on(
+            key: Key,
+            config: Config,
+            models: Models,
+            episode: jax.Array,
+            number: jax.Array,
+            state: MissionState,
+        ):
+            team = with_config(mission, config)
+            keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(episode)
+            keys = jax.vmap(jax.random.fold_in)(keys, number)
+            state, records = play(keys, team, models, state, chunk, share)
+            return state, jax.vmap(lambda s: figures(team, models, s))(state), records
+
+        key, numbers = jax.random.key(0), jax.ShapeDtypeStruct((batch,), jnp.int32)
+        faults = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((batch, *x.shape), x.dtype), no_faults(config)
+        )
+        self._begin = Program(compiler, "mission", "begin")
+        state = self._begin.compile(
+            begin, key, config, numbers, numbers, faults, workers=workers, whole=(0, 1)
+        )
+        models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
+        self._go_on = Program(compiler, "mission", "go_on")
+        self._go_on.compile(
+            go_on, key, config, models, numbers, numbers, state, workers=workers, whole=(0, 1, 2)
+        )
+
+    def wait(self) -> None:
+        """Waits until the programs are compiled."""
+        self._begin.wait()
+        self._go_on.wait()
+
+    def play(self, key: Key, models: Models, played: dict[str, Case], episodes: int) -> Played:
+        """Plays every case in the same arenas.
+
+        Args:
+          key: random key.
+          models: trained networks.
+          played: what to play with.
+          episodes: how many missions of each case.
+
+        Raises:
+          StageError: if the models or the map of a mission are not finite; a policy would take a
+            value that is not for the end of its mission.
+        """
+        with self._lock:  # they fill the machine
+            return self._play(key, models, played, episodes)
+
+    def _play(self, key: Key, models: Models, played: dict[str, Case], episodes: int) -> Played:
+        """See `play`."""
+        self._monitor.check_finite("mission", "models", models)
+        config = self.mission.config
+        total = episodes * len(played)
+        row = np.arange(-(-total // self._batch) * self._batch, dtype=np.int32) % total
+        case, episode = row // episodes, row % episodes
+        policies = np.array([c.policy for c in played.values()], np.int32)[case]
+        faults = jax.tree.map(lambda *x: np.stack(x)[case], *[c.faults for c in played.values()])
+        inputs = episode, policies, faults
+
+        def begin(first: int) -> MissionState:
+            part = jax.tree.map(lambda x: x[first : first + self._batch], inputs)
+            return jax.tree.map(np.asarray, self._begin(key, config, *part))
+
+        begun = [begin(first) for first in range(0, len(row), self._batch)]
+        starts = jax.tree.map(lambda *x: np.concatenate(x), *begun)
+
+        # A mission that is over makes room for the next one, so that short ones do not wait.
+        state = jax.tree.map(lambda x: x[: self._batch].copy(), starts)
+        playing, waiting = np.arange(self._batch), iter(range(self._batch, total))
+        chunk, done = np.zeros(self._batch, np.int32), np.zeros(len(row), bool)
+        results: Any = None
+        first: list[tuple[MissionState, Record]] = []
+        control_steps = 0
+        while not done[:total].all():
+            self._monitor.check_stop()
+            state, found, records = self._go_on(key, config, models, episode[playing], chunk, state)
+            state, found, records = jax.tree.map(np.array, (state, found, records))
+            at = f"beliefs after {chunk.max() + 1} chunks"
+            self._monitor.check_finite("mission", at, state.belief)
+            if not done[0]:
+                first.append(jax.tree.map(lambda x: x[0].copy(), (state, records)))
+            if results is None:
+                results = jax.tree.map(lambda x: np.zeros((len(row), *x.shape[1:]), x.dtype), found)
+            chunk += 1
+            for slot in np.flatnonzero(state.is_over & ~done[playing]).tolist():
+                done[playing[slot]] = True
+                control_steps += int(state.steps[slot])
+                _set_row(results, int(playing[slot]), found, slot)
+                following = next(waiting, None)
+                if following is not None:
+                    playing[slot], chunk[slot] = following, 0
+                    _set_row(state, slot, starts, following)
+            self._monitor.progress("mission", int(done[:total].sum()), total)
+        ends, chunks_of_records = zip(*first, strict=True)
+        whole = jax.tree.map(lambda *parts: np.concatenate(parts), *chunks_of_records)
+        metrics = {
+            name: jax.tree.map(lambda x: x[i * episodes : (i + 1) * episodes], results)  # noqa: B023
+            for i, name in enumerate(played)
+        }
+        return Played(metrics, Recording(ends[-1], whole), control_steps)
+
+
+def _set_row(target: Any, row: int, source: Any, from_row: int) -> None:
+    """Copies a row of every array of a tree into another."""
+
+    def copy(target: np.ndarray, source: np.ndarray) -> None:
+        target[row] = source[from_row]
+
+    jax.tree.map(copy, target, source)
+
+
+def summary(mission: Mission, played: Played) -> dict[str, Any]:
+    """The summary's block `mission`."""
+    config = mission.config
+    blocks = {name: summarise(config, name, found) for name, found in played.metrics.items()}
+    detections = sum(found["detections"].sum(axis=0) for found in played.metrics.values())
+    size = bytes_per_detection(mission, np.asarray(detections))
+    return {**blocks, "bytes_per_detection": size}

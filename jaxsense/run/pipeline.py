@@ -1,0 +1,128 @@
+"""A whole run: the training, the missions, and the summary of both."""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxsense import examine, mission
+from jaxsense.config import Config
+from jaxsense.models import Models
+from jaxsense.run import missions
+from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run.compilation import Compiler, Kept
+from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.loop import Trained, train
+from jaxsense.run.monitor import Monitor
+from jaxsense.run.programs import Programs, compile_programs
+from jaxsense.sim.world import make_world
+from jaxsense.stages import mission_key, models
+from jaxsense.types import Belief, Key
+
+
+@dataclasses.dataclass(frozen=True)
+class RunResult:
+    """What a run leaves.
+
+    Attributes:
+      models: the trained networks.
+      windows: for each modality `[C, 1, F]` one look at each class.
+      posteriors: for each set of modalities, `[C, S', D]` beliefs of held-out detections.
+      rewards: for each modality `[epochs]` mean total reward of the episodes that ended; NaN where
+        none did.
+      recording: the first mission of the latent policy.
+      summary: the blocks `detectors`, `jmvae`, `dqn` and `mission` of `summary.json`.
+    """
+
+    models: Models
+    windows: dict[str, np.ndarray]
+    posteriors: dict[str, Belief]
+    rewards: dict[str, np.ndarray]
+    recording: missions.Recording
+    summary: dict[str, Any]
+
+
+@contextlib.contextmanager
+def compiled(
+    config: Config,
+    monitor: Monitor,
+    workers: Workers = ALONE,
+    kept: Kept | None = None,
+    num_seeds: int = 1,
+) -> Iterator[Programs]:
+    """The programs of runs with the same settings, compiled in the background.
+
+    Args:
+      config: all settings.
+      monitor: is told how long it takes.
+      workers: who shares scenes, missions and seeds.
+      kept: where compiled programs are kept for later runs, if anywhere.
+      num_seeds: runs that go side by side, see `compile_programs`.
+    """
+    with Compiler(monitor, kept) as compiler:
+        yield compile_programs(config, make_world(config), compiler, workers, num_seeds)
+
+
+def run(
+    key: Key, programs: Programs, monitor: Monitor, checkpoints: Checkpoints | None = None
+) -> RunResult:
+    """Trains everything, plays the missions and sums up.
+
+    Args:
+      key: the only source of randomness.
+      programs: from `compiled`, with the same monitor.
+      monitor: is told of time and progress.
+      checkpoints: see `loop.train`, as for what is raised.
+    """
+    config, checkpoints = programs.config, checkpoints or Checkpoints()
+    trained = train(key, programs, monitor, checkpoints)
+    outputs = jax.tree.map(np.asarray, {n: trained.outputs[n] for n in _SHOWN})
+    networks = models(trained.outputs, config)
+    played = {n: case for n, case in mission.cases(config).items() if n in mission.POLICIES}
+    player, episodes = programs.player.result(), config.mission.episodes
+    found = player.play(mission_key(key), networks, played, episodes)
+    checkpoints.forget_unfinished()
+    posteriors, latent = outputs["latent_space"]
+    detections = outputs["detections"]
+    accuracy = zip(config.modalities, detections.accuracy.tolist(), strict=True)
+    return RunResult(
+        models=networks,
+        windows=dict(zip(config.modalities, detections.windows, strict=True)),
+        posteriors=posteriors,
+        rewards={n: np.array(trained.curves[f"dqn_{n}"]["reward"]) for n in config.modalities},
+        recording=found.recording,
+        summary={
+            "detectors": {name: {"accuracy": value} for name, value in accuracy},
+            "jmvae": _as_lists(latent),
+            "dqn": {name: _of_agent(config, name, trained) for name in config.modalities},
+            "mission": missions.summary(player.mission, found),
+        },
+    )
+
+
+_SHOWN = "detections", "latent_space"
+"""Outputs that a summary or a plot shows."""
+
+
+def _of_agent(config: Config, modality: str, trained: Trained) -> dict[str, Any]:
+    """The block of one modality in the summary's `dqn`."""
+    total, first = map(np.asarray, trained.outputs[f"policies_{modality}"])
+    env_steps = config.dqn.epochs * config.dqn.num_envs
+    seconds = sum(trained.curves[f"dqn_{modality}"]["seconds"])
+    return {
+        **examine.policy_figures(total, first, config.evaluation.num_starts),
+        "env_steps": env_steps,
+        "env_steps_per_s": env_steps / seconds,
+    }
+
+
+def _as_lists(figures: dict[str, Any]) -> dict[str, Any]:
+    """The summary's block `jmvae` from the arrays of `examine.latent_space`."""
+    lists = jax.tree.map(lambda x: x.tolist(), figures)
+    lists["unambiguous"] = {
+        name: [share > 0.9 for share in shares] for name, shares in lists["unambiguous"].items()
+    }
+    return lists

@@ -1,0 +1,211 @@
+"""The compiled programs of a run: those of every stage, and those of its missions.
+
+All of them are known before the run begins. They are traced one after the other, in a thread, and
+compiled as soon as they are traced, while the stages run whose programs are ready. Shapes come from
+tracing alone: what a stage returns is what those after it take.
+"""
+
+import dataclasses
+from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
+from contextlib import suppress
+from typing import Any
+
+import jax
+
+from jaxsense import mission
+from jaxsense.config import Config
+from jaxsense.run import missions
+from jaxsense.run.compilation import Compiler, Program
+from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.together import Team, TeamProgram
+from jaxsense.sim.world import World
+from jaxsense.stages import Stage, stages
+
+
+@dataclasses.dataclass(frozen=True)
+class Shapes:
+    """What the programs of a stage return, as shapes and dtypes.
+
+    Attributes:
+      output: of the stage.
+      progress: of one chunk; None for a stage without steps.
+    """
+
+    output: Any
+    progress: Any = None
+
+
+@dataclasses.dataclass(frozen=True)
+class StagePrograms:
+    """The programs of a stage.
+
+    Attributes:
+      begin: `(key, config, *inputs) -> state`, or the output of a stage without steps.
+      advance: `(key, config, state, *inputs) -> (state, Progress)`.
+      finish: `(config, state, *inputs) -> output`.
+      shapes: known as soon as the programs are traced.
+    """
+
+    begin: Program | TeamProgram
+    advance: Program | TeamProgram
+    finish: Program | TeamProgram
+    shapes: Future[Shapes]
+
+
+@dataclasses.dataclass(frozen=True)
+class Programs:
+    """The programs of runs with the same settings, but for the numbers that are leaves of them.
+
+    Attributes:
+      config: all settings.
+      stages: of the training.
+      of_stages: their programs, by `Stage.program`.
+      player: of the missions.
+      workers: who shares rows and missions.
+      team: the trainings that go side by side.
+    """
+
+    config: Config
+    stages: list[Stage]
+    of_stages: dict[str, StagePrograms]
+    player: Future[missions.Player]
+    workers: Workers
+    team: Team
+
+    def of(self, stage: Stage) -> StagePrograms:
+        """The programs of a stage."""
+        return self.of_stages[_name(stage)]
+
+    def fail(self, error: BaseException) -> None:
+        """Raises an error from whoever waits for a program, now or later."""
+        for each in self.of_stages.values():
+            for program in (each.begin, each.advance, each.finish):
+                program.fail(error)
+        for future in (self.player, *(each.shapes for each in self.of_stages.values())):
+            with suppress(InvalidStateError):
+                future.set_exception(error)
+
+
+def compile_programs(
+    config: Config,
+    world: World,
+    compiler: Compiler,
+    workers: Workers = ALONE,
+    num_seeds: int = 1,
+) -> Programs:
+    """Begins to trace and to compile the programs of a run in the background.
+
+    Args:
+      config: all settings.
+      world: the simulation, without contacts.
+      compiler: compiles them.
+      workers: who shares rows, missions and seeds.
+      num_seeds: trainings that go side by side, in threads, each of which calls the programs.
+    """
+    found, team = stages(config, world), Team(num_seeds)
+
+    def program(stage: Stage, part: str) -> Program | TeamProgram:
+        alone = Program(compiler, _name(stage), part)
+        return alone if stage.has_rows or num_seeds == 1 else TeamProgram(alone, team, workers)
+
+    programs = Programs(
+        config=config,
+        stages=found,
+        of_stages={
+            _name(stage): StagePrograms(
+                begin=program(stage, "begin"),
+                advance=program(stage, "advance"),
+                finish=program(stage, "finish"),
+                shapes=Future(),
+            )
+            for stage in found
+        },
+        player=Future(),
+        workers=workers,
+        team=team,
+    )
+
+    def trace() -> None:
+        try:
+            for stage in found[:_BEFORE_MISSIONS]:
+                _trace_stage(programs, stage)
+            # Needed last, but on a CPU they take longest to compile. Beside an accelerator are
+            # cores enough to compile, and what all wait for is tracing.
+            if _on_cpu():
+                _trace_missions(programs, compiler)
+            for stage in found[_BEFORE_MISSIONS:]:
+                _trace_stage(programs, stage)
+            if not _on_cpu():
+                _trace_missions(programs, compiler)
+        except BaseException as error:
+            programs.fail(error)
+
+    thread = ThreadPoolExecutor(1)
+    thread.submit(trace)
+    thread.shutdown(wait=False)
+    return programs
+
+
+_BEFORE_MISSIONS = 2  # stages that all others wait for
+
+
+def _name(stage: Stage) -> str:
+    return stage.program or stage.name
+
+
+def _on_cpu() -> bool:
+    """Whether the programs run on a CPU; accelerators train faster than they compile."""
+    return jax.default_backend() == "cpu"
+
+
+def _trace_missions(programs: Programs, compiler: Compiler) -> None:
+    config = programs.config
+    batch = missions.batch_of(len(mission.POLICIES) * config.mission.episodes)
+    team = mission.make_mission(config)
+    programs.player.set_result(missions.Player(team, compiler, batch, programs.workers))
+
+
+def _trace_stage(programs: Programs, stage: Stage) -> None:
+    """Traces the programs of a stage, unless they are those of one before."""
+    compiled, key, config = programs.of(stage), jax.random.key(0), programs.config
+    if compiled.shapes.done():
+        return
+    outputs = {
+        before.name: programs.of(before).shapes.result().output
+        for before in programs.stages
+        if before.name in stage.inputs
+    }
+    inputs = stage.select(outputs)
+    if isinstance(compiled.begin, Program) and stage.has_rows:
+        inputs = padded(inputs, programs.workers.number)
+        whole = {"workers": programs.workers, "whole": (0, 1)}
+        output = compiled.begin.compile(stage.begin, key, config, *inputs, **whole)
+        number = len(jax.tree.leaves(outputs)[0])
+        compiled.shapes.set_result(Shapes(jax.tree.map(lambda x: _with_rows(x, number), output)))
+        return
+    state = compiled.begin.compile(stage.begin, key, config, *inputs, whole=(1,))
+    if not stage.steps:
+        compiled.shapes.set_result(Shapes(state))
+        return
+    runs_long = stage.is_dense and _on_cpu()
+    _, progress = compiled.advance.compile(
+        stage.advance, key, config, state, *inputs, runs_long=runs_long, whole=(1,)
+    )
+    output = compiled.finish.compile(stage.finish, config, state, *inputs, whole=(0,))
+    compiled.shapes.set_result(Shapes(output, progress))
+
+
+def padded(inputs: Any, number: int) -> Any:
+    """Inputs with rows, of which the first are repeated so that `number` divides them."""
+
+    def pad(x: Any) -> Any:
+        rows = -(-x.shape[0] // number) * number
+        if isinstance(x, jax.ShapeDtypeStruct):
+            return _with_rows(x, rows)
+        return x if rows == len(x) else x[jax.numpy.arange(rows) % len(x)]
+
+    return jax.tree.map(pad, inputs)
+
+
+def _with_rows(x: jax.ShapeDtypeStruct, rows: int) -> jax.ShapeDtypeStruct:
+    return x.update(shape=(rows, *x.shape[1:]))

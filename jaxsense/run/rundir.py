@@ -1,0 +1,346 @@
+"""The directory that a run leaves behind: writing it, going on in it, and reading it back."""
+
+import contextlib
+import dataclasses
+import errno
+import importlib.metadata
+import itertools
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxsense import models, stages
+from jaxsense.config import (
+    PRESETS,
+    Config,
+    ConfigError,
+    as_plain,
+    from_plain,
+    parse_json,
+    require_trust,
+)
+from jaxsense.models import Models
+from jaxsense.run import files
+from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run.version import __version__
+
+BLOCKS = ("detectors", "jmvae", "dqn", "mission")
+"""What a summary holds of what was trained."""
+_METRICS = "metrics.jsonl"
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """All that a run's results follow from, on the same devices and versions.
+
+    Attributes:
+      preset: where the settings came from.
+      seed: of all randomness.
+      config: the settings.
+      num_seeds: how many seeds are trained, from `seed` on.
+    """
+
+    preset: str
+    seed: int
+    config: Config
+    num_seeds: int = 1
+
+    @property
+    def seeds(self) -> range:
+        """All seeds."""
+        return range(self.seed, self.seed + self.num_seeds)
+
+
+class RunDirectory:
+    """Writes the files of one run; never over those of another.
+
+    As a context, it keeps the directory for this process, see `create` and `resume`.
+
+    Attributes:
+      path: the directory.
+      settings: of the run.
+      checkpoints: what it saves while it trains.
+    """
+
+    def __init__(self, path: Path, settings: Settings):
+        """A directory that is there; see `create` and `resume`."""
+        self.path, self.settings = path, settings
+        self.checkpoints = Checkpoints(path / "checkpoints")
+
+    @classmethod
+    @contextlib.contextmanager
+    def create(cls, path: Path, settings: Settings) -> "Iterator[RunDirectory]":
+        """Makes the directory, writes `config.json`, and keeps the directory for this process.
+
+        Raises:
+          ConfigError: if the directory holds something already, cannot be written, or is kept by
+            another process.
+        """
+        content = {
+            "preset": settings.preset,
+            "seed": settings.seed,
+            "num_seeds": settings.num_seeds,
+            "config": as_plain(settings.config),
+            "versions": versions(),
+            "commit": commit(),
+        }
+        reason = "cannot be written ({}); must be a new directory"
+        with contextlib.ExitStack() as kept:
+            try:
+                path.mkdir(parents=True, exist_ok=True)
+                # Also before the lock, which would be one file more in somebody's directory.
+                _check_empty(path)
+                kept.enter_context(_locked(path, "out"))
+                run = cls(path, settings)
+                run._remove_unfinished()
+                _check_empty(path)
+                write_json(path / "config.json", content)
+            except OSError as error:
+                raise ConfigError("out", str(path), reason.format(error.strerror)) from None
+            yield run
+
+    @classmethod
+    @contextlib.contextmanager
+    def resume(cls, path: Path, trust: bool = False) -> "Iterator[RunDirectory]":
+        """The directory of a run that has stopped, kept for this process.
+
+        Raises:
+          ConfigError: as `resumable`, or if another process keeps the directory.
+        """
+        settings = resumable(path, trust)
+        with _locked(path, "resume"):
+            run = cls(path, settings)
+            run._remove_unfinished()
+            run.checkpoints.check(is_begun=(path / _METRICS).exists())
+            run._drop_unfinished_line()
+            yield run
+
+    def write_json(self, name: str, content: Any) -> None:
+        """Writes a file of the run, see the function of the same name."""
+        write_json(self.path / name, content)
+
+    def save_models(self, models: Models) -> None:
+        """Saves trained models, for `load`; an `OSError` says that they cannot be written."""
+        for name, tree in _named(models, self.settings.config).items():
+            self.checkpoints.save(name, tree)
+
+    def append_metrics(self, **figures: Any) -> None:
+        """Adds a line to `metrics.jsonl`."""
+        files.append(self.path / _METRICS, json.dumps(figures))
+
+    def _remove_unfinished(self) -> None:
+        """Removes what a process that was killed has left of files of this run."""
+        for place in (self.path, *self.checkpoints.directories()):
+            files.remove_unfinished(place)
+
+    def _drop_unfinished_line(self) -> None:
+        """Cuts what a process that was killed has left of a line of `metrics.jsonl`."""
+        path = self.path / _METRICS
+        if path.exists():
+            content = path.read_bytes()
+            whole = content[: content.rfind(b"\n") + 1]
+            if whole != content:
+                files.write(path, whole)
+
+
+def unused(path: Path) -> Path:
+    """A directory that was not there, made under this name or, if it is taken, a numbered one.
+
+    Raises:
+      ConfigError: if it cannot be made.
+    """
+    first = path
+    try:
+        first.parent.mkdir(parents=True, exist_ok=True)
+        for number in itertools.count(2):
+            try:
+                path.mkdir()
+                break
+            except FileExistsError:
+                path = first.with_name(f"{first.name}-{number}")
+    except OSError as error:
+        raise ConfigError("out", str(path), f"cannot be made ({error.strerror})") from None
+    return path
+
+
+def _check_empty(path: Path) -> None:
+    """Raises a `ConfigError` if a directory holds more than a lock."""
+    # A lock and the beginning of a file are left by a process that was killed at once.
+    if any(f.name != ".lock" and not files.is_unfinished(f, "config.json") for f in path.iterdir()):
+        raise ConfigError("out", str(path), "is not empty; must be a new directory")
+
+
+def resumable(path: Path, trust: bool = False) -> Settings:
+    """The settings of a run that has stopped.
+
+    Raises:
+      ConfigError: if there is no such run, if another version wrote it, if it is finished, or if it
+        names code, see `read_settings`.
+    """
+    content = _read_config(path / "config.json", "resume", path)
+    _check_version(content, "resume", path)
+    if (path / "summary.json").exists():
+        raise ConfigError("resume", str(path), "is finished; there is nothing to go on with")
+    return _settings_of(content, trust)
+
+
+@contextlib.contextmanager
+def _locked(path: Path, field: str) -> Iterator[None]:
+    """Keeps a directory for this process; a `ConfigError` about `field` if another one has it."""
+    with contextlib.ExitStack() as kept:
+        try:
+            kept.enter_context(files.locked(path, waits=False))
+        except BlockingIOError:
+            reason = "is being written by another process; wait for its end"
+            raise ConfigError(field, str(path), reason) from None
+        yield
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that results depend on."""
+    others = {package: importlib.metadata.version(package) for package in _PACKAGES}
+    return {"jaxsense": __version__, **others}
+
+
+def commit() -> str | None:
+    """The commit of jaxsense's source, with `-dirty` if it was changed; None outside of Git."""
+    source = Path(__file__).parents[1]
+    if not (source / ".git").exists():
+        return None
+    command = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=40"]
+    command += ["--exclude", "*"]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip()
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Writes a file, see `files.write`."""
+    files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def read_settings(file: Path, trust: bool = False) -> Settings:
+    """The settings in the `config.json` of a run.
+
+    What is not given there is as in the preset that it names, or `default`, with seed 0.
+
+    Args:
+      file: the file.
+      trust: whether it may name code, which is run when its sensors are made.
+
+    Raises:
+      ConfigError: if the file cannot be read, or names code without trust; else names the field
+        that is unknown or wrong.
+    """
+    return _settings_of(_read_config(file, "config", file), trust)
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """The `summary.json` of a finished run; a `ConfigError` if there is none."""
+    try:
+        summary = parse_json((path / "summary.json").read_text(encoding="utf-8"))
+        parts = {"timing", *BLOCKS}
+        if not isinstance(summary, dict) or not parts <= set(summary):
+            raise ValueError(f"must be an object with {', '.join(sorted(parts))}")
+        return summary
+    except (OSError, ValueError) as error:
+        reason = f"must hold the summary.json of a finished run ({error})"
+        raise ConfigError("run", str(path), reason) from None
+
+
+def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
+    """Reads the settings and the trained models of a finished run.
+
+    Args:
+      path: the run's directory.
+      trust: whether to run the functions that its `config.json` names for sensors of one's own.
+
+    Returns:
+      The settings and the models, on the default device.
+
+    Raises:
+      ConfigError: if the directory holds no finished run, one of another version, a damaged
+        checkpoint, or one that names code without trust.
+    """
+    path = Path(path)
+    content = _read_config(path / "config.json", "run", path)
+    _check_version(content, "run", path)
+    config = _settings_of(content, trust).config
+    shapes = jax.eval_shape(lambda: models.untrained(jax.random.key(0), config))
+    checkpoints = Checkpoints(path / "checkpoints")
+
+    if not checkpoints.exists() and content.get("num_seeds", 1) != 1:
+        raise ConfigError("run", str(path), f"holds several seeds; choose one, {path}/seed-...")
+
+    def restore(name: str, shape: Any) -> Any:
+        found = checkpoints.load(name, shape)
+        if found is None:
+            reason = f"must be a finished run (there is no checkpoint {name!r})"
+            raise ConfigError("run", str(path), reason)
+        return jax.device_put(found)
+
+    found = {name: restore(name, shape) for name, shape in _named(shapes, config).items()}
+    return config, stages.models(found, config)
+
+
+def _named(models: Models, config: Config) -> dict[str, Any]:
+    """The parts of the models by the names of their stages, which are those of checkpoints."""
+    detectors = zip(config.modalities, models.detectors, strict=True)
+    q_networks = zip(config.modalities, models.q_networks, strict=True)
+    return {
+        **{f"detector_{name}": detector for name, detector in detectors},
+        "jmvae": models.jmvae,
+        "class_beliefs": models.class_beliefs,
+        **{f"dqn_{name}": q_network for name, q_network in q_networks},
+    }
+
+
+def _read_config(file: Path, field: str, value: Path) -> dict[str, Any]:
+    """What lies in a `config.json`; a `ConfigError` about `field = value` if it cannot be read."""
+    try:
+        if file.exists() and not (file.is_file() or file.is_dir()):
+            raise OSError(errno.EINVAL, "Not a regular file")  # it may never end
+        content = parse_json(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        reason = f"must hold a run's settings ({file.name}: {error.strerror})"
+        raise ConfigError(field, str(value), reason) from None
+    except ValueError as error:
+        reason = f"must hold a run's settings ({file.name} is no JSON: {error})"
+        raise ConfigError(field, str(value), reason) from None
+    if not isinstance(content, dict):
+        raise ConfigError(field, str(value), f"{file.name} must hold an object")
+    return content
+
+
+def _settings_of(content: dict[str, Any], trust: bool) -> Settings:
+    """The settings in what lies in a `config.json`."""
+    unknown = sorted(set(content) - {"preset", "seed", "num_seeds", "config", "versions", "commit"})
+    if unknown:
+        raise ConfigError(unknown[0], content[unknown[0]], "is no field of a run's config.json")
+    preset = content.get("preset", "default")
+    if not isinstance(preset, str) or preset not in PRESETS:
+        raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
+    numbers = {"seed": content.get("seed", 0), "num_seeds": content.get("num_seeds", 1)}
+    for name, number in numbers.items():
+        if not isinstance(number, int) or isinstance(number, bool):
+            raise ConfigError(name, number, "must be a whole number")
+    config = from_plain(content.get("config", {}), PRESETS[preset])
+    if not trust:
+        require_trust(config)
+    return Settings(preset, config=config, **numbers)
+
+
+def _check_version(content: dict[str, Any], field: str, path: Path) -> None:
+    """Raises a `ConfigError` if a run was written by a version whose checkpoints may differ."""
+    recorded = content.get("versions")
+    wrote = recorded.get("jaxsense") if isinstance(recorded, dict) else None
+    if not isinstance(wrote, str) or wrote.split(".")[:2] != __version__.split(".")[:2]:
+        by = f"jaxsense {wrote}" if wrote else "an older jaxsense"
+        raise ConfigError(field, str(path), f"was written by {by}; this is {__version__}")

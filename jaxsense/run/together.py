@@ -1,0 +1,137 @@
+"""Several trainings side by side on an accelerator: their calls of a program become one.
+
+Each training walks its own stages in threads of its own, and saves, stops and fails by itself. What
+they share are the programs: calls of the same program are stacked and made at once by `vmap`.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense.run.compilation import Program
+from jaxsense.run.devices import ALONE, Workers
+
+_PATIENCE = 0.5  # s without another call, after which those that wait go on without the others
+
+
+class Team:
+    """Trainings that go side by side.
+
+    Attributes:
+      number: how many there can be.
+      active: how many have begun and not ended.
+    """
+
+    def __init__(self, number: int):
+        self.number = self.active = number
+        self._lock = threading.Lock()
+
+    def begin(self, number: int) -> None:
+        """So many trainings begin, not more than the team has places."""
+        self.active = number
+
+    def leave(self) -> None:
+        """One of them has ended; the others wait for it no longer."""
+        with self._lock:
+            self.active -= 1
+
+
+class TeamProgram:
+    """A `Program` that is called by every training of a team, with arguments of its own."""
+
+    def __init__(self, program: Program, team: Team, workers: Workers = ALONE):
+        """Makes a program one of a team.
+
+        Args:
+          program: what compiles it.
+          team: who calls it.
+          workers: accelerators that share the trainings, if their number divides that of the team.
+        """
+        self._program, self._team = program, team
+        self._workers = workers if team.number % workers.number == 0 else ALONE
+        self._whole: tuple[int, ...] = ()
+        self._lock = threading.Lock()
+        self._waiting: list[tuple[tuple[Any, ...], Future[Any]]] = []
+        self._last = 0.0
+
+    def compile(
+        self,
+        function: Callable[..., Any],
+        *args: Any,
+        runs_long: bool = False,
+        whole: tuple[int, ...] = (),
+    ) -> Any:
+        """See `Program.compile`; arguments in `whole` are the same for all trainings."""
+        self._whole, number = whole, self._team.number
+        axes = tuple(None if i in whole else 0 for i in range(len(args)))
+        shapes = jax.eval_shape(lambda args: args, args)
+        stacked = [
+            arg if i in whole else jax.tree.map(lambda x: _with_rows(x, number), shapes[i])
+            for i, arg in enumerate(args)
+        ]
+        results = self._program.compile(
+            jax.vmap(function, axes),
+            *stacked,
+            runs_long=runs_long,
+            workers=self._workers,
+            whole=whole,
+        )
+        return jax.tree.map(lambda x: x.update(shape=x.shape[1:]), results)
+
+    def fail(self, error: BaseException) -> None:
+        """See `Program.fail`."""
+        self._program.fail(error)
+
+    def wait(self) -> Any:
+        """See `Program.wait`."""
+        return self._program.wait()
+
+    def __call__(self, *args: Any) -> Any:
+        """Runs the program for all trainings that call it now; returns this one's results."""
+        mine: Future[Any] = Future()
+        with self._lock:
+            self._waiting.append((args, mine))
+            self._last = time.monotonic()
+        while not mine.done():
+            calls = self._take()
+            if calls:
+                self._run(calls)
+            else:
+                wait((mine,), timeout=_PATIENCE / 10)
+        return mine.result()
+
+    def _take(self) -> list[tuple[tuple[Any, ...], Future[Any]]]:
+        """The calls to make now: as many as there are trainings, or all that wait for long."""
+        with self._lock:
+            is_late = time.monotonic() - self._last > _PATIENCE
+            if not (len(self._waiting) >= self._team.active or is_late):
+                return []
+            number = self._team.number
+            calls, self._waiting = self._waiting[:number], self._waiting[number:]
+            return calls
+
+    def _run(self, calls: list[tuple[tuple[Any, ...], Future[Any]]]) -> None:
+        """Makes calls together; a place that nobody takes repeats the first call."""
+        rows = [args for args, _ in calls]
+        rows += rows[:1] * (self._team.number - len(rows))
+        stacked = [
+            column[0] if i in self._whole else jax.tree.map(lambda *x: jnp.stack(x), *column)
+            for i, column in enumerate(zip(*rows, strict=True))
+        ]
+        try:
+            results = self._program(*stacked)
+        except BaseException as error:
+            for _, future in calls:
+                future.set_exception(error)
+            return
+        for i, (_, future) in enumerate(calls):
+            future.set_result(jax.tree.map(lambda x: x[i], results))  # noqa: B023
+
+
+def _with_rows(x: Any, number: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((number, *x.shape), x.dtype)

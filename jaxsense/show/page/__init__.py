@@ -1,0 +1,3 @@
+"""The report of a run: one page that needs nothing but itself."""
+
+from jaxsense.show.page.write import write as write

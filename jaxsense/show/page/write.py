@@ -1,0 +1,151 @@
+"""Reads a run directory, and writes its `report.html`."""
+
+import base64
+import contextlib
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from jaxsense.config import PRESETS, Config, ConfigError, as_plain, parse_json
+from jaxsense.run import files
+from jaxsense.show.page import tables
+from jaxsense.show.page.inline import Film, read_film
+
+PLOTS = {
+    "latent_space": (
+        "Posteriors of detections as ellipses in the latent space, for all sensors together and "
+        "for each alone, by class and by uncertainty",
+        "The paper's Fig. 4. What all sensors see together is one class; what one sensor cannot "
+        "tell apart lies between the classes, with a larger sigma.",
+    ),
+    "reward": (
+        "Total reward of an episode over the epochs of training, for each Q-network, with lines "
+        "for the optimal, the naive and the random policy",
+        "The paper's Fig. 5. While it trains, a Q-network still explores; greedy is what it has "
+        "learned.",
+    ),
+    "scanlines": (
+        "What each detector reads of one look at each class",
+        "What the detectors read: one look at each class.",
+    ),
+}
+"""The plots of a run: alternative text and caption."""
+
+
+def write(run: Path, config: Config, summary: dict[str, Any]) -> Path:
+    """Writes `report.html` of a run.
+
+    Args:
+      run: its directory; plots `NAME.png` and animations `mission*.svg` are shown if they are there
+        and are what a run writes.
+      config: its settings.
+      summary: what is in its `summary.json`, or will be.
+
+    Returns:
+      The page's path.
+
+    Raises:
+      ConfigError: if the summary lacks something or holds what is no figure.
+      OSError: if a file cannot be read or written.
+    """
+    try:
+        text = _render(run, config, summary)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        reason = f"must hold the summary.json of a finished run ({error!r})"
+        raise ConfigError("run", str(run), reason) from None
+    except jinja2.UndefinedError as error:
+        reason = f"must hold the summary.json of a finished run ({error})"
+        raise ConfigError("run", str(run), reason) from None
+    path = run / "report.html"
+    files.write(path, text)
+    return path
+
+
+def _render(run: Path, config: Config, summary: dict[str, Any]) -> str:
+    """The page."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("jaxsense.show.page", "."),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    columns, table = tables.unambiguous(summary, list(config.arena.classes))
+    mission_columns, missions = tables.missions(summary)
+    return environment.get_template("report.html.jinja").render(
+        run=run,
+        summary=summary,
+        modalities=[modality for modality, _ in summary["dqn"].items()],
+        num_devices=len(summary["devices"]),
+        devices=sorted(set(summary["devices"])),
+        commit=_commit(run),
+        changed=_changed(config, summary["preset"]),
+        config=json.dumps(as_plain(config), indent=2),
+        policies=tables.policies(summary),
+        latent_space=tables.latent_space(summary),
+        table_columns=columns,
+        table=table,
+        mission_columns=mission_columns,
+        missions=missions,
+        stages=tables.timing(summary),
+        plots=_plots(run),
+        films=_films(run),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Plot:
+    """A plot, as base64, with the alternative text and its caption."""
+
+    data: str
+    alternative: str
+    caption: str
+
+
+def _plots(run: Path) -> list[Plot]:
+    """Those plots that there are."""
+    return [
+        Plot(base64.b64encode(path.read_bytes()).decode(), *texts)
+        for name, texts in PLOTS.items()
+        if (path := run / f"{name}.png").exists()
+    ]
+
+
+def _films(run: Path) -> list[Film]:
+    """Animations, that of the run first."""
+    found = map(read_film, sorted(run.glob("mission*.svg"), key=lambda path: path.stem))
+    return [film for film in found if film is not None]
+
+
+def _commit(run: Path) -> str | None:
+    """The commit that a run's `config.json` tells, if it does."""
+    with contextlib.suppress(OSError, ValueError):
+        content = parse_json((run / "config.json").read_text(encoding="utf-8"))
+        return content.get("commit") if isinstance(content, dict) else None
+    return None
+
+
+def _changed(config: Config, preset: str) -> dict[str, tuple[str, str]]:
+    """Settings that are not the preset's: what they are, and what the preset has."""
+    if preset not in PRESETS:
+        return {}
+    before = _flat(as_plain(PRESETS[preset]))
+    return {
+        name: (json.dumps(value), json.dumps(before.get(name)))
+        for name, value in _flat(as_plain(config)).items()
+        if value != before.get(name)
+    }
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as `section.name`."""
+    found = {}
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            found.update(_flat(value, f"{prefix}{name}."))
+        else:
+            found[f"{prefix}{name}"] = value
+    return found

@@ -1,0 +1,183 @@
+"""The plots of a run: the paper's Fig. 4 and Fig. 5, and what the sensors see."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import cm, colormaps
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from matplotlib.patheffects import withStroke
+
+from jaxsense.config import Config
+from jaxsense.run import files
+from jaxsense.run.pipeline import RunResult
+from jaxsense.show.colours import as_srgb, class_colour
+from jaxsense.sim import sensors
+from jaxsense.types import Belief
+
+_MOST_ELLIPSES = 40
+_SMOOTHING = 20  # epochs
+_FAR = 0.2  # sigma from the median of its class, beyond which a detection is an outlier
+
+
+def write_plots(path: Path, config: Config, result: RunResult) -> None:
+    """Writes `latent_space.png`, `reward.png` and `scanlines.png` into a directory."""
+    plots = {
+        "latent_space": latent_space(config, result.posteriors),
+        "reward": rewards(result.rewards, result.summary["dqn"]),
+        "scanlines": scanlines(config, result.windows),
+    }
+    for name, figure in plots.items():
+        content = io.BytesIO()
+        figure.savefig(content, format="png", dpi=120)
+        files.write(path / f"{name}.png", content.getvalue())
+
+
+def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
+    """The paper's Fig. 4: posteriors of held-out detections as 1-sigma ellipses.
+
+    Above, classes by colour; below, `||sigma||` by colour; one column for detections by all
+    modalities together, and one for each alone. Of a latent space of more than two dimensions the
+    first two are shown. Detections far from the others of their class are crosses.
+    """
+    names = ["joint", *config.modalities]
+    titles = {"joint": " & ".join(config.modalities)}
+    figure = Figure(figsize=(3.6 * len(names) + 1.2, 7.6), layout="constrained")
+    axes = figure.subplots(2, len(names), sharex=True, sharey=True, squeeze=False)
+    norms = {name: np.linalg.norm(belief.std, axis=-1) for name, belief in posteriors.items()}
+    lowest = min(norm[:, :_MOST_ELLIPSES].min() for norm in norms.values())
+    highest = max(norm[:, :_MOST_ELLIPSES].max() for norm in norms.values())
+    scale = Normalize(lowest, highest)
+    sigma_map = colormaps["viridis"]
+    colours = [class_colour(config.arena, label) for label in config.arena.classes]
+    num_far = 0
+    for column, name in enumerate(names):
+        belief = posteriors[name]
+        axes[0, column].set_title(titles.get(name, f"{name} alone"))
+        mean, std = (_in_plane(x[:, :_MOST_ELLIPSES]) for x in (belief.mean, belief.std))
+        centre, spread = np.median(mean, axis=1), np.median(std, axis=1)
+        is_far = _apart(mean, centre[:, None], spread[:, None]) > _FAR
+        num_far += int(is_far.sum())
+        for c, colour in enumerate(colours):
+            by_class = np.tile(colour, (mean.shape[1], 1))
+            by_sigma = sigma_map(scale(norms[name][c, :_MOST_ELLIPSES]))
+            for row, shades in enumerate((by_class, by_sigma)):
+                _ellipses(axes[row, column], mean[c], std[c], shades, is_far[c])
+        _name_classes(axes[0, column], centre, spread)
+        axes[1, column].set_xlabel("$\\mu_1$")
+    for c, (colour, label) in enumerate(zip(colours, config.arena.classes, strict=True)):
+        axes[0, 0].plot([], [], "o", color=colour, label=f"({c + 1}) {label}")
+    if num_far:
+        total = sum(norm[:, :_MOST_ELLIPSES].size for norm in norms.values())
+        label = f"{num_far} of {total} detections, where a detector was not sure"
+        axes[0, 0].plot([], [], "x", color="0.3", label=label)
+    axes[0, 0].set_ylabel("class\n$\\mu_2$")
+    axes[1, 0].set_ylabel("uncertainty\n$\\mu_2$")
+    shown = [_in_plane(b.mean[:, :_MOST_ELLIPSES]) for b in posteriors.values()]
+    radii = [_in_plane(b.std[:, :_MOST_ELLIPSES]) for b in posteriors.values()]
+    low = np.min(np.subtract(shown, radii), axis=(0, 1, 2))
+    high = np.max(np.add(shown, radii), axis=(0, 1, 2))
+    half = 0.63 * np.max(high - low)  # with room for the names of classes
+    x, y = (low + high) / 2
+    axes[0, 0].set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+    for ax in axes.flat:
+        ax.set_aspect("equal", adjustable="box")
+    mappable = cm.ScalarMappable(scale, sigma_map)
+    figure.colorbar(mappable, ax=axes[1, :], label="$\\|\\sigma\\|_2$")
+    columns = len(config.arena.classes) + bool(num_far)
+    figure.legend(loc="outside upper center", ncols=min(columns, 4), frameon=False)
+    return figure
+
+
+def _in_plane(values: Any) -> np.ndarray:
+    """`[..., D]` as `[..., 2]`: the first two, or zero."""
+    values = np.asarray(values)
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, 1)])[..., :2]
+
+
+def _apart(mean: np.ndarray, centre: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """How far means `[..., 2]` are from a centre, in standard deviations."""
+    return np.linalg.norm((mean - centre) / np.maximum(spread, 1e-6), axis=-1)
+
+
+def _ellipses(
+    axes: Any, mean: np.ndarray, std: np.ndarray, colours: np.ndarray, is_far: np.ndarray
+) -> None:
+    """Ellipses and their centres, `[S, 2]`, in the colours `[S, 3 or 4]`; crosses if far `[S]`."""
+    for marker, line, chosen in ((".", "-", ~is_far), ("x", ":", is_far)):
+        pairs = zip(mean[chosen], std[chosen], strict=True)
+        patches = [Ellipse(m, 2 * s[0], 2 * s[1]) for m, s in pairs]
+        axes.add_collection(
+            PatchCollection(
+                patches, facecolors="none", edgecolors=colours[chosen], alpha=0.5, linestyles=line
+            )
+        )
+        axes.scatter(*mean[chosen].T, s=25, marker=marker, c=colours[chosen])
+
+
+def _name_classes(axes: Any, centre: np.ndarray, spread: np.ndarray) -> None:
+    """Writes the number of each class, `[C, 2]`, above its ellipse; those in one place together."""
+    waiting = list(range(len(centre)))
+    while waiting:
+        first = waiting[0]
+        apart = _apart(centre[waiting], centre[first], spread[first])
+        together = [c for c, distance in zip(waiting, apart, strict=True) if distance < _FAR]
+        waiting = [c for c in waiting if c not in together]
+        axes.annotate(
+            " & ".join(f"({c + 1})" for c in together),
+            (centre[first, 0], centre[first, 1] + max(spread[c, 1] for c in together)),
+            (0, 4),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            weight="bold",
+            path_effects=[withStroke(linewidth=3, foreground="white")],
+        )
+
+
+def rewards(per_epoch: dict[str, np.ndarray], figures: dict[str, Any]) -> Figure:
+    """The paper's Fig. 5: reward of whole episodes over the epochs, with baselines as lines."""
+    figure = Figure(figsize=(5 * len(per_epoch), 4), layout="constrained")
+    axes = figure.subplots(1, len(per_epoch), squeeze=False)
+    for ax, (name, reward) in zip(axes[0], per_epoch.items(), strict=True):
+        window = min(_SMOOTHING, len(reward))
+        # An epoch in which no episode ended has no reward.
+        number = np.convolve(np.isfinite(reward), np.ones(window), mode="valid")
+        total = np.convolve(np.nan_to_num(reward), np.ones(window), mode="valid")
+        smooth = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+        ax.plot(reward, color="C0", alpha=0.25, linewidth=0.8)
+        ax.plot(np.arange(window - 1, len(reward)), smooth, color="C0", label="DQN, exploring")
+        lines = {"return": "DQN, greedy", "optimal": "optimal", "naive": "naive exploration"}
+        for i, (key, label) in enumerate([*lines.items(), ("random", "random")]):
+            style = ("-.", "--", ":", (0, (1, 4)))[i]
+            ax.axhline(figures[name][key], color=f"C{i + 1}", linestyle=style, label=label)
+        ax.set(title=f"{name} DQN", xlabel="epoch", ylabel="total reward of an episode")
+        ax.set_ylim(bottom=1.3 * min(figures[name]["random"], -0.1))
+        ax.grid(alpha=0.3)
+    axes[0, 0].legend(loc="lower right")
+    return figure
+
+
+def scanlines(config: Config, windows: dict[str, np.ndarray]) -> Figure:
+    """What each detector reads of one look at each class, from left to right."""
+    classes = config.arena.classes
+    figure = Figure(figsize=(3.6 * len(classes), 2.6 * len(windows)), layout="constrained")
+    axes = figure.subplots(len(windows), len(classes), squeeze=False)
+    for row, sensor in zip(axes, sensors.make(config), strict=True):
+        name, ray = sensor.name, {"camera": "pixel", "lidar": "beam"}.get(sensor.name, "ray")
+        from_left = 1 if sensor.angles[0] > sensor.angles[-1] else -1
+        for ax, label, window in zip(row, classes, windows[name][:, 0], strict=True):
+            readings = window.reshape(sensor.window, sensor.channels)[::from_left]
+            ax.set(title=f"{name}: {label}", xlabel=f"{ray} of the window, left to right")
+            if name == "camera":
+                ax.imshow(as_srgb(readings)[None], aspect="auto", interpolation="nearest")
+                ax.set(yticks=[])
+            else:
+                ax.plot(readings, ".", color=class_colour(config.arena, label), markersize=3)
+            if name == "lidar":
+                ax.set(ylabel="distance [m]", ylim=(0, None))
+    return figure

@@ -1,0 +1,540 @@
+"""The whole training, written once: a list of stages, and their composition.
+
+A stage is a value: a name and three pure functions, `begin`, `advance` and `finish`. `learn`
+composes the list in one function, to be vmapped over seeds and settings; `run` walks it from the
+host, where it reports, saves and stops between two calls of `advance`. Both spend the same keys.
+"""
+
+import dataclasses
+import functools
+import zlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense import examine, observe
+from jaxsense.config import Config
+from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import training as dqn
+from jaxsense.dqn.belief_mdp import MapMdp, MapState
+from jaxsense.dqn.training import DqnState
+from jaxsense.models import Models, jmvae_shape
+from jaxsense.networks import Params
+from jaxsense.observe import Bank
+from jaxsense.sim import world as worlds
+from jaxsense.sim.world import Scene, World
+from jaxsense.types import Belief, Key, pytree
+from jaxsense.vae import detectors, jmvae
+from jaxsense.vae.detectors import Detector
+from jaxsense.vae.minibatch import FitState
+
+_MOST_CHUNKS = 20
+
+
+@pytree
+class Progress:
+    """What some steps of a training report.
+
+    Attributes:
+      loss: `[steps]`; NaN where anything that the step has seen or learnt is not finite.
+      metrics: other numbers of each step, `[steps]` each; NaN where there is none.
+    """
+
+    loss: jax.Array
+    metrics: dict[str, jax.Array]
+
+
+def _never(key: Key, config: Config, state: Any, *inputs: Any) -> tuple[Any, Progress]:
+    raise NotImplementedError("a stage without steps")
+
+
+def _state(config: Config, state: Any, *inputs: Any) -> Any:
+    return state
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Stage:
+    """One stage of a training.
+
+    Attributes:
+      name: of the stage; its random keys follow from it.
+      begin: `(key, config, *inputs) -> state`.
+      inputs: names of the stages before whose outputs are its inputs.
+      index: the first of the inputs, if given: an `[]` int32 array.
+      advance: `(key, config, state, *inputs) -> (state, Progress)`, one chunk of the training.
+      finish: `(config, state, *inputs) -> output`; without, the state is the output.
+      steps: of the training; 0 where `begin` does everything.
+      chunks: calls of `advance`. The last one may have less to do than the others.
+      program: name of the programs; stages with the same one have the same functions and shapes.
+      has_rows: the rows of inputs and output know nothing of one another, so that devices can share
+        them. Such a stage has no steps.
+      is_saved: it is part of what a run saves, and is not repeated when the run goes on.
+      is_optional: a training whose loss is not finite ends early and leaves the others be.
+      is_dense: nearly all of its time goes into small dense networks.
+    """
+
+    name: str
+    begin: Callable[..., Any]
+    inputs: tuple[str, ...] = ()
+    index: int | None = None
+    advance: Callable[..., tuple[Any, Progress]] = _never
+    finish: Callable[..., Any] = _state
+    steps: int = 0
+    chunks: int = 0
+    program: str = ""
+    has_rows: bool = False
+    is_saved: bool = False
+    is_optional: bool = False
+    is_dense: bool = False
+
+    def keys(self, key: Key) -> tuple[Key, Key]:
+        """The key of `begin`, and the `[chunks]` keys of `advance`, from the key of a training."""
+        own = _key_of(key, self.name)
+        of_chunks = jax.vmap(lambda i: jax.random.fold_in(own, i))(1 + jnp.arange(self.chunks))
+        return jax.random.fold_in(own, 0), of_chunks
+
+    def select(self, outputs: Mapping[str, Any]) -> tuple[Any, ...]:
+        """Its inputs from the outputs of the stages before."""
+        index = () if self.index is None else (jnp.int32(self.index),)
+        return *index, *(outputs[name] for name in self.inputs)
+
+
+@pytree
+class Surveys:
+    """Looks at every PoI of `[S]` scenes by every robot.
+
+    Attributes:
+      classes: `[S, N]` int32 true classes.
+      scenes: `[S]` scenes.
+      windows: for each modality `[S, N, F]` what its detector reads.
+    """
+
+    classes: jax.Array
+    scenes: Scene
+    windows: tuple[jax.Array, ...]
+
+
+@pytree
+class Detections:
+    """What the detectors make of surveys that they were not trained on.
+
+    Attributes:
+      bank: for each modality `[C, S, D_m]` detections for training.
+      held_out: the same from other scenes, for measuring.
+      starts: classes, scenes and `[S, N, D_m]` features for each modality, in which episodes start;
+        none with a bank.
+      accuracy: `[M]` of each detector on the held-out looks.
+      windows: for each modality `[C, 1, F]` one held-out look at each class.
+    """
+
+    bank: Bank
+    held_out: Bank
+    starts: tuple[jax.Array, Scene, tuple[jax.Array, ...]]
+    accuracy: jax.Array
+    windows: tuple[jax.Array, ...]
+
+
+@pytree
+class Learned:
+    """What a training returns.
+
+    Attributes:
+      outputs: of every stage, by its name.
+      progress: `[steps]` of every stage that has steps, by its name.
+      is_finite: `[]` whether all losses and outputs are; of an optional stage they need not be.
+    """
+
+    outputs: dict[str, Any]
+    progress: dict[str, Progress]
+    is_finite: jax.Array
+
+
+def stages(config: Config, world: World | None = None) -> list[Stage]:
+    """The stages of a training, each after those that it needs.
+
+    Args:
+      config: all settings; which stages there are, and all sizes, follow from what is no leaf.
+      world: from `sim.make_world(config)`, if there is one already.
+    """
+    world = worlds.make_world(config) if world is None else world
+    detector_names = tuple(f"detector_{name}" for name in config.modalities)
+    restarts = tuple(f"jmvae_{i + 1}" for i in range(config.jmvae.restarts))
+    learned = "starts", "detections", "jmvae", *detector_names
+    restart = Stage(
+        "",
+        _begin_jmvae,
+        ("detections",),
+        advance=_advance_jmvae,
+        finish=_finish_jmvae,
+        steps=config.jmvae.steps,
+        chunks=_num_chunks(config.jmvae.steps),
+        program="jmvae",
+        is_saved=True,
+        is_optional=config.jmvae.restarts > 1,
+        is_dense=True,
+    )
+    agent = Stage(
+        "",
+        functools.partial(_begin_dqn, world),
+        learned,
+        advance=functools.partial(_advance_dqn, world),
+        finish=_finish_dqn,
+        steps=config.dqn.epochs,
+        chunks=config.dqn.epochs // config.dqn.chunk,
+        program="dqn",
+        is_saved=True,
+        is_dense=config.dqn.observe == "bank",
+    )
+    return [
+        Stage("scenes", _draw_scenes),
+        Stage("survey", functools.partial(_survey, world), ("scenes",), has_rows=True),
+        *(_detector_stage(m, name, config) for m, name in enumerate(detector_names)),
+        Stage("detections", _detect, ("survey", *detector_names)),
+        *(dataclasses.replace(restart, name=name) for name in restarts),
+        Stage("jmvae", _best_jmvae, restarts, program="best_jmvae", is_saved=True),
+        Stage("latent_space", _latent_space, ("jmvae", "detections")),
+        Stage("class_beliefs", _class_beliefs, ("latent_space",), is_saved=True),
+        Stage("starts", functools.partial(_starts, world), learned[1:]),
+        *(
+            dataclasses.replace(agent, name=f"dqn_{name}", index=m)
+            for m, name in enumerate(config.modalities)
+        ),
+        *(
+            Stage(
+                f"policies_{name}",
+                _play_policies,
+                (f"dqn_{name}", "jmvae", "detections"),
+                index=m,
+                program="policies",
+            )
+            for m, name in enumerate(config.modalities)
+        ),
+    ]
+
+
+def learn(
+    key: Key,
+    config: Config,
+    world: World | None = None,
+    *,
+    until: str | None = None,
+) -> Learned:
+    """The whole training as one pure function.
+
+    Args:
+      key: the only source of randomness.
+      config: all settings. Fields declared `Traced` may be traced, so that `jax.vmap` varies them.
+      world: from `sim.make_world(config)`, if there is one already.
+      until: name of the last stage; if not given, all stages are composed.
+
+    Returns:
+      The outputs of the stages: the trained networks, see `models`, and all that a run measures but
+      its missions.
+
+    Raises:
+      ValueError: if there is no such stage.
+    """
+    found = stages(config, world)
+    names = [stage.name for stage in found]
+    if until is not None and until not in names:
+        raise ValueError(f"until = {until!r}: must be one of {', '.join(names)}")
+    outputs: dict[str, Any] = {}
+    progress: dict[str, Progress] = {}
+    finite = [jnp.bool_(True)]
+    for stage in found[: None if until is None else names.index(until) + 1]:
+        inputs = stage.select(outputs)
+        begin_key, chunk_keys = stage.keys(key)
+        state = stage.begin(begin_key, config, *inputs)
+        if stage.steps:
+            state, chunks = jax.lax.scan(
+                lambda state, key: stage.advance(key, config, state, *inputs),  # noqa: B023
+                state,
+                chunk_keys,
+            )
+            progress[stage.name] = jax.tree.map(lambda x: x.reshape(-1)[: stage.steps], chunks)  # noqa: B023
+        outputs[stage.name] = stage.finish(config, state, *inputs)
+        if not stage.is_optional:
+            losses = [progress[stage.name].loss] if stage.steps else []
+            finite.append(is_finite((outputs[stage.name], losses)))
+    return Learned(outputs, progress, jnp.stack(finite).all())
+
+
+def models(outputs: Mapping[str, Any], config: Config) -> Models:
+    """The networks among the outputs of all stages."""
+    return Models(
+        detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
+        jmvae=outputs["jmvae"],
+        class_beliefs=outputs["class_beliefs"],
+        q_networks=tuple(outputs[f"dqn_{name}"] for name in config.modalities),
+    )
+
+
+def mission_key(key: Key) -> Key:
+    """The key of the missions that follow a training with this key."""
+    return _key_of(key, "mission")
+
+
+def _key_of(key: Key, name: str) -> Key:
+    """A key of its own for each name, whatever else there is."""
+    return jax.random.fold_in(key, zlib.crc32(name.encode()))
+
+
+def is_finite(values: Any) -> jax.Array:
+    """`[]` whether all real numbers in a pytree are finite."""
+    leaves = [x for x in jax.tree.leaves(values) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
+    return jnp.stack([jnp.isfinite(x).all() for x in leaves] or [jnp.bool_(True)]).all()
+
+
+def num_scenes(config: Config) -> tuple[int, int, int]:
+    """How many scenes are surveyed to train the detectors, for the bank, and to measure."""
+    num_pois, num_classes = config.arena.num_pois, len(config.arena.classes)
+    num_bank = -(-config.jmvae.samples_per_class * num_classes // num_pois)
+    num_held_out = -(-_held_out_per_class(config) * num_classes // num_pois)
+    num_train = -(-config.detector.num_scans // num_pois)
+    return num_train, max(num_bank, _num_scene_starts(config)), num_held_out
+
+
+def make_map_mdp(
+    world: World, config: Config, bank: Bank, params: Params, trained: tuple[Detector, ...]
+) -> MapMdp:
+    """The map MDP in which the Q-networks learn, by whichever way of looking the settings name."""
+    model = jmvae_shape(config)
+    if config.dqn.observe == "live":
+        return observe.live_mdp(config, worlds.with_config(world, config), trained, params, model)
+    return observe.bank_mdp(config, bank, params, model)
+
+
+def _held_out_per_class(config: Config) -> int:
+    return -(-config.detector.num_held_out // len(config.arena.classes))
+
+
+def _num_scene_starts(config: Config) -> int:
+    """Surveyed scenes in which episodes start; with a bank there are no scenes."""
+    return config.dqn.num_starts if config.dqn.observe == "live" else 0
+
+
+def _chunk_size(steps: int) -> int:
+    """Steps of a chunk, of which there are at most 20."""
+    return -(-steps // _MOST_CHUNKS)
+
+
+def _num_chunks(steps: int) -> int:
+    return -(-steps // _chunk_size(steps))
+
+
+def _draw_scenes(key: Key, config: Config) -> tuple[Key, jax.Array]:
+    """`[S]` keys of all scenes, and `[S, N]` classes of the PoIs in them."""
+    class_key, scene_key = jax.random.split(key)
+    numbers = num_scenes(config)
+    keys = jax.random.split(class_key, len(numbers))
+    parts = [observe.balanced_classes(k, config, n) for k, n in zip(keys, numbers, strict=True)]
+    return jax.random.split(scene_key, sum(numbers)), jnp.concatenate(parts)
+
+
+def _survey(world: World, key: Key, config: Config, scenes: tuple[Key, jax.Array]) -> Surveys:
+    """Looks at every PoI of all scenes, for all purposes: compiling takes longer than running."""
+    del key
+    scene_keys, classes = scenes
+    found = observe.surveys(scene_keys, worlds.with_config(world, config), classes)
+    return Surveys(classes, *found)
+
+
+def _detector_stage(modality: int, name: str, config: Config) -> Stage:
+    """The training of one modality's detector."""
+    settings = config.detector
+    num_train, size = num_scenes(config)[0], _chunk_size(settings.steps)
+    labels = jnp.array(config.label_of_class(config.modalities[modality]))
+
+    def examples(surveys: Surveys) -> tuple[jax.Array, jax.Array]:
+        windows = surveys.windows[modality][:num_train]
+        of_windows = labels[surveys.classes[:num_train]]
+        return windows.reshape(-1, windows.shape[-1]), of_windows.reshape(-1)
+
+    def begin(key: Key, config: Config, surveys: Surveys) -> tuple[Detector, FitState]:
+        num_labels = len(config.labels(config.modalities[modality]))
+        detector = detectors.init(key, examples(surveys)[0], num_labels, config.detector)
+        return detector, detectors.start(detector, config.detector)
+
+    def advance(key: Key, config: Config, state: tuple[Detector, FitState], surveys: Surveys):
+        detector, fit = state
+        inputs = *examples(surveys), config.detector, size
+        fit, losses = detectors.train(key, fit, detector, *inputs)
+        return (detector, fit), Progress(losses, {})
+
+    def finish(config: Config, state: tuple[Detector, FitState], surveys: Surveys) -> Detector:
+        detector, fit = state
+        return dataclasses.replace(detector, params=fit.params)
+
+    return Stage(
+        name,
+        begin,
+        ("survey",),
+        advance=advance,
+        finish=finish,
+        steps=settings.steps,
+        chunks=_num_chunks(settings.steps),
+        program=name,
+        is_saved=True,
+        is_dense=True,
+    )
+
+
+def _detect(key: Key, config: Config, surveys: Surveys, *trained: Detector) -> Detections:
+    """Applies the detectors to the surveys that they were not trained on."""
+    del key
+    num_train, num_bank, _ = num_scenes(config)
+    others = jax.tree.map(lambda x: x[num_train:], surveys)
+    detect = jax.vmap(jax.vmap(detectors.detect, (None, 0)), (None, 0))
+    features = tuple(detect(d, w) for d, w in zip(trained, others.windows, strict=True))
+
+    def by_class(values: jax.Array, part: slice, number: int) -> jax.Array:
+        return _by_class(values[part], others.classes[part], config, number)
+
+    for_bank, for_measuring = slice(None, num_bank), slice(num_bank, None)
+    held_out = tuple(by_class(f, for_measuring, _held_out_per_class(config)) for f in features)
+    labels = [jnp.array(config.label_of_class(name)) for name in config.modalities]
+    is_right = [
+        jnp.mean(looks.argmax(axis=-1) == of_class[:, None])
+        for looks, of_class in zip(held_out, labels, strict=True)
+    ]
+    starts = others.classes, others.scenes, features
+    return Detections(
+        bank=tuple(by_class(f, for_bank, config.jmvae.samples_per_class) for f in features),
+        held_out=held_out,
+        starts=jax.tree.map(lambda x: x[: _num_scene_starts(config)], starts),
+        accuracy=jnp.stack(is_right),
+        windows=tuple(by_class(w, for_measuring, 1) for w in others.windows),
+    )
+
+
+def _by_class(values: jax.Array, classes: jax.Array, config: Config, number: int) -> jax.Array:
+    """`[C, number, ...]` from `[S, N, ...]` looks of at least that many of each class."""
+    flat, classes = values.reshape(-1, *values.shape[2:]), classes.reshape(-1)
+    each = range(len(config.arena.classes))
+    rows = jnp.stack([jnp.nonzero(classes == c, size=number)[0] for c in each])
+    return flat[rows]
+
+
+def _begin_jmvae(key: Key, config: Config, detections: Detections) -> tuple[FitState, jax.Array]:
+    """The state of a fit, and `[]` the mean loss of its last chunk."""
+    del detections
+    fit = jmvae.start(jmvae.init(key, jmvae_shape(config)), config.jmvae)
+    return fit, jnp.float32(jnp.inf)
+
+
+def _advance_jmvae(
+    key: Key, config: Config, state: tuple[FitState, jax.Array], detections: Detections
+) -> tuple[tuple[FitState, jax.Array], Progress]:
+    fit, _ = state
+    settings = config.jmvae
+    size = _chunk_size(settings.steps)
+    inputs = jmvae_shape(config), detections.bank, settings, size
+    after, losses = jmvae.train(key, fit, *inputs)
+    counts = fit.step + jnp.arange(size) < settings.steps
+    return (after, jnp.mean(losses, where=counts)), Progress(losses, {})
+
+
+def _finish_jmvae(
+    config: Config, state: tuple[FitState, jax.Array], detections: Detections
+) -> tuple[Params, jax.Array]:
+    """The parameters, and `[]` the mean loss at the end."""
+    fit, loss = state
+    return fit.params, loss
+
+
+def _best_jmvae(key: Key, config: Config, *restarts: tuple[Params, jax.Array]) -> Params:
+    """The restart with the lowest loss at the end; one that is not finite only if all are."""
+    del key, config
+    losses = jnp.stack([loss for _, loss in restarts])
+    best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
+    return jax.tree.map(lambda *x: jnp.stack(x)[best], *(params for params, _ in restarts))
+
+
+def _latent_space(
+    key: Key, config: Config, params: Params, detections: Detections
+) -> tuple[dict[str, Belief], dict[str, Any]]:
+    """See `examine.latent_space`."""
+    del key
+    return examine.latent_space(params, detections.held_out, config)
+
+
+def _class_beliefs(
+    key: Key, config: Config, latent_space: tuple[dict[str, Belief], dict[str, Any]]
+) -> Belief:
+    """`[C, D]` mean joint posterior of each class."""
+    del key, config
+    posteriors, _ = latent_space
+    return jax.tree.map(lambda x: x.mean(axis=1), posteriors["joint"])
+
+
+def _starts(
+    world: World,
+    key: Key,
+    config: Config,
+    detections: Detections,
+    params: Params,
+    *trained: Detector,
+) -> MapState:
+    """`[num_starts]` states in which episodes start."""
+    mdp = make_map_mdp(world, config, detections.bank, params, trained)
+    number = config.dqn.num_starts
+    if config.dqn.observe == "bank":
+        return dqn.starts(key, mdp, number)
+
+    def begin(key: Key, classes: jax.Array, scene: Scene, looks: tuple[jax.Array, ...]):
+        seen_key, begin_key = jax.random.split(key)
+        seen = belief_mdp.random_start(seen_key, mdp)[1]
+        return belief_mdp.begin(begin_key, mdp, scene, classes, seen, looks)
+
+    return jax.vmap(begin)(jax.random.split(key, number), *detections.starts)
+
+
+def _begin_dqn(
+    world: World,
+    key: Key,
+    config: Config,
+    modality: jax.Array,
+    starts: MapState,
+    detections: Detections,
+    params: Params,
+    *trained: Detector,
+) -> DqnState:
+    del modality
+    mdp = make_map_mdp(world, config, detections.bank, params, trained)
+    return dqn.init(key, mdp, config.dqn, starts)
+
+
+def _advance_dqn(
+    world: World,
+    key: Key,
+    config: Config,
+    state: DqnState,
+    modality: jax.Array,
+    starts: MapState,
+    detections: Detections,
+    params: Params,
+    *trained: Detector,
+) -> tuple[DqnState, Progress]:
+    mdp = make_map_mdp(world, config, detections.bank, params, trained)
+    state, info = dqn.train_chunk(key, mdp, modality, config.dqn, state, starts)
+    reward = jnp.where(info.episodes > 0, info.episode_return, jnp.nan)
+    loss = jnp.where(info.is_finite, info.loss, jnp.nan)
+    return state, Progress(loss, {"reward": reward, "epsilon": info.epsilon})
+
+
+def _finish_dqn(config: Config, state: DqnState, *inputs: Any) -> Params:
+    return state.params
+
+
+def _play_policies(
+    key: Key,
+    config: Config,
+    modality: jax.Array,
+    q_network: Params,
+    params: Params,
+    detections: Detections,
+) -> tuple[jax.Array, jax.Array]:
+    """See `examine.play`."""
+    return examine.play(key, modality, q_network, params, detections.held_out, config)

@@ -1,0 +1,194 @@
+"""The loop that drives the stages of a training from the host."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import examine
+from jaxsense.config import PRESETS
+from jaxsense.run import loop, pipeline, programs
+from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run.loop import run_chunks
+from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.stages import Progress, Stage
+
+SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
+
+
+def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(monkeypatch):
+    def broken(*args, **settings):
+        raise ArithmeticError("no such policy")
+
+    monkeypatch.setattr(examine, "latent_space", broken)
+    # What compiles longest is traced after the error then.
+    monkeypatch.setattr(programs, "_on_cpu", lambda: False)
+    monitor = Monitor()
+    with (
+        pytest.raises(ArithmeticError, match="no such policy"),
+        pipeline.compiled(SMOKE, monitor) as compiled,
+    ):
+        loop.train(KEY, compiled, monitor)
+
+
+@pytest.fixture
+def toy(monkeypatch, tmp_path):
+    """Trains toy stages: their programs are compiled as those of a run, without missions."""
+    monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
+
+    def train(*stages, saved=False):
+        monkeypatch.setattr(programs, "stages", lambda config, world: list(stages))
+        heard, warned = [], []
+        monitor = Monitor(lambda *report: heard.append(report), warned.append)
+        checkpoints = Checkpoints(tmp_path if saved else None, warned.append)
+        with pipeline.compiled(SMOKE, monitor) as compiled:
+            found = loop.train(KEY, compiled, monitor, checkpoints)
+        return found, [report for report in heard if report[2]], warned
+
+    return train
+
+
+def begin(key, config, *inputs):
+    return jnp.zeros(2)
+
+
+def counting(name, bad_from=jnp.inf, **settings):
+    """A stage of 5 steps in 3 chunks whose state counts them, with a loss of 10 less that."""
+
+    def advance(key, config, state, *inputs):
+        steps = state[0] + 1 + jnp.arange(2)
+        loss = jnp.where(steps >= bad_from, jnp.nan, 10 - steps)
+        metrics = {"double": jnp.where(steps == 2, jnp.nan, 2 * steps)}
+        return state + 2, Progress(loss, metrics)
+
+    return Stage(name, begin, advance=advance, steps=5, chunks=3, program=name, **settings)
+
+
+def test_a_stage_reports_its_steps_and_none_beyond_the_last(toy):
+    found, heard, _ = toy(counting("count"))
+    np.testing.assert_array_equal(found.outputs["count"], [6, 6])
+    assert [report[:3] for report in heard] == [("count", n, 5) for n in (2, 4, 5)]
+    # Steps 1 and 2, of which the second has no metric; 3 and 4; 5 alone.
+    assert [report[3] for report in heard] == [
+        {"loss": 8.5, "double": 2.0}, {"loss": 6.5, "double": 7.0}, {"loss": 5.0, "double": 10.0},
+    ]  # fmt: skip
+    curves = found.curves["count"]
+    np.testing.assert_array_equal(curves["double"], [2, np.nan, 6, 8, 10])
+    assert len(curves["seconds"]) == 3
+
+
+def test_stages_are_given_what_those_before_return(toy):
+    double = Stage("double", lambda key, config, x: 2 * x, ("count",))
+    row = Stage("row", lambda key, config, x: {"x": x + 1}, ("double",), has_rows=True)
+    found, _, _ = toy(counting("count"), double, row)
+    np.testing.assert_array_equal(found.outputs["row"]["x"], [13, 13])
+
+
+def test_what_was_saved_is_not_trained_again(toy):
+    first, heard, _ = toy(counting("count", is_saved=True), saved=True)
+    assert heard
+    again, heard, _ = toy(counting("count", is_saved=True), saved=True)
+    assert not heard
+    np.testing.assert_array_equal(first.outputs["count"], again.outputs["count"])
+    np.testing.assert_array_equal(first.curves["count"]["double"], again.curves["count"]["double"])
+
+
+@pytest.mark.parametrize("bad", [(), (0,), (1,)])
+def test_an_optional_training_that_is_not_finite_is_left_out_and_named(toy, bad):
+    def finish(config, state, *inputs):
+        return state[0]
+
+    trials = [
+        counting(f"trial_{i}", 4 if i in bad else jnp.inf, is_optional=True, finish=finish)
+        for i in range(2)
+    ]
+    best = Stage("best", lambda key, config, *x: jnp.nanmin(jnp.stack(x)), ("trial_0", "trial_1"))
+    found, _, warned = toy(*trials, best, saved=True)
+    assert warned == [f"trial_{i}: loss = nan at step 4 of 5: left out" for i in bad]
+    assert found.outputs["best"] == 6
+    assert [bool(np.isnan(found.outputs[f"trial_{i}"])) for i in range(2)] == [
+        i in bad for i in range(2)
+    ]
+
+
+def test_a_training_ends_if_what_comes_of_optional_ones_is_not_finite(toy):
+    trial = counting("trial", 4, is_optional=True)
+    with pytest.raises(StageError, match="best: results are not finite"):
+        toy(trial, Stage("best", lambda key, config, x: x, ("trial",)))
+
+
+def test_a_training_that_is_not_finite_ends_what_follows_from_it(toy):
+    follows = Stage("follows", lambda key, config, x: x, ("count",))
+    with pytest.raises(StageError, match="count: loss = nan at step 4 of 5"):
+        toy(counting("count", 4), follows, counting("beside"))
+
+
+def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
+    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
+
+    def run(chunk, state):
+        monitor.report("jmvae", chunk + 1, 4, np.array([np.nan if chunk == 2 else 1.0]))
+        return {"x": state["x"] + 1}, {"chunk": [chunk]}
+
+    start = {"x": np.zeros(2, np.float32)}
+    with pytest.raises(StageError, match="jmvae: loss = nan at step 3 of 4"):
+        run_chunks("jmvae", start, 4, run, monitor, checkpoints)
+    done, state, curves = checkpoints.load_unfinished("jmvae", start)
+    assert (done, curves) == (2, {"chunk": [0, 1]})
+    np.testing.assert_array_equal(state["x"], [2, 2])
+
+
+def test_a_stop_is_heard_after_every_chunk(tmp_path):
+    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
+
+    def run(chunk, state):
+        if chunk == 1:
+            monitor.stop()
+        return state + 1, {}
+
+    with pytest.raises(Stopped):
+        run_chunks("jmvae", np.float32(0), 4, run, monitor, checkpoints)
+    assert checkpoints.load_unfinished("jmvae", np.float32(0))[:2] == (2, 2.0)
+
+
+def test_a_training_that_is_over_is_saved_when_another_one_stops(tmp_path):
+    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
+    monitor.stop()
+    state, curves = run_chunks(
+        "camera", np.float32(0), 1, lambda i, x: (x + 1, {"i": [i]}), monitor, checkpoints
+    )
+    assert (state, curves) == (1, {"i": [0]})
+
+    def never(chunk, state):
+        raise AssertionError("trained again")
+
+    again = run_chunks("camera", np.float32(0), 1, never, Monitor(), checkpoints)
+    assert again == (1, {"i": [0]})
+
+
+def test_a_training_that_fails_ends_what_goes_on_beside_it(tmp_path):
+    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
+
+    def run(chunk, state):
+        monitor.fail(StageError("dqn_lidar: loss = nan at step 7 of 40"))
+        return state + 1, {}
+
+    with pytest.raises(StageError, match="dqn_lidar"):
+        run_chunks("dqn_camera", np.float32(0), 9, run, monitor, checkpoints)
+    assert checkpoints.load_unfinished("dqn_camera", np.float32(0))[:2] == (1, 1.0)
+    monitor.begin(lambda *_: None)  # the next seed
+    monitor.check_stop()
+
+
+def test_nan_on_a_full_disk_tells_of_both(monkeypatch, tmp_path):
+    def full(*_):
+        raise OSError(28, "No space left on device", "jmvae.msgpack")
+
+    checkpoints = Checkpoints(tmp_path)
+    monkeypatch.setattr(checkpoints, "save_unfinished", full)
+
+    def run(chunk, state):
+        raise StageError("jmvae: loss = nan at step 1 of 4")
+
+    with pytest.raises(StageError, match=r"nan at step 1 of 4; .* No space left on device"):
+        run_chunks("jmvae", np.float32(0), 4, run, Monitor(), checkpoints)

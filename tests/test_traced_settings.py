@@ -1,0 +1,132 @@
+"""Every number that may be traced does what the same constant does, in one program for all."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import observe
+from jaxsense.config import Config, DetectorConfig, DqnConfig, JmvaeConfig, MdpConfig
+from jaxsense.dqn import training as dqn
+from jaxsense.models import jmvae_shape
+from jaxsense.vae import detectors, jmvae
+
+CONFIG = Config(
+    detector=DetectorConfig(hidden=(2,), steps=3, batch=4),
+    jmvae=JmvaeConfig(hidden=(4,), steps=4, batch=4, annealing=0.5),
+    mdp=MdpConfig(max_steps=3),
+    dqn=DqnConfig(
+        hidden=(4,), num_envs=8, epochs=6, chunk=6, updates=1, batch=8, replay_capacity=32,
+        target_period=2, num_starts=16,
+    ),
+)  # fmt: skip
+# Two values of each. Large learning rates, so that a few steps show; a threshold among the gains.
+VALUES = {
+    "detector.learning_rate": (0.01, 0.05),
+    "jmvae.alpha": (0.1, 3.0),
+    "jmvae.beta": (0.01, 0.3),
+    "jmvae.initial_beta": (0.7, 5.0),
+    "jmvae.annealing": (0.1, 1.0),
+    "jmvae.learning_rate": (0.02, 0.08),
+    "mdp.min_increase": (0.05, 0.65),
+    "mdp.unseen_variance": (20.0, 4.0),
+    "mdp.max_steps": (3, 1),
+    "dqn.discount": (0.5, 0.9),
+    "dqn.learning_rate": (0.02, 0.1),
+    "dqn.final_learning_rate": (0.001, 0.015),
+    "dqn.epsilon_start": (0.9, 0.6),
+    "dqn.epsilon_min": (0.02, 0.2),
+    "dqn.epsilon_decay": (0.3, 0.6),
+    "dqn.target_period": (2, 3),
+}
+
+
+def learn(config):
+    """A few steps of each training, on numbers drawn at random in place of scans."""
+    keys = jax.random.split(jax.random.key(0), 8)
+    windows = jax.random.normal(keys[0], (12, 3))
+    detector = detectors.init(keys[1], windows, 2, config.detector)
+    fit = detectors.start(detector, config.detector)
+    inputs = windows, jnp.arange(12) % 2, config.detector, config.detector.steps
+    fit, _ = detectors.train(keys[2], fit, detector, *inputs)
+
+    model = jmvae_shape(config)
+    bank = tuple(jax.random.uniform(k, (3, 5, 2)) for k in keys[3:5])
+    latent = jmvae.start(jmvae.init(keys[5], model), config.jmvae)
+    latent, _ = jmvae.train(keys[6], latent, model, bank, config.jmvae, config.jmvae.steps)
+
+    # Apart from the JMVAE that was trained: what its settings change must not stand for those here.
+    mdp = observe.bank_mdp(config, bank, jmvae.init(keys[5], model), model)
+    state, info = dqn.train(keys[7], mdp, 0, config.dqn)
+    return {"detector": fit.params, "jmvae": latent.params, "dqn": (state.params, info)}
+
+
+def with_values(values):
+    """The settings with other values of some fields, by their names."""
+    sections = {}
+    for name, value in values.items():
+        section, _, field = name.partition(".")
+        sections.setdefault(section, {})[field] = value
+    changed = {n: dataclasses.replace(getattr(CONFIG, n), **v) for n, v in sections.items()}
+    return dataclasses.replace(CONFIG, **changed)
+
+
+@pytest.fixture(scope="module")
+def together():
+    """All at their first value, all at their second, and both but for one, in one program."""
+    first, second = (np.array([v[i] for v in VALUES.values()]) for i in (0, 1))
+    one = np.eye(len(VALUES), dtype=bool)
+    rows = [first, second, *np.where(one, second, first), *np.where(one, first, second)]
+
+    def train(values):
+        return learn(with_values(dict(zip(VALUES, values, strict=True))))
+
+    return jax.jit(jax.vmap(train))(jnp.array(np.stack(rows), jnp.float32))
+
+
+def test_the_table_has_all_numbers_of_learning_that_may_be_traced():
+    leaves = jax.tree_util.tree_leaves_with_path(CONFIG)
+    names = {".".join(part.name for part in path if hasattr(part, "name")) for path, _ in leaves}
+    learning = {
+        name for name in names if name.partition(".")[0] in ("detector", "jmvae", "mdp", "dqn")
+    }
+    assert set(VALUES) == learning - {"jmvae.reconstruction_weights"}  # several numbers
+
+
+def test_all_settings_together_do_what_the_constants_do(together):
+    second = {name: values[1] for name, values in VALUES.items()}
+    alone = jax.jit(lambda: learn(with_values(second)))()
+    here = jax.tree.map(lambda x: x[1], together)
+    chex.assert_trees_all_close(here, alone, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_each_setting_changes_its_training_and_no_other(together, name):
+    place, part = list(VALUES).index(name), name.partition(".")[0].replace("mdp", "dqn")
+    for base, row in ((0, 2 + place), (1, 2 + len(VALUES) + place)):
+        differ = {
+            n: max(float(np.max(np.abs(x[base] - x[row]))) for x in map(np.asarray, leaves))
+            for n, tree in together.items()
+            if (leaves := jax.tree.leaves(jax.tree.map(lambda x: x.astype(jnp.float32), tree)))
+        }
+        assert differ.pop(part) > 1e-3
+        assert max(differ.values()) < 1e-6
+
+
+def test_weights_of_reconstruction_may_be_traced():
+    model, key = jmvae_shape(CONFIG), jax.random.key(1)
+    params = jmvae.init(key, model)
+
+    def loss(weights):
+        settings = dataclasses.replace(CONFIG.jmvae, reconstruction_weights=weights)
+        features = jnp.ones(2), jnp.zeros(2)
+        weights = settings.reconstruction_weights
+        return jmvae.loss(
+            key, params, model, features, alpha=0.1, beta=0.1, reconstruction_weights=weights
+        )[0]
+
+    np.testing.assert_allclose(jax.jit(loss)((3.0, 0.5)), loss((3.0, 0.5)), rtol=1e-5)
+    assert abs(loss((3.0, 0.5)) - loss((1.0, 0.5))) > 0.1
