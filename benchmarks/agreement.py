@@ -13,7 +13,7 @@ import rich.table
 
 from jaxsense import mission, observe
 from jaxsense.config import PRESETS
-from jaxsense.models import jmvae_shape, untrained
+from jaxsense.models import init, make_jmvae
 from jaxsense.run import devices
 from jaxsense.vae import detectors, jmvae
 
@@ -47,7 +47,7 @@ def _results() -> dict[str, np.ndarray]:
     """Scans, beliefs and motion in random scenes, on the default device."""
     config = PRESETS["default"]
     team = mission.make_mission(config)
-    models, model = untrained(jax.random.key(0), config), jmvae_shape(config)
+    models, model = init(jax.random.key(0), config), make_jmvae(config)
     keys = jax.random.split(jax.random.key(1), _SCENES)
 
     @jax.jit
@@ -61,7 +61,7 @@ def _results() -> dict[str, np.ndarray]:
         encode = jax.vmap(jax.vmap(lambda *f: jmvae.posterior(models.jmvae, model, f)))
         states = jax.vmap(lambda key: mission.reset(key, team, 1))(keys)
         periods = round(_SECONDS / config.mission.control_period)
-        states, _ = mission.play(keys, team, models, states, periods, every=_SCENES)
+        states, _ = mission.rollout_batch(keys, team, models, states, periods, every=_SCENES)
         found = dict(zip(config.modalities, windows, strict=True))
         return found, encode(*features), states.scene.poses
 

@@ -55,7 +55,7 @@ def dqn_live(options: Options) -> Row:
     """With a scan cast in each environment's own arena at every step."""
     task, networks = untrained_task(_settings(options, epochs=100))
     world = worlds.make_world(task.config)
-    shape = models.jmvae_shape(task.config)
+    shape = models.make_jmvae(task.config)
 
     def make_mdp(detectors: Any, params: Any) -> MapMdp:
         return observe.live_mdp(task.config, world, detectors, params, shape)

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks import measure, peers
 from benchmarks.measure import Options, Row
 from jaxsense.config import PRESETS
-from jaxsense.models import jmvae_shape
+from jaxsense.models import make_jmvae
 from jaxsense.observe import Bank
 from jaxsense.vae import jmvae as our_jmvae
 
@@ -20,7 +20,7 @@ def jmvae(options: Options) -> Row:
     """Samples per second of forward, backward and Adam, batches drawn from the same bank."""
     steps = _STEPS_QUICK if options.quick else _STEPS
     config = dataclasses.replace(PRESETS["default"].jmvae, steps=steps)
-    model = jmvae_shape(PRESETS["default"])
+    model = make_jmvae(PRESETS["default"])
     num_classes = len(PRESETS["default"].arena.classes)
     bank = random_bank(jax.random.key(0), model.feature_sizes, num_classes, _SAMPLES_PER_CLASS)
 

@@ -45,15 +45,15 @@ class Task:
     @property
     def mdp_of(self) -> Callable[[Params, Bank], MapMdp]:
         """The MDP from parameters and bank, for where they are arguments of a jitted function."""
-        shape = models.jmvae_shape(self.config)
+        shape = models.make_jmvae(self.config)
         return lambda params, bank: observe.bank_mdp(self.config, bank, params, shape)
 
 
 def untrained_task(dqn: DqnConfig, samples: int = 10000) -> tuple[Task, Models]:
     """A task of the real sizes with random networks and detections: as fast as a trained one."""
     config = dataclasses.replace(PRESETS["default"], dqn=dqn)
-    networks = models.untrained(jax.random.key(0), config)
-    sizes = models.jmvae_shape(config).feature_sizes
+    networks = models.init(jax.random.key(0), config)
+    sizes = models.make_jmvae(config).feature_sizes
     bank = random_bank(jax.random.key(1), sizes, len(config.arena.classes), samples)
     return Task(config, networks.jmvae, bank), networks
 
@@ -90,7 +90,7 @@ class Examiner:
 
         def mean_return(policy: policies.Policy, starts: belief_mdp.MapState) -> jax.Array:
             def play(key: jax.Array, start: belief_mdp.MapState) -> jax.Array:
-                return episodes.play(key, mdp, policy, start, MODALITY)[0]
+                return episodes.run_episode(key, mdp, policy, start, MODALITY)[0]
 
             return jnp.mean(jax.vmap(play)(play_keys, starts))
 

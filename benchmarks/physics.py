@@ -127,7 +127,7 @@ def _random_drives(key: jax.Array, config: Config, batch: int, steps: int) -> Dr
 def _mid_mission(batch: int, periods: int) -> tuple[Mission, MissionState]:
     """`[B, P]` states that the physics was given in P successive periods of naive missions."""
     team = mission.make_mission(_UNTRAINED)
-    networks = models.untrained(jax.random.key(0), team.config)
+    networks = models.init(jax.random.key(0), team.config)
 
     def play(keys: jax.Array) -> MissionState:
         reset_keys, play_keys = jax.vmap(jax.random.split, out_axes=1)(keys)

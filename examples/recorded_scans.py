@@ -31,7 +31,7 @@ def main(run: Path, recording: Path, trust: bool = False) -> None:
         np.savez(recording, **simulate(config))
     recorded = np.load(recording)
 
-    sensors, model = sim.sensors.make(config), jaxsense.jmvae_shape(config)
+    sensors, model = sim.sensors.make(config), jaxsense.make_jmvae(config)
     for n, place in enumerate(recorded["places"]):
         print(f"PoI {n + 1}")
         entry = vae.unseen(model, config.mdp.unseen_variance)

@@ -22,8 +22,8 @@ from jaxsense.config import ConfigError as ConfigError
 from jaxsense.config import SensorConfig as SensorConfig
 from jaxsense.config import Shape as Shape
 from jaxsense.models import Models as Models
-from jaxsense.models import jmvae_shape as jmvae_shape
-from jaxsense.models import untrained as untrained
+from jaxsense.models import init as init
+from jaxsense.models import make_jmvae as make_jmvae
 from jaxsense.observe import bank_mdp as bank_mdp
 from jaxsense.observe import live_mdp as live_mdp
 from jaxsense.run.rundir import load as load

@@ -116,7 +116,7 @@ def _write(
     found: dict[str, Any],
     recording: missions.Recording,
 ) -> list[str]:
-    """Writes the figures into the run's summary and its page, and the animation if asked for.
+    """Writes the metrics into the run's summary and its page, and the animation if asked for.
 
     Returns:
       Lines that say where they are.
@@ -128,13 +128,13 @@ def _write(
         title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
         animation.write(film, config, recording, class_beliefs, title)
         written.append(f"The first mission of {name} is in {film}.")
-    # Another evaluation may have written its own figures since this one began.
+    # Another evaluation may have written its own metrics since this one began.
     with files.locked(arguments.run, waits=True):
         summary = rundir.read_summary(arguments.run)
         summary["mission"] = _merge(summary["mission"], found, arguments)
         rundir.write_json(path, summary)
         report = page.write(arguments.run, config, summary)
-    return [*written, f"The figures are in {path}, and with all others in {report}."]
+    return [*written, f"The metrics are in {path}, and with all others in {report}."]
 
 
 def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) -> dict[str, Any]:

@@ -1,6 +1,8 @@
-"""What a trained JMVAE and trained policies are worth: the figures of `summary.json`."""
+"""What a trained JMVAE and trained policies are worth: the metrics of `summary.json`."""
 
 import functools
+import itertools
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -10,12 +12,13 @@ import numpy as np
 from jaxsense import observe
 from jaxsense.config import Config
 from jaxsense.dqn import episodes, policies
-from jaxsense.dqn.belief_mdp import MapState, random_start, reset
-from jaxsense.models import jmvae_shape
+from jaxsense.dqn.belief_mdp import MapMdp, MapState, random_start, reset
+from jaxsense.models import make_jmvae
 from jaxsense.networks import Params
 from jaxsense.observe import Bank
 from jaxsense.types import Belief, Key
 from jaxsense.vae import fusion, jmvae, metrics
+from jaxsense.vae.jmvae import Jmvae
 
 POLICIES = ("return", "optimal", "naive", "random")
 """The greedy policy of a Q-network, and those to compare it with."""
@@ -37,64 +40,69 @@ def latent_space(
       `[C, S, D]` beliefs for `joint` and for each modality, and the block `jmvae` of the summary as
       arrays. Parameters or detections that are not finite are not caught here: look at the beliefs.
     """
-    model = jmvae_shape(config)
-    labels = [config.label_of_class(m) for m in config.modalities]
-    num_modalities, num_classes = len(bank), bank[0].shape[0]
-
-    def encode_all(*keep: bool) -> Belief:
-        def encode(*features: jax.Array) -> Belief:
-            kept = tuple(f if k else None for f, k in zip(features, keep, strict=True))
-            return jmvae.posterior(params, model, kept)
-
-        return jax.vmap(jax.vmap(encode))(*bank)
-
-    joint = encode_all(*[True] * num_modalities)
-    alone = [encode_all(*(i == m for i in range(num_modalities))) for m in range(num_modalities)]
+    model, num_modalities = make_jmvae(config), len(bank)
+    joint = _encode(params, model, bank, range(num_modalities))
+    alone = [_encode(params, model, bank, [m]) for m in range(num_modalities)]
     posteriors = {"joint": joint, **dict(zip(model.modalities, alone, strict=True))}
     class_means = joint.mean.mean(axis=1)
-    classes = jnp.arange(num_classes)
-
-    is_unambiguous = jax.vmap(
-        jax.vmap(metrics.unambiguous, in_axes=(0, None, None)), in_axes=(0, None, 0)
-    )
-    errors = []
-    for belief, label_of_class in zip(alone, labels, strict=True):
-        for c, consistent in enumerate(metrics.consistent_classes(label_of_class)):
-            members = jnp.array(np.flatnonzero(consistent))
-            parts = jax.tree.map(lambda x: x[members].reshape(-1, x.shape[-1]), joint)  # noqa: B023
-            of_class = jax.tree.map(lambda x: x[c], belief)  # noqa: B023
-            error = jax.vmap(metrics.moment_matching_error, in_axes=(0, None))(of_class, parts)
-            errors.append(error.mean())
-
-    is_right, distances = [], []
-    for first in range(num_modalities):
-        seen = jnp.arange(num_modalities) == first
-        for second in set(range(num_modalities)) - {first}:
-            write = lambda old, new: fusion.write(params, model, old, seen, new, second)  # noqa: B023, E731
-            fused = jax.vmap(jax.vmap(write))(alone[first], bank[second])
-            both = encode_all(*(m in (first, second) for m in range(num_modalities)))
-            nearest = jax.vmap(jax.vmap(lambda b: metrics.nearest_class(b, class_means)))(fused)
-            is_right.append(nearest == classes[:, None])
-            offset = (fused.mean - both.mean) / both.std
-            distances.append(jnp.linalg.norm(offset, axis=-1))
-
-    figures = {
+    is_unambiguous = jax.vmap(jax.vmap(metrics.unambiguous, (0, None, None)), (0, None, 0))
+    classes = jnp.arange(bank[0].shape[0])
+    return posteriors, {
         "active_units": metrics.active_units(joint.mean.reshape(-1, joint.mean.shape[-1])),
         "sigma_norm": {n: metrics.sigma_norm(b.std).mean(axis=1) for n, b in posteriors.items()},
         "unambiguous": {
             n: is_unambiguous(b, class_means, classes).mean(axis=1) for n, b in posteriors.items()
         },
-        "moment_matching_error": jnp.mean(jnp.array(errors)),
-        # With one modality there is nothing to fuse.
-        "fusion": {
-            "accuracy": jnp.mean(jnp.array(is_right)) if is_right else None,
-            "mean_error": jnp.mean(jnp.array(distances)) if distances else None,
-        },
+        "moment_matching_error": _moment_matching_error(joint, alone, config),
+        "fusion": _fusion(params, model, bank, alone, class_means),
     }
-    return posteriors, figures
 
 
-def play(
+def _encode(params: Params, model: Jmvae, bank: Bank, members: Iterable[int]) -> Belief:
+    """`[C, S, D]` posteriors of detections by some of the modalities."""
+    chosen = set(members)
+
+    def encode(*features: jax.Array) -> Belief:
+        kept = tuple(f if m in chosen else None for m, f in enumerate(features))
+        return jmvae.posterior(params, model, kept)
+
+    return jax.vmap(jax.vmap(encode))(*bank)
+
+
+def _moment_matching_error(joint: Belief, alone: list[Belief], config: Config) -> jax.Array:
+    """`[]` mean distance of the posteriors of one modality from those they should have."""
+    errors = []
+    for modality, belief in zip(config.modalities, alone, strict=True):
+        labels = config.label_of_class(modality)
+        for c, consistent in enumerate(metrics.consistent_classes(labels)):
+            members = jnp.array(np.flatnonzero(consistent))
+            parts = jax.tree.map(lambda x: x[members].reshape(-1, x.shape[-1]), joint)  # noqa: B023
+            of_class = jax.tree.map(lambda x: x[c], belief)  # noqa: B023
+            errors.append(jax.vmap(metrics.moment_matching_error, (0, None))(of_class, parts))
+    return jnp.mean(jnp.stack(errors))
+
+
+def _fusion(
+    params: Params, model: Jmvae, bank: Bank, alone: list[Belief], class_means: jax.Array
+) -> dict[str, jax.Array | None]:
+    """How good entries are after a look by one modality and a second one by another."""
+    is_right, distances = [], []
+    nearest = jax.vmap(jax.vmap(lambda belief: metrics.nearest_class(belief, class_means)))
+    for first, second in itertools.permutations(range(len(bank)), 2):
+        seen = jnp.arange(len(bank)) == first
+        write = lambda old, new: fusion.write(params, model, old, seen, new, second)  # noqa: B023, E731
+        fused = jax.vmap(jax.vmap(write))(alone[first], bank[second])
+        both = _encode(params, model, bank, (first, second))
+        is_right.append(nearest(fused) == jnp.arange(len(class_means))[:, None])
+        distances.append(jnp.linalg.norm((fused.mean - both.mean) / both.std, axis=-1))
+    # With one modality there is nothing to fuse.
+    return {
+        "accuracy": jnp.mean(jnp.array(is_right)) if is_right else None,
+        "mean_error": jnp.mean(jnp.array(distances)) if distances else None,
+    }
+
+
+def compare_policies(
     key: Key,
     modality: jax.Array,
     q_network: Params,
@@ -118,21 +126,16 @@ def play(
       `episodes.num_starts` random ones.
     """
     settings = config.evaluation
-    mdp = observe.bank_mdp(config, bank, params, jmvae_shape(config))
-    labels = jnp.array([config.label_of_class(m) for m in config.modalities])
+    mdp = observe.bank_mdp(config, bank, params, make_jmvae(config))
     start_key, table_key, play_key = jax.random.split(key, 3)
-    start_keys = jax.random.split(start_key, settings.num_starts)
-    random_starts = jax.vmap(lambda key: random_start(key, mdp))(start_keys)
-    classes, seen = (
-        jnp.concatenate([jnp.asarray(every), drawn])
-        for every, drawn in zip(episodes.every_state(mdp), random_starts, strict=True)
-    )
+    classes, seen = _every_start(start_key, mdp, settings.num_starts)
+    labels = jnp.array([config.label_of_class(m) for m in config.modalities])
     expected = policies.expected_rewards(table_key, mdp, modality, _EXPECTATION_DRAWS)
     compared = (
         policies.greedy(mdp, q_network, config.dqn.hidden),
         policies.optimal(mdp, expected, labels),
         policies.naive(mdp, modality),
-        policies.uniform(mdp),
+        policies.random(mdp),
     )
 
     # One policy after the other, by a switch: the program is compiled once for all of them.
@@ -144,7 +147,7 @@ def play(
         def episode(key: Key, classes: jax.Array, seen: jax.Array):
             reset_key, episode_key = jax.random.split(key)
             start = reset(reset_key, mdp, classes, seen)
-            return episodes.play(episode_key, mdp, act, start, modality)
+            return episodes.run_episode(episode_key, mdp, act, start, modality)
 
         def repeat(i: jax.Array, sums: tuple[jax.Array, jax.Array]):
             keys = jax.random.split(jax.random.fold_in(play_key, i), len(classes))
@@ -160,12 +163,22 @@ def play(
     return jax.lax.map(with_policy, jnp.arange(len(compared)))
 
 
-def policy_figures(total: np.ndarray, first: np.ndarray, num_random: int) -> dict[str, Any]:
+def _every_start(key: Key, mdp: MapMdp, number: int) -> tuple[jax.Array, jax.Array]:
+    """`[S, N]` classes and `[S, N, M]` looks of every state of the map, then of random starts."""
+    drawn = jax.vmap(lambda key: random_start(key, mdp))(jax.random.split(key, number))
+    classes, seen = (
+        jnp.concatenate([jnp.asarray(every), some])
+        for every, some in zip(episodes.every_state(mdp), drawn, strict=True)
+    )
+    return classes, seen
+
+
+def policy_metrics(total: np.ndarray, first: np.ndarray, num_random: int) -> dict[str, Any]:
     """The block of one modality in the summary's `dqn`, without the speed.
 
     Args:
-      total: `[P, S]` from `play`.
-      first: `[P, S]` from `play`.
+      total: `[P, S]` from `compare_policies`.
+      first: `[P, S]` from `compare_policies`.
       num_random: how many of the starts, the last ones, are random; the others are every state.
     """
     num_states = total.shape[1] - num_random

@@ -23,7 +23,7 @@ from jaxsense import cli
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import require_types
 from jaxsense.interfaces.onboard import Function, functions
-from jaxsense.models import Models, jmvae_shape
+from jaxsense.models import Models, make_jmvae
 from jaxsense.run import files, rundir
 from jaxsense.run.version import __version__
 from jaxsense.vae import fusion
@@ -65,7 +65,7 @@ def _description(config: Config, models: Models) -> dict[str, Any]:
     """What a reader of the file has to know besides the programs."""
     arena = config.arena
     versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib")}
-    unseen = fusion.unseen(jmvae_shape(config), config.mdp.unseen_variance)
+    unseen = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
     return {
         "modalities": config.modalities,
         "classes": arena.classes,

@@ -30,16 +30,16 @@ class Models:
     q_networks: tuple[Params, ...]
 
 
-def jmvae_shape(config: Config) -> Jmvae:
+def make_jmvae(config: Config) -> Jmvae:
     """The JMVAE that fits the modalities and classes of a configuration."""
     sizes = tuple(len(config.labels(m)) for m in config.modalities)
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
 
-def untrained(key: Key, config: Config) -> Models:
+def init(key: Key, config: Config) -> Models:
     """Models of the right shapes with random parameters, for a first look at the functions."""
     detector_key, jmvae_key, dqn_key = jax.random.split(key, 3)
-    num_labels = jmvae_shape(config).feature_sizes
+    num_labels = make_jmvae(config).feature_sizes
     keys = jax.random.split(detector_key, len(config.modalities))
     trained = tuple(
         detectors.init(k, jnp.zeros((2, s.window * s.channels)), size, config.detector)
@@ -51,7 +51,7 @@ def untrained(key: Key, config: Config) -> Models:
     shape = (len(config.arena.classes), config.jmvae.latent_size)
     return Models(
         detectors=trained,
-        jmvae=jmvae.init(jmvae_key, jmvae_shape(config)),
+        jmvae=jmvae.init(jmvae_key, make_jmvae(config)),
         class_beliefs=Belief(jnp.zeros(shape), jnp.ones(shape)),
         q_networks=tuple(networks.init(k, q_network, size) for k in dqn_keys),
     )

@@ -20,7 +20,7 @@ from jaxsense.dqn import belief_mdp
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.training import DqnState
-from jaxsense.models import Models, jmvae_shape
+from jaxsense.models import Models, make_jmvae
 from jaxsense.networks import Params
 from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
@@ -300,7 +300,7 @@ def make_map_mdp(
     world: World, config: Config, bank: Bank, params: Params, trained: tuple[Detector, ...]
 ) -> MapMdp:
     """The map MDP in which the Q-networks learn, by whichever way of looking the settings name."""
-    model = jmvae_shape(config)
+    model = make_jmvae(config)
     if config.dqn.observe == "live":
         return observe.live_mdp(config, worlds.with_config(world, config), trained, params, model)
     return observe.bank_mdp(config, bank, params, model)
@@ -420,7 +420,7 @@ def _by_class(values: jax.Array, classes: jax.Array, config: Config, number: int
 def _begin_jmvae(key: Key, config: Config, detections: Detections) -> tuple[FitState, jax.Array]:
     """The state of a fit, and `[]` the mean loss of its last chunk."""
     del detections
-    fit = jmvae.start(jmvae.init(key, jmvae_shape(config)), config.jmvae)
+    fit = jmvae.start(jmvae.init(key, make_jmvae(config)), config.jmvae)
     return fit, jnp.float32(jnp.inf)
 
 
@@ -430,7 +430,7 @@ def _advance_jmvae(
     fit, _ = state
     settings = config.jmvae
     size = _chunk_size(settings.steps)
-    inputs = jmvae_shape(config), detections.bank, settings, size
+    inputs = make_jmvae(config), detections.bank, settings, size
     after, losses = jmvae.train(key, fit, *inputs)
     counts = fit.step + jnp.arange(size) < settings.steps
     return (after, jnp.mean(losses, where=counts)), Progress(losses, {})
@@ -536,5 +536,5 @@ def _play_policies(
     params: Params,
     detections: Detections,
 ) -> tuple[jax.Array, jax.Array]:
-    """See `examine.play`."""
-    return examine.play(key, modality, q_network, params, detections.held_out, config)
+    """See `examine.compare_policies`."""
+    return examine.compare_policies(key, modality, q_network, params, detections.held_out, config)

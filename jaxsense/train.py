@@ -379,7 +379,7 @@ def _header(run: RunDirectory, timing: dict[str, Any]) -> dict[str, Any]:
 
 
 def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
-    """A table of the figures that matter most; of several seeds mean and 95% interval."""
+    """A table of the metrics that matter most; of several seeds mean and 95% interval."""
     summary = rundir.read_summary(run.path)
     settings, policies = run.settings, summary["dqn"]
     seeds = f", seed {settings.seed}"

@@ -61,7 +61,7 @@ class Transition:
     """One step of the map MDP as a Q-network learns from it, or a batch of them as columns.
 
     Attributes:
-      s_tm1: `[N * 2D, ...]` float32 map before the action, see `belief_mdp.as_state`.
+      s_tm1: `[N * 2D, ...]` float32 map before the action, see `belief_mdp.observation`.
       a_tm1: `[...]` int32 action, `N` being no operation.
       r_t: `[...]` float32 reward.
       discount_t: `[...]` float32, 0 where the episode ended and 1 elsewhere.

@@ -151,7 +151,7 @@ def played():
             "Dense_1": {"kernel": jnp.zeros((2, 4)), "bias": bias},
         }
         inputs = jnp.int32(0), {"params": layers}, PARAMS, bank, CONFIG
-        return examine.play(jax.random.key(0), *inputs)
+        return examine.compare_policies(jax.random.key(0), *inputs)
 
     return jax.jit(play)
 
@@ -189,7 +189,7 @@ def test_figures_of_policies_as_worked_by_hand():
             [0.0, 0.0, -1.0, 0.0, -0.5],
         ]
     )
-    figures = examine.policy_figures(total, total / 2, 3)
+    figures = examine.policy_metrics(total, total / 2, 3)
     expected = {"return": 1.0, "optimal": 1.1, "naive": 0.6, "random": -0.5}
     assert {name: figures[name] for name in expected} == pytest.approx(expected)
     assert figures["fraction_of_optimal"] == pytest.approx(1 / 1.1)
@@ -198,6 +198,6 @@ def test_figures_of_policies_as_worked_by_hand():
     # .02 and .009 below the optimum, of which .01 is let pass; more than the optimum is too.
     assert (figures["optimal_states"], figures["num_states"]) == (1, 2)
     total[0, 0] = 5.0
-    assert examine.policy_figures(total, total, 3)["optimal_states"] == 2
-    nothing = examine.policy_figures(np.zeros((4, 5)), np.zeros((4, 5)), 3)
+    assert examine.policy_metrics(total, total, 3)["optimal_states"] == 2
+    nothing = examine.policy_metrics(np.zeros((4, 5)), np.zeros((4, 5)), 3)
     assert nothing["fraction_of_optimal"] is None

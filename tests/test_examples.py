@@ -47,7 +47,7 @@ def learned():
 def runs(learned, tmp_path_factory):
     """A directory with a run `thermal`, whose Q-networks are not trained."""
     config, outputs = learned
-    untrained = jaxsense.untrained(jax.random.key(0), config)
+    untrained = jaxsense.init(jax.random.key(0), config)
     q_networks = zip(config.modalities, untrained.q_networks, strict=True)
     models = stages.models(outputs | {f"dqn_{name}": q for name, q in q_networks}, config)
     path = tmp_path_factory.mktemp("runs")
@@ -117,6 +117,6 @@ def test_a_run_whose_sensor_cannot_be_imported_is_named(runs, capsys, monkeypatc
 def test_three_sensors_fit_together(example):
     # The whole of it is what `python examples/new_modality.py` trains.
     config = example("new_modality").change(PRESETS["default"])
-    shape = jaxsense.jmvae_shape(config)
+    shape = jaxsense.make_jmvae(config)
     assert shape.modalities == ("camera", "lidar", "thermal")
     assert shape.feature_sizes == (2, 2, 2)

@@ -17,9 +17,9 @@ import pytest
 
 from jaxsense import export
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
-from jaxsense.dqn import as_state
+from jaxsense.dqn import observation
 from jaxsense.interfaces.onboard import functions
-from jaxsense.models import jmvae_shape, untrained
+from jaxsense.models import init, make_jmvae
 from jaxsense.networks import MLP
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.run.version import __version__
@@ -63,7 +63,7 @@ def run_alone(code, *arguments):
 
 @pytest.fixture(scope="module")
 def models():
-    models = untrained(jax.random.key(0), CONFIG)
+    models = init(jax.random.key(0), CONFIG)
     means = jax.random.normal(jax.random.key(1), models.class_beliefs.mean.shape)
     return dataclasses.replace(models, class_beliefs=Belief(means, jnp.ones_like(means)))
 
@@ -112,7 +112,7 @@ def check(results, name, expected, *keys):
 
 @pytest.mark.parametrize("m", [0, 1])
 def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
-    name, model = CONFIG.modalities[m], jmvae_shape(CONFIG)
+    name, model = CONFIG.modalities[m], make_jmvae(CONFIG)
     sensor = sensors.make(CONFIG)[m]
 
     def window(readings, bearing):
@@ -128,7 +128,7 @@ def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
 
     def decide(mean, std):
         network = MLP(CONFIG.dqn.hidden, CONFIG.arena.num_pois + 1)
-        values = network.apply(models.q_networks[m], as_state(Belief(mean, std)))
+        values = network.apply(models.q_networks[m], observation(Belief(mean, std)))
         return np.argmax(values), values
 
     check(results, f"window_{name}", window, "window")
@@ -146,7 +146,7 @@ def test_encoders_give_what_jaxsense_gives(models, results, name, given):
         of_each = [None, None]
         for m, x in zip(given, features, strict=True):
             of_each[m] = x
-        mean, log_var = jmvae.encode(models.jmvae, jmvae_shape(CONFIG), tuple(of_each))
+        mean, log_var = jmvae.encode(models.jmvae, make_jmvae(CONFIG), tuple(of_each))
         return mean, jnp.exp(log_var / 2)
 
     check(results, f"encode_{name}", encode, "mean", "std")

@@ -1,8 +1,10 @@
-"""The one network, for rows and for columns."""
+"""The one network, for an example and for columns of them."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from flax import linen as nn
 
 from jaxsense import networks
 
@@ -17,15 +19,35 @@ def test_a_network_as_worked_by_hand():
     # (1, 2): hidden (1 + 4 + 1, -1 + 1) = (6, 0), output 18 - 2.
     # (-1, -1): hidden (-1 - 2 + 1, 1 + 1), of which the first is cut to 0: output 2 - 2.
     x = jnp.array([[1.0, 2.0], [-1.0, -1.0]])
-    rows = networks.MLP((2,), 1).apply(params, x)
-    np.testing.assert_allclose(np.asarray(rows), [[16.0], [0.0]])
-    np.testing.assert_allclose(networks.apply_to_columns(params, x.T), [[16.0, 0.0]])
+    network = networks.MLP((2,), 1)
+    np.testing.assert_allclose(network.apply(params, x[0]), [16.0])
+    np.testing.assert_allclose(network.apply(params, x.T), [[16.0, 0.0]])
 
 
-def test_columns_give_what_rows_give():
+def test_columns_are_single_examples():
     network = networks.MLP((8, 5), 3)
-    params = network.init(jax.random.key(0), jnp.zeros(4))
+    params = networks.init(jax.random.key(0), network, 4)
     x = jax.random.normal(jax.random.key(1), (7, 4))
-    rows = network.apply(params, x)
-    columns = networks.apply_to_columns(params, x.T)
-    np.testing.assert_allclose(columns.T, rows, rtol=1e-5, atol=1e-6)
+    singles = jax.vmap(lambda x: network.apply(params, x))(x)
+    np.testing.assert_allclose(network.apply(params, x.T).T, singles, rtol=1e-5, atol=1e-6)
+
+
+def test_parameters_are_those_of_flax():
+    # What a run has saved must be read by those who know flax alone.
+    layers = networks.init(jax.random.key(0), networks.MLP((64, 64), 3), 40)["params"]
+    shapes = {name: {n: x.shape for n, x in layer.items()} for name, layer in layers.items()}
+    assert shapes == {
+        "Dense_0": {"kernel": (40, 64), "bias": (64,)},
+        "Dense_1": {"kernel": (64, 64), "bias": (64,)},
+        "Dense_2": {"kernel": (64, 3), "bias": (3,)},
+    }
+    x = jax.random.normal(jax.random.key(1), (40,))
+    hidden = nn.relu(nn.Dense(64).apply({"params": layers["Dense_0"]}, x))
+    hidden = nn.relu(nn.Dense(64).apply({"params": layers["Dense_1"]}, hidden))
+    expected = nn.Dense(3).apply({"params": layers["Dense_2"]}, hidden)
+    ours = networks.MLP((64, 64), 3).apply({"params": layers}, x)
+    np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=1e-6)
+    # He's variance where ReLU follows, LeCun's at the end; no bias.
+    assert np.std(layers["Dense_1"]["kernel"]) == pytest.approx((2 / 64) ** 0.5, rel=0.05)
+    assert np.std(layers["Dense_2"]["kernel"]) == pytest.approx((1 / 64) ** 0.5, rel=0.15)
+    assert not np.any(layers["Dense_0"]["bias"])

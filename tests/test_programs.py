@@ -88,7 +88,7 @@ def test_summary_keeps_its_contract(smoke_run):
 def test_a_finished_run_is_loaded_with_its_settings(smoke_run):
     config, models = jaxsense.load(smoke_run)
     assert config == PRESETS["smoke"]
-    untrained = jaxsense.untrained(jax.random.key(0), config)
+    untrained = jaxsense.init(jax.random.key(0), config)
     assert jax.tree.structure(models) == jax.tree.structure(untrained)
     kernel = models.jmvae["encoders"]["camera"]["params"]["Dense_0"]["kernel"]
     assert np.isfinite(kernel).all()

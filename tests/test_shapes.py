@@ -13,7 +13,7 @@ from jaxsense.types import Belief
 from jaxsense.vae import jmvae, metrics
 
 CONFIG = jaxsense.PRESETS["smoke"]
-MODEL = jaxsense.jmvae_shape(CONFIG)
+MODEL = jaxsense.make_jmvae(CONFIG)
 KEY = jax.random.key(0)
 
 
@@ -52,8 +52,8 @@ def write(old, seen, features):
         ("class_means", lambda: metrics.nearest_class(belief(2), zeros(3, 4))),
         ("std", lambda: vae.sigma_norm(jnp.float32(1))),
         ("std", lambda: dqn.information(jnp.float32(1))),
-        ("belief.mean", lambda: dqn.as_state(belief(2))),
-        ("belief.std", lambda: dqn.as_state(Belief(zeros(3, 2), zeros(3, 1)))),
+        ("belief.mean", lambda: dqn.observation(belief(2))),
+        ("belief.std", lambda: dqn.observation(Belief(zeros(3, 2), zeros(3, 1)))),
         ("bank", lambda: train_on(zeros(3, 8, 2), zeros(3, 8, 4))),
         ("bank", lambda: train_on(zeros(3, 8, 2), zeros(2, 8, 2))),
         ("features of lidar", lambda: encode(zeros(2), zeros(3))),

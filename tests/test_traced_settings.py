@@ -11,7 +11,7 @@ import pytest
 from jaxsense import observe
 from jaxsense.config import Config, DetectorConfig, DqnConfig, JmvaeConfig, MdpConfig
 from jaxsense.dqn import training as dqn
-from jaxsense.models import jmvae_shape
+from jaxsense.models import make_jmvae
 from jaxsense.vae import detectors, jmvae
 
 CONFIG = Config(
@@ -53,7 +53,7 @@ def learn(config):
     inputs = windows, jnp.arange(12) % 2, config.detector, config.detector.steps
     fit, _ = detectors.train(keys[2], fit, detector, *inputs)
 
-    model = jmvae_shape(config)
+    model = make_jmvae(config)
     bank = tuple(jax.random.uniform(k, (3, 5, 2)) for k in keys[3:5])
     latent = jmvae.start(jmvae.init(keys[5], model), config.jmvae)
     latent, _ = jmvae.train(keys[6], latent, model, bank, config.jmvae, config.jmvae.steps)
@@ -117,7 +117,7 @@ def test_each_setting_changes_its_training_and_no_other(together, name):
 
 
 def test_weights_of_reconstruction_may_be_traced():
-    model, key = jmvae_shape(CONFIG), jax.random.key(1)
+    model, key = make_jmvae(CONFIG), jax.random.key(1)
     params = jmvae.init(key, model)
 
     def loss(weights):

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxsense.config import Config
-from jaxsense.models import jmvae_shape
+from jaxsense.models import make_jmvae
 
 
 @dataclasses.dataclass
@@ -37,7 +37,7 @@ class NumpyMdp:
         self.modality = modality
         self.num_pois = config.arena.num_pois
         self.num_modalities = len(config.modalities)
-        self._shape = jmvae_shape(config)
+        self._shape = make_jmvae(config)
         self._bank = [np.asarray(features) for features in bank]
         self._encoders = {name: _layers(p) for name, p in params["encoders"].items()}
         self._decoders = [_layers(params["decoders"][name]) for name in config.modalities]

@@ -36,8 +36,8 @@ class MapEnv(gymnasium.Env):
 
     def step(self, action: Any):
         """One action."""
-        reward, is_over, is_cut = self._mdp.step(self.np_random, self._state, int(action))
-        return self._mdp.observation(self._state), reward, is_over, is_cut, {}
+        reward, terminated, truncated = self._mdp.step(self.np_random, self._state, int(action))
+        return self._mdp.observation(self._state), reward, terminated, truncated, {}
 
 
 def make(task: Task, **settings: Any) -> DQN:

@@ -3,13 +3,13 @@
 from jaxsense.dqn.belief_mdp import MapMdp as MapMdp
 from jaxsense.dqn.belief_mdp import MapState as MapState
 from jaxsense.dqn.belief_mdp import Outcome as Outcome
-from jaxsense.dqn.belief_mdp import as_state as as_state
 from jaxsense.dqn.belief_mdp import information as information
+from jaxsense.dqn.belief_mdp import observation as observation
 from jaxsense.dqn.belief_mdp import reset as reset
 from jaxsense.dqn.belief_mdp import step as step
 from jaxsense.dqn.policies import greedy as greedy
 from jaxsense.dqn.policies import naive as naive
 from jaxsense.dqn.policies import optimal as optimal
-from jaxsense.dqn.policies import uniform as uniform
+from jaxsense.dqn.policies import random as random
 from jaxsense.dqn.training import DqnState as DqnState
 from jaxsense.dqn.training import train as train

@@ -71,13 +71,13 @@ class Outcome:
 
     Attributes:
       reward: `[]` float32.
-      is_over: `[]` bool, the episode has ended by NOP.
-      is_cut: `[]` bool, the episode has ended because it was too long.
+      terminated: `[]` bool, the episode has ended by NOP.
+      truncated: `[]` bool, the episode has ended because it was too long.
     """
 
     reward: jax.Array
-    is_over: jax.Array
-    is_cut: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
 
 
 def information(std: jax.Array) -> jax.Array:
@@ -94,7 +94,7 @@ def information(std: jax.Array) -> jax.Array:
     return 1.0 / jnp.linalg.norm(std, axis=-1)
 
 
-def as_state(belief: Belief) -> jax.Array:
+def observation(belief: Belief) -> jax.Array:
     """`[N * 2D]` the map as a Q-network sees it: mean and standard deviation of each PoI."""
     chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
     chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
@@ -216,8 +216,8 @@ def step(
     after = dataclasses.replace(after, steps=state.steps + 1)
     outcome = Outcome(
         reward=jnp.where(exists, jnp.where(is_nop, 0.0, reward), jnp.nan),
-        is_over=is_nop,
-        is_cut=~is_nop & (after.steps >= mdp.config.max_steps),
+        terminated=is_nop,
+        truncated=~is_nop & (after.steps >= mdp.config.max_steps),
     )
     return after, outcome
 

@@ -16,7 +16,7 @@ from jaxsense.types import Index, Key
 MOST_STATES = 4096
 
 
-def play(
+def run_episode(
     key: Key, mdp: MapMdp, policy: Policy, start: MapState, modality: Index
 ) -> tuple[jax.Array, jax.Array]:
     """Plays one episode with a policy.
@@ -46,8 +46,8 @@ def play(
         is_first = state.steps == start.steps
         state, outcome = belief_mdp.step(look_key, mdp, state, action, modality)
         first = jnp.where(is_first, outcome.reward, first)
-        is_over = outcome.is_over | outcome.is_cut
-        return state, is_over, total + outcome.reward, first, times.at[action].add(1)
+        terminated = outcome.terminated | outcome.truncated
+        return state, terminated, total + outcome.reward, first, times.at[action].add(1)
 
     policy_key, looks_key = jax.random.split(key)
     times = jnp.zeros(mdp.num_pois + 1, jnp.int32)

@@ -7,6 +7,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxsense import networks
 from jaxsense.config import values
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
@@ -26,13 +27,13 @@ def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
 
     def act(key: Key, state: MapState) -> jax.Array:
         del key
-        values = q_network(mdp, hidden).apply(params, belief_mdp.as_state(state.belief))
-        return _best(jnp.asarray(values))
+        seen = belief_mdp.observation(state.belief)
+        return _best(networks.apply(q_network(mdp, hidden), params, seen))
 
     return act
 
 
-def uniform(mdp: MapMdp) -> Policy:
+def random(mdp: MapMdp) -> Policy:
     """Every action with equal chance."""
     return lambda key, state: jax.random.randint(key, (), 0, mdp.num_pois + 1)
 

@@ -17,7 +17,7 @@ from jaxsense.config import DqnConfig
 from jaxsense.dqn import belief_mdp, losses, replay
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.policies import q_network
-from jaxsense.networks import Params, apply_to_columns
+from jaxsense.networks import MLP, Params
 from jaxsense.types import Index, Key, Transition, pytree
 
 
@@ -199,26 +199,27 @@ def _epoch(
         config.epsilon_min, config.epsilon_start * config.epsilon_decay**state.epoch
     )
     started = _restart(draws.start, state.envs, shares, state.needs_start)
-    as_states = jax.vmap(belief_mdp.as_state, out_axes=-1)
-    s_tm1 = as_states(started.belief)
-    values = apply_to_columns(state.params, s_tm1)
+    observations = jax.vmap(belief_mdp.observation, out_axes=-1)
+    s_tm1 = observations(started.belief)
+    network = q_network(mdp, config.hidden)
+    values = networks.apply(network, state.params, s_tm1)
     chex.assert_shape(values, (mdp.num_pois + 1, None))
     greedy = jnp.argmax(values, axis=0).astype(jnp.int32)
     a_tm1 = jnp.where(draws.coin < epsilon, draws.action, greedy)
     envs, outcome = jax.vmap(lambda k, env, a: belief_mdp.step(k, mdp, env, a, modality))(
         draws.step, started, a_tm1
     )
-    discount_t = jnp.where(outcome.is_over, 0.0, 1.0)
-    s_t = as_states(envs.belief)
+    discount_t = jnp.where(outcome.terminated, 0.0, 1.0)
+    s_t = observations(envs.belief)
     transitions = Transition(s_tm1, a_tm1, outcome.reward, discount_t, s_t)
     memory = replay.add(state.replay, transitions)
 
-    has_ended = outcome.is_over | outcome.is_cut
+    has_ended = outcome.terminated | outcome.truncated
     total_reward = state.total_reward + outcome.reward
     episodes = jnp.sum(has_ended)
     ended_reward = jnp.sum(jnp.where(has_ended, total_reward, 0.0))
 
-    params, optimiser, loss = _learn(config, state, memory, draws.replay)
+    params, optimiser, loss = _learn(config, network, state, memory, draws.replay)
     is_copied = (state.epoch + 1) % config.target_period == 0
     target = jax.tree.map(lambda new, old: jnp.where(is_copied, new, old), params, state.target)
     checked = values, outcome.reward, loss, params
@@ -245,6 +246,7 @@ def _epoch(
 
 def _learn(
     config: DqnConfig,
+    network: MLP,
     state: DqnState,
     memory: replay.Replay,
     draws: jax.Array,
@@ -253,8 +255,8 @@ def _learn(
     optimiser = _optimiser(config)
 
     def loss(params: Params, batch: Transition) -> jax.Array:
-        q_tm1 = apply_to_columns(params, batch.s_tm1)
-        q_t = apply_to_columns(state.target, batch.s_t)
+        q_tm1 = networks.apply(network, params, batch.s_tm1)
+        q_t = networks.apply(network, state.target, batch.s_t)
         discount_t = config.discount * batch.discount_t
         error = losses.td_error(q_tm1, batch.a_tm1, batch.r_t, discount_t, q_t)
         return jnp.mean(losses.pseudo_huber(error))

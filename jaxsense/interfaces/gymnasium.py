@@ -26,8 +26,8 @@ with extra("gymnasium"):
 class MapVectorEnv(VectorEnv):
     """Many environments of one agent, stepped side by side by one compiled program.
 
-    An observation is the `[N * 2D]` map, see `dqn.as_state`. Action n < N looks at PoI n, action N
-    is NOP and terminates the episode. All methods are those of Gymnasium.
+    An observation is the `[N * 2D]` map, see `dqn.observation`. Action n < N looks at PoI n; action
+    N is NOP and terminates the episode. All methods are those of Gymnasium.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class MapVectorEnv(VectorEnv):
         )
         observations = np.array(observations)
         rewards = np.array(outcome.reward, np.float64)
-        terminations, truncations = np.array(outcome.is_over), np.array(outcome.is_cut)
+        terminations, truncations = np.array(outcome.terminated), np.array(outcome.truncated)
         infos = {}
         if mode is AutoresetMode.NEXT_STEP and ended.any():
             observations = self._restarted(ended)
@@ -155,7 +155,7 @@ def _step(
     next_key, key = jax.random.split(key)
     step = jax.vmap(lambda k, s, a: belief_mdp.step(k, mdp, s, a, modality))
     states, outcome = step(jax.random.split(key, len(actions)), states, actions)
-    return next_key, jax.vmap(belief_mdp.as_state)(states.belief), states, outcome
+    return next_key, jax.vmap(belief_mdp.observation)(states.belief), states, outcome
 
 
 def _start(
@@ -175,4 +175,4 @@ def _start(
         return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     begun = fresh if states is None else jax.tree.map(pick, fresh, states)
-    return next_key, jax.vmap(belief_mdp.as_state)(begun.belief), begun
+    return next_key, jax.vmap(belief_mdp.observation)(begun.belief), begun

@@ -23,11 +23,11 @@ class MapEnvState(environment.EnvState):
     Attributes:
       time: `[]` int32 actions so far.
       map: the state of the MDP.
-      is_over: `[]` bool, the last action was NOP.
+      terminated: `[]` bool, the last action was NOP.
     """
 
     map: MapState
-    is_over: jax.Array
+    terminated: jax.Array
 
 
 @struct.dataclass
@@ -47,8 +47,8 @@ class MapEnvParams(environment.EnvParams):
 class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     """The map MDP of one agent.
 
-    An observation is the `[N * 2D]` map, see `dqn.as_state`. Action n < N looks at PoI n, action N
-    is NOP and terminates the episode. All methods are those of gymnax.
+    An observation is the `[N * 2D]` map, see `dqn.observation`. Action n < N looks at PoI n; action
+    N is NOP and terminates the episode. All methods are those of gymnax.
     """
 
     def __init__(self, mdp: MapMdp, modality: int):
@@ -74,7 +74,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     def reset_env(self, key: Key, params: MapEnvParams) -> tuple[jax.Array, MapEnvState]:
         """A random start."""
         start = common.start(key, self.mdp, params.starts)
-        state = MapEnvState(time=start.steps, map=start, is_over=jnp.bool_(False))  # pyright: ignore
+        state = MapEnvState(time=start.steps, map=start, terminated=jnp.bool_(False))  # pyright: ignore
         return self.observe(key, state, None, params), state
 
     def step_env(
@@ -83,24 +83,24 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         """One action, without a reset."""
         action = jnp.asarray(action, jnp.int32)
         after, outcome = belief_mdp.step(key, self.mdp, state.map, action, self.modality)
-        state = MapEnvState(time=after.steps, map=after, is_over=outcome.is_over)  # pyright: ignore
+        state = MapEnvState(time=after.steps, map=after, terminated=outcome.terminated)  # pyright: ignore
         info = {"discount": self.discount(state, params)}
         observation = self.observe(key, state, action, params)
-        return observation, state, outcome.reward, outcome.is_over, info
+        return observation, state, outcome.reward, outcome.terminated, info
 
     def observe(self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams) -> jax.Array:
         """`[N * 2D]` the map."""
         del key, action, params
-        return belief_mdp.as_state(state.map.belief)
+        return belief_mdp.observation(state.map.belief)
 
     def is_terminated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
         """`[]` bool, the last action was NOP."""
         del params
-        return state.is_over
+        return state.terminated
 
     def is_truncated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
         """`[]` bool, the episode was too long and did not end by itself."""
-        return ~state.is_over & (state.time >= params.max_steps_in_episode)
+        return ~state.terminated & (state.time >= params.max_steps_in_episode)
 
     @property
     def name(self) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxsense import observe
 from jaxsense.config import Config, values
 from jaxsense.dqn.belief_mdp import MapMdp
-from jaxsense.models import Models, jmvae_shape
+from jaxsense.models import Models, make_jmvae
 from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
 from jaxsense.types import Key
@@ -19,11 +19,11 @@ def map_mdp(config: Config, models: Models, bank: Bank | None = None) -> MapMdp:
 
     Args:
       config: the settings.
-      models: from `jaxsense.load`, or `jaxsense.untrained`.
+      models: from `jaxsense.load`, or `jaxsense.init`.
       bank: stored detections to draw from, for example from `detections`; without, every look casts
         a scan in the environment's own arena.
     """
-    shape = jmvae_shape(config)
+    shape = make_jmvae(config)
     if bank is not None:
         return observe.bank_mdp(config, bank, models.jmvae, shape)
     world = worlds.make_world(config)

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsense import networks
 from jaxsense.config import Config
 from jaxsense.dqn import belief_mdp
-from jaxsense.models import Models, jmvae_shape
+from jaxsense.models import Models, make_jmvae
 from jaxsense.networks import MLP
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
@@ -38,7 +39,7 @@ def functions(config: Config, models: Models) -> dict[str, Function]:
     modalities that the JMVAE has an encoder for, an `encode_M`, for example `encode_camera+lidar`;
     and there is `classify`.
     """
-    model = jmvae_shape(config)
+    model = make_jmvae(config)
     found = {}
     for m, name in enumerate(model.modalities):
         found |= {
@@ -105,8 +106,8 @@ def _decide(config: Config, models: Models, m: int) -> Function:
     q_network = MLP(config.dqn.hidden, num_pois + 1)
 
     def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
-        state = belief_mdp.as_state(Belief(mean, std))
-        values = jnp.asarray(q_network.apply(models.q_networks[m], state))
+        state = belief_mdp.observation(Belief(mean, std))
+        values = networks.apply(q_network, models.q_networks[m], state)
         return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
 
     shape = num_pois, config.jmvae.latent_size

@@ -51,7 +51,9 @@ class MapVecEnv(VecEnv):
         observations, rewards, terminations, truncations, infos = self.env.step(self._actions)
         dones = terminations | truncations
         cuts = truncations & ~terminations
-        of_each: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(is_cut)} for is_cut in cuts]
+        of_each: list[dict[str, Any]] = [
+            {"TimeLimit.truncated": bool(truncated)} for truncated in cuts
+        ]
         for i in np.flatnonzero(dones):
             of_each[i]["terminal_observation"] = infos["final_obs"][i]
         return observations, rewards.astype(np.float32), dones, of_each

@@ -9,10 +9,10 @@ map has changed under way. Everything is a pure function of one episode: `vmap` 
 from jaxsense.mission.cases import Case as Case
 from jaxsense.mission.cases import cases as cases
 from jaxsense.mission.outcome import REASONS as REASONS
-from jaxsense.mission.outcome import figures as figures
+from jaxsense.mission.outcome import measure as measure
 from jaxsense.mission.outcome import reason as reason
-from jaxsense.mission.rollout import play as play
 from jaxsense.mission.rollout import rollout as rollout
+from jaxsense.mission.rollout import rollout_batch as rollout_batch
 from jaxsense.mission.rollout import step as step
 from jaxsense.mission.state import LATENT as LATENT
 from jaxsense.mission.state import NAIVE as NAIVE

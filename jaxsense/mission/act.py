@@ -17,7 +17,7 @@ from jaxsense.mission.state import (
     now,
     update_robot,
 )
-from jaxsense.models import Models, jmvae_shape
+from jaxsense.models import Models, make_jmvae
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import navigation, roadmap, sensors, viewpoints
 from jaxsense.sim import world as worlds
@@ -221,7 +221,7 @@ def _look(
     features = detectors.detect(models.detectors[robot], sensors.as_window(sensor, readings))
     is_sure = jnp.max(features) >= mission.config.mission.least_confidence
     old = jax.tree.map(lambda x: x[aim.poi], state.belief)
-    shape, seen = jmvae_shape(mission.config), state.seen[aim.poi]
+    shape, seen = make_jmvae(mission.config), state.seen[aim.poi]
     return shows & is_sure, fusion.write(models.jmvae, shape, old, seen, features, robot)
 
 

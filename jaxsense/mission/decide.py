@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from jaxsense import networks
 from jaxsense.config import ROBOT_RADIUS, Config
 from jaxsense.dqn import belief_mdp
 from jaxsense.mission.state import (
@@ -86,7 +87,7 @@ def _choose(
         known = jax.tree.map(
             lambda entry, sure: jnp.where(given_up[:, None], sure[None], entry), state.belief, sure
         )
-        return jnp.asarray(network.apply(q_network, belief_mdp.as_state(known)))
+        return networks.apply(network, q_network, belief_mdp.observation(known))
 
     # As it is, an entry that was given up would let the network count on what is left to learn of
     # it. Of one that is known nothing is; since nobody can tell its class, each counts alike.

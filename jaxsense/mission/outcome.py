@@ -31,7 +31,7 @@ def reason(state: MissionState) -> jax.Array:
     robots = state.robots
     working = robots.phase != FAILED
     ends = [
-        (~state.is_over, "running"),
+        (~state.done, "running"),
         (~jnp.any(working), "no robot left"),
         (jnp.any(working & (robots.phase != ENDED)), "time limit"),
         (jnp.any(robots.unreachable), "unreachable"),
@@ -44,7 +44,7 @@ def reason(state: MissionState) -> jax.Array:
     return code
 
 
-def figures(mission: Mission, models: Models, state: MissionState) -> dict[str, Any]:
+def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, Any]:
     """What a mission has achieved.
 
     Returns:

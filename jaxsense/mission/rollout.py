@@ -47,7 +47,7 @@ def rollout(
     return jax.tree.map(lambda x: x[0], states), records
 
 
-def play(
+def rollout_batch(
     keys: Key, mission: Mission, models: Models, states: MissionState, steps: int, every: int
 ) -> tuple[MissionState, Record]:
     """`rollout` of missions side by side, of which only some are recorded.
@@ -96,9 +96,9 @@ def step(
     is_idle = jnp.all((robots.phase == ENDED) | (robots.phase == FAILED), axis=-1)
     steps, settings = states.steps + 1, mission.config.mission
     is_late = steps * settings.control_period >= settings.time_limit
-    after = dataclasses.replace(states, steps=steps, is_over=is_idle | is_late)
+    after = dataclasses.replace(states, steps=steps, done=is_idle | is_late)
     keep = jax.vmap(jnp.where)
-    states = jax.tree.map(lambda x, y: keep(before.is_over, x, y), before, after)
+    states = jax.tree.map(lambda x, y: keep(before.done, x, y), before, after)
     records = Record(
         time=states.steps * settings.control_period,
         poses=states.scene.poses,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jaxsense.config import Config
 from jaxsense.config import values as checks
-from jaxsense.models import jmvae_shape
+from jaxsense.models import make_jmvae
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import roadmap, sensors
 from jaxsense.sim import world as worlds
@@ -126,7 +126,7 @@ class MissionState:
       steps: `[]` int32 control periods so far.
       contacts: `[]` int32 control periods in which a robot touched something.
       least_clearance: `[]` smallest free distance around any robot so far, in metres.
-      is_over: `[]` bool.
+      done: `[]` bool.
     """
 
     scene: Scene
@@ -143,7 +143,7 @@ class MissionState:
     steps: jax.Array
     contacts: jax.Array
     least_clearance: jax.Array
-    is_over: jax.Array
+    done: jax.Array
 
 
 @pytree
@@ -248,7 +248,7 @@ def start(
         chex.assert_shape(times, shape, custom_message=f"faults.{name}")
         is_time = "must be seconds, infinite for never"
         checks.require(f"faults.{name}", times, lambda x: x >= 0, is_time)
-    entry = fusion.unseen(jmvae_shape(config), config.mdp.unseen_variance)
+    entry = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
     ways = roadmap.build(config, scene.layout) if ways is None else ways
     number = jnp.zeros(num_robots, jnp.int32)
     seconds = jnp.zeros(num_robots)
@@ -286,7 +286,7 @@ def start(
         steps=jnp.int32(0),
         contacts=jnp.int32(0),
         least_clearance=jnp.float32(jnp.inf),
-        is_over=jnp.bool_(False),
+        done=jnp.bool_(False),
     )
 
 

@@ -35,7 +35,7 @@ class Unfinished(NamedTuple):
     Attributes:
       done: chunks so far.
       state: what the next chunk starts from.
-      curves: figures of the chunks so far.
+      curves: metrics of the chunks so far.
     """
 
     done: int

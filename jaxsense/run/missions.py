@@ -11,8 +11,8 @@ import numpy as np
 
 from jaxsense.config import Config, values
 from jaxsense.mission.cases import Case
-from jaxsense.mission.outcome import bytes_per_detection, figures, summarise
-from jaxsense.mission.rollout import play
+from jaxsense.mission.outcome import bytes_per_detection, measure, summarise
+from jaxsense.mission.rollout import rollout_batch
 from jaxsense.mission.state import (
     Faults,
     Mission,
@@ -22,7 +22,7 @@ from jaxsense.mission.state import (
     reset,
     with_config,
 )
-from jaxsense.models import Models, untrained
+from jaxsense.models import Models, init
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.types import Key
@@ -49,7 +49,7 @@ class Played:
     """What many missions have come to.
 
     Attributes:
-      metrics: for each case the `[episodes, ...]` figures of `mission.figures`.
+      metrics: for each case the `[episodes, ...]` metrics, see `mission.measure`.
       recording: the first mission of the first case.
       control_steps: control periods of all missions, until they were over.
     """
@@ -116,8 +116,8 @@ class Player:
             team = with_config(mission, config)
             keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(episode)
             keys = jax.vmap(jax.random.fold_in)(keys, number)
-            state, records = play(keys, team, models, state, chunk, share)
-            return state, jax.vmap(lambda s: figures(team, models, s))(state), records
+            state, records = rollout_batch(keys, team, models, state, chunk, share)
+            return state, jax.vmap(lambda s: measure(team, models, s))(state), records
 
         key, numbers = jax.random.key(0), jax.ShapeDtypeStruct((batch,), jnp.int32)
         faults = jax.tree.map(
@@ -127,7 +127,7 @@ class Player:
         state = self._begin.compile(
             begin, key, config, numbers, numbers, faults, workers=workers, whole=(0, 1)
         )
-        models = jax.eval_shape(lambda: untrained(jax.random.key(0), config))
+        models = jax.eval_shape(lambda: init(jax.random.key(0), config))
         self._go_on = Program(compiler, "mission", "go_on")
         self._go_on.compile(
             go_on, key, config, models, numbers, numbers, state, workers=workers, whole=(0, 1, 2)
@@ -190,7 +190,7 @@ class Player:
             if results is None:
                 results = jax.tree.map(lambda x: np.zeros((len(row), *x.shape[1:]), x.dtype), found)
             chunk += 1
-            for slot in np.flatnonzero(state.is_over & ~done[playing]).tolist():
+            for slot in np.flatnonzero(state.done & ~done[playing]).tolist():
                 done[playing[slot]] = True
                 control_steps += int(state.steps[slot])
                 _set_row(results, int(playing[slot]), found, slot)

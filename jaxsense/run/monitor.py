@@ -1,4 +1,4 @@
-"""What a stage tells the outside while it runs: time, progress, figures, and bad ends."""
+"""What a stage tells the outside while it runs: time, progress, metrics, and bad ends."""
 
 import threading
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 Listener = Callable[[str, int, int, dict[str, float]], None]
-"""`(stage, done, total, figures)`, called from the host between two chunks of work."""
+"""`(stage, done, total, metrics)`, called from the host between two chunks of work."""
 
 
 class StageError(RuntimeError):
@@ -35,7 +35,7 @@ class Monitor:
 
     def __init__(
         self,
-        listener: Listener = lambda stage, done, total, figures: None,
+        listener: Listener = lambda stage, done, total, metrics: None,
         warn: Callable[[str], None] = lambda text: None,
     ):
         """Begins a run.
@@ -61,10 +61,10 @@ class Monitor:
         other._stop = self._stop
         return other
 
-    def _listener(self, stage: str, done: int, total: int, figures: dict[str, float]) -> None:
+    def _listener(self, stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
         """Tells the listener; stages may run side by side."""
         with self._lock:
-            self._one_listener(stage, done, total, figures)
+            self._one_listener(stage, done, total, metrics)
 
     def stop(self) -> None:
         """Asks the stages to save what they have and to stop."""
@@ -112,7 +112,7 @@ class Monitor:
         total: int,
         losses: np.ndarray,
         params: Any = (),
-        **figures: float,
+        **metrics: float,
     ) -> None:
         """Reports a chunk of training.
 
@@ -122,7 +122,7 @@ class Monitor:
           total: steps of the whole stage.
           losses: `[steps]` of the chunk; their mean is reported.
           params: what was trained, as it is after the chunk.
-          **figures: what else to report.
+          **metrics: what else to report.
 
         Raises:
           StageError: if a loss or a parameter is not finite; names the step.
@@ -132,7 +132,7 @@ class Monitor:
             step = done - len(losses) + bad[0] + 1
             raise StageError(f"{stage}: loss = {losses[bad[0]]} at step {step} of {total}")
         self.check_finite(stage, f"parameters after step {done} of {total}", params)
-        self._listener(stage, done, total, {"loss": float(np.mean(losses)), **figures})
+        self._listener(stage, done, total, {"loss": float(np.mean(losses)), **metrics})
 
     def add(self, stage: str, kind: str, seconds: float) -> None:
         """Adds to the time of a stage; `kind` is "compile_s" or "run_s"."""

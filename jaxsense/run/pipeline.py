@@ -113,15 +113,15 @@ def _of_agent(config: Config, modality: str, trained: Trained) -> dict[str, Any]
     env_steps = config.dqn.epochs * config.dqn.num_envs
     seconds = sum(trained.curves[f"dqn_{modality}"]["seconds"])
     return {
-        **examine.policy_figures(total, first, config.evaluation.num_starts),
+        **examine.policy_metrics(total, first, config.evaluation.num_starts),
         "env_steps": env_steps,
         "env_steps_per_s": env_steps / seconds,
     }
 
 
-def _as_lists(figures: dict[str, Any]) -> dict[str, Any]:
+def _as_lists(metrics: dict[str, Any]) -> dict[str, Any]:
     """The summary's block `jmvae` from the arrays of `examine.latent_space`."""
-    lists = jax.tree.map(lambda x: x.tolist(), figures)
+    lists = jax.tree.map(lambda x: x.tolist(), metrics)
     lists["unambiguous"] = {
         name: [share > 0.9 for share in shares] for name, shares in lists["unambiguous"].items()
     }

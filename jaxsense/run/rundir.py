@@ -129,9 +129,9 @@ class RunDirectory:
         for name, tree in _named(models, self.settings.config).items():
             self.checkpoints.save(name, tree)
 
-    def append_metrics(self, **figures: Any) -> None:
+    def append_metrics(self, **metrics: Any) -> None:
         """Adds a line to `metrics.jsonl`."""
-        files.append(self.path / _METRICS, json.dumps(figures))
+        files.append(self.path / _METRICS, json.dumps(metrics))
 
     def _remove_unfinished(self) -> None:
         """Removes what a process that was killed has left of files of this run."""
@@ -273,7 +273,7 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     content = _read_config(path / "config.json", "run", path)
     _check_version(content, "run", path)
     config = _settings_of(content, trust).config
-    shapes = jax.eval_shape(lambda: models.untrained(jax.random.key(0), config))
+    shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
     checkpoints = Checkpoints(path / "checkpoints")
 
     if not checkpoints.exists() and content.get("num_seeds", 1) != 1:

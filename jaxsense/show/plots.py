@@ -139,7 +139,7 @@ def _name_classes(axes: Any, centre: np.ndarray, spread: np.ndarray) -> None:
         )
 
 
-def rewards(per_epoch: dict[str, np.ndarray], figures: dict[str, Any]) -> Figure:
+def rewards(per_epoch: dict[str, np.ndarray], metrics: dict[str, Any]) -> Figure:
     """The paper's Fig. 5: reward of whole episodes over the epochs, with baselines as lines."""
     figure = Figure(figsize=(5 * len(per_epoch), 4), layout="constrained")
     axes = figure.subplots(1, len(per_epoch), squeeze=False)
@@ -154,9 +154,9 @@ def rewards(per_epoch: dict[str, np.ndarray], figures: dict[str, Any]) -> Figure
         lines = {"return": "DQN, greedy", "optimal": "optimal", "naive": "naive exploration"}
         for i, (key, label) in enumerate([*lines.items(), ("random", "random")]):
             style = ("-.", "--", ":", (0, (1, 4)))[i]
-            ax.axhline(figures[name][key], color=f"C{i + 1}", linestyle=style, label=label)
+            ax.axhline(metrics[name][key], color=f"C{i + 1}", linestyle=style, label=label)
         ax.set(title=f"{name} DQN", xlabel="epoch", ylabel="total reward of an episode")
-        ax.set_ylim(bottom=1.3 * min(figures[name]["random"], -0.1))
+        ax.set_ylim(bottom=1.3 * min(metrics[name]["random"], -0.1))
         ax.grid(alpha=0.3)
     axes[0, 0].legend(loc="lower right")
     return figure

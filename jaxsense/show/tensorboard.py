@@ -8,7 +8,7 @@ from jaxsense.config import ConfigError
 
 
 def make_writer(path: Path) -> Callable[..., None]:
-    """A function that writes the figures of a report to event files in a directory.
+    """A function that writes the metrics of a report to event files in a directory.
 
     Raises:
       ConfigError: if the package that writes them is not installed.
@@ -21,8 +21,8 @@ def make_writer(path: Path) -> Callable[..., None]:
         raise ConfigError("tensorboard", True, reason) from None
     writer: Any = SummaryWriter(str(path))
 
-    def write(*, stage: str, step: int, **figures: float) -> None:
-        for name, value in figures.items():
+    def write(*, stage: str, step: int, **metrics: float) -> None:
+        for name, value in metrics.items():
             writer.add_scalar(f"{stage}/{name}", value, step)
         writer.flush()
 

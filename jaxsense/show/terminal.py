@@ -25,7 +25,7 @@ class Display:
 
         Args:
           console: where to.
-          *records: each takes the figures of every report.
+          *records: each takes the metrics of every report.
           quiet: show nothing, but do record.
         """
         self._console, self._records, self._quiet = console, records, quiet
@@ -40,7 +40,7 @@ class Display:
             *([columns.BarColumn()] if is_wide else []),
             *(
                 columns.TextColumn(f"{{task.fields[{name}]}}", table_column=Column(min_width=width))
-                for name, width in {"count": 10, "rate": 7, "left": 10, "figures": 0}.items()
+                for name, width in {"count": 10, "rate": 7, "left": 10, "metrics": 0}.items()
             ),
             console=console,
             disable=quiet or not console.is_terminal,
@@ -53,14 +53,14 @@ class Display:
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
-    def show(self, stage: str, done: int, total: int, figures: dict[str, float]) -> None:
+    def show(self, stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
         """Takes a report of a `Monitor`; one without a total says that a stage compiles."""
         if total:
             for record in self._records:
-                record(stage=stage, step=done, **figures)
+                record(stage=stage, step=done, **metrics)
         if self._quiet:
             return
-        text = "  ".join(f"{name} {value:.4g}" for name, value in figures.items())
+        text = "  ".join(f"{name} {value:.4g}" for name, value in metrics.items())
         if self._console.is_terminal:
             self._show_bar(stage, done, total, text)
         else:
@@ -69,7 +69,7 @@ class Display:
     def _show_bar(self, stage: str, done: int, total: int, text: str) -> None:
         if stage not in self._tasks:
             self._tasks[stage] = self._progress.add_task(
-                stage, total=None, count="compiling", rate="", left="", figures=""
+                stage, total=None, count="compiling", rate="", left="", metrics=""
             )
         if not total:
             return
@@ -81,7 +81,7 @@ class Display:
             count=f"{done}/{total}",
             rate=rate,
             left=left,
-            figures=text,
+            metrics=text,
         )
         # What only compiles or examines has no end of its own to tell of.
         for other in self._progress.tasks:

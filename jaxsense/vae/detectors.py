@@ -8,7 +8,7 @@ from flax import struct
 
 from jaxsense import networks
 from jaxsense.config import DetectorConfig
-from jaxsense.networks import MLP, Params, apply_to_columns
+from jaxsense.networks import MLP, Params
 from jaxsense.types import Key, pytree
 from jaxsense.vae import minibatch
 from jaxsense.vae.minibatch import FitState
@@ -46,7 +46,7 @@ def logits(detector: Detector, window: jax.Array) -> jax.Array:
     """`[D_m]` unnormalised log-probabilities of the labels, from one `[F]` window."""
     chex.assert_shape(window, detector.offset.shape, custom_message="window")
     standard = (window - detector.offset) / detector.scale
-    return MLP(detector.hidden, detector.num_labels).apply(detector.params, standard)  # pyright: ignore
+    return networks.apply(_network(detector), detector.params, standard)
 
 
 def detect(detector: Detector, window: jax.Array) -> jax.Array:
@@ -97,10 +97,14 @@ def train(
     def loss(params: Params, rows: jax.Array, step: jax.Array) -> jax.Array:
         del step
         standard = (windows[rows] - detector.offset[None]) / detector.scale
-        predicted = apply_to_columns(params, standard.T)
+        predicted = networks.apply(_network(detector), params, standard.T)
         return optax.softmax_cross_entropy_with_integer_labels(predicted, labels[rows], 0).mean()
 
     return minibatch.fit(state, loss, rows, _optimiser(config), config.steps)
+
+
+def _network(detector: Detector) -> MLP:
+    return MLP(detector.hidden, detector.num_labels)
 
 
 def _optimiser(config: DetectorConfig) -> optax.GradientTransformation:

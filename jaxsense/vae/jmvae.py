@@ -16,7 +16,7 @@ import optax
 
 from jaxsense import networks
 from jaxsense.config import JmvaeConfig, values
-from jaxsense.networks import MLP, Params, apply_to_columns
+from jaxsense.networks import MLP, Params
 from jaxsense.types import Belief, Features, Key
 from jaxsense.vae import gaussian, minibatch
 from jaxsense.vae.minibatch import FitState
@@ -107,10 +107,17 @@ def encode(params: Params, model: Jmvae, features: Features) -> tuple[jax.Array,
             (model.feature_sizes[m],),
             custom_message=f"features of {model.modalities[m]}",
         )
-    joined = jnp.concatenate([f for f in features if f is not None])
+    return _encode(params, model, subset, features)
+
+
+def _encode(
+    params: Params, model: Jmvae, subset: tuple[int, ...], features: Features
+) -> tuple[jax.Array, jax.Array]:
+    """`[D]` mean and log-variance from `[D_m]` features, or `[D, B]` from `[D_m, B]`."""
+    joined = jnp.concatenate([x for m, x in enumerate(features) if m in subset and x is not None])
     network = MLP(model.hidden, 2 * model.latent_size)
-    output = network.apply(params["encoders"][model.encoder_name(subset)], joined)
-    mean, log_var = jnp.split(jnp.asarray(output), 2)
+    output = networks.apply(network, params["encoders"][model.encoder_name(subset)], joined)
+    mean, log_var = jnp.split(output, 2)
     return mean, log_var
 
 
@@ -128,8 +135,13 @@ def check_features(model: Jmvae, features: Features) -> None:
 def decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]:
     """The mean of `p(features | z)` of every modality, `[D_m]` each, from `[D]` latents."""
     chex.assert_shape(z, (model.latent_size,), custom_message="z")
+    return _decode(params, model, z)
+
+
+def _decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]:
+    """`[D_m]` from `[D]` latents, or `[D_m, B]` from `[D, B]`."""
     return tuple(
-        jnp.asarray(MLP(model.hidden, size).apply(params["decoders"][name], z))
+        networks.apply(MLP(model.hidden, size), params["decoders"][name], z)
         for name, size in zip(model.modalities, model.feature_sizes, strict=True)
     )
 
@@ -223,22 +235,16 @@ def losses(
     for x, size in zip(features, model.feature_sizes, strict=True):
         chex.assert_shape(x, (size, batch), custom_message="features")
 
-    def posterior_of(subset: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
-        network = params["encoders"][model.encoder_name(subset)]
-        output = apply_to_columns(network, jnp.concatenate([features[m] for m in subset]))
-        mean, log_var = jnp.split(output, 2)
-        return mean, log_var
-
-    joint = posterior_of(model.subsets[-1])
-    z = gaussian.sample(noise, *joint)
+    *others, every = model.subsets
+    joint = _encode(params, model, every, features)
+    decoded = _decode(params, model, gaussian.sample(noise, *joint))
     reconstruction = jnp.zeros(batch)
-    for name, x, weight in zip(model.modalities, features, reconstruction_weights, strict=True):
-        decoded = apply_to_columns(params["decoders"][name], z)
-        reconstruction += weight * 0.5 * jnp.sum((x - decoded) ** 2, axis=0)
+    for x, mean, weight in zip(features, decoded, reconstruction_weights, strict=True):
+        reconstruction += weight * 0.5 * jnp.sum((x - mean) ** 2, axis=0)
     prior = jax.vmap(gaussian.kl_to_standard_normal, in_axes=-1)(*joint)
     divergence, subsets = jax.vmap(gaussian.kl_divergence, in_axes=-1), jnp.zeros(batch)
-    for subset in model.subsets[:-1]:
-        subsets += divergence(*joint, *posterior_of(subset))
+    for subset in others:
+        subsets += divergence(*joint, *_encode(params, model, subset, features))
     parts = {"reconstruction": reconstruction, "prior": prior, "subsets": subsets}
     return reconstruction + beta * prior + alpha * subsets, parts
 

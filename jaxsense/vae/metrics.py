@@ -1,4 +1,4 @@
-"""How good a latent space is: the figures of a run's summary, and what a belief says of a class."""
+"""How good a latent space is: the metrics of a run's summary, and what a belief says of a class."""
 
 import chex
 import jax

@@ -32,7 +32,7 @@ SECONDS = 10.0
 def run(tmp_path_factory):
     """The directory of a run that trained nothing, without a summary."""
     path = tmp_path_factory.mktemp("runs") / "run"
-    models = jaxsense.untrained(jax.random.key(0), SMOKE)
+    models = jaxsense.init(jax.random.key(0), SMOKE)
     with RunDirectory.create(path, Settings("smoke", 0, SMOKE)) as created:
         created.save_models(models)
     return path

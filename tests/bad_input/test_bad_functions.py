@@ -19,8 +19,8 @@ class World:
 
     def __init__(self):
         self.key = jax.random.key(0)
-        self.models = jaxsense.untrained(self.key, SMOKE)
-        self.params, self.model = self.models.jmvae, jaxsense.jmvae_shape(SMOKE)
+        self.models = jaxsense.init(self.key, SMOKE)
+        self.params, self.model = self.models.jmvae, jaxsense.make_jmvae(SMOKE)
         self.world = sim.make_world(SMOKE)
         self.camera, self.lidar = self.world.sensors
         self.classes = jnp.array([0, 1, 2])
@@ -215,8 +215,8 @@ FUNCTIONS = {
     "information zero": (lambda w: dqn.information(w.x), "std = 0.0: must be greater than 0"),
     "information nan": (lambda w: dqn.information(w.x * NAN), "std = nan"),
     "information rank": (lambda w: dqn.information(jnp.float32(1)), "std"),
-    "as_state rank": (lambda w: dqn.as_state(w.belief), "belief.mean"),
-    "as_state std": (lambda w: dqn.as_state(Belief(w.means, w.means)), "belief.std = 0.0"),
+    "observation rank": (lambda w: dqn.observation(w.belief), "belief.mean"),
+    "observation std": (lambda w: dqn.observation(Belief(w.means, w.means)), "belief.std = 0.0"),
     "reset classes": (lambda w: dqn.reset(w.key, w.mdp, BAD), "classes = 7"),
     "reset number": (lambda w: dqn.reset(w.key, w.mdp, w.classes[:2]), "classes"),
     "reset seen": (
@@ -307,6 +307,6 @@ def test_environments_refuse(given_world):
     for actions in ([0, 4], [-1, 0], [0.5, 1.0], [0], [[0, 1]], "x"):
         with pytest.raises(ValueError, match=r"actions = .*: must be in"):
             env.step(actions)
-    start = gymnax.MapEnvState(time=0, map=given_world.state, is_over=jnp.bool_(False))
+    start = gymnax.MapEnvState(time=0, map=given_world.state, terminated=jnp.bool_(False))
     with pytest.raises(ValueError, match="action = 4: must be a whole number from 0 to 3"):
         gymnax.MapEnv(mdp, 0).step_env(given_world.key, start, 4, gymnax.MapEnvParams())

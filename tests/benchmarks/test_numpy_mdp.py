@@ -34,13 +34,13 @@ def test_every_step_equals_ours(task, modality):
         for action in [*rng.integers(3, size=7), 3]:
             np.testing.assert_allclose(
                 theirs.observation(their_state),
-                belief_mdp.as_state(state.belief),
+                belief_mdp.observation(state.belief),
                 atol=TOLERANCE,
             )
             state, outcome = step(jax.random.key(1), state, jnp.int32(action))
-            reward, is_over, is_cut = theirs.step(rng, their_state, int(action))
+            reward, terminated, truncated = theirs.step(rng, their_state, int(action))
             np.testing.assert_allclose(reward, outcome.reward, atol=TOLERANCE)
-            assert (is_over, is_cut) == (bool(outcome.is_over), bool(outcome.is_cut))
+            assert (terminated, truncated) == (bool(outcome.terminated), bool(outcome.truncated))
             np.testing.assert_array_equal(their_state.seen, state.seen)
 
 

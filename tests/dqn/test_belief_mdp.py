@@ -48,9 +48,9 @@ def test_information_is_the_inverse_norm_of_the_deviations():
 
 def test_state_is_mean_and_deviation_of_one_poi_after_the_other():
     belief = Belief(jnp.array([[1.0, 2.0], [5.0, 6.0]]), jnp.array([[3.0, 4.0], [7.0, 8.0]]))
-    np.testing.assert_array_equal(belief_mdp.as_state(belief), [1, 2, 3, 4, 5, 6, 7, 8])
+    np.testing.assert_array_equal(belief_mdp.observation(belief), [1, 2, 3, 4, 5, 6, 7, 8])
     with pytest.raises(AssertionError, match="belief"):
-        belief_mdp.as_state(Belief(jnp.zeros(2), jnp.ones(2)))
+        belief_mdp.observation(Belief(jnp.zeros(2), jnp.ones(2)))
 
 
 def test_reset_writes_what_has_been_seen_and_nothing_else():
@@ -80,8 +80,8 @@ def test_reset_writes_the_modalities_in_random_order():
 def test_a_first_look_pays_its_gain_of_information():
     after, outcome = lidar_step(start(), jnp.int32(0))
     np.testing.assert_allclose(outcome.reward, 0.2 - UNSEEN_INFORMATION, rtol=1e-4)
-    assert not outcome.is_over
-    assert not outcome.is_cut
+    assert not outcome.terminated
+    assert not outcome.truncated
     np.testing.assert_allclose(after.belief.mean[0], [0.0, 1.0])  # class 0 by modality 1
     np.testing.assert_allclose(after.belief.std[0], [3.0, 4.0])
     assert after.steps == 1
@@ -131,8 +131,8 @@ def test_nop_gives_nothing_ends_the_episode_and_leaves_the_map():
     before = start()
     after, outcome = lidar_step(before, jnp.int32(NOP))
     assert outcome.reward == 0.0
-    assert outcome.is_over
-    assert not outcome.is_cut
+    assert outcome.terminated
+    assert not outcome.truncated
     for name in ("belief", "seen", "classes", "scene"):
         jax.tree.map(np.testing.assert_array_equal, getattr(after, name), getattr(before, name))
 
@@ -141,14 +141,14 @@ def test_an_episode_is_cut_after_max_steps():
     mdp, state, cut = classes_mdp(max_steps=3), start(), []
     for _ in range(3):
         state, outcome = belief_mdp.step(jax.random.key(0), mdp, state, jnp.int32(0), 0)
-        cut.append(bool(outcome.is_cut))
-        assert not outcome.is_over
+        cut.append(bool(outcome.truncated))
+        assert not outcome.terminated
     assert cut == [False, False, True]
     # An episode that NOP ends is not cut as well.
     late = replace(state, steps=jnp.int32(2))
     _, outcome = belief_mdp.step(jax.random.key(0), mdp, late, jnp.int32(NOP), 0)
-    assert outcome.is_over
-    assert not outcome.is_cut
+    assert outcome.terminated
+    assert not outcome.truncated
 
 
 def permute(state, order):

@@ -71,7 +71,7 @@ def probe():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_values_are_those_worked_by_hand(probe, seed):
     params = jax.tree.map(lambda x: x[seed], probe[0].params)
-    inputs = jax.vmap(belief_mdp.as_state)(states().belief)
+    inputs = jax.vmap(belief_mdp.observation)(states().belief)
     values = policies.q_network(MDP, PROBE.hidden).apply(params, inputs)
     np.testing.assert_allclose(np.asarray(values), Q, atol=0.05)
 

@@ -22,7 +22,7 @@ def scripted(*actions):
 
 def play(mdp, policy, seen, modality=0):
     state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.array(seen, bool))
-    return episodes.play(KEY, mdp, policy, state, modality)
+    return episodes.run_episode(KEY, mdp, policy, state, modality)
 
 
 def test_every_state_of_the_paper_is_there_once():
@@ -99,7 +99,7 @@ def test_policies_draw_anew_at_every_step():
     mdp = classes_mdp(max_steps=20)
     state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.ones((3, 2), bool))
     keys = jax.random.split(KEY, 400)
-    totals, _ = jax.vmap(lambda key: episodes.play(key, mdp, coin, state, 0))(keys)
+    totals, _ = jax.vmap(lambda key: episodes.run_episode(key, mdp, coin, state, 0))(keys)
     # Looks in vain until the first NOP: geometric, mean 1, variance 2; +- 4 sqrt(2 / 400).
     np.testing.assert_allclose(-totals.mean(), 1.0, atol=0.29)
     assert len(np.unique(totals)) >= 5

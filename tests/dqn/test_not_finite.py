@@ -26,7 +26,7 @@ def test_an_action_that_is_none_pays_nan(action):
     step = jax.jit(lambda action: belief_mdp.step(KEY, MDP, start(), action, 0)[1])
     outcome = step(jnp.int32(action))
     assert np.isnan(outcome.reward)
-    assert not outcome.is_over
+    assert not outcome.terminated
 
 
 def test_a_belief_that_is_not_a_number_pays_nan_and_not_a_look_in_vain():
@@ -46,7 +46,7 @@ def test_values_that_are_not_numbers_choose_no_action_and_total_nan(worst):
         MDP, {"params": {**params, "Dense_1": {**params["Dense_1"], "bias": bias}}}, (4,)
     )
     assert greedy(KEY, start()) == -1
-    total, first = episodes.play(KEY, MDP, greedy, start(), 0)
+    total, first = episodes.run_episode(KEY, MDP, greedy, start(), 0)
     assert np.isnan(total)
     assert np.isnan(first)
 

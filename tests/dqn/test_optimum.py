@@ -86,12 +86,12 @@ def test_no_policy_expects_more_than_the_optimal_one(num_pois):
         compared = (
             policies.optimal(mdp, rewards, jnp.array(LABELS)),
             policies.naive(mdp, modality),
-            policies.uniform(mdp),
+            policies.random(mdp),
         )
 
         def totals(key, classes, seen):
             start = belief_mdp.reset(KEY, mdp, classes, seen)
-            return [episodes.play(key, mdp, p, start, modality)[0] for p in compared]
+            return [episodes.run_episode(key, mdp, p, start, modality)[0] for p in compared]
 
         return jax.vmap(totals)(jax.random.split(KEY, len(states)), classes, seen)
 

@@ -76,7 +76,7 @@ def test_optimal_averages_over_the_classes_that_the_looks_leave_open(rewards_of_
 
 def test_uniform_takes_every_action_equally_often():
     keys = jax.random.split(KEY, 4000)
-    actions = jax.vmap(policies.uniform(MDP), in_axes=(0, None))(keys, start(np.zeros((3, 2))))
+    actions = jax.vmap(policies.random(MDP), in_axes=(0, None))(keys, start(np.zeros((3, 2))))
     # 1000 each +- 4 sqrt(4000 x 3/16) = +- 110.
     np.testing.assert_allclose(np.bincount(actions, minlength=4), 1000, atol=110)
 

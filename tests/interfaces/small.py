@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxsense.config import MODALITIES, PRESETS, Config, JmvaeConfig
 from jaxsense.dqn import belief_mdp, episodes, policies
 from jaxsense.interfaces import map_mdp
-from jaxsense.models import Models, jmvae_shape, untrained
+from jaxsense.models import Models, init, make_jmvae
 from jaxsense.observe import Bank
 from jaxsense.vae import jmvae
 
@@ -34,8 +34,8 @@ def noisy_bank(key: jax.Array, config: Config, samples: int = 256) -> Bank:
 @functools.cache
 def trained() -> tuple[Models, Bank]:
     """Models of which the JMVAE is trained, and its bank."""
-    models = untrained(jax.random.key(0), CONFIG)
-    bank, model, settings = noisy_bank(jax.random.key(1), CONFIG), jmvae_shape(CONFIG), CONFIG.jmvae
+    models = init(jax.random.key(0), CONFIG)
+    bank, model, settings = noisy_bank(jax.random.key(1), CONFIG), make_jmvae(CONFIG), CONFIG.jmvae
     state = jmvae.start(models.jmvae, settings)
     train = jax.jit(lambda key, state: jmvae.train(key, state, model, bank, settings, 3000)[0])
     state = train(jax.random.key(2), state)
@@ -66,7 +66,7 @@ def returns(policy: policies.Policy, number: int = 256) -> jax.Array:
     def play(key):
         start_key, play_key = jax.random.split(key)
         start = belief_mdp.reset(start_key, mdp)
-        return episodes.play(play_key, mdp, policy, start, 0)[0]
+        return episodes.run_episode(play_key, mdp, policy, start, 0)[0]
 
     return jax.jit(jax.vmap(play))(jax.random.split(jax.random.key(3), number))
 

@@ -33,7 +33,7 @@ class OneEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Discrete(4)
 
     def observation(self):
-        return np.asarray(belief_mdp.as_state(self.state.belief))
+        return np.asarray(belief_mdp.observation(self.state.belief))
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -42,7 +42,7 @@ class OneEnv(gymnasium.Env):
 
     def step(self, action):
         self.state, outcome = self.mdp_step(jax.random.key(0), self.state, jnp.int32(action))
-        ends = bool(outcome.is_over), bool(outcome.is_cut)
+        ends = bool(outcome.terminated), bool(outcome.truncated)
         return self.observation(), float(outcome.reward), *ends, {}
 
 
@@ -57,14 +57,14 @@ def test_every_step_equals_the_mdps(starts):
     states = jax.tree.map(lambda x: x[np.array(rows)], starts)
     step = jax.jit(jax.vmap(lambda k, s, a: belief_mdp.step(k, mdp, s, a, LIDAR)))
     for actions in ([0, 1, 2, 0], [1, 1, 0, 2], [2, 0, NOP, NOP]):
-        expected = jax.vmap(belief_mdp.as_state)(states.belief)
+        expected = jax.vmap(belief_mdp.observation)(states.belief)
         np.testing.assert_allclose(observations, expected, rtol=1e-6)
         observations, rewards, terminations, truncations, _ = env.step(np.array(actions))
         key, step_key = jax.random.split(key)
         states, outcome = step(jax.random.split(step_key, 4), states, jnp.array(actions))
         np.testing.assert_allclose(rewards, outcome.reward, rtol=1e-5)
-        np.testing.assert_array_equal(terminations, outcome.is_over)
-        np.testing.assert_array_equal(truncations, outcome.is_cut)
+        np.testing.assert_array_equal(terminations, outcome.terminated)
+        np.testing.assert_array_equal(truncations, outcome.truncated)
     assert list(terminations) == [False, False, True, True]
 
 

@@ -14,7 +14,7 @@ from gymnax.wrappers.gym import GymnaxToGymWrapper
 from jaxsense.dqn import belief_mdp
 from jaxsense.interfaces import map_mdp
 from jaxsense.interfaces.gymnax import MapEnv
-from jaxsense.models import untrained
+from jaxsense.models import init
 
 LIDAR = 1
 
@@ -34,20 +34,20 @@ def test_every_step_equals_the_mdps(env):
     expected = jax.jit(lambda key: belief_mdp.reset(key, env.mdp))(jax.random.key(0))
     mdp_step = jax.jit(lambda k, s, a: belief_mdp.step(k, env.mdp, s, a, LIDAR))
     for i, action in enumerate([0, 1, 0, 2, 3]):
-        np.testing.assert_allclose(obs, belief_mdp.as_state(expected.belief), rtol=1e-6)
+        np.testing.assert_allclose(obs, belief_mdp.observation(expected.belief), rtol=1e-6)
         assert_trees_equal(state.map.seen, expected.seen)
         key = jax.random.key(10 + i)
         obs, state, reward, terminated, truncated, info = env.step(key, state, action, params)
         expected, outcome = mdp_step(jax.random.split(key)[0], expected, jnp.int32(action))
         np.testing.assert_allclose(reward, outcome.reward, rtol=1e-5)
-        assert (terminated, truncated) == (outcome.is_over, outcome.is_cut)
-        final = belief_mdp.as_state(expected.belief)
+        assert (terminated, truncated) == (outcome.terminated, outcome.truncated)
+        final = belief_mdp.observation(expected.belief)
         np.testing.assert_allclose(info["final_observation"], final, rtol=1e-6)
-        assert info["discount"] == 1.0 - outcome.is_over
+        assert info["discount"] == 1.0 - outcome.terminated
     assert terminated
     start, _ = env.reset(jax.random.split(key)[1], params)
     np.testing.assert_allclose(obs, start, rtol=1e-6)
-    assert not state.is_over
+    assert not state.terminated
     assert state.time == 0
 
 
@@ -67,7 +67,7 @@ def test_prepared_starts_are_drawn_and_no_others(env):
     params = env.prepared_params(jax.random.key(2), 5)
     keys = jax.random.split(jax.random.key(3), 100)
     drawn, _ = jax.vmap(env.reset, (0, None))(keys, params)
-    starts = jax.vmap(belief_mdp.as_state)(params.starts.belief)
+    starts = jax.vmap(belief_mdp.observation)(params.starts.belief)
     distances = np.abs(np.asarray(drawn)[:, None] - np.asarray(starts)[None]).max(axis=2)
     assert (distances.min(axis=1) == 0).all()
     assert (distances.min(axis=0) == 0).all()
@@ -111,7 +111,7 @@ def test_wrappers_of_gymnax_take_it(env):
 
 
 def test_live_observations_trace():
-    models = untrained(jax.random.key(0), small.CONFIG)
+    models = init(jax.random.key(0), small.CONFIG)
     env = MapEnv(map_mdp(small.CONFIG, models), 0)
 
     def play(key):

@@ -11,7 +11,7 @@ import pytest
 
 import jaxsense
 from jaxsense import export
-from jaxsense.models import untrained
+from jaxsense.models import init
 from jaxsense.vae.detectors import Detector
 
 PAGE = Path(__file__).parent.parent.parent / "docs" / "interfaces.md"
@@ -34,11 +34,11 @@ def names():
     found: dict = {}
 
     def with_colours(key, config):
-        models = untrained(key, config)
+        models = init(key, config)
         return dataclasses.replace(models, detectors=(colour_detector(), models.detectors[1]))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jaxsense, "untrained", with_colours)
+        patch.setattr(jaxsense, "init", with_colours)
         exec(compile(FIRST, PAGE.name, "exec"), found)
     return found
 

@@ -17,7 +17,7 @@ def team():
 
 @pytest.fixture(scope="session")
 def models():
-    return jaxsense.untrained(jax.random.key(0), CONFIG)
+    return jaxsense.init(jax.random.key(0), CONFIG)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from teams import CONFIG
 
 from jaxsense import mission
 from jaxsense.mission.state import Record
-from jaxsense.models import untrained
+from jaxsense.models import init
 from jaxsense.run import devices, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
@@ -27,10 +27,10 @@ LAST = 2 * CHUNK - 3  # control periods, within the second chunk
 def fake_step(keys, team, models, states):
     """No physics, which would take long to compile: every robot walks where chance takes it."""
     moves = jax.vmap(lambda key: jax.random.normal(key, states.scene.poses.shape[1:]))(keys)
-    moves = jnp.where(states.is_over[:, None, None], 0.0, moves)
+    moves = jnp.where(states.done[:, None, None], 0.0, moves)
     scene = dataclasses.replace(states.scene, poses=states.scene.poses + moves)
-    steps = states.steps + ~states.is_over
-    states = dataclasses.replace(states, scene=scene, steps=steps, is_over=steps >= LAST)
+    steps = states.steps + ~states.done
+    states = dataclasses.replace(states, scene=scene, steps=steps, done=steps >= LAST)
     fields = dict.fromkeys((f.name for f in dataclasses.fields(Record)), steps)
     return states, Record(**{**fields, "poses": scene.poses})
 
@@ -52,10 +52,10 @@ def test_the_whole_first_mission_is_recorded(split, team, monkeypatch):
 
     monkeypatch.setattr(ROLLOUT, "step", fake_step)
     monkeypatch.setattr(missions, "reset", fake_reset)
-    monkeypatch.setattr(missions, "figures", lambda team, models, s: {"steps": s.steps})
+    monkeypatch.setattr(missions, "measure", lambda team, models, s: {"steps": s.steps})
     with Compiler(Monitor()) as compiler:
         player = missions.Player(team, compiler, 4, WORKERS[split]())
-        models = untrained(jax.random.key(0), CONFIG)
+        models = init(jax.random.key(0), CONFIG)
         played = player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, 9)
     np.testing.assert_array_equal(played.metrics["naive"]["steps"], np.full(9, LAST))
 
@@ -74,4 +74,4 @@ def test_the_whole_first_mission_is_recorded(split, team, monkeypatch):
     np.testing.assert_allclose(records.poses[:LAST], walk, atol=1e-4)
     np.testing.assert_array_equal(records.poses[LAST:], records.poses[LAST - 1 : -1])
     np.testing.assert_array_equal(end.scene.poses, records.poses[-1])
-    assert end.is_over
+    assert end.done

@@ -1,4 +1,4 @@
-"""What the page says in tables: the figures of `summary.json`, beside those of the paper."""
+"""What the page says in tables: the metrics of `summary.json`, beside those of the paper."""
 
 import dataclasses
 from collections.abc import Callable
@@ -113,17 +113,17 @@ def policies(summary: Summary) -> list[Row]:
 
 def latent_space(summary: Summary) -> list[Row]:
     """The JMVAE, with a single column."""
-    figures = summary["jmvae"]
+    metrics = summary["jmvae"]
     pairs = [
         (norm, is_clear)
-        for name, norms in figures["sigma_norm"].items()
-        for norm, is_clear in zip(norms, figures["unambiguous"][name], strict=True)
+        for name, norms in metrics["sigma_norm"].items()
+        for norm, is_clear in zip(norms, metrics["unambiguous"][name], strict=True)
     ]
-    fusion = figures["fusion"]
+    fusion = metrics["fusion"]
     return [
         Row(
             "dimensions in use",
-            [number(figures["active_units"])],
+            [number(metrics["active_units"])],
             "1",
             "Of the latent space; the paper's Fig. 4 uses one of two.",
         ),
@@ -155,7 +155,7 @@ def latent_space(summary: Summary) -> list[Row]:
         ),
         Row(
             "error of moments",
-            [number(figures["moment_matching_error"])],
+            [number(metrics["moment_matching_error"])],
             "0 in theory",
             "How far a sensor's belief is from the best single Gaussian over the classes that it "
             "leaves open.",
@@ -182,8 +182,8 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
       The columns, and a row for each class: what holds here, and in the paper's Table I if that has
       the same classes and sensors.
     """
-    figures = summary["jmvae"]["unambiguous"]
-    alone = [name for name in figures if name != "joint"]
+    metrics = summary["jmvae"]["unambiguous"]
+    alone = [name for name in metrics if name != "joint"]
     is_paper = set(classes) == PAPER_CLASSES and set(alone) == PAPER_MODALITIES
 
     def cell(label: str, name: str, holds: bool) -> str:
@@ -195,14 +195,14 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
 
     columns = [*alone, "joint"]
     rows = [
-        Row(label, [cell(label, name, figures[name][c]) for name in columns], "", "")
+        Row(label, [cell(label, name, metrics[name][c]) for name in columns], "", "")
         for c, label in enumerate(classes)
     ]
     return [*alone, "together"], rows
 
 
 def missions(summary: Summary) -> tuple[list[str], list[Row]]:
-    """Missions: the policies and failures that were played, as columns, and their figures."""
+    """Missions: the policies and failures that were played, as columns, and their metrics."""
     blocks = {n: b for n, b in summary["mission"].items() if n != "bytes_per_detection"}
 
     def row(name: str, key: str, digits: int, meaning: str) -> Row:

@@ -28,7 +28,7 @@ def known(models):
 def ended(arena_of):
     state = arena_of(POSITIONS, POSES, classes=(0, 1, 2))
     robots = replace(state.robots, phase=jnp.full(2, ENDED))
-    return replace(state, robots=robots, is_over=jnp.bool_(True), steps=jnp.int32(123))
+    return replace(state, robots=robots, done=jnp.bool_(True), steps=jnp.int32(123))
 
 
 def test_figures_as_worked_by_hand(team, known, ended):
@@ -44,7 +44,7 @@ def test_figures_as_worked_by_hand(team, known, ended):
     )
     state = replace(ended, belief=Belief(mean, std), robots=robots, contacts=jnp.int32(4))
     state = replace(state, seen=jnp.array([[True, False]] * 3))
-    found = mission.figures(team, known, state)
+    found = mission.measure(team, known, state)
     np.testing.assert_array_equal(found["is_right"], [True, True, False])
     np.testing.assert_array_equal(found["ambiguous"], [False, True, False])
     # Colours: green, red and, wrongly, green; shapes: round, round and, wrongly, round.
@@ -56,7 +56,7 @@ def test_figures_as_worked_by_hand(team, known, ended):
     # 1 / .5 + 1 / sqrt(.09 + 1.44) + 1 / .5
     np.testing.assert_allclose(found["information"], 4 + 1 / np.sqrt(1.53), rtol=1e-5)
     # What nobody has seen is neither right nor reported.
-    unseen = mission.figures(team, known, replace(state, seen=jnp.zeros((3, 2), bool)))
+    unseen = mission.measure(team, known, replace(state, seen=jnp.zeros((3, 2), bool)))
     assert not np.any(unseen["is_right"])
     assert not np.any(unseen["ambiguous"])
     assert unseen["told"]["camera"] == 0
@@ -70,7 +70,7 @@ def one(flag_of, robot, poi):
     ("expected", "change"),
     [
         ("finished", lambda s: s),
-        ("running", lambda s: replace(s, is_over=jnp.bool_(False))),
+        ("running", lambda s: replace(s, done=jnp.bool_(False))),
         ("time limit", lambda s: _phases(s, ENDED, DRIVING)),
         ("no robot left", lambda s: _phases(s, FAILED, FAILED)),
         ("robot failed", lambda s: _phases(s, FAILED, ENDED)),
