@@ -20,7 +20,7 @@ from jaxsense.config.mission import MOST_EPISODES
 from jaxsense.run import devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError
-from jaxsense.show import animation, page
+from jaxsense.show import animation, metrics, page
 from jaxsense.show.terminal import Display
 from jaxsense.sim.arena import TIMESTEP
 from jaxsense.types import Belief
@@ -164,28 +164,15 @@ def _cases(arguments: Arguments, config: Config) -> dict[str, mission.Case]:
 
 def _print_table(console: rich.console.Console, found: dict[str, Any]) -> None:
     """All cases beside one another."""
-    columns = {
-        "accuracy": "accuracy",
-        "looks": "observations_per_poi",
-        "time": "time_s",
-        "contacts": "collisions",
-        "goals": "goals_reached_fraction",
-        "inform.": "information",
-        "told": "told",
-        "ambig.": "ambiguous_reported",
-    }
+    columns = [metric.label for metric in metrics.MISSIONS]
     table = rich.table.Table("policy", *columns, box=rich.box.SIMPLE, pad_edge=False)
     blocks = {name: block for name, block in found.items() if name != "bytes_per_detection"}
     for name, block in blocks.items():
-        values = (block.get(key) for key in columns.values())
-        table.add_row(name, *("" if v is None else f"{v:.4g}" for v in values))
+        table.add_row(name, *(metric.text(block) for metric in metrics.MISSIONS))
     console.print(table)
-    console.print(
-        "accuracy of the finished map; looks per PoI; median time [s]; control periods with "
-        "contact; share of goals that were reached; information in the map; accuracy of what a "
-        "robot alone can tell; share of the other PoIs that the map shows as ambiguous.\n",
-        markup=False,
-    )
+    for metric in metrics.MISSIONS:
+        if metric.meaning:
+            console.print(f"{metric.label}: {metric.meaning}", markup=False, style="dim")
     if {"latent", "naive"} <= set(blocks):
         ratio = blocks["latent"]["time_s"] / blocks["naive"]["time_s"]
         console.print(f"The latent policy takes {ratio:.2f} of the time of the naive one.")

@@ -33,6 +33,10 @@ from jaxsense.vae.minibatch import FitState
 _MOST_CHUNKS = 20
 
 
+Examples = tuple[jax.Array, jax.Array]
+"""Windows of a detector, and their labels."""
+
+
 @pytree
 class Progress:
     """What some steps of a training report.
@@ -190,6 +194,7 @@ def stages(config: Config, world: World | None = None) -> list[Stage]:
     return [
         Stage("scenes", _draw_scenes),
         Stage("survey", functools.partial(_survey, world), ("scenes",), has_rows=True),
+        Stage("examples", _examples, ("survey",)),
         *(_detector_stage(m, name, config) for m, name in enumerate(detector_names)),
         Stage("detections", _detect, ("survey", *detector_names)),
         *(dataclasses.replace(restart, name=name) for name in restarts),
@@ -341,40 +346,51 @@ def _survey(world: World, key: Key, config: Config, scenes: tuple[Key, jax.Array
     return Surveys(classes, *found)
 
 
+def _examples(key: Key, config: Config, surveys: Surveys) -> tuple[Examples, ...]:
+    """What each detector is trained on: `[L, F]` windows and their `[L]` int32 labels."""
+    del key
+    num_train = num_scenes(config)[0]
+    classes = surveys.classes[:num_train].reshape(-1)
+    return tuple(
+        (
+            windows[:num_train].reshape(-1, windows.shape[-1]),
+            jnp.array(config.label_of_class(name))[classes],
+        )
+        for name, windows in zip(config.modalities, surveys.windows, strict=True)
+    )
+
+
 def _detector_stage(modality: int, name: str, config: Config) -> Stage:
     """The training of one modality's detector."""
-    settings = config.detector
-    num_train, size = num_scenes(config)[0], _chunk_size(settings.steps)
-    labels = jnp.array(config.label_of_class(config.modalities[modality]))
+    size = _chunk_size(config.detector.steps)
 
-    def examples(surveys: Surveys) -> tuple[jax.Array, jax.Array]:
-        windows = surveys.windows[modality][:num_train]
-        of_windows = labels[surveys.classes[:num_train]]
-        return windows.reshape(-1, windows.shape[-1]), of_windows.reshape(-1)
-
-    def begin(key: Key, config: Config, surveys: Surveys) -> tuple[Detector, FitState]:
+    def begin(
+        key: Key, config: Config, examples: tuple[Examples, ...]
+    ) -> tuple[Detector, FitState]:
         num_labels = len(config.labels(config.modalities[modality]))
-        detector = detectors.init(key, examples(surveys)[0], num_labels, config.detector)
+        detector = detectors.init(key, examples[modality][0], num_labels, config.detector)
         return detector, detectors.start(detector, config.detector)
 
-    def advance(key: Key, config: Config, state: tuple[Detector, FitState], surveys: Surveys):
+    def advance(
+        key: Key, config: Config, state: tuple[Detector, FitState], examples: tuple[Examples, ...]
+    ) -> tuple[tuple[Detector, FitState], Progress]:
         detector, fit = state
-        inputs = *examples(surveys), config.detector, size
+        inputs = *examples[modality], config.detector, size
         fit, losses = detectors.train(key, fit, detector, *inputs)
         return (detector, fit), Progress(losses, {})
 
-    def finish(config: Config, state: tuple[Detector, FitState], surveys: Surveys) -> Detector:
+    def finish(config: Config, state: tuple[Detector, FitState], *inputs: Any) -> Detector:
         detector, fit = state
         return dataclasses.replace(detector, params=fit.params)
 
     return Stage(
         name,
         begin,
-        ("survey",),
+        ("examples",),
         advance=advance,
         finish=finish,
-        steps=settings.steps,
-        chunks=_num_chunks(settings.steps),
+        steps=config.detector.steps,
+        chunks=_num_chunks(config.detector.steps),
         program=name,
         is_saved=True,
         is_dense=True,

@@ -28,7 +28,7 @@ from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.pipeline import RunResult
 from jaxsense.run.programs import Programs
 from jaxsense.run.rundir import RunDirectory, Settings
-from jaxsense.show import animation, page, plots, tensorboard
+from jaxsense.show import animation, metrics, page, plots, tensorboard
 from jaxsense.show.terminal import Display, say
 from jaxsense.sim import sensors
 
@@ -121,7 +121,7 @@ def main(
             _print_summary(console, run)
     first = next(path for path in _paths(run) if (path / "report.html").exists())
     # The one thing that a quiet run says.
-    say(f"Everything is in {run.path}; open {first / 'report.html'} first.")
+    say(f"Everything is in {run.path}; open {run.path / 'report.html'} first.")
     trust = " --trust" if arguments.config.sensors else ""
     say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
 
@@ -331,12 +331,13 @@ def _of_seed(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager
 
 
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
-    """Writes the summary of several seeds: of each, and over those that did not fail."""
-    found = {
-        str(seed): rundir.read_summary(path)
+    """Writes the page, the curves and the summary of several seeds, without those that failed."""
+    sound = {
+        str(seed): path
         for seed, path in zip(run.settings.seeds, _paths(run), strict=True)
         if seed not in failed
     }
+    found = {seed: rundir.read_summary(path) for seed, path in sound.items()}
     blocks = [{name: one[name] for name in rundir.BLOCKS} for one in found.values()]
     timing = {
         "total_s": sum(one["timing"]["total_s"] for one in found.values()),
@@ -345,7 +346,11 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     summary = {**_header(run, timing), "seeds": dict(zip(found, blocks, strict=True))}
     if failed:
         summary["failed"] = {str(seed): reason for seed, reason in failed.items()}
-    run.write_json("summary.json", {**summary, **seeds.statistics(blocks)})
+    summary |= seeds.statistics(blocks)
+    curves = seeds.rewards(list(sound.values()), run.settings.config)
+    plots.write_rewards(run.path, curves, summary["dqn"])
+    page.write_seeds(run.path, run.settings.config, summary)
+    run.write_json("summary.json", summary)
 
 
 def _warn(text: str) -> None:
@@ -386,34 +391,18 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     if settings.num_seeds > 1:
         last = settings.seed + settings.num_seeds - 1
         seeds = f", seeds {settings.seed} to {last}: mean, 95% interval"
-    table = rich.table.Table("figure", *policies, title=f"{settings.preset} preset{seeds}")
-    table.add_row(
-        "detector accuracy",
-        *(_figure(summary["detectors"][modality]["accuracy"]) for modality in policies),
-    )
-    rows = {
-        "episode reward, DQN": "return",
-        "episode reward, optimal": "optimal",
-        "episode reward, naive": "naive",
-        "episode reward, random": "random",
-        "fraction of optimal": "fraction_of_optimal",
-        "optimal in states": "optimal_states",
-        "states": "num_states",
-    }
-    for name, key in rows.items():
-        table.add_row(name, *(_figure(policy.get(key)) for policy in policies.values()))
+    table = rich.table.Table("metric", *policies, title=f"{settings.preset} preset{seeds}")
+    detectors = [summary["detectors"][modality] for modality in policies]
+    blocks = [*((metric, detectors) for metric in metrics.DETECTORS)]
+    blocks += [(metric, [*policies.values()]) for metric in metrics.headline()]
+    for metric, columns in blocks:
+        table.add_row(metric.label, *map(metric.text, columns))
     console.print(table)
+    units = metrics.LATENT_SPACE[0]
     console.print(
-        f"latent units in use: {_figure(summary['jmvae']['active_units'])}, "
+        f"{units.label}: {units.text(summary['jmvae'])}, "
         f"total time: {summary['timing']['total_s']:.0f} s"
     )
-
-
-def _figure(value: Any) -> str:
-    """A figure as a cell of the table."""
-    if isinstance(value, dict):
-        return f"{value['mean']:.4g}, {value['low']:.4g} to {value['high']:.4g}"
-    return "" if value is None else f"{value:.5g}"
 
 
 if __name__ == "__main__":

@@ -11,6 +11,8 @@ from smoke import error_line, interrupting, without_times
 
 import jaxsense
 from jaxsense import evaluate, train
+from jaxsense.run import seeds as of_seeds
+from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.compilation import Program
 from jaxsense.run.rundir import RunDirectory, read_settings
 
@@ -43,6 +45,20 @@ def test_a_seed_of_several_is_the_run_of_that_seed(seeds, smoke_run):
     assert names == {path.name for path in smoke_run.iterdir()}
 
 
+def test_curves_are_those_of_all_seeds(seeds):
+    config = read_settings(seeds / "config.json").config
+    curves = of_seeds.rewards([seeds / "seed-4", seeds / "seed-5"], config)
+    saved = {name: np.full(60, np.nan, np.float32) for name in ("reward", "epsilon")}
+    saved["seconds"] = np.zeros(3, np.float32)
+    of_5 = Checkpoints(seeds / "seed-5" / "checkpoints").load("curves_dqn_lidar", saved)
+    assert curves["lidar"].shape == (2, 60)
+    np.testing.assert_array_equal(curves["lidar"][1], of_5["reward"])
+    # 1 and 3: the mean 2, its error 1, and t(.975, 1 degree of freedom) 12.706; 2 and 2 have none.
+    low, high = of_seeds.interval(np.array([[1.0, 2.0], [3.0, 2.0]]))
+    np.testing.assert_allclose(low, [2 - 12.706, 2], atol=1e-3)
+    np.testing.assert_allclose(high, [2 + 12.706, 2], atol=1e-3)
+
+
 def test_the_summary_of_several_seeds_is_over_all_of_them(seeds, capsys):
     summary = json.loads((seeds / "summary.json").read_text(encoding="utf-8"))
     each = [without_times(seeds / f"seed-{s}") for s in (4, 5)]
@@ -51,6 +67,13 @@ def test_the_summary_of_several_seeds_is_over_all_of_them(seeds, capsys):
     assert summary["seeds"]["4"]["mission"] == each[0]["mission"]
     assert summary["seeds"]["5"]["dqn"]["camera"]["env_steps_per_s"] > 0
     assert "failed" not in summary
+    page = (seeds / "report.html").read_text(encoding="utf-8")
+    assert '<a href="seed-4/report.html">4</a>' in page
+    mean, low, high = (
+        summary["detectors"]["lidar"]["accuracy"][n] for n in ("mean", "low", "high")
+    )
+    assert f"<td>{mean:.4f} ({low:.4f} to {high:.4f})</td>" in page
+    assert page.count("<img") == 1  # the curves
     with pytest.raises(SystemExit):
         evaluate.main([str(seeds)])
     assert "holds several seeds; choose one" in capsys.readouterr().err

@@ -252,8 +252,9 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
     monkeypatch.setattr(detectors, "train", train)
     monkeypatch.setattr(detectors, "detect", lambda detector, window: window)
     for name in ("detector_camera", "detector_lidar"):
-        state = listed[name].begin(KEY, MEASURED, surveys)
-        listed[name].advance(KEY, MEASURED, state, surveys)
+        examples = listed["examples"].begin(KEY, MEASURED, surveys)
+        state = listed[name].begin(KEY, MEASURED, examples)
+        listed[name].advance(KEY, MEASURED, state, examples)
     looks = listed["detections"].begin(KEY, MEASURED, surveys, None, None)
 
     seen, bank, held_out = used(trained_on), used(looks.bank), used(looks.held_out)

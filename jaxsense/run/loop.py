@@ -121,7 +121,8 @@ class _Loop:
             return program(key, config, *inputs)
         number = len(jax.tree.leaves(inputs)[0])
         found = program(key, config, *padded(inputs, self._programs.workers.number))
-        return jax.tree.map(lambda x: x[:number], found)
+        # What threads have joined is on the host, from where every program would fetch it anew.
+        return jax.device_put(jax.tree.map(lambda x: x[:number], found))
 
     def _train(self, stage: Stage, inputs: tuple[Any, ...]) -> Any:
         """The output of a stage with steps."""

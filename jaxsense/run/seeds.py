@@ -1,10 +1,14 @@
-"""Several seeds: the means and intervals of what their summaries hold."""
+"""Several seeds: the means and intervals of what their runs hold."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.stats
+
+from jaxsense.config import Config
+from jaxsense.run.checkpoints import Checkpoints
 
 _CONFIDENCE = 0.95
 
@@ -21,6 +25,21 @@ def statistics(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
       number nor holds numbers; in a list, None takes its place.
     """
     return _statistics(list(summaries)) or {}
+
+
+def rewards(runs: Sequence[Path], config: Config) -> dict[str, np.ndarray]:
+    """For each modality `[K, epochs]` mean total rewards of several runs, as they saved them."""
+    shapes = {
+        "reward": np.zeros(config.dqn.epochs, np.float32),
+        "epsilon": np.zeros(config.dqn.epochs, np.float32),
+        "seconds": np.zeros(config.dqn.epochs // config.dqn.chunk, np.float32),
+    }
+
+    def load(run: Path, modality: str) -> np.ndarray:
+        name = f"curves_dqn_{modality}"
+        return Checkpoints(run / "checkpoints").load(name, shapes)["reward"]
+
+    return {name: np.stack([load(run, name) for run in runs]) for name in config.modalities}
 
 
 def totals(timings: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
@@ -43,14 +62,19 @@ def _statistics(values: list[Any]) -> Any:
     if isinstance(first, list):
         return [_statistics(list(row)) for row in zip(*values, strict=True)]
     if isinstance(first, bool | int | float):
-        return None if None in values else _interval(np.array(values, float))
+        return None if None in values else _described(np.array(values, float))
     return None
 
 
-def _interval(values: np.ndarray) -> dict[str, float]:
-    mean = float(values.mean())
-    error = float(scipy.stats.sem(values)) if len(values) > 1 else 0.0
-    low, high = mean, mean
-    if error > 0:
-        low, high = scipy.stats.t.interval(_CONFIDENCE, len(values) - 1, loc=mean, scale=error)
-    return {"mean": mean, "low": float(low), "high": float(high)}
+def interval(values: np.ndarray) -> tuple[Any, Any]:
+    """The 95% interval of the mean of `[K, ...]` values, by Student's t."""
+    average = values.mean(axis=0)
+    if len(values) == 1:
+        return average, average
+    error = scipy.stats.sem(values) * scipy.stats.t.ppf((1 + _CONFIDENCE) / 2, len(values) - 1)
+    return average - error, average + error
+
+
+def _described(values: np.ndarray) -> dict[str, float]:
+    low, high = interval(values)
+    return {"mean": float(values.mean()), "low": float(low), "high": float(high)}

@@ -15,6 +15,8 @@ from matplotlib.patheffects import withStroke
 from jaxsense.config import Config
 from jaxsense.run import files
 from jaxsense.run.pipeline import RunResult
+from jaxsense.run.seeds import interval
+from jaxsense.show import metrics
 from jaxsense.show.colours import as_srgb, class_colour
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
@@ -32,9 +34,18 @@ def write_plots(path: Path, config: Config, result: RunResult) -> None:
         "scanlines": scanlines(config, result.windows),
     }
     for name, figure in plots.items():
-        content = io.BytesIO()
-        figure.savefig(content, format="png", dpi=120)
-        files.write(path / f"{name}.png", content.getvalue())
+        _write(path / f"{name}.png", figure)
+
+
+def write_rewards(path: Path, curves: dict[str, np.ndarray], agents: dict[str, Any]) -> None:
+    """Writes `reward.png` of several seeds into a directory, see `rewards`."""
+    _write(path / "reward.png", rewards(curves, agents))
+
+
+def _write(path: Path, figure: Figure) -> None:
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=120)
+    files.write(path, content.getvalue())
 
 
 def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
@@ -139,27 +150,41 @@ def _name_classes(axes: Any, centre: np.ndarray, spread: np.ndarray) -> None:
         )
 
 
-def rewards(per_epoch: dict[str, np.ndarray], metrics: dict[str, Any]) -> Figure:
-    """The paper's Fig. 5: reward of whole episodes over the epochs, with baselines as lines."""
+def rewards(per_epoch: dict[str, np.ndarray], agents: dict[str, Any]) -> Figure:
+    """The paper's Fig. 5: reward of whole episodes over the epochs, with baselines as lines.
+
+    Args:
+      per_epoch: for each modality `[epochs]` rewards, NaN where no episode ended; or `[K, epochs]`
+        of several seeds, of which the mean and its 95% interval are shown.
+      agents: the block `dqn` of the summary.
+    """
     figure = Figure(figsize=(5 * len(per_epoch), 4), layout="constrained")
     axes = figure.subplots(1, len(per_epoch), squeeze=False)
     for ax, (name, reward) in zip(axes[0], per_epoch.items(), strict=True):
-        window = min(_SMOOTHING, len(reward))
-        # An epoch in which no episode ended has no reward.
-        number = np.convolve(np.isfinite(reward), np.ones(window), mode="valid")
-        total = np.convolve(np.nan_to_num(reward), np.ones(window), mode="valid")
-        smooth = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-        ax.plot(reward, color="C0", alpha=0.25, linewidth=0.8)
-        ax.plot(np.arange(window - 1, len(reward)), smooth, color="C0", label="DQN, exploring")
-        lines = {"return": "DQN, greedy", "optimal": "optimal", "naive": "naive exploration"}
-        for i, (key, label) in enumerate([*lines.items(), ("random", "random")]):
+        if reward.ndim == 1:
+            ax.plot(reward, color="C0", alpha=0.25, linewidth=0.8)
+        smooth = np.stack([_smoothed(of_seed) for of_seed in np.atleast_2d(reward)])
+        epochs = np.arange(reward.shape[-1] - smooth.shape[-1], reward.shape[-1])
+        ax.plot(epochs, smooth.mean(axis=0), color="C0", label="DQN, exploring")
+        if len(smooth) > 1:
+            ax.fill_between(epochs, *interval(smooth), color="C0", alpha=0.2, linewidth=0)
+        for i, key in enumerate(("return", "optimal", "naive", "random")):
             style = ("-.", "--", ":", (0, (1, 4)))[i]
-            ax.axhline(metrics[name][key], color=f"C{i + 1}", linestyle=style, label=label)
+            value = metrics.mean(agents[name][key])
+            ax.axhline(value, color=f"C{i + 1}", linestyle=style, label=metrics.label(key))
         ax.set(title=f"{name} DQN", xlabel="epoch", ylabel="total reward of an episode")
-        ax.set_ylim(bottom=1.3 * min(metrics[name]["random"], -0.1))
+        ax.set_ylim(bottom=1.3 * min(metrics.mean(agents[name]["random"]), -0.1))
         ax.grid(alpha=0.3)
     axes[0, 0].legend(loc="lower right")
     return figure
+
+
+def _smoothed(reward: np.ndarray) -> np.ndarray:
+    """The mean of the last epochs in which an episode ended, for each epoch from one on."""
+    window = min(_SMOOTHING, len(reward))
+    number = np.convolve(np.isfinite(reward), np.ones(window), mode="valid")
+    total = np.convolve(np.nan_to_num(reward), np.ones(window), mode="valid")
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
 
 
 def scanlines(config: Config, windows: dict[str, np.ndarray]) -> Figure:

@@ -1,8 +1,10 @@
 """What the page says in tables: the metrics of `summary.json`, beside those of the paper."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Iterable
 from typing import Any
+
+from jaxsense.show.metrics import AGENTS, DETECTORS, LATENT_SPACE, MISSIONS, Metric, mean, text
 
 Summary = dict[str, Any]
 PAPER_TABLE = {
@@ -14,7 +16,7 @@ PAPER_TABLE = {
     ("red cube", "lidar"): True,
 }
 """Table I of Korthals et al. 2018: whether a sensor alone can tell a class for certain."""
-_YES_OR_NO = ("no", "yes")
+_YES_OR_NO = {0.0: "no", 1.0: "yes"}
 PAPER_CLASSES = {label for label, _ in PAPER_TABLE}
 PAPER_MODALITIES = {modality for _, modality in PAPER_TABLE}
 
@@ -36,97 +38,31 @@ class Row:
     meaning: str
 
 
-def number(value: Any, digits: int = 3) -> str:
-    """A figure as text; a dash for one that there is not."""
-    if value is None:
-        return "-"
-    return f"{value:,}" if isinstance(value, int) else f"{value:,.{digits}f}"
+def _row(metric: Metric, blocks: Iterable[dict[str, Any]]) -> Row:
+    """A metric of several blocks, one in each column."""
+    values = [metric.text(block) for block in blocks]
+    return Row(metric.label, values, metric.paper, metric.meaning)
 
 
 def policies(summary: Summary) -> list[Row]:
     """Detectors and Q-networks, one column for each modality."""
-    blocks = summary["dqn"]
-
-    def row(name: str, meaning: str, value: Callable[[str], str], paper: str = "") -> Row:
-        return Row(name, [value(modality) for modality in blocks], paper, meaning)
-
-    def of_dqn(name: str, key: str, meaning: str, paper: str = "") -> Row:
-        return row(name, meaning, lambda m: number(blocks[m][key]), paper)
-
-    def one_step(name: str, key: str, meaning: str, paper: str) -> Row:
-        return row(name, meaning, lambda m: number(blocks[m]["one_step"][key]), paper)
-
-    return [
-        row(
-            "detector: accuracy",
-            "Share of scans, from scenes it was not trained on, whose class it tells as well as "
-            "the sensor can.",
-            lambda m: number(summary["detectors"][m]["accuracy"], 4),
-        ),
-        of_dqn(
-            "reward of an episode: DQN",
-            "return",
-            "What the greedy policy of the Q-network gains in information, summed over an episode; "
-            "a look in vain costs 1.",
-            "Fig. 5",
-        ),
-        of_dqn(
-            "reward of an episode: optimal",
-            "optimal",
-            "The policy that knows what every look can tell on average.",
-            "0.550*",
-        ),
-        of_dqn("reward of an episode: naive", "naive", "Every point once, whatever is known."),
-        of_dqn("reward of an episode: random", "random", "Any look, or the end, by chance."),
-        of_dqn("fraction of optimal", "fraction_of_optimal", "The first of these over the second."),
-        row(
-            "optimal in states",
-            "States of the map, all that there are, in which the policy gains within 0.01 of the "
-            "optimum.",
-            lambda m: f"{blocks[m]['optimal_states']} of {blocks[m]['num_states']}",
-            "384 states",
-        ),
-        one_step(
-            "reward of one step: DQN",
-            "policy",
-            "Of the first step alone, as the authors' code measures it.",
-            "0.340, 0.385*",
-        ),
-        one_step(
-            "reward of one step: optimal", "optimal", "The optimal policy's first step.", "0.426*"
-        ),
-        one_step("reward of one step: random", "random", "A random first step.", "-0.302*"),
-        row(
-            "steps of training",
-            "Steps of all environments together.",
-            lambda m: number(blocks[m]["env_steps"]),
-            "2,000 epochs",
-        ),
-        row(
-            "steps per second",
-            "Of the environments, with learning.",
-            # Several seeds in one program have no rate of their own.
-            lambda m: number(blocks[m].get("env_steps_per_s"), 0),
-        ),
-    ]
+    agents = summary["dqn"]
+    detectors = [summary["detectors"][modality] for modality in agents]
+    rows = [_row(metric, detectors) for metric in DETECTORS]
+    return rows + [_row(metric, agents.values()) for metric in AGENTS]
 
 
 def latent_space(summary: Summary) -> list[Row]:
     """The JMVAE, with a single column."""
-    metrics = summary["jmvae"]
+    block = summary["jmvae"]
     pairs = [
-        (norm, is_clear)
-        for name, norms in metrics["sigma_norm"].items()
-        for norm, is_clear in zip(norms, metrics["unambiguous"][name], strict=True)
+        (mean(norm), mean(is_clear) > 0.5)
+        for name, norms in block["sigma_norm"].items()
+        for norm, is_clear in zip(norms, block["unambiguous"][name], strict=True)
     ]
-    fusion = metrics["fusion"]
+    units, *others = (_row(metric, [block]) for metric in LATENT_SPACE)
     return [
-        Row(
-            "dimensions in use",
-            [number(metrics["active_units"])],
-            "1",
-            "Of the latent space; the paper's Fig. 4 uses one of two.",
-        ),
+        units,
         Row(
             "sigma norm, unambiguous",
             [_range([norm for norm, is_clear in pairs if is_clear])],
@@ -137,29 +73,9 @@ def latent_space(summary: Summary) -> list[Row]:
             "sigma norm, ambiguous",
             [_range([norm for norm, is_clear in pairs if not is_clear])],
             "to 1.25",
-            "Uncertainty of beliefs between classes that a sensor cannot tell apart.",
+            "Uncertainty of beliefs between classes that a sensor cannot distinguish.",
         ),
-        Row(
-            "fusion: right class",
-            [number(fusion["accuracy"], 4)],
-            "",
-            "Share of entries, written by one sensor and then by another, that are nearest to the "
-            "true class.",
-        ),
-        Row(
-            "fusion: error",
-            [number(fusion["mean_error"])],
-            "",
-            "How far such an entry is from what both sensors together give, in standard "
-            "deviations.",
-        ),
-        Row(
-            "error of moments",
-            [number(metrics["moment_matching_error"])],
-            "0 in theory",
-            "How far a sensor's belief is from the best single Gaussian over the classes that it "
-            "leaves open.",
-        ),
+        *others,
     ]
 
 
@@ -186,8 +102,8 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
     alone = [name for name in metrics if name != "joint"]
     is_paper = set(classes) == PAPER_CLASSES and set(alone) == PAPER_MODALITIES
 
-    def cell(label: str, name: str, holds: bool) -> str:
-        here = _YES_OR_NO[holds]
+    def cell(label: str, name: str, holds: float) -> str:
+        here = _YES_OR_NO.get(holds, f"{holds:.0%}")  # of several seeds
         if not is_paper:
             return here
         there = _YES_OR_NO[name == "joint" or PAPER_TABLE[label, name]]
@@ -195,7 +111,7 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
 
     columns = [*alone, "joint"]
     rows = [
-        Row(label, [cell(label, name, metrics[name][c]) for name in columns], "", "")
+        Row(label, [cell(label, name, mean(metrics[name][c])) for name in columns], "", "")
         for c, label in enumerate(classes)
     ]
     return [*alone, "together"], rows
@@ -204,34 +120,11 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
 def missions(summary: Summary) -> tuple[list[str], list[Row]]:
     """Missions: the policies and failures that were played, as columns, and their metrics."""
     blocks = {n: b for n, b in summary["mission"].items() if n != "bytes_per_detection"}
-
-    def row(name: str, key: str, digits: int, meaning: str) -> Row:
-        return Row(name, [number(block.get(key), digits) for block in blocks.values()], "", meaning)
-
-    rows = [
-        row(
-            "accuracy",
-            "accuracy",
-            3,
-            "Share of points whose most likely class in the finished map is the true one.",
-        ),
-        row(
-            "looks per point", "observations_per_poi", 2, "The fewer, the better they were chosen."
-        ),
-        row("time [s]", "time_s", 1, "Until all robots have ended; the median."),
-        row("collisions", "collisions", 0, "Control periods in which a robot touched something."),
-        row(
-            "goals reached",
-            "goals_reached_fraction",
-            3,
-            "Share of the viewpoints that robots set out for.",
-        ),
-        row("information", "information", 2, "In the finished map: the sum of 1 / sigma norm."),
-        row("missions", "episodes", 0, ""),
-    ]
+    rows = [_row(metric, blocks.values()) for metric in MISSIONS]
+    rows = [row for row in rows if set(row.values) != {"-"}]
     reasons = {reason for block in blocks.values() for reason in block["ended"]} - {"finished"}
     for reason in sorted(reasons):
-        numbers = [number(block["ended"].get(reason, 0)) for block in blocks.values()]
+        numbers = [text(block["ended"].get(reason, 0)) for block in blocks.values()]
         rows.append(Row(reason, numbers, "", "Missions that did not finish, for this reason."))
     return [name.replace("_", " ") for name in blocks], rows
 

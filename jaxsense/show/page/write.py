@@ -11,6 +11,7 @@ import jinja2
 
 from jaxsense.config import PRESETS, Config, ConfigError, as_plain, parse_json
 from jaxsense.run import files
+from jaxsense.show import metrics
 from jaxsense.show.page import tables
 from jaxsense.show.page.inline import Film, read_film
 
@@ -51,8 +52,17 @@ def write(run: Path, config: Config, summary: dict[str, Any]) -> Path:
       ConfigError: if the summary lacks something or holds what is no figure.
       OSError: if a file cannot be read or written.
     """
+    return _write(run, config, summary, "report.html.jinja")
+
+
+def write_seeds(run: Path, config: Config, summary: dict[str, Any]) -> Path:
+    """Writes `report.html` of several seeds, which leads to the page of each; see `write`."""
+    return _write(run, config, summary, "seeds.html.jinja")
+
+
+def _write(run: Path, config: Config, summary: dict[str, Any], template: str) -> Path:
     try:
-        text = _render(run, config, summary)
+        text = _render(run, config, summary, template)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         reason = f"must hold the summary.json of a finished run ({error!r})"
         raise ConfigError("run", str(run), reason) from None
@@ -64,7 +74,7 @@ def write(run: Path, config: Config, summary: dict[str, Any]) -> Path:
     return path
 
 
-def _render(run: Path, config: Config, summary: dict[str, Any]) -> str:
+def _render(run: Path, config: Config, summary: dict[str, Any], template: str) -> str:
     """The page."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("jaxsense.show.page", "."),
@@ -75,10 +85,11 @@ def _render(run: Path, config: Config, summary: dict[str, Any]) -> str:
     )
     columns, table = tables.unambiguous(summary, list(config.arena.classes))
     mission_columns, missions = tables.missions(summary)
-    return environment.get_template("report.html.jinja").render(
+    return environment.get_template(template).render(
         run=run,
         summary=summary,
         modalities=[modality for modality, _ in summary["dqn"].items()],
+        mean=metrics.mean,
         num_devices=len(summary["devices"]),
         devices=sorted(set(summary["devices"])),
         commit=_commit(run),

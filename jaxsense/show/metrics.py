@@ -1,0 +1,169 @@
+"""The metrics of a summary: one table that the terminal, the page, the plots and the docs read."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Metric:
+    """A metric of a block of `summary.json`.
+
+    Attributes:
+      key: where it stands in the block; a dot leads into a block within.
+      label: its name.
+      meaning: what it measures; empty if the label says it.
+      paper: what the paper reports; with a star, what its authors' code prints.
+      digits: after the point.
+    """
+
+    key: str
+    label: str
+    meaning: str = ""
+    paper: str = ""
+    digits: int = 3
+
+    def text(self, block: dict[str, Any]) -> str:
+        """Its value in a block: a number, of several seeds the mean and its 95% interval."""
+        value: Any = block
+        for part in self.key.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        return text(value, self.digits)
+
+
+DETECTORS = (
+    Metric(
+        "accuracy",
+        "detector: accuracy",
+        "Share of scans, from scenes it was not trained on, whose class it names as well as the "
+        "sensor can.",
+        digits=4,
+    ),
+)
+"""`summary["detectors"][MODALITY]`."""
+
+AGENTS = (
+    Metric(
+        "return",
+        "episode: DQN",
+        "Information that the greedy policy of the Q-network gains in an episode; a look in vain "
+        "costs 1.",
+        "Fig. 5",
+    ),
+    Metric(
+        "optimal",
+        "episode: optimal",
+        "The policy that knows what every look can reveal on average.",
+        "0.550*",
+    ),
+    Metric("naive", "episode: naive", "Looks at every point once, whatever is known."),
+    Metric("random", "episode: random", "Takes any look, or ends, by chance."),
+    Metric("fraction_of_optimal", "fraction of optimal", "The first of these over the second."),
+    Metric(
+        "optimal_states",
+        "optimal in states",
+        "States of the map in which the policy's reward is within 0.01 of the optimum.",
+    ),
+    Metric("num_states", "states of the map", "At most 4,096 are examined.", "384"),
+    Metric(
+        "one_step.policy",
+        "one step: DQN",
+        "Reward of the first step alone, as the authors' code measures it.",
+        "0.340, 0.385*",
+    ),
+    Metric("one_step.optimal", "one step: optimal", "The optimal policy's first step.", "0.426*"),
+    Metric("one_step.random", "one step: random", "A random first step.", "-0.302*"),
+    Metric("env_steps", "steps of training", "Steps of all environments together.", "2,000 epochs"),
+    Metric("env_steps_per_s", "steps per second", "Of all environments, with learning.", digits=0),
+)
+"""`summary["dqn"][MODALITY]`."""
+
+LATENT_SPACE = (
+    Metric(
+        "active_units",
+        "dimensions in use",
+        "Of the latent space; the paper's Fig. 4 uses one of two.",
+        "1",
+    ),
+    Metric(
+        "fusion.accuracy",
+        "fusion: right class",
+        "Share of entries, written by one sensor and then by another, that are nearest to the true "
+        "class.",
+        digits=4,
+    ),
+    Metric(
+        "fusion.mean_error",
+        "fusion: error",
+        "Distance of these entries from what both sensors together yield, in standard deviations.",
+    ),
+    Metric(
+        "moment_matching_error",
+        "error of moments",
+        "Distance of a sensor's belief from the best single Gaussian over the classes that it "
+        "leaves open.",
+        "0 in theory",
+    ),
+)
+"""`summary["jmvae"]`."""
+
+MISSIONS = (
+    Metric(
+        "accuracy",
+        "accuracy",
+        "Share of points whose most likely class in the finished map is the true one.",
+    ),
+    Metric(
+        "observations_per_poi",
+        "looks per point",
+        "The fewer, the better they were chosen.",
+        digits=2,
+    ),
+    Metric("time_s", "time [s]", "Until all robots have ended; the median.", digits=1),
+    Metric(
+        "collisions", "collisions", "Control periods in which a robot touched something.", digits=0
+    ),
+    Metric(
+        "goals_reached_fraction",
+        "goals reached",
+        "Share of the viewpoints that robots set out for.",
+    ),
+    Metric(
+        "information", "information", "In the finished map: the sum of 1 / sigma norm.", digits=2
+    ),
+    Metric("told", "told", "Accuracy of what a robot alone can distinguish."),
+    Metric(
+        "ambiguous_reported",
+        "ambiguous",
+        "Share of the other points that the map shows as ambiguous.",
+    ),
+    Metric("episodes", "missions", digits=0),
+)
+"""`summary["mission"][POLICY]`."""
+
+_PAGE_ONLY = {"one_step.policy", "one_step.optimal", "one_step.random", "env_steps"}
+
+
+def headline() -> Iterator[Metric]:
+    """Those of `AGENTS` that a terminal has room for."""
+    return (metric for metric in AGENTS if metric.key not in _PAGE_ONLY)
+
+
+def label(key: str) -> str:
+    """The name of one of `AGENTS`."""
+    return next(metric.label for metric in AGENTS if metric.key == key)
+
+
+def mean(value: Any) -> float:
+    """A number, or the mean of several seeds."""
+    return value["mean"] if isinstance(value, dict) else value
+
+
+def text(value: Any, digits: int = 3) -> str:
+    """A number, or a mean and its interval, as text; a dash for one that is missing."""
+    if value is None:
+        return "-"
+    if isinstance(value, dict):
+        mean, low, high = (text(float(value[name]), digits) for name in ("mean", "low", "high"))
+        return f"{mean} ({low} to {high})"
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.{digits}f}"
