@@ -275,7 +275,7 @@ def _train_together(
     with displays[0]:
         monitor.begin(displays[0].show)
         results = devices.side_by_side(train, len(runs))
-        timing = {"total_s": time.perf_counter() - begin, "stages": monitor.seconds}
+        timing = _share(time.perf_counter() - begin, monitor.seconds, len(runs))
         failed: dict[int, str] = {}
         for run, result in zip(runs, results, strict=True):
             try:
@@ -286,6 +286,15 @@ def _train_together(
                 failed[run.settings.seed] = str(error)
                 _warn(f"{error}; what was saved before is in {run.path}")
     return failed
+
+
+def _share(total: float, stages: dict[str, dict[str, float]], number: int) -> dict[str, Any]:
+    """The time of each of some runs side by side."""
+    shared = {
+        stage: {kind: value / number for kind, value in seconds.items()}
+        for stage, seconds in stages.items()
+    }
+    return {"total_s": total / number, "stages": shared}
 
 
 def _display(

@@ -113,7 +113,7 @@ def test_the_page_asks_for_nothing(run, read):
 
 def test_figures_stand_beside_those_of_the_paper(read):
     rows = {row[0]: row[1:] for row in read.rows if len(row) > 1}
-    assert rows["episode: DQN"] == ["1.234", "1.234", "Fig. 5"]
+    assert rows["episode: DQN, greedy"] == ["1.234", "1.234", "Fig. 5"]
     assert rows["one step: optimal"] == ["0.870", "0.870", "0.426*"]
     assert rows["optimal in states"] == ["380", "380", "-"]
     assert rows["states of the map"] == ["384", "384", "384"]

@@ -14,8 +14,10 @@ from jaxsense.mission.state import (
     IDLE,
     Mission,
     MissionState,
+    Robots,
     now,
-    update_robot,
+    robot_of,
+    with_robot,
 )
 from jaxsense.models import Models, make_jmvae
 from jaxsense.sim import arena as arenas
@@ -33,76 +35,103 @@ _TURNS_SLOWLY = 0.35  # rad/s, at which a robot may scan
 
 def approach(mission: Mission, state: MissionState, robot: Index) -> MissionState:
     """Drives to the viewpoint, turns to the PoI, and backs off where there is no progress."""
-    config, robots, scene = mission.config, state.robots, state.scene
-    settings, period = config.navigation, config.mission.control_period
-    time = now(mission, state)
-    phase, view = robots.phase[robot], robots.view[robot]
-    num_views = state.roadmap.viewpoints.shape[1]
-    poi = jnp.minimum(robots.target[robot], config.arena.num_pois - 1)
-    pose = scene.poses[robot]
+    config, own = mission.config, robot_of(state, robot)
+    way = _way(mission, state, robot, own)
+    time, is_driving = now(mission, state), own.phase == DRIVING
+    arrives = is_driving & way.is_there
+    # Another robot has come to stand there or in the view; that is nobody's failure.
+    is_taken = is_driving & ~way.is_there & way.is_taken
+    progresses = is_driving & (way.length < own.way_left - _PROGRESS)
+    waits = time - own.progress_at
+    is_stuck = is_driving & ~way.is_there & ~is_taken & ~progresses
+    is_stuck &= waits > config.navigation.stuck_time
+    is_back = (own.phase == BACKING) & (time >= own.backs_off_until)
 
-    goal, standing = jnp.minimum(view, num_views - 1), standing_robots(state, robot)
-    way_left, waypoint = roadmap.next_place(
-        config,
-        scene.layout,
-        state.roadmap,
-        pose[:2],
-        standing,
-        poi,
-        goal,
+    failed, gives_up = _fail(own, is_stuck, config.mission.attempts)
+    after = dataclasses.replace(
+        failed,
+        phase=jnp.select(
+            [arrives, is_taken, is_stuck, is_back], [FACING, IDLE, BACKING, IDLE], own.phase
+        ),
+        unreachable=own.unreachable | gives_up,
+        goals=own.goals - is_taken,
+        reached=own.reached + (arrives & ~way.is_here),
+        excluded=jnp.where(is_taken, failed.excluded.at[own.view].set(True), failed.excluded),
+        way_left=jnp.where(progresses, way.length, own.way_left),
+        progress_at=jnp.where(progresses | arrives, time, own.progress_at),
+        backs_off_until=jnp.where(
+            is_stuck, time + config.navigation.recovery_time, own.backs_off_until
+        ),
+    )
+    makes_room = (after.phase == ENDED) & _is_in_the_way(mission, state, robot)
+    makes_room &= time < state.faults.stops_at[robot]
+    wanted = _wanted(mission, state, robot, after.phase, way.waypoint, makes_room)
+    return with_robot(state, robot, own, dataclasses.replace(after, wanted=wanted))
+
+
+@pytree
+class _Way:
+    """The way of a robot to its viewpoint.
+
+    Attributes:
+      length: `[]` metres left.
+      waypoint: `[2]` the next place on it, in metres.
+      is_here: `[]` bool, the viewpoint is where the robot stands.
+      is_there: `[]` bool, the robot has arrived.
+      is_taken: `[]` bool, another robot stands there or in the view.
+    """
+
+    length: jax.Array
+    waypoint: jax.Array
+    is_here: jax.Array
+    is_there: jax.Array
+    is_taken: jax.Array
+
+
+def _way(mission: Mission, state: MissionState, robot: Index, own: Robots) -> _Way:
+    config, scene = mission.config, state.scene
+    position, standing = scene.poses[robot, :2], standing_robots(state, robot)
+    num_views = state.roadmap.viewpoints.shape[1]
+    poi = jnp.minimum(own.target, config.arena.num_pois - 1)
+    goal = jnp.minimum(own.view, num_views - 1)
+    length, waypoint = roadmap.next_place(
+        config, scene.layout, state.roadmap, position, standing, poi, goal
     )
     place = state.roadmap.viewpoints[poi, goal]
-    is_near = jnp.linalg.norm(place - pose[:2]) <= settings.goal_distance
-    is_there = (view == num_views) | (is_near & sees(mission, state, robot, poi))
-    arrives = (phase == DRIVING) & is_there
-    # Another robot has come to stand there or in the view; that is nobody's failure.
-    margin = planning_margin(config)
+    is_near = jnp.linalg.norm(place - position) <= config.navigation.goal_distance
     room = viewpoints.free_room(
-        place[:1], place[1:], margin, config.arena, scene.layout, standing, poi
+        place[:1], place[1:], planning_margin(config), config.arena, scene.layout, standing, poi
     )
-    is_taken = (phase == DRIVING) & ~is_there & (room[0] <= 0)
+    is_here = own.view == num_views
+    is_there = is_here | (is_near & sees(mission, state, robot, poi))
+    return _Way(length, waypoint, is_here, is_there, room[0] <= 0)
 
-    progresses = (phase == DRIVING) & (way_left < robots.way_left[robot] - _PROGRESS)
-    waits = time - robots.progress_at[robot]
-    is_stuck = (phase == DRIVING) & ~is_there & ~is_taken & ~progresses
-    is_stuck &= waits > settings.stuck_time
-    state = _fail(state, robot, is_stuck, "unreachable", config.mission.attempts)
-    robots = state.robots
-    is_back = (phase == BACKING) & (time >= robots.backs_off_until[robot])
-    cases = [arrives, is_taken, is_stuck, is_back]
-    phase = jnp.select(cases, [FACING, IDLE, BACKING, IDLE], phase)
-    excluded = robots.excluded[robot]
 
-    makes_room = (phase == ENDED) & _is_in_the_way(mission, state, robot)
-    makes_room &= time < state.faults.stops_at[robot]
+def _wanted(
+    mission: Mission,
+    state: MissionState,
+    robot: Index,
+    phase: jax.Array,
+    waypoint: jax.Array,
+    makes_room: jax.Array,
+) -> jax.Array:
+    """`[2]` speeds that a robot wants: along its way, away from where it is stuck, or turning."""
+    config, scene, own = mission.config, state.scene, robot_of(state, robot)
     drive = navigation.drive_to(
-        settings,
+        config.navigation,
         config.arena,
         scene.layout,
         scene.poses,
-        robots.command,
+        state.robots.command,
         robot,
         waypoint,
-        period,
+        config.mission.control_period,
         backs_off=(phase == BACKING) | makes_room,
     )
+    poi = jnp.minimum(own.target, config.arena.num_pois - 1)
     turn = navigation.face(_bearing(scene, robot, poi))
     is_driving = (phase == DRIVING) | (phase == BACKING) | makes_room
-    wanted = jnp.where(is_driving, drive, jnp.where(phase == FACING, turn, 0.0))
-    return update_robot(
-        state,
-        robot,
-        phase=phase,
-        wanted=wanted,
-        goals=robots.goals[robot] - is_taken,
-        reached=robots.reached[robot] + (arrives & (view < num_views)),
-        excluded=jnp.where(is_taken, excluded.at[view].set(True), excluded),
-        way_left=jnp.where(progresses, way_left, robots.way_left[robot]),
-        progress_at=jnp.where(progresses | arrives, time, robots.progress_at[robot]),
-        backs_off_until=jnp.where(
-            is_stuck, time + settings.recovery_time, robots.backs_off_until[robot]
-        ),
-    )
+    return jnp.where(is_driving, drive, jnp.where(phase == FACING, turn, 0.0))
 
 
 def _is_in_the_way(mission: Mission, state: MissionState, robot: Index) -> jax.Array:
@@ -113,26 +142,20 @@ def _is_in_the_way(mission: Mission, state: MissionState, robot: Index) -> jax.A
     return jnp.any(others((robots.phase == DRIVING) & waits & is_near, robot))
 
 
-def _fail(
-    state: MissionState, robot: Index, applies: jax.Array, given_up_as: str, attempts: int
-) -> MissionState:
-    """Notes that a viewpoint has failed; after some attempts the robot gives its target up."""
-    robots = state.robots
-    failures = robots.attempts[robot] + applies
+def _fail(own: Robots, applies: jax.Array, attempts: int) -> tuple[Robots, jax.Array]:
+    """Notes that a viewpoint has failed.
+
+    Returns:
+      The robot, and `[N]` bool, the target that it gives up after some attempts.
+    """
+    failures = own.attempts + applies
     gives_up = applies & (failures >= attempts)
-    given_up = getattr(robots, given_up_as)[robot]
-    excluded = robots.excluded[robot]
-    return update_robot(
-        state,
-        robot,
+    after = dataclasses.replace(
+        own,
         attempts=failures,
-        excluded=jnp.where(applies, excluded.at[robots.view[robot]].set(True), excluded),
-        **{
-            given_up_as: jnp.where(
-                gives_up, given_up.at[robots.target[robot]].set(True, mode="drop"), given_up
-            )
-        },
+        excluded=jnp.where(applies, own.excluded.at[own.view].set(True), own.excluded),
     )
+    return after, gives_up & (jnp.arange(own.unreachable.shape[0]) == own.target)
 
 
 @pytree
@@ -235,17 +258,18 @@ def _write(
 ) -> MissionState:
     """Notes a scan, and writes the entry into the map if the PoI was seen."""
     poi, detects = aim.poi, aim.scans & is_seen
-    state = _fail(state, robot, aim.scans & ~detects, "undetected", mission.config.mission.attempts)
-    robots = state.robots
-    state = update_robot(
-        state,
-        robot,
-        phase=jnp.where(aim.scans, IDLE, robots.phase[robot]),
+    own = robot_of(state, robot)
+    failed, gives_up = _fail(own, aim.scans & ~detects, mission.config.mission.attempts)
+    after = dataclasses.replace(
+        failed,
+        undetected=own.undetected | gives_up,
+        phase=jnp.where(aim.scans, IDLE, own.phase),
         # After a detection the same PoI is a new target.
-        target=jnp.where(detects, mission.config.arena.num_pois, robots.target[robot]),
-        looks=robots.looks[robot] + aim.scans,
-        detections=robots.detections[robot] + detects,
+        target=jnp.where(detects, mission.config.arena.num_pois, own.target),
+        looks=own.looks + aim.scans,
+        detections=own.detections + detects,
     )
+    state = with_robot(state, robot, own, after)
     return dataclasses.replace(
         state,
         belief=jax.tree.map(

@@ -1,5 +1,7 @@
 """Which PoI a robot looks at next, and from where."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
@@ -16,7 +18,8 @@ from jaxsense.mission.state import (
     Mission,
     MissionState,
     now,
-    update_robot,
+    robot_of,
+    with_robot,
 )
 from jaxsense.models import Models
 from jaxsense.networks import MLP
@@ -31,45 +34,40 @@ def decide(
     key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> MissionState:
     """Asks the policy where one is due, and sets out for a viewpoint of what it says."""
-    robots, config = state.robots, mission.config
-    phase, target = robots.phase[robot], robots.target[robot]
-    is_idle = phase == IDLE
-    is_under_way = (phase == DRIVING) | (phase == FACING)
-    has_news = (state.version != robots.decided_on[robot]) & (state.policy == LATENT)
+    own, config = robot_of(state, robot), mission.config
+    is_idle = own.phase == IDLE
+    is_under_way = (own.phase == DRIVING) | (own.phase == FACING)
+    has_news = (state.version != own.decided_on) & (state.policy == LATENT)
     decides = is_idle | (is_under_way & has_news)
-    action = jnp.where(decides, _choose(key, mission, models, state, robot), target)
-    is_new = action != target
+    action = jnp.where(decides, _choose(key, mission, models, state, robot), own.target)
+    is_new = action != own.target
     sets_out = decides & (is_idle | is_new) & (action < config.arena.num_pois)
 
     # What is known of failures belongs to one target.
-    excluded = jnp.where(is_new, False, robots.excluded[robot])
-    attempts = jnp.where(is_new, 0, robots.attempts[robot])
+    excluded = jnp.where(is_new, False, own.excluded)
     view, length, excluded = _best_view(mission, state, robot, action, excluded)
     has_way = jnp.isfinite(length)
     sets_out_now, gives_up = sets_out & has_way, sets_out & ~has_way
     poi = jnp.minimum(action, config.arena.num_pois - 1)
-    unreachable = robots.unreachable[robot]
     ends = decides & (action == config.arena.num_pois)
-    phase = jnp.select([ends, sets_out_now, gives_up], [ENDED, DRIVING, IDLE], phase)
     # A look from where the robot stands is no goal; a PoI that there is no way to is one missed.
     num_views = state.roadmap.viewpoints.shape[1]
     is_goal = (sets_out_now & (view < num_views)) | gives_up
-    was_needless = decides & is_new & (robots.phase[robot] == DRIVING)
-    was_needless &= robots.view[robot] < num_views
-    return update_robot(
-        state,
-        robot,
-        phase=phase,
+    was_needless = decides & is_new & (own.phase == DRIVING) & (own.view < num_views)
+    after = dataclasses.replace(
+        own,
+        phase=jnp.select([ends, sets_out_now, gives_up], [ENDED, DRIVING, IDLE], own.phase),
         target=action,
-        view=jnp.where(sets_out_now, view, robots.view[robot]),
-        decided_on=jnp.where(decides, state.version, robots.decided_on[robot]),
+        view=jnp.where(sets_out_now, view, own.view),
+        decided_on=jnp.where(decides, state.version, own.decided_on),
         excluded=excluded,
-        attempts=attempts,
-        unreachable=jnp.where(gives_up, unreachable.at[poi].set(True), unreachable),
-        way_left=jnp.where(sets_out_now, length, robots.way_left[robot]),
-        progress_at=jnp.where(sets_out_now, now(mission, state), robots.progress_at[robot]),
-        goals=robots.goals[robot] + is_goal - was_needless,
+        attempts=jnp.where(is_new, 0, own.attempts),
+        unreachable=jnp.where(gives_up, own.unreachable.at[poi].set(True), own.unreachable),
+        way_left=jnp.where(sets_out_now, length, own.way_left),
+        progress_at=jnp.where(sets_out_now, now(mission, state), own.progress_at),
+        goals=own.goals + is_goal - was_needless,
     )
+    return with_robot(state, robot, own, after)
 
 
 def _choose(

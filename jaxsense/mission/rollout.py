@@ -15,7 +15,8 @@ from jaxsense.mission.state import (
     MissionState,
     Record,
     now,
-    update_robot,
+    robot_of,
+    with_robot,
 )
 from jaxsense.models import Models
 from jaxsense.types import Key
@@ -122,14 +123,14 @@ def _act(
 
     def get_there(key: Key, state: MissionState) -> MissionState:
         stops = now(mission, state) >= state.faults.stops_at[robot]
-        robots = state.robots
-        fails = stops & (robots.phase[robot] != ENDED)
-        state = update_robot(
-            state,
-            robot,
-            phase=jnp.where(fails, FAILED, robots.phase[robot]),
-            target=jnp.where(fails, mission.config.arena.num_pois, robots.target[robot]),
+        own = robot_of(state, robot)
+        fails = stops & (own.phase != ENDED)
+        failed = dataclasses.replace(
+            own,
+            phase=jnp.where(fails, FAILED, own.phase),
+            target=jnp.where(fails, mission.config.arena.num_pois, own.target),
         )
+        state = with_robot(state, robot, own, failed)
         state = decide.decide(key, mission, models, state, robot)
         return act.approach(mission, state, robot)
 

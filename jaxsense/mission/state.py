@@ -1,7 +1,6 @@
 """What a mission is made of, and how it begins."""
 
 import dataclasses
-from typing import Any
 
 import chex
 import jax
@@ -318,11 +317,18 @@ def _random_poses(key: Key, config: Config, layout: arenas.Layout, ways: Roadmap
     return poses
 
 
-def update_robot(state: MissionState, robot: Index, **values: Any) -> MissionState:
-    """The state with some entries of one robot replaced."""
-    robots = state.robots
-    changed = {name: getattr(robots, name).at[robot].set(value) for name, value in values.items()}
-    return dataclasses.replace(state, robots=dataclasses.replace(robots, **changed))
+def robot_of(state: MissionState, robot: Index) -> Robots:
+    """What one robot is up to: the fields of `Robots` without their first axis."""
+    return jax.tree.map(lambda x: x[robot], state.robots)
+
+
+def with_robot(state: MissionState, robot: Index, before: Robots, after: Robots) -> MissionState:
+    """The state after one robot has changed from `before`, from `robot_of`, to `after`."""
+
+    def put(rows: jax.Array, old: jax.Array, new: jax.Array) -> jax.Array:
+        return rows if new is old else rows.at[robot].set(new)
+
+    return dataclasses.replace(state, robots=jax.tree.map(put, state.robots, before, after))
 
 
 def now(mission: Mission, state: MissionState) -> jax.Array:

@@ -45,7 +45,7 @@ DETECTORS = (
 AGENTS = (
     Metric(
         "return",
-        "episode: DQN",
+        "episode: DQN, greedy",
         "Information that the greedy policy of the Q-network gains in an episode; a look in vain "
         "costs 1.",
         "Fig. 5",
@@ -63,8 +63,9 @@ AGENTS = (
         "optimal_states",
         "optimal in states",
         "States of the map in which the policy's reward is within 0.01 of the optimum.",
+        digits=1,
     ),
-    Metric("num_states", "states of the map", "At most 4,096 are examined.", "384"),
+    Metric("num_states", "states of the map", "At most 4,096 are examined.", "384", 0),
     Metric(
         "one_step.policy",
         "one step: DQN",
@@ -73,7 +74,7 @@ AGENTS = (
     ),
     Metric("one_step.optimal", "one step: optimal", "The optimal policy's first step.", "0.426*"),
     Metric("one_step.random", "one step: random", "A random first step.", "-0.302*"),
-    Metric("env_steps", "steps of training", "Steps of all environments together.", "2,000 epochs"),
+    Metric("env_steps", "steps of training", "Of all environments together.", "2,000 epochs", 0),
     Metric("env_steps_per_s", "steps per second", "Of all environments, with learning.", digits=0),
 )
 """`summary["dqn"][MODALITY]`."""
@@ -84,6 +85,7 @@ LATENT_SPACE = (
         "dimensions in use",
         "Of the latent space; the paper's Fig. 4 uses one of two.",
         "1",
+        1,
     ),
     Metric(
         "fusion.accuracy",
@@ -164,6 +166,6 @@ def text(value: Any, digits: int = 3) -> str:
     if value is None:
         return "-"
     if isinstance(value, dict):
-        mean, low, high = (text(float(value[name]), digits) for name in ("mean", "low", "high"))
-        return f"{mean} ({low} to {high})"
+        average, low, high = (text(float(value[n]), digits) for n in ("mean", "low", "high"))
+        return average if low == high else f"{average} ({low} to {high})"
     return f"{value:,}" if isinstance(value, int) else f"{value:,.{digits}f}"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from toys import paying_once_mdp
 
+from jaxsense import networks
 from jaxsense.config import DqnConfig
 from jaxsense.dqn import belief_mdp, policies, replay, training
 
@@ -72,8 +73,8 @@ def probe():
 def test_values_are_those_worked_by_hand(probe, seed):
     params = jax.tree.map(lambda x: x[seed], probe[0].params)
     inputs = jax.vmap(belief_mdp.observation)(states().belief)
-    values = policies.q_network(MDP, PROBE.hidden).apply(params, inputs)
-    np.testing.assert_allclose(np.asarray(values), Q, atol=0.05)
+    values = networks.apply(policies.q_network(MDP, PROBE.hidden), params, inputs.T)
+    np.testing.assert_allclose(values.T, Q, atol=0.05)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -120,11 +120,12 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
 def missions(summary: Summary) -> tuple[list[str], list[Row]]:
     """Missions: the policies and failures that were played, as columns, and their metrics."""
     blocks = {n: b for n, b in summary["mission"].items() if n != "bytes_per_detection"}
-    rows = [_row(metric, blocks.values()) for metric in MISSIONS]
-    rows = [row for row in rows if set(row.values) != {"-"}]
+    # What is measured of robots alone is not there without them.
+    measured = [m for m in MISSIONS if any(m.key in block for block in blocks.values())]
+    rows = [_row(metric, blocks.values()) for metric in measured]
     reasons = {reason for block in blocks.values() for reason in block["ended"]} - {"finished"}
     for reason in sorted(reasons):
-        numbers = [text(block["ended"].get(reason, 0)) for block in blocks.values()]
+        numbers = [text(block["ended"].get(reason, 0), 1) for block in blocks.values()]
         rows.append(Row(reason, numbers, "", "Missions that did not finish, for this reason."))
     return [name.replace("_", " ") for name in blocks], rows
 
