@@ -29,7 +29,7 @@ exclude_patterns = ["_build"]
 templates_path = ["_templates"]
 # A reference within jaxsense that leads nowhere is a warning.
 nitpicky = True
-nitpick_ignore_regex = [("py:.*", r"(?!jaxsense).*"), ("py:class", r".*\.T")]
+nitpick_ignore_regex = [("py:.*", r"(?!jaxsense).*"), ("py:(class|obj)", r".*\.T")]
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
 myst_heading_anchors = 3
