@@ -1,14 +1,14 @@
 """Coordinated multi-modal robot perception in JAX.
 
-Robots with different sensors look at points of interest, write what they see into one shared map of
-latent Gaussians, and a policy for each sensor decides where looking next buys the most information.
-After Korthals, Leitner and Rueckert, "Coordinated Heterogeneous Distributed Perception based on
-Latent Space Representation", 2018.
+Robots with different sensors look at points of interest and write what they see into one shared map
+of latent Gaussians. A policy for each sensor decides which look gains the most information. After
+Korthals, Leitner and Rueckert, "Coordinated Heterogeneous Distributed Perception based on Latent
+Space Representation", 2018.
 
 The parts are `jaxsense.sim` (arena, ray-caster, sensors), `jaxsense.vae` (detectors, JMVAE, fusion)
 and `jaxsense.dqn` (map MDP, Q-learning). `jaxsense.observe` joins them, `jaxsense.stages` trains
 them, and `jaxsense.mission` drives all robots in closed loop. Every function is pure, takes its
-random key first, and works on one example: `vmap` and `jit` are yours.
+random key first and works on one example: add `vmap` and `jit` yourself.
 """
 
 from jaxsense import dqn as dqn

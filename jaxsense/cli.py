@@ -1,4 +1,4 @@
-"""Command lines: options by tyro, and errors of the user as one line."""
+"""Command lines: options by tyro, and user errors as one line."""
 
 import contextlib
 import dataclasses
@@ -27,10 +27,10 @@ def parse(program: str, arguments: type[T], argv: list[str], default: T | None =
     """Reads a command line; ends the program with status 2 and one line if it is wrong.
 
     Args:
-      program: module that is run, for example "jaxsense.train".
-      arguments: dataclass of the options, which checks their types when it is made.
+      program: module to run, for example "jaxsense.train".
+      arguments: dataclass of the options, which checks their types.
       argv: the command line without the program.
-      default: options that are not given.
+      default: values of options that are missing.
 
     Returns:
       The options.
@@ -59,9 +59,9 @@ def parse(program: str, arguments: type[T], argv: list[str], default: T | None =
 
 
 def run(main: Callable[[], None]) -> None:
-    """Runs a program, which Ctrl-C ends without many words."""
+    """Runs a program; Ctrl-C ends it without a traceback."""
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # The name of a directory may be none that the terminal can show.
+        # The terminal may be unable to show the name of a directory.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         main()
@@ -73,7 +73,7 @@ def run(main: Callable[[], None]) -> None:
 
 
 def _exit(status: int) -> NoReturn:
-    """Ends the process at once: threads that compile would hold up any other way out."""
+    """Ends the process at once: any other exit would wait for threads that compile."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError):
             stream.flush()
@@ -81,24 +81,24 @@ def _exit(status: int) -> NoReturn:
 
 
 def complain(text: str) -> None:
-    """Prints a line about something that went wrong, if anybody still reads."""
+    """Prints a line to standard error, if it is still open."""
     with contextlib.suppress(OSError):
         print(text, file=sys.stderr, flush=True)
 
 
 def fail(program: str, message: str) -> NoReturn:
-    """Ends a program for a reason that is the user's to mend."""
+    """Ends a program with status 2 for an error that the user can correct."""
     complain(f"{program}: {' '.join(message.splitlines())}")
     sys.exit(2)
 
 
 def reason(error: OSError) -> str:
-    """What the system refuses, as one line."""
+    """An `OSError` as one line."""
     return f"{error.filename}: {error.strerror}" if error.filename else str(error)
 
 
 def require_directory(field: str, path: Path | None) -> None:
-    """Raises `ConfigError` if something else than a directory lies at a path, or nothing can."""
+    """Raises `ConfigError` if a path is no directory, or cannot be one."""
     try:
         is_other = path is not None and path.exists() and not path.is_dir()
     except OSError as error:
@@ -108,17 +108,17 @@ def require_directory(field: str, path: Path | None) -> None:
 
 
 def keep_programs(program: str, directory: Path | None, config: Config) -> Kept | None:
-    """Where compiled programs are kept.
+    """Opens the directory of compiled programs.
 
     Args:
-      program: module that is run.
-      directory: where the user wants them, if anywhere.
+      program: module that runs.
+      directory: where to keep them, if anywhere.
       config: all settings.
 
     Returns:
-      The programs with these settings; None if the directory cannot be used, which is told.
+      The programs with these settings; None, with a warning, if the directory cannot be used.
     """
-    # Programs of several processes need all of them to load.
+    # Several processes can load a program only together.
     if directory is None or jax.process_count() > 1:
         return None
     try:
@@ -131,9 +131,9 @@ def keep_programs(program: str, directory: Path | None, config: Config) -> Kept 
 
 
 def _texts_of_wrong_types() -> ConstructorRegistry:
-    """Rules by which tyro leaves a text that is not of an option's type as it is.
+    """Rules that make tyro pass on a text that is not of an option's type.
 
-    The dataclass that is made of it names the option, the text and what would be right.
+    The dataclass then names the option, the text and what would be right.
     """
     registry = ConstructorRegistry()
 
@@ -158,7 +158,7 @@ def _is_literal(kind: Any) -> bool:
 
 
 def _metavar(kind: Any) -> str:
-    """How `--help` writes the value of an option."""
+    """The value of an option in `--help`."""
     if get_origin(kind) in (Union, types.UnionType):
         return "|".join(map(_metavar, get_args(kind)))
     if _is_literal(kind):
@@ -167,7 +167,7 @@ def _metavar(kind: Any) -> str:
 
 
 def _read(kind: Any, text: str) -> Any:
-    """What a text stands for, or the text itself if that is of another type."""
+    """The value of a text, or the text itself if it is of another type."""
     if get_origin(kind) in (Union, types.UnionType):
         return None if text == "None" else _read(get_args(kind)[0], text)
     if _is_literal(kind):
@@ -181,7 +181,7 @@ def _read(kind: Any, text: str) -> Any:
 
 
 def _options(arguments: Any, prefix: str = "--") -> dict[str, Any]:
-    """The options of a dataclass, with their types."""
+    """The options of a dataclass and their types."""
     found = {}
     for field, annotated in get_type_hints(arguments, include_extras=True).items():
         kind, *marks = get_args(annotated) if hasattr(annotated, "__metadata__") else [annotated]
@@ -195,14 +195,14 @@ def _options(arguments: Any, prefix: str = "--") -> dict[str, Any]:
 
 
 def _cause(error: BaseException | None) -> ConfigError | None:
-    """The error of a dataclass that ended tyro."""
+    """The dataclass error that ended tyro, if any."""
     while error is not None and not isinstance(error, ConfigError):
         error = error.__context__
     return error
 
 
 def _unknown(arguments: Any, words: list[str]) -> ConfigError:
-    """The error of words that belong to no option."""
+    """The error about words that belong to no option."""
     word = next((word for word in words if word.startswith("-")), words[0])
     name = word.partition("=")[0].replace("_", "-")
     similar = difflib.get_close_matches(name, _options(arguments), 1, 0.7)
@@ -211,7 +211,7 @@ def _unknown(arguments: Any, words: list[str]) -> ConfigError:
 
 
 def _lacking(arguments: Any, argv: list[str]) -> ConfigError:
-    """The error of an option that lacks values, or of a word that must be there."""
+    """The error about an option without a value, or a missing word."""
     options = _options(arguments)
     for word, following in itertools.pairwise([*argv, "--"]):
         kind = options.get(word.replace("_", "-"), bool)

@@ -1,4 +1,4 @@
-"""`python -m jaxsense.evaluate RUN_DIR`: missions with the policies of a finished run."""
+"""`python -m jaxsense.evaluate RUN_DIR`: plays missions with the policies of a finished run."""
 
 import contextlib
 import dataclasses
@@ -39,18 +39,18 @@ class Arguments:
     seed: int = 0
     """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
     policy: str = "all"
-    """`latent`, `naive` or `random`; `MODALITY_alone`, `MODALITY_stops` or `MODALITY_blind`, for
-    example `camera_alone`: the latent policy where that robot is alone, stops or goes blind after
-    6 s; `policies` for the first three, or `all`."""
+    """`latent`, `naive` or `random`; `policies` for these three; `MODALITY_alone`,
+    `MODALITY_stops` or `MODALITY_blind`, for example `camera_alone`, for the latent policy where
+    that robot is alone, stops or goes blind after 6 s; or `all`."""
     devices: int | None = None
-    """Devices that missions are split over: accelerators, or threads of the CPU. By default all
-    accelerators there are; on a CPU as many threads as cores, at most 8."""
+    """Accelerators, or threads on a CPU, that share the missions. By default all accelerators, or
+    as many threads as cores, at most 8."""
     cache: Path | None = Path("~/.cache/jaxsense")
-    """Directory in which compiled programs are kept for later runs; `None` to keep none."""
+    """Directory to keep compiled programs in for later runs; `None` keeps none."""
     animate: bool = False
     """Also write an animation of the first mission as `mission-POLICY-SEED.svg`."""
     trust: bool = False
-    """Run the functions that the run's `config.json` names for sensors of one's own."""
+    """Run the functions that the run's `config.json` names for your own sensors."""
 
     def __post_init__(self):
         require_types(self, bits=64)
@@ -61,14 +61,14 @@ class Arguments:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """The program."""
+    """Runs the program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
         workers = devices.start(arguments.devices)
         config, models = rundir.load(arguments.run, arguments.trust)
         played = _cases(arguments, config)
         path = arguments.run / "summary.json"
-        # Now, not after minutes of work, is the time to find out that they cannot be written.
+        # If these files cannot be written, fail now rather than after minutes of work.
         with files.locked(arguments.run, waits=True):
             summary = rundir.read_summary(arguments.run)
             page.write(arguments.run, config, summary)
@@ -98,7 +98,7 @@ def main(argv: list[str] | None = None) -> None:
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({cli.reason(error)})")
     rate = found.control_steps / seconds
-    with contextlib.suppress(OSError):  # as in `display.say`
+    with contextlib.suppress(OSError):  # as in `say`
         _print_table(console, block)
         console.print(
             f"{number} missions in {seconds:.1f} s after {compiling:.0f} s of compilation: "
@@ -116,19 +116,19 @@ def _write(
     found: dict[str, Any],
     recording: missions.Recording,
 ) -> list[str]:
-    """Writes the metrics into the run's summary and its page, and the animation if asked for.
+    """Writes the metrics into the run's summary and page, and the animation if requested.
 
     Returns:
-      Lines that say where they are.
+      Lines about where they are.
     """
     path, written = arguments.run / "summary.json", []
     if arguments.animate:
-        name = next(name for name in found if name != "bytes_per_detection")
+        name = next(iter(metrics.cases(found)))
         film = arguments.run / f"mission-{name}-{arguments.seed}.svg"
         title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
         animation.write(film, config, recording, class_beliefs, title)
         written.append(f"The first mission of {name} is in {film}.")
-    # Another evaluation may have written its own metrics since this one began.
+    # Another evaluation may have written metrics since this one began.
     with files.locked(arguments.run, waits=True):
         summary = rundir.read_summary(arguments.run)
         summary["mission"] = _merge(summary["mission"], found, arguments)
@@ -138,17 +138,15 @@ def _write(
 
 
 def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) -> dict[str, Any]:
-    """The new blocks, each with its seed, and those of before of what was not played now."""
-    new = {
-        name: {**block, "seed": arguments.seed} if name != "bytes_per_detection" else block
-        for name, block in found.items()
-    }
-    return {**before, **new}
+    """The earlier blocks, with those of the cases played now and their seed."""
+    cases = metrics.cases(found).items()
+    new = {name: {**block, "seed": arguments.seed} for name, block in cases}
+    return {**before, **found, **new}
 
 
 def _cases(arguments: Arguments, config: Config) -> dict[str, mission.Case]:
-    """What is to be played; a `ConfigError` names what cannot be."""
-    # As many as one of the run's own evaluations may have, with these settings.
+    """The cases to play; raises `ConfigError` for an unknown policy or too many episodes."""
+    # Checked like the number of a run's own missions.
     settings = dataclasses.replace(config.mission, episodes=arguments.episodes)
     dataclasses.replace(config, mission=settings)
     cases = mission.cases(config)
@@ -163,10 +161,10 @@ def _cases(arguments: Arguments, config: Config) -> dict[str, mission.Case]:
 
 
 def _print_table(console: rich.console.Console, found: dict[str, Any]) -> None:
-    """All cases beside one another."""
+    """Prints the metrics of all cases."""
     columns = [metric.label for metric in metrics.MISSIONS]
     table = rich.table.Table("policy", *columns, box=rich.box.SIMPLE, pad_edge=False)
-    blocks = {name: block for name, block in found.items() if name != "bytes_per_detection"}
+    blocks = metrics.cases(found)
     for name, block in blocks.items():
         table.add_row(name, *(metric.text(block) for metric in metrics.MISSIONS))
     console.print(table)

@@ -1,8 +1,8 @@
-"""What a trained JMVAE and trained policies are worth: the metrics of `summary.json`."""
+"""Measures a trained JMVAE and trained policies: the metrics of `summary.json`."""
 
 import functools
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -21,7 +21,7 @@ from jaxsense.vae import fusion, jmvae, metrics
 from jaxsense.vae.jmvae import Jmvae
 
 POLICIES = ("return", "optimal", "naive", "random")
-"""The greedy policy of a Q-network, and those to compare it with."""
+"""The greedy policy of a Q-network, and its baselines."""
 _EXPECTATION_DRAWS = 1024
 
 
@@ -38,7 +38,7 @@ def latent_space(
 
     Returns:
       `[C, S, D]` beliefs for `joint` and for each modality, and the block `jmvae` of the summary as
-      arrays. Parameters or detections that are not finite are not caught here: look at the beliefs.
+      arrays. Parameters and detections that are not finite are not caught: check the beliefs.
     """
     model, num_modalities = make_jmvae(config), len(bank)
     joint = _encode(params, model, bank, range(num_modalities))
@@ -59,7 +59,7 @@ def latent_space(
 
 
 def _encode(params: Params, model: Jmvae, bank: Bank, members: Iterable[int]) -> Belief:
-    """`[C, S, D]` posteriors of detections by some of the modalities."""
+    """`[C, S, D]` posteriors from some of the modalities."""
     chosen = set(members)
 
     def encode(*features: jax.Array) -> Belief:
@@ -70,7 +70,7 @@ def _encode(params: Params, model: Jmvae, bank: Bank, members: Iterable[int]) ->
 
 
 def _moment_matching_error(joint: Belief, alone: list[Belief], config: Config) -> jax.Array:
-    """`[]` mean distance of the posteriors of one modality from those they should have."""
+    """`[]` mean distance of single modalities' posteriors from their moment-matched targets."""
     errors = []
     for modality, belief in zip(config.modalities, alone, strict=True):
         labels = config.label_of_class(modality)
@@ -85,7 +85,7 @@ def _moment_matching_error(joint: Belief, alone: list[Belief], config: Config) -
 def _fusion(
     params: Params, model: Jmvae, bank: Bank, alone: list[Belief], class_means: jax.Array
 ) -> dict[str, jax.Array | None]:
-    """How good entries are after a look by one modality and a second one by another."""
+    """Quality of map entries after one modality's look and then another's."""
     is_right, distances = [], []
     nearest = jax.vmap(jax.vmap(lambda belief: metrics.nearest_class(belief, class_means)))
     for first, second in itertools.permutations(range(len(bank)), 2):
@@ -95,7 +95,7 @@ def _fusion(
         both = _encode(params, model, bank, (first, second))
         is_right.append(nearest(fused) == jnp.arange(len(class_means))[:, None])
         distances.append(jnp.linalg.norm((fused.mean - both.mean) / both.std, axis=-1))
-    # With one modality there is nothing to fuse.
+    # One modality fuses nothing.
     return {
         "accuracy": jnp.mean(jnp.array(is_right)) if is_right else None,
         "mean_error": jnp.mean(jnp.array(distances)) if distances else None,
@@ -110,7 +110,7 @@ def compare_policies(
     bank: Bank,
     config: Config,
 ) -> tuple[jax.Array, jax.Array]:
-    """Plays whole episodes with each of `POLICIES`, on the same detections from the same starts.
+    """Plays episodes with each of `POLICIES`, on the same detections from the same starts.
 
     Args:
       key: random key.
@@ -123,12 +123,12 @@ def compare_policies(
     Returns:
       `[P, S]` total reward and reward of the first action, means over the noise of detections; NaN
       where a value or a reward was. The starts are every state of the map, then
-      `episodes.num_starts` random ones.
+      `config.evaluation.num_starts` random ones.
     """
     settings = config.evaluation
     mdp = observe.bank_mdp(config, bank, params, make_jmvae(config))
     start_key, table_key, play_key = jax.random.split(key, 3)
-    classes, seen = _every_start(start_key, mdp, settings.num_starts)
+    starts = _every_start(start_key, mdp, settings.num_starts)
     labels = jnp.array([config.label_of_class(m) for m in config.modalities])
     expected = policies.expected_rewards(table_key, mdp, modality, _EXPECTATION_DRAWS)
     compared = (
@@ -144,23 +144,35 @@ def compare_policies(
             branches = [functools.partial(policy, key, state) for policy in compared]
             return jax.lax.switch(which, [lambda b=b: b().astype(jnp.int32) for b in branches])
 
-        def episode(key: Key, classes: jax.Array, seen: jax.Array):
-            reset_key, episode_key = jax.random.split(key)
-            start = reset(reset_key, mdp, classes, seen)
-            return episodes.run_episode(episode_key, mdp, act, start, modality)
-
-        def repeat(i: jax.Array, sums: tuple[jax.Array, jax.Array]):
-            keys = jax.random.split(jax.random.fold_in(play_key, i), len(classes))
-            found = jax.vmap(episode)(keys, classes, seen)
-            return jax.tree.map(jnp.add, sums, found)
-
         # Only the first two are compared state by state.
         number = jnp.where(which < 2, settings.num_repeats, -(-settings.num_repeats // 8))
-        zero = jnp.zeros(len(classes))
-        total, first = jax.lax.fori_loop(0, number, repeat, (zero, zero))
-        return total / number, first / number
+        return _mean_rewards(play_key, mdp, act, modality, starts, number)
 
     return jax.lax.map(with_policy, jnp.arange(len(compared)))
+
+
+def _mean_rewards(
+    key: Key,
+    mdp: MapMdp,
+    act: Callable[[Key, MapState], jax.Array],
+    modality: jax.Array,
+    starts: tuple[jax.Array, jax.Array],
+    number: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """`[S]` total and first reward of `number` episodes from each start, on average."""
+
+    def episode(key: Key, classes: jax.Array, seen: jax.Array):
+        reset_key, episode_key = jax.random.split(key)
+        start = reset(reset_key, mdp, classes, seen)
+        return episodes.run_episode(episode_key, mdp, act, start, modality)
+
+    def repeat(i: jax.Array, sums: tuple[jax.Array, jax.Array]):
+        keys = jax.random.split(jax.random.fold_in(key, i), len(starts[0]))
+        return jax.tree.map(jnp.add, sums, jax.vmap(episode)(keys, *starts))
+
+    zero = jnp.zeros(len(starts[0]))
+    total, first = jax.lax.fori_loop(0, number, repeat, (zero, zero))
+    return total / number, first / number
 
 
 def _every_start(key: Key, mdp: MapMdp, number: int) -> tuple[jax.Array, jax.Array]:
@@ -174,12 +186,12 @@ def _every_start(key: Key, mdp: MapMdp, number: int) -> tuple[jax.Array, jax.Arr
 
 
 def policy_metrics(total: np.ndarray, first: np.ndarray, num_random: int) -> dict[str, Any]:
-    """The block of one modality in the summary's `dqn`, without the speed.
+    """One modality's block in the summary's `dqn`, without the speed.
 
     Args:
       total: `[P, S]` from `compare_policies`.
       first: `[P, S]` from `compare_policies`.
-      num_random: how many of the starts, the last ones, are random; the others are every state.
+      num_random: how many starts, at the end, are random; the others are every state.
     """
     num_states = total.shape[1] - num_random
     whole = dict(zip(POLICIES, total[:, num_states:].mean(axis=1).tolist(), strict=True))
@@ -187,7 +199,7 @@ def policy_metrics(total: np.ndarray, first: np.ndarray, num_random: int) -> dic
     missed = total[POLICIES.index("optimal"), :num_states] - total[0, :num_states]
     return {
         **whole,
-        # Where no look pays, no policy has anything to reach.
+        # Where no look pays, the optimum is 0.
         "fraction_of_optimal": whole["return"] / whole["optimal"] if whole["optimal"] else None,
         "one_step": {
             "policy": one_step["return"],

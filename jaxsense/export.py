@@ -1,7 +1,7 @@
 """`python -m jaxsense.export RUN_DIR`: a run's models as one file that runs without jaxsense.
 
-The file is a zip archive of `jax.export` artefacts and of a `contents.json` that says what they are
-called, what they take and what they give. `examples/run_exported.py` shows how to run them.
+The file is a zip archive of `jax.export` artefacts and a `contents.json` with their names, inputs
+and outputs. `examples/run_exported.py` shows how to run them.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from jaxsense.vae import fusion
 
 PROGRAM = "jaxsense.export"
 PLATFORMS = ("cpu", "cuda", "tpu")
-"""What the programs of a file run on."""
+"""Platforms that the programs of a file run on."""
 
 
 def exported(function: Function) -> export.Exported:
@@ -41,7 +41,7 @@ def exported(function: Function) -> export.Exported:
 
 
 def archive(config: Config, models: Models) -> bytes:
-    """The whole file."""
+    """The content of the file."""
     content, programs = io.BytesIO(), {}
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as files:
         for name, function in functions(config, models).items():
@@ -62,7 +62,7 @@ def archive(config: Config, models: Models) -> bytes:
 
 
 def _description(config: Config, models: Models) -> dict[str, Any]:
-    """What a reader of the file has to know besides the programs."""
+    """What a reader of the file needs besides the programs."""
     arena = config.arena
     versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib")}
     unseen = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
@@ -80,7 +80,7 @@ def _description(config: Config, models: Models) -> dict[str, Any]:
 
 
 def _described(aval: Any) -> dict[str, Any]:
-    """Shape, with "batch" for the batch, and dtype."""
+    """Dtype and shape, with "batch" for the batch."""
     shape = [n if isinstance(n, int) else str(n) for n in aval.shape]
     return {"shape": shape, "dtype": aval.dtype.name}
 
@@ -92,16 +92,16 @@ class Arguments:
     run: Annotated[Path, tyro.conf.Positional]
     """Directory of the run."""
     out: Path | None = None
-    """The file, which must not exist; by default `exported.zip` in the run's directory."""
+    """The file to write; must be new. By default `exported.zip` in the run's directory."""
     trust: bool = False
-    """Run the functions that the run's `config.json` names for sensors of one's own."""
+    """Run the functions that the run's `config.json` names for your own sensors."""
 
     def __post_init__(self):
         require_types(self)
 
 
 def main(argv: list[str] | None = None) -> None:
-    """The program."""
+    """Runs the program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     path = arguments.out or arguments.run / "exported.zip"
     try:

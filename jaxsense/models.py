@@ -1,4 +1,4 @@
-"""Everything that a run trains, as one pytree."""
+"""All trained networks of a run, as one pytree."""
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +15,12 @@ from jaxsense.vae.jmvae import Jmvae
 
 @pytree
 class Models:
-    """Everything that a run trains.
+    """All trained networks of a run.
 
     Attributes:
       detectors: one for each modality.
       jmvae: parameters of the JMVAE.
-      class_beliefs: `[C, D]` mean joint posterior of each class, by which the map is read.
+      class_beliefs: `[C, D]` mean joint posterior of each class, to read the map with.
       q_networks: parameters of one Q-network for each modality.
     """
 
@@ -31,13 +31,13 @@ class Models:
 
 
 def make_jmvae(config: Config) -> Jmvae:
-    """The JMVAE that fits the modalities and classes of a configuration."""
+    """The JMVAE for the modalities and classes of a configuration."""
     sizes = tuple(len(config.labels(m)) for m in config.modalities)
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
 
 def init(key: Key, config: Config) -> Models:
-    """Models of the right shapes with random parameters, for a first look at the functions."""
+    """Models with random parameters, to try the functions before training."""
     detector_key, jmvae_key, dqn_key = jax.random.split(key, 3)
     num_labels = make_jmvae(config).feature_sizes
     keys = jax.random.split(detector_key, len(config.modalities))

@@ -1,4 +1,4 @@
-"""The one network of jaxsense: dense layers with ReLU between them."""
+"""Multi-layer perceptrons: dense layers with ReLU between them."""
 
 import functools
 from typing import Any
@@ -12,9 +12,9 @@ Params = Any
 
 
 class _Dense(nn.Module):
-    """A layer of `[F]` features, or of `[F, B]`, an example in each column.
+    """A layer for `[F]` features, or for `[F, B]`, with an example in each column.
 
-    With the batch as last axis, layers of this size and their gradients take a CPU half as long.
+    With the batch last, layers of this size and their gradients take half as long on a CPU.
     """
 
     size: int
@@ -51,7 +51,7 @@ class MLP(nn.Module):
 
 @functools.partial(jax.jit, static_argnames=("network", "inputs"))
 def init(key: jax.Array, network: MLP, inputs: int) -> Params:
-    """Random parameters of a network for `[inputs]`, by one program for each of its shapes."""
+    """Random parameters of a network for `[inputs]`, compiled once per shape."""
     return network.init(key, jnp.zeros(inputs))
 
 

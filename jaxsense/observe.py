@@ -1,7 +1,7 @@
-"""The two ways in which the map MDP looks at a point of interest.
+"""Two ways for the map MDP to look at a point of interest.
 
 `live` casts a scan in the environment's own MJX arena and runs the detector on it; `bank` draws
-from stored detections of such scans. Their features have the same distribution.
+from stored detections of those scans. Their features have the same distribution.
 """
 
 import chex
@@ -18,7 +18,7 @@ from jaxsense.vae.detectors import Detector
 from jaxsense.vae.jmvae import Jmvae
 
 Bank = tuple[jax.Array, ...]
-"""For each modality `[C, S, D_m]` features of S detections of every class."""
+"""`[C, S, D_m]` features of each modality: S detections of every class."""
 
 
 def live_mdp(
@@ -28,7 +28,7 @@ def live_mdp(
     params: Params,
     model: Jmvae,
 ) -> MapMdp:
-    """The map MDP over scenes of their own, one MJX arena for each environment."""
+    """The map MDP over live scenes, one MJX arena for each environment."""
     values.require_one_each("trained", trained, model.modalities)
 
     def new_scene(key: Key, classes: jax.Array):
@@ -52,7 +52,7 @@ def bank_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> MapMdp
 
     def observe(key: Key, classes: jax.Array, poi: jax.Array, modality: int):
         samples = bank[modality]
-        # A key that comes from a split is as random as what would be drawn from it.
+        # A key from a split is as random as a draw from it.
         row = jax.random.key_data(key)[-1] % samples.shape[1]
         return samples[classes[poi], row], classes
 
@@ -83,14 +83,14 @@ def surveys(
       keys: `[S]` random keys.
       world: the simulation.
       classes: `[S, N]` int32 classes of the PoIs.
-      chunk: how many scenes are simulated side by side.
+      chunk: number of scenes to simulate side by side.
 
     Returns:
       `[S]` scenes, and for each modality `[S, N, F]` windows.
     """
     number = len(keys)
     chunk = min(chunk, number)
-    # A remainder would be compiled once more.
+    # A remainder would compile again.
     rows = jnp.arange(-(-number // chunk) * chunk) % number
     found = jax.lax.map(
         lambda scene: worlds.survey(scene[0], world, scene[1]),
@@ -101,7 +101,7 @@ def surveys(
 
 
 def balanced_classes(key: Key, config: Config, number: int) -> jax.Array:
-    """`[number, N]` int32 classes in random order, all equally frequent but for a remainder."""
+    """`[number, N]` int32 classes in random order, equally frequent up to a remainder."""
     num_pois = config.arena.num_pois
     even = jnp.arange(number * num_pois) % len(config.arena.classes)
     return jax.random.permutation(key, even).reshape(number, num_pois)

@@ -1,8 +1,9 @@
 """The whole training, written once: a list of stages, and their composition.
 
 A stage is a value: a name and three pure functions, `begin`, `advance` and `finish`. `learn`
-composes the list in one function, to be vmapped over seeds and settings; `run` walks it from the
-host, where it reports, saves and stops between two calls of `advance`. Both spend the same keys.
+composes the list into one function, which you can `vmap` over seeds and settings. `jaxsense.run`
+walks it from the host, and reports, saves and stops between two calls of `advance`. Both use the
+same keys.
 """
 
 import dataclasses
@@ -39,11 +40,11 @@ Examples = tuple[jax.Array, jax.Array]
 
 @pytree
 class Progress:
-    """What some steps of a training report.
+    """Loss and metrics of some steps of a training.
 
     Attributes:
-      loss: `[steps]`; NaN where anything that the step has seen or learnt is not finite.
-      metrics: other numbers of each step, `[steps]` each; NaN where there is none.
+      loss: `[steps]`; NaN where an input or a parameter of the step is not finite.
+      metrics: `[steps]` each; NaN where a step has none.
     """
 
     loss: jax.Array
@@ -63,20 +64,20 @@ class Stage:
     """One stage of a training.
 
     Attributes:
-      name: of the stage; its random keys follow from it.
+      name: determines the random keys of the stage.
       begin: `(key, config, *inputs) -> state`.
-      inputs: names of the stages before whose outputs are its inputs.
-      index: the first of the inputs, if given: an `[]` int32 array.
+      inputs: names of the earlier stages whose outputs it takes.
+      index: passed before the other inputs if given, as `[]` int32.
       advance: `(key, config, state, *inputs) -> (state, Progress)`, one chunk of the training.
-      finish: `(config, state, *inputs) -> output`; without, the state is the output.
+      finish: `(config, state, *inputs) -> output`; by default the state.
       steps: of the training; 0 where `begin` does everything.
-      chunks: calls of `advance`. The last one may have less to do than the others.
-      program: name of the programs; stages with the same one have the same functions and shapes.
-      has_rows: the rows of inputs and output know nothing of one another, so that devices can share
-        them. Such a stage has no steps.
-      is_saved: it is part of what a run saves, and is not repeated when the run goes on.
-      is_optional: a training whose loss is not finite ends early and leaves the others be.
-      is_dense: nearly all of its time goes into small dense networks.
+      chunks: calls of `advance`; the last one may have fewer steps.
+      program: name of the programs; stages that share it have the same functions and shapes.
+      has_rows: the rows of inputs and output are independent, so that devices can share them; the
+        stage has no steps.
+      is_saved: a run saves the output, and does not repeat the stage when it resumes.
+      is_optional: a loss that is not finite ends this training early, and no other.
+      is_dense: small dense networks take nearly all of the time.
     """
 
     name: str
@@ -94,25 +95,25 @@ class Stage:
     is_dense: bool = False
 
     def keys(self, key: Key) -> tuple[Key, Key]:
-        """The key of `begin`, and the `[chunks]` keys of `advance`, from the key of a training."""
+        """Keys of `begin`, `[]`, and of `advance`, `[chunks]`, from the key of a training."""
         own = _key_of(key, self.name)
         of_chunks = jax.vmap(lambda i: jax.random.fold_in(own, i))(1 + jnp.arange(self.chunks))
         return jax.random.fold_in(own, 0), of_chunks
 
     def select(self, outputs: Mapping[str, Any]) -> tuple[Any, ...]:
-        """Its inputs from the outputs of the stages before."""
+        """The inputs, from the outputs of earlier stages."""
         index = () if self.index is None else (jnp.int32(self.index),)
         return *index, *(outputs[name] for name in self.inputs)
 
 
 @pytree
 class Surveys:
-    """Looks at every PoI of `[S]` scenes by every robot.
+    """Every robot's look at every PoI of `[S]` scenes.
 
     Attributes:
       classes: `[S, N]` int32 true classes.
       scenes: `[S]` scenes.
-      windows: for each modality `[S, N, F]` what its detector reads.
+      windows: for each modality `[S, N, F]` the input of its detector.
     """
 
     classes: jax.Array
@@ -122,13 +123,13 @@ class Surveys:
 
 @pytree
 class Detections:
-    """What the detectors make of surveys that they were not trained on.
+    """Detections on surveys that no detector was trained on.
 
     Attributes:
       bank: for each modality `[C, S, D_m]` detections for training.
-      held_out: the same from other scenes, for measuring.
-      starts: classes, scenes and `[S, N, D_m]` features for each modality, in which episodes start;
-        none with a bank.
+      held_out: the same from other scenes, to measure on.
+      starts: classes, scenes and for each modality `[S, N, D_m]` features, where episodes start;
+        empty with a bank.
       accuracy: `[M]` of each detector on the held-out looks.
       windows: for each modality `[C, 1, F]` one held-out look at each class.
     """
@@ -142,12 +143,12 @@ class Detections:
 
 @pytree
 class Learned:
-    """What a training returns.
+    """The outputs of a training.
 
     Attributes:
       outputs: of every stage, by its name.
       progress: `[steps]` of every stage that has steps, by its name.
-      is_finite: `[]` whether all losses and outputs are; of an optional stage they need not be.
+      is_finite: `[]` whether all losses and outputs are, except those of optional stages.
     """
 
     outputs: dict[str, Any]
@@ -156,66 +157,29 @@ class Learned:
 
 
 def stages(config: Config, world: World | None = None) -> list[Stage]:
-    """The stages of a training, each after those that it needs.
+    """The stages of a training, each after its inputs.
 
     Args:
-      config: all settings; which stages there are, and all sizes, follow from what is no leaf.
-      world: from `sim.make_world(config)`, if there is one already.
+      config: all settings; its static fields determine the stages and all sizes.
+      world: from `sim.make_world(config)`, to reuse one.
     """
     world = worlds.make_world(config) if world is None else world
     detector_names = tuple(f"detector_{name}" for name in config.modalities)
     restarts = tuple(f"jmvae_{i + 1}" for i in range(config.jmvae.restarts))
-    learned = "starts", "detections", "jmvae", *detector_names
-    restart = Stage(
-        "",
-        _begin_jmvae,
-        ("detections",),
-        advance=_advance_jmvae,
-        finish=_finish_jmvae,
-        steps=config.jmvae.steps,
-        chunks=_num_chunks(config.jmvae.steps),
-        program="jmvae",
-        is_saved=True,
-        is_optional=config.jmvae.restarts > 1,
-        is_dense=True,
-    )
-    agent = Stage(
-        "",
-        functools.partial(_begin_dqn, world),
-        learned,
-        advance=functools.partial(_advance_dqn, world),
-        finish=_finish_dqn,
-        steps=config.dqn.epochs,
-        chunks=config.dqn.epochs // config.dqn.chunk,
-        program="dqn",
-        is_saved=True,
-        is_dense=config.dqn.observe == "bank",
-    )
+    learned = "detections", "jmvae", *detector_names
     return [
         Stage("scenes", _draw_scenes),
         Stage("survey", functools.partial(_survey, world), ("scenes",), has_rows=True),
         Stage("examples", _examples, ("survey",)),
         *(_detector_stage(m, name, config) for m, name in enumerate(detector_names)),
         Stage("detections", _detect, ("survey", *detector_names)),
-        *(dataclasses.replace(restart, name=name) for name in restarts),
+        *(_restart_stage(name, config) for name in restarts),
         Stage("jmvae", _best_jmvae, restarts, program="best_jmvae", is_saved=True),
         Stage("latent_space", _latent_space, ("jmvae", "detections")),
         Stage("class_beliefs", _class_beliefs, ("latent_space",), is_saved=True),
-        Stage("starts", functools.partial(_starts, world), learned[1:]),
-        *(
-            dataclasses.replace(agent, name=f"dqn_{name}", index=m)
-            for m, name in enumerate(config.modalities)
-        ),
-        *(
-            Stage(
-                f"policies_{name}",
-                _play_policies,
-                (f"dqn_{name}", "jmvae", "detections"),
-                index=m,
-                program="policies",
-            )
-            for m, name in enumerate(config.modalities)
-        ),
+        Stage("starts", functools.partial(_starts, world), learned),
+        *(_agent_stage(m, world, config, learned) for m in range(len(config.modalities))),
+        *(_policies_stage(m, name) for m, name in enumerate(config.modalities)),
     ]
 
 
@@ -231,15 +195,15 @@ def learn(
     Args:
       key: the only source of randomness.
       config: all settings. Fields declared `Traced` may be traced, so that `jax.vmap` varies them.
-      world: from `sim.make_world(config)`, if there is one already.
-      until: name of the last stage; if not given, all stages are composed.
+      world: from `sim.make_world(config)`, to reuse one.
+      until: name of the last stage to compose; all by default.
 
     Returns:
-      The outputs of the stages: the trained networks, see `models`, and all that a run measures but
-      its missions.
+      The outputs of the stages: the trained networks, see `models`, and all that a run measures
+      except its missions.
 
     Raises:
-      ValueError: if there is no such stage.
+      ValueError: if no stage has this name.
     """
     found = stages(config, world)
     names = [stage.name for stage in found]
@@ -282,7 +246,7 @@ def mission_key(key: Key) -> Key:
 
 
 def _key_of(key: Key, name: str) -> Key:
-    """A key of its own for each name, whatever else there is."""
+    """The key of a name, independent of all other names."""
     return jax.random.fold_in(key, zlib.crc32(name.encode()))
 
 
@@ -293,7 +257,7 @@ def is_finite(values: Any) -> jax.Array:
 
 
 def num_scenes(config: Config) -> tuple[int, int, int]:
-    """How many scenes are surveyed to train the detectors, for the bank, and to measure."""
+    """Numbers of scenes to train the detectors, for the bank, and to measure."""
     num_pois, num_classes = config.arena.num_pois, len(config.arena.classes)
     num_bank = -(-config.jmvae.samples_per_class * num_classes // num_pois)
     num_held_out = -(-_held_out_per_class(config) * num_classes // num_pois)
@@ -304,7 +268,7 @@ def num_scenes(config: Config) -> tuple[int, int, int]:
 def make_map_mdp(
     world: World, config: Config, bank: Bank, params: Params, trained: tuple[Detector, ...]
 ) -> MapMdp:
-    """The map MDP in which the Q-networks learn, by whichever way of looking the settings name."""
+    """The map MDP in which the Q-networks learn, with looks as `config.dqn.observe` sets."""
     model = make_jmvae(config)
     if config.dqn.observe == "live":
         return observe.live_mdp(config, worlds.with_config(world, config), trained, params, model)
@@ -316,12 +280,12 @@ def _held_out_per_class(config: Config) -> int:
 
 
 def _num_scene_starts(config: Config) -> int:
-    """Surveyed scenes in which episodes start; with a bank there are no scenes."""
+    """Surveyed scenes in which episodes start; none with a bank."""
     return config.dqn.num_starts if config.dqn.observe == "live" else 0
 
 
 def _chunk_size(steps: int) -> int:
-    """Steps of a chunk, of which there are at most 20."""
+    """Steps of a chunk, for at most 20 chunks."""
     return -(-steps // _MOST_CHUNKS)
 
 
@@ -330,7 +294,7 @@ def _num_chunks(steps: int) -> int:
 
 
 def _draw_scenes(key: Key, config: Config) -> tuple[Key, jax.Array]:
-    """`[S]` keys of all scenes, and `[S, N]` classes of the PoIs in them."""
+    """`[S]` keys of all scenes, and `[S, N]` classes of their PoIs."""
     class_key, scene_key = jax.random.split(key)
     numbers = num_scenes(config)
     keys = jax.random.split(class_key, len(numbers))
@@ -339,7 +303,7 @@ def _draw_scenes(key: Key, config: Config) -> tuple[Key, jax.Array]:
 
 
 def _survey(world: World, key: Key, config: Config, scenes: tuple[Key, jax.Array]) -> Surveys:
-    """Looks at every PoI of all scenes, for all purposes: compiling takes longer than running."""
+    """Surveys all scenes at once, as compiling takes longer than running."""
     del key
     scene_keys, classes = scenes
     found = observe.surveys(scene_keys, worlds.with_config(world, config), classes)
@@ -398,7 +362,7 @@ def _detector_stage(modality: int, name: str, config: Config) -> Stage:
 
 
 def _detect(key: Key, config: Config, surveys: Surveys, *trained: Detector) -> Detections:
-    """Applies the detectors to the surveys that they were not trained on."""
+    """Applies the detectors to the surveys that none was trained on."""
     del key
     num_train, num_bank, _ = num_scenes(config)
     others = jax.tree.map(lambda x: x[num_train:], surveys)
@@ -426,15 +390,32 @@ def _detect(key: Key, config: Config, surveys: Surveys, *trained: Detector) -> D
 
 
 def _by_class(values: jax.Array, classes: jax.Array, config: Config, number: int) -> jax.Array:
-    """`[C, number, ...]` from `[S, N, ...]` looks of at least that many of each class."""
+    """`[C, number, ...]` looks by class, from `[S, N, ...]` with at least `number` of each."""
     flat, classes = values.reshape(-1, *values.shape[2:]), classes.reshape(-1)
     each = range(len(config.arena.classes))
     rows = jnp.stack([jnp.nonzero(classes == c, size=number)[0] for c in each])
     return flat[rows]
 
 
+def _restart_stage(name: str, config: Config) -> Stage:
+    """One training of the JMVAE."""
+    return Stage(
+        name,
+        _begin_jmvae,
+        ("detections",),
+        advance=_advance_jmvae,
+        finish=_finish_jmvae,
+        steps=config.jmvae.steps,
+        chunks=_num_chunks(config.jmvae.steps),
+        program="jmvae",
+        is_saved=True,
+        is_optional=config.jmvae.restarts > 1,
+        is_dense=True,
+    )
+
+
 def _begin_jmvae(key: Key, config: Config, detections: Detections) -> tuple[FitState, jax.Array]:
-    """The state of a fit, and `[]` the mean loss of its last chunk."""
+    """The state of a fit, and the `[]` mean loss of its last chunk."""
     del detections
     fit = jmvae.start(jmvae.init(key, make_jmvae(config)), config.jmvae)
     return fit, jnp.float32(jnp.inf)
@@ -455,13 +436,13 @@ def _advance_jmvae(
 def _finish_jmvae(
     config: Config, state: tuple[FitState, jax.Array], detections: Detections
 ) -> tuple[Params, jax.Array]:
-    """The parameters, and `[]` the mean loss at the end."""
+    """The parameters, and their `[]` mean loss in the last chunk."""
     fit, loss = state
     return fit.params, loss
 
 
 def _best_jmvae(key: Key, config: Config, *restarts: tuple[Params, jax.Array]) -> Params:
-    """The restart with the lowest loss at the end; one that is not finite only if all are."""
+    """The restart with the lowest final loss; one that is not finite only if none is."""
     del key, config
     losses = jnp.stack([loss for _, loss in restarts])
     best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
@@ -493,7 +474,7 @@ def _starts(
     params: Params,
     *trained: Detector,
 ) -> MapState:
-    """`[num_starts]` states in which episodes start."""
+    """`[num_starts]` first states of episodes."""
     mdp = make_map_mdp(world, config, detections.bank, params, trained)
     number = config.dqn.num_starts
     if config.dqn.observe == "bank":
@@ -505,6 +486,23 @@ def _starts(
         return belief_mdp.begin(begin_key, mdp, scene, classes, seen, looks)
 
     return jax.vmap(begin)(jax.random.split(key, number), *detections.starts)
+
+
+def _agent_stage(modality: int, world: World, config: Config, learned: tuple[str, ...]) -> Stage:
+    """The training of one modality's Q-network."""
+    return Stage(
+        f"dqn_{config.modalities[modality]}",
+        functools.partial(_begin_dqn, world),
+        ("starts", *learned),
+        modality,
+        functools.partial(_advance_dqn, world),
+        _finish_dqn,
+        steps=config.dqn.epochs,
+        chunks=config.dqn.epochs // config.dqn.chunk,
+        program="dqn",
+        is_saved=True,
+        is_dense=config.dqn.observe == "bank",
+    )
 
 
 def _begin_dqn(
@@ -542,6 +540,12 @@ def _advance_dqn(
 
 def _finish_dqn(config: Config, state: DqnState, *inputs: Any) -> Params:
     return state.params
+
+
+def _policies_stage(modality: int, name: str) -> Stage:
+    """The comparison of one modality's policies."""
+    inputs = f"dqn_{name}", "jmvae", "detections"
+    return Stage(f"policies_{name}", _play_policies, inputs, modality, program="policies")
 
 
 def _play_policies(

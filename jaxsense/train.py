@@ -1,4 +1,4 @@
-"""`python -m jaxsense.train`: the whole pipeline, from scanlines to policies, in one command."""
+"""`python -m jaxsense.train`: trains the whole pipeline, from scanlines to policies."""
 
 import contextlib
 import dataclasses
@@ -35,7 +35,7 @@ from jaxsense.sim import sensors
 PROGRAM = "jaxsense.train"
 _MOST_SEEDS = 10_000
 _MOST_TOGETHER = 16  # seeds in one program on an accelerator
-_INTERRUPTED = 130  # exit status, as shells give it
+_INTERRUPTED = 130  # exit status, as in shells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,31 +50,31 @@ class Arguments:
     out: Path | None = None
     """Directory to write; must be new. By default `runs/DATE-TIME-PRESET`."""
     num_seeds: int = 1
-    """Seeds to train one after the other with the same programs, from `seed` on; each gets a run
-    directory in that of the run, which holds their means and 95% intervals."""
+    """Number of seeds to train with the same programs, from `seed` on. Each has its own directory
+    within the run, which holds their means and 95% intervals."""
     file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
     """The `config.json` of a run, to start from its preset, seed and settings."""
     resume: Path | None = None
-    """Directory of a run that was stopped, to go on in it with its settings."""
+    """Directory of a stopped run, to resume it with its settings."""
     trust: bool = False
-    """Run the functions that the `config.json` of `--config` or `--resume` names for sensors of
-    one's own."""
+    """Run the functions that the `config.json` of `--config` or `--resume` names for your own
+    sensors."""
     quiet: bool = False
-    """Show nothing but errors and where everything is."""
+    """Show only errors and the path of the results."""
     tensorboard: bool = False
-    """Also write event files for TensorBoard, into `tensorboard/` of the run."""
+    """Also write event files for TensorBoard to `tensorboard/` in the run."""
     devices: int | None = None
-    """Accelerators that scenes and missions are split over, by default all there are; on a CPU,
-    threads that share them, by default as many as cores, at most 8."""
+    """Accelerators, or threads on a CPU, that share scenes and missions. By default all
+    accelerators, or as many threads as cores, at most 8."""
     coordinator: str | None = None
-    """`HOST:PORT` of the first of several processes that share scenes and missions, each started
-    with the same options but `--process-index`. The first one writes the run."""
+    """`HOST:PORT` of the first of several processes that share scenes and missions. Start all with
+    the same options except `--process-index`; the first one writes the run."""
     num_processes: int | None = None
-    """How many processes share the run."""
+    """Number of processes that share the run."""
     process_index: int | None = None
-    """Which of them this is, from 0."""
+    """Index of this process, from 0."""
     cache: Path | None = Path("~/.cache/jaxsense")
-    """Directory in which compiled programs are kept for later runs; `None` to keep none."""
+    """Directory to keep compiled programs in for later runs; `None` keeps none."""
 
     def __post_init__(self):
         if isinstance(self.file, str):
@@ -84,18 +84,18 @@ class Arguments:
 
     @property
     def settings(self) -> Settings:
-        """What the results follow from."""
+        """The settings that determine the results."""
         return Settings(self.preset, self.seed, self.config, self.num_seeds)
 
 
 def main(
     argv: list[str] | None = None, change: Callable[[Config], Config] = lambda config: config
 ) -> None:
-    """The program.
+    """Runs the program.
 
     Args:
-      argv: the command line without the program; that of the process if not given.
-      change: what a program of your own makes of a preset, before the other options change that.
+      argv: the command line without the program; by default the process's own.
+      change: changes a preset in your own program, before the other options do.
     """
     begin = time.perf_counter()
     arguments = parse(sys.argv[1:] if argv is None else argv, change)
@@ -112,22 +112,22 @@ def main(
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except files.WriteError as error:
-        # A full disk, mostly. What is there was written as a whole, or not at all.
+        # Usually a full disk. Every file is written as a whole or not at all.
         cli.fail(PROGRAM, f"cannot write {cli.reason(error)}; what was saved before is still there")
     except OSError as error:
         cli.fail(PROGRAM, f"{cli.reason(error)}; what was saved before is still there")
     if not arguments.quiet:
-        with contextlib.suppress(OSError):  # as in `display.say`
+        with contextlib.suppress(OSError):  # as in `say`
             _print_summary(console, run)
-    first = next(path for path in _paths(run) if (path / "report.html").exists())
-    # The one thing that a quiet run says.
+    first = next(path for path in _paths(run).values() if (path / "report.html").exists())
+    # A quiet run prints only this.
     say(f"Everything is in {run.path}; open {run.path / 'report.html'} first.")
     trust = " --trust" if arguments.config.sensors else ""
     say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
 
 
 def _help(begin: float, arguments: Arguments, workers: Workers) -> None:
-    """Runs what the first process runs, whose files are those that stay."""
+    """Runs along with the first process, and discards its own files."""
     quiet = dataclasses.replace(arguments, quiet=True, tensorboard=False)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "run"
@@ -156,13 +156,13 @@ def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: c
             reason = f"must be within 1 and {_MOST_SEEDS:,}"
             raise ConfigError("num_seeds", arguments.num_seeds, reason)
         if arguments.file is not None and _option(argv, "preset"):
-            raise ConfigError("config", str(arguments.file), "holds a preset; give no --preset")
+            raise ConfigError("config", str(arguments.file), "names a preset; omit --preset")
         if arguments.resume is not None:
             if arguments.out is not None or arguments.file is not None:
-                reason = "goes on in its own directory; give no --out and no --config"
+                reason = "resumes in its own directory; omit --out and --config"
                 raise ConfigError("resume", str(arguments.resume), reason)
             if arguments.settings != stored:
-                reason = "goes on with its own settings; give none that differ"
+                reason = "resumes with its own settings; omit others"
                 raise ConfigError("resume", str(arguments.resume), reason)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
@@ -170,7 +170,7 @@ def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: c
 
 
 def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
-    """The settings that the other options change, which must be known before they are read."""
+    """The settings that the other options change, needed before those are read."""
     resume, file = _option(argv, "resume"), _option(argv, "config")
     trust = [each for each in argv if each in {"--trust", "--no-trust"}][-1:] == ["--trust"]
     if resume:
@@ -184,13 +184,13 @@ def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
 
 
 def _option(argv: list[str], name: str) -> str | None:
-    """What is given for an option last, if it is given."""
+    """The last value of an option, if any."""
     found = re.findall(rf"(?:^|\0)--{name}(?:=|\0)([^\0]+)", "\0".join(argv))
     return found[-1] if found else None
 
 
 def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:
-    """The run directory, which is made unless the run goes on."""
+    """The run directory: a new one, or the one to resume."""
     if arguments.resume is not None:
         return RunDirectory.resume(arguments.resume, arguments.trust)
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
@@ -205,7 +205,7 @@ def _train(
     workers: Workers,
     console: rich.console.Console,
 ) -> None:
-    """Trains all seeds with the same programs, and writes what they leave."""
+    """Trains all seeds with the same programs, and writes their results."""
     settings, failed = run.settings, dict[int, str]()
     _check_seeds(run)
     kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config)
@@ -214,12 +214,10 @@ def _train(
     def stop() -> None:
         monitor.stop()
         if not arguments.quiet:
-            say("Stopping as soon as all is saved; Ctrl-C again does not wait for that.")
+            say("Stopping once everything is saved; Ctrl-C again stops at once.")
 
     left = [
-        (seed, path)
-        for seed, path in zip(settings.seeds, _paths(run), strict=True)
-        if not (path / "summary.json").exists()
+        (seed, path) for seed, path in _paths(run).items() if not (path / "summary.json").exists()
     ]
     size = min(len(left), 1 if jax.default_backend() == "cpu" else _MOST_TOGETHER)
     try:
@@ -238,7 +236,7 @@ def _train(
     except Stopped:
         trust = " --trust" if settings.config.sensors else ""
         go_on = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}{trust}"
-        cli.complain(f"Stopped; all that was trained is saved. To go on: {go_on}")
+        cli.complain(f"Stopped; all training so far is saved. To resume: {go_on}")
         sys.exit(_INTERRUPTED)
     if len(failed) == settings.num_seeds:
         sys.exit(2)
@@ -257,7 +255,7 @@ def _train_together(
     """Trains some seeds side by side and writes their run directories.
 
     Returns:
-      The seeds that have failed, and why.
+      The failed seeds, and why.
     """
     displays = [_display(arguments, run, console, is_shown=run is runs[0]) for run in runs]
     programs.team.begin(len(runs))
@@ -266,7 +264,9 @@ def _train_together(
         key = jax.random.key(runs[i].settings.seed)
         of_seed = monitor if len(runs) == 1 else monitor.beside(displays[i].show)
         try:
-            return pipeline.run(key, programs, of_seed, runs[i].checkpoints)
+            return pipeline.run(
+                key, runs[i].settings.config, programs, of_seed, runs[i].checkpoints
+            )
         except StageError as error:
             return error
         finally:
@@ -289,7 +289,7 @@ def _train_together(
 
 
 def _share(total: float, stages: dict[str, dict[str, float]], number: int) -> dict[str, Any]:
-    """The time of each of some runs side by side."""
+    """The time of each of `number` runs side by side."""
     shared = {
         stage: {kind: value / number for kind, value in seconds.items()}
         for stage, seconds in stages.items()
@@ -300,26 +300,26 @@ def _share(total: float, stages: dict[str, dict[str, float]], number: int) -> di
 def _display(
     arguments: Arguments, run: RunDirectory, console: rich.console.Console, *, is_shown: bool
 ) -> Display:
-    """Records the progress of a run, and shows it unless another one is shown."""
+    """Records the progress of a run, and shows it if `is_shown`."""
     records = [run.append_metrics]
     if arguments.tensorboard:
         records.append(tensorboard.make_writer(run.path / "tensorboard"))
     return Display(console, *records, quiet=arguments.quiet or not is_shown)
 
 
-def _paths(run: RunDirectory) -> list[Path]:
+def _paths(run: RunDirectory) -> dict[int, Path]:
     """The directory of each seed."""
     if run.settings.num_seeds == 1:
-        return [run.path]
-    return [run.path / f"seed-{seed}" for seed in run.settings.seeds]
+        return {run.settings.seed: run.path}
+    return {seed: run.path / f"seed-{seed}" for seed in run.settings.seeds}
 
 
 def _check_seeds(run: RunDirectory) -> None:
     """Raises `ConfigError` if the directory of one of several seeds holds another run."""
-    for seed, path in zip(run.settings.seeds, _paths(run), strict=True):
+    for seed, path in _paths(run).items():
         if path == run.path or not (path / "config.json").exists():
             continue
-        # Compared, and nothing that they name is made.
+        # Only compared: no code that they name runs.
         if rundir.read_settings(path / "config.json", trust=True) != _settings_of(run, seed):
             reason = f"must have the settings of {run.path / 'config.json'}, with seed {seed}"
             raise ConfigError("resume", str(path), reason)
@@ -331,7 +331,7 @@ def _settings_of(run: RunDirectory, seed: int) -> Settings:
 
 
 def _of_seed(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager[RunDirectory]:
-    """The run directory of one seed: of several, one of its own, as of a run of that seed alone."""
+    """The run directory of one seed, like a run of that seed alone."""
     if path == run.path:
         return contextlib.nullcontext(run)
     if (path / "config.json").exists():
@@ -340,12 +340,8 @@ def _of_seed(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager
 
 
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
-    """Writes the page, the curves and the summary of several seeds, without those that failed."""
-    sound = {
-        str(seed): path
-        for seed, path in zip(run.settings.seeds, _paths(run), strict=True)
-        if seed not in failed
-    }
+    """Writes the page, curves and summary of several seeds, without failed ones."""
+    sound = {str(seed): path for seed, path in _paths(run).items() if seed not in failed}
     found = {seed: rundir.read_summary(path) for seed, path in sound.items()}
     blocks = [{name: one[name] for name in rundir.BLOCKS} for one in found.values()]
     timing = {
@@ -363,12 +359,12 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
 
 
 def _warn(text: str) -> None:
-    """A line about something that went wrong."""
+    """Prints a warning."""
     cli.complain(f"{PROGRAM}: {text}")
 
 
 def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any], monitor: Monitor) -> None:
-    """Plots, the report and at last the summary, which says that the run is finished."""
+    """Writes plots, the report and last the summary, which marks the run as finished."""
     config = run.settings.config
     monitor.check_stop()
     plots.write_plots(run.path, config, result)
@@ -381,7 +377,7 @@ def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any], monitor
 
 
 def _header(run: RunDirectory, timing: dict[str, Any]) -> dict[str, Any]:
-    """What a summary says of the run itself."""
+    """A summary's fields about the run itself."""
     settings = run.settings
     return {
         "preset": settings.preset,
@@ -393,7 +389,7 @@ def _header(run: RunDirectory, timing: dict[str, Any]) -> dict[str, Any]:
 
 
 def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
-    """A table of the metrics that matter most; of several seeds mean and 95% interval."""
+    """Prints the main metrics; of several seeds, mean and 95% interval."""
     summary = rundir.read_summary(run.path)
     settings, policies = run.settings, summary["dqn"]
     seeds = f", seed {settings.seed}"

@@ -1,4 +1,4 @@
-"""What crosses the borders between `sim`, `vae`, `dqn` and what joins them."""
+"""Types shared by `sim`, `vae`, `dqn` and the modules that join them."""
 
 import functools
 import json
@@ -14,24 +14,24 @@ from jax import export
 T = TypeVar("T")
 
 Key = jax.Array
-"""A typed or legacy JAX random key; consumed exactly once by the function that takes it."""
+"""A typed or legacy JAX random key; the function that takes it consumes it exactly once."""
 
 Index = int | jax.Array
 """A Python integer, or a `[]` int32 array."""
 
 Features = tuple[jax.Array | None, ...]
-"""For each modality its `[D_m]` features, or None where it is missing."""
+"""`[D_m]` features of each modality, or None where it is missing."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(struct.field,))
 def pytree(cls: type[T]) -> type[T]:
-    """Makes a frozen dataclass a pytree, which `jax.export` can write and read as well."""
+    """Makes a frozen dataclass a pytree that `jax.export` can serialise."""
     made: Any = struct.dataclass(cls)
 
     def as_tuples(value: Any) -> Any:
         return tuple(map(as_tuples, value)) if isinstance(value, list) else value
 
-    # What is no array is a number, a text, or tuples of them.
+    # Static fields are numbers, texts, or tuples of them.
     export.register_pytree_node_serialization(
         made,
         serialized_name=f"{made.__module__}.{made.__qualname__}",
@@ -43,9 +43,9 @@ def pytree(cls: type[T]) -> type[T]:
 
 @pytree
 class Belief:
-    """What is known of a point of interest: a diagonal Gaussian in the latent space.
+    """Belief in a point of interest: a diagonal Gaussian in the latent space.
 
-    Any number of leading axes is allowed, for example `[N]` for a map of N points of interest.
+    May have leading axes, for example `[N]` for a map of N points of interest.
 
     Attributes:
       mean: `[..., D]` float32, in latent units.
@@ -58,7 +58,7 @@ class Belief:
 
 @pytree
 class Transition:
-    """One step of the map MDP as a Q-network learns from it, or a batch of them as columns.
+    """One step of the map MDP for a Q-network to learn from, or a batch as columns.
 
     Attributes:
       s_tm1: `[N * 2D, ...]` float32 map before the action, see `belief_mdp.observation`.
@@ -81,12 +81,12 @@ def is_static(index: Index) -> bool:
 
 
 def call(function: Callable[[int], T], index: Index, number: int) -> T:
-    """`function(index)` of a function that can take a static index only.
+    """Calls a function of a static index with any index.
 
     Args:
-      function: gives results of the same shapes for every index.
-      index: which; if it is an array, the program switches between all that there are.
-      number: how many there are.
+      function: returns the same shapes for every index.
+      index: if an array, the program switches between all indices.
+      number: of indices.
     """
     if is_static(index):
         return function(int(index))
@@ -94,6 +94,6 @@ def call(function: Callable[[int], T], index: Index, number: int) -> T:
 
 
 def others(rows: jax.Array, index: Index) -> jax.Array:
-    """`[R - 1, ...]` all of `[R, ...]` rows but one, beginning with the one after it."""
+    """`[R - 1, ...]` of `[R, ...]` rows: all but one, from the one after it on."""
     number = len(rows)
     return rows[(index + 1 + jnp.arange(number - 1)) % number]

@@ -28,7 +28,7 @@ def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(monkeypatch
         pytest.raises(ArithmeticError, match="no such policy"),
         pipeline.compiled(SMOKE, monitor) as compiled,
     ):
-        loop.train(KEY, compiled, monitor)
+        loop.train(KEY, SMOKE, compiled, monitor)
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def toy(monkeypatch, tmp_path):
         monitor = Monitor(lambda *report: heard.append(report), warned.append)
         checkpoints = Checkpoints(tmp_path if saved else None, warned.append)
         with pipeline.compiled(SMOKE, monitor) as compiled:
-            found = loop.train(KEY, compiled, monitor, checkpoints)
+            found = loop.train(KEY, SMOKE, compiled, monitor, checkpoints)
         return found, [report for report in heard if report[2]], warned
 
     return train

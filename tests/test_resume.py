@@ -107,8 +107,8 @@ def test_a_run_goes_on_from_what_is_sound(stopped, smoke_run, cache, tmp_path, c
 def test_a_run_goes_on_with_its_own_settings(stopped, tmp_path, capsys):
     resume = ["--resume", str(stopped)]
     for options in (["--seed", "4"], ["--dqn.epochs", "80"]):
-        assert "goes on with its own settings" in error_line([*resume, *options], capsys)
-    assert "goes on in its own directory" in error_line([*resume, "--out", "x"], capsys)
+        assert "resumes with its own settings" in error_line([*resume, *options], capsys)
+    assert "resumes in its own directory" in error_line([*resume, "--out", "x"], capsys)
 
 
 def test_a_run_that_is_being_written_is_left_alone(stopped, capsys):
@@ -158,7 +158,7 @@ def test_a_config_reproduces_its_run(smoke_run, cache, tmp_path, capsys):
     assert json.loads((path / "config.json").read_text(encoding="utf-8")) == content
     assert content["seed"] == 5
     assert content["versions"]["jaxsense"] == jaxsense.__version__
-    assert "give no --preset" in error_line(["--config", str(file), "--preset", "paper"], capsys)
+    assert "omit --preset" in error_line(["--config", str(file), "--preset", "paper"], capsys)
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ def trained(request):
     """The programs of a run, and what they have trained."""
     monitor = Monitor()
     with pipeline.compiled(with_observe(request.param), monitor) as programs:
-        yield programs, loop.train(KEY, programs, monitor)
+        yield programs, loop.train(KEY, programs.config, programs, monitor)
 
 
 def first_chunk(stage, config, key, inputs):

@@ -1,7 +1,7 @@
 """Every setting of a run: frozen dataclasses, checked when made, and the presets.
 
-A value that makes no sense raises `ConfigError`, a `ValueError` whose one line names the field, its
-value and what would be right. The attribute docstrings are the text of `--help`.
+An invalid value raises `ConfigError`, a `ValueError` whose one line names the field, its value and
+what would be right. The attribute docstrings are the text of `--help`.
 """
 
 from jaxsense.config.checks import ConfigError as ConfigError

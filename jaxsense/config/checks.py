@@ -1,4 +1,4 @@
-"""What is checked when a section is made, and the error of a check that fails."""
+"""Checks of a new section, and the error of a failed check."""
 
 import types
 from pathlib import Path
@@ -9,7 +9,7 @@ _LEAST, _MOST = 1e-30, 1e30  # a product of two still fits float32
 
 
 class ConfigError(ValueError):
-    """A setting that cannot be used: `field = value: what would be right`."""
+    """An invalid setting: `field = value: what would be right`."""
 
     def __init__(self, field: str, value: object, expected: str):
         super().__init__(f"{field} = {_shown(value)}: {expected}")
@@ -25,13 +25,13 @@ def require(condition: bool, section: object, field: str, expected: str) -> None
 
 
 def require_types(section: Any, bits: int = 31) -> None:
-    """Raises `ConfigError` unless each field holds what it is declared to hold.
+    """Raises `ConfigError` unless each field has its declared type.
 
-    A whole number where a real one is declared becomes one, as JAX tells them apart.
+    Whole numbers in real fields become real, because JAX tells them apart.
 
     Args:
       section: the dataclass.
-      bits: that a whole number may have; real numbers must be finite and fit 32 bits.
+      bits: most bits of a whole number; real numbers must be finite and fit 32 bits.
     """
     hints = get_type_hints(type(section))
     for name, kind in hints.items():
@@ -57,7 +57,7 @@ def require_not_negative(section: object, *fields: str) -> None:
 
 
 def require_at_most(section: object, **most: float) -> None:
-    """Raises `ConfigError` for a field that is greater than the number given for it."""
+    """Raises `ConfigError` for a field that exceeds its limit."""
     for field, limit in most.items():
         require(getattr(section, field) <= limit, section, field, f"must be at most {limit:,}")
 
@@ -87,7 +87,7 @@ def require_window(section, num_rays: int) -> None:
 
 
 def _is_a(value: Any, kind: Any) -> bool:
-    """Whether a value is of the type that a field is declared with."""
+    """Whether a value is of a field's declared type."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin is Literal:
         return any(type(value) is type(each) and value == each for each in inner)
@@ -101,7 +101,7 @@ def _is_a(value: Any, kind: Any) -> bool:
 
 
 def _holds(values: Any, kinds: tuple[Any, ...]) -> bool:
-    """Whether a tuple or a dictionary holds what it is declared to hold."""
+    """Whether the items of a tuple or a dictionary are of their declared types."""
     if isinstance(values, dict):
         return all(_holds(pair, kinds) for pair in values.items())
     kinds = kinds[:1] * len(values) if ... in kinds else kinds
@@ -116,7 +116,7 @@ def _is_number(value: Any, kind: Any) -> bool:
 
 
 def _described(kind: Any, *, many: bool = False) -> str:
-    """What a field that is declared with a type must be, in words."""
+    """Description of a declared type, after "must be"."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin is Literal:
         return f"one of {', '.join(map(str, inner))}"
@@ -140,7 +140,7 @@ def _described(kind: Any, *, many: bool = False) -> str:
 
 
 def _shown(value: object) -> str:
-    """A value in one line that is not too long."""
+    """A value in one short line."""
     try:
         text = repr(value)
     except (RecursionError, ValueError):  # of more than 4300 digits or a thousand levels

@@ -1,4 +1,4 @@
-"""What is learned and how: detectors, the JMVAE, the map MDP and its Q-networks."""
+"""Settings of learning: detectors, the JMVAE, the map MDP and its Q-networks."""
 
 import math
 from typing import Literal
@@ -24,18 +24,18 @@ class DetectorConfig:
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers."""
     num_scans: int = 98304
-    """Simulated scans to train on, for each modality."""
+    """Simulated scans to train on, per modality."""
     num_held_out: int = 8192
-    """Further simulated scans, on which accuracy is measured."""
+    """Held-out simulated scans, to measure accuracy."""
     steps: int = 4000
     """Gradient steps."""
     batch: int = 512
-    """Scans of one gradient step."""
+    """Scans per gradient step."""
     learning_rate: Traced[float] = 2e-3
     """Highest learning rate of Adam; decays to zero by a cosine."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_sizes(self, "hidden")
         require_positive(self, "num_scans", "num_held_out", "steps", "batch", "learning_rate")
@@ -51,28 +51,28 @@ class JmvaeConfig:
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers of every encoder and decoder."""
     alpha: Traced[float] = 0.1
-    """Weight of the divergence from the joint posterior to each uni-modal one."""
+    """Weight of the divergence from the joint posterior to each subset's."""
     beta: Traced[float] = 0.001
     """Weight of the divergence from the joint posterior to the prior."""
     initial_beta: Traced[float] = 0.7
-    """Where beta starts: from far above, one latent dimension after the other comes into use."""
+    """Start value of beta; far above beta, latent dimensions come into use one by one."""
     annealing: Traced[float] = 0.5
-    """Share of the training in which beta falls from initial_beta to beta."""
+    """Share of the training during which beta falls from initial_beta to beta."""
     reconstruction_weights: Traced[tuple[float, ...]] = (10.0, 10.0)
     """Weight of each modality's reconstruction, in the order of `modalities`."""
     restarts: int = 3
-    """Trainings from different random parameters, of which the one with the lowest loss is kept."""
+    """Trainings from different random parameters; the one with the lowest loss is kept."""
     samples_per_class: int = 10000
-    """Detections of each class and modality in the training set."""
+    """Detections per class and modality in the training set."""
     steps: int = 3000
     """Gradient steps."""
     batch: int = 256
-    """Pairs of detections in one gradient step."""
+    """Sets of detections, one of each modality, per gradient step."""
     learning_rate: Traced[float] = 2e-3
     """Highest learning rate of Adam; decays to zero by a cosine."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_sizes(self, "hidden")
         require_positive(self, "latent_size", "samples_per_class", "steps", "batch")
@@ -95,16 +95,16 @@ class MdpConfig:
     """The map of beliefs as a Markov decision process."""
 
     unseen_variance: Traced[float] = 20.0
-    """Variance of each latent dimension of a PoI that nobody has seen."""
+    """Variance of each latent dimension of an unseen PoI."""
     min_increase: Traced[float] = 0.05
-    """Information that a look must gain, in inverse latent units, or its reward is -1."""
+    """Gain of information, in inverse latent units, up to which a look's reward is -1."""
     max_steps: Traced[int] = 20
-    """Actions after which an episode is cut off."""
+    """Longest episode, in actions."""
     partly_seen_starts: bool = False
-    """Leave out the starts in which every PoI has been seen by all modalities, or none by any."""
+    """Exclude starts in which all modalities have seen all PoIs, or none any."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(self, "unseen_variance", "max_steps")
         require_not_negative(self, "min_increase")
@@ -121,37 +121,36 @@ class DqnConfig:
     hidden: tuple[int, ...] = (24, 24)
     """Sizes of the hidden layers."""
     num_envs: int = 512
-    """Environments that are stepped side by side."""
+    """Environments that step side by side."""
     epochs: int = 800
-    """Epochs; in each, every environment makes one step, and the network `updates` steps."""
+    """Epochs, each of one step per environment and `updates` gradient steps."""
     updates: int = 64
-    """Gradient steps of one epoch."""
+    """Gradient steps per epoch."""
     batch: int = 512
-    """Transitions of one gradient step."""
+    """Transitions per gradient step."""
     replay_capacity: int = 512000
-    """Transitions that the replay holds; a multiple of num_envs."""
+    """Capacity of the replay, in transitions; a multiple of num_envs."""
     discount: Traced[float] = 0.5
     """Discount factor, gamma."""
     learning_rate: Traced[float] = 1e-3
     """Learning rate of Adam."""
     final_learning_rate: Traced[float] = 1e-5
-    """Learning rate of the last epoch; the way there is a cosine."""
+    """Learning rate of the last epoch, reached along a cosine."""
     epsilon_start: Traced[float] = 1.0
-    """Chance of a random action in the first epoch."""
+    """Probability of a random action in the first epoch, epsilon."""
     epsilon_min: Traced[float] = 0.01
-    """Lowest chance of a random action."""
+    """Lowest probability of a random action."""
     epsilon_decay: Traced[float] = 0.99
-    """Factor on epsilon for each epoch."""
+    """Factor on epsilon per epoch."""
     target_period: Traced[int] = 50
-    """Epochs between two copies of the network to the target network."""
+    """Epochs between updates of the target network."""
     num_starts: int = 8192
-    """Start states that are prepared; each environment has a share of them, from which its episodes
-    start. A multiple of num_envs."""
+    """Start states, prepared once and shared out among the environments; a multiple of num_envs."""
     chunk: int = 100
-    """Epochs between two reports of progress."""
+    """Epochs between reports of progress."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_sizes(self, "hidden")
         require_positive(self, "num_envs", "epochs", "updates", "batch", "replay_capacity")
@@ -188,7 +187,7 @@ class DqnConfig:
 
     @property
     def block(self) -> int:
-        """Neighbouring environments whose transitions are drawn together, see `dqn.replay`."""
+        """Size of a block of environments in the replay, see `dqn.replay`."""
         return math.gcd(self.num_envs, self.batch) // math.gcd(
             self.num_envs, self.batch, _MOST_BLOCKS
         )
@@ -196,15 +195,15 @@ class DqnConfig:
 
 @section
 class EvaluationConfig:
-    """How the trained policies are examined."""
+    """Evaluation of the trained policies."""
 
     num_starts: int = 512
-    """Start states from which whole episodes are played."""
+    """Start states of the episodes."""
     num_repeats: Traced[int] = 192
-    """Episodes from each start state, over which the noise of detections is averaged; for
-    the naive and the random policy an eighth of them."""
+    """Episodes per start state, to average over the noise of detections; an eighth as many for the
+    naive and the random policy."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(self, "num_starts", "num_repeats")

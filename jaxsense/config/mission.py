@@ -1,4 +1,4 @@
-"""How robots drive, and the missions that they drive in."""
+"""Settings of navigation and of missions."""
 
 from jaxsense.config.checks import (
     require,
@@ -11,25 +11,25 @@ from jaxsense.config.scene import ROBOT_RADIUS, TIMESTEP
 from jaxsense.config.section import Traced, section
 
 MOST_EPISODES = 100_000
-"""Missions of one policy whose states fit the memory of a computer."""
+"""Most missions of one policy whose states fit a computer's memory."""
 
 
 @section
 class NavigationConfig:
-    """How a robot finds its way: the paper's move_base, with the AMiRo's numbers."""
+    """Navigation of a robot: the paper's move_base, with the AMiRo's numbers."""
 
     horizon: Traced[float] = 2.0
-    """How far ahead a trajectory is rolled out, in seconds."""
+    """Length of a trajectory, in seconds."""
     speed_samples: int = 6
-    """Forward speeds that are tried, one of them backwards."""
+    """Speeds to try, one of them backwards."""
     turn_samples: int = 21
-    """Turn rates that are tried."""
+    """Turn rates to try."""
     robot_radius: Traced[float] = 0.1
-    """Radius that a robot is given in planning, in metres; it measures 0.05."""
+    """Radius of a robot in planning, in metres; its body's is 0.05."""
     inflation: Traced[float] = 0.1
-    """Distance to obstacles below which a way is held to be worse, in metres."""
+    """Distance to obstacles below which a way costs more, in metres."""
     goal_distance: Traced[float] = 0.2
-    """How near a viewpoint counts as reached if the PoI is in view, in metres."""
+    """Distance at which a viewpoint counts as reached if the PoI is in view, in metres."""
     goal_angle: Traced[float] = 6.0
     """Largest angle to the PoI at which a robot scans it, in degrees."""
     view_distances: Traced[tuple[float, ...]] = (0.5, 0.9)
@@ -41,10 +41,10 @@ class NavigationConfig:
     stuck_time: Traced[float] = 6.0
     """Seconds without progress after which a robot backs off and tries another viewpoint."""
     recovery_time: Traced[float] = 1.0
-    """Seconds for which a robot backs off."""
+    """Seconds that a robot backs off."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(self, "horizon", "robot_radius", "goal_distance", "goal_angle")
         require(self.horizon >= 1.0, self, "horizon", "must be at least 1 s")
@@ -71,23 +71,21 @@ class MissionConfig:
     """The closed loop of all robots in one arena."""
 
     episodes: int = 128
-    """Missions that are played with each policy at the end of a run."""
+    """Missions per policy at the end of a run."""
     time_limit: Traced[float] = 120.0
-    """Seconds after which a mission ends in any case."""
+    """Longest mission, in seconds."""
     control_period: float = 0.1
-    """Seconds between two decisions of a robot; also between two scans."""
+    """Seconds between a robot's decisions, and between its scans."""
     equal_values: Traced[float] = 0.1
-    """Actions whose values differ by less than this from the best count as equally good, in inverse
-    latent units; the robot takes the PoI that no other robot is heading for, and of these the
-    nearest."""
+    """Actions whose values are this close to the best, in inverse latent units, count as equally
+    good; of these the robot prefers PoIs that no other robot heads for, then the nearest."""
     least_confidence: Traced[float] = 0.98
-    """Probability that a detector must give to its answer for it to be written into the map."""
+    """Lowest probability of a detected label for a scan to enter the map."""
     attempts: Traced[int] = 3
-    """Looks that detect nothing, or goals that are not reached, after which a robot gives a PoI
-    up."""
+    """Failed looks or goals after which a robot gives up a PoI."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(self, "episodes", "time_limit", "control_period", "attempts")
         require_at_most(self, episodes=MOST_EPISODES, time_limit=3600)

@@ -1,4 +1,4 @@
-"""What points of interest can look like: names for colours, shapes and attributes of one's own."""
+"""Colours, shapes and custom attributes of points of interest."""
 
 import dataclasses
 import re
@@ -8,7 +8,7 @@ from typing import Literal
 from jaxsense.config.checks import ConfigError, require, require_types
 
 LEAST_SHARE = 0.5
-"""Smallest half side of a shape: of a narrower one a sensor may miss what it believes it faces."""
+"""Smallest half side of a shape; sensors may miss a narrower one that they face."""
 
 _LONGEST_NAME = 64  # letters; it becomes part of the names of files
 
@@ -41,10 +41,10 @@ class Shape:
 
 @dataclasses.dataclass(frozen=True)
 class Attribute:
-    """A number that PoIs have beside colour and shape, for example a temperature."""
+    """A number of each PoI besides colour and shape, for example a temperature."""
 
     values: dict[str, float] = dataclasses.field(hash=False)
-    """For each word that a class can have, the number that it stands for."""
+    """Number of each word that a class can have."""
     elsewhere: float = 0.0
     """The number of walls and robots."""
 
@@ -59,14 +59,14 @@ COLOURS: dict[str, tuple[float, float, float]] = {
     "blue": (0.1, 0.2, 0.8),
     "yellow": (0.8, 0.7, 0.1),
 }
-"""The colours that are known from the start: albedo, linear RGB in [0, 1]."""
+"""Built-in colours: albedo, linear RGB in [0, 1]."""
 
 SHAPES: dict[str, Shape] = {"cylinder": Shape("cylinder"), "cube": Shape("box")}
-"""The shapes that are known from the start."""
+"""Built-in shapes."""
 
 
 def require_words(named: Mapping[str, object], field: str) -> None:
-    """Raises `ConfigError` unless there are names, and each is one word."""
+    """Raises `ConfigError` unless there is a name, and each is one word."""
     for name in named:
         if not re.fullmatch(rf"[\w-]{{1,{_LONGEST_NAME}}}", name):
             reason = f"must be a word of 1 to {_LONGEST_NAME} letters, digits, - and _"

@@ -1,4 +1,4 @@
-"""The settings that a run can start from."""
+"""Presets: settings to start a run from."""
 
 from jaxsense.config.learning import (
     DetectorConfig,

@@ -1,4 +1,4 @@
-"""The arena, the sensors in it, and where a robot looks from."""
+"""Settings of the arena, the sensors in it, and viewpoints."""
 
 import dataclasses
 import math
@@ -23,10 +23,10 @@ LIDAR_HEIGHT = 0.152
 """Height of an AMiRo's laser beams above the floor, in metres."""
 
 TIMESTEP = 0.01
-"""One step of the physics, in seconds."""
+"""Step of the physics, in seconds."""
 
 MODALITIES: dict[str, str] = {"camera": "colour", "lidar": "shape"}
-"""The sensors that `sim` knows, and the attribute of a PoI that each one tells apart."""
+"""Built-in sensors, and the attribute of a PoI that each tells apart."""
 
 
 @section
@@ -38,27 +38,24 @@ class ArenaConfig:
     num_pois: int = 3
     """Number of points of interest."""
     poi_radius: float = 0.1
-    """Radius of a cylinder and half the side of a cube, in metres; other shapes are given as shares
-    of it."""
+    """Radius of a cylinder and half the side of a cube, in metres; unit of custom shapes."""
     poi_height: float = 0.2
     """Height of a PoI, in metres; more than 0.152, or the LiDAR looks over it."""
     poi_gap: float = 0.3
-    """Smallest free gap between two PoIs, in metres; a robot needs 0.1 to pass."""
+    """Smallest gap between two PoIs, in metres; a robot needs 0.1 to pass."""
     classes: tuple[str, ...] = ("green cylinder", "red cylinder", "red cube")
-    """Classes of PoIs, each `"COLOUR SHAPE"` and a word for each of `attributes`, drawn with equal
-    chance."""
+    """Equally likely classes of PoIs, each `"COLOUR SHAPE"` and a word for each of `attributes`."""
     colours: dict[str, tuple[float, float, float]] = dataclasses.field(
         default_factory=COLOURS.copy, hash=False
     )
-    """Albedo of each colour that a class can have, linear RGB in [0, 1]."""
+    """Albedo of each colour, linear RGB in [0, 1]."""
     shapes: dict[str, Shape] = dataclasses.field(default_factory=SHAPES.copy, hash=False)
-    """The solid of each shape that a class can have. Every PoI carries all of them, which the rays
-    are cast at."""
+    """Solid of each shape. Every PoI carries all of them, and rays are cast at each."""
     attributes: dict[str, Attribute] = dataclasses.field(default_factory=dict, hash=False)
-    """Attributes beside colour and shape that a sensor of one's own can tell."""
+    """Attributes besides colour and shape, for custom sensors."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(self, "side", "num_pois", "poi_radius", "poi_height", "poi_gap")
         require_at_most(self, side=100, num_pois=64, poi_height=10)
@@ -105,7 +102,7 @@ class ArenaConfig:
             of_words: dict[Any, str] = {}
             for word in self.labels(name):
                 what = self._words[name][word]
-                # A PoI may be turned any way.
+                # A PoI may have any yaw.
                 look = (what.primitive, *sorted(what.half_sides)) if name == "shape" else what
                 twin = of_words.setdefault(look, word)
                 reason = f"must not use both {twin!r} and {word!r}, which no sensor can tell apart"
@@ -118,31 +115,31 @@ class ArenaConfig:
 
     @property
     def poi_pitch(self) -> float:
-        """Distance of two PoIs' centres that leaves the gap between them free, in metres."""
+        """Smallest distance of two PoIs' centres that keeps the gap, in metres."""
         return 2.0 * self.poi_extent + self.poi_gap
 
     @property
     def poi_half_width(self) -> float:
-        """Half the width that a PoI of any class shows at least, from any side, in metres."""
+        """Half the smallest width of a PoI of any class from any side, in metres."""
         used = [self.shapes[shape] for shape in self.labels("shape")]
         return min(min(shape.half_sides) for shape in used) * self.poi_radius
 
     @property
     def _words(self) -> dict[str, dict[str, Any]]:
-        """For each word of a class, what it is called and what it can be."""
+        """For each word of a class, its attribute and the possible values."""
         own = {name: attribute.values for name, attribute in self.attributes.items()}
         return {"colour": self.colours, "shape": self.shapes, **own}
 
     def values(self, attribute: str) -> tuple[Any, ...]:
-        """For each class, what its word stands for: RGB, a `Shape`, or a number."""
+        """For each class, the value of its word: RGB, a `Shape`, or a number."""
         known = self._words[attribute]
         return tuple(known[word] for word in self._words_of_classes(attribute))
 
     def labels(self, attribute: str) -> tuple[str, ...]:
-        """The distinct colours, shapes or other words of the classes, in order of declaration.
+        """Distinct colours, shapes or other words of the classes, in order of declaration.
 
-        Green and red come as ("red", "green"), round and edgy as ("cylinder", "cube"): the order of
-        the paper's feature vectors, which is the order of `colours` and `shapes`.
+        By default ("red", "green") and ("cylinder", "cube"): the order of `colours` and `shapes`,
+        and of the paper's feature vectors.
         """
         used = self._words_of_classes(attribute)
         return tuple(label for label in self._words[attribute] if label in used)
@@ -162,24 +159,24 @@ class LidarConfig:
     """The Hokuyo URG-04LX on the AMiRo."""
 
     num_beams: int = 683
-    """Beams of one scan."""
+    """Beams per scan."""
     field_of_view: float = 240.0
     """Angle between the first and the last beam, in degrees."""
     min_range: Traced[float] = 0.08
-    """Shortest distance that is measured, in metres."""
+    """Shortest measured distance, in metres."""
     max_range: Traced[float] = 5.0
-    """Longest distance that is measured, in metres; also what a beam without a return reads."""
+    """Longest measured distance, in metres; also the reading of a beam without a return."""
     range_noise: Traced[float] = 0.01
-    """Standard deviation of a distance, in metres."""
+    """Standard deviation of a measured distance, in metres."""
     window: int = 128
     """Beams around the PoI's bearing that the detector reads."""
     stride: int = 1
-    """From each beam that the detector reads to the next, in beams."""
+    """Step between the beams that the detector reads, in beams."""
     window_range: Traced[float] = 1.5
-    """Longest distance that the detector is shown, in metres: what is behind a PoI is cut off."""
+    """Longest distance in the detector's input, in metres: cuts off the background."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(
             self, "num_beams", "field_of_view", "min_range", "max_range", "window_range"
@@ -194,7 +191,7 @@ class LidarConfig:
 
 @section
 class CameraConfig:
-    """The camera on the AMiRo, of which one line of pixels is used."""
+    """One line of pixels of the camera on the AMiRo."""
 
     num_pixels: int = 640
     """Pixels of the scanline."""
@@ -205,10 +202,10 @@ class CameraConfig:
     window: int = 80
     """Pixels around the PoI's bearing that the detector reads."""
     stride: int = 4
-    """From each pixel that the detector reads to the next, in pixels."""
+    """Step between the pixels that the detector reads, in pixels."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(self, "num_pixels", "field_of_view")
         require_not_negative(self, "pixel_noise")
@@ -219,7 +216,7 @@ class CameraConfig:
 
 @section
 class ViewpointConfig:
-    """Where a robot stands when it looks at a PoI."""
+    """Viewpoints from which a robot looks at a PoI."""
 
     min_distance: Traced[float] = 0.3
     """Shortest distance from the sensor to the PoI's centre, in metres."""
@@ -228,12 +225,12 @@ class ViewpointConfig:
     max_bearing: Traced[float] = 20.0
     """Largest angle between the robot's heading and the PoI, to either side, in degrees."""
     bearing_error: Traced[float] = 1.0
-    """Largest error of the bearing at which the detector's window is centred, in degrees."""
+    """Largest error of the bearing on which the detector's window is centred, in degrees."""
     clearance: Traced[float] = 0.03
     """Free space around the robot at a viewpoint, in metres."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(self, "min_distance", "max_distance")
         require_not_negative(self, "max_bearing", "bearing_error", "clearance")
@@ -249,13 +246,13 @@ class ViewpointConfig:
 
 @dataclasses.dataclass(frozen=True)
 class SensorConfig:
-    """A sensor of one's own, which a robot carries as it does a camera or a LiDAR."""
+    """A custom sensor, carried like a camera or a LiDAR."""
 
     make: str
-    """Function of `Config` that makes the `sim.Sensor`, as `package.module:function`. The name of a
-    function and not the function itself, so that a run can be written down and read back."""
+    """Function of `Config` that makes the `sim.Sensor`, as `package.module:function`; a name, for
+    runs to store."""
     attribute: str
-    """What it tells apart: `colour`, `shape` or one of `arena.attributes`."""
+    """Attribute that it tells apart: `colour`, `shape` or one of `arena.attributes`."""
 
     def __post_init__(self):
         require_types(self)

@@ -1,7 +1,7 @@
-"""What a section of the settings is: a frozen dataclass, and a pytree.
+"""Sections of the settings: frozen dataclasses that are also pytrees.
 
-Numbers that only enter the arithmetic are the leaves, so that a compiled program takes them as
-inputs; whatever shapes a program is structure.
+Numbers that only enter the arithmetic are leaves, inputs of a compiled program; everything that
+shapes a program is structure.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ Traced = Annotated[T, _LEAF]
 
 @dataclasses.dataclass(frozen=True)
 class _Structure:
-    """The settings of a section that are no leaves; equal if all of them are."""
+    """Settings of a section that are not leaves; equal if all of them are."""
 
     values: tuple[Any, ...]
 
@@ -31,8 +31,8 @@ class _Structure:
 def section(cls: type[T]) -> type[T]:
     """Makes a frozen dataclass and a pytree, whose leaves are the fields declared `Traced`.
 
-    The method `check` is called whenever one is made of plain values; arrays and what JAX puts in
-    their place have no values to check.
+    Sections of plain values call their method `check` when made; arrays and JAX's placeholders have
+    no values to check.
     """
 
     def check(self: Any) -> None:
@@ -58,11 +58,11 @@ def section(cls: type[T]) -> type[T]:
 
 
 def _is_leaf(kind: Any) -> bool:
-    """Whether a field holds leaves: it is declared `Traced`, or is a section itself."""
+    """Whether a field holds leaves: it is declared `Traced` or is a section."""
     return _LEAF in get_args(kind)[1:] or hasattr(kind, "check")
 
 
 def _is_plain(value: Any) -> bool:
-    """Whether a value is one of Python or NumPy, not what JAX puts in its place."""
+    """Whether a value is Python's or NumPy's, not a placeholder of JAX."""
     is_of_python = type(value).__module__ == "builtins" and type(value) is not object
     return is_of_python or isinstance(value, np.generic)

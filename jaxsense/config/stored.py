@@ -1,4 +1,4 @@
-"""Settings as plain data, as they are kept in a run's `config.json`."""
+"""Settings as plain data, the form of a run's `config.json`."""
 
 import dataclasses
 import difflib
@@ -12,19 +12,19 @@ from jaxsense.config.whole import Config
 
 
 def as_plain(config: Config) -> dict[str, Any]:
-    """Dictionaries, lists, numbers and strings, for JSON."""
+    """Converts settings to dictionaries, lists, numbers and strings, for JSON."""
     return dataclasses.asdict(config)
 
 
 def from_plain(stored: Any, base: Config | None = None) -> Config:
-    """The inverse of `as_plain`, through JSON.
+    """Makes settings from plain data, the inverse of `as_plain`.
 
     Args:
       stored: sections and their fields.
-      base: settings that are not given; the defaults, if none are.
+      base: source of missing settings; the defaults by default.
 
     Raises:
-      ConfigError: names a field that is unknown, of the wrong type, or cannot be used.
+      ConfigError: names a field that is unknown, of the wrong type, or invalid.
     """
     if not isinstance(stored, dict):
         raise ConfigError("config", stored, "must be an object with a section for each part")
@@ -47,10 +47,10 @@ def from_plain(stored: Any, base: Config | None = None) -> Config:
 
 
 def parse_json(text: str) -> Any:
-    """What a text in JSON stands for.
+    """Parses JSON.
 
     Raises:
-      ValueError: if it is no JSON, is nested too deeply, or names a field twice.
+      ValueError: if the text is not JSON, is nested too deeply, or names a field twice.
     """
     try:
         return json.loads(text, object_pairs_hook=_without_twins)
@@ -59,7 +59,7 @@ def parse_json(text: str) -> Any:
 
 
 def _without_twins(fields: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON, whose fields must have different names."""
+    """Object of JSON; raises `ValueError` if two of its fields share a name."""
     found = dict(fields)
     if len(found) < len(fields):
         names = [name for name, _ in fields]
@@ -69,14 +69,14 @@ def _without_twins(fields: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def require_trust(config: Config) -> None:
-    """Raises a `ConfigError` if settings name code that making their sensors would run."""
+    """Raises a `ConfigError` if settings name code of custom sensors, which would run."""
     for name, sensor in config.sensors.items():
         reason = "names code that would be run; pass --trust (trust=True) if you trust it"
         raise ConfigError(f"sensors.{name}.make", sensor.make, reason)
 
 
 def _find(stored: dict[str, Any], name: str) -> Any:
-    """The value of the first field with a name, in any section."""
+    """Value of the first field of a name, in any section."""
     if name in stored:
         return stored[name]
     sections = (section for section in stored.values() if isinstance(section, dict))
@@ -85,7 +85,7 @@ def _find(stored: dict[str, Any], name: str) -> Any:
 
 
 def _over(base: Config, stored: dict[str, Any]) -> dict[str, Any]:
-    """Settings, in which the given fields take the place of those of another one."""
+    """Plain settings of `base`, with the stored fields in place of its own."""
     plain = as_plain(base)
     for name, section in stored.items():
         is_section = dataclasses.is_dataclass(getattr(base, name, None))
@@ -95,20 +95,20 @@ def _over(base: Config, stored: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_tuples(value: Any) -> Any:
-    """JSON has lists for tuples."""
+    """Replaces lists, JSON's form of tuples."""
     if isinstance(value, dict):
         return {name: _with_tuples(each) for name, each in value.items()}
     return tuple(map(_with_tuples, value)) if isinstance(value, list | tuple) else value
 
 
 def _number(value: Any) -> Any:
-    """JSON writes 1 for 1.0."""
+    """Makes whole numbers real: JSON may write 1 for 1.0."""
     is_whole = isinstance(value, int) and not isinstance(value, bool)
     return float(value) if is_whole and abs(value) < 2**1000 else value
 
 
 def _names(section: Any, prefix: str = "") -> list[str]:
-    """All settings with their sections."""
+    """Names of all settings with their sections."""
     names = []
     for field in dataclasses.fields(section):
         names.append(prefix + field.name)

@@ -1,6 +1,6 @@
-"""Checks of what functions are given, in the words of `ConfigError`: `name = value: what is right`.
+"""Checks of functions' arguments, in the form of `ConfigError`: `name = value: what is right`.
 
-They look at values that are known. Those that are traced have none yet, and cost nothing.
+Traced values are unknown: their checks pass and cost nothing.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,12 +14,12 @@ from jax.core import Tracer
 def require(
     name: str, value: Any, is_right: Callable[[np.ndarray], np.ndarray], expected: str
 ) -> None:
-    """Raises a `ValueError` that names the first number of an array that is not right.
+    """Raises a `ValueError` that names the first wrong number of an array.
 
     Args:
       name: of the argument.
       value: the array.
-      is_right: tells for each of its numbers whether it can be used.
+      is_right: `array -> bool array`, which of its numbers are right.
       expected: what would be right.
     """
     if isinstance(value, Tracer):
@@ -52,14 +52,14 @@ def require_index(name: str, value: Any, number: int) -> None:
 
 
 def require_number(name: str, value: Any) -> None:
-    """Raises a `ValueError` unless this is one whole number greater than 0."""
+    """Raises a `ValueError` unless the value is one whole number greater than 0."""
     is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not is_whole or value < 1:
         raise ValueError(f"{name} = {value!r}: must be a whole number greater than 0")
 
 
 def require_one_each(name: str, values: Sequence[Any], modalities: Sequence[str]) -> None:
-    """Raises a `ValueError` unless there are as many values as modalities."""
+    """Raises a `ValueError` unless each modality has one value."""
     if len(values) != len(modalities):
         raise ValueError(
             f"{name} has {len(values)} entries: must be {len(modalities)}, one for each of "

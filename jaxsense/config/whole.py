@@ -1,4 +1,4 @@
-"""All sections together, and what must hold between them."""
+"""All sections together, and the checks between them."""
 
 # The defaults are frozen, which ruff does not see in another file.
 
@@ -30,7 +30,7 @@ from jaxsense.config.section import section
 
 _MOST_NUMBERS = 2**32
 """Numbers of 32 bits in an array or a network, 16 GiB."""
-_MOST_MODALITIES = 8  # the JMVAE has an encoder for each set of them
+_MOST_MODALITIES = 8  # the JMVAE has an encoder for each subset
 _PLANNED_AT_ONCE = 384  # missions side by side, see `run.missions`
 _NODES_PER_POI = 10  # of the roadmap
 
@@ -42,7 +42,7 @@ class Config:
     modalities: tuple[str, ...] = ("camera", "lidar")
     """The sensors, one robot each."""
     sensors: dict[str, SensorConfig] = dataclasses.field(default_factory=dict, hash=False)
-    """Sensors of one's own, by the name of their modality."""
+    """Custom sensors, by the name of their modality."""
     arena: ArenaConfig = ArenaConfig()
     lidar: LidarConfig = LidarConfig()
     camera: CameraConfig = CameraConfig()
@@ -56,7 +56,7 @@ class Config:
     mission: MissionConfig = MissionConfig()
 
     def check(self) -> None:
-        """Raises `ConfigError` for a field that cannot be used."""
+        """Raises `ConfigError` for an invalid field."""
         require_types(self)
         self._check_modalities()
         self._check_classes()
@@ -67,6 +67,20 @@ class Config:
                 weights,
                 f"must hold one weight for each of modalities = {self.modalities}",
             )
+        self._check_viewpoints()
+        self._check_views()
+        looks = self.arena.num_pois * len(self.modalities)
+        if self.mdp.partly_seen_starts and not 2 <= looks <= 30:
+            raise ConfigError(
+                "mdp.partly_seen_starts",
+                True,
+                f"needs 2 to 30 pairs of PoI and modality, not {looks}; must be False",
+            )
+        self._check_fields_of_view()
+        self._check_memory()
+
+    def _check_viewpoints(self) -> None:
+        """Viewpoints for training must be clear of the PoI and inside the arena."""
         nearest = self.arena.poi_extent + ROBOT_RADIUS + self.viewpoint.clearance
         if self.viewpoint.min_distance < nearest:
             raise ConfigError(
@@ -80,6 +94,9 @@ class Config:
                 self.viewpoint.max_distance,
                 f"must be at most half the arena's side, {self.arena.side / 2} m",
             )
+
+    def _check_views(self) -> None:
+        """Viewpoints in missions must be clear of the PoI and within the range of training."""
         nearest = max(
             self.arena.poi_extent + self.navigation.robot_radius, self.viewpoint.min_distance
         )
@@ -99,15 +116,6 @@ class Config:
                 f"must lie between {nearest:.3f} m, where the robot is clear of the PoI, and "
                 f"navigation.view_range = {farthest} m",
             )
-        looks = self.arena.num_pois * len(self.modalities)
-        if self.mdp.partly_seen_starts and not 2 <= looks <= 30:
-            raise ConfigError(
-                "mdp.partly_seen_starts",
-                True,
-                f"needs 2 to 30 pairs of PoI and modality, not {looks}; must be False",
-            )
-        self._check_fields_of_view()
-        self._check_memory()
 
     def _check_modalities(self) -> None:
         known = ", ".join([*MODALITIES, *self.sensors])
@@ -133,7 +141,7 @@ class Config:
             raise ConfigError("modalities", self.modalities, "must name no modality twice")
 
     def _check_classes(self) -> None:
-        """The classes must differ in something that a sensor, of this team or not, tells apart."""
+        """Classes must differ in something that a sensor, of this team or not, tells apart."""
         of_sensors = zip(*map(self.label_of_class, [*MODALITIES, *self.sensors]), strict=True)
         seen: dict[tuple[int, ...], str] = {}
         for name, labels in zip(self.arena.classes, of_sensors, strict=True):
@@ -145,7 +153,7 @@ class Config:
                 )
 
     def _check_fields_of_view(self) -> None:
-        """Sensors must have in view what they look at."""
+        """Sensors must have the PoIs that they look at in view."""
         viewpoint = self.viewpoint
         for name, sensor in {"camera": self.camera, "lidar": self.lidar}.items():
             most = sensor.field_of_view / 2 - viewpoint.bearing_error
@@ -158,7 +166,7 @@ class Config:
                 )
 
     def _check_memory(self) -> None:
-        """No array may be larger than a computer's memory; those that may become large are here."""
+        """No array that can become large may exceed a computer's memory."""
         arena, jmvae, dqn, ways = self.arena, self.jmvae, self.dqn, self.navigation
         num_pois, num_classes = arena.num_pois, len(arena.classes)
         num_labels = sum(len(self.labels(name)) for name in self.modalities)
@@ -200,16 +208,16 @@ class Config:
                 )
 
     def attribute(self, modality: str) -> str:
-        """What a modality tells apart: `colour`, `shape` or one of `arena.attributes`."""
+        """Attribute that a modality tells apart: `colour`, `shape` or one of `arena.attributes`."""
         own = self.sensors.get(modality)
         return MODALITIES[modality] if own is None else own.attribute
 
     def labels(self, modality: str) -> tuple[str, ...]:
-        """The words that a modality tells apart, in the order of its features."""
+        """Words that a modality tells apart, in the order of its features."""
         return self.arena.labels(self.attribute(modality))
 
     def label_of_class(self, modality: str) -> tuple[int, ...]:
-        """For each class, the index of what a modality detects of it."""
+        """For each class, the index of its label in a modality."""
         return self.arena.label_of_class(self.attribute(modality))
 
 

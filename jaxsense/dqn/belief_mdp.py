@@ -1,9 +1,9 @@
 """The shared map as a Markov decision process.
 
 Korthals et al. 2018, Sec. III and IV. The map holds a Gaussian belief for each of N points of
-interest. Action n < N looks at PoI n with the agent's own sensor and writes what it sees into the
-map; action N is no operation (NOP), and ends the episode. What a look sees, and how it is written,
-are functions that the caller gives.
+interest. Action n < N looks at PoI n with the agent's own sensor and writes the detection into the
+map; action N is no operation (NOP) and ends the episode. The caller supplies the functions that
+look and write.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from jaxsense.config import MdpConfig, values
 from jaxsense.types import Belief, Index, Key, call, pytree
 
 Scene = Any
-"""A pytree that `observe` looks at; the MDP only carries it."""
+"""Pytree that `observe` looks at; the MDP only carries it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class MapMdp:
       num_pois: N.
       num_classes: classes that a PoI can have.
       num_modalities: M.
-      unseen: `[D]` the entry of a PoI that nobody has seen.
+      unseen: `[D]` entry of an unseen PoI.
       new_scene: `(key, classes [N]) -> scene`.
       observe: `(key, scene, poi, modality) -> (features [D_m], scene)`.
       write: `(belief [D], seen [M], features [D_m], modality) -> belief [D]`.
@@ -48,7 +48,7 @@ class MapMdp:
 
 @pytree
 class MapState:
-    """The map, and what it is a map of.
+    """The map, and the scene that it describes.
 
     Attributes:
       belief: `[N, D]` the map.
@@ -67,12 +67,12 @@ class MapState:
 
 @pytree
 class Outcome:
-    """What an action led to.
+    """Outcome of an action.
 
     Attributes:
       reward: `[]` float32.
-      terminated: `[]` bool, the episode has ended by NOP.
-      truncated: `[]` bool, the episode has ended because it was too long.
+      terminated: `[]` bool, NOP has ended the episode.
+      truncated: `[]` bool, the episode has reached its limit of steps.
     """
 
     reward: jax.Array
@@ -95,7 +95,7 @@ def information(std: jax.Array) -> jax.Array:
 
 
 def observation(belief: Belief) -> jax.Array:
-    """`[N * 2D]` the map as a Q-network sees it: mean and standard deviation of each PoI."""
+    """Mean and standard deviation of each PoI's belief, `[N * 2D]`, as a Q-network reads them."""
     chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
     chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
     values.require_positive("belief.std", belief.std)
@@ -103,7 +103,7 @@ def observation(belief: Belief) -> jax.Array:
 
 
 def random_start(key: Key, mdp: MapMdp) -> tuple[jax.Array, jax.Array]:
-    """`[N]` int32 classes, drawn independently, and `[N, M]` bool, which looks have been taken."""
+    """Independent `[N]` int32 classes, and `[N, M]` bool, which modality has seen which PoI."""
     class_key, seen_key = jax.random.split(key)
     classes = jax.random.randint(class_key, (mdp.num_pois,), 0, mdp.num_classes)
     shape = (mdp.num_pois, mdp.num_modalities)
@@ -113,17 +113,17 @@ def random_start(key: Key, mdp: MapMdp) -> tuple[jax.Array, jax.Array]:
 def reset(
     key: Key, mdp: MapMdp, classes: jax.Array | None = None, seen: jax.Array | None = None
 ) -> MapState:
-    """The start of an episode: some modalities have seen some of the PoIs.
+    """Starts an episode, in which some modalities have seen some of the PoIs.
 
     Args:
       key: random key.
       mdp: the MDP.
-      classes: `[N]` int32 true classes; drawn independently for each PoI if not given.
-      seen: `[N, M]` bool, who has seen what; random if not given.
+      classes: `[N]` int32 true classes; independent for each PoI by default.
+      seen: `[N, M]` bool, which modality has seen which PoI; random by default.
 
     Returns:
-      The state. What has been seen was really looked at: the map holds real detections. Each PoI
-      has its looks written in the order of the modalities, from a random one on.
+      The state, whose map holds real detections. The looks at a PoI are written in the order of the
+      modalities, from a random one on.
     """
     start_key, scene_key, begin_key, look_key = jax.random.split(key, 4)
     random_classes, random_seen = random_start(start_key, mdp)
@@ -148,16 +148,16 @@ def begin(
     seen: jax.Array,
     looks: tuple[jax.Array, ...],
 ) -> MapState:
-    """The start of an episode in a given scene; `reset` says how the map is written.
+    """Starts an episode in a given scene; `reset` explains how the map is written.
 
     Args:
       key: random key.
       mdp: the MDP.
       scene: what `observe` will look at.
       classes: `[N]` int32 true classes.
-      seen: `[N, M]` bool, who has seen what.
-      looks: for each modality `[N, D_m]` features of a look at each PoI; those that `seen` does not
-        tell of are not used.
+      seen: `[N, M]` bool, which modality has seen which PoI.
+      looks: for each modality `[N, D_m]` features of a look at each PoI; ignored where `seen` is
+        False.
     """
     chex.assert_shape(seen, (mdp.num_pois, mdp.num_modalities), custom_message="seen")
     if seen.dtype != bool:
@@ -175,24 +175,19 @@ def step(
     Args:
       key: random key.
       mdp: the MDP.
-      state: the present state.
+      state: the current state.
       action: `[]` int32, a PoI or N for NOP.
       modality: index of the agent's own sensor. As a `[]` int32 array one program serves all
-        modalities; an index that does not exist is not noticed then.
+        modalities, and its range is not checked.
 
     Returns:
       The next state and the outcome. The reward is the gain of information; -1 if that is not above
-      `min_increase`; 0 for NOP; NaN if the gain is NaN or the action is none of these.
+      `min_increase`; 0 for NOP; NaN if the gain is NaN or the action does not exist.
 
     Raises:
       ValueError: if there is no such modality.
     """
-    values.require_index("modality", modality, mdp.num_modalities)
-    chex.assert_rank(action, 0, custom_message="action")
-    values.require_index("action", action, mdp.num_pois + 1)
-    shape = (mdp.num_pois, *mdp.unseen.mean.shape)
-    for part in (state.belief.mean, state.belief.std):
-        chex.assert_shape(part, shape, custom_message="state.belief")
+    _check_step(mdp, state, action, modality)
     is_nop = action == mdp.num_pois
     poi = jnp.minimum(action, mdp.num_pois - 1)
     old = jax.tree.map(lambda x: x[poi], state.belief)
@@ -222,8 +217,18 @@ def step(
     return after, outcome
 
 
+def _check_step(mdp: MapMdp, state: MapState, action: jax.Array, modality: Index) -> None:
+    """Raises an error that names an argument of `step` that does not fit the MDP."""
+    values.require_index("modality", modality, mdp.num_modalities)
+    chex.assert_rank(action, 0, custom_message="action")
+    values.require_index("action", action, mdp.num_pois + 1)
+    shape = (mdp.num_pois, *mdp.unseen.mean.shape)
+    for part in (state.belief.mean, state.belief.std):
+        chex.assert_shape(part, shape, custom_message="state.belief")
+
+
 def _random_seen(key: Key, shape: tuple[int, int], is_partial: bool) -> jax.Array:
-    """Fair coins; with `is_partial`, given that they do not all fall the same way."""
+    """Fair coins; with `is_partial`, on condition that they differ."""
     if not is_partial:
         return jax.random.bernoulli(key, 0.5, shape)
     num_bits = shape[0] * shape[1]
@@ -232,7 +237,7 @@ def _random_seen(key: Key, shape: tuple[int, int], is_partial: bool) -> jax.Arra
 
 
 def _looked_at(mdp: MapMdp, looks: tuple[jax.Array, ...], seen, first) -> Belief:
-    """The entry of one PoI after those of the looks that `seen` [M] tells of, in rotated order."""
+    """Entry of one PoI after the looks for which `[M]` `seen` is True, in rotated order."""
     entry = mdp.unseen
     for start in range(mdp.num_modalities):
         order = [(start + i) % mdp.num_modalities for i in range(mdp.num_modalities)]

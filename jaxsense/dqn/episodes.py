@@ -21,14 +21,13 @@ def run_episode(
 ) -> tuple[jax.Array, jax.Array]:
     """Plays one episode with a policy.
 
-    The k-th look at a PoI sees the same with the same key, whatever has been done before, so that
-    policies are compared on the same detections. Under `vmap` it goes on until the longest of the
-    episodes has ended.
+    With the same key, the k-th look at a PoI sees the same whatever came before, so that policies
+    are compared on the same detections. Under `vmap` it runs until the longest episode has ended.
 
     Args:
       key: random key.
       mdp: the MDP.
-      policy: what to do.
+      policy: chooses the actions.
       start: from `belief_mdp.reset`.
       modality: index of the agent's own sensor, see `belief_mdp.step`.
 
@@ -57,26 +56,25 @@ def run_episode(
 
 
 def every_state(mdp: MapMdp) -> tuple[np.ndarray, np.ndarray]:
-    """The states of the paper's count `N! 2^(N M)`: classes in every order, every set of looks.
+    """Lists the paper's `N! 2^(N M)` states: classes in every order, every set of looks.
 
-    With fewer PoIs than classes, the orders are those of N of the classes; with more, all
-    combinations. Of more than 4096 states that many are taken: cut into 4096 equal parts, each part
-    gives a random one of its states, always the same.
+    With fewer PoIs than classes, every order of N of the classes; with more, all combinations. Of
+    more than 4096 states, one random state, always the same, of each of 4096 equal parts.
 
     Returns:
       `[S, N]` int32 classes and `[S, N, M]` bool looks.
     """
     num_pois, num_classes = mdp.num_pois, mdp.num_classes
     is_order = num_pois <= num_classes
-    # A state is a number: a digit for the class of each PoI, of those that are left in an order,
-    # then a bit for each look.
+    # A state is a number: a digit for the class of each PoI (in an order, among those left), then
+    # a bit for each look.
     radices = [num_classes - n if is_order else num_classes for n in range(num_pois)]
     num_bits = num_pois * mdp.num_modalities
     number = math.prod(radices) << num_bits
     parts = min(number, MOST_STATES)
     edges = [i * number // parts for i in range(parts + 1)]
     draw = random.Random(0)
-    # Of 25 PoIs there are more states than an int64 can count: Python's integers.
+    # Python's integers: the states of 25 PoIs overflow an int64.
     states = np.array([draw.randrange(*part) for part in itertools.pairwise(edges)], object)
     bits = states[:, None] >> np.arange(num_bits, dtype=object) & 1
     states >>= num_bits

@@ -27,7 +27,7 @@ def td_error(
     chex.assert_equal_shape([a_tm1, r_t, discount_t])
     chex.assert_shape([q_tm1, q_t], (None, *a_tm1.shape))
     target = r_t + discount_t * jnp.max(q_t, axis=0)
-    # Cheaper than to index, whose gradient is a scatter.
+    # Cheaper than indexing, whose gradient is a scatter.
     actions = jnp.arange(q_tm1.shape[0]).reshape(-1, *[1] * a_tm1.ndim)
     value = jnp.sum(jnp.where(actions == a_tm1[None], q_tm1, 0.0), axis=0)
     return jax.lax.stop_gradient(target) - value

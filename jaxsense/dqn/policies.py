@@ -1,4 +1,4 @@
-"""Policies: the DQN's, and those to compare it with. Each is `(key, state) -> action`."""
+"""Policies: the DQN's and its baselines. Each is `(key, state) -> action`."""
 
 import math
 from collections.abc import Callable
@@ -18,12 +18,12 @@ Policy = Callable[[Key, MapState], jax.Array]
 
 
 def q_network(mdp: MapMdp, hidden: tuple[int, ...]) -> MLP:
-    """The Q-network: `[N * 2D]` map to `[N + 1]` values, the last that of NOP."""
+    """The Q-network: `[N * 2D]` map to `[N + 1]` values, NOP's last."""
     return MLP(hidden, mdp.num_pois + 1)
 
 
 def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
-    """The action of highest value in a Q-network, or -1, whose reward is NaN, if one is NaN."""
+    """Takes a Q-network's best action, or -1, whose reward is NaN, if a value is NaN."""
 
     def act(key: Key, state: MapState) -> jax.Array:
         del key
@@ -34,12 +34,12 @@ def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
 
 
 def random(mdp: MapMdp) -> Policy:
-    """Every action with equal chance."""
+    """Takes every action with equal chance."""
     return lambda key, state: jax.random.randint(key, (), 0, mdp.num_pois + 1)
 
 
 def naive(mdp: MapMdp, modality: Index) -> Policy:
-    """Naive exploration: the first PoI that the own sensor has not seen, NOP when all are."""
+    """Explores naively: the first PoI that the own sensor has not seen; NOP after the last."""
     values.require_index("modality", modality, mdp.num_modalities)
 
     def act(key: Key, state: MapState) -> jax.Array:
@@ -51,7 +51,7 @@ def naive(mdp: MapMdp, modality: Index) -> Policy:
 
 
 def expected_rewards(key: Key, mdp: MapMdp, modality: Index, num_draws: int) -> jax.Array:
-    """Expected reward of a look, by what it is a look at.
+    """Expected reward of a look, by class and earlier looks.
 
     Args:
       key: random key.
@@ -60,8 +60,8 @@ def expected_rewards(key: Key, mdp: MapMdp, modality: Index, num_draws: int) -> 
       num_draws: simulated looks for each entry of the table.
 
     Returns:
-      `[2^M, C]` mean reward of looking at a PoI of class c after the looks that the bits of the
-      first index tell of, modality m being bit m.
+      `[2^M, C]` mean reward of looking at a PoI of class c after looks by the modalities m whose
+      bits m are set in the first index.
     """
 
     def reward(key: Key, code: jax.Array, poi_class: jax.Array) -> jax.Array:
@@ -80,17 +80,17 @@ def expected_rewards(key: Key, mdp: MapMdp, modality: Index, num_draws: int) -> 
 
 
 def optimal(mdp: MapMdp, rewards: jax.Array, label_of_class: jax.Array) -> Policy:
-    """Greedy on the true expected reward, given what the looks so far can have told.
+    """Acts greedily on the true expected reward, given what the looks so far can reveal.
 
     Optimal for the total reward, because PoIs are independent: every look that pays is worth taking
-    and the order is free. It knows which looks have been taken and what they should have told, not
-    the noise of single detections.
+    and the order is free. It knows which looks were taken and their noise-free results, not the
+    noise of single detections.
 
     Args:
       mdp: the MDP.
       rewards: `[2^M, C]` from `expected_rewards`, for the agent's own modality.
-      label_of_class: `[M, C]` int32, what each modality detects of each class. Classes that every
-        modality that has looked detects as it does the true one are equally likely.
+      label_of_class: `[M, C]` int32, label that each modality detects for each class. Classes whose
+        labels match the true one's in all modalities that have looked are equally likely.
 
     Returns:
       The policy; it uses the hidden parts of the state. Its action is -1 if a reward is NaN.
@@ -114,5 +114,5 @@ def optimal(mdp: MapMdp, rewards: jax.Array, label_of_class: jax.Array) -> Polic
 
 
 def _best(values: jax.Array) -> jax.Array:
-    """`[]` int32 action of the highest of `[N + 1]` values; -1, which is none, if one is NaN."""
+    """Action, `[]` int32, of the highest of `[N + 1]` values; -1, which is none, if one is NaN."""
     return jnp.where(jnp.any(jnp.isnan(values)), -1, jnp.argmax(values))

@@ -1,7 +1,7 @@
 """A replay memory as pure functions: a ring of rounds, with one transition of each environment.
 
-Transitions are columns of numbers, and what is drawn is drawn in blocks of neighbouring
-environments: that copies a few pieces of memory, many times as fast as picking single numbers.
+Transitions are columns, drawn in blocks of neighbouring environments: copying a few pieces of
+memory is many times faster than picking single numbers.
 """
 
 import chex
@@ -29,16 +29,16 @@ def init(state_size: int, rounds: int, blocks: int, width: int) -> Replay:
 
     Args:
       state_size: numbers in a state.
-      rounds: that it holds.
-      blocks: of environments.
-      width: environments in a block. Transitions of one round know nothing of one another, so that
-        a batch of a few dozen blocks is as good as one of single transitions.
+      rounds: capacity, T.
+      blocks: of environments, G.
+      width: environments in a block, W. Transitions of one round are independent, so a batch of a
+        few dozen blocks is as good as one of single transitions.
     """
     return Replay(jnp.zeros((rounds, blocks, 2 * state_size + 3, width)), jnp.int32(0))
 
 
 def add(replay: Replay, transitions: Transition) -> Replay:
-    """Adds a round over the oldest one: `[S, E]` states, `[E]` of all else."""
+    """Adds a round in place of the oldest: `[S, E]` states, `[E]` of all else."""
     rounds, blocks, rows, width = replay.columns.shape
     chex.assert_shape(
         [transitions.s_tm1, transitions.s_t],
@@ -56,8 +56,8 @@ def add(replay: Replay, transitions: Transition) -> Replay:
 def sample(draws: jax.Array, replay: Replay) -> Transition:
     """Draws blocks of transitions from a memory that is not empty.
 
-    All transitions are drawn with the same chance: the round is uniform and with replacement; of
-    the blocks of environments, in order, each draw gets an equal share and takes one of it.
+    All transitions are equally likely: rounds are uniform, with replacement; each draw takes one of
+    its equal share of the blocks of environments, in order.
 
     Args:
       draws: `[B, 2]` uniform numbers in [0, 1), for the round and for the block.

@@ -1,7 +1,7 @@
 """Deep Q-learning over many environments at once (Mnih et al. 2015), as pure functions.
 
-All random numbers are drawn for a whole chunk of epochs at once: in the loop they would cost more
-than all the rest.
+Random numbers are drawn for a whole chunk of epochs at once: in the loop they would dominate its
+cost.
 """
 
 import functools
@@ -23,7 +23,7 @@ from jaxsense.types import Index, Key, Transition, pytree
 
 @pytree
 class DqnState:
-    """Everything that training carries from one chunk of epochs to the next.
+    """Training state between two chunks of epochs.
 
     Attributes:
       params: of the Q-network.
@@ -48,14 +48,14 @@ class DqnState:
 
 @pytree
 class EpochInfo:
-    """What happened in one epoch.
+    """Metrics of one epoch.
 
     Attributes:
       loss: `[]` mean over the gradient steps.
-      episode_return: `[]` mean total reward of the episodes that ended, of the exploring policy.
+      episode_return: `[]` mean total reward of the exploring policy's episodes that ended.
       episodes: `[]` int32 episodes that ended.
       epsilon: `[]` chance of a random action.
-      is_finite: `[]` bool, whether values, rewards, the loss and the parameters after it are.
+      is_finite: `[]` bool, whether values, rewards, loss and new parameters are.
     """
 
     loss: jax.Array
@@ -67,14 +67,14 @@ class EpochInfo:
 
 @pytree
 class _Draws:
-    """The random numbers of one epoch: uniform in [0, 1), but for the keys.
+    """Random numbers of one epoch.
 
     Attributes:
-      coin: `[E]` whether an environment explores.
-      action: `[E]` which action it tries then.
-      start: `[E]` which start follows an episode that has ended.
+      coin: `[E]` in [0, 1), below epsilon to explore.
+      action: `[E]` int32 action to explore.
+      start: `[E]` int32 start to follow an ended episode.
       step: `[E]` keys of the steps.
-      replay: `[updates, blocks, 2]` what is learnt from.
+      replay: `[updates, blocks, 2]` in [0, 1), see `replay.sample`.
     """
 
     coin: jax.Array
@@ -85,13 +85,13 @@ class _Draws:
 
 
 def init(key: Key, mdp: MapMdp, config: DqnConfig, prepared: MapState) -> DqnState:
-    """A fresh network, an empty replay, and environments that wait for their first start.
+    """Fresh network, empty replay, and environments before their first start.
 
     Args:
       key: random key of the network.
       mdp: the MDP.
       config: the settings.
-      prepared: from `starts`, for the shapes alone.
+      prepared: from `starts`; only its shapes count.
     """
     envs = jax.tree.map(lambda x: jnp.zeros((config.num_envs, *x.shape[1:]), x.dtype), prepared)
     size = 2 * math.prod(prepared.belief.mean.shape[1:])
@@ -110,17 +110,17 @@ def init(key: Key, mdp: MapMdp, config: DqnConfig, prepared: MapState) -> DqnSta
 
 
 def starts(key: Key, mdp: MapMdp, number: int) -> MapState:
-    """`[number]` random states for episodes to start from.
+    """Random states, `[number]`, for episodes to start from.
 
-    They are prepared once for a training: a start takes a look at everything that has been seen in
-    it, which costs far more than a step.
+    A training prepares them once: a start looks at everything it has seen, which costs far more
+    than a step.
     """
     keys = jax.random.split(key, number)
     return jax.vmap(lambda key: belief_mdp.reset(key, mdp))(keys)
 
 
 def train(key: Key, mdp: MapMdp, modality: Index, config: DqnConfig) -> tuple[DqnState, EpochInfo]:
-    """A whole training; `vmap` over `key` for several seeds, over `modality` for several agents.
+    """Trains one agent; `vmap` over `key` for several seeds, over `modality` for several agents.
 
     Args:
       key: random key.
@@ -151,16 +151,16 @@ def train_chunk(
     state: DqnState,
     prepared: MapState,
 ) -> tuple[DqnState, EpochInfo]:
-    """`config.chunk` epochs.
+    """Trains for `config.chunk` epochs.
 
     Args:
       key: random key.
       mdp: the MDP.
       modality: index of the agent's own sensor, see `belief_mdp.step`.
       config: the settings.
-      state: the present state.
-      prepared: `[num_starts]` from `starts`. Each environment has a share of them, and every
-        episode starts from a random one of the share.
+      state: the current state.
+      prepared: `[num_starts]` from `starts`. Each environment has a share of them, and starts every
+        episode from a random one of its share.
 
     Returns:
       The next state and the `[chunk]` infos.
@@ -173,7 +173,7 @@ def train_chunk(
 
 
 def _draw(key: Key, mdp: MapMdp, config: DqnConfig) -> _Draws:
-    """`[chunk]` of random numbers: drawn in one go, they cost a small part of what they would."""
+    """Random numbers of `[chunk]` epochs."""
     env_key, step_key, replay_key = jax.random.split(key, 3)
     shape, blocks = (config.chunk, config.num_envs), config.batch // config.block
     coin, action, start = jax.random.uniform(env_key, (3, *shape))
@@ -199,30 +199,20 @@ def _epoch(
         config.epsilon_min, config.epsilon_start * config.epsilon_decay**state.epoch
     )
     started = _restart(draws.start, state.envs, shares, state.needs_start)
-    observations = jax.vmap(belief_mdp.observation, out_axes=-1)
-    s_tm1 = observations(started.belief)
     network = q_network(mdp, config.hidden)
-    values = networks.apply(network, state.params, s_tm1)
-    chex.assert_shape(values, (mdp.num_pois + 1, None))
-    greedy = jnp.argmax(values, axis=0).astype(jnp.int32)
-    a_tm1 = jnp.where(draws.coin < epsilon, draws.action, greedy)
-    envs, outcome = jax.vmap(lambda k, env, a: belief_mdp.step(k, mdp, env, a, modality))(
-        draws.step, started, a_tm1
+    envs, has_ended, transitions, values = _explore(
+        mdp, modality, network, state.params, started, epsilon, draws
     )
-    discount_t = jnp.where(outcome.terminated, 0.0, 1.0)
-    s_t = observations(envs.belief)
-    transitions = Transition(s_tm1, a_tm1, outcome.reward, discount_t, s_t)
     memory = replay.add(state.replay, transitions)
 
-    has_ended = outcome.terminated | outcome.truncated
-    total_reward = state.total_reward + outcome.reward
+    total_reward = state.total_reward + transitions.r_t
     episodes = jnp.sum(has_ended)
     ended_reward = jnp.sum(jnp.where(has_ended, total_reward, 0.0))
 
     params, optimiser, loss = _learn(config, network, state, memory, draws.replay)
     is_copied = (state.epoch + 1) % config.target_period == 0
     target = jax.tree.map(lambda new, old: jnp.where(is_copied, new, old), params, state.target)
-    checked = values, outcome.reward, loss, params
+    checked = values, transitions.r_t, loss, params
     is_finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(checked)]).all()
     info = EpochInfo(
         loss=loss,
@@ -242,6 +232,31 @@ def _epoch(
         epoch=state.epoch + 1,
     )
     return state, info
+
+
+def _explore(
+    mdp: MapMdp,
+    modality: Index,
+    network: MLP,
+    params: Params,
+    started: MapState,
+    epsilon: jax.Array,
+    draws: _Draws,
+) -> tuple[MapState, jax.Array, Transition, jax.Array]:
+    """Next states, which episodes have ended, transitions and `[N + 1, E]` values before them."""
+    observations = jax.vmap(belief_mdp.observation, out_axes=-1)
+    s_tm1 = observations(started.belief)
+    values = networks.apply(network, params, s_tm1)
+    chex.assert_shape(values, (mdp.num_pois + 1, None))
+    greedy = jnp.argmax(values, axis=0).astype(jnp.int32)
+    a_tm1 = jnp.where(draws.coin < epsilon, draws.action, greedy)
+    envs, outcome = jax.vmap(lambda k, env, a: belief_mdp.step(k, mdp, env, a, modality))(
+        draws.step, started, a_tm1
+    )
+    discount_t = jnp.where(outcome.terminated, 0.0, 1.0)
+    s_t = observations(envs.belief)
+    transitions = Transition(s_tm1, a_tm1, outcome.reward, discount_t, s_t)
+    return envs, outcome.terminated | outcome.truncated, transitions, values
 
 
 def _learn(
@@ -278,12 +293,12 @@ def _optimiser(config: DqnConfig) -> optax.GradientTransformation:
         config.epochs * config.updates,
         config.final_learning_rate / config.learning_rate,
     )
-    # As one vector: the network is so small that every array costs more than what is in it.
+    # As one vector: the network is so small that each array costs more than its content.
     return optax.flatten(optax.adam(schedule))
 
 
 def _restart(rows: jax.Array, envs: MapState, shares: MapState, needs_start: jax.Array) -> MapState:
-    """Gives each environment that needs it the start of that row of its share."""
+    """Restarts each environment that needs it from that row of its share."""
 
     def pick(env: jax.Array, share: jax.Array) -> jax.Array:
         mask = needs_start.reshape(-1, *[1] * (env.ndim - 1))

@@ -1,7 +1,7 @@
-"""The map MDP behind the interfaces of other libraries, each an extra of its own.
+"""The map MDP behind the interfaces of other libraries, one extra each.
 
-`jaxsense.interfaces.gymnax`, `.rejax`, `.gymnasium` and `.stable_baselines3` are imported by name,
-so that only the one that is used has to be installed.
+Import `jaxsense.interfaces.gymnax`, `.rejax`, `.gymnasium` or `.stable_baselines3` by name; only
+that library needs to be installed.
 """
 
 from jaxsense.interfaces.common import prepared_starts as prepared_starts

@@ -1,4 +1,4 @@
-"""What all interfaces have in common: the map MDP as one agent meets it."""
+"""The part that all interfaces share: the map MDP of one agent."""
 
 import jax
 
@@ -14,7 +14,7 @@ def check_modality(mdp: MapMdp, modality: int) -> None:
 
 
 def num_actions(mdp: MapMdp) -> int:
-    """A look at each PoI, and NOP."""
+    """Number of actions: a look at each PoI, and NOP."""
     return mdp.num_pois + 1
 
 
@@ -24,23 +24,22 @@ def observation_size(mdp: MapMdp) -> int:
 
 
 def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
-    """`[number]` random states for episodes to start from, compiled.
+    """Random states, `[number]`, for episodes to start from.
 
-    A start takes a look at everything that has been seen in it, which costs several steps; drawn
-    from a few thousand that were prepared once, it costs nothing.
+    A start looks at everything it has seen, which costs several steps; a draw from a few thousand
+    prepared ones costs nothing.
     """
     values.require_number("number", number)
     return jax.jit(lambda key: training.starts(key, mdp, number))(key)
 
 
 def start(key: Key, mdp: MapMdp, starts: MapState | None) -> MapState:
-    """The start of an episode.
+    """Starts an episode.
 
     Args:
       key: random key.
       mdp: the MDP.
-      starts: `[S]` from `prepared_starts`, of which a random one is taken; without, the start is
-        made anew.
+      starts: `[S]` from `prepared_starts`, to pick a random one; by default the start is new.
     """
     if starts is None:
         return belief_mdp.reset(key, mdp)

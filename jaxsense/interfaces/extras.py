@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def extra(name: str) -> Iterator[None]:
-    """Says which extra of jaxsense holds a package whose import fails."""
+    """Names the extra of jaxsense that installs a package whose import fails."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -38,15 +38,15 @@ class MapVectorEnv(VectorEnv):
         starts: MapState | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ):
-        """Makes the environments; `reset` comes before the first step.
+        """Makes the environments; call `reset` before the first step.
 
         Args:
           mdp: the MDP, see `interfaces.map_mdp`.
           modality: index of the agent's own sensor.
           num_envs: how many environments, E.
-          starts: `[S]` from `interfaces.prepared_starts`, of which a random one starts each
-            episode; without, each start is made anew, which costs several steps.
-          autoreset_mode: what follows the end of an episode, as in `gymnasium.vector`.
+          starts: `[S]` from `interfaces.prepared_starts`, to start each episode from a random one;
+            by default each start is new, at the cost of several steps.
+          autoreset_mode: when an ended episode restarts, as in `gymnasium.vector`.
 
         Raises:
           ValueError: if there is no such sensor or mode, or no environment.
@@ -72,11 +72,11 @@ class MapVectorEnv(VectorEnv):
         """Starts new episodes.
 
         Args:
-          seed: of all that is random from here on; without, it goes on as it was.
+          seed: of all random numbers from here on; by default they continue.
           options: `{"reset_mask": [E] bool}` to restart only some of the environments.
 
         Returns:
-          `[E, N * 2D]` float32 observations, and no information.
+          `[E, N * 2D]` float32 observations and an empty dictionary.
         """
         super().reset(seed=seed)
         if seed is not None or self._states is None:
@@ -91,29 +91,23 @@ class MapVectorEnv(VectorEnv):
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One action in each environment.
+        """Takes one action in each environment.
 
         Args:
           actions: `[E]` integers.
 
         Returns:
           `[E, N * 2D]` float32 observations, `[E]` float64 rewards, `[E]` bool terminations and
-          truncations, and, where the mode is `SAME_STEP`, the last observation of each episode that
-          has ended as `final_obs`.
+          truncations, and, in mode `SAME_STEP`, the last observation of each ended episode as
+          `final_obs`.
 
         Raises:
           ResetNeeded: before the first reset; in mode `DISABLED`, if an episode has ended.
           ValueError: if there is no such action.
         """
-        if self._states is None:
-            raise error.ResetNeeded("step before reset")
-        mode, ended = self.metadata["autoreset_mode"], self._ended
-        if mode is AutoresetMode.DISABLED and ended.any():
-            raise error.ResetNeeded(f"environments {np.flatnonzero(ended)} have ended")
         actions = np.asarray(actions)
-        is_whole = np.issubdtype(actions.dtype, np.integer)
-        if not (is_whole and self.action_space.contains(actions)):
-            raise ValueError(f"actions = {actions!r}: must be in {self.action_space}")
+        self._check_step(actions)
+        mode, ended = self.metadata["autoreset_mode"], self._ended
         self._key, observations, self._states, outcome = self._step(
             self._key, self._states, actions.astype(np.int32)
         )
@@ -128,24 +122,33 @@ class MapVectorEnv(VectorEnv):
             truncations &= ~ended
         self._ended = terminations | truncations
         if mode is AutoresetMode.SAME_STEP and self._ended.any():
-            ended = self._ended
-            final = np.full(self.num_envs, None, object)
-            for i in np.flatnonzero(ended):
-                final[i] = observations[i]
-            infos = {
-                "final_obs": final,
-                "_final_obs": ended,
-                "final_info": {},
-                "_final_info": ended,
-            }
-            observations = self._restarted(ended)
+            infos = _final(observations, self._ended)
+            observations = self._restarted(self._ended)
         return observations, rewards, terminations, truncations, infos
 
+    def _check_step(self, actions: np.ndarray) -> None:
+        """Raises what `step` raises."""
+        if self._states is None:
+            raise error.ResetNeeded("step before reset")
+        if self.metadata["autoreset_mode"] is AutoresetMode.DISABLED and self._ended.any():
+            raise error.ResetNeeded(f"environments {np.flatnonzero(self._ended)} have ended")
+        is_whole = np.issubdtype(actions.dtype, np.integer)
+        if not (is_whole and self.action_space.contains(actions)):
+            raise ValueError(f"actions = {actions!r}: must be in {self.action_space}")
+
     def _restarted(self, mask: np.ndarray) -> np.ndarray:
-        """The observations after new starts where the mask is True."""
+        """Observations after new starts where the mask is True."""
         self._key, observations, self._states = self._start(self._key, self._states, mask)
         self._ended = self._ended & ~mask
         return np.array(observations)
+
+
+def _final(observations: np.ndarray, ended: np.ndarray) -> dict[str, Any]:
+    """Gymnasium's information about `[E]` bool `ended` episodes."""
+    final = np.full(len(ended), None, object)
+    for i in np.flatnonzero(ended):
+        final[i] = observations[i]
+    return {"final_obs": final, "_final_obs": ended, "final_info": {}, "_final_info": ended}
 
 
 def _step(

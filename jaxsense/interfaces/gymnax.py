@@ -32,12 +32,12 @@ class MapEnvState(environment.EnvState):
 
 @struct.dataclass
 class MapEnvParams(environment.EnvParams):
-    """What an environment is given in each call.
+    """Parameters of an environment.
 
     Attributes:
       max_steps_in_episode: actions after which an episode is truncated.
-      starts: `[S]` from `interfaces.prepared_starts`, of which a random one starts each episode;
-        None to make each start anew. gymnax makes one in every step, so that this is slow.
+      starts: `[S]` from `interfaces.prepared_starts`, to start each episode from a random one; None
+        for new starts, which are slow: gymnax makes one in every step.
     """
 
     max_steps_in_episode: int = 20
@@ -52,7 +52,11 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     """
 
     def __init__(self, mdp: MapMdp, modality: int):
-        """Takes the MDP, see `interfaces.map_mdp`, and the index of the agent's own sensor.
+        """Makes the environment.
+
+        Args:
+          mdp: the MDP, see `interfaces.map_mdp`.
+          modality: index of the agent's own sensor.
 
         Raises:
           ValueError: if there is no such sensor.
@@ -63,16 +67,16 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
 
     @property
     def default_params(self) -> MapEnvParams:
-        """With the episode length of the MDP, and a new start for each episode."""
+        """Parameters with the MDP's episode length and a new start for each episode."""
         return MapEnvParams(max_steps_in_episode=self.mdp.config.max_steps)
 
     def prepared_params(self, key: Key, number: int) -> MapEnvParams:
-        """The default with `number` prepared starts, which make training many times faster."""
+        """Default parameters with `number` prepared starts, which make training far faster."""
         starts = common.prepared_starts(key, self.mdp, number)
         return self.default_params.replace(starts=starts)  # pyright: ignore
 
     def reset_env(self, key: Key, params: MapEnvParams) -> tuple[jax.Array, MapEnvState]:
-        """A random start."""
+        """Starts an episode."""
         start = common.start(key, self.mdp, params.starts)
         state = MapEnvState(time=start.steps, map=start, terminated=jnp.bool_(False))  # pyright: ignore
         return self.observe(key, state, None, params), state
@@ -80,7 +84,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     def step_env(
         self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams
     ) -> tuple[jax.Array, MapEnvState, jax.Array, jax.Array, dict[Any, Any]]:
-        """One action, without a reset."""
+        """Takes one action, without a reset."""
         action = jnp.asarray(action, jnp.int32)
         after, outcome = belief_mdp.step(key, self.mdp, state.map, action, self.modality)
         state = MapEnvState(time=after.steps, map=after, terminated=outcome.terminated)  # pyright: ignore
@@ -89,35 +93,35 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         return observation, state, outcome.reward, outcome.terminated, info
 
     def observe(self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams) -> jax.Array:
-        """`[N * 2D]` the map."""
+        """The map, `[N * 2D]`."""
         del key, action, params
         return belief_mdp.observation(state.map.belief)
 
     def is_terminated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
-        """`[]` bool, the last action was NOP."""
+        """Whether the last action was NOP, `[]` bool."""
         del params
         return state.terminated
 
     def is_truncated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
-        """`[]` bool, the episode was too long and did not end by itself."""
+        """Whether the episode reached its limit without NOP, `[]` bool."""
         return ~state.terminated & (state.time >= params.max_steps_in_episode)
 
     @property
     def name(self) -> str:
-        """Of the environment."""
+        """Name of the environment."""
         return "jaxsense-Map"
 
     @property
     def num_actions(self) -> int:
-        """A look at each PoI, and NOP."""
+        """Number of actions: a look at each PoI, and NOP."""
         return common.num_actions(self.mdp)
 
     def action_space(self, params: MapEnvParams | None = None) -> spaces.Discrete:
-        """A look at each PoI, and NOP."""
+        """Space of the actions: a look at each PoI, and NOP."""
         del params
         return spaces.Discrete(self.num_actions)
 
     def observation_space(self, params: MapEnvParams | None = None) -> spaces.Box:
-        """The map."""
+        """Space of the map."""
         del params
         return spaces.Box(-jnp.inf, jnp.inf, (common.observation_size(self.mdp),), jnp.float32)

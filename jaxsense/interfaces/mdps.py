@@ -1,4 +1,4 @@
-"""The map MDP of a run's models."""
+"""The map MDP built from a run's models."""
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +15,13 @@ from jaxsense.vae import detectors
 
 
 def map_mdp(config: Config, models: Models, bank: Bank | None = None) -> MapMdp:
-    """The map MDP with the detectors and the JMVAE of a run.
+    """Builds the map MDP from the detectors and the JMVAE of a run.
 
     Args:
       config: the settings.
       models: from `jaxsense.load`, or `jaxsense.init`.
-      bank: stored detections to draw from, for example from `detections`; without, every look casts
-        a scan in the environment's own arena.
+      bank: stored detections to draw from, for example from `detections`; by default every look
+        casts a scan in the environment's own arena.
     """
     shape = make_jmvae(config)
     if bank is not None:
@@ -31,7 +31,7 @@ def map_mdp(config: Config, models: Models, bank: Bank | None = None) -> MapMdp:
 
 
 def detections(key: Key, config: Config, models: Models, samples: int) -> Bank:
-    """What the detectors make of simulated looks at every class: a bank for `map_mdp`.
+    """Detections in simulated looks at every class: a bank for `map_mdp`.
 
     Args:
       key: random key.

@@ -1,4 +1,4 @@
-"""What a robot needs of a run, as functions of one example that know nothing of the run."""
+"""Functions of one example that a robot needs of a run, independent of the run."""
 
 import dataclasses
 from collections.abc import Callable
@@ -22,7 +22,7 @@ class Function:
     """A function of one example.
 
     Attributes:
-      about: what it gives, in one line.
+      about: its result, in one line.
       inputs: shape and dtype of each input, by its name.
       apply: `(*inputs) -> {name: output}`.
     """
@@ -35,9 +35,8 @@ class Function:
 def functions(config: Config, models: Models) -> dict[str, Function]:
     """All functions, by name.
 
-    For each modality M there are `window_M`, `detect_M`, `write_M` and `decide_M`; for each set of
-    modalities that the JMVAE has an encoder for, an `encode_M`, for example `encode_camera+lidar`;
-    and there is `classify`.
+    For each modality M `window_M`, `detect_M`, `write_M` and `decide_M`; for each encoder of the
+    JMVAE an `encode_M`, for example `encode_camera+lidar`; and `classify`.
     """
     model = make_jmvae(config)
     found = {}

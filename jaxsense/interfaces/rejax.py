@@ -12,9 +12,9 @@ with extra("rejax"):
 
 
 class MapEnv(gymnax.MapEnv):
-    """The environment of gymnax 1.x, whose step gives five values as before gymnax 1.0.
+    """The environment of gymnax 1.x, whose step returns five values as before gymnax 1.0.
 
-    rejax 0.1.3 takes a truncated episode for one that has ended, and learns so.
+    rejax 0.1.3 treats a truncated episode as terminated when it learns.
     """
 
     def step(  # pyright: ignore
@@ -24,7 +24,7 @@ class MapEnv(gymnax.MapEnv):
         action: Any,
         params: gymnax.MapEnvParams | None = None,
     ) -> tuple[jax.Array, gymnax.MapEnvState, jax.Array, jax.Array, dict[Any, Any]]:
-        """Observation, state, reward, whether the episode has ended, and info."""
+        """Returns observation, state, reward, whether the episode has ended, and info."""
         result = super().step(key, state, action, params)
         observation, state, reward, terminated, truncated, info = result
         return observation, state, reward, terminated | truncated, info

@@ -15,15 +15,15 @@ with extra("sb3"):
 
 
 class MapVecEnv(VecEnv):
-    """A vector environment of Gymnasium as Stable-Baselines3 takes it.
+    """A vector environment of Gymnasium in the form that Stable-Baselines3 takes.
 
     `MapVecEnv(MapVectorEnv(mdp, modality, num_envs, autoreset_mode="SameStep"))`. All methods are
-    those of Stable-Baselines3. The environments are one program, and not to be had one by one: what
-    is set is set for all.
+    those of Stable-Baselines3. The environments are one program: attributes and methods apply to
+    all, whatever the indices.
     """
 
     def __init__(self, env: VectorEnv):
-        """Takes an environment whose episodes start again in the step in which they end.
+        """Wraps an environment whose episodes restart in the step in which they end.
 
         Raises:
           ValueError: if they do not.
@@ -36,18 +36,18 @@ class MapVecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Starts new episodes, with the seed that `seed` was given."""
+        """Starts new episodes, with the seed passed to `seed`."""
         observations, _ = self.env.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._reset_options()
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keeps the actions."""
+        """Stores the actions."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Takes the actions that were kept."""
+        """Takes the stored actions."""
         observations, rewards, terminations, truncations, infos = self.env.step(self._actions)
         dones = terminations | truncations
         cuts = truncations & ~terminations
@@ -63,18 +63,18 @@ class MapVecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The attribute of the whole, once for each index."""
+        """Returns the shared attribute once for each index."""
         return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Sets the attribute of the whole."""
+        """Sets the shared attribute."""
         setattr(self.env, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **more: Any) -> list:
-        """Calls the method of the whole, and gives its result once for each index."""
+        """Calls the shared method and returns its result once for each index."""
         result = getattr(self.env, method_name)(*args, **more)
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """No environment is wrapped by itself."""
+        """Returns False for each index: no environment has its own wrapper."""
         return [False for _ in self._get_indices(indices)]

@@ -1,9 +1,9 @@
 """The mission: all robots at once in one MJX arena, in closed loop over one shared map.
 
 Each robot asks its policy which PoI to look at, drives to a viewpoint, turns to the PoI, scans it,
-writes what its detector makes of the scan into the shared map, and asks again, until the policy
-says NOP. Robots decide each at its own time; one whose policy reads the map decides again when the
-map has changed under way. Everything is a pure function of one episode: `vmap` over episodes.
+writes the detection into the shared map, and asks again, until the policy chooses NOP. Each robot
+decides at its own time; one whose policy reads the map decides again when the map changes under
+way. Everything is a pure function of one episode: `vmap` over episodes.
 """
 
 from jaxsense.mission.cases import Case as Case

@@ -1,4 +1,4 @@
-"""Getting to a viewpoint, turning to the PoI, scanning it, and writing the map."""
+"""Driving to a viewpoint, turning to the PoI, scanning it, and writing the map."""
 
 import dataclasses
 
@@ -27,19 +27,19 @@ from jaxsense.sim.world import Scene
 from jaxsense.types import Belief, Index, Key, call, others, pytree
 from jaxsense.vae import detectors, fusion
 
-_PROGRESS = 0.02  # m, by which a way must become shorter to count as progress
-_PATIENCE = 2.0  # s without progress of another robot, after which one that has ended makes room
+_PROGRESS = 0.02  # m, least shortening of a way that counts as progress
+_PATIENCE = 2.0  # s without progress of another robot, then one that has ended makes room
 _NEARBY = 1.0  # m, between their middles
-_TURNS_SLOWLY = 0.35  # rad/s, at which a robot may scan
+_TURNS_SLOWLY = 0.35  # rad/s, fastest turn at which a robot scans
 
 
 def approach(mission: Mission, state: MissionState, robot: Index) -> MissionState:
-    """Drives to the viewpoint, turns to the PoI, and backs off where there is no progress."""
+    """Drives to the viewpoint, turns to the PoI, and backs off without progress."""
     config, own = mission.config, robot_of(state, robot)
     way = _way(mission, state, robot, own)
     time, is_driving = now(mission, state), own.phase == DRIVING
     arrives = is_driving & way.is_there
-    # Another robot has come to stand there or in the view; that is nobody's failure.
+    # Another robot now stands there or in the view, which counts as nobody's failure.
     is_taken = is_driving & ~way.is_there & way.is_taken
     progresses = is_driving & (way.length < own.way_left - _PROGRESS)
     waits = time - own.progress_at
@@ -115,7 +115,7 @@ def _wanted(
     waypoint: jax.Array,
     makes_room: jax.Array,
 ) -> jax.Array:
-    """`[2]` speeds that a robot wants: along its way, away from where it is stuck, or turning."""
+    """Speeds that a robot wants, `[2]`: along its way, backing off, or turning."""
     config, scene, own = mission.config, state.scene, robot_of(state, robot)
     drive = navigation.drive_to(
         config.navigation,
@@ -135,7 +135,7 @@ def _wanted(
 
 
 def _is_in_the_way(mission: Mission, state: MissionState, robot: Index) -> jax.Array:
-    """`[]` bool: a robot nearby drives and makes no progress."""
+    """Whether a robot nearby drives without progress, `[]` bool."""
     robots, poses = state.robots, state.scene.poses
     waits = now(mission, state) - robots.progress_at > _PATIENCE
     is_near = jnp.linalg.norm(poses[:, :2] - poses[robot][None, :2], axis=-1) < _NEARBY
@@ -143,10 +143,10 @@ def _is_in_the_way(mission: Mission, state: MissionState, robot: Index) -> jax.A
 
 
 def _fail(own: Robots, applies: jax.Array, attempts: int) -> tuple[Robots, jax.Array]:
-    """Notes that a viewpoint has failed.
+    """Records the failure of a viewpoint.
 
     Returns:
-      The robot, and `[N]` bool, the target that it gives up after some attempts.
+      The robot, and `[N]` bool, the target if the robot gives it up.
     """
     failures = own.attempts + applies
     gives_up = applies & (failures >= attempts)
@@ -160,12 +160,12 @@ def _fail(own: Robots, applies: jax.Array, attempts: int) -> tuple[Robots, jax.A
 
 @pytree
 class _Aim:
-    """What a robot is about to scan.
+    """The next scan of a robot.
 
     Attributes:
       scans: `[]` bool, whether it scans at all.
-      poi: `[]` int32 which it faces.
-      bearing: `[]` of the PoI as the robot believes it, in radians.
+      poi: `[]` int32 PoI that it faces.
+      bearing: `[]` believed bearing of the PoI, in radians.
       distance: `[]` of the PoI, in metres.
       noise_key: random key of the sensor's noise.
     """
@@ -180,7 +180,7 @@ class _Aim:
 def scan(
     keys: Key, mission: Mission, models: Models, states: MissionState, robot: Index
 ) -> MissionState:
-    """Takes a scan of the PoI that a robot faces, and writes what it shows into the map.
+    """Scans the PoI that a robot faces, and writes the detection into the map.
 
     Args:
       keys: `[B]` random keys.
@@ -213,7 +213,7 @@ def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
     bearing = _bearing(scene, robot, poi)
     is_aligned = jnp.abs(bearing) <= jnp.radians(config.navigation.goal_angle)
     is_calm = jnp.abs(robots.command[robot, 1]) <= _TURNS_SLOWLY
-    # A robot that drives through the view is waited for, but not for long.
+    # It waits for a robot that drives through the view, but not for long.
     place = scene.poses[robot, :2]
     standing = others(scene.poses[:, :2], robot)
     room = viewpoints.free_room(
@@ -234,7 +234,7 @@ def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
 def _look(
     mission: Mission, models: Models, state: MissionState, aim: _Aim, robot: int
 ) -> tuple[jax.Array, Belief]:
-    """`[]` bool whether the PoI is seen, and the entry that the map would get."""
+    """Whether the PoI is seen, `[]` bool, and the map's new entry if it is."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[robot]
     data = arenas.place(world.arena, scene.layout, scene.poses)
     readings = worlds.scan_around(aim.noise_key, world, scene, data, robot, aim.bearing)
@@ -256,7 +256,7 @@ def _write(
     entry: Belief,
     robot: Index,
 ) -> MissionState:
-    """Notes a scan, and writes the entry into the map if the PoI was seen."""
+    """Records a scan, and writes the entry into the map if the PoI was seen."""
     poi, detects = aim.poi, aim.scans & is_seen
     own = robot_of(state, robot)
     failed, gives_up = _fail(own, aim.scans & ~detects, mission.config.mission.attempts)
@@ -283,5 +283,5 @@ def _write(
 
 
 def _bearing(scene: Scene, robot: Index, poi: jax.Array) -> jax.Array:
-    """`[]` angle from a robot's heading to a PoI, in radians within -pi and pi."""
+    """Angle from a robot's heading to a PoI, `[]` radians within -pi and pi."""
     return viewpoints.bearing(scene.poses[robot], scene.layout.position[poi])

@@ -1,4 +1,4 @@
-"""What missions are played with: policies, and robots that fail."""
+"""Cases to play missions with: policies, and robots that fail."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ FAULT_TIME = 6.0  # s
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """Something to play missions with.
+    """A policy and faults to play missions with.
 
     Attributes:
       policy: index into `POLICIES`.
@@ -24,11 +24,11 @@ class Case:
 
 
 def cases(config: Config) -> dict[str, Case]:
-    """The policies, each robot alone, and each robot failing in mid-mission.
+    """Lists the policies, each robot alone, and each robot failing in mid-mission.
 
-    `latent`, `naive` and `random` are the policies; `MODALITY_alone` has all other robots stand
+    `latent`, `naive` and `random` are the policies; in `MODALITY_alone` all other robots stand
     still from the start; in `MODALITY_stops` and `MODALITY_blind` the robot stops or its sensor
-    goes blind after 6 s. Failures are played with the latent policy.
+    goes blind after 6 s. Cases with faults use the latent policy.
     """
     healthy = no_faults(config)
     found = {name: Case(policy, healthy) for policy, name in enumerate(POLICIES)}

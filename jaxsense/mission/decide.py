@@ -1,4 +1,4 @@
-"""Which PoI a robot looks at next, and from where."""
+"""Choosing the PoI that a robot looks at next, and the viewpoint."""
 
 import dataclasses
 
@@ -26,14 +26,14 @@ from jaxsense.networks import MLP
 from jaxsense.sim import roadmap, viewpoints
 from jaxsense.types import Belief, Index, Key, others
 
-_KEPT, _HEADED_FOR = -1e4, 1e2  # m, in place of a distance: more than any that there is
-_DETOUR = 2.0  # m, that a robot would go to avoid a viewpoint on which another robot stands
+_KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
+_DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
 
 
 def decide(
     key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> MissionState:
-    """Asks the policy where one is due, and sets out for a viewpoint of what it says."""
+    """Asks the policy if a decision is due, and sets out for a viewpoint of the PoI."""
     own, config = robot_of(state, robot), mission.config
     is_idle = own.phase == IDLE
     is_under_way = (own.phase == DRIVING) | (own.phase == FACING)
@@ -43,14 +43,14 @@ def decide(
     is_new = action != own.target
     sets_out = decides & (is_idle | is_new) & (action < config.arena.num_pois)
 
-    # What is known of failures belongs to one target.
+    # Failures belong to one target.
     excluded = jnp.where(is_new, False, own.excluded)
     view, length, excluded = _best_view(mission, state, robot, action, excluded)
     has_way = jnp.isfinite(length)
     sets_out_now, gives_up = sets_out & has_way, sets_out & ~has_way
     poi = jnp.minimum(action, config.arena.num_pois - 1)
     ends = decides & (action == config.arena.num_pois)
-    # A look from where the robot stands is no goal; a PoI that there is no way to is one missed.
+    # A look from the current place is no goal; a PoI without a way to it is a missed one.
     num_views = state.roadmap.viewpoints.shape[1]
     is_goal = (sets_out_now & (view < num_views)) | gives_up
     was_needless = decides & is_new & (own.phase == DRIVING) & (own.view < num_views)
@@ -73,7 +73,7 @@ def decide(
 def _choose(
     key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> jax.Array:
-    """`[]` int32, the PoI that a robot's policy says, or N for NOP."""
+    """PoI that a robot's policy chooses, `[]` int32, or N for NOP."""
     config, robots = mission.config, state.robots
     num_pois = config.arena.num_pois
     given_up = robots.unreachable[robot] | robots.undetected[robot]
@@ -81,14 +81,14 @@ def _choose(
     q_network = jax.tree.map(lambda *x: jnp.stack(x)[robot], *models.q_networks)
 
     def values_if(sure: Belief) -> jax.Array:
-        """What the network says if all that is given up were known to be of one class."""
+        """The network's values as if all PoIs given up were known to be of one class."""
         known = jax.tree.map(
             lambda entry, sure: jnp.where(given_up[:, None], sure[None], entry), state.belief, sure
         )
         return networks.apply(network, q_network, belief_mdp.observation(known))
 
-    # As it is, an entry that was given up would let the network count on what is left to learn of
-    # it. Of one that is known nothing is; since nobody can tell its class, each counts alike.
+    # The network would count on learning more about a PoI given up. Of a known one nothing is left
+    # to learn; since its class is unknown, all classes count alike.
     q = jnp.mean(jax.vmap(values_if)(models.class_beliefs), axis=0)
     naive = jnp.append(jnp.where(state.seen[:, robot], -1.0, 1.0), 0.0)
     random = jax.nn.one_hot(jax.random.randint(key, (), 0, num_pois + 1), num_pois + 1)
@@ -103,7 +103,7 @@ def _choose(
     is_kept = jnp.arange(num_pois) == robots.target[robot]
     targets = others(robots.target, robot)
     is_others = jnp.any(jnp.arange(num_pois)[:, None] == targets[None], axis=-1)
-    # A PoI that the robot is heading for already, then one that no other heads for, then distance.
+    # First the PoI that the robot heads for already, then those no other heads for, then distance.
     rank = distance + _KEPT * is_kept + _HEADED_FOR * (is_others & is_latent)
     poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
     return jnp.where(jnp.any(is_best), poi, num_pois)
@@ -112,11 +112,11 @@ def _choose(
 def _best_view(
     mission: Mission, state: MissionState, robot: Index, target: jax.Array, excluded: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The viewpoint of a PoI with the shortest way, V being where the robot stands.
+    """Viewpoint of a PoI with the shortest way, V for the robot's current place.
 
     Returns:
-      The viewpoint, the length of the way, and the `[V + 1]` viewpoints that stay excluded: if all
-      to which there is a way have been, they are tried once more.
+      The viewpoint, the length of the way, and the `[V + 1]` viewpoints that stay excluded: none if
+      all that can be reached have been.
     """
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
@@ -136,7 +136,7 @@ def _best_view(
 
 
 def sees(mission: Mission, state: MissionState, robot: Index, poi: jax.Array) -> jax.Array:
-    """`[]` bool: from where a robot stands, a PoI is in range and nothing that stands covers it."""
+    """Whether a PoI is in range of a robot and nothing standing covers it, `[]` bool."""
     config, place = mission.config, state.scene.poses[robot, :2]
     layout, standing = state.scene.layout, standing_robots(state, robot)
     distance = jnp.linalg.norm(layout.position[poi] - place)
@@ -147,12 +147,12 @@ def sees(mission: Mission, state: MissionState, robot: Index, poi: jax.Array) ->
 
 
 def standing_robots(state: MissionState, robot: Index) -> jax.Array:
-    """`[R - 1, 2]` where the other robots stand; those that drive will be elsewhere: far away."""
+    """Places of the other robots, `[R - 1, 2]`; far away for moving ones, which will be gone."""
     phase = others(state.robots.phase, robot)
     drives = (phase == DRIVING) | (phase == BACKING)
     return jnp.where(drives[:, None], 1e3, others(state.scene.poses[:, :2], robot))
 
 
 def planning_margin(config: Config) -> float:
-    """Free space around a robot's body that planning asks for, in metres."""
+    """Free space around a robot's body in planning, in metres."""
     return config.navigation.robot_radius - ROBOT_RADIUS

@@ -18,7 +18,7 @@ from jaxsense.types import pytree
 
 @pytree
 class _Motion:
-    """What the physics carries, for each of B missions.
+    """State of the physics of B missions.
 
     Attributes:
       poses: `[B, R, 3]`.
@@ -36,15 +36,15 @@ class _Motion:
 
 
 def move(mission: Mission, states: MissionState) -> tuple[MissionState, jax.Array]:
-    """One control period of physics, for missions side by side.
+    """Simulates one control period of missions side by side.
 
-    Contacts cost several times as much as all the rest, and the planner sees to it that there are
-    none. As long as no robot of any mission is near enough to anything to touch it within the
-    period, the robots are integrated in an empty arena, which gives the same motion.
+    Contacts cost several times as much as everything else, and the planner avoids them. While no
+    robot of any mission can touch anything within the period, the robots move in an empty arena,
+    which results in the same motion.
 
     Args:
       mission: the mission.
-      states: `[B]` present states. Under a `vmap` contacts are always computed.
+      states: `[B]` current states. Under a `vmap` contacts are always computed.
 
     Returns:
       The `[B]` next states, and `[B]` the smallest free distance around any robot in the period, in
@@ -54,7 +54,7 @@ def move(mission: Mission, states: MissionState) -> tuple[MissionState, jax.Arra
     poses = states.scene.poses
     far = jnp.full(poses.shape[0], jnp.inf)
     motion = _Motion(poses, states.velocity, states.warmstart, robots.command, far)
-    # Two robots that drive at each other, and a margin for what the wheels lag behind.
+    # For two robots that drive at each other, with a margin for the lag of the wheels.
     reach = 2 * amiro.MAX_SPEED * config.mission.control_period + 0.005
     is_near = jnp.any(_clearance(config.arena, layout, poses) < reach)
 
@@ -77,7 +77,7 @@ def move(mission: Mission, states: MissionState) -> tuple[MissionState, jax.Arra
 
 
 def _clearance(config: ArenaConfig, layout: Layout, poses: jax.Array) -> jax.Array:
-    """`[B]` the smallest free distance around any robot, in metres."""
+    """Smallest free distance around any robot, `[B]` metres."""
     around = jax.vmap(lambda layout, poses: navigation.clearance(config, layout, poses))
     return jnp.min(around(layout, poses), axis=-1)
 
@@ -85,7 +85,7 @@ def _clearance(config: ArenaConfig, layout: Layout, poses: jax.Array) -> jax.Arr
 def _integrate(
     mission: Mission, arena: Arena, motion: _Motion, wanted: jax.Array, layout: Layout
 ) -> _Motion:
-    """Physics steps, in each of which the commands go on towards the wanted ones."""
+    """Makes the physics steps, in each of which commands approach the wanted ones."""
     is_empty = not np.any(arena.poi_of_geom >= 0)
 
     def place_pois(layout: Layout, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -95,7 +95,7 @@ def _integrate(
     placed = jax.vmap(place_pois)(layout, motion.poses)
 
     def step(motion: _Motion, wanted: jax.Array, placed: tuple[jax.Array, jax.Array]) -> _Motion:
-        """One step of one mission."""
+        """Makes one step of one mission."""
         command = navigation.ramp(motion.command, wanted, arenas.TIMESTEP)
         data: mjx.Data = arena.data.replace(
             mocap_pos=placed[0],

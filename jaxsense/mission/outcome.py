@@ -1,4 +1,4 @@
-"""How a mission has ended and what it has achieved."""
+"""Ends and results of missions."""
 
 from typing import Any
 
@@ -21,13 +21,13 @@ REASONS = (
     "robot failed",
     "no robot left",
 )
-"""How a mission has ended. `unreachable`: a robot gave up a PoI to which it found no way or did not
-get; `undetected`: one gave up a PoI after looks that showed nothing; `robot failed`: the others
-finished. The index is the reason's code."""
+"""Ends of a mission. `unreachable`: a robot gave up a PoI without getting there; `undetected`: it
+gave up one after looks that showed nothing; `robot failed`: the others finished. The index is the
+reason's code."""
 
 
 def reason(state: MissionState) -> jax.Array:
-    """`[]` int32 index into `REASONS`."""
+    """Reason of a mission's end, `[]` int32 index into `REASONS`."""
     robots = state.robots
     working = robots.phase != FAILED
     ends = [
@@ -45,15 +45,15 @@ def reason(state: MissionState) -> jax.Array:
 
 
 def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, Any]:
-    """What a mission has achieved.
+    """Measures the results of a mission.
 
     Returns:
-      `classes`, the true ones, `seen`, whether the PoI is in the map, `is_right`, whether the map's
-      most likely class is the true one, and `ambiguous`, whether the map leaves more than one open,
-      `[N]` each, PoIs that nobody has seen being neither; `told`, for each modality `[]`
-      the share of the map that is right in what the sensor can tell; `observations_per_poi`;
-      `time_s`; `collisions`, control periods with contact; `goals` and `goals_reached`;
-      `information`, the sum over the map; `detections` `[R]`; and `reason`.
+      `[N]` each, `classes`, the true ones, `seen`, whether the PoI is in the map, `is_right`,
+      whether the map's most likely class is true, and `ambiguous`, whether the map leaves more than
+      one open (unseen PoIs are neither); `told`, for each modality `[]` the share of PoIs whose
+      label the map has right; `observations_per_poi`; `time_s`; `collisions`, control periods with
+      contact; `goals` and `goals_reached`; `information`, the sum over the map; `detections` `[R]`;
+      and `reason`.
     """
     config = mission.config
     nearest = jax.vmap(lambda b: metrics.nearest_class(b, models.class_beliefs.mean))(state.belief)
@@ -85,7 +85,7 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
 
 
 def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any]:
-    """One case's block of `summary.json`.
+    """Summarises one case for `summary.json`.
 
     Args:
       config: all settings.
@@ -93,9 +93,9 @@ def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any
       found: `[E, ...]` from `Player.play`.
 
     Returns:
-      Means over the missions, but for `time_s`, which is the median, and `collisions`, the sum.
-      For a robot alone also `told`, the accuracy of what its sensor can tell apart, and
-      `ambiguous_reported`, how many of the PoIs it cannot tell apart the map shows as ambiguous.
+      Means over the missions, except the median of `time_s` and the sum of `collisions`. For a
+      robot alone also `told`, the accuracy of its sensor's labels, and `ambiguous_reported`, the
+      share of the PoIs it cannot tell apart that the map shows as ambiguous.
     """
     block: dict[str, Any] = {
         "accuracy": float(found["is_right"].mean()),
@@ -123,20 +123,20 @@ def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any
 
 
 def _share(part: Any, whole: Any) -> float | None:
-    """A share; None of nothing."""
+    """Share of a whole; None if that is 0."""
     return float(part / whole) if whole else None
 
 
 def bytes_per_detection(mission: Mission, detections: np.ndarray) -> dict[str, float]:
-    """What a detection puts on the network, in bytes.
+    """Network traffic of a detection, in bytes.
 
     Args:
       mission: the mission.
-      detections: `[R]` how many of each robot.
+      detections: `[R]` number of each robot's detections.
 
     Returns:
-      `latent`, the size of an entry of the map, and `raw`, the mean size of the scans that the
-      detections were made of; of the sensors' scans if there were none.
+      `latent`, the size of an entry of the map, and `raw`, the mean size of the detections' scans;
+      without detections the mean over the sensors.
     """
     detections = np.maximum(detections, 0 if np.any(detections) else 1)
     scans = np.array([sensor.scan_bytes for sensor in mission.world.sensors])

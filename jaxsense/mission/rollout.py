@@ -25,14 +25,14 @@ from jaxsense.types import Key
 def rollout(
     key: Key, mission: Mission, models: Models, state: MissionState, steps: int
 ) -> tuple[MissionState, Record]:
-    """Some control periods of a mission, as one `lax.scan`.
+    """Runs some control periods of a mission as one `lax.scan`.
 
     Args:
       key: random key.
       mission: the mission.
       models: trained networks.
-      state: where to begin.
-      steps: how many control periods; static. A mission that is over stays as it is.
+      state: the first state.
+      steps: how many control periods; static. A mission that is over no longer changes.
 
     Returns:
       The state after the last one, and the `[steps]` records.
@@ -51,16 +51,16 @@ def rollout(
 def rollout_batch(
     keys: Key, mission: Mission, models: Models, states: MissionState, steps: int, every: int
 ) -> tuple[MissionState, Record]:
-    """`rollout` of missions side by side, of which only some are recorded.
+    """Runs missions side by side and records some of them.
 
     Args:
-      keys: `[B]` random keys; each mission goes as `rollout` would with its key.
+      keys: `[B]` random keys; each mission runs as in `rollout` with its key.
       mission: the mission.
       models: trained networks.
-      states: `[B]` where to begin.
+      states: `[B]` first states.
       steps: how many control periods; static.
-      every: the first of so many missions is recorded, and again of so many; divides B. With as
-        many as a device plays, each device records one and none waits for another's.
+      every: records the first of each group of this size; divides B. With one group per device,
+        no device waits for another's record.
 
     Returns:
       The `[B]` states after the last one, and `[B / every, steps]` records.
@@ -78,15 +78,15 @@ def rollout_batch(
 def step(
     keys: Key, mission: Mission, models: Models, states: MissionState
 ) -> tuple[MissionState, Record]:
-    """One control period of `[B]` missions side by side.
+    """Runs one control period of `[B]` missions side by side.
 
-    In each, all robots look, decide and set their speeds, then all move.
+    In each, all robots decide, set their speeds and look, then all move.
     """
     before = states
     looks = states.robots.looks, states.robots.detections
     num_robots = mission.world.arena.num_robots
     robot_keys = jax.vmap(lambda key: jax.random.split(key, num_robots), out_axes=1)(keys)
-    # One after the other, so that nobody scans what another one has just made certain.
+    # One after the other, so that no robot scans what another has just made certain.
     states, _ = jax.lax.scan(
         lambda states, robot: (_act(robot[1], mission, models, states, robot[0]), None),
         states,
@@ -119,7 +119,7 @@ def step(
 def _act(
     keys: Key, mission: Mission, models: Models, states: MissionState, robot: jax.Array
 ) -> MissionState:
-    """What one robot of each of `[B]` missions does at the beginning of a control period."""
+    """Decides, sets speeds and scans for one robot of each of `[B]` missions."""
 
     def get_there(key: Key, state: MissionState) -> MissionState:
         stops = now(mission, state) >= state.faults.stops_at[robot]

@@ -1,4 +1,4 @@
-"""What a mission is made of, and how it begins."""
+"""State of a mission, and its start."""
 
 import dataclasses
 
@@ -24,15 +24,15 @@ any PoI, or ends. The index is the policy's code."""
 LATENT, NAIVE, RANDOM = range(3)
 
 IDLE, DRIVING, FACING, BACKING, ENDED, FAILED = range(6)
-"""What a robot is doing: asking its policy, driving to a viewpoint, turning to a PoI and scanning
-it, backing off after it got stuck, nothing more (NOP), or nothing because it has failed."""
+"""Phases of a robot: asking its policy, driving to a viewpoint, turning to a PoI and scanning it,
+backing off when stuck, ended by NOP, or failed."""
 
 _FREE_DRAWS = 32
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mission:
-    """What is the same for all missions of a configuration. Static under `jit`.
+    """The parts that all missions of a configuration share. Static under `jit`.
 
     Attributes:
       world: the simulation, with contacts or without.
@@ -53,8 +53,8 @@ class Faults:
     """When robots fail, in seconds from the start; infinite for never.
 
     Attributes:
-      stops_at: `[R]` the robot stops for good and does nothing any more.
-      blind_at: `[R]` its sensor reads nothing any more; the robot does not know.
+      stops_at: `[R]` when the robot stops for good.
+      blind_at: `[R]` when its sensor goes blind, unknown to the robot.
     """
 
     stops_at: jax.Array
@@ -63,28 +63,27 @@ class Faults:
 
 @pytree
 class Robots:
-    """What the robots are up to, `[R]` each unless said otherwise.
+    """State of the robots, `[R]` each unless another shape is listed.
 
     Attributes:
       phase: int32, one of IDLE to FAILED.
       target: int32 PoI, or N for none.
-      view: int32 viewpoint of the target, or V for the place where the robot stands.
-      command: `[R, 2]` speeds that the wheels are driven at, see `navigation`.
-      wanted: `[R, 2]` speeds that they are to reach.
-      decided_on: int32 version of the map that the last decision was made on.
+      view: int32 viewpoint of the target, or V for the robot's current place.
+      command: `[R, 2]` current speeds, see `navigation`.
+      wanted: `[R, 2]` target speeds.
+      decided_on: int32 version of the map at the last decision.
       excluded: `[R, V + 1]` bool viewpoints of the target that have failed.
       attempts: int32 failures at the target.
-      way_left: length in metres of the way that was left when there was progress.
-      progress_at: seconds, when that was.
+      way_left: metres left of the way at the last progress.
+      progress_at: seconds, time of the last progress.
       backs_off_until: seconds.
-      unreachable: `[R, N]` bool, PoIs given up because there was no way, or after the robot got
-        stuck on its last attempt.
-      undetected: `[R, N]` bool, PoIs given up because the last attempt's look showed nothing.
-      goals: int32 viewpoints set out for, and PoIs given up because there was no way; without
-        goals that a new decision made needless or that another robot came to stand on.
+      unreachable: `[R, N]` bool, PoIs given up without a way, or stuck on the last attempt.
+      undetected: `[R, N]` bool, PoIs given up after a last look that showed nothing.
+      goals: int32 viewpoints set out for and PoIs given up without a way, less the goals that a new
+        decision made needless or another robot occupied.
       reached: int32 goals reached.
       looks: int32 scans.
-      detections: int32 scans that were written into the map.
+      detections: int32 scans written into the map.
     """
 
     phase: jax.Array
@@ -112,16 +111,16 @@ class MissionState:
 
     Attributes:
       scene: PoIs, light and the robots' poses.
-      classes: `[N]` int32 true classes, hidden from everybody.
+      classes: `[N]` int32 true classes, hidden from the robots.
       roadmap: ways through the layout.
       faults: which robots will fail.
       policy: `[]` int32 index into `POLICIES`.
-      velocity: `[R, 3]` of the poses.
+      velocity: `[R, 3]` time derivative of the poses.
       warmstart: `[3 R]` MJX's last accelerations.
       belief: `[N, D]` the shared map.
       seen: `[N, R]` bool, which robots have written which PoI.
       version: `[]` int32, writes into the map so far.
-      robots: what they are up to.
+      robots: their state.
       steps: `[]` int32 control periods so far.
       contacts: `[]` int32 control periods in which a robot touched something.
       least_clearance: `[]` smallest free distance around any robot so far, in metres.
@@ -147,7 +146,7 @@ class MissionState:
 
 @pytree
 class Record:
-    """What is kept of one control period, for plots and tests.
+    """Record of one control period, for plots and tests.
 
     Attributes:
       time: `[]` seconds from the start, at its end.
@@ -157,7 +156,7 @@ class Record:
       phase: `[R]`.
       target: `[R]`.
       scanned: `[R]` bool, the robot took a scan.
-      detected: `[R]` bool, and it was written into the map.
+      detected: `[R]` bool, the scan was written into the map.
       belief: `[N, D]` the map.
       seen: `[N, R]` bool.
       clearance: `[]` smallest free distance around any robot in it, in metres.
@@ -177,7 +176,7 @@ class Record:
 
 
 def make_mission(config: Config, *, contacts: bool = True) -> Mission:
-    """Compiles the arena of a mission, with contacts unless told otherwise."""
+    """Compiles the arena of a mission, by default with contacts."""
     carries_lidar = tuple(modality == "lidar" for modality in config.modalities)
     free = arenas.build(config.arena, carries_lidar, obstacles=False)
     return Mission(worlds.make_world(config, contacts=contacts), free)
@@ -201,14 +200,14 @@ def reset(
     faults: Faults | None = None,
     classes: jax.Array | None = None,
 ) -> MissionState:
-    """A random arena before anybody has looked at anything.
+    """Starts a mission in a random arena with an empty map.
 
     Args:
-      key: random key; the same key gives the same arena for every policy and all faults.
+      key: random key, which alone determines the arena.
       mission: the mission.
       policy: `[]` int32 index into `POLICIES`.
-      faults: which robots will fail; none if not given.
-      classes: `[N]` int32 classes of the PoIs; drawn independently if not given.
+      faults: which robots will fail; none by default.
+      classes: `[N]` int32 classes of the PoIs; independent by default.
 
     Returns:
       The state. Robots stand at random places with room around them.
@@ -234,42 +233,16 @@ def start(
     faults: Faults,
     ways: Roadmap | None = None,
 ) -> MissionState:
-    """A given arena before anybody has looked at anything; see `reset` for the arguments."""
+    """Starts a mission in a given arena with an empty map; see `reset` for the arguments."""
     config = mission.config
     num_robots, num_pois = len(config.modalities), config.arena.num_pois
     chex.assert_shape(classes, (num_pois,), custom_message="classes")
     checks.require_index("classes", classes, len(config.arena.classes))
     checks.require_index("policy", policy, len(POLICIES))
     chex.assert_shape(scene.poses, (num_robots, 3), custom_message="scene.poses")
-    for name in ("stops_at", "blind_at"):
-        shape = (num_robots,)
-        times = getattr(faults, name)
-        chex.assert_shape(times, shape, custom_message=f"faults.{name}")
-        is_time = "must be seconds, infinite for never"
-        checks.require(f"faults.{name}", times, lambda x: x >= 0, is_time)
+    _check_faults(faults, num_robots)
     entry = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
     ways = roadmap.build(config, scene.layout) if ways is None else ways
-    number = jnp.zeros(num_robots, jnp.int32)
-    seconds = jnp.zeros(num_robots)
-    robots = Robots(
-        phase=number + IDLE,
-        target=number + num_pois,
-        view=number,
-        command=jnp.zeros((num_robots, 2)),
-        wanted=jnp.zeros((num_robots, 2)),
-        decided_on=number,
-        excluded=jnp.zeros((num_robots, ways.is_free.shape[1] + 1), bool),
-        attempts=number,
-        way_left=seconds,
-        progress_at=seconds,
-        backs_off_until=seconds,
-        unreachable=jnp.zeros((num_robots, num_pois), bool),
-        undetected=jnp.zeros((num_robots, num_pois), bool),
-        goals=number,
-        reached=number,
-        looks=number,
-        detections=number,
-    )
     return MissionState(
         scene=scene,
         classes=classes,
@@ -281,7 +254,7 @@ def start(
         belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), entry),
         seen=jnp.zeros((num_pois, num_robots), bool),
         version=jnp.int32(0),
-        robots=robots,
+        robots=_idle_robots(num_robots, *ways.is_free.shape),
         steps=jnp.int32(0),
         contacts=jnp.int32(0),
         least_clearance=jnp.float32(jnp.inf),
@@ -289,8 +262,42 @@ def start(
     )
 
 
+def _check_faults(faults: Faults, num_robots: int) -> None:
+    """Raises an error that names a time that does not fit the robots."""
+    for name in ("stops_at", "blind_at"):
+        times = getattr(faults, name)
+        chex.assert_shape(times, (num_robots,), custom_message=f"faults.{name}")
+        is_time = "must be seconds, infinite for never"
+        checks.require(f"faults.{name}", times, lambda x: x >= 0, is_time)
+
+
+def _idle_robots(num_robots: int, num_pois: int, num_views: int) -> Robots:
+    """Robots before their first decision."""
+    number = jnp.zeros(num_robots, jnp.int32)
+    seconds = jnp.zeros(num_robots)
+    return Robots(
+        phase=number + IDLE,
+        target=number + num_pois,
+        view=number,
+        command=jnp.zeros((num_robots, 2)),
+        wanted=jnp.zeros((num_robots, 2)),
+        decided_on=number,
+        excluded=jnp.zeros((num_robots, num_views + 1), bool),
+        attempts=number,
+        way_left=seconds,
+        progress_at=seconds,
+        backs_off_until=seconds,
+        unreachable=jnp.zeros((num_robots, num_pois), bool),
+        undetected=jnp.zeros((num_robots, num_pois), bool),
+        goals=number,
+        reached=number,
+        looks=number,
+        detections=number,
+    )
+
+
 def _random_poses(key: Key, config: Config, layout: arenas.Layout, ways: Roadmap) -> jax.Array:
-    """`[R, 3]` poses with room around the robots and a way to every PoI that there is one to."""
+    """Random `[R, 3]` poses with room around the robots and, where possible, ways to all PoIs."""
     num_robots = len(config.modalities)
     draws = jax.random.uniform(key, (num_robots, 3, _FREE_DRAWS), minval=-1.0)
     reach = config.arena.side / 2 - config.navigation.robot_radius
@@ -318,12 +325,12 @@ def _random_poses(key: Key, config: Config, layout: arenas.Layout, ways: Roadmap
 
 
 def robot_of(state: MissionState, robot: Index) -> Robots:
-    """What one robot is up to: the fields of `Robots` without their first axis."""
+    """State of one robot: the fields of `Robots` without their first axis."""
     return jax.tree.map(lambda x: x[robot], state.robots)
 
 
 def with_robot(state: MissionState, robot: Index, before: Robots, after: Robots) -> MissionState:
-    """The state after one robot has changed from `before`, from `robot_of`, to `after`."""
+    """Replaces one robot, `before` from `robot_of`, by `after`."""
 
     def put(rows: jax.Array, old: jax.Array, new: jax.Array) -> jax.Array:
         return rows if new is old else rows.at[robot].set(new)
@@ -332,5 +339,5 @@ def with_robot(state: MissionState, robot: Index, before: Robots, after: Robots)
 
 
 def now(mission: Mission, state: MissionState) -> jax.Array:
-    """`[]` seconds since the start."""
+    """Seconds since the start, `[]`."""
     return state.steps * mission.config.mission.control_period

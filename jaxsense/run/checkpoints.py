@@ -1,6 +1,6 @@
-"""What a run saves while it trains: what is finished, and trainings under way.
+"""Checkpoints of a run: finished stages, and trainings under way.
 
-A checkpoint is one file: a digest of SHA-256, and what `flax.serialization` makes of its arrays.
+A checkpoint is one file: a SHA-256 digest, then arrays in the format of `flax.serialization`.
 """
 
 import hashlib
@@ -22,11 +22,12 @@ T = TypeVar("T")
 
 _DIGEST = hashlib.sha256().digest_size
 _SUFFIX = ".msgpack"
+_AGAIN = "its content is trained again"
 _LIST = "saved"
-"""The checkpoint that lists the names of all others, so that a missing file is noticed."""
+"""The checkpoint that lists all others, to detect a missing file."""
 
 Curves = dict[str, list[float]]
-"""Figures of a training so far, by their names."""
+"""Metrics of a training so far, by name."""
 
 
 class Unfinished(NamedTuple):
@@ -34,7 +35,7 @@ class Unfinished(NamedTuple):
 
     Attributes:
       done: chunks so far.
-      state: what the next chunk starts from.
+      state: input of the next chunk.
       curves: metrics of the chunks so far.
     """
 
@@ -44,10 +45,10 @@ class Unfinished(NamedTuple):
 
 
 class Checkpoints:
-    """The checkpoints of a run, in a directory; without one nothing is saved and nothing is there.
+    """The checkpoints of a run in a directory; without one, nothing is saved or found.
 
-    A checkpoint that is damaged is put aside, and what it held is trained again, which comes to the
-    same: a run follows from its seed and settings.
+    A damaged checkpoint is put aside and trained again, with the same result: a run follows from
+    its seed and settings.
 
     Attributes:
       path: the directory.
@@ -58,7 +59,7 @@ class Checkpoints:
         path: Path | None = None,
         warn: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
     ):
-        """Names a directory, and who is told of checkpoints that are damaged."""
+        """Takes the directory, and a function that receives warnings of damaged checkpoints."""
         self.path, self._warn = path, warn
         self._lock = threading.Lock()
 
@@ -67,7 +68,7 @@ class Checkpoints:
         return self.path is not None and self.path.exists()
 
     def save(self, name: str, tree: Any) -> None:
-        """Saves something finished; an `OSError` names the file that cannot be written."""
+        """Saves something finished; an `OSError` names a file that cannot be written."""
         if self.path is None:
             return
         self._file(name).parent.mkdir(parents=True, exist_ok=True)
@@ -79,26 +80,26 @@ class Checkpoints:
             self._list(self._listed() | {name})
 
     def load(self, name: str, shapes: Any) -> Any:
-        """Loads what was saved.
+        """Loads what `save` saved.
 
         Args:
-          name: as it was saved.
-          shapes: a tree like it.
+          name: as in `save`.
+          shapes: a tree of the same structure and shapes.
 
         Returns:
-          The tree, of arrays on the host; None if there is none.
+          The tree, with arrays on the host; None if nothing was saved.
 
         Raises:
-          ConfigError: names the file if it is damaged, missing, or of other shapes.
+          ConfigError: names a file that is damaged, missing, or of other shapes.
         """
         return self._load(name, lambda found: _like(shapes, found))
 
     def load_or_forget(self, name: str, shapes: Any) -> Any:
-        """`load`, but a file that cannot be used is named, put aside, and counts as not there."""
+        """`load`, but warns of a file that cannot be used, puts it aside and returns None."""
         return self._or_forget(name, lambda found: _like(shapes, found))
 
     def save_unfinished(self, stage: str, unfinished: Unfinished) -> None:
-        """Saves a training under way, in place of what was saved of it before; see `save`."""
+        """Saves a training under way over its last checkpoint; see `save`."""
         curves = {name: np.array(values, np.float64) for name, values in unfinished.curves.items()}
         saved = {"done": np.int64(unfinished.done), "state": unfinished.state, "curves": curves}
         self.save(_unfinished(stage), saved)
@@ -111,7 +112,7 @@ class Checkpoints:
           state: any state of it, for structure and shapes.
 
         Returns:
-          The training as it was saved last; None if it was not, or if the file is damaged.
+          The training as last saved; None if it was not, or if the file is damaged.
         """
 
         def restore(found: Any) -> Unfinished:
@@ -121,7 +122,7 @@ class Checkpoints:
         return self._or_forget(_unfinished(stage), restore)
 
     def forget_unfinished(self) -> None:
-        """Removes all trainings under way: the run is finished."""
+        """Removes all trainings under way, once the run is finished."""
         if self.path is not None:
             shutil.rmtree(self.path / _unfinished(""), ignore_errors=True)
             with self._lock:
@@ -130,10 +131,10 @@ class Checkpoints:
                 )
 
     def check(self, is_begun: bool = False) -> None:
-        """Names whatever is damaged or missing, and puts it aside.
+        """Warns of checkpoints that are damaged or missing, and puts them aside.
 
         Args:
-          is_begun: whether something has been trained, and is missing if nothing was saved.
+          is_begun: whether training has begun, so that an absent directory is missing.
         """
         if self.path is None:
             return
@@ -144,13 +145,13 @@ class Checkpoints:
             return
         there = self._there()
         if there or self._file(_LIST).exists():
-            self._check(_LIST, "the run goes on from all that is there")
+            self._check(_LIST, "the run resumes from all checkpoints found")
         expected = sorted(self._listed() | there)
-        sound = {name for name in expected if self._check(name, "what it held is trained again")}
+        sound = {name for name in expected if self._check(name)}
         self._write(_LIST, sorted(sound))
 
-    def _check(self, name: str, consequence: str) -> bool:
-        """Whether a checkpoint is as it was saved; if not, it is named and put aside."""
+    def _check(self, name: str, consequence: str = _AGAIN) -> bool:
+        """Whether a checkpoint is as it was saved; if not, warns and puts it aside."""
         try:
             _read(self._file(name))
         except (OSError, ValueError) as error:
@@ -159,19 +160,19 @@ class Checkpoints:
         return True
 
     def directories(self) -> list[Path]:
-        """Where checkpoints lie, as far as that is there."""
+        """The existing directories of checkpoints."""
         if self.path is None:
             return []
         return [p for p in (self.path, self.path / _unfinished("")) if p.is_dir()]
 
     def _there(self) -> set[str]:
-        """Names of all that is there, but for the list of them."""
+        """Names of all checkpoints on disk, except the list."""
         assert self.path is not None
         found = (file.relative_to(self.path).as_posix() for file in self.path.rglob(f"*{_SUFFIX}"))
         return {name.removesuffix(_SUFFIX) for name in found} - {_LIST}
 
     def _listed(self) -> set[str]:
-        """Names of all that was saved; of all that is there, if that is not known."""
+        """Names of all checkpoints that were saved; those on disk if the list is damaged."""
         try:
             return set(_read(self._file(_LIST)))
         except (OSError, ValueError):
@@ -186,7 +187,7 @@ class Checkpoints:
         files.write(self._file(name), hashlib.sha256(packed).digest() + packed)
 
     def _load(self, name: str, restore: Callable[[Any], T]) -> T | None:
-        """What `restore` makes of what was saved; see `load`."""
+        """Applies `restore` to a checkpoint's content; see `load`."""
         if self.path is None:
             return None
         if not self._file(name).exists():
@@ -202,11 +203,11 @@ class Checkpoints:
         try:
             return self._load(name, restore)
         except ConfigError as error:
-            self._forget(name, error.expected, "what it held is trained again")
+            self._forget(name, error.expected)
             return None
 
-    def _forget(self, name: str, reason: str, consequence: str) -> None:
-        """Puts a checkpoint aside, and says so."""
+    def _forget(self, name: str, reason: str, consequence: str = _AGAIN) -> None:
+        """Puts a checkpoint aside, with a warning."""
         file = self._file(name)
         if file.exists():
             file.replace(file.with_name(f"{file.name}.damaged"))
@@ -221,12 +222,12 @@ class Checkpoints:
 
 
 def _unfinished(stage: str) -> str:
-    """Under which name a training under way is saved."""
+    """The checkpoint's name of a training under way."""
     return f"unfinished/{stage}"
 
 
 def _read(file: Path) -> Any:
-    """What lies in a checkpoint, as nested dictionaries; a `ValueError` if it is damaged."""
+    """A checkpoint's content as nested dictionaries; raises `ValueError` if it is damaged."""
     whole = file.read_bytes()
     content = whole[_DIGEST:]
     if hashlib.sha256(content).digest() != whole[:_DIGEST]:
@@ -235,7 +236,7 @@ def _read(file: Path) -> Any:
 
 
 def _what_is_wrong(error: Exception) -> str:
-    """What keeps a checkpoint from being used."""
+    """Why a checkpoint cannot be used."""
     if isinstance(error, FileNotFoundError):
         return "is missing"
     if isinstance(error, OSError):
@@ -244,7 +245,7 @@ def _what_is_wrong(error: Exception) -> str:
 
 
 def _like(shapes: Any, found: Any) -> Any:
-    """A tree like `shapes` from nested dictionaries; a `ValueError` if it does not fit."""
+    """A tree like `shapes` from nested dictionaries; raises `ValueError` if they differ."""
 
     def check(expected: Any, found: Any) -> np.ndarray:
         found = np.asarray(found)

@@ -1,8 +1,7 @@
-"""Programs that are compiled in the background, and kept for later runs."""
+"""Compiles programs in the background, and keeps them for later runs."""
 
 import contextlib
 import hashlib
-import importlib.metadata
 import os
 import platform
 import re
@@ -21,16 +20,16 @@ from jax.experimental import multihost_utils
 from jaxsense.run import devices, files
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import Monitor
+from jaxsense.run.version import versions
 
 _THREADS = min(os.cpu_count() or 1, 8)
-_PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 _DIGEST = hashlib.sha256().digest_size
-# Read when it is imported, as the rest of it is then.
+# Read at import, so that it matches the code that runs.
 _SOURCE = [
     (path.name, hashlib.sha256(path.read_bytes()).hexdigest())
     for path in sorted(Path(__file__).parents[1].rglob("*.py"))
 ]
-_MOST_KEPT = 512  # traced programs, of which a run has some twenty
+_MOST_KEPT = 512  # traced programs; a run has about twenty
 _MOST_BYTES = 2**31  # of compiled programs
 _FILE = re.compile(r"[a-z0-9_]+-[a-z]+-[0-9a-f]{32}\.stablehlo")
 
@@ -39,39 +38,38 @@ for _state in (optax.ScaleByAdamState, optax.ScaleByScheduleState, optax.EmptySt
 
 
 class Kept:
-    """Programs of former runs, in a directory.
+    """Programs of earlier runs, in a directory.
 
-    JAX's compilation cache keeps what is compiled, in a directory of its own, and finds it by what
-    tracing yields. Here lies what tracing yields, found by all that tracing depends on, so that
-    nothing is traced again: that takes as long as all the rest.
+    JAX's compilation cache finds compiled programs by their traces. This directory keeps the traces
+    and finds them by all that tracing depends on: tracing takes as long as all the rest.
 
     Attributes:
       path: the directory of traced programs.
     """
 
     def __init__(self, directory: Path, *settings: Any):
-        """Finds the programs that were kept, and forgets those that were not used for longest.
+        """Opens the directory, and removes the least recently used programs.
 
         Args:
-          directory: where programs are kept; JAX is told to keep its own there.
-          *settings: all that programs close over and that is not in jaxsense's source, as values
-            whose `repr` tells them apart.
+          directory: where programs are kept, and JAX's compilation cache.
+          *settings: all that programs close over outside jaxsense's source, as values that differ
+            in their `repr`.
 
         Raises:
-          OSError: if the directory cannot be made, or others than this user may write it: a program
-            that is loaded is code that is run.
+          OSError: if the directory cannot be made, or other users may write it: a program that is
+            loaded is code that runs.
         """
         self.path = directory / "traced"
         _make_private(self.path)
         _make_private(directory / "compiled")
         self._depends = repr((settings, _SOURCE, _surroundings())).encode()
-        # Another run may forget some at the same time.
+        # Another run may remove some at the same time.
         with contextlib.suppress(FileNotFoundError):
             self._forget_oldest()
         _use_cache_of_jax(directory / "compiled")
 
     def _forget_oldest(self) -> None:
-        """Removes programs that were not used for longest, and nothing else."""
+        """Removes the least recently used programs, and nothing else."""
         ours = [
             path
             for path in self.path.iterdir()
@@ -82,16 +80,16 @@ class Kept:
         files.remove_unfinished(self.path)
 
     def find(self, name: str, args: Any) -> export.Exported | None:
-        """A program that was kept.
+        """Finds a kept program.
 
         Args:
           name: of the program.
           args: its arguments or their shapes.
 
         Returns:
-          The traced program; None if it is not there or its file is damaged.
+          The traced program; None if its file is missing or damaged.
         """
-        # Whatever is wrong with a file, tracing again mends it.
+        # Whatever is wrong with a file, tracing again repairs it.
         with contextlib.suppress(Exception):
             path = self._file(name, args)
             with path.open("rb") as file:
@@ -109,16 +107,16 @@ class Kept:
     def find_or_trace(
         self, name: str, function: Callable[..., Any], args: Any
     ) -> export.Exported | None:
-        """A program that was kept, or is kept from now on; None if JAX cannot write it down."""
+        """A kept program, or a new one that is kept from now on; None if JAX cannot export it."""
         found = self.find(name, args)
         if found is not None:
             return found
         leaves, tree = jax.tree.flatten(args)
         flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(tree, leaves)))
-        # A run must not end because the next one will be slower: on a full disk, or where a sensor
-        # of the user's own calls something that JAX does not promise to find again.
+        # A run must not end because the next one will be slower: on a full disk, or where your own
+        # sensor calls something that JAX cannot export.
         with contextlib.suppress(Exception):
-            traced = export.export(flat)(*_shapes(leaves))
+            traced = export.export(flat)(*shapes_of(leaves))
             program = bytes(traced.serialize())
             content = hashlib.sha256(program).digest() + program
             files.write(self._file(name, args), content, mode=0o600)
@@ -126,14 +124,14 @@ class Kept:
         return None
 
     def _file(self, name: str, args: Any) -> Path:
-        """Where a program is kept."""
-        shapes = repr(jax.eval_shape(lambda args: args, args)).encode()
+        """The file of a program."""
+        shapes = repr(shapes_of(args)).encode()
         digest = hashlib.sha256(self._depends + shapes).hexdigest()[:32]
         return self.path / f"{name}-{digest}.stablehlo"
 
 
 def _use_cache_of_jax(path: Path) -> None:
-    """Lets JAX keep what it compiles, also small programs, unless the user has told it where."""
+    """Sets JAX's compilation cache, also for small programs, unless the user has set it."""
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
     jax.config.update("jax_compilation_cache_dir", str(path))
@@ -143,10 +141,10 @@ def _use_cache_of_jax(path: Path) -> None:
 
 
 class Compiler:
-    """Compiles the programs of a run in threads of its own.
+    """Compiles the programs of a run in its own threads.
 
     Attributes:
-      monitor: is told how long it takes.
+      monitor: receives the time that it takes.
       kept: where programs are kept, if anywhere.
     """
 
@@ -159,28 +157,28 @@ class Compiler:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        """Gives up what is still waiting, or else the process would go on with it."""
+        """Cancels what still waits, which would otherwise hold up the process."""
         self._is_closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     def check_open(self) -> None:
-        """Raises `CancelledError` if the run is over."""
+        """Raises `CancelledError` once the run is over."""
         if self._is_closed:
             raise CancelledError
 
     def submit(self, work: Callable[[], None]) -> None:
-        """Runs something in one of the threads."""
+        """Runs `work` in one of the threads."""
         self._threads.submit(work)
 
 
 class Program:
-    """A function of a stage that is compiled in the background; a call waits for that and runs it.
+    """A function of a stage, compiled in the background.
 
-    It may be called, from another thread, before it is known what it does.
+    Callable before `compile`, from another thread; blocks until compiled.
     """
 
     def __init__(self, compiler: Compiler, stage: str, name: str):
-        """Names a program; no other of the same run may have this name in this stage."""
+        """Names a program, uniquely within a stage of a run."""
         self._compiler, self._monitor = compiler, compiler.monitor
         self._stage, self._name = stage, name
         self._compiled: Future[Callable[..., Any]] = Future()
@@ -188,7 +186,7 @@ class Program:
 
     @property
     def num_workers(self) -> int:
-        """Who shares the rows of the arguments; known once the program is compiled."""
+        """Number of workers that share the rows of the arguments; blocks until compiled."""
         self.wait()
         return self._workers.number
 
@@ -200,14 +198,14 @@ class Program:
         workers: Workers = ALONE,
         whole: tuple[int, ...] = (),
     ) -> Any:
-        """Traces a function, unless that was kept, and begins to compile it.
+        """Traces a function, unless its trace was kept, and starts to compile it.
 
         Args:
           function: what to compile.
           *args: arguments or their shapes, for example the result of another program's `compile`.
           runs_long: see `devices.compiler_options`.
-          workers: who shares the rows of the arguments; their number divides the rows.
-          whole: positions of arguments that every worker gets as they are.
+          workers: what shares the rows of the arguments; their number divides the rows.
+          whole: positions of arguments that every worker gets undivided.
 
         Returns:
           Shapes and dtypes of the results, as a pytree.
@@ -229,7 +227,7 @@ class Program:
                 self.fail(error)
                 return
             self._monitor.add(self._stage, "compile_s", time.perf_counter() - begin)
-            with contextlib.suppress(InvalidStateError):  # it has failed for another reason
+            with contextlib.suppress(InvalidStateError):  # failed already for another reason
                 self._compiled.set_result(compiled)
 
         self._compiler.submit(compile_lowered)
@@ -238,13 +236,13 @@ class Program:
     def _lower(self, function: Callable[..., Any], args: Any) -> tuple[jax.stages.Lowered, Any]:
         """A function ready to be compiled, and the shapes of its results; see `compile`."""
         kept = self._compiler.kept
-        # What is split over devices cannot be called from a program that is not.
+        # A program split over devices cannot be called from one that is not.
         if kept is not None and self._workers.mesh is None:
             found = kept.find_or_trace(f"{self._stage}-{self._name}", function, args)
             if found is not None:
                 call = jax.jit(lambda *args: found.call(*jax.tree.leaves(args)))
                 avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in found.out_avals]
-                return call.lower(*_shapes(args)), jax.tree.unflatten(found.out_tree, avals)
+                return call.lower(*shapes_of(args)), jax.tree.unflatten(found.out_tree, avals)
         options: dict[str, Any] = {}
         if self._is_of_many:
             assert self._workers.mesh is not None
@@ -259,12 +257,12 @@ class Program:
         return self._workers.mesh is not None and jax.process_count() > 1
 
     def fail(self, error: BaseException) -> None:
-        """Raises an error from all calls, unless the program is there already."""
+        """Makes all calls raise an error, unless the program is compiled already."""
         with contextlib.suppress(InvalidStateError):
             self._compiled.set_exception(error)
 
     def wait(self) -> Callable[..., Any]:
-        """Waits until the program is compiled, and gives it; `Stopped` if the run is to stop."""
+        """Blocks until compiled and returns the program; raises `Stopped` if the run must stop."""
         if not self._compiled.done():
             self._monitor.announce(self._stage)
         while not self._compiled.done():
@@ -273,7 +271,7 @@ class Program:
         return self._compiled.result()
 
     def __call__(self, *args: Any) -> Any:
-        """Runs the program until its results are there."""
+        """Runs the program, and blocks until its results are ready."""
         compiled = self.wait()
         begin, number = time.perf_counter(), self._workers.threads
 
@@ -291,13 +289,13 @@ class Program:
         return output
 
 
-def _shapes(args: Any) -> Any:
-    """Shapes and dtypes of arguments; a number of Python is one of JAX."""
+def shapes_of(args: Any) -> Any:
+    """Shapes and dtypes of arguments; Python numbers count as those of JAX."""
     return jax.eval_shape(lambda args: args, args)
 
 
 def _make_private(path: Path) -> None:
-    """Makes a directory of this user's alone; an `OSError` says if one is there that is not."""
+    """Makes a directory private to this user; raises `OSError` if it exists and is not."""
     with contextlib.suppress(FileExistsError):
         path.mkdir(mode=0o700, parents=True)
     found = path.lstat()
@@ -306,19 +304,19 @@ def _make_private(path: Path) -> None:
 
 
 def _is_private(found: os.stat_result, others: int) -> bool:
-    """Whether something is this user's, and gives others none of these rights."""
+    """Whether a file belongs to this user, and others have none of these rights."""
     is_own = not hasattr(os, "getuid") or found.st_uid == os.getuid()
     return is_own and found.st_mode & others == 0
 
 
 def _surroundings() -> list[Any]:
-    """What else tracing and compiling depend on: versions, options, devices and processor."""
+    """All else that tracing and compiling depend on: versions, options, devices and processor."""
     features = set()
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         features = {line for line in lines if line.startswith(("flags", "model name", "Features"))}
     return [
-        [(package, importlib.metadata.version(package)) for package in _PACKAGES],
+        versions(),
         sorted((k, v) for k, v in os.environ.items() if k.startswith(("JAX_", "XLA_"))),
         sorted((name, str(value)) for name, value in jax.config.values.items()),
         jax.devices()[0].client.platform_version,

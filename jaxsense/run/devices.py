@@ -1,4 +1,4 @@
-"""Work spread over the cores of a CPU, over several accelerators, and over several processes."""
+"""Spreads work over the cores of a CPU, over accelerators, and over processes."""
 
 import dataclasses
 import functools
@@ -23,17 +23,17 @@ _MOST_DEVICES = 256
 
 
 def compiler_options(*, runs_long: bool = False) -> dict[str, Any]:
-    """Options with which compiling and running a program take least together.
+    """Compiler options that minimise the time to compile and run a program.
 
-    On a CPU, optimisation at level 1 takes a third less time than at level 3, and its programs are
-    as fast. Without the newer code generator it is again a third less, but the program may be a
-    third slower. On an accelerator most of the time would go into trying kernels for products.
+    On a CPU, level 1 compiles a third faster than level 3, and its programs are as fast. The older
+    code generator saves another third, but the program may run a third slower. On an accelerator,
+    autotuning of matrix products would take most of the time.
 
     Args:
-      runs_long: far longer than it takes to compile.
+      runs_long: the program runs far longer than it compiles.
 
     Returns:
-      Those options that the installed compiler knows; none where JAX is told to compile quickly.
+      The options that the installed compiler knows; none if JAX is set to compile quickly.
     """
     if jax.config.values["jax_disable_most_optimizations"]:
         return {}
@@ -47,7 +47,7 @@ def compiler_options(*, runs_long: bool = False) -> dict[str, Any]:
 
 @functools.cache
 def _is_known(option: str, value: Any) -> bool:
-    """Whether the installed compiler has an option; they come and go with its versions."""
+    """Whether the installed compiler has an option; options change with its version."""
     try:
         jax.jit(lambda: 0).lower().compile(compiler_options={option: value})
     except jax.errors.JaxRuntimeError:
@@ -60,7 +60,7 @@ class Workers:
     """What shares the rows of a batch: threads of a CPU, or the devices of a mesh.
 
     Attributes:
-      threads: how many, each with a program of its own; 1 beside a mesh.
+      threads: how many, each with its own call of a program; 1 with a mesh.
       mesh: from `make_mesh`; None for a single device.
     """
 
@@ -69,7 +69,7 @@ class Workers:
 
     @property
     def number(self) -> int:
-        """How many parts a batch is cut into."""
+        """Number of parts of a batch."""
         return self.threads if self.mesh is None else self.mesh.size
 
 
@@ -77,18 +77,18 @@ ALONE = Workers()
 
 
 def start(number: int | None) -> Workers:
-    """The devices of a program.
+    """Selects the devices of a program.
 
     Args:
-      number: of accelerators, or of threads on a CPU. If not given, all accelerators there are; or
-        as many threads as cores, at most 8.
+      number: of accelerators, or of threads on a CPU. By default all accelerators, or as many
+        threads as cores, at most 8.
 
     Returns:
-      Who shares scenes and missions. Nobody shares a training: to agree on a gradient takes devices
-      longer than to work it out.
+      The workers that share scenes and missions. A training stays on one device, as exchanging
+      gradients takes longer than computing them.
 
     Raises:
-      ConfigError: if there are not that many devices.
+      ConfigError: if there are fewer devices.
     """
     jax.config.update("jax_default_matmul_precision", "highest")
     if number is not None and not 1 <= number <= _MOST_DEVICES:
@@ -106,33 +106,33 @@ def make_mesh(number: int | None = None) -> Mesh:
     """A row of devices.
 
     Args:
-      number: how many; all there are if not given. Devices of all processes count.
+      number: how many, over all processes; all by default.
 
     Returns:
       The mesh, with the axis `AXIS`.
 
     Raises:
-      ValueError: if there are not that many devices.
+      ValueError: if there are fewer devices.
     """
     there = jax.devices()
     number = len(there) if number is None else number
     if not 1 <= number <= len(there):
         raise ValueError(
-            f"devices = {number}: must be within 1 and {len(there)}, as many there are"
+            f"devices = {number}: must be within 1 and {len(there)}, the number of devices"
         )
     return Mesh(np.array(there[:number]), (AXIS,))
 
 
 def join(coordinator: str | None, number: int | None, index: int | None) -> None:
-    """Joins the processes that share a run; does nothing if none of the three is given.
+    """Joins the processes that share a run; does nothing without arguments.
 
     Args:
       coordinator: `HOST:PORT` at which the first process listens.
       number: of processes.
-      index: of this one, from 0.
+      index: of this process, from 0.
 
     Raises:
-      ConfigError: if only some of the three are given, or they cannot be.
+      ConfigError: if only some are given, or a value is wrong.
     """
     given = {"coordinator": coordinator, "num_processes": number, "process_index": index}
     if set(given.values()) == {None}:
@@ -157,13 +157,13 @@ def join(coordinator: str | None, number: int | None, index: int | None) -> None
 
 
 def leave() -> None:
-    """Waits for the processes that share the run, if there are any, and leaves them."""
+    """Waits for the other processes of the run, if any, and disconnects."""
     if jax.process_count() > 1:
         jax.distributed.shutdown()
 
 
 def shardings(mesh: Mesh, number: int, whole: tuple[int, ...]) -> tuple[NamedSharding, ...]:
-    """Where arguments lie: a part of their rows on each device, or all of them if `whole`."""
+    """Places of arguments: a part of their rows on each device, or all rows if in `whole`."""
     return tuple(
         NamedSharding(mesh, PartitionSpec() if i in whole else PartitionSpec(AXIS))
         for i in range(number)
@@ -171,7 +171,7 @@ def shardings(mesh: Mesh, number: int, whole: tuple[int, ...]) -> tuple[NamedSha
 
 
 def put(args: tuple[Any, ...], places: tuple[NamedSharding, ...]) -> tuple[Any, ...]:
-    """Arguments that every process has, put where all processes together hold them."""
+    """Distributes arguments that every process has over the devices of all processes."""
 
     def put_one(x: Any, place: NamedSharding) -> jax.Array:
         if jnp.issubdtype(jnp.result_type(x), jax.dtypes.prng_key):
@@ -188,20 +188,19 @@ def put(args: tuple[Any, ...], places: tuple[NamedSharding, ...]) -> tuple[Any, 
 def spread(
     function: Callable[..., Any], mesh: Mesh | None, whole: tuple[int, ...] = ()
 ) -> Callable[..., Any]:
-    """A function whose inputs and outputs are split along their first axis, a part on each device.
+    """Splits a function's inputs and outputs along their first axis, a part on each device.
 
     XLA's partitioner finds the split. Under `shard_map`, jaxlib 0.11.2 crashes while it compiles a
     step of MJX, on a CPU and on accelerators: its Shardy drops inputs that the body does not use
     (`ManualComputationUnusedInputsPattern`), and MJX closes over a hundred constants.
 
     Args:
-      function: of arrays, or pytrees of them, with a batch as first axis; rows must not depend on
-        one another.
+      function: of arrays, or pytrees of them, with a batch of independent rows as first axis.
       mesh: from `make_mesh`; its size must divide the batch. Without one nothing is split.
-      whole: positions of arguments that every device gets as they are.
+      whole: positions of arguments that every device gets undivided.
 
     Returns:
-      The same function, to be called under `jit`.
+      The same function; call it under `jit`.
     """
     if mesh is None:
         return function
@@ -216,12 +215,12 @@ def spread(
 
 
 def side_by_side(function: Callable[[int], T], number: int) -> list[T]:
-    """`function(0)`, `function(1)` and so on, each in a thread: one alone leaves cores idle."""
+    """Calls `function(0)`, `function(1)` and so on, each in a thread to use all cores."""
     if number == 1:
         return [function(0)]
     with ThreadPoolExecutor(number) as executor:
         futures = [executor.submit(function, i) for i in range(number)]
-        # A thread that waits for good may not hear of Ctrl-C.
+        # A wait without timeout may not notice Ctrl-C.
         while wait(futures, timeout=0.2).not_done:
             pass
         return [future.result() for future in futures]
@@ -236,7 +235,7 @@ def part(
       args: arrays, their shapes, or pytrees of them; `number` divides their first axis.
       i: which part.
       number: of parts.
-      whole: positions of arguments that are in every part as they are.
+      whole: positions of arguments that every part gets undivided.
     """
     if number == 1:
         return args
@@ -251,7 +250,7 @@ def part(
 
 
 def of_all_parts(shapes: Any, number: int) -> Any:
-    """The shapes of the results of `number` parts together, from those of one."""
+    """The shapes of the joined results of `number` parts, from those of one."""
     if number == 1:
         return shapes
     return jax.tree.map(
@@ -260,7 +259,7 @@ def of_all_parts(shapes: Any, number: int) -> Any:
 
 
 def joined(parts: list[Any]) -> Any:
-    """The results of parts as one, on the host if there are several."""
+    """Joins the results of parts, on the host if there are several."""
     if len(parts) == 1:
         return parts[0]
     return jax.tree.map(lambda *x: np.concatenate([np.asarray(each) for each in x]), *parts)

@@ -1,4 +1,4 @@
-"""Files that are written as a whole or not at all, and directories kept for one process."""
+"""Writes files as a whole or not at all, and locks directories."""
 
 import contextlib
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 import filelock
 
 _UNFINISHED_NAME = re.compile(r"\.(.+)\.[0-9a-f]{16}\.unfinished")
-"""The names of files that are not yet whole."""
+"""Names of partial files."""
 
 
 class WriteError(OSError):
@@ -18,17 +18,17 @@ class WriteError(OSError):
 
 
 def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
-    """Writes a file so that a reader never sees half of it, also after a power failure.
+    """Writes a file so that a reader never sees a part of it, even after a power failure.
 
     Args:
-      path: the file; replaces what was there.
+      path: the file; an existing one is replaced.
       content: of the file; text as UTF-8.
-      mode: of the file, less what the umask takes away.
+      mode: of the file, before the umask.
 
     Raises:
-      WriteError: names the file, which is then as it was before.
+      WriteError: names the file, which is then unchanged.
     """
-    # A name of its own, as another process may write the same file.
+    # A unique name, as another process may write the same file.
     unfinished = path.with_name(f".{path.name}.{secrets.token_hex(8)}.unfinished")
     try:
         unfinished.touch(mode, exist_ok=False)
@@ -47,14 +47,14 @@ def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
 
 
 def is_unfinished(path: Path, name: str | None = None) -> bool:
-    """Whether `write` was killed while it wrote this, in place of the file `name` if given."""
+    """Whether this is a partial file of a killed `write`, of the file `name` if given."""
     found = _UNFINISHED_NAME.fullmatch(path.name)
     is_ours = found is not None and name in (None, found[1])
     return is_ours and path.is_file() and not path.is_symlink()
 
 
 def remove_unfinished(directory: Path) -> None:
-    """Removes what a `write` that was killed has left in a directory."""
+    """Removes partial files of a killed `write` from a directory."""
     for path in filter(is_unfinished, directory.iterdir()):
         with contextlib.suppress(OSError):
             path.unlink()
@@ -62,13 +62,11 @@ def remove_unfinished(directory: Path) -> None:
 
 @contextlib.contextmanager
 def reserved(path: Path) -> Iterator[None]:
-    """Makes an empty file for what is about to be written, so that nobody else takes its name.
-
-    It is removed if that fails.
+    """Reserves a file's name by an empty file, which is removed if the context fails.
 
     Raises:
-      FileExistsError: if there is something already.
-      OSError: if nothing can be written there.
+      FileExistsError: if the path exists.
+      OSError: if it cannot be written.
     """
     path.open("xb").close()
     try:
@@ -79,7 +77,7 @@ def reserved(path: Path) -> Iterator[None]:
 
 
 def append(path: Path, line: str) -> None:
-    """Adds a line to a text file; a `WriteError` names the file if it cannot be written."""
+    """Adds a line to a text file; a `WriteError` names a file that cannot be written."""
     try:
         with path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")
@@ -99,14 +97,14 @@ def _sync(directory: Path) -> None:
 
 @contextlib.contextmanager
 def locked(directory: Path, *, waits: bool) -> Iterator[None]:
-    """Keeps a directory for this process, by a lock on the file `.lock` in it.
+    """Locks a directory for this process, by the file `.lock` in it.
 
     Args:
       directory: must exist.
-      waits: wait until another process gives the directory up.
+      waits: wait until another process releases the directory.
 
     Raises:
-      BlockingIOError: if another process keeps the directory, and `waits` is False.
+      BlockingIOError: if another process holds the lock, and `waits` is False.
       OSError: if the lock cannot be taken.
     """
     lock = filelock.FileLock(directory / ".lock", timeout=-1 if waits else 0)

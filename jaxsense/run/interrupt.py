@@ -1,4 +1,4 @@
-"""Ctrl-C and the end of a job's time: stopping in order."""
+"""Stops a run in order on Ctrl-C or at the end of a job's time."""
 
 import contextlib
 import os
@@ -13,9 +13,9 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
     """Calls `stop` at the first Ctrl-C or SIGTERM; the second one ends the process at once.
 
-    To be used in the main thread, where Python handles signals.
+    Call it in the main thread, where Python handles signals.
     """
-    # What started this process may have set signals aside that are meant for another one.
+    # The parent process may ignore signals that are meant for another one.
     before = {
         number: handler
         for number in _SIGNALS

@@ -1,4 +1,4 @@
-"""The loop that drives a training from the host: stage after stage, chunk after chunk."""
+"""Drives a training from the host: stage after stage, chunk after chunk."""
 
 import dataclasses
 import time
@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxsense.config import Config
 from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import Programs, padded
@@ -20,11 +21,11 @@ _SAVE_PERIOD = 60.0  # s
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """What a training leaves.
+    """The results of a training.
 
     Attributes:
       outputs: of every stage, by its name.
-      curves: of every stage with steps: the metrics of its `[steps]`, and `seconds` of each chunk.
+      curves: of every stage with steps: `[steps]` of each metric, and `seconds` of each chunk.
     """
 
     outputs: dict[str, Any]
@@ -32,29 +33,34 @@ class Trained:
 
 
 def train(
-    key: Key, programs: Programs, monitor: Monitor, checkpoints: Checkpoints | None = None
+    key: Key,
+    config: Config,
+    programs: Programs,
+    monitor: Monitor,
+    checkpoints: Checkpoints | None = None,
 ) -> Trained:
-    """Runs all stages; those that do not need one another run side by side.
+    """Runs all stages; independent ones run side by side.
 
     Args:
       key: the only source of randomness.
+      config: all settings; its `Traced` fields are inputs of the programs.
       programs: of the stages.
-      monitor: is told of time and progress.
-      checkpoints: where what is trained is saved, if anywhere; what is there already, from the same
-        key and settings, is not trained again.
+      monitor: receives time and progress.
+      checkpoints: where to save, if anywhere; what is there, from the same key and settings, is not
+        trained again.
 
     Raises:
-      StageError: if something is not finite; trainings under way have been saved as they were
-        before.
-      Stopped: if the monitor was told to stop; trainings under way have been saved.
+      StageError: if a loss, parameter or result is not finite; trainings under way are saved as
+        they were before.
+      Stopped: if the monitor was asked to stop; trainings under way are saved.
       OSError: if a checkpoint cannot be written.
     """
     with ThreadPoolExecutor(1) as saver:
-        loop = _Loop(key, programs, monitor, checkpoints or Checkpoints(), saver)
+        loop = _Loop(key, config, programs, monitor, checkpoints or Checkpoints(), saver)
         try:
             return loop.run()
         except Stopped:
-            # Who is told that all is saved must be told if it is not.
+            # The user reads that all is saved, and must learn if it is not.
             loop.wait_for_saving()
             raise
 
@@ -65,24 +71,26 @@ class _Loop:
     def __init__(
         self,
         key: Key,
+        config: Config,
         programs: Programs,
         monitor: Monitor,
         checkpoints: Checkpoints,
         saver: ThreadPoolExecutor,
     ):
-        self._key, self._programs, self._monitor = key, programs, monitor
+        self._key, self._config = key, config
+        self._programs, self._monitor = programs, monitor
         self._checkpoints, self._saver = checkpoints, saver
         self._saving: list[Future[None]] = []
         self._curves: dict[str, Curves] = {}
 
     def run(self) -> Trained:
-        """All stages."""
+        """Runs all stages."""
         stages, done = self._programs.stages, dict[str, Future[Any]]()
         with ThreadPoolExecutor(len(stages)) as threads:
             for stage in stages:
                 before = {name: done[name] for name in stage.inputs}
                 done[stage.name] = threads.submit(self._run_stage, stage, before)
-            # A thread that waits for good may not hear of Ctrl-C.
+            # A wait without timeout may not notice Ctrl-C.
             while wait(done.values(), timeout=0.2).not_done:
                 pass
         outputs = {name: future.result() for name, future in done.items()}
@@ -91,12 +99,12 @@ class _Loop:
         return Trained(outputs, self._curves)
 
     def wait_for_saving(self) -> None:
-        """Waits until all is saved; raises the first error."""
+        """Waits until all is saved, and raises the first error."""
         for each in self._saving:
             each.result()
 
     def _run_stage(self, stage: Stage, before: dict[str, Future[Any]]) -> Any:
-        """The output of a stage, which is loaded if it was saved."""
+        """The output of a stage, loaded if it was saved."""
         try:
             found = self._load(stage) if stage.is_saved else None
             if found is not None:
@@ -114,21 +122,21 @@ class _Loop:
             raise
 
     def _begin(self, stage: Stage, inputs: tuple[Any, ...]) -> Any:
-        """What `begin` returns: the state, or the output of a stage without steps."""
+        """The first state, or the output of a stage without steps."""
         key, _ = stage.keys(self._key)
-        program, config = self._programs.of(stage).begin, self._programs.config
+        program, config = self._programs.of(stage).begin, self._config
         if not stage.has_rows:
             return program(key, config, *inputs)
         number = len(jax.tree.leaves(inputs)[0])
         found = program(key, config, *padded(inputs, self._programs.workers.number))
-        # What threads have joined is on the host, from where every program would fetch it anew.
+        # Joined parts lie on the host, and every program would transfer them again.
         return jax.device_put(jax.tree.map(lambda x: x[:number], found))
 
     def _train(self, stage: Stage, inputs: tuple[Any, ...]) -> Any:
         """The output of a stage with steps."""
-        programs, config = self._programs.of(stage), self._programs.config
+        programs, config = self._programs.of(stage), self._config
         _, keys = stage.keys(self._key)
-        # The rate is that of training, without the compilation.
+        # The rate must not include compilation.
         programs.advance.wait()
 
         def advance(chunk: int, state: Any) -> tuple[Any, Curves]:
@@ -152,7 +160,7 @@ class _Loop:
         return programs.finish(config, state, *inputs)
 
     def _report(self, stage: Stage, chunk: int, progress: Progress, output: Any) -> Curves:
-        """Reports a chunk and what the training would return now; returns the steps' metrics."""
+        """Reports a chunk, checks the output so far, and returns the steps' metrics."""
         size = len(progress.loss)
         done = min((chunk + 1) * size, stage.steps)
         losses, metrics = jax.tree.map(
@@ -167,7 +175,7 @@ class _Loop:
         return {name: values.tolist() for name, values in metrics.items()}
 
     def _load(self, stage: Stage) -> Any:
-        """What was saved of a stage that has ended; None if it was not."""
+        """The saved output of a finished stage; None if there is none."""
         if stage.steps:
             shapes = _as_arrays(self._no_curves(stage))
             curves = self._checkpoints.load_or_forget(f"curves_{stage.name}", shapes)
@@ -178,12 +186,12 @@ class _Loop:
         return self._checkpoints.load_or_forget(stage.name, output)
 
     def _no_curves(self, stage: Stage) -> Curves:
-        """The curves of a training that has failed."""
+        """The curves of a failed training."""
         metrics = self._programs.of(stage).shapes.result().progress.metrics
         return {**dict.fromkeys(metrics, [np.nan] * stage.steps), "seconds": [0.0] * stage.chunks}
 
     def _save(self, stage: Stage, output: Any) -> None:
-        """Saves a stage that has ended, while others run; raises if that failed before."""
+        """Saves a finished stage while others run; raises if an earlier save failed."""
         for each in self._saving:
             if each.done():
                 each.result()
@@ -204,7 +212,7 @@ def _as_arrays(curves: Curves) -> dict[str, np.ndarray]:
 
 
 def _failed(state: Any) -> Any:
-    """A state of a training that has failed: not a number wherever there can be one."""
+    """The state of a failed training: every float is NaN."""
 
     def fail(x: Any) -> np.ndarray:
         x = np.asarray(x)
@@ -221,22 +229,22 @@ def run_chunks(
     monitor: Monitor,
     checkpoints: Checkpoints,
 ) -> tuple[Any, Curves]:
-    """Runs a training, from where it was when it was saved last.
+    """Runs a training from where it was last saved.
 
     Args:
       stage: its name.
-      state: what it starts from.
+      state: first state.
       number: of chunks.
-      run: `(chunk, state) -> (state, metrics)`; the same for the same chunk and state.
-      monitor: knows whether to stop.
-      checkpoints: where the training is saved once a minute, and when it stops.
+      run: `(chunk, state) -> (state, metrics)`, deterministic.
+      monitor: asked whether to stop.
+      checkpoints: where to save the training once a minute, and when it stops.
 
     Returns:
       The last state and the metrics of all chunks.
 
     Raises:
-      Stopped: if the run is to stop before the training is over; it has been saved.
-      StageError: from `run`; what was there before the chunk has been saved.
+      Stopped: if the run must stop before the training ends; it is saved.
+      StageError: from `run`; the state before the chunk is saved.
     """
     done, curves = 0, Curves()
     found = checkpoints.load_unfinished(stage, state)

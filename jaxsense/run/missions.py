@@ -1,4 +1,4 @@
-"""Many missions in batches, to compare policies and to see what failures do."""
+"""Many missions in batches, to compare policies and failures."""
 
 import dataclasses
 import math
@@ -37,7 +37,7 @@ class Recording:
 
     Attributes:
       end: the state in which it ended.
-      records: `[steps]` of all control periods, and of some after its end that are like the last.
+      records: `[steps]` of all control periods; after its end, the last one repeats.
     """
 
     end: MissionState
@@ -46,12 +46,12 @@ class Recording:
 
 @dataclasses.dataclass(frozen=True)
 class Played:
-    """What many missions have come to.
+    """The results of many missions.
 
     Attributes:
-      metrics: for each case the `[episodes, ...]` metrics, see `mission.measure`.
+      metrics: `[episodes, ...]` metrics of each case, see `mission.measure`.
       recording: the first mission of the first case.
-      control_steps: control periods of all missions, until they were over.
+      control_steps: control periods of all missions until their end.
     """
 
     metrics: dict[str, dict[str, Any]]
@@ -60,35 +60,35 @@ class Played:
 
 
 def chunks(config: Config) -> tuple[int, int]:
-    """Control periods of a chunk, after which the host looks on, and the most chunks there are."""
+    """Control periods of a chunk, and chunks of the longest mission."""
     settings = config.mission
     chunk = math.ceil(min(_CHUNK_TIME, settings.time_limit) / settings.control_period)
     return chunk, math.ceil(settings.time_limit / settings.control_period / chunk)
 
 
 def batch_of(total: int) -> int:
-    """How many of all missions to play side by side: fewer than all, as some last long."""
+    """How many missions to play side by side: fewer than `total`, as some last long."""
     values.require_number("total", total)
     return min(_MOST_AT_ONCE, -(-total // 3))
 
 
 def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
-    """Keys of an episode's arena, and of what happens in it; fold the number of a chunk into it."""
+    """Keys of an episode's arena and of its events; fold a chunk's number into the latter."""
     arena_key, play_key = jax.random.split(key)
     return jax.random.fold_in(arena_key, episode), jax.random.fold_in(play_key, episode)
 
 
 class Player:
-    """Plays missions in batches, with programs that are compiled once, before there are models.
+    """Plays missions in batches, with programs compiled once, before any model is trained.
 
-    Episode i has the same arena in every case, and in every batch.
+    Episode i has the same arena in every case and batch.
 
     Attributes:
       mission: the mission.
     """
 
     def __init__(self, mission: Mission, compiler: Compiler, batch: int, workers: Workers = ALONE):
-        """Compiles for about `batch` missions side by side, which the workers share."""
+        """Compiles for about `batch` missions side by side, shared by the workers."""
         batch = -(-batch // workers.number) * workers.number
         self.mission, self._monitor, self._batch = mission, compiler.monitor, batch
         config, share = mission.config, batch // workers.number
@@ -144,20 +144,20 @@ class Player:
         Args:
           key: random key.
           models: trained networks.
-          played: what to play with.
-          episodes: how many missions of each case.
+          played: the cases.
+          episodes: missions of each case.
 
         Raises:
-          StageError: if the models or the map of a mission are not finite; a policy would take a
-            value that is not for the end of its mission.
+          StageError: if the models or the map of a mission are not finite; a policy would take NaN
+            for the end of its mission.
         """
-        with self._lock:  # they fill the machine
+        with self._lock:  # one call fills the machine
             return self._play(key, models, played, episodes)
 
-    def _play(self, key: Key, models: Models, played: dict[str, Case], episodes: int) -> Played:
-        """See `play`."""
-        self._monitor.check_finite("mission", "models", models)
-        config = self.mission.config
+    def _starts(
+        self, key: Key, played: dict[str, Case], episodes: int
+    ) -> tuple[np.ndarray, MissionState]:
+        """Episodes and first states of all missions, the first ones repeated to fill a batch."""
         total = episodes * len(played)
         row = np.arange(-(-total // self._batch) * self._batch, dtype=np.int32) % total
         case, episode = row // episodes, row % episodes
@@ -167,15 +167,21 @@ class Player:
 
         def begin(first: int) -> MissionState:
             part = jax.tree.map(lambda x: x[first : first + self._batch], inputs)
-            return jax.tree.map(np.asarray, self._begin(key, config, *part))
+            return jax.tree.map(np.asarray, self._begin(key, self.mission.config, *part))
 
         begun = [begin(first) for first in range(0, len(row), self._batch)]
-        starts = jax.tree.map(lambda *x: np.concatenate(x), *begun)
+        return episode, jax.tree.map(lambda *x: np.concatenate(x), *begun)
+
+    def _play(self, key: Key, models: Models, played: dict[str, Case], episodes: int) -> Played:
+        """See `play`."""
+        self._monitor.check_finite("mission", "models", models)
+        config, total = self.mission.config, episodes * len(played)
+        episode, starts = self._starts(key, played, episodes)
 
         # A mission that is over makes room for the next one, so that short ones do not wait.
         state = jax.tree.map(lambda x: x[: self._batch].copy(), starts)
         playing, waiting = np.arange(self._batch), iter(range(self._batch, total))
-        chunk, done = np.zeros(self._batch, np.int32), np.zeros(len(row), bool)
+        chunk, done = np.zeros(self._batch, np.int32), np.zeros(len(episode), bool)
         results: Any = None
         first: list[tuple[MissionState, Record]] = []
         control_steps = 0
@@ -188,7 +194,9 @@ class Player:
             if not done[0]:
                 first.append(jax.tree.map(lambda x: x[0].copy(), (state, records)))
             if results is None:
-                results = jax.tree.map(lambda x: np.zeros((len(row), *x.shape[1:]), x.dtype), found)
+                results = jax.tree.map(
+                    lambda x: np.zeros((len(done), *x.shape[1:]), x.dtype), found
+                )
             chunk += 1
             for slot in np.flatnonzero(state.done & ~done[playing]).tolist():
                 done[playing[slot]] = True
@@ -209,7 +217,7 @@ class Player:
 
 
 def _set_row(target: Any, row: int, source: Any, from_row: int) -> None:
-    """Copies a row of every array of a tree into another."""
+    """Copies a row of every array of one tree into another."""
 
     def copy(target: np.ndarray, source: np.ndarray) -> None:
         target[row] = source[from_row]

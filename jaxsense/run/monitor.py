@@ -1,4 +1,4 @@
-"""What a stage tells the outside while it runs: time, progress, metrics, and bad ends."""
+"""Reports of running stages: time, progress, metrics and failures."""
 
 import threading
 from collections.abc import Callable
@@ -13,11 +13,11 @@ Listener = Callable[[str, int, int, dict[str, float]], None]
 
 
 class StageError(RuntimeError):
-    """A training that cannot go on: names the stage and the step."""
+    """A training that cannot continue; names the stage and the step."""
 
 
 class Stopped(Exception):  # noqa: N818 (nothing is wrong)
-    """A run that was asked to stop; what it trained until then has been saved."""
+    """A run that was asked to stop, with all its training saved."""
 
 
 def is_finite(values: Any) -> bool:
@@ -27,7 +27,7 @@ def is_finite(values: Any) -> bool:
 
 
 class Monitor:
-    """What the stages of a run have in common: a clock and a listener.
+    """The clock and the listener that the stages of a run share.
 
     Attributes:
       seconds: for each stage, `{"compile_s": ..., "run_s": ...}` so far.
@@ -41,8 +41,8 @@ class Monitor:
         """Begins a run.
 
         Args:
-          listener: is told of progress.
-          warn: takes a line about something that went wrong and does not end the run.
+          listener: receives progress.
+          warn: receives a line about a failure that does not end the run.
         """
         self._lock = threading.Lock()
         self._stop = threading.Event()
@@ -50,52 +50,52 @@ class Monitor:
         self.begin(listener)
 
     def begin(self, listener: Listener) -> None:
-        """Begins another run, with other times and another listener."""
+        """Begins another run, with times from zero and another listener."""
         self.seconds: dict[str, dict[str, float]] = {}
         self._failure: StageError | None = None
         self._one_listener = listener
 
     def beside(self, listener: Listener) -> "Monitor":
-        """The monitor of another run, side by side with this one: it stops with it."""
+        """The monitor of another run side by side, which stops with this one."""
         other = Monitor(listener, self.warn)
         other._stop = self._stop
         return other
 
     def _listener(self, stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
-        """Tells the listener; stages may run side by side."""
+        """Calls the listener, from one stage at a time."""
         with self._lock:
             self._one_listener(stage, done, total, metrics)
 
     def stop(self) -> None:
-        """Asks the stages to save what they have and to stop."""
+        """Asks the stages to save and to stop."""
         self._stop.set()
 
     def fail(self, failure: StageError) -> None:
-        """Ends what goes on side by side with a stage that has failed."""
+        """Ends the stages that run side by side with a failed one."""
         self._failure = failure
 
     @property
     def is_stopping(self) -> bool:
-        """Whether the stages are to stop."""
+        """Whether the stages must stop."""
         return self._stop.is_set() or self._failure is not None
 
     def check_stop(self) -> None:
-        """Raises `Stopped` if the stages are to stop; the failure, if another one has failed."""
+        """Raises `Stopped` if the stages must stop, or the failure of another stage."""
         if self._failure is not None:
             raise self._failure
         if self.is_stopping:
             raise Stopped
 
     def announce(self, stage: str) -> None:
-        """Reports that a stage is being compiled."""
+        """Reports that a stage compiles."""
         self._listener(stage, 0, 0, {})
 
     def progress(self, stage: str, done: int, total: int) -> None:
-        """Reports progress of a stage that has no loss."""
+        """Reports progress of a stage without a loss."""
         self._listener(stage, done, total, {})
 
     def check_finite(self, stage: str, name: str, values: Any) -> None:
-        """Raises a `StageError` that names the stage and the values, if one is not finite.
+        """Raises a `StageError` that names the stage and the values if any is not finite.
 
         Args:
           stage: its name.
@@ -118,11 +118,11 @@ class Monitor:
 
         Args:
           stage: its name.
-          done: steps so far, those of the chunk included.
+          done: steps so far, including the chunk.
           total: steps of the whole stage.
           losses: `[steps]` of the chunk; their mean is reported.
-          params: what was trained, as it is after the chunk.
-          **metrics: what else to report.
+          params: parameters after the chunk.
+          **metrics: others to report.
 
         Raises:
           StageError: if a loss or a parameter is not finite; names the step.

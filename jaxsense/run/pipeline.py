@@ -25,14 +25,13 @@ from jaxsense.types import Belief, Key
 
 @dataclasses.dataclass(frozen=True)
 class RunResult:
-    """What a run leaves.
+    """The results of a run.
 
     Attributes:
       models: the trained networks.
       windows: for each modality `[C, 1, F]` one look at each class.
-      posteriors: for each set of modalities, `[C, S', D]` beliefs of held-out detections.
-      rewards: for each modality `[epochs]` mean total reward of the episodes that ended; NaN where
-        none did.
+      posteriors: `[C, S', D]` beliefs of held-out detections, `joint` and for each modality.
+      rewards: for each modality `[epochs]` mean total reward of the episodes that ended, or NaN.
       recording: the first mission of the latent policy.
       summary: the blocks `detectors`, `jmvae`, `dqn` and `mission` of `summary.json`.
     """
@@ -57,36 +56,43 @@ def compiled(
 
     Args:
       config: all settings.
-      monitor: is told how long it takes.
-      workers: who shares scenes, missions and seeds.
-      kept: where compiled programs are kept for later runs, if anywhere.
-      num_seeds: runs that go side by side, see `compile_programs`.
+      monitor: receives the time that it takes.
+      workers: what shares scenes, missions and seeds.
+      kept: where to keep compiled programs for later runs, if anywhere.
+      num_seeds: runs side by side, see `compile_programs`.
     """
     with Compiler(monitor, kept) as compiler:
         yield compile_programs(config, make_world(config), compiler, workers, num_seeds)
 
 
 def run(
-    key: Key, programs: Programs, monitor: Monitor, checkpoints: Checkpoints | None = None
+    key: Key,
+    config: Config,
+    programs: Programs,
+    monitor: Monitor,
+    checkpoints: Checkpoints | None = None,
 ) -> RunResult:
-    """Trains everything, plays the missions and sums up.
+    """Trains everything, plays the missions and summarises.
 
     Args:
       key: the only source of randomness.
+      config: all settings.
       programs: from `compiled`, with the same monitor.
-      monitor: is told of time and progress.
-      checkpoints: see `loop.train`, as for what is raised.
+      monitor: receives time and progress.
+      checkpoints: see `loop.train`.
+
+    Raises:
+      StageError, Stopped, OSError: see `loop.train`.
     """
-    config, checkpoints = programs.config, checkpoints or Checkpoints()
-    trained = train(key, programs, monitor, checkpoints)
-    outputs = jax.tree.map(np.asarray, {n: trained.outputs[n] for n in _SHOWN})
+    checkpoints = checkpoints or Checkpoints()
+    trained = train(key, config, programs, monitor, checkpoints)
     networks = models(trained.outputs, config)
     played = {n: case for n, case in mission.cases(config).items() if n in mission.POLICIES}
     player, episodes = programs.player.result(), config.mission.episodes
     found = player.play(mission_key(key), networks, played, episodes)
     checkpoints.forget_unfinished()
-    posteriors, latent = outputs["latent_space"]
-    detections = outputs["detections"]
+    posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
+    detections = jax.tree.map(np.asarray, trained.outputs["detections"])
     accuracy = zip(config.modalities, detections.accuracy.tolist(), strict=True)
     return RunResult(
         models=networks,
@@ -103,12 +109,8 @@ def run(
     )
 
 
-_SHOWN = "detections", "latent_space"
-"""Outputs that a summary or a plot shows."""
-
-
 def _of_agent(config: Config, modality: str, trained: Trained) -> dict[str, Any]:
-    """The block of one modality in the summary's `dqn`."""
+    """One modality's block in the summary's `dqn`."""
     total, first = map(np.asarray, trained.outputs[f"policies_{modality}"])
     env_steps = config.dqn.epochs * config.dqn.num_envs
     seconds = sum(trained.curves[f"dqn_{modality}"]["seconds"])

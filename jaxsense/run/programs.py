@@ -1,8 +1,7 @@
-"""The compiled programs of a run: those of every stage, and those of its missions.
+"""The compiled programs of a run: of every stage, and of its missions.
 
-All of them are known before the run begins. They are traced one after the other, in a thread, and
-compiled as soon as they are traced, while the stages run whose programs are ready. Shapes come from
-tracing alone: what a stage returns is what those after it take.
+A thread traces them one after the other. Each compiles as soon as it is traced, while stages with
+compiled programs already run. Shapes come from tracing: a stage's outputs are later stages' inputs.
 """
 
 import dataclasses
@@ -24,7 +23,7 @@ from jaxsense.stages import Stage, stages
 
 @dataclasses.dataclass(frozen=True)
 class Shapes:
-    """What the programs of a stage return, as shapes and dtypes.
+    """Shapes and dtypes of what a stage's programs return.
 
     Attributes:
       output: of the stage.
@@ -43,7 +42,7 @@ class StagePrograms:
       begin: `(key, config, *inputs) -> state`, or the output of a stage without steps.
       advance: `(key, config, state, *inputs) -> (state, Progress)`.
       finish: `(config, state, *inputs) -> output`.
-      shapes: known as soon as the programs are traced.
+      shapes: known once the programs are traced.
     """
 
     begin: Program | TeamProgram
@@ -54,15 +53,15 @@ class StagePrograms:
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """The programs of runs with the same settings, but for the numbers that are leaves of them.
+    """The programs of runs whose settings differ in their leaves at most.
 
     Attributes:
       config: all settings.
       stages: of the training.
       of_stages: their programs, by `Stage.program`.
       player: of the missions.
-      workers: who shares rows and missions.
-      team: the trainings that go side by side.
+      workers: what shares rows and missions.
+      team: the trainings side by side.
     """
 
     config: Config
@@ -77,7 +76,7 @@ class Programs:
         return self.of_stages[_name(stage)]
 
     def fail(self, error: BaseException) -> None:
-        """Raises an error from whoever waits for a program, now or later."""
+        """Raises an error wherever a program is awaited, now or later."""
         for each in self.of_stages.values():
             for program in (each.begin, each.advance, each.finish):
                 program.fail(error)
@@ -93,14 +92,14 @@ def compile_programs(
     workers: Workers = ALONE,
     num_seeds: int = 1,
 ) -> Programs:
-    """Begins to trace and to compile the programs of a run in the background.
+    """Starts to trace and compile the programs of a run in the background.
 
     Args:
       config: all settings.
       world: the simulation, without contacts.
       compiler: compiles them.
-      workers: who shares rows, missions and seeds.
-      num_seeds: trainings that go side by side, in threads, each of which calls the programs.
+      workers: what shares rows, missions and seeds.
+      num_seeds: trainings side by side; each calls the programs from its own threads.
     """
     found, team = stages(config, world), Team(num_seeds)
 
@@ -125,23 +124,8 @@ def compile_programs(
         team=team,
     )
 
-    def trace() -> None:
-        try:
-            for stage in found[:_BEFORE_MISSIONS]:
-                _trace_stage(programs, stage)
-            # Needed last, but on a CPU they take longest to compile. Beside an accelerator are
-            # cores enough to compile, and what all wait for is tracing.
-            if _on_cpu():
-                _trace_missions(programs, compiler)
-            for stage in found[_BEFORE_MISSIONS:]:
-                _trace_stage(programs, stage)
-            if not _on_cpu():
-                _trace_missions(programs, compiler)
-        except BaseException as error:
-            programs.fail(error)
-
     thread = ThreadPoolExecutor(1)
-    thread.submit(trace)
+    thread.submit(_trace, programs, compiler)
     thread.shutdown(wait=False)
     return programs
 
@@ -158,6 +142,23 @@ def _on_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
+def _trace(programs: Programs, compiler: Compiler) -> None:
+    """Traces all programs; an error reaches whoever waits for one."""
+    try:
+        for stage in programs.stages[:_BEFORE_MISSIONS]:
+            _trace_stage(programs, stage)
+        # Missions come last, but take a CPU longest to compile. With an accelerator, cores are
+        # free to compile, and everything waits for tracing.
+        if _on_cpu():
+            _trace_missions(programs, compiler)
+        for stage in programs.stages[_BEFORE_MISSIONS:]:
+            _trace_stage(programs, stage)
+        if not _on_cpu():
+            _trace_missions(programs, compiler)
+    except BaseException as error:
+        programs.fail(error)
+
+
 def _trace_missions(programs: Programs, compiler: Compiler) -> None:
     config = programs.config
     batch = missions.batch_of(len(mission.POLICIES) * config.mission.episodes)
@@ -166,7 +167,7 @@ def _trace_missions(programs: Programs, compiler: Compiler) -> None:
 
 
 def _trace_stage(programs: Programs, stage: Stage) -> None:
-    """Traces the programs of a stage, unless they are those of one before."""
+    """Traces the programs of a stage, unless an earlier stage shares them."""
     compiled, key, config = programs.of(stage), jax.random.key(0), programs.config
     if compiled.shapes.done():
         return
@@ -196,7 +197,7 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
 
 
 def padded(inputs: Any, number: int) -> Any:
-    """Inputs with rows, of which the first are repeated so that `number` divides them."""
+    """Repeats the first rows of inputs until `number` divides their count."""
 
     def pad(x: Any) -> Any:
         rows = -(-x.shape[0] // number) * number

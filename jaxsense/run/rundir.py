@@ -1,9 +1,8 @@
-"""The directory that a run leaves behind: writing it, going on in it, and reading it back."""
+"""The directory of a run: writes it, resumes in it, and reads it back."""
 
 import contextlib
 import dataclasses
 import errno
-import importlib.metadata
 import itertools
 import json
 import subprocess
@@ -26,23 +25,22 @@ from jaxsense.config import (
 from jaxsense.models import Models
 from jaxsense.run import files
 from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.version import __version__
+from jaxsense.run.version import __version__, versions
 
 BLOCKS = ("detectors", "jmvae", "dqn", "mission")
-"""What a summary holds of what was trained."""
+"""The blocks of a summary that hold results."""
 _METRICS = "metrics.jsonl"
-_PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """All that a run's results follow from, on the same devices and versions.
+    """All that determines a run's results, on the same devices and versions.
 
     Attributes:
-      preset: where the settings came from.
+      preset: origin of the settings.
       seed: of all randomness.
       config: the settings.
-      num_seeds: how many seeds are trained, from `seed` on.
+      num_seeds: number of seeds to train, from `seed` on.
     """
 
     preset: str
@@ -57,29 +55,27 @@ class Settings:
 
 
 class RunDirectory:
-    """Writes the files of one run; never over those of another.
-
-    As a context, it keeps the directory for this process, see `create` and `resume`.
+    """Writes the files of one run, and never overwrites those of another.
 
     Attributes:
       path: the directory.
       settings: of the run.
-      checkpoints: what it saves while it trains.
+      checkpoints: of the run.
     """
 
     def __init__(self, path: Path, settings: Settings):
-        """A directory that is there; see `create` and `resume`."""
+        """Takes an existing directory; see `create` and `resume`."""
         self.path, self.settings = path, settings
         self.checkpoints = Checkpoints(path / "checkpoints")
 
     @classmethod
     @contextlib.contextmanager
     def create(cls, path: Path, settings: Settings) -> "Iterator[RunDirectory]":
-        """Makes the directory, writes `config.json`, and keeps the directory for this process.
+        """Makes the directory with its `config.json`, and locks it for this process.
 
         Raises:
-          ConfigError: if the directory holds something already, cannot be written, or is kept by
-            another process.
+          ConfigError: if the directory is not empty or cannot be written, or another process
+            locks it.
         """
         content = {
             "preset": settings.preset,
@@ -93,7 +89,7 @@ class RunDirectory:
         with contextlib.ExitStack() as kept:
             try:
                 path.mkdir(parents=True, exist_ok=True)
-                # Also before the lock, which would be one file more in somebody's directory.
+                # Before the lock too, so as to add no file to another directory.
                 _check_empty(path)
                 kept.enter_context(_locked(path, "out"))
                 run = cls(path, settings)
@@ -107,10 +103,10 @@ class RunDirectory:
     @classmethod
     @contextlib.contextmanager
     def resume(cls, path: Path, trust: bool = False) -> "Iterator[RunDirectory]":
-        """The directory of a run that has stopped, kept for this process.
+        """Opens the directory of a stopped run, and locks it for this process.
 
         Raises:
-          ConfigError: as `resumable`, or if another process keeps the directory.
+          ConfigError: as `resumable`, or if another process locks the directory.
         """
         settings = resumable(path, trust)
         with _locked(path, "resume"):
@@ -121,11 +117,11 @@ class RunDirectory:
             yield run
 
     def write_json(self, name: str, content: Any) -> None:
-        """Writes a file of the run, see the function of the same name."""
+        """Writes a file of the run, see the function `write_json`."""
         write_json(self.path / name, content)
 
     def save_models(self, models: Models) -> None:
-        """Saves trained models, for `load`; an `OSError` says that they cannot be written."""
+        """Saves trained models for `load`; raises `OSError` if they cannot be written."""
         for name, tree in _named(models, self.settings.config).items():
             self.checkpoints.save(name, tree)
 
@@ -134,12 +130,12 @@ class RunDirectory:
         files.append(self.path / _METRICS, json.dumps(metrics))
 
     def _remove_unfinished(self) -> None:
-        """Removes what a process that was killed has left of files of this run."""
+        """Removes partial files of a killed process."""
         for place in (self.path, *self.checkpoints.directories()):
             files.remove_unfinished(place)
 
     def _drop_unfinished_line(self) -> None:
-        """Cuts what a process that was killed has left of a line of `metrics.jsonl`."""
+        """Removes the partial last line of a killed process from `metrics.jsonl`."""
         path = self.path / _METRICS
         if path.exists():
             content = path.read_bytes()
@@ -149,7 +145,7 @@ class RunDirectory:
 
 
 def unused(path: Path) -> Path:
-    """A directory that was not there, made under this name or, if it is taken, a numbered one.
+    """Makes a new directory, with a number after its name if the name is taken.
 
     Raises:
       ConfigError: if it cannot be made.
@@ -169,29 +165,29 @@ def unused(path: Path) -> Path:
 
 
 def _check_empty(path: Path) -> None:
-    """Raises a `ConfigError` if a directory holds more than a lock."""
-    # A lock and the beginning of a file are left by a process that was killed at once.
+    """Raises `ConfigError` if a directory holds more than a lock."""
+    # A process killed at once may leave a lock and a partial file.
     if any(f.name != ".lock" and not files.is_unfinished(f, "config.json") for f in path.iterdir()):
         raise ConfigError("out", str(path), "is not empty; must be a new directory")
 
 
 def resumable(path: Path, trust: bool = False) -> Settings:
-    """The settings of a run that has stopped.
+    """The settings of a stopped run.
 
     Raises:
-      ConfigError: if there is no such run, if another version wrote it, if it is finished, or if it
-        names code, see `read_settings`.
+      ConfigError: if there is no run, another version wrote it, it is finished, or it names code
+        without trust.
     """
     content = _read_config(path / "config.json", "resume", path)
     _check_version(content, "resume", path)
     if (path / "summary.json").exists():
-        raise ConfigError("resume", str(path), "is finished; there is nothing to go on with")
+        raise ConfigError("resume", str(path), "is finished; must be a stopped run")
     return _settings_of(content, trust)
 
 
 @contextlib.contextmanager
 def _locked(path: Path, field: str) -> Iterator[None]:
-    """Keeps a directory for this process; a `ConfigError` about `field` if another one has it."""
+    """Locks a directory; raises `ConfigError` about `field` if another process holds it."""
     with contextlib.ExitStack() as kept:
         try:
             kept.enter_context(files.locked(path, waits=False))
@@ -201,14 +197,8 @@ def _locked(path: Path, field: str) -> Iterator[None]:
         yield
 
 
-def versions() -> dict[str, str]:
-    """Versions of the packages that results depend on."""
-    others = {package: importlib.metadata.version(package) for package in _PACKAGES}
-    return {"jaxsense": __version__, **others}
-
-
 def commit() -> str | None:
-    """The commit of jaxsense's source, with `-dirty` if it was changed; None outside of Git."""
+    """The commit of jaxsense's source, with `-dirty` if changed; None outside Git."""
     source = Path(__file__).parents[1]
     if not (source / ".git").exists():
         return None
@@ -222,28 +212,28 @@ def commit() -> str | None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Writes a file, see `files.write`."""
+    """Writes a JSON file, see `files.write`."""
     files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def read_settings(file: Path, trust: bool = False) -> Settings:
-    """The settings in the `config.json` of a run.
+    """Reads the settings in the `config.json` of a run.
 
-    What is not given there is as in the preset that it names, or `default`, with seed 0.
+    Missing ones come from the preset that it names, by default `default`, with seed 0.
 
     Args:
       file: the file.
-      trust: whether it may name code, which is run when its sensors are made.
+      trust: whether it may name code, which runs when its sensors are made.
 
     Raises:
-      ConfigError: if the file cannot be read, or names code without trust; else names the field
+      ConfigError: if the file cannot be read or names code without trust; otherwise names the field
         that is unknown or wrong.
     """
     return _settings_of(_read_config(file, "config", file), trust)
 
 
 def read_summary(path: Path) -> dict[str, Any]:
-    """The `summary.json` of a finished run; a `ConfigError` if there is none."""
+    """Reads the `summary.json` of a finished run; raises `ConfigError` if that fails."""
     try:
         summary = parse_json((path / "summary.json").read_text(encoding="utf-8"))
         parts = {"timing", *BLOCKS}
@@ -260,14 +250,14 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
 
     Args:
       path: the run's directory.
-      trust: whether to run the functions that its `config.json` names for sensors of one's own.
+      trust: whether to run the functions that its `config.json` names for your own sensors.
 
     Returns:
       The settings and the models, on the default device.
 
     Raises:
-      ConfigError: if the directory holds no finished run, one of another version, a damaged
-        checkpoint, or one that names code without trust.
+      ConfigError: if the directory holds no finished run, a run of another version, a damaged
+        checkpoint, or settings that name code without trust.
     """
     path = Path(path)
     content = _read_config(path / "config.json", "run", path)
@@ -291,7 +281,7 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
 
 
 def _named(models: Models, config: Config) -> dict[str, Any]:
-    """The parts of the models by the names of their stages, which are those of checkpoints."""
+    """The parts of the models, by the names of their stages and checkpoints."""
     detectors = zip(config.modalities, models.detectors, strict=True)
     q_networks = zip(config.modalities, models.q_networks, strict=True)
     return {
@@ -303,7 +293,7 @@ def _named(models: Models, config: Config) -> dict[str, Any]:
 
 
 def _read_config(file: Path, field: str, value: Path) -> dict[str, Any]:
-    """What lies in a `config.json`; a `ConfigError` about `field = value` if it cannot be read."""
+    """Reads a `config.json`; raises `ConfigError` about `field = value` if that fails."""
     try:
         if file.exists() and not (file.is_file() or file.is_dir()):
             raise OSError(errno.EINVAL, "Not a regular file")  # it may never end
@@ -320,7 +310,7 @@ def _read_config(file: Path, field: str, value: Path) -> dict[str, Any]:
 
 
 def _settings_of(content: dict[str, Any], trust: bool) -> Settings:
-    """The settings in what lies in a `config.json`."""
+    """The settings in the content of a `config.json`."""
     unknown = sorted(set(content) - {"preset", "seed", "num_seeds", "config", "versions", "commit"})
     if unknown:
         raise ConfigError(unknown[0], content[unknown[0]], "is no field of a run's config.json")
@@ -338,7 +328,7 @@ def _settings_of(content: dict[str, Any], trust: bool) -> Settings:
 
 
 def _check_version(content: dict[str, Any], field: str, path: Path) -> None:
-    """Raises a `ConfigError` if a run was written by a version whose checkpoints may differ."""
+    """Raises `ConfigError` if a version whose checkpoints may differ wrote the run."""
     recorded = content.get("versions")
     wrote = recorded.get("jaxsense") if isinstance(recorded, dict) else None
     if not isinstance(wrote, str) or wrote.split(".")[:2] != __version__.split(".")[:2]:

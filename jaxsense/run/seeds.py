@@ -1,4 +1,4 @@
-"""Several seeds: the means and intervals of what their runs hold."""
+"""Means and confidence intervals of the metrics of several seeds."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,21 +14,21 @@ _CONFIDENCE = 0.95
 
 
 def statistics(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Mean and confidence of every figure of several summaries.
+    """Mean and confidence interval of every number in several summaries.
 
     Args:
-      summaries: the blocks of several runs, of the same structure; two or more.
+      summaries: the blocks of two or more runs, of the same structure.
 
     Returns:
-      The same structure, with `{"mean", "low", "high"}` in place of every number: the mean and the
-      95% interval of it by Student's t. Left out is what not every run has, and what is neither a
-      number nor holds numbers; in a list, None takes its place.
+      The same structure, with `{"mean", "low", "high"}` in place of every number: the mean and its
+      95% interval by Student's t. Omits what some run lacks and what is no number; in a list, None
+      takes its place.
     """
     return _statistics(list(summaries)) or {}
 
 
 def rewards(runs: Sequence[Path], config: Config) -> dict[str, np.ndarray]:
-    """For each modality `[K, epochs]` mean total rewards of several runs, as they saved them."""
+    """`[K, epochs]` mean total rewards for each modality, from the checkpoints of several runs."""
     shapes = {
         "reward": np.zeros(config.dqn.epochs, np.float32),
         "epsilon": np.zeros(config.dqn.epochs, np.float32),
@@ -43,7 +43,7 @@ def rewards(runs: Sequence[Path], config: Config) -> dict[str, np.ndarray]:
 
 
 def totals(timings: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    """The seconds of each stage of several runs together."""
+    """Total seconds of each stage over several runs."""
     found: dict[str, dict[str, float]] = {}
     for timing in timings:
         for stage, seconds in timing.items():

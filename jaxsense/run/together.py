@@ -1,7 +1,7 @@
-"""Several trainings side by side on an accelerator: their calls of a program become one.
+"""Runs several trainings side by side on an accelerator: their calls of a program become one.
 
-Each training walks its own stages in threads of its own, and saves, stops and fails by itself. What
-they share are the programs: calls of the same program are stacked and made at once by `vmap`.
+Each training has its own threads, and saves, stops and fails by itself. They share their programs:
+`vmap` stacks calls of the same program into one.
 """
 
 import threading
@@ -13,18 +13,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsense.run.compilation import Program
+from jaxsense.run.compilation import Program, shapes_of
 from jaxsense.run.devices import ALONE, Workers
 
-_PATIENCE = 0.5  # s without another call, after which those that wait go on without the others
+_PATIENCE = 0.5  # s without another call, after which those that wait stop waiting for the others
 
 
 class Team:
-    """Trainings that go side by side.
+    """Trainings side by side.
 
     Attributes:
-      number: how many there can be.
-      active: how many have begun and not ended.
+      number: the most trainings at a time.
+      active: trainings that have begun and not ended.
     """
 
     def __init__(self, number: int):
@@ -32,25 +32,25 @@ class Team:
         self._lock = threading.Lock()
 
     def begin(self, number: int) -> None:
-        """So many trainings begin, not more than the team has places."""
+        """Begins `number` trainings, at most as many as the team has places."""
         self.active = number
 
     def leave(self) -> None:
-        """One of them has ended; the others wait for it no longer."""
+        """Ends one training; the others stop waiting for it."""
         with self._lock:
             self.active -= 1
 
 
 class TeamProgram:
-    """A `Program` that is called by every training of a team, with arguments of its own."""
+    """A `Program` that every training of a team calls with its own arguments."""
 
     def __init__(self, program: Program, team: Team, workers: Workers = ALONE):
-        """Makes a program one of a team.
+        """Shares a program in a team.
 
         Args:
-          program: what compiles it.
-          team: who calls it.
-          workers: accelerators that share the trainings, if their number divides that of the team.
+          program: compiles and runs the stacked calls.
+          team: calls it.
+          workers: accelerators that share the trainings, if their number divides the team's.
         """
         self._program, self._team = program, team
         self._workers = workers if team.number % workers.number == 0 else ALONE
@@ -66,10 +66,10 @@ class TeamProgram:
         runs_long: bool = False,
         whole: tuple[int, ...] = (),
     ) -> Any:
-        """See `Program.compile`; arguments in `whole` are the same for all trainings."""
+        """See `Program.compile`; all trainings share the arguments in `whole`."""
         self._whole, number = whole, self._team.number
         axes = tuple(None if i in whole else 0 for i in range(len(args)))
-        shapes = jax.eval_shape(lambda args: args, args)
+        shapes = shapes_of(args)
         stacked = [
             arg if i in whole else jax.tree.map(lambda x: _with_rows(x, number), shapes[i])
             for i, arg in enumerate(args)
@@ -92,7 +92,7 @@ class TeamProgram:
         return self._program.wait()
 
     def __call__(self, *args: Any) -> Any:
-        """Runs the program for all trainings that call it now; returns this one's results."""
+        """Runs the program for all trainings that call it now, and returns this one's results."""
         mine: Future[Any] = Future()
         with self._lock:
             self._waiting.append((args, mine))
@@ -106,7 +106,7 @@ class TeamProgram:
         return mine.result()
 
     def _take(self) -> list[tuple[tuple[Any, ...], Future[Any]]]:
-        """The calls to make now: as many as there are trainings, or all that wait for long."""
+        """The calls to make now: one per training, or all that have waited too long."""
         with self._lock:
             is_late = time.monotonic() - self._last > _PATIENCE
             if not (len(self._waiting) >= self._team.active or is_late):
@@ -116,7 +116,7 @@ class TeamProgram:
             return calls
 
     def _run(self, calls: list[tuple[tuple[Any, ...], Future[Any]]]) -> None:
-        """Makes calls together; a place that nobody takes repeats the first call."""
+        """Makes calls together; an empty place repeats the first call."""
         rows = [args for args, _ in calls]
         rows += rows[:1] * (self._team.number - len(rows))
         stacked = [

@@ -1,1 +1,1 @@
-"""What people see of a run: the terminal, plots, the animation and the report page."""
+"""Shows a run: the terminal, plots, the animation and the report page."""

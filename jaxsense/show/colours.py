@@ -9,19 +9,19 @@ from jaxsense.config import ArenaConfig
 RGB = tuple[float, float, float]
 
 ROBOT_COLOURS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
-_APART = 0.25  # of two colours in RGB, which are then told apart at a glance
+_APART = 0.25  # in RGB, which the eye distinguishes at a glance
 _DARKEST, _LIGHTEST = -0.75, 0.6
 
 
 def class_colour(arena: ArenaConfig, label: str) -> RGB:
-    """The colour of a class, RGB in [0, 1], which no other class of the arena has.
+    """The colour of a class, RGB in [0, 1], unique in the arena.
 
-    It is that of its PoIs; where classes before it have that, a shade: half as bright, half way to
-    white or, if those are taken as well, the one that differs most from all that are.
+    The colour of its PoIs or, if an earlier class has taken it, a shade: half as bright, half way
+    to white or, if those are taken too, the shade that differs most from all others.
     """
     classes, taken = arena.classes, []
     for each in classes[: classes.index(label) + 1]:
-        # More than there are classes, also of black or white, which cannot be darker or lighter.
+        # More than classes, also for black or white, which cannot be darker or lighter.
         tones = (0.0, -0.5, 0.5, *np.linspace(_DARKEST, _LIGHTEST, 4 * len(classes)).tolist())
         shades = [_shade(arena.colours[each.split(" ")[0]], tone) for tone in tones]
         taken.append(max(shades, key=lambda shade: _distance(shade, taken)))
@@ -35,7 +35,7 @@ def _shade(colour: RGB, tone: float) -> RGB:
 
 
 def _distance(colour: RGB, others: list[RGB]) -> float:
-    """How far a colour is from the nearest of others, if it is not far enough."""
+    """Distance of a colour from the nearest of others, at most `_APART`."""
     return min([_APART, *(math.dist(colour, other) for other in others)])
 
 
@@ -45,5 +45,5 @@ def as_hex(colour: RGB) -> str:
 
 
 def as_srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear RGB in [0, 1] as screens take it, with the gamma of sRGB (IEC 61966-2-1)."""
+    """Linear RGB in [0, 1] as sRGB (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)

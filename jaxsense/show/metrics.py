@@ -1,4 +1,4 @@
-"""The metrics of a summary: one table that the terminal, the page, the plots and the docs read."""
+"""The table of metrics, shared by the terminal, the page, the plots and the docs."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -7,13 +7,13 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """A metric of a block of `summary.json`.
+    """A metric in a block of `summary.json`.
 
     Attributes:
-      key: where it stands in the block; a dot leads into a block within.
+      key: its place in the block; a dot leads into an inner block.
       label: its name.
-      meaning: what it measures; empty if the label says it.
-      paper: what the paper reports; with a star, what its authors' code prints.
+      meaning: what it measures; empty if the label is enough.
+      paper: the paper's value; with a star, the output of its authors' code.
       digits: after the point.
     """
 
@@ -24,7 +24,7 @@ class Metric:
     digits: int = 3
 
     def text(self, block: dict[str, Any]) -> str:
-        """Its value in a block: a number, of several seeds the mean and its 95% interval."""
+        """Its value in a block, or of several seeds the mean and its 95% interval."""
         value: Any = block
         for part in self.key.split("."):
             value = value.get(part) if isinstance(value, dict) else None
@@ -35,8 +35,7 @@ DETECTORS = (
     Metric(
         "accuracy",
         "detector: accuracy",
-        "Share of scans, from scenes it was not trained on, whose class it names as well as the "
-        "sensor can.",
+        "Share of scans, from scenes it was not trained on, that it labels correctly.",
         digits=4,
     ),
 )
@@ -46,30 +45,30 @@ AGENTS = (
     Metric(
         "return",
         "episode: DQN, greedy",
-        "Information that the greedy policy of the Q-network gains in an episode; a look in vain "
-        "costs 1.",
+        "Information that the Q-network's greedy policy gains in an episode; a useless look costs "
+        "1.",
         "Fig. 5",
     ),
     Metric(
         "optimal",
         "episode: optimal",
-        "The policy that knows what every look can reveal on average.",
+        "The policy that knows what each look reveals on average.",
         "0.550*",
     ),
-    Metric("naive", "episode: naive", "Looks at every point once, whatever is known."),
-    Metric("random", "episode: random", "Takes any look, or ends, by chance."),
-    Metric("fraction_of_optimal", "fraction of optimal", "The first of these over the second."),
+    Metric("naive", "episode: naive", "Looks at every point once, whatever the map holds."),
+    Metric("random", "episode: random", "Looks anywhere, or ends, at random."),
+    Metric("fraction_of_optimal", "fraction of optimal", "DQN over optimal."),
     Metric(
         "optimal_states",
         "optimal in states",
-        "States of the map in which the policy's reward is within 0.01 of the optimum.",
+        "States of the map where the policy's reward is within 0.01 of the optimum.",
         digits=1,
     ),
     Metric("num_states", "states of the map", "At most 4,096 are examined.", "384", 0),
     Metric(
         "one_step.policy",
         "one step: DQN",
-        "Reward of the first step alone, as the authors' code measures it.",
+        "Reward of the first step alone, as in the authors' code.",
         "0.340, 0.385*",
     ),
     Metric("one_step.optimal", "one step: optimal", "The optimal policy's first step.", "0.426*"),
@@ -83,27 +82,26 @@ LATENT_SPACE = (
     Metric(
         "active_units",
         "dimensions in use",
-        "Of the latent space; the paper's Fig. 4 uses one of two.",
+        "Of the latent space; one of two in the paper's Fig. 4.",
         "1",
         1,
     ),
     Metric(
         "fusion.accuracy",
         "fusion: right class",
-        "Share of entries, written by one sensor and then by another, that are nearest to the true "
-        "class.",
+        "Share of map entries nearest to the true class, after one sensor and then another.",
         digits=4,
     ),
     Metric(
         "fusion.mean_error",
         "fusion: error",
-        "Distance of these entries from what both sensors together yield, in standard deviations.",
+        "Distance of these entries from both sensors' joint belief, in standard deviations.",
     ),
     Metric(
         "moment_matching_error",
         "error of moments",
-        "Distance of a sensor's belief from the best single Gaussian over the classes that it "
-        "leaves open.",
+        "Distance of a sensor's belief from the best single Gaussian over the classes that remain "
+        "possible.",
         "0 in theory",
     ),
 )
@@ -113,27 +111,25 @@ MISSIONS = (
     Metric(
         "accuracy",
         "accuracy",
-        "Share of points whose most likely class in the finished map is the true one.",
+        "Share of points whose most likely class in the finished map is right.",
     ),
     Metric(
         "observations_per_poi",
         "looks per point",
-        "The fewer, the better they were chosen.",
+        "Fewer are better.",
         digits=2,
     ),
-    Metric("time_s", "time [s]", "Until all robots have ended; the median.", digits=1),
+    Metric("time_s", "time [s]", "Median time until all robots have ended.", digits=1),
     Metric(
         "collisions", "collisions", "Control periods in which a robot touched something.", digits=0
     ),
     Metric(
         "goals_reached_fraction",
         "goals reached",
-        "Share of the viewpoints that robots set out for.",
+        "Share of chosen viewpoints that robots reached.",
     ),
-    Metric(
-        "information", "information", "In the finished map: the sum of 1 / sigma norm.", digits=2
-    ),
-    Metric("told", "told", "Accuracy of what a robot alone can distinguish."),
+    Metric("information", "information", "Sum of 1 / sigma norm over the finished map.", digits=2),
+    Metric("told", "told", "Accuracy where one robot alone can distinguish the class."),
     Metric(
         "ambiguous_reported",
         "ambiguous",
@@ -147,7 +143,7 @@ _PAGE_ONLY = {"one_step.policy", "one_step.optimal", "one_step.random", "env_ste
 
 
 def headline() -> Iterator[Metric]:
-    """Those of `AGENTS` that a terminal has room for."""
+    """The metrics of `AGENTS` that fit into a terminal."""
     return (metric for metric in AGENTS if metric.key not in _PAGE_ONLY)
 
 
@@ -156,13 +152,18 @@ def label(key: str) -> str:
     return next(metric.label for metric in AGENTS if metric.key == key)
 
 
+def cases(block: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The cases in a summary's block `mission`."""
+    return {name: case for name, case in block.items() if name != "bytes_per_detection"}
+
+
 def mean(value: Any) -> float:
     """A number, or the mean of several seeds."""
     return value["mean"] if isinstance(value, dict) else value
 
 
 def text(value: Any, digits: int = 3) -> str:
-    """A number, or a mean and its interval, as text; a dash for one that is missing."""
+    """A number, or a mean and its interval, as text; a dash for None."""
     if value is None:
         return "-"
     if isinstance(value, dict):

@@ -1,9 +1,10 @@
-"""The plots of a run: the paper's Fig. 4 and Fig. 5, and what the sensors see."""
+"""The plots of a run: the paper's Fig. 4 and Fig. 5, and the sensors' scanlines."""
 
 import io
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from matplotlib import cm, colormaps
 from matplotlib.collections import PatchCollection
@@ -17,7 +18,7 @@ from jaxsense.run import files
 from jaxsense.run.pipeline import RunResult
 from jaxsense.run.seeds import interval
 from jaxsense.show import metrics
-from jaxsense.show.colours import as_srgb, class_colour
+from jaxsense.show.colours import RGB, as_srgb, class_colour
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
 
@@ -51,57 +52,64 @@ def _write(path: Path, figure: Figure) -> None:
 def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     """The paper's Fig. 4: posteriors of held-out detections as 1-sigma ellipses.
 
-    Above, classes by colour; below, `||sigma||` by colour; one column for detections by all
-    modalities together, and one for each alone. Of a latent space of more than two dimensions the
-    first two are shown. Detections far from the others of their class are crosses.
+    Colours show classes above and `||sigma||` below. The first column shows detections by all
+    modalities together, the others by each alone, in the first two latent dimensions. Crosses mark
+    detections far from the others of their class.
     """
     names = ["joint", *config.modalities]
     titles = {"joint": " & ".join(config.modalities)}
     figure = Figure(figsize=(3.6 * len(names) + 1.2, 7.6), layout="constrained")
     axes = figure.subplots(2, len(names), sharex=True, sharey=True, squeeze=False)
-    norms = {name: np.linalg.norm(belief.std, axis=-1) for name, belief in posteriors.items()}
-    lowest = min(norm[:, :_MOST_ELLIPSES].min() for norm in norms.values())
-    highest = max(norm[:, :_MOST_ELLIPSES].max() for norm in norms.values())
-    scale = Normalize(lowest, highest)
+    shown = {n: jax.tree.map(lambda x: x[:, :_MOST_ELLIPSES], posteriors[n]) for n in names}
+    norms = {name: np.linalg.norm(belief.std, axis=-1) for name, belief in shown.items()}
+    scale = Normalize(min(x.min() for x in norms.values()), max(x.max() for x in norms.values()))
     sigma_map = colormaps["viridis"]
-    colours = [class_colour(config.arena, label) for label in config.arena.classes]
+    classes = config.arena.classes
+    colours = [class_colour(config.arena, label) for label in classes]
     num_far = 0
-    for column, name in enumerate(names):
-        belief = posteriors[name]
-        axes[0, column].set_title(titles.get(name, f"{name} alone"))
-        mean, std = (_in_plane(x[:, :_MOST_ELLIPSES]) for x in (belief.mean, belief.std))
-        centre, spread = np.median(mean, axis=1), np.median(std, axis=1)
-        is_far = _apart(mean, centre[:, None], spread[:, None]) > _FAR
-        num_far += int(is_far.sum())
-        for c, colour in enumerate(colours):
-            by_class = np.tile(colour, (mean.shape[1], 1))
-            by_sigma = sigma_map(scale(norms[name][c, :_MOST_ELLIPSES]))
-            for row, shades in enumerate((by_class, by_sigma)):
-                _ellipses(axes[row, column], mean[c], std[c], shades, is_far[c])
-        _name_classes(axes[0, column], centre, spread)
-        axes[1, column].set_xlabel("$\\mu_1$")
-    for c, (colour, label) in enumerate(zip(colours, config.arena.classes, strict=True)):
+    for column, (name, belief) in zip(axes.T, shown.items(), strict=True):
+        column[0].set_title(titles.get(name, f"{name} alone"))
+        num_far += _beliefs(column, belief, colours, sigma_map(scale(norms[name])))
+    for c, (colour, label) in enumerate(zip(colours, classes, strict=True)):
         axes[0, 0].plot([], [], "o", color=colour, label=f"({c + 1}) {label}")
     if num_far:
-        total = sum(norm[:, :_MOST_ELLIPSES].size for norm in norms.values())
+        total = sum(norm.size for norm in norms.values())
         label = f"{num_far} of {total} detections, where a detector was not sure"
         axes[0, 0].plot([], [], "x", color="0.3", label=label)
     axes[0, 0].set_ylabel("class\n$\\mu_2$")
     axes[1, 0].set_ylabel("uncertainty\n$\\mu_2$")
-    shown = [_in_plane(b.mean[:, :_MOST_ELLIPSES]) for b in posteriors.values()]
-    radii = [_in_plane(b.std[:, :_MOST_ELLIPSES]) for b in posteriors.values()]
-    low = np.min(np.subtract(shown, radii), axis=(0, 1, 2))
-    high = np.max(np.add(shown, radii), axis=(0, 1, 2))
-    half = 0.63 * np.max(high - low)  # with room for the names of classes
+    _fit(axes, [*shown.values()])
+    mappable = cm.ScalarMappable(scale, sigma_map)
+    figure.colorbar(mappable, ax=axes[1, :], label="$\\|\\sigma\\|_2$")
+    columns = min(len(classes) + bool(num_far), 4)
+    figure.legend(loc="outside upper center", ncols=columns, frameon=False)
+    return figure
+
+
+def _beliefs(axes: Any, belief: Belief, by_class: list[RGB], by_sigma: np.ndarray) -> int:
+    """Draws `[C, S]` beliefs on two axes; returns how many lie far from their class."""
+    mean, std = _in_plane(belief.mean), _in_plane(belief.std)
+    centre, spread = np.median(mean, axis=1), np.median(std, axis=1)
+    is_far = _apart(mean, centre[:, None], spread[:, None]) > _FAR
+    for c, colour in enumerate(by_class):
+        _ellipses(axes[0], mean[c], std[c], np.tile(colour, (mean.shape[1], 1)), is_far[c])
+        _ellipses(axes[1], mean[c], std[c], by_sigma[c], is_far[c])
+    _name_classes(axes[0], centre, spread)
+    axes[1].set_xlabel("$\\mu_1$")
+    return int(is_far.sum())
+
+
+def _fit(axes: np.ndarray, beliefs: list[Belief]) -> None:
+    """Limits the axes to a square around all ellipses, with room for the names of classes."""
+    means = [_in_plane(belief.mean) for belief in beliefs]
+    radii = [_in_plane(belief.std) for belief in beliefs]
+    low = np.min(np.subtract(means, radii), axis=(0, 1, 2))
+    high = np.max(np.add(means, radii), axis=(0, 1, 2))
+    half = 0.63 * np.max(high - low)
     x, y = (low + high) / 2
     axes[0, 0].set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     for ax in axes.flat:
         ax.set_aspect("equal", adjustable="box")
-    mappable = cm.ScalarMappable(scale, sigma_map)
-    figure.colorbar(mappable, ax=axes[1, :], label="$\\|\\sigma\\|_2$")
-    columns = len(config.arena.classes) + bool(num_far)
-    figure.legend(loc="outside upper center", ncols=min(columns, 4), frameon=False)
-    return figure
 
 
 def _in_plane(values: Any) -> np.ndarray:
@@ -111,7 +119,7 @@ def _in_plane(values: Any) -> np.ndarray:
 
 
 def _apart(mean: np.ndarray, centre: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """How far means `[..., 2]` are from a centre, in standard deviations."""
+    """Distance of `[..., 2]` means from a centre, in standard deviations."""
     return np.linalg.norm((mean - centre) / np.maximum(spread, 1e-6), axis=-1)
 
 
@@ -131,7 +139,7 @@ def _ellipses(
 
 
 def _name_classes(axes: Any, centre: np.ndarray, spread: np.ndarray) -> None:
-    """Writes the number of each class, `[C, 2]`, above its ellipse; those in one place together."""
+    """Writes the numbers of classes, `[C, 2]`, above their ellipses; joins those in one place."""
     waiting = list(range(len(centre)))
     while waiting:
         first = waiting[0]
@@ -155,7 +163,7 @@ def rewards(per_epoch: dict[str, np.ndarray], agents: dict[str, Any]) -> Figure:
 
     Args:
       per_epoch: for each modality `[epochs]` rewards, NaN where no episode ended; or `[K, epochs]`
-        of several seeds, of which the mean and its 95% interval are shown.
+        of several seeds, to show their mean and its 95% interval.
       agents: the block `dqn` of the summary.
     """
     figure = Figure(figsize=(5 * len(per_epoch), 4), layout="constrained")
@@ -180,7 +188,7 @@ def rewards(per_epoch: dict[str, np.ndarray], agents: dict[str, Any]) -> Figure:
 
 
 def _smoothed(reward: np.ndarray) -> np.ndarray:
-    """The mean of the last epochs in which an episode ended, for each epoch from one on."""
+    """Running mean over the epochs in which an episode ended."""
     window = min(_SMOOTHING, len(reward))
     number = np.convolve(np.isfinite(reward), np.ones(window), mode="valid")
     total = np.convolve(np.nan_to_num(reward), np.ones(window), mode="valid")
@@ -188,7 +196,7 @@ def _smoothed(reward: np.ndarray) -> np.ndarray:
 
 
 def scanlines(config: Config, windows: dict[str, np.ndarray]) -> Figure:
-    """What each detector reads of one look at each class, from left to right."""
+    """One look at each class as each detector reads it, from left to right."""
     classes = config.arena.classes
     figure = Figure(figsize=(3.6 * len(classes), 2.6 * len(windows)), layout="constrained")
     axes = figure.subplots(len(windows), len(classes), squeeze=False)

@@ -1,4 +1,4 @@
-"""Event files for TensorBoard, as an option."""
+"""Optional event files for TensorBoard."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,13 +8,13 @@ from jaxsense.config import ConfigError
 
 
 def make_writer(path: Path) -> Callable[..., None]:
-    """A function that writes the metrics of a report to event files in a directory.
+    """Returns a function that writes reported metrics to event files in a directory.
 
     Raises:
-      ConfigError: if the package that writes them is not installed.
+      ConfigError: if tensorboardX is not installed.
     """
     try:
-        # Only who asks for event files needs it.
+        # An optional dependency.
         from tensorboardX import SummaryWriter  # noqa: PLC0415
     except ImportError:
         reason = "needs tensorboardX: pip install 'jaxsense[tensorboard]'"

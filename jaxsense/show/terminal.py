@@ -1,4 +1,4 @@
-"""What a program shows of its progress."""
+"""Shows the progress of a program."""
 
 import contextlib
 import time
@@ -9,11 +9,11 @@ import rich.progress
 from rich.table import Column
 
 _LINE_PERIOD = 5.0  # s
-_WIDE = 110  # columns of a terminal, from which there is room for a bar
+_WIDE = 110  # columns of a terminal, enough for a bar
 
 
 class Display:
-    """Progress of a run: a live bar for each stage, or plain lines where there is no terminal."""
+    """Progress of a run: a live bar for each stage, or plain lines without a terminal."""
 
     def __init__(
         self,
@@ -24,9 +24,9 @@ class Display:
         """Shows progress on a console.
 
         Args:
-          console: where to.
-          *records: each takes the metrics of every report.
-          quiet: show nothing, but do record.
+          console: to show it on.
+          *records: receive the metrics of every report.
+          quiet: record, but show nothing.
         """
         self._console, self._records, self._quiet = console, records, quiet
         self._tasks: dict[str, rich.progress.TaskID] = {}
@@ -54,7 +54,7 @@ class Display:
         self._progress.stop()
 
     def show(self, stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
-        """Takes a report of a `Monitor`; one without a total says that a stage compiles."""
+        """Shows a report of a `Monitor`; a total of 0 means that a stage compiles."""
         if total:
             for record in self._records:
                 record(stage=stage, step=done, **metrics)
@@ -83,13 +83,13 @@ class Display:
             left=left,
             metrics=text,
         )
-        # What only compiles or examines has no end of its own to tell of.
+        # Stages that only compile or examine never report an end.
         for other in self._progress.tasks:
             if other.total is None and other.description != stage:
                 self._progress.update(other.id, visible=False)
 
     def _rate(self, stage: str, done: int, total: int, now: float) -> tuple[str, str]:
-        """Rate and time left as text; empty at the first report, which ends the first chunk."""
+        """Rate and time left as text; empty at the end of the first chunk."""
         since, before = self._first.setdefault(stage, (now, done))
         if done <= before or now <= since:
             return "", ""
@@ -97,7 +97,7 @@ class Display:
         return f"{rate:.0f}/s", f"{(total - done) / rate:.0f} s left"
 
     def _show_line(self, stage: str, done: int, total: int, text: str) -> None:
-        """At most a line in some seconds for each stage, but for its first and its last."""
+        """Prints a line for each stage every few seconds, always its first and last."""
         now = time.perf_counter()
         clock = f"{now - self._begin:6.1f} s  {stage}"
         if not total:
@@ -116,6 +116,6 @@ class Display:
 
 
 def say(text: str) -> None:
-    """Prints a line, if it can be: a run must not be lost with what shows it."""
+    """Prints a line; ignores a closed output, which must not end a run."""
     with contextlib.suppress(OSError):
         print(text, flush=True)

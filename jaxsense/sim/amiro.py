@@ -1,10 +1,10 @@
 """The AMiRo mini robot: its sizes and its MJCF.
 
-Numbers are those of the robot's published URDF (`amiro_description`). The robot moves in the plane:
-two slides and a hinge, so `qpos` and `qvel` of one robot are x [m], y [m] and yaw [rad]. Its wheels
-are velocity servos that push the body at the two points where the wheels stand; a third, passive
-actuator holds it against sliding sideways. There is no other coupling, so a wheel that cannot reach
-its speed slips, within the servo's force.
+Numbers come from the robot's published URDF (`amiro_description`). The robot moves in the plane on
+two slides and a hinge, so its `qpos` and `qvel` are x [m], y [m] and yaw [rad]. Its wheels are
+velocity servos that push the body where the wheels stand; a third, passive actuator keeps it from
+sliding sideways. Nothing else couples them: a wheel that cannot reach its speed slips, within the
+servo's force.
 """
 
 from jaxsense.config import ROBOT_RADIUS
@@ -29,8 +29,8 @@ MAX_ACCELERATION = 2.5  # m/s^2
 MAX_TURN_ACCELERATION = 3.2  # rad/s^2
 
 _MASS = BODY_MASS + 2 * WHEEL_MASS
-# The servo reaches a commanded wheel speed with this time constant; two physics steps or more keep
-# the integration stable and well damped.
+# Of the servo on its way to a commanded wheel speed; two physics steps or more keep the integration
+# stable and well damped.
 _TIME_CONSTANT = 0.02  # s
 _WHEEL_GAIN = _MASS * WHEEL_RADIUS**2 / (2 * _TIME_CONSTANT)  # N m s / rad
 _WHEEL_TORQUE = _MASS * MAX_ACCELERATION * WHEEL_RADIUS / 2  # N m
@@ -41,8 +41,8 @@ _WHEEL_INERTIA = WHEEL_MASS * (WHEEL_RADIUS**2 / 4 + WHEEL_WIDTH**2 / 12)  # abo
 _YAW_INERTIA = BODY_MASS * BODY_RADIUS**2 / 2 + 2 * (
     _WHEEL_INERTIA + WHEEL_MASS * (WHEEL_SEPARATION / 2) ** 2
 )  # kg m^2
-# Both accelerations come from the same motors: each rad/s^2 of turning takes this much from what is
-# left for going forward.
+# Both accelerations come from the same motors: each rad/s^2 of turning takes this much from the
+# forward acceleration.
 FORWARD_PER_TURN = 2 * _YAW_INERTIA / (_MASS * WHEEL_SEPARATION)  # m/rad
 
 MAX_WHEEL_SPEED = (MAX_SPEED + MAX_TURN_RATE * WHEEL_SEPARATION / 2) / WHEEL_RADIUS  # rad/s
@@ -53,12 +53,12 @@ def body(name: str, has_lidar: bool, reach: float) -> str:
 
     Args:
       name: prefix of the names of its parts.
-      has_lidar: whether it carries a laser scanner on top; else only the camera in its body.
-      reach: how far the robot's centre may go from the origin along x and along y, in metres.
+      has_lidar: whether it carries a laser scanner on top besides the camera in its body.
+      reach: largest distance of the robot's centre from the origin along x and along y, in metres.
 
     Returns:
-      An MJCF `<body>` element. Only the sphere in its middle collides: seen from above it is the
-      robot's disc, and it meets upright cylinders, boxes and other robots where the disc does.
+      An MJCF `<body>` element. Only the sphere in its middle collides: it meets upright cylinders,
+      boxes and other robots where the robot's disc does.
     """
     middle = GROUND_CLEARANCE + BODY_HEIGHT / 2
     tower = (LIDAR_TOP - GROUND_CLEARANCE - BODY_HEIGHT) / 2

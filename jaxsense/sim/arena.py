@@ -1,8 +1,8 @@
 """The arena in MuJoCo-MJX: walls, robots, and points of interest whose kind is data.
 
-A PoI slot owns one upright solid for each shape, each a mocap body; those that the slot does not
-show wait below the floor. Its pose and shape are therefore entries of the MJX state, its colour an
-entry of the layout, and a new layout or class never recompiles anything.
+A PoI slot owns one upright solid for each shape, each a mocap body; all but the one it shows wait
+below the floor. Pose and shape are therefore entries of the MJX state, colour is an entry of the
+layout, and a new layout or class never recompiles anything.
 """
 
 import dataclasses
@@ -23,13 +23,13 @@ from jaxsense.types import Key, pytree
 
 WALL_HEIGHT = 0.3  # m
 WALL_THICKNESS = 0.05  # m
-_STORE = -2.0  # m, height at which the shapes that are not shown wait below the floor
+_STORE = -2.0  # m, height of hidden shapes, below the floor
 _WALL_COLOUR = (0.6, 0.6, 0.6)
 
 
 @pytree
 class Layout:
-    """What stands where in one arena; all of it data, so that nothing recompiles.
+    """PoIs of one arena, all as data, so that nothing recompiles.
 
     Attributes:
       position: `[N, 2]` float32 centres of the PoIs, in metres from the arena's centre.
@@ -48,13 +48,13 @@ class Layout:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Arena:
-    """A compiled arena: what is the same for all its layouts. Static under `jit`.
+    """A compiled arena, shared by all its layouts. Static under `jit`.
 
     Attributes:
       config: the settings it was built from.
       mj_model: the model for C MuJoCo.
       model: the same for MJX.
-      data: an MJX state of it, to be filled by `place`.
+      data: an MJX state, which `place` fills.
       num_robots: robots, named robot0, robot1 and so on.
     """
 
@@ -66,7 +66,7 @@ class Arena:
 
     @functools.cached_property
     def robot_of_geom(self) -> np.ndarray:
-        """`[G]` int32, the robot that each geom belongs to, or -1."""
+        """Robot that owns each geom, `[G]` int32, or -1."""
         bodies = [self.mj_model.body(f"robot{r}").id for r in range(self.num_robots)]
         return np.array(
             [bodies.index(b) if b in bodies else -1 for b in self.mj_model.geom_bodyid], np.int32
@@ -74,7 +74,7 @@ class Arena:
 
     @functools.cached_property
     def poi_of_geom(self) -> np.ndarray:
-        """`[G]` int32, the PoI slot that each geom belongs to, or -1."""
+        """PoI slot that owns each geom, `[G]` int32, or -1."""
         names = [self.mj_model.geom(g).name for g in range(self.mj_model.ngeom)]
         return np.array(
             [int(n.split("_")[0][3:]) if n.startswith("poi") else -1 for n in names], np.int32
@@ -94,12 +94,23 @@ def build(
       config: sizes and number of PoIs.
       lidar_robots: for each robot, whether it carries a laser scanner.
       contacts: whether robots collide with PoIs, with each other and with the walls.
-      obstacles: whether there are PoIs and walls; without them robots move as they do where nothing
-        is near, and nothing can be seen.
+      obstacles: whether there are PoIs and walls; without them robots move freely and see nothing.
 
     Returns:
       The arena; its `data` holds every robot and PoI at the origin.
     """
+    mjcf = _mjcf(config, lidar_robots, contacts, obstacles)
+    mj_model = mujoco.MjModel.from_xml_string(mjcf)  # pyright: ignore[reportAttributeAccessIssue]
+    # By itself MJX takes the first device of all processes.
+    device = jax.local_devices()[0]
+    model = mjx.put_model(mj_model, device=device, impl="jax")
+    return Arena(config, mj_model, model, mjx.make_data(model, device=device), len(lidar_robots))
+
+
+def _mjcf(
+    config: ArenaConfig, lidar_robots: tuple[bool, ...], contacts: bool, obstacles: bool
+) -> str:
+    """MJCF of the whole arena."""
     reach = config.side / 2 - amiro.BODY_RADIUS
     robots = [f"robot{r}" for r in range(len(lidar_robots))]
     pois = "".join(
@@ -107,19 +118,10 @@ def build(
         for n in range(config.num_pois)
         for name, shape in config.shapes.items()
     )
-    offset = (config.side + WALL_THICKNESS) / 2
-    half = (WALL_THICKNESS / 2, config.side / 2 + WALL_THICKNESS)
-    walls = "".join(
-        f'<geom name="wall{w}" type="box" pos="{x} {y} {WALL_HEIGHT / 2}" '
-        f'size="{half[abs(y) > 0]} {half[abs(x) > 0]} {WALL_HEIGHT / 2}" '
-        f'rgba="{" ".join(map(str, _WALL_COLOUR))} 1"/>'
-        for w, (x, y) in enumerate(((offset, 0), (0, offset), (-offset, 0), (0, -offset)))
-    )
     bits = (1, 2) if contacts else (0, 0)
-    # Euler, because MJX's implicitfast leaves out that a servo's force is limited, and accelerates
-    # a third less than C MuJoCo. The servos' time constant of two steps keeps it stable.
-    mj_model = mujoco.MjModel.from_xml_string(  # pyright: ignore[reportAttributeAccessIssue]
-        f"""
+    # Euler, because MJX's implicitfast ignores the limit of a servo's force, and accelerates a
+    # third less than C MuJoCo. The servos' time constant of two steps keeps it stable.
+    return f"""
     <mujoco model="jaxsense">
       <compiler angle="degree" autolimits="true"/>
       <option timestep="{TIMESTEP}" integrator="Euler" iterations="1" ls_iterations="4">
@@ -135,16 +137,23 @@ def build(
         </default>
       </default>
       <worldbody>
-        {walls + pois if obstacles else ""}
+        {_walls(config) + pois if obstacles else ""}
         {"".join(amiro.body(n, h, reach) for n, h in zip(robots, lidar_robots, strict=True))}
       </worldbody>
       <actuator>{"".join(map(amiro.actuators, robots))}</actuator>
     </mujoco>"""
+
+
+def _walls(config: ArenaConfig) -> str:
+    """MJCF of the four walls."""
+    offset = (config.side + WALL_THICKNESS) / 2
+    half = (WALL_THICKNESS / 2, config.side / 2 + WALL_THICKNESS)
+    return "".join(
+        f'<geom name="wall{w}" type="box" pos="{x} {y} {WALL_HEIGHT / 2}" '
+        f'size="{half[abs(y) > 0]} {half[abs(x) > 0]} {WALL_HEIGHT / 2}" '
+        f'rgba="{" ".join(map(str, _WALL_COLOUR))} 1"/>'
+        for w, (x, y) in enumerate(((offset, 0), (0, offset), (-offset, 0), (0, -offset)))
     )
-    # By itself MJX takes the first device of all processes.
-    device = jax.local_devices()[0]
-    model = mjx.put_model(mj_model, device=device, impl="jax")
-    return Arena(config, mj_model, model, mjx.make_data(model, device=device), len(robots))
 
 
 def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
@@ -157,8 +166,8 @@ def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
     collides = 'class="obstacle"/>'
     if is_box or not contacts:
         return f'<body name="{name}" mocap="true">{solid} {collides}</body>'
-    # MJX finds contacts of cylinders by descent and those of capsules in closed form. At the height
-    # of a robot's collider both are the same.
+    # MJX finds contacts of cylinders by descent, of capsules in closed form. At the height of a
+    # robot's collider both shapes are the same.
     capsule = f'<geom name="{name}_collider" type="capsule" size="{size}" group="3" {collides}'
     return f'<body name="{name}" mocap="true">{solid}/>{capsule}</body>'
 
@@ -166,7 +175,7 @@ def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
 def make_layout(
     config: ArenaConfig, position: jax.Array, yaw: jax.Array, classes: jax.Array
 ) -> Layout:
-    """The layout in which PoI n is of class `classes[n]`, an `[N]` index into `config.classes`."""
+    """Builds the layout of PoIs of `[N]` int32 `classes`, an index into `config.classes`."""
     chex.assert_shape(position, (config.num_pois, 2), custom_message="position")
     chex.assert_shape([yaw, classes], (config.num_pois,), custom_message="yaw, classes")
     checks.require_finite("position", position)
@@ -182,8 +191,8 @@ def make_layout(
 def random_layout(key: Key, config: ArenaConfig, classes: jax.Array) -> Layout:
     """Puts PoIs of the given classes at random places that keep `poi_gap` between them.
 
-    The arena is cut into square cells, about twice as many as there are PoIs; each PoI gets a cell
-    of its own and a place in it that leaves half the gap free on every side.
+    Square cells, about twice as many as PoIs, divide the arena; each PoI gets its own cell and a
+    place in it with half the gap free on every side.
 
     Args:
       key: random key.
@@ -210,7 +219,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: jax.Array) -> Layout:
 
 @functools.partial(jax.jit, static_argnums=0)  # traced once for all who look
 def place(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
-    """The MJX state with PoIs and robots at rest where they are told to be.
+    """Puts PoIs and robots, at rest, into the MJX state.
 
     Args:
       arena: the arena.
@@ -218,13 +227,13 @@ def place(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
       poses: `[R, 3]` x [m], y [m] and yaw [rad] of each robot.
 
     Returns:
-      The state after MJX's kinematics, which fill `geom_xpos` and `geom_xmat`.
+      The state after MJX's kinematics, with `geom_xpos` and `geom_xmat`.
     """
     return mjx.kinematics(arena.model, put(arena, layout, poses))
 
 
 def put(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
-    """`place` without the kinematics, which a physics step does itself."""
+    """Does what `place` does, without the kinematics: a physics step computes them itself."""
     chex.assert_shape(poses, (arena.num_robots, 3), custom_message="poses")
     check_layout(arena.config, layout)
     shown = layout.shape[:, None] == jnp.arange(len(arena.config.shapes))[None]
@@ -242,7 +251,7 @@ def put(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
 
 
 def check_layout(config: ArenaConfig, layout: Layout) -> None:
-    """Raises an `AssertionError` that names the part of a layout which does not fit the arena."""
+    """Raises an `AssertionError` naming the part of a layout that does not fit the arena."""
     shapes = {"position": (2,), "yaw": (), "shape": (), "colour": (3,)}
     for name, shape in shapes.items():
         chex.assert_shape(
@@ -256,7 +265,7 @@ def robot_poses(data: mjx.Data) -> jax.Array:
 
 
 def drive(arena: Arena, data: mjx.Data, wheel_speeds: jax.Array) -> mjx.Data:
-    """One physics step of `TIMESTEP` seconds under commanded wheel speeds.
+    """Makes one physics step of `TIMESTEP` seconds under commanded wheel speeds.
 
     Args:
       arena: the arena.
@@ -267,7 +276,7 @@ def drive(arena: Arena, data: mjx.Data, wheel_speeds: jax.Array) -> mjx.Data:
       The next MJX state.
     """
     chex.assert_shape(wheel_speeds, (arena.num_robots, 2), custom_message="wheel_speeds")
-    # MJX promotes ranks, which a caller may have forbidden for their own code.
+    # MJX promotes ranks, which the caller may have forbidden.
     with jax.numpy_rank_promotion("allow"):
         return mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds)))
 

@@ -1,10 +1,12 @@
 """Driving among obstacles: the local part of the paper's move_base, as pure functions.
 
-Trajectory rollout (Fox, Burgard and Thrun 1997, the dynamic window approach): of the arcs that a
-robot can take up from its present speed, it takes the one from which it is soonest at its goal,
-among those that keep clear of the walls, the PoIs and the other robots. A command is a forward
-speed [m/s] and a turn rate [rad/s].
+Trajectory rollout (Fox, Burgard and Thrun 1997, the dynamic window approach): of the arcs within
+reach of its present speed that keep clear of walls, PoIs and other robots, a robot takes the one
+that brings it to its goal soonest. A command is a forward speed [m/s] and a turn rate [rad/s].
 """
+
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import chex
 import jax
@@ -18,11 +20,11 @@ from jaxsense.types import Index, others
 
 BACKWARD_SPEED = 0.1  # m/s
 _SAMPLE_TIMES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0)  # shares of the horizon
-# From half the horizon on an arc may be left; at once would make standing still worth as much.
+# Robots may leave an arc from half the horizon on; earlier, standing still would score as well.
 _MAY_LEAVE = _SAMPLE_TIMES.index(0.5)
-_GRAZE = 0.005  # m, by which a trajectory may cut the planning radius: samples are coarse
-_SIDESTEP = 0.06  # m, by which a way around another robot is wider than it must be
-_INFLATION_COST = 0.1  # s, of a way that just touches the planning radius
+_GRAZE = 0.005  # m, a trajectory may cut the planning radius: samples are coarse
+_SIDESTEP = 0.06  # m, extra width of a way around another robot
+_INFLATION_COST = 0.1  # s, where a way just touches the planning radius
 
 
 def wheel_speeds(command: jax.Array) -> jax.Array:
@@ -32,12 +34,12 @@ def wheel_speeds(command: jax.Array) -> jax.Array:
 
 
 def ramp(command: jax.Array, wanted: jax.Array, seconds: float) -> jax.Array:
-    """The command after some time on the way to a wanted one, within the robot's limits.
+    """Moves a command towards a wanted one, within the robot's limits.
 
-    What turning takes of the motors' force is not there for going forward.
+    Turning uses up motor force that forward acceleration then lacks.
 
     Args:
-      command: `[..., 2]` the present one.
+      command: `[..., 2]` the current one.
       wanted: `[..., 2]`, cut to the limits of speed and turn rate.
       seconds: how long the command may change.
 
@@ -54,12 +56,12 @@ def ramp(command: jax.Array, wanted: jax.Array, seconds: float) -> jax.Array:
 
 
 def face(bearing: jax.Array) -> jax.Array:
-    """`[2]` the command that turns a standing robot towards a bearing [rad] in its frame."""
+    """Command, `[2]`, that turns a standing robot towards a bearing [rad] in its frame."""
     return jnp.stack([jnp.zeros_like(bearing), jnp.clip(4.0 * bearing, -1.0, 1.0)])
 
 
 def clearance(arena: ArenaConfig, layout: Layout, poses: jax.Array) -> jax.Array:
-    """Free distance around each robot, exact for the shapes that the PoIs really have.
+    """Free distance around each robot, exact for the actual shapes of the PoIs.
 
     Args:
       arena: its sizes.
@@ -67,8 +69,7 @@ def clearance(arena: ArenaConfig, layout: Layout, poses: jax.Array) -> jax.Array
       poses: `[R, 3]` of the robots.
 
     Returns:
-      `[R]` metres from a robot's outline to the nearest wall, PoI or robot; negative if it is in
-      one.
+      `[R]` metres from a robot's outline to the nearest wall, PoI or robot; negative inside one.
     """
     chex.assert_shape(poses, (None, 3), custom_message="poses")
     x, y = poses[:, 0], poses[:, 1]
@@ -91,6 +92,34 @@ def clearance(arena: ArenaConfig, layout: Layout, poses: jax.Array) -> jax.Array
     return nearest - amiro.BODY_RADIUS
 
 
+class _Arcs(NamedTuple):
+    """Arcs of `[S, 2]` commands at `[T]` times [s]: `[S, T]` x [m], y [m] and heading [rad]."""
+
+    commands: np.ndarray
+    times: jax.Array
+    x: jax.Array
+    y: jax.Array
+    heading: jax.Array
+
+
+class _Frame(NamedTuple):
+    """A robot's frame, in which its arcs are constants: its `[3]` pose, and cosine and sine."""
+
+    pose: jax.Array
+    cos: jax.Array
+    sin: jax.Array
+
+    def of(self, place: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Coordinates of a place, from those in the world."""
+        to_x, to_y = place[0] - self.pose[0], place[1] - self.pose[1]
+        return self.cos * to_x + self.sin * to_y, self.cos * to_y - self.sin * to_x
+
+    def in_world(self, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Coordinates in the world of places in the frame."""
+        pose, cos, sin = self
+        return pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y
+
+
 def drive_to(
     settings: NavigationConfig,
     arena: ArenaConfig,
@@ -102,14 +131,14 @@ def drive_to(
     seconds: float,
     backs_off: jax.Array,
 ) -> jax.Array:
-    """The command that brings a robot to a waypoint soonest without touching anything.
+    """Command that brings a robot to a waypoint soonest without touching anything.
 
-    Arcs that come closer to something than `robot_radius` (less 5 mm, for their coarse samples) are
-    out, but for those that lead away from what is too close already. PoIs are the circles that hold
-    both shapes. Other robots are held to stay and, just as well, to go straight on as they do now.
-    The value of an arc is the least time to the waypoint over the points where the robot may leave
-    it, from half the horizon on: the time so far, that of turning to the waypoint, and that of a
-    straight drive; ways through the inflation around obstacles cost extra time.
+    Arcs closer to something than `robot_radius` (less 5 mm, for their coarse samples) are out,
+    unless they lead away from what is too close already. PoIs are circles that hold every shape.
+    Other robots may stand or go straight on; an arc must be clear of both. The cost of an arc is
+    the least time to the waypoint over the points where the robot may leave it, from half the
+    horizon on: time so far, turning to the waypoint and driving straight; ways through the
+    inflation around obstacles cost extra time.
 
     Args:
       settings: of the planner.
@@ -117,69 +146,96 @@ def drive_to(
       layout: the PoIs' places; their shapes are not used.
       poses: `[R, 3]` of all robots.
       commands: `[R, 2]` of all robots.
-      robot: which one is asking.
+      robot: index of the one to drive.
       waypoint: `[2]` in metres.
-      seconds: for which the command will be held.
-      backs_off: `[]` bool: instead, have as much room as possible in half the horizon from now.
+      seconds: how long the robot keeps the command.
+      backs_off: `[]` bool: seek as much room as possible in half the horizon instead.
 
     Returns:
       `[2]` the wanted command.
     """
     chex.assert_shape(waypoint, (2,), custom_message="waypoint")
     chex.assert_equal_shape_prefix([poses, commands], 1, custom_message="commands")
-    samples, times, x, y, heading = _arcs(settings)
+    arcs = _arcs(settings)
     pose, present = poses[robot], commands[robot]
-    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
+    frame = _Frame(pose, jnp.cos(pose[2]), jnp.sin(pose[2]))
+    room_of_map = _room_of_map(settings, arena, layout, frame, arcs)
+    moving = zip(others(poses, robot), others(commands, robot), strict=True)
+    room, room_now = _room_beside(settings, frame, arcs, moving, *room_of_map)
+    least = jax.lax.cummin(room, axis=1)
 
-    # All in the robot's frame, where the arcs are constants.
-    def in_frame(place: jax.Array) -> tuple[jax.Array, jax.Array]:
-        to_x, to_y = place[0] - pose[0], place[1] - pose[1]
-        return cos * to_x + sin * to_y, cos * to_y - sin * to_x
+    beside = sidestep(settings, arena, layout, pose[:2], waypoint, others(poses[:, :2], robot))
+    arrival = _arrival(settings, arcs, *frame.of(beside), room_of_map[0])
+    is_safe = least >= jnp.minimum(room_now - 1e-4, -_GRAZE)
+    value = jnp.min(jnp.where(is_safe, arrival, jnp.inf)[:, _MAY_LEAVE:], axis=1)
+    value = jnp.where(backs_off, -room[:, _MAY_LEAVE], value)
+    # The first part of the arc must be safe: it will be driven.
+    return _best(arcs, present, seconds, value, may_start=is_safe[:, 0])
 
-    reach = settings.robot_radius
-    world_x, world_y = pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y
+
+def _room_of_map(
+    settings: NavigationConfig, arena: ArenaConfig, layout: Layout, frame: _Frame, arcs: _Arcs
+) -> tuple[jax.Array, jax.Array]:
+    """Metres to walls and PoIs, `[S, T]` from the arcs and `[]` from the robot's current place."""
+    x, y, reach = arcs.x, arcs.y, settings.robot_radius
+    world_x, world_y = frame.in_world(x, y)
     room = arena.side / 2 - jnp.maximum(jnp.abs(world_x), jnp.abs(world_y)) - reach
-    room_now = arena.side / 2 - jnp.max(jnp.abs(pose[:2])) - reach
+    room_now = arena.side / 2 - jnp.max(jnp.abs(frame.pose[:2])) - reach
     for n in range(arena.num_pois):
-        at_x, at_y = in_frame(layout.position[n])
+        at_x, at_y = frame.of(layout.position[n])
         keep = arena.poi_extent + reach
         room = jnp.minimum(room, jnp.hypot(x - at_x, y - at_y) - keep)
         room_now = jnp.minimum(room_now, jnp.hypot(at_x, at_y) - keep)
-    room_of_map = jax.lax.cummin(room, axis=1)
-    for other, command in zip(others(poses, robot), others(commands, robot), strict=True):
-        at_x, at_y = in_frame(other)
-        course, speed = other[2] - pose[2], command[0]
-        then_x, then_y = (
-            at_x + times * speed * jnp.cos(course),
-            at_y + times * speed * jnp.sin(course),
-        )
-        keep = 2 * reach
+    return room, room_now
+
+
+def _room_beside(
+    settings: NavigationConfig,
+    frame: _Frame,
+    arcs: _Arcs,
+    moving: Iterable[tuple[jax.Array, jax.Array]],
+    room: jax.Array,
+    room_now: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Reduces both results of `_room_of_map` by robots, each a `[3]` pose and `[2]` command."""
+    x, y, keep = arcs.x, arcs.y, 2 * settings.robot_radius
+    for other, command in moving:
+        at_x, at_y = frame.of(other)
+        course, speed = other[2] - frame.pose[2], command[0]
+        then_x = at_x + arcs.times * speed * jnp.cos(course)
+        then_y = at_y + arcs.times * speed * jnp.sin(course)
         to_other = jnp.minimum(
             jnp.hypot(x - then_x[None], y - then_y[None]), jnp.hypot(x - at_x, y - at_y)
         )
         room = jnp.minimum(room, to_other - keep)
         room_now = jnp.minimum(room_now, jnp.hypot(at_x, at_y) - keep)
-    least = jax.lax.cummin(room, axis=1)
+    return room, room_now
 
-    beside = sidestep(settings, arena, layout, pose[:2], waypoint, others(poses[:, :2], robot))
-    goal_x, goal_y = in_frame(beside)
-    distance = jnp.hypot(goal_x - x, goal_y - y)
-    turn = jnp.arctan2(goal_y - y, goal_x - x) - heading
+
+def _arrival(
+    settings: NavigationConfig, arcs: _Arcs, goal_x: jax.Array, goal_y: jax.Array, room: jax.Array
+) -> jax.Array:
+    """Seconds to a goal, `[S, T]`, for a robot that leaves the arc at each of its points."""
+    distance = jnp.hypot(goal_x - arcs.x, goal_y - arcs.y)
+    turn = jnp.arctan2(goal_y - arcs.y, goal_x - arcs.x) - arcs.heading
     turn = jnp.abs((turn + jnp.pi) % (2 * jnp.pi) - jnp.pi)
     # Near the waypoint its direction means nothing.
     turn *= jnp.clip(distance / 0.08 - 0.25, 0.0, 1.0)
     inflation = jnp.maximum(settings.inflation, 1e-6)
-    cost = _INFLATION_COST * jnp.clip(1.0 - room_of_map / inflation, 0.0, 1.0)
-    arrival = times[None] + turn / amiro.MAX_TURN_RATE + distance / amiro.MAX_SPEED + cost
-    is_safe = least >= jnp.minimum(room_now - 1e-4, -_GRAZE)
-    value = jnp.min(jnp.where(is_safe, arrival, jnp.inf)[:, _MAY_LEAVE:], axis=1)
-    value = jnp.where(backs_off, -room[:, _MAY_LEAVE], value)
+    narrowest = jax.lax.cummin(room, axis=1)
+    cost = _INFLATION_COST * jnp.clip(1.0 - narrowest / inflation, 0.0, 1.0)
+    return arcs.times[None] + turn / amiro.MAX_TURN_RATE + distance / amiro.MAX_SPEED + cost
+
+
+def _best(
+    arcs: _Arcs, present: jax.Array, seconds: float, value: jax.Array, may_start: jax.Array
+) -> jax.Array:
+    """Command of least `[S]` value in reach of the present one where `[S]` `may_start`, or 0."""
     change = seconds * jnp.array([amiro.MAX_ACCELERATION, amiro.MAX_TURN_ACCELERATION]) + 1e-6
-    in_window = jnp.all(jnp.abs(samples - present[None]) <= change[None], axis=-1)
-    # The first part of the arc must be safe in any case: it will be driven.
-    value = jnp.where(in_window & is_safe[:, 0], value, jnp.inf)
+    in_window = jnp.all(jnp.abs(arcs.commands - present[None]) <= change[None], axis=-1)
+    value = jnp.where(in_window & may_start, value, jnp.inf)
     best = jnp.argmin(value)
-    return jnp.where(jnp.isfinite(value[best]), jnp.array(samples)[best], 0.0)
+    return jnp.where(jnp.isfinite(value[best]), jnp.array(arcs.commands)[best], 0.0)
 
 
 def sidestep(
@@ -190,7 +246,7 @@ def sidestep(
     waypoint: jax.Array,
     blocking: jax.Array,
 ) -> jax.Array:
-    """The next place to go to on a straight way that another robot may stand in.
+    """Next place on a straight way that another robot may block.
 
     Args:
       settings: of the planner.
@@ -201,8 +257,8 @@ def sidestep(
       blocking: `[K, 2]` where the other robots are.
 
     Returns:
-      `[2]` the waypoint, or a place beside the robot that is in the way: on the side of the shorter
-      way on which there is room, the right one if both are equal.
+      `[2]` the waypoint, or a place beside the robot in the way: on the shorter side with room, the
+      right one if both are equal.
     """
     keep = 2 * settings.robot_radius + _SIDESTEP
     reach = arena.side / 2 - settings.robot_radius
@@ -214,7 +270,7 @@ def sidestep(
         right = jnp.stack([along[1], -along[0]])
         ahead, beside = jnp.dot(other - place, along), jnp.dot(other - place, right)
         blocks = (jnp.abs(beside) < keep - _SIDESTEP / 2) & (ahead > 0) & (ahead < length)
-        # On the tangents to a circle around the other robot; closer than that, outwards.
+        # On the tangents to a circle around the other robot; inside it, outwards.
         to_other = other - place
         apart = jnp.maximum(jnp.linalg.norm(to_other), 1e-6)
         turn = jnp.arcsin(jnp.minimum(keep / apart, 1.0)) + jnp.maximum(1.0 - apart / keep, 0.0)
@@ -233,17 +289,17 @@ def sidestep(
     return result
 
 
-def _arcs(settings: NavigationConfig):
-    """Commands `[S, 2]`, times `[T]`, and places and headings `[S, T]` on their arcs from 0."""
+def _arcs(settings: NavigationConfig) -> _Arcs:
+    """Arcs of all commands that the planner tries."""
     forward = np.linspace(0.0, amiro.MAX_SPEED, settings.speed_samples - 1)
     turns = np.linspace(-amiro.MAX_TURN_RATE, amiro.MAX_TURN_RATE, settings.turn_samples)
     speeds = np.concatenate([[-BACKWARD_SPEED], forward])
     samples = np.stack(np.meshgrid(speeds, turns, indexing="ij"), axis=-1).reshape(-1, 2)
     samples = samples.astype(np.float32)
     times = settings.horizon * jnp.array(_SAMPLE_TIMES, jnp.float32)
-    v, w = samples[:, :1], samples[:, 1:]
+    v, w = jnp.array(samples[:, :1]), jnp.array(samples[:, 1:])
     heading = w * times[None]
     # sin(h) / w and (1 - cos(h)) / w, also where w is 0.
     x = v * times[None] * jnp.sinc(heading / np.pi)
     y = v * times[None] * jnp.sin(heading / 2) * jnp.sinc(heading / (2 * np.pi))
-    return samples, times, x, y, heading
+    return _Arcs(samples, times, x, y, heading)

@@ -1,8 +1,8 @@
 """An exact ray-caster for horizontal rays over the MJX state.
 
-Everything in the arena that a sensor can see is upright: cylinders, boxes turned about the
-vertical, and spheres. At the height of a sensor the scene is therefore a set of circles and
-rectangles, and a ray meets them in closed form.
+Everything that a sensor can see is upright: cylinders, and boxes turned about the vertical. At a
+sensor's height the scene is therefore a set of circles and rectangles, which a ray meets in closed
+form.
 """
 
 import functools
@@ -33,7 +33,7 @@ class CrossSection:
       half: `[O, 2]` half the sides, for a circle its radius twice, in metres; 0 where the plane
         does not cut the geom.
       geom: for each outline, the MuJoCo geom id.
-      num_circles: how many of the outlines are circles.
+      num_circles: number of circles.
     """
 
     centre: jax.Array
@@ -45,13 +45,13 @@ class CrossSection:
 
 @pytree
 class Hit:
-    """What a ray met first.
+    """The first hit of a ray.
 
     Attributes:
-      distance: `[...]` float32, in metres; infinite where nothing was met.
-      geom: `[...]` int32 MuJoCo geom id; -1 where nothing was met.
-      normal: x and y part, `[...]` float32 each, of the surface's outward unit normal; 0 where
-        nothing was met.
+      distance: `[...]` float32, in metres; infinite without a hit.
+      geom: `[...]` int32 MuJoCo geom id; -1 without a hit.
+      normal: x and y part, `[...]` float32 each, of the surface's outward unit normal; 0 without a
+        hit.
     """
 
     distance: jax.Array
@@ -66,11 +66,11 @@ def cross_section(arena: Arena, data: mjx.Data, height: float, robot: int) -> Cr
       arena: the arena.
       data: its MJX state, with current `geom_xpos` and `geom_xmat`.
       height: of the plane, in metres.
-      robot: index of the robot whose own geoms are left out, or -1 for none.
+      robot: index of the robot whose own geoms to omit, or -1 for none.
 
     Returns:
-      The cross-section. Wheels and casters are not in it: they do not reach beyond the body's
-      cylinder at any height above the ground clearance, where the sensors are.
+      The cross-section, without wheels and casters: at the height of sensors they do not reach
+      beyond the body's cylinder.
 
     Raises:
       ValueError: if there is no such robot.
@@ -108,9 +108,9 @@ def cast(section: CrossSection, origin: jax.Array, angle: jax.Array) -> Hit:
 
     A ray that starts inside a geom meets it where it leaves, as in MuJoCo's `mj_ray`.
 
-    Distance and normal can be differentiated in origin, angle and section, forwards and backwards.
-    The derivatives are finite for every ray, 0 for one that meets nothing, and exact wherever they
-    exist; they do not at edges, on tangents and where two outlines are equally far.
+    Distance and normal are differentiable in origin, angle and section, forwards and backwards. The
+    derivatives are finite for every ray, 0 without a hit, and exact wherever they exist: not at
+    edges, on tangents and where two outlines are equally far.
 
     Args:
       section: the scene.
@@ -124,7 +124,7 @@ def cast(section: CrossSection, origin: jax.Array, angle: jax.Array) -> Hit:
 
 
 def cast_along(section: CrossSection, origin: jax.Array, direction: Direction) -> Hit:
-    """`cast` along unit vectors: twice as fast, where they need not be worked out for every ray."""
+    """Casts rays along unit vectors: twice as fast as `cast` if these are shared by many calls."""
     chex.assert_shape(origin, (2,), custom_message="origin")
     chex.assert_equal_shape(direction, custom_message="direction")
     values.require_finite("origin", origin)
@@ -136,7 +136,7 @@ def cast_along(section: CrossSection, origin: jax.Array, direction: Direction) -
     distance, outline = nearest(section, origin, direction)
     is_hit = outline < len(section.geom)
     geom = jnp.where(is_hit, choose(jnp.array(section.geom), outline), -1)
-    # Where nothing is met, infinity times a direction would have no derivative.
+    # Without a hit, infinity times a direction would have no derivative.
     finite = jnp.where(jnp.isfinite(distance), distance, 0.0)
     normal_x, normal_y = _normal(section, outline, origin, direction, finite)
     normal = jnp.where(is_hit, normal_x, 0.0), jnp.where(is_hit, normal_y, 0.0)
@@ -144,17 +144,17 @@ def cast_along(section: CrossSection, origin: jax.Array, direction: Direction) -
 
 
 def turned(direction: Direction, yaw: jax.Array) -> Direction:
-    """Unit vectors turned to the left by `[]` yaw, in radians."""
+    """Turns unit vectors to the left by `[]` yaw, in radians."""
     x, y = direction
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     return cos * x - sin * y, cos * y + sin * x
 
 
 def choose(table: jax.Array, index: jax.Array) -> jax.Array:
-    """`table[index]` along the first axis, as a chain of selects.
+    """Returns `table[index]` along the first axis by a chain of selects.
 
     For a few rows and many indices under `vmap` this is ten times faster on CPU than a gather. An
-    index outside the table gives the first row.
+    index outside the table selects the first row.
     """
     return functools.reduce(
         lambda chosen, i: jnp.where(index == i, table[i], chosen), range(len(table)), table[0]
@@ -162,7 +162,7 @@ def choose(table: jax.Array, index: jax.Array) -> jax.Array:
 
 
 def _distances(section: CrossSection, origin: jax.Array, direction: Direction) -> list[jax.Array]:
-    """The distance to each outline; infinite where it is not met."""
+    """Distance to each outline, infinite without a hit."""
     return [
         (_to_circle if i < section.num_circles else _to_rectangle)(section, i, origin, direction)
         for i in range(len(section.geom))
@@ -190,7 +190,7 @@ def _to_rectangle(section: CrossSection, i: int, origin, direction) -> jax.Array
     from_y = origin[1] - section.centre[i, 1]
 
     def slab(position, speed, half):
-        # One division for both sides: it costs as much as all the rest.
+        # One division for both sides: it costs as much as everything else.
         pace = 1.0 / jnp.where(jnp.abs(speed) < 1e-12, 1e-12, speed)
         middle, reach = -position * pace, jnp.abs(half * pace)
         return middle - reach, middle + reach
@@ -207,7 +207,7 @@ def _to_rectangle(section: CrossSection, i: int, origin, direction) -> jax.Array
 def _nearest_by_one_loop(
     section: CrossSection, origin: jax.Array, direction: Direction
 ) -> tuple[jax.Array, jax.Array]:
-    """The distance to what a ray meets first, and the index of its outline."""
+    """Distance to a ray's first hit, and the index of its outline."""
     distance, outline = jnp.float32(jnp.inf), jnp.float32(len(section.geom))
     for i, each in enumerate(_distances(section, origin, direction)):
         is_nearer = (each <= distance) & (each < jnp.inf)
@@ -219,17 +219,16 @@ def _nearest_by_one_loop(
 def _nearest_by_two_loops(
     section: CrossSection, origin: jax.Array, direction: Direction
 ) -> tuple[jax.Array, jax.Array]:
-    """The same where one loop with several results is not vectorised.
+    """Distance and index where XLA does not vectorise one loop with two results.
 
-    The nearest outline is found by a loop of its own, from inputs that the compiler does not
-    recognise as the same.
+    A second loop finds the outline, from inputs that the compiler does not recognise as the same.
     """
     distance = functools.reduce(jnp.minimum, _distances(section, origin, direction))
     return distance, _nearest_outline(*jax.lax.optimization_barrier((section, origin, direction)))
 
 
 def _nearest_outline(section: CrossSection, origin: jax.Array, direction: Direction) -> jax.Array:
-    """`[...]` float32 index of the outline that a ray meets first; their number for none."""
+    """Index of the outline that a ray hits first, `[...]` float32; their number for none."""
     distances = _distances(section, origin, direction)
     nearest = functools.reduce(jnp.minimum, distances)
     squared_index = functools.reduce(
@@ -237,8 +236,8 @@ def _nearest_outline(section: CrossSection, origin: jax.Array, direction: Direct
         range(len(distances)),
         jnp.float32(len(distances) ** 2),
     )
-    # A square root is an operation that XLA computes once and keeps. Without one it repeats the
-    # whole chain wherever the index is used, hundreds of times slower.
+    # XLA computes a square root once and keeps it. Without one it repeats the whole chain at every
+    # use of the index, hundreds of times slower.
     return jnp.round(jnp.sqrt(squared_index))
 
 

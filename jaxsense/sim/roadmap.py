@@ -1,9 +1,9 @@
-"""Shortest ways around the PoIs of an arena, and the viewpoints that they lead to.
+"""Shortest ways around the PoIs of an arena to viewpoints.
 
-A robot does not know which shape a PoI has before it has looked, so every PoI is the circle that
-holds both shapes. A few nodes around each circle and the lengths of the free ways between them are
-worked out once for a layout; a way from anywhere to any viewpoint is then a minimum over two of
-them. This is the part of the paper's move_base that knows the map of the arena.
+A robot does not know a PoI's shape before it has looked, so every PoI is a circle that holds all
+shapes. A roadmap has a few nodes around each circle and the lengths of the free ways between them;
+a way from anywhere to any viewpoint is then a minimum over two of them. This is the part of the
+paper's move_base that knows the map of the arena.
 """
 
 import math
@@ -18,9 +18,9 @@ from jaxsense.sim.arena import Layout
 from jaxsense.types import pytree
 
 NODES_PER_POI = 10
-_LEEWAY = 0.035  # m, within which of a node the next one is still in view
-_MARGIN = 0.02  # m, by which ways between nodes keep farther off than a robot must
-_SLACK = 1e-3  # m, by which a way may cut an obstacle: nodes touch their own circle
+_LEEWAY = 0.035  # m, within which of a node the next one stays in view
+_MARGIN = 0.02  # m, extra distance of ways between nodes from PoIs
+_SLACK = 1e-3  # m, a way may cut an obstacle: nodes touch their own circle
 
 
 @pytree
@@ -29,10 +29,10 @@ class Roadmap:
 
     Attributes:
       nodes: `[K, 2]` in metres.
-      viewpoints: `[N, V, 2]` places from which a PoI can be looked at, in metres.
+      viewpoints: `[N, V, 2]` places to look at a PoI from, in metres.
       to_viewpoint: `[N, V, K]` length of the shortest way from each node to each viewpoint, in
-        metres; infinite where there is none, or where the viewpoint is of no use.
-      is_free: `[N, V]` bool, viewpoints where a robot has room and sees the PoI.
+        metres; infinite if there is none or the viewpoint is not free.
+      is_free: `[N, V]` bool, viewpoints with room for a robot and a view of the PoI.
     """
 
     nodes: jax.Array
@@ -42,7 +42,7 @@ class Roadmap:
 
 
 def build(config: Config, layout: Layout) -> Roadmap:
-    """Works out the ways and the viewpoints of a layout."""
+    """Computes the ways and the viewpoints of a layout."""
     arena, settings = config.arena, config.navigation
     radius = _radius(config)
     sides = 2 * jnp.pi * jnp.arange(NODES_PER_POI) / NODES_PER_POI
@@ -66,15 +66,15 @@ def build(config: Config, layout: Layout) -> Roadmap:
 def lengths(
     config: Config, layout: Layout, roadmap: Roadmap, place: jax.Array, poi: jax.Array
 ) -> jax.Array:
-    """`[V]` metres from a place to the viewpoints of a PoI; infinite where there is no way.
+    """Lengths of the ways from a place to the viewpoints of a PoI, `[V]` metres; infinite for none.
 
-    Other robots are left out: they will be elsewhere, or make room.
+    Ignores other robots: they will be elsewhere, or make room.
 
     Args:
       config: all settings.
       layout: where the PoIs stand.
       roadmap: of the layout.
-      place: `[2]` in metres; may be closer to a PoI than planning allows, if the way leads off.
+      place: `[2]` in metres; may be closer to a PoI than planning allows, if the way leads away.
       poi: `[]` int32.
     """
     chex.assert_shape(place, (2,), custom_message="place")
@@ -95,27 +95,27 @@ def next_place(
     poi: jax.Array,
     view: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """The way to one viewpoint.
+    """Length and next place of the way to one viewpoint.
 
     Args:
       config: all settings.
       layout: where the PoIs stand.
       roadmap: of the layout.
       place: `[2]` in metres, see `lengths`.
-      others: `[R', 2]` robots that stand, in metres; the way does not begin where one is.
+      others: `[R', 2]` places of standing robots, in metres; the way does not begin at one.
       poi: `[]` int32.
       view: `[]` int32, one of the PoI's viewpoints.
 
     Returns:
-      `[]` its length, infinite where there is no way, and `[2]` the first place on it, to which a
-      straight line is free.
+      `[]` length, infinite if there is no way, and `[2]` the first place on it, to which a straight
+      line is free.
     """
     chex.assert_shape(place, (2,), custom_message="place")
     ends = jnp.concatenate([roadmap.viewpoints[poi, view][None], roadmap.nodes])
     first = _straight(place[None], ends, layout.position, _radius(config) - _MARGIN)[0]
     apart = jnp.linalg.norm(ends[:, None] - others[None], axis=-1)
     is_taken = jnp.any(apart < 2 * config.navigation.robot_radius, axis=-1)
-    # Of two nodes on the same way the farther one, or a robot that has reached a node would stay.
+    # Of two nodes on one way the farther one, or a robot that has reached a node would stay there.
     remaining = jnp.append(0.0, 1.001 * roadmap.to_viewpoint[poi, view])
     total = first + jnp.where(roadmap.is_free[poi, view], remaining, jnp.inf)
     total = jnp.where(is_taken, jnp.inf, total)
@@ -124,7 +124,7 @@ def next_place(
 
 
 def _radius(config: Config) -> float:
-    """Distance that ways between nodes keep from the centres of PoIs, in metres."""
+    """Distance of ways between nodes from the centres of PoIs, in metres."""
     return config.arena.poi_extent + config.navigation.robot_radius + _MARGIN
 
 
@@ -137,7 +137,7 @@ def _viewpoints(config: Config, layout: Layout) -> tuple[jax.Array, jax.Array]:
     offsets = (distances[:, None, None] * ring[None]).reshape(-1, 2)
     places = layout.position[:, None] + offsets[None]
     none = jnp.zeros((0, 2))
-    # Room for the robot as planning sees it, not only for its body.
+    # Room for the planning radius, not only for the body.
     clearance = settings.robot_radius - amiro.BODY_RADIUS
 
     def room(places: jax.Array, poi: jax.Array) -> jax.Array:
@@ -148,10 +148,10 @@ def _viewpoints(config: Config, layout: Layout) -> tuple[jax.Array, jax.Array]:
 
 
 def _straight(start: jax.Array, end: jax.Array, centres: jax.Array, radius: float) -> jax.Array:
-    """`[A, B]` lengths of straight ways between `[A, 2]` and `[B, 2]`, infinite where not free.
+    """Lengths `[A, B]` of straight ways between `[A, 2]` and `[B, 2]`, infinite where not free.
 
-    A way is free if it keeps `radius` from all `[N, 2]` centres, or where it begins or ends closer
-    than that, comes no closer on the way.
+    A free way keeps `radius` from all `[N, 2]` centres or, where it begins or ends closer, comes no
+    closer on the way.
     """
     along = end[None] - start[:, None]
     is_free = jnp.ones(along.shape[:2], bool)
@@ -164,7 +164,7 @@ def _straight(start: jax.Array, end: jax.Array, centres: jax.Array, radius: floa
 
 
 def _from_segments(start: jax.Array, end: jax.Array, point: jax.Array) -> jax.Array:
-    """`[A, B]` distances of a point from the straight ways between `[A, 2]` and `[B, 2]`."""
+    """Distances `[A, B]` of a point from the straight ways between `[A, 2]` and `[B, 2]`."""
     start_x, start_y = start[:, None, 0], start[:, None, 1]
     along_x, along_y = end[None, :, 0] - start_x, end[None, :, 1] - start_y
     to_x, to_y = point[0] - start_x, point[1] - start_y
@@ -174,7 +174,7 @@ def _from_segments(start: jax.Array, end: jax.Array, point: jax.Array) -> jax.Ar
 
 
 def _shortest(edges: jax.Array) -> jax.Array:
-    """`[K, K]` lengths of shortest ways over any number of nodes, from those of single edges."""
+    """Lengths `[K, K]` of shortest ways over any number of nodes, from `[K, K]` single edges."""
     ways = jnp.where(jnp.eye(len(edges), dtype=bool), 0.0, edges)
     for _ in range(max(1, math.ceil(math.log2(len(edges))))):
         ways = _min_plus(ways, ways)
@@ -182,5 +182,5 @@ def _shortest(edges: jax.Array) -> jax.Array:
 
 
 def _min_plus(first: jax.Array, second: jax.Array) -> jax.Array:
-    """`[A, C]` the least sum over B of `[A, B]` and `[B, C]`."""
+    """Least sum over B of `[A, B]` and `[B, C]`, `[A, C]`."""
     return jax.lax.map(lambda row: jnp.min(row[:, None] + second, axis=0), first)

@@ -1,7 +1,7 @@
 """LiDAR scans and camera scanlines: thin layers over the ray-caster.
 
-A sensor is a value: its rays, its height and how it turns hits into readings. One of your own is
-made by a function that `Config.sensors` names; nothing else in the package names a sensor.
+A sensor is a value: its rays, its height and how it turns hits into readings. `Config.sensors`
+names functions that make custom sensors; nothing else in the package names a sensor.
 """
 
 import dataclasses
@@ -28,21 +28,21 @@ from jaxsense.sim import amiro, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
 from jaxsense.types import Key, pytree
 
-_LEAST_CHROMA = 0.1  # difference of a pixel's channels; walls, robots and the dark have none
+_LEAST_CHROMA = 0.1  # difference of a pixel's channels, 0 on walls, robots and in the dark
 _RANGE_TOLERANCE = 5.0  # standard deviations of the LiDAR's noise
-_LEAST_RANGE_TOLERANCE = 0.001  # m, more than what rounding makes of a distance
-_SHARE_OF_WIDTH = 0.7  # of a PoI, which is in view however wrong its bearing is believed
+_LEAST_RANGE_TOLERANCE = 0.001  # m, above the rounding of a distance
+_SHARE_OF_WIDTH = 0.7  # of a PoI, in view at any error of its bearing
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour where a ray leaves the arena
 
 
 @pytree
 class Light:
-    """One distant light and the light from all around.
+    """A distant light and ambient light.
 
     Attributes:
       direction: `[3]` unit vector towards the light.
       diffuse: `[]` strength of the distant light.
-      ambient: `[]` strength of the light from all around.
+      ambient: `[]` strength of the ambient light.
     """
 
     direction: jax.Array
@@ -51,12 +51,12 @@ class Light:
 
 
 Surfaces = dict[str, jax.Array]
-"""What each of G geoms shows: `colour`, its `[G, 3]` albedo, and for each of `arena.attributes` its
-`[G]` number."""
+"""Surfaces of G geoms: `colour`, their `[G, 3]` albedo, and `[G]` numbers for each of
+`arena.attributes`."""
 
 
 def _shows_all(readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
-    """Evidence of a sensor that cannot tell a PoI from anything else."""
+    """Default of `Sensor.shows`: any ray can have met a PoI."""
     del distance, extent
     return jnp.ones(len(readings), bool)
 
@@ -69,16 +69,16 @@ class Sensor:
       name: of the modality.
       height: of its rays above the floor, in metres.
       angles: `[B]` of its rays in the robot's frame, in radians, in the order of the readings.
-      centre: index, as a real number, of the ray that points along a bearing in radians.
+      centre: `bearing [] -> []` real index of the ray along a bearing, in radians.
       window: number of rays that the detector reads.
       read: `(key, hits of B rays, surfaces, light) -> [B, ...] readings`.
       channels: numbers in the reading of one ray.
-      stride: from each ray that the detector reads to the next.
-      window_limit: highest reading that the detector is shown.
+      stride: step between the rays that the detector reads.
+      window_limit: highest reading in the detector's input.
       shows: `(readings [B, ...], distance [], extent) -> [B]` bool, which rays can have met a PoI
         of that extent [m] with its centre at that distance [m]; by default all.
-      blind: the reading of every ray when the sensor has failed.
-      ray_bytes: size of one ray's reading as ROS sends it.
+      blind: reading of every ray when the sensor has failed.
+      ray_bytes: size of one ray's reading in a ROS message.
     """
 
     name: str
@@ -101,18 +101,18 @@ class Sensor:
 
     @property
     def scan_bytes(self) -> int:
-        """Size of a whole scan as ROS sends it."""
+        """Size of a whole scan in a ROS message."""
         return self.ray_bytes * len(self.angles)
 
     @property
     def directions(self) -> np.ndarray:
-        """`[2, B]` unit vectors along the rays in the robot's frame."""
+        """Unit vectors along the rays in the robot's frame, `[2, B]`."""
         angles = self.angles.astype(np.float64)
         return np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
 
 
 def random_light(key: Key) -> Light:
-    """A light from any side, 20 to 70 degrees high, of random strength."""
+    """Draws a light of random strength from any side, 20 to 70 degrees high."""
     side, height, diffuse, ambient = jax.random.uniform(key, (4,))
     side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)
     flat = jnp.cos(height)
@@ -121,7 +121,7 @@ def random_light(key: Key) -> Light:
 
 
 def fan(num_rays: int, field_of_view: float) -> tuple[np.ndarray, Callable]:
-    """Rays at equal angles, from right to left.
+    """Spreads rays at equal angles, from right to left.
 
     Args:
       num_rays: how many.
@@ -140,7 +140,7 @@ def fan(num_rays: int, field_of_view: float) -> tuple[np.ndarray, Callable]:
 
 
 def lidar(config: LidarConfig) -> Sensor:
-    """The laser scanner: one distance in metres for each beam, from right to left."""
+    """The laser scanner: one distance in metres per beam, from right to left."""
     angles, centre = fan(config.num_beams, config.field_of_view)
 
     def read(key, hits, surfaces, light):
@@ -168,7 +168,7 @@ def lidar(config: LidarConfig) -> Sensor:
 
 
 def camera(config: CameraConfig) -> Sensor:
-    """The camera's scanline: linear RGB in [0, 1] for each pixel, from left to right."""
+    """The camera's scanline: linear RGB in [0, 1] per pixel, from left to right."""
     middle = (config.num_pixels - 1) / 2
     focal_length = (config.num_pixels / 2) / np.tan(np.radians(config.field_of_view) / 2)
     columns = np.arange(config.num_pixels)
@@ -209,7 +209,7 @@ def camera(config: CameraConfig) -> Sensor:
 
 
 def make(config: Config) -> tuple[Sensor, ...]:
-    """The sensor of each modality, in the order of `config.modalities`."""
+    """Makes the sensor of each modality, in the order of `config.modalities`."""
     known = {"camera": lambda: camera(config.camera), "lidar": lambda: lidar(config.lidar)}
     return tuple(
         _own(name, config) if name in config.sensors else known[name]()
@@ -218,7 +218,7 @@ def make(config: Config) -> tuple[Sensor, ...]:
 
 
 def _own(name: str, config: Config) -> Sensor:
-    """A sensor that the user has declared; a `ConfigError` if it cannot be made or does not fit."""
+    """Makes a custom sensor; raises `ConfigError` if it cannot be made or does not fit."""
     entry, field = config.sensors[name].make, f"sensors.{name}"
     module, _, function = entry.partition(":")
     try:
@@ -241,9 +241,9 @@ def _own(name: str, config: Config) -> Sensor:
 
 
 def fingerprints(config: Config) -> list[str]:
-    """What tells each of the user's own sensors from all others: also what its functions compute.
+    """Fingerprints of the custom sensors, which also cover what their functions compute.
 
-    Programs that are kept close over sensors, whose code is not in the configuration.
+    Stored programs close over sensors, whose code is not in the configuration.
     """
     own = [sensor for sensor in make(config) if sensor.name in config.sensors]
     return [_fingerprint(sensor, tuple(config.arena.attributes)) for sensor in own]
@@ -266,7 +266,7 @@ def _fingerprint(sensor: Sensor, attributes: tuple[str, ...]) -> str:
 
 
 def surfaces(arena: Arena, layout: Layout) -> Surfaces:
-    """What every geom shows: the PoIs' from the layout, the others' from model and settings."""
+    """Surfaces of all geoms: of PoIs from the layout, of others from model and settings."""
     poi = jnp.array(arena.poi_of_geom)
     albedo = jnp.where((poi >= 0)[:, None], layout.colour[poi], arena.model.geom_rgba[:, :3])
     own = {
@@ -286,16 +286,16 @@ def scan(
     robot: int,
     directions: jax.Array,
 ) -> jax.Array:
-    """Readings of one robot's sensor along some of its rays.
+    """Scans along some rays of one robot's sensor.
 
     Args:
       key: random key of the noise.
       sensor: the sensor.
       arena: the arena.
       data: its MJX state, after kinematics.
-      layout: the PoIs, for what their surfaces show.
+      layout: the PoIs, for their surfaces.
       light: the light.
-      robot: index of the robot that carries the sensor; its own parts are not seen.
+      robot: index of the robot that carries the sensor, which does not see its own parts.
       directions: `[2, B]` unit vectors in the robot's frame; `sensor.directions` for a full scan.
 
     Returns:
@@ -312,13 +312,13 @@ def scan(
 
 
 def window_of(sensor: Sensor, values: np.ndarray, bearing: jax.Array) -> jax.Array:
-    """Those values that belong to the rays which the detector reads of a scan.
+    """Values of those rays of a scan that the detector reads.
 
     Args:
       sensor: the sensor.
       values: `[..., B]` of all rays, for example `sensor.angles`.
-      bearing: `[]` around which the rays lie, in radians in the robot's frame; near the edge of the
-        field of view they stop at its last ray.
+      bearing: `[]` at the centre of these rays, in radians in the robot's frame; near the edge of
+        the field of view they stop at its last ray.
 
     Returns:
       `[..., window]` values.
@@ -326,8 +326,8 @@ def window_of(sensor: Sensor, values: np.ndarray, bearing: jax.Array) -> jax.Arr
     chex.assert_rank(bearing, 0, custom_message="bearing")
     *shape, number = values.shape
     start = _first_ray(sensor, bearing)
-    # Cut out as one piece, of every ray that is a stride from the next: a list of indices would
-    # be worked out for each ray from the bearing on.
+    # One slice of all rays a stride apart: XLA would recompute a list of indices for each ray, from
+    # the bearing on.
     padded = np.pad(values, [(0, 0)] * len(shape) + [(0, -number % sensor.stride)])
     strided = jnp.array(padded.reshape(*shape, -1, sensor.stride))
     place = [0] * len(shape) + [start // sensor.stride, start % sensor.stride]
@@ -335,14 +335,14 @@ def window_of(sensor: Sensor, values: np.ndarray, bearing: jax.Array) -> jax.Arr
 
 
 def _first_ray(sensor: Sensor, bearing: jax.Array) -> jax.Array:
-    """`[]` int32 index of the first ray that the detector reads around a bearing."""
+    """Index of the first ray that the detector reads around a bearing, `[]` int32."""
     span = (sensor.window - 1) * sensor.stride
     start = jnp.round(sensor.centre(bearing) - span / 2).astype(jnp.int32)
     return jnp.clip(start, 0, len(sensor.angles) - 1 - span)
 
 
 def cut_out(sensor: Sensor, readings: jax.Array | np.ndarray, bearing: jax.Array | float):
-    """The detector's input from a whole scan, recorded or simulated.
+    """Cuts the detector's input out of a whole scan, recorded or simulated.
 
     Args:
       sensor: the sensor.
@@ -351,7 +351,7 @@ def cut_out(sensor: Sensor, readings: jax.Array | np.ndarray, bearing: jax.Array
       bearing: `[]` of the PoI in the robot's frame, in radians, positive to the left.
 
     Returns:
-      `[F]` what `vae.detect` takes.
+      `[F]` input of `vae.detect`.
     """
     channels = () if sensor.channels == 1 else (sensor.channels,)
     shape = (len(sensor.angles), *channels)
@@ -376,10 +376,10 @@ def shows_poi(
     distance: jax.Array,
     arena: ArenaConfig,
 ) -> jax.Array:
-    """Whether a PoI may be seen where it is expected, from the readings alone.
+    """Whether readings may show a PoI where it is expected.
 
-    The LiDAR tells by the distance. A camera tells a PoI from walls, robots and darkness by its
-    colour, but not from another PoI before or behind it: viewpoints are chosen to have none there.
+    The LiDAR judges by distance. The camera distinguishes a PoI from walls, robots and darkness by
+    its colour, but not from another PoI before or behind it: good viewpoints have none there.
 
     Args:
       sensor: the sensor.
@@ -389,8 +389,8 @@ def shows_poi(
       arena: sizes of PoIs.
 
     Returns:
-      `[]` bool: all rays that must meet a PoI of that size can have met one. Something else before
-      it, a PoI that is not there and a sensor that has failed give False.
+      `[]` bool: all rays that must meet a PoI of this size can have met one. False for a covered or
+      absent PoI, or a failed sensor.
     """
     angles = window_of(sensor, sensor.angles, bearing) - bearing
     half_width = jnp.arcsin(jnp.minimum(arena.poi_half_width / distance, 1.0))
@@ -399,6 +399,6 @@ def shows_poi(
 
 
 def as_window(sensor: Sensor, readings: jax.Array) -> jax.Array:
-    """`[F]` the detector's input from the `[window, ...]` readings of the rays it reads."""
+    """Input of the detector, `[F]`, from the `[window, ...]` readings of its rays."""
     chex.assert_axis_dimension(readings, 0, sensor.window, custom_message="readings")
     return jnp.minimum(readings, sensor.window_limit).reshape(-1)

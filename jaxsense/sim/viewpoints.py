@@ -23,8 +23,8 @@ def random_viewpoint(
 ) -> tuple[jax.Array, jax.Array]:
     """Draws a pose from which a robot looks at a PoI.
 
-    Candidates are uniform in distance and direction. The first is taken that stands free and sees
-    the PoI past the other PoIs and robots; where none does, the one that is closest to that.
+    Candidates are uniform in distance and direction. The first one wins that is free and sees the
+    PoI past the other PoIs and robots; if there is none, the one with the most room.
 
     Args:
       key: random key.
@@ -35,12 +35,12 @@ def random_viewpoint(
       poi: `[]` int32 index of the PoI to look at.
 
     Returns:
-      `[3]` pose x [m], y [m], yaw [rad], and `[]` the bearing of the PoI in the robot's frame as
-      the robot believes it, in radians.
+      `[3]` pose x [m], y [m], yaw [rad], and `[]` the PoI's believed bearing in the robot's frame,
+      in radians.
     """
     chex.assert_shape(others, (None, 2), custom_message="others")
     chex.assert_rank(poi, 0, custom_message="poi")
-    # One draw for everything: every use of the random generator takes long to compile.
+    # One draw for everything: each use of the random generator takes long to compile.
     draws = jax.random.uniform(key, (2 * NUM_CANDIDATES + 2,))
     near, far = config.min_distance, config.max_distance
     distance = near + (far - near) * draws[:NUM_CANDIDATES]
@@ -58,7 +58,7 @@ def random_viewpoint(
 
 
 def bearing(pose: jax.Array | np.ndarray, place: jax.Array | np.ndarray) -> jax.Array:
-    """At which angle a robot sees a place.
+    """Angle at which a robot sees a place.
 
     Args:
       pose: `[3]` x [m], y [m] and yaw [rad] of the robot.
@@ -83,7 +83,7 @@ def free_room(
     others: jax.Array,
     poi: jax.Array,
 ) -> jax.Array:
-    """How much room is left around viewpoints and in the view from them.
+    """Free room around viewpoints and in the view from them.
 
     Args:
       x: `[C]` of the candidates, in metres.
@@ -95,8 +95,8 @@ def free_room(
       poi: `[]` int32 index of the PoI to look at.
 
     Returns:
-      `[C]` metres, the smallest over walls, robots and PoIs; 0 or less where a robot would stand
-      too close to something, or something covers part of the view of the PoI.
+      `[C]` metres, the smallest over walls, robots and PoIs; 0 or less where a robot would be too
+      close to something, or something covers part of the PoI.
     """
     chex.assert_equal_shape([x, y], custom_message="x, y")
     reach = amiro.BODY_RADIUS + clearance
@@ -117,8 +117,8 @@ def free_room(
         in_view = across - share * arena.poi_extent - radius
         return jnp.minimum(room, jnp.minimum(standing, in_view)), None
 
-    # The PoI that is looked at is nowhere in the way. A loop makes the compiler finish the
-    # candidates first; fused with what is done for each obstacle, they are worked out every time.
+    # The target itself is never in the way. A loop makes the compiler finish the candidates first;
+    # fused with the work for each obstacle, they would be recomputed every time.
     is_target = jnp.arange(arena.num_pois) == poi
     of_pois = jnp.where(is_target, -jnp.inf, arena.poi_extent)
     of_robots = jnp.full(len(others), amiro.BODY_RADIUS)

@@ -1,4 +1,4 @@
-"""Looking at points of interest in simulated arenas: all that training needs of the simulator."""
+"""Looks at points of interest in simulated arenas: the simulator's interface for training."""
 
 import dataclasses
 import functools
@@ -16,7 +16,7 @@ from jaxsense.types import Key, others, pytree
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class World:
-    """The parts of a simulation that are the same for all scenes. Static under `jit`.
+    """The parts of a simulation that all scenes share. Static under `jit`.
 
     Attributes:
       config: all settings.
@@ -31,7 +31,7 @@ class World:
 
 @pytree
 class Scene:
-    """One arena at one moment: what its MJX state is made from.
+    """One arena at one moment, the source of its MJX state.
 
     Attributes:
       layout: the PoIs.
@@ -52,12 +52,12 @@ def make_world(config: Config, *, contacts: bool = False) -> World:
 
 
 def with_config(world: World, config: Config) -> World:
-    """The same simulation with other numbers, which may be traced; the arena stays as it is."""
+    """Replaces a simulation's numbers, which may be traced; the arena stays the same."""
     return dataclasses.replace(world, config=config, sensors=sensors.make(config))
 
 
 def random_scene(key: Key, world: World, classes: jax.Array) -> Scene:
-    """A scene with PoIs of the given classes at random places under random light.
+    """Draws a scene with PoIs of the given classes at random places under random light.
 
     Args:
       key: random key.
@@ -82,13 +82,13 @@ def look(
 ) -> tuple[jax.Array, Scene]:
     """Puts a robot at a random viewpoint of a PoI, updates MJX's kinematics and scans.
 
-    Only the rays that the detector reads are cast; they read what they would in a full scan.
+    Casts only the rays that the detector reads; their readings are those of a full scan.
 
     Args:
       key: random key.
       world: the simulation.
-      scene: the present scene.
-      robot: index of the robot, which is that of its modality; static.
+      scene: the current scene.
+      robot: index of the robot and of its modality; static.
       poi: `[]` int32 index of the PoI.
 
     Returns:
@@ -110,12 +110,12 @@ def look(
 def scan_around(
     key: Key, world: World, scene: Scene, data: mjx.Data, robot: int, bearing: jax.Array
 ) -> jax.Array:
-    """What a robot's sensor reads around a bearing from where the robot stands.
+    """Readings of a robot's sensor around a bearing from its current place.
 
     Args:
       key: random key of the noise.
       world: the simulation.
-      scene: where everything stands.
+      scene: the scene.
       data: the MJX state of the scene, from `place`.
       robot: index of the robot; static.
       bearing: `[]` in the robot's frame, in radians.
@@ -129,7 +129,7 @@ def scan_around(
 
 
 def survey(key: Key, world: World, classes: jax.Array) -> tuple[Scene, tuple[jax.Array, ...]]:
-    """A random scene, and what each robot reads of each PoI in it.
+    """Draws a scene, and scans each PoI in it by each robot.
 
     Args:
       key: random key.

@@ -21,9 +21,9 @@ class Detector:
     Attributes:
       params: of its network.
       offset: `[F]` mean of the windows it was trained on.
-      scale: `[]` their standard deviation over everything.
+      scale: `[]` their overall standard deviation.
       hidden: sizes of the hidden layers.
-      num_labels: number of labels it tells apart, D_m.
+      num_labels: number of labels, D_m.
     """
 
     params: Params
@@ -34,7 +34,7 @@ class Detector:
 
 
 def init(key: Key, windows: jax.Array, num_labels: int, config: DetectorConfig) -> Detector:
-    """An untrained detector, standardised to the `[S, F]` windows that it will be trained on."""
+    """Untrained detector, standardised to the `[S, F]` windows of its training."""
     chex.assert_rank(windows, 2, custom_message="windows")
     params = networks.init(key, MLP(config.hidden, num_labels), windows.shape[1])
     offset = jnp.mean(windows, axis=0)
@@ -43,14 +43,14 @@ def init(key: Key, windows: jax.Array, num_labels: int, config: DetectorConfig) 
 
 
 def logits(detector: Detector, window: jax.Array) -> jax.Array:
-    """`[D_m]` unnormalised log-probabilities of the labels, from one `[F]` window."""
+    """Unnormalised log-probabilities of the labels, `[D_m]`, from one `[F]` window."""
     chex.assert_shape(window, detector.offset.shape, custom_message="window")
     standard = (window - detector.offset) / detector.scale
     return networks.apply(_network(detector), detector.params, standard)
 
 
 def detect(detector: Detector, window: jax.Array) -> jax.Array:
-    """The features of one look.
+    """Features of one look.
 
     Args:
       detector: a trained detector.
@@ -76,16 +76,16 @@ def train(
     config: DetectorConfig,
     steps: int,
 ) -> tuple[FitState, jax.Array]:
-    """Some gradient steps on the cross-entropy of a detector's labels.
+    """Trains a detector on the cross-entropy of its labels for some gradient steps.
 
     Args:
       key: random key.
-      state: from `start`, or from the steps before.
+      state: from `start` or an earlier call.
       detector: from `init`.
       windows: `[S, F]` simulated looks.
       labels: `[S]` int32.
       config: batch, learning rate, and the number of steps of the whole training.
-      steps: how many of them to make.
+      steps: how many of them to take.
 
     Returns:
       The next state, whose parameters are the detector's, and the `[steps]` losses.

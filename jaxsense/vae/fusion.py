@@ -24,24 +24,23 @@ def fuse(
     seen: jax.Array | np.ndarray,
     features: Features,
 ) -> Belief:
-    """The map's entry of a PoI after a look at it by one sensor, or by several at once.
+    """Updates the map's entry of a PoI after a look by one sensor, or by several at once.
 
-    The first look gives `q(z|x)`. If other modalities have seen the PoI, their features are no
-    longer there: they are decoded from the entry's mean and encoded together with the new ones.
+    The first look writes `q(z|x)`. The map does not keep the features of modalities that have seen
+    the PoI before: they are decoded from the entry's mean and encoded together with the new ones.
 
     Args:
       params: of the JMVAE.
       model: its shape.
-      belief: `[D]` the present entry.
+      belief: `[D]` current entry.
       seen: `[M]` bool, which modalities have seen the PoI before.
-      features: for each modality `[D_m]` what the look has detected, or None for those that have
-        not looked.
+      features: for each modality `[D_m]` new detections, or None where it has not looked.
 
     Returns:
-      The new entry. The old one does not enter it but through the decoder.
+      The new entry. The old one enters it only through the decoder.
 
     Raises:
-      ValueError: if `features` has not one entry for each modality, or none of them is there.
+      ValueError: if `features` lacks an entry for a modality, or all are None.
     """
     chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
     chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
@@ -70,7 +69,7 @@ def write(
     features: jax.Array,
     modality: int,
 ) -> Belief:
-    """`fuse` of a look by the one sensor of that index, with its `[D_m]` features.
+    """Fuses a look by one sensor, `modality` its index, with its `[D_m]` features.
 
     Raises:
       ValueError: if there is no such modality.
@@ -82,7 +81,7 @@ def write(
 
 
 def unseen(model: Jmvae, variance: float) -> Belief:
-    """The entry of a PoI that nobody has seen: mean 0 and the given variance in each dimension."""
+    """Entry of an unseen PoI: mean 0 and the given variance in each dimension."""
     values.require_positive("variance", variance)
     return Belief(
         jnp.zeros(model.latent_size), jnp.full(model.latent_size, jnp.sqrt(jnp.float32(variance)))

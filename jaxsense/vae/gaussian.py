@@ -36,7 +36,7 @@ def kl_to_standard_normal(mean: jax.Array, log_var: jax.Array) -> jax.Array:
 
 
 def sample(noise: jax.Array, mean: jax.Array, log_var: jax.Array) -> jax.Array:
-    """A draw, differentiable in `mean` and `log_var` (reparameterised).
+    """Reparameterised draw, differentiable in `mean` and `log_var`.
 
     Args:
       noise: `[D, ...]` standard normal numbers.
@@ -51,8 +51,8 @@ def sample(noise: jax.Array, mean: jax.Array, log_var: jax.Array) -> jax.Array:
 def moment_match(mean: jax.Array, std: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The Gaussian with the mean and variance of an equal mixture of diagonal Gaussians.
 
-    It minimises `E KL(component || q)` over diagonal Gaussians q, which is what the uni-modal
-    encoders of a JMVAE are trained to do.
+    It minimises `E KL(component || q)` over diagonal Gaussians q, the training goal of a JMVAE's
+    uni-modal encoders.
 
     Args:
       mean: `[K, D]` of the components.

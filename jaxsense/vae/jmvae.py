@@ -1,9 +1,9 @@
 """The joint multi-modal VAE (JMVAE) for any tuple of modalities.
 
-Suzuki, Nakayama and Matsuo 2017, as used in Korthals et al. 2018, Sec. II. There is an encoder for
-every non-empty subset of the modalities: the one of all of them is the joint encoder, and each of
-the others is drawn to it by a Kullback-Leibler divergence. For two modalities these are the joint
-and the two uni-modal encoders of the paper.
+Suzuki, Nakayama and Matsuo 2017, as used in Korthals et al. 2018, Sec. II. Every non-empty subset
+of the modalities has an encoder: the full set's is the joint encoder, to which a Kullback-Leibler
+divergence draws each of the others. For two modalities these are the joint and the two uni-modal
+encoders of the paper.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ class Jmvae:
     """The shape of a JMVAE; hashable, static under `jit`.
 
     Attributes:
-      modalities: names, in the order in which features are given.
+      modalities: names, in the order of the features.
       feature_sizes: D_m of each modality.
       latent_size: D.
       hidden: sizes of the hidden layers of every encoder and decoder.
@@ -55,7 +55,7 @@ class Jmvae:
 
     @property
     def subsets(self) -> tuple[tuple[int, ...], ...]:
-        """Every non-empty subset of the modalities, the one of all of them last."""
+        """Every non-empty subset of the modalities, the full set last."""
         indices = range(len(self.modalities))
         sizes = range(1, len(self.modalities) + 1)
         return tuple(s for size in sizes for s in itertools.combinations(indices, size))
@@ -86,7 +86,7 @@ def init(key: Key, model: Jmvae) -> Params:
 
 
 def encode(params: Params, model: Jmvae, features: Features) -> tuple[jax.Array, jax.Array]:
-    """The posterior `q(z | the features that are there)`.
+    """The posterior `q(z | present features)`.
 
     Args:
       params: from `init` or `train`.
@@ -97,7 +97,7 @@ def encode(params: Params, model: Jmvae, features: Features) -> tuple[jax.Array,
       `[D]` mean and `[D]` log-variance.
 
     Raises:
-      ValueError: if `features` has not one entry for each modality, or none of them is there.
+      ValueError: if `features` lacks an entry for a modality, or all are None.
     """
     check_features(model, features)
     subset = tuple(m for m, feature in enumerate(features) if feature is not None)
@@ -122,7 +122,7 @@ def _encode(
 
 
 def check_features(model: Jmvae, features: Features) -> None:
-    """Raises a `ValueError` unless there is an entry for each modality, and not only None."""
+    """Raises a `ValueError` unless each modality has an entry, and one or more are not None."""
     if len(features) != len(model.modalities):
         raise ValueError(
             f"features has {len(features)} entries: must be {len(model.modalities)}, one for each "
@@ -133,7 +133,7 @@ def check_features(model: Jmvae, features: Features) -> None:
 
 
 def decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]:
-    """The mean of `p(features | z)` of every modality, `[D_m]` each, from `[D]` latents."""
+    """Mean of `p(features | z)` of every modality, `[D_m]` each, from `[D]` latents."""
     chex.assert_shape(z, (model.latent_size,), custom_message="z")
     return _decode(params, model, z)
 
@@ -147,7 +147,7 @@ def _decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]
 
 
 def posterior(params: Params, model: Jmvae, features: Features) -> Belief:
-    """`encode` as a belief."""
+    """The posterior of `encode` as a belief."""
     mean, log_var = encode(params, model, features)
     return Belief(mean, jnp.exp(0.5 * log_var))
 
@@ -162,7 +162,7 @@ def loss(
     beta: float | jax.Array,
     reconstruction_weights: tuple[float, ...],
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """The JMVAE-kl objective for one example (Suzuki et al. 2017, Sec. 3.3), to be minimised.
+    """JMVAE-kl objective of one example (Suzuki et al. 2017, Sec. 3.3), to minimise.
 
     `-E[sum_m w_m log p(x_m|z)] + beta KL(q(z|all) || N(0, I)) + alpha sum_s KL(q(z|all) || q(z|s))`
     with z one reparameterised draw from `q(z|all)`, Gaussian p of unit variance without its
@@ -173,7 +173,7 @@ def loss(
       params: from `init`.
       model: the shape.
       features: `[D_m]` of every modality.
-      alpha: weight of the divergences to the encoders of the subsets.
+      alpha: weight of the divergences to the subsets' encoders.
       beta: weight of the divergence to the prior.
       reconstruction_weights: w_m.
 
@@ -209,10 +209,10 @@ def losses(
     beta: float | jax.Array,
     reconstruction_weights: tuple[float, ...],
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """`loss` of a batch, whose axis is the last one of everything.
+    """Losses of a batch, which is the last axis of all arrays.
 
     Args:
-      noise: `[D, B]` standard normal numbers, by which z is drawn.
+      noise: `[D, B]` standard normal numbers that draw z.
       params: from `init`.
       model: the shape.
       features: `[D_m, B]` of every modality.
@@ -262,16 +262,16 @@ def train(
     config: JmvaeConfig,
     steps: int,
 ) -> tuple[FitState, jax.Array]:
-    """Some gradient steps of a JMVAE on detections.
+    """Trains a JMVAE on detections for some gradient steps.
 
     Args:
       key: random key.
-      state: from `start`, or from the steps before.
+      state: from `start` or an earlier call.
       model: the shape.
       bank: for each modality `[C, S, D_m]` detections of every class. A training example is one
         detection of each modality, of the same class and otherwise independent.
       config: weights, batch, learning rate, and the number of steps of the whole training.
-      steps: how many of them to make.
+      steps: how many of them to take.
 
     Returns:
       The next state and the `[steps]` losses.
@@ -280,19 +280,6 @@ def train(
     values.require_one_each("bank", bank, model.modalities)
     for features, size in zip(bank, model.feature_sizes, strict=True):
         chex.assert_shape(features, (bank[0].shape[0], None, size), custom_message="bank")
-    num_classes = bank[0].shape[0]
-    columns = [jnp.moveaxis(x, -1, 0) for x in bank]
-
-    def draw(key: Key):
-        class_key, noise_key, *row_keys = jax.random.split(key, 2 + len(bank))
-        shape = (steps, config.batch)
-        classes = jax.random.randint(class_key, shape, 0, num_classes)
-        features = [
-            jnp.moveaxis(x[:, classes, jax.random.randint(k, shape, 0, x.shape[-1])], 1, 0)
-            for x, k in zip(columns, row_keys, strict=True)
-        ]
-        noise = jax.random.normal(noise_key, (steps, model.latent_size, config.batch))
-        return noise, tuple(features)
 
     def batch_loss(params: Params, drawn, step: jax.Array) -> jax.Array:
         noise, features = drawn
@@ -307,15 +294,31 @@ def train(
         )
         return jnp.mean(total)
 
-    return minibatch.fit(state, batch_loss, draw(key), _optimiser(config), config.steps)
+    drawn = _draw(key, bank, (steps, config.batch), model.latent_size)
+    return minibatch.fit(state, batch_loss, drawn, _optimiser(config), config.steps)
+
+
+def _draw(
+    key: Key, bank: tuple[jax.Array, ...], shape: tuple[int, int], latent_size: int
+) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    """Noise `[steps, D, B]` and features `[steps, D_m, B]` of batches, of a `(steps, B)` shape."""
+    columns = [jnp.moveaxis(x, -1, 0) for x in bank]
+    class_key, noise_key, *row_keys = jax.random.split(key, 2 + len(bank))
+    classes = jax.random.randint(class_key, shape, 0, bank[0].shape[0])
+    features = [
+        jnp.moveaxis(x[:, classes, jax.random.randint(k, shape, 0, x.shape[-1])], 1, 0)
+        for x, k in zip(columns, row_keys, strict=True)
+    ]
+    noise = jax.random.normal(noise_key, (shape[0], latent_size, shape[1]))
+    return noise, tuple(features)
 
 
 def annealed_beta(step: jax.Array, config: JmvaeConfig) -> jax.Array:
-    """`[]` beta at a gradient step: from `initial_beta` to `beta` by equal factors, then constant.
+    """Beta at a gradient step, `[]`: from `initial_beta` to `beta` by equal factors, then constant.
 
-    From far above its last value, beta lets one latent dimension after the other come into use, as
-    soon as it explains enough of the features. Started low, all classes may end up on one line, a
-    local optimum that leaves the other dimensions empty.
+    Falling from far above its last value, beta lets each latent dimension come into use once it
+    explains enough of the features. Started low, all classes may end up on one line, a local
+    optimum in which the other dimensions are empty.
     """
     # Without annealing the first step is beyond its end.
     annealing_steps = jnp.maximum(config.annealing * config.steps, 1e-6)

@@ -1,4 +1,4 @@
-"""How good a latent space is: the metrics of a run's summary, and what a belief says of a class."""
+"""Metrics of a latent space for a run's summary, and the classes that a belief leaves open."""
 
 import chex
 import jax
@@ -14,32 +14,32 @@ PLAUSIBLE_DISTANCE = 2.0
 
 
 def sigma_norm(std: jax.Array) -> jax.Array:
-    """`||sigma||_2` of `[..., D]` standard deviations: what the paper's Fig. 4 shows as colour."""
+    """`||sigma||_2` of `[..., D]` standard deviations, the colour in the paper's Fig. 4."""
     chex.assert_shape(std, (..., None), custom_message="std")
     values.require_positive("std", std)
     return jnp.linalg.norm(std, axis=-1)
 
 
 def active_units(mean: jax.Array) -> jax.Array:
-    """`[]` int32, latent dimensions in use: those whose `[S, D]` posterior means vary.
+    """Number of latent dimensions in use, `[]` int32.
 
-    A dimension counts when the variance of the means over the data exceeds 0.01 (Burda, Grosse and
-    Salakhutdinov 2016, Sec. 5.2).
+    A dimension counts when the variance of its `[S, D]` posterior means over the data exceeds 0.01
+    (Burda, Grosse and Salakhutdinov 2016, Sec. 5.2).
     """
     chex.assert_rank(mean, 2, custom_message="mean")
     return jnp.sum(jnp.var(mean, axis=0) > ACTIVE_VARIANCE)
 
 
 def plausible_classes(belief: Belief, class_means: jax.Array) -> jax.Array:
-    """Which classes a belief leaves open.
+    """Classes that a belief leaves open.
 
     Args:
       belief: `[D]`.
       class_means: `[C, D]` mean of the joint posterior of each class.
 
     Returns:
-      `[C]` bool: the class's mean is at most two standard deviations away. The nearest is always
-      one of them, so that a belief between everything still names a class.
+      `[C]` bool: the class's mean is at most two standard deviations away, or the nearest, so that
+      a belief far from all classes still names one.
     """
     _check_belief(belief, class_means)
     distance = jnp.linalg.norm((class_means - belief.mean[None]) / belief.std[None], axis=-1)
@@ -47,7 +47,7 @@ def plausible_classes(belief: Belief, class_means: jax.Array) -> jax.Array:
 
 
 def nearest_class(belief: Belief, class_means: jax.Array) -> jax.Array:
-    """`[]` int32, the class whose joint mean is nearest to a belief's mean."""
+    """Class whose joint mean is nearest to a belief's mean, `[]` int32."""
     _check_belief(belief, class_means)
     return jnp.argmin(jnp.linalg.norm(class_means - belief.mean[None], axis=-1))
 
@@ -62,17 +62,17 @@ def _check_belief(belief: Belief, class_means: jax.Array) -> None:
 
 
 def unambiguous(belief: Belief, class_means: jax.Array, true_class: jax.Array) -> jax.Array:
-    """`[]` bool: a belief leaves open its true class and no other (the paper's Table I)."""
+    """Whether a belief leaves only its true class open, `[]` bool (the paper's Table I)."""
     plausible = plausible_classes(belief, class_means)
     return plausible[true_class] & (jnp.sum(plausible) == 1)
 
 
 def moment_matching_error(belief: Belief, components: Belief) -> jax.Array:
-    """How far a uni-modal posterior is from the best one.
+    """Distance of a uni-modal posterior from the best one.
 
     Args:
       belief: `[D]` posterior of one modality's detection.
-      components: `[K, D]` the joint posteriors that are consistent with that detection.
+      components: `[K, D]` joint posteriors that are consistent with the detection.
 
     Returns:
       `[]` mean over the dimensions of `|mean difference|`, in matched standard deviations, plus
@@ -84,6 +84,6 @@ def moment_matching_error(belief: Belief, components: Belief) -> jax.Array:
 
 
 def consistent_classes(label_of_class: tuple[int, ...]) -> np.ndarray:
-    """`[C, C]` bool: classes that a modality with these labels cannot tell apart."""
+    """Pairs of classes, `[C, C]` bool, that a modality with these labels cannot tell apart."""
     labels = np.array(label_of_class)
     return labels[:, None] == labels[None, :]

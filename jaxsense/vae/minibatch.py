@@ -13,7 +13,7 @@ from jaxsense.types import pytree
 
 @pytree
 class FitState:
-    """A training between two calls of `fit`.
+    """Training state between two calls of `fit`.
 
     Attributes:
       params: of the network.
@@ -28,7 +28,7 @@ class FitState:
 
 def adam(learning_rate: float, steps: int) -> optax.GradientTransformation:
     """Adam with a learning rate that falls from `learning_rate` to zero along a cosine."""
-    # As one vector: the networks are so small that every array costs more than what is in it.
+    # As one vector: the networks are so small that each array costs more than its content.
     return optax.flatten(optax.adam(optax.cosine_decay_schedule(learning_rate, steps)))
 
 
@@ -44,20 +44,20 @@ def fit(
     optimiser: optax.GradientTransformation,
     total: int | None = None,
 ) -> tuple[FitState, jax.Array]:
-    """Makes gradient steps, but none beyond the last one of the whole training.
+    """Makes gradient steps, at most up to the end of the whole training.
 
     Args:
       state: where to start.
       loss: `(params, drawn, step) -> []`, where step counts from the start of the training.
-      drawn: pytree of `[steps, ...]` arrays, all that is random in each step. Drawn for all steps
-        at once, random numbers cost a small part of what they would in the loop.
+      drawn: pytree of `[steps, ...]` arrays, everything random in each step. Drawing all steps at
+        once is much cheaper than drawing in the loop.
       optimiser: of optax.
-      total: steps of the whole training; without, there are at least those that are drawn.
+      total: steps of the whole training; by default no limit.
 
     Returns:
       The state after the last step and the `[steps]` losses; those beyond `total` mean nothing.
-      Nothing that is not finite is caught here: look at the losses, of which the last that means
-      something is NaN if the parameters after it are not finite.
+      Non-finite values raise no error: the last meaningful loss is NaN if the parameters after it
+      are not finite.
     """
     steps = jax.tree.leaves(drawn)[0].shape[0]
 
@@ -72,7 +72,7 @@ def fit(
         return after, value
 
     after, losses = jax.lax.scan(make_step, state, drawn)
-    # Parameters of the steps before show in the loss of the next one.
+    # Earlier parameters show in the loss of the next step.
     is_finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(after.params)]).all()
     last = jnp.maximum(after.step - state.step - 1, 0)
     return after, jnp.asarray(losses).at[last].mul(jnp.where(is_finite, 1.0, jnp.nan))

@@ -1,4 +1,4 @@
-"""The report of a run: one page that needs nothing but itself."""
+"""The report of a run: one self-contained page."""
 
 from jaxsense.show.page.write import write as write
 from jaxsense.show.page.write import write_seeds as write_seeds

@@ -1,4 +1,4 @@
-"""An animation inside the page: its halves side by side, or one above the other on a phone."""
+"""Embeds an animation in the page: halves side by side, or stacked on a phone."""
 
 import dataclasses
 import re
@@ -28,7 +28,7 @@ class Film:
 
     Attributes:
       left: the animation, cut to its left half.
-      right: its right half, which repeats what the left one shows.
+      right: its right half, a view of the same elements.
     """
 
     left: Markup
@@ -36,13 +36,13 @@ class Film:
 
 
 def read_film(path: Path) -> Film | None:
-    """Reads what `animation.write` has written; None if a file holds anything else.
+    """Reads an animation of `animation.write`; None if a file holds anything else.
 
-    A page that shows a file from elsewhere must not run or load what that file names.
+    A file from elsewhere must not make the page run or load anything.
     """
     try:
         text = path.read_text(encoding="utf-8")
-        # Entities, which a document type declares, may grow beyond all memory.
+        # Entities of a document type may expand beyond all memory.
         root = ElementTree.Element("") if "<!" in text else ElementTree.fromstring(text)
         _, _, width, height = (float(part) for part in root.get("viewBox", "").split())
     except (ElementTree.ParseError, ValueError):
@@ -58,7 +58,7 @@ def read_film(path: Path) -> Film | None:
 
 
 def _is_ours(element: Element) -> bool:
-    """Whether `animation.write` writes such an element, which loads and runs nothing."""
+    """Whether an element is one of `animation.write`, and loads and runs nothing."""
     namespace, _, name = element.tag.removeprefix("{").rpartition("}")
     values = " ".join([*element.attrib.values(), element.text or ""])
     return (
@@ -66,6 +66,6 @@ def _is_ours(element: Element) -> bool:
         and name in _ELEMENTS
         and set(element.attrib) <= _ATTRIBUTES
         and element.get("attributeName", "x") in _ATTRIBUTES
-        # Styles, too, can load something: by `url`, `@import` or a letter written as a number.
+        # Styles can load too: by `url`, `@import` or an escaped letter.
         and not re.search(r"url\s*\((?!#[\w-]+\))|@import|\\", values, re.IGNORECASE)
     )

@@ -1,10 +1,11 @@
-"""What the page says in tables: the metrics of `summary.json`, beside those of the paper."""
+"""The tables of the page: metrics of `summary.json` beside the paper's."""
 
 import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
-from jaxsense.show.metrics import AGENTS, DETECTORS, LATENT_SPACE, MISSIONS, Metric, mean, text
+from jaxsense.show import metrics
+from jaxsense.show.metrics import Metric, cases, mean, text
 
 Summary = dict[str, Any]
 PAPER_TABLE = {
@@ -15,7 +16,7 @@ PAPER_TABLE = {
     ("red cube", "camera"): False,
     ("red cube", "lidar"): True,
 }
-"""Table I of Korthals et al. 2018: whether a sensor alone can tell a class for certain."""
+"""Table I of Korthals et al. 2018: whether a sensor alone identifies a class."""
 _YES_OR_NO = {0.0: "no", 1.0: "yes"}
 PAPER_CLASSES = {label for label, _ in PAPER_TABLE}
 PAPER_MODALITIES = {modality for _, modality in PAPER_TABLE}
@@ -28,8 +29,8 @@ class Row:
     Attributes:
       name: of the figure.
       values: one for each column.
-      paper: what the paper has.
-      meaning: what the figure tells.
+      paper: the paper's value.
+      meaning: what the figure measures.
     """
 
     name: str
@@ -48,8 +49,8 @@ def policies(summary: Summary) -> list[Row]:
     """Detectors and Q-networks, one column for each modality."""
     agents = summary["dqn"]
     detectors = [summary["detectors"][modality] for modality in agents]
-    rows = [_row(metric, detectors) for metric in DETECTORS]
-    return rows + [_row(metric, agents.values()) for metric in AGENTS]
+    rows = [_row(metric, detectors) for metric in metrics.DETECTORS]
+    return rows + [_row(metric, agents.values()) for metric in metrics.AGENTS]
 
 
 def latent_space(summary: Summary) -> list[Row]:
@@ -60,14 +61,14 @@ def latent_space(summary: Summary) -> list[Row]:
         for name, norms in block["sigma_norm"].items()
         for norm, is_clear in zip(norms, block["unambiguous"][name], strict=True)
     ]
-    units, *others = (_row(metric, [block]) for metric in LATENT_SPACE)
+    units, *others = (_row(metric, [block]) for metric in metrics.LATENT_SPACE)
     return [
         units,
         Row(
             "sigma norm, unambiguous",
             [_range([norm for norm, is_clear in pairs if is_clear])],
             "from 1.05",
-            "Uncertainty of beliefs in a single class: the smaller, the more is known (Fig. 4).",
+            "Uncertainty of beliefs in a single class; smaller is better (Fig. 4).",
         ),
         Row(
             "sigma norm, ambiguous",
@@ -80,7 +81,7 @@ def latent_space(summary: Summary) -> list[Row]:
 
 
 def _range(values: list[float]) -> str:
-    """The least and the greatest."""
+    """The least and the greatest value, as text."""
     if not values:
         return "-"
     least, greatest = (f"{f(values):.2f}" for f in (min, max))
@@ -88,18 +89,18 @@ def _range(values: list[float]) -> str:
 
 
 def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[Row]]:
-    """What each sensor alone, and all together, can tell for certain.
+    """Classes that each sensor alone, and all together, identify with certainty.
 
     Args:
       summary: of the run.
       classes: of the arena.
 
     Returns:
-      The columns, and a row for each class: what holds here, and in the paper's Table I if that has
-      the same classes and sensors.
+      The columns, and a row for each class: the result here, and in the paper's Table I if that
+      has the same classes and sensors.
     """
-    metrics = summary["jmvae"]["unambiguous"]
-    alone = [name for name in metrics if name != "joint"]
+    shares = summary["jmvae"]["unambiguous"]
+    alone = [name for name in shares if name != "joint"]
     is_paper = set(classes) == PAPER_CLASSES and set(alone) == PAPER_MODALITIES
 
     def cell(label: str, name: str, holds: float) -> str:
@@ -111,28 +112,28 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
 
     columns = [*alone, "joint"]
     rows = [
-        Row(label, [cell(label, name, mean(metrics[name][c])) for name in columns], "", "")
+        Row(label, [cell(label, name, mean(shares[name][c])) for name in columns], "", "")
         for c, label in enumerate(classes)
     ]
     return [*alone, "together"], rows
 
 
 def missions(summary: Summary) -> tuple[list[str], list[Row]]:
-    """Missions: the policies and failures that were played, as columns, and their metrics."""
-    blocks = {n: b for n, b in summary["mission"].items() if n != "bytes_per_detection"}
-    # What is measured of robots alone is not there without them.
-    measured = [m for m in MISSIONS if any(m.key in block for block in blocks.values())]
+    """Missions: policies and failures as columns, and their metrics as rows."""
+    blocks = cases(summary["mission"])
+    # Some metrics exist only where a robot is alone.
+    measured = [m for m in metrics.MISSIONS if any(m.key in block for block in blocks.values())]
     rows = [_row(metric, blocks.values()) for metric in measured]
     reasons = {reason for block in blocks.values() for reason in block["ended"]} - {"finished"}
     for reason in sorted(reasons):
         numbers = [text(block["ended"].get(reason, 0), 1) for block in blocks.values()]
-        rows.append(Row(reason, numbers, "", "Missions that did not finish, for this reason."))
+        rows.append(Row(reason, numbers, "", "Missions that ended early for this reason."))
     return [name.replace("_", " ") for name in blocks], rows
 
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """The time of a stage in seconds, and as shares of the longest's in percent."""
+    """The time of a stage in seconds, and in percent of the longest stage's."""
 
     name: str
     compile_s: float
@@ -142,7 +143,7 @@ class Stage:
 
 
 def timing(summary: Summary) -> list[Stage]:
-    """The stages, in their order."""
+    """The time of each stage, in order."""
     stages = summary["timing"]["stages"]
     longest = max((s["compile_s"] + s["run_s"] for s in stages.values()), default=1.0) or 1.0
     return [

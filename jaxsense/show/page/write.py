@@ -1,4 +1,4 @@
-"""Reads a run directory, and writes its `report.html`."""
+"""Writes the `report.html` of a run directory."""
 
 import base64
 import contextlib
@@ -15,22 +15,23 @@ from jaxsense.show import metrics
 from jaxsense.show.page import tables
 from jaxsense.show.page.inline import Film, read_film
 
+_WRONG = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 PLOTS = {
     "latent_space": (
         "Posteriors of detections as ellipses in the latent space, for all sensors together and "
         "for each alone, by class and by uncertainty",
-        "The paper's Fig. 4. What all sensors see together is one class; what one sensor cannot "
-        "tell apart lies between the classes, with a larger sigma.",
+        "The paper's Fig. 4. All sensors together identify one class; classes that one sensor "
+        "cannot distinguish share a place between them, with a larger sigma.",
     ),
     "reward": (
         "Total reward of an episode over the epochs of training, for each Q-network, with lines "
         "for the optimal, the naive and the random policy",
-        "The paper's Fig. 5. While it trains, a Q-network still explores; greedy is what it has "
-        "learned.",
+        "The paper's Fig. 5. A Q-network still explores while it trains; the greedy line is what "
+        "it has learned.",
     ),
     "scanlines": (
-        "What each detector reads of one look at each class",
-        "What the detectors read: one look at each class.",
+        "One look at each class, as each detector reads it",
+        "The detectors' input: one look at each class.",
     ),
 }
 """The plots of a run: alternative text and caption."""
@@ -40,34 +41,31 @@ def write(run: Path, config: Config, summary: dict[str, Any]) -> Path:
     """Writes `report.html` of a run.
 
     Args:
-      run: its directory; plots `NAME.png` and animations `mission*.svg` are shown if they are there
-        and are what a run writes.
+      run: its directory; the page shows plots `NAME.png` and animations `mission*.svg` that a run
+        wrote there.
       config: its settings.
-      summary: what is in its `summary.json`, or will be.
+      summary: the content of its `summary.json`.
 
     Returns:
       The page's path.
 
     Raises:
-      ConfigError: if the summary lacks something or holds what is no figure.
+      ConfigError: if the summary lacks a value or holds a wrong one.
       OSError: if a file cannot be read or written.
     """
     return _write(run, config, summary, "report.html.jinja")
 
 
 def write_seeds(run: Path, config: Config, summary: dict[str, Any]) -> Path:
-    """Writes `report.html` of several seeds, which leads to the page of each; see `write`."""
+    """Writes `report.html` of several seeds, with links to the page of each; see `write`."""
     return _write(run, config, summary, "seeds.html.jinja")
 
 
 def _write(run: Path, config: Config, summary: dict[str, Any], template: str) -> Path:
     try:
         text = _render(run, config, summary, template)
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+    except (*_WRONG, jinja2.UndefinedError) as error:
         reason = f"must hold the summary.json of a finished run ({error!r})"
-        raise ConfigError("run", str(run), reason) from None
-    except jinja2.UndefinedError as error:
-        reason = f"must hold the summary.json of a finished run ({error})"
         raise ConfigError("run", str(run), reason) from None
     path = run / "report.html"
     files.write(path, text)
@@ -88,7 +86,7 @@ def _render(run: Path, config: Config, summary: dict[str, Any], template: str) -
     return environment.get_template(template).render(
         run=run,
         summary=summary,
-        modalities=[modality for modality, _ in summary["dqn"].items()],
+        modalities=[*summary["dqn"]],
         mean=metrics.mean,
         num_devices=len(summary["devices"]),
         devices=sorted(set(summary["devices"])),
@@ -117,7 +115,7 @@ class Plot:
 
 
 def _plots(run: Path) -> list[Plot]:
-    """Those plots that there are."""
+    """The plots in a run directory."""
     return [
         Plot(base64.b64encode(path.read_bytes()).decode(), *texts)
         for name, texts in PLOTS.items()
@@ -126,13 +124,13 @@ def _plots(run: Path) -> list[Plot]:
 
 
 def _films(run: Path) -> list[Film]:
-    """Animations, that of the run first."""
+    """The animations in a run directory, the run's own first."""
     found = map(read_film, sorted(run.glob("mission*.svg"), key=lambda path: path.stem))
     return [film for film in found if film is not None]
 
 
 def _commit(run: Path) -> str | None:
-    """The commit that a run's `config.json` tells, if it does."""
+    """The commit in a run's `config.json`, if any."""
     with contextlib.suppress(OSError, ValueError):
         content = parse_json((run / "config.json").read_text(encoding="utf-8"))
         return content.get("commit") if isinstance(content, dict) else None
@@ -140,7 +138,7 @@ def _commit(run: Path) -> str | None:
 
 
 def _changed(config: Config, preset: str) -> dict[str, tuple[str, str]]:
-    """Settings that are not the preset's: what they are, and what the preset has."""
+    """Settings that differ from the preset's: their value, and the preset's."""
     if preset not in PRESETS:
         return {}
     before = _flat(as_plain(PRESETS[preset]))
