@@ -7,6 +7,7 @@ import platform
 import re
 import stat
 import time
+import warnings
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor, wait
 from pathlib import Path
@@ -132,6 +133,8 @@ class Kept:
 
 def _use_cache_of_jax(path: Path) -> None:
     """Sets JAX's compilation cache, also for small programs, unless the user has set it."""
+    # A cache that cannot be read or written costs time, on a full disk for example, and no result.
+    warnings.filterwarnings("ignore", category=UserWarning, module=r"jax\._src\.compiler")
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
     jax.config.update("jax_compilation_cache_dir", str(path))
