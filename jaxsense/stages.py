@@ -51,59 +51,63 @@ class Progress:
     metrics: dict[str, jax.Array]
 
 
-def _never(key: Key, config: Config, state: Any, *inputs: Any) -> tuple[Any, Progress]:
-    raise NotImplementedError("a stage without steps")
-
-
-def _state(config: Config, state: Any, *inputs: Any) -> Any:
-    return state
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stage:
     """One stage of a training.
 
     Attributes:
       name: determines the random keys of the stage.
-      begin: `(key, config, *inputs) -> state`.
+      begin: `(key, config, *inputs) -> output`.
       inputs: names of the earlier stages whose outputs it takes.
       index: passed before the other inputs if given, as `[]` int32.
-      advance: `(key, config, state, *inputs) -> (state, Progress)`, one chunk of the training.
-      finish: `(config, state, *inputs) -> output`; by default the state.
-      steps: of the training; 0 where `begin` does everything.
-      chunks: calls of `advance`; the last one may have fewer steps.
       program: name of the programs; stages that share it have the same functions and shapes.
-      has_rows: the rows of inputs and output are independent, so that devices can share them; the
-        stage has no steps.
+      has_rows: the rows of inputs and output are independent, so that devices can share them.
       is_saved: a run saves the output, and does not repeat the stage when it resumes.
-      is_optional: a loss that is not finite ends this training early, and no other.
-      is_dense: small dense networks take nearly all of the time.
     """
 
     name: str
     begin: Callable[..., Any]
     inputs: tuple[str, ...] = ()
     index: int | None = None
-    advance: Callable[..., tuple[Any, Progress]] = _never
-    finish: Callable[..., Any] = _state
-    steps: int = 0
-    chunks: int = 0
     program: str = ""
     has_rows: bool = False
     is_saved: bool = False
-    is_optional: bool = False
-    is_dense: bool = False
 
-    def keys(self, key: Key) -> tuple[Key, Key]:
-        """Keys of `begin`, `[]`, and of `advance`, `[chunks]`, from the key of a training."""
-        own = _key_of(key, self.name)
-        of_chunks = jax.vmap(lambda i: jax.random.fold_in(own, i))(1 + jnp.arange(self.chunks))
-        return jax.random.fold_in(own, 0), of_chunks
+    def key(self, key: Key) -> Key:
+        """The key of `begin`, from the key of a training."""
+        return jax.random.fold_in(_key_of(key, self.name), 0)
 
     def select(self, outputs: Mapping[str, Any]) -> tuple[Any, ...]:
         """The inputs, from the outputs of earlier stages."""
         index = () if self.index is None else (jnp.int32(self.index),)
         return *index, *(outputs[name] for name in self.inputs)
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Steps(Stage):
+    """A stage of many steps, in chunks; its `begin` returns the first state.
+
+    Attributes:
+      advance: `(key, config, state, *inputs) -> (state, Progress)`, one chunk.
+      finish: `(config, state, *inputs) -> output`.
+      steps: number of steps.
+      chunks: calls of `advance`; the last one may have fewer steps.
+      is_optional: a loss that is not finite ends this stage early, and no other.
+      is_dense: small dense networks take nearly all of the time.
+    """
+
+    advance: Callable[..., tuple[Any, Progress]]
+    finish: Callable[..., Any]
+    steps: int
+    chunks: int
+    is_saved: bool = True
+    is_optional: bool = False
+    is_dense: bool = True
+
+    def chunk_keys(self, key: Key) -> Key:
+        """The `[chunks]` keys of `advance`, from the key of a training."""
+        own = _key_of(key, self.name)
+        return jax.vmap(lambda i: jax.random.fold_in(own, i))(1 + jnp.arange(self.chunks))
 
 
 @pytree
@@ -214,20 +218,28 @@ def learn(
     finite = [jnp.bool_(True)]
     for stage in found[: None if until is None else names.index(until) + 1]:
         inputs = stage.select(outputs)
-        begin_key, chunk_keys = stage.keys(key)
-        state = stage.begin(begin_key, config, *inputs)
-        if stage.steps:
-            state, chunks = jax.lax.scan(
-                lambda state, key: stage.advance(key, config, state, *inputs),  # noqa: B023
-                state,
-                chunk_keys,
-            )
-            progress[stage.name] = jax.tree.map(lambda x: x.reshape(-1)[: stage.steps], chunks)  # noqa: B023
-        outputs[stage.name] = stage.finish(config, state, *inputs)
-        if not stage.is_optional:
-            losses = [progress[stage.name].loss] if stage.steps else []
-            finite.append(is_finite((outputs[stage.name], losses)))
+        output = stage.begin(stage.key(key), config, *inputs)
+        if isinstance(stage, Steps):
+            output, progress[stage.name] = _run_steps(stage, key, config, output, inputs)
+            # Of an optional stage nothing need be finite; `jmvae` chooses among them.
+            finite += [] if stage.is_optional else [is_finite((output, progress[stage.name].loss))]
+        else:
+            finite.append(is_finite(output))
+        outputs[stage.name] = output
     return Learned(outputs, progress, jnp.stack(finite).all())
+
+
+def _run_steps(
+    stage: Steps, key: Key, config: Config, state: Any, inputs: tuple[Any, ...]
+) -> tuple[Any, Progress]:
+    """All chunks of a stage: its output and `[steps]` of progress."""
+
+    def advance(state: Any, key: Key) -> tuple[Any, Progress]:
+        return stage.advance(key, config, state, *inputs)
+
+    state, chunks = jax.lax.scan(advance, state, stage.chunk_keys(key))
+    progress = jax.tree.map(lambda x: x.reshape(-1)[: stage.steps], chunks)
+    return stage.finish(config, state, *inputs), progress
 
 
 def models(outputs: Mapping[str, Any], config: Config) -> Models:
@@ -324,7 +336,7 @@ def _examples(key: Key, config: Config, surveys: Surveys) -> tuple[Examples, ...
     )
 
 
-def _detector_stage(modality: int, name: str, config: Config) -> Stage:
+def _detector_stage(modality: int, name: str, config: Config) -> Steps:
     """The training of one modality's detector."""
     size = _chunk_size(config.detector.steps)
 
@@ -347,7 +359,7 @@ def _detector_stage(modality: int, name: str, config: Config) -> Stage:
         detector, fit = state
         return dataclasses.replace(detector, params=fit.params)
 
-    return Stage(
+    return Steps(
         name,
         begin,
         ("examples",),
@@ -356,8 +368,6 @@ def _detector_stage(modality: int, name: str, config: Config) -> Stage:
         steps=config.detector.steps,
         chunks=_num_chunks(config.detector.steps),
         program=name,
-        is_saved=True,
-        is_dense=True,
     )
 
 
@@ -397,9 +407,9 @@ def _by_class(values: jax.Array, classes: jax.Array, config: Config, number: int
     return flat[rows]
 
 
-def _restart_stage(name: str, config: Config) -> Stage:
+def _restart_stage(name: str, config: Config) -> Steps:
     """One training of the JMVAE."""
-    return Stage(
+    return Steps(
         name,
         _begin_jmvae,
         ("detections",),
@@ -408,9 +418,7 @@ def _restart_stage(name: str, config: Config) -> Stage:
         steps=config.jmvae.steps,
         chunks=_num_chunks(config.jmvae.steps),
         program="jmvae",
-        is_saved=True,
         is_optional=config.jmvae.restarts > 1,
-        is_dense=True,
     )
 
 
@@ -488,19 +496,18 @@ def _starts(
     return jax.vmap(begin)(jax.random.split(key, number), *detections.starts)
 
 
-def _agent_stage(modality: int, world: World, config: Config, learned: tuple[str, ...]) -> Stage:
+def _agent_stage(modality: int, world: World, config: Config, learned: tuple[str, ...]) -> Steps:
     """The training of one modality's Q-network."""
-    return Stage(
+    return Steps(
         f"dqn_{config.modalities[modality]}",
         functools.partial(_begin_dqn, world),
         ("starts", *learned),
         modality,
-        functools.partial(_advance_dqn, world),
-        _finish_dqn,
+        advance=functools.partial(_advance_dqn, world),
+        finish=_finish_dqn,
         steps=config.dqn.epochs,
         chunks=config.dqn.epochs // config.dqn.chunk,
         program="dqn",
-        is_saved=True,
         is_dense=config.dqn.observe == "bank",
     )
 

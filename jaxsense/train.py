@@ -119,7 +119,7 @@ def main(
     if not arguments.quiet:
         with contextlib.suppress(OSError):  # as in `say`
             _print_summary(console, run)
-    first = next(path for path in _paths(run).values() if (path / "report.html").exists())
+    first = next(path for path in seeds.paths(run).values() if (path / "report.html").exists())
     # A quiet run prints only this.
     say(f"Everything is in {run.path}; open {run.path / 'report.html'} first.")
     trust = " --trust" if arguments.config.sensors else ""
@@ -207,7 +207,7 @@ def _train(
 ) -> None:
     """Trains all seeds with the same programs, and writes their results."""
     settings, failed = run.settings, dict[int, str]()
-    _check_seeds(run)
+    seeds.check(run)
     kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config)
     monitor = Monitor(warn=_warn)
 
@@ -216,9 +216,8 @@ def _train(
         if not arguments.quiet:
             say("Stopping once everything is saved; Ctrl-C again stops at once.")
 
-    left = [
-        (seed, path) for seed, path in _paths(run).items() if not (path / "summary.json").exists()
-    ]
+    paths = seeds.paths(run).items()
+    left = [(seed, path) for seed, path in paths if not (path / "summary.json").exists()]
     size = min(len(left), 1 if jax.default_backend() == "cpu" else _MOST_TOGETHER)
     try:
         with (
@@ -228,7 +227,7 @@ def _train(
             for first in range(0, len(left), size):
                 with contextlib.ExitStack() as opened:
                     runs = [
-                        opened.enter_context(_of_seed(run, seed, path))
+                        opened.enter_context(seeds.open_run(run, seed, path))
                         for seed, path in left[first : first + size]
                     ]
                     failed |= _train_together(begin, arguments, runs, programs, monitor, console)
@@ -275,7 +274,7 @@ def _train_together(
     with displays[0]:
         monitor.begin(displays[0].show)
         results = devices.side_by_side(train, len(runs))
-        timing = _share(time.perf_counter() - begin, monitor.seconds, len(runs))
+        timing = seeds.share(time.perf_counter() - begin, monitor.seconds, len(runs))
         failed: dict[int, str] = {}
         for run, result in zip(runs, results, strict=True):
             try:
@@ -288,15 +287,6 @@ def _train_together(
     return failed
 
 
-def _share(total: float, stages: dict[str, dict[str, float]], number: int) -> dict[str, Any]:
-    """The time of each of `number` runs side by side."""
-    shared = {
-        stage: {kind: value / number for kind, value in seconds.items()}
-        for stage, seconds in stages.items()
-    }
-    return {"total_s": total / number, "stages": shared}
-
-
 def _display(
     arguments: Arguments, run: RunDirectory, console: rich.console.Console, *, is_shown: bool
 ) -> Display:
@@ -307,52 +297,14 @@ def _display(
     return Display(console, *records, quiet=arguments.quiet or not is_shown)
 
 
-def _paths(run: RunDirectory) -> dict[int, Path]:
-    """The directory of each seed."""
-    if run.settings.num_seeds == 1:
-        return {run.settings.seed: run.path}
-    return {seed: run.path / f"seed-{seed}" for seed in run.settings.seeds}
-
-
-def _check_seeds(run: RunDirectory) -> None:
-    """Raises `ConfigError` if the directory of one of several seeds holds another run."""
-    for seed, path in _paths(run).items():
-        if path == run.path or not (path / "config.json").exists():
-            continue
-        # Only compared: no code that they name runs.
-        if rundir.read_settings(path / "config.json", trust=True) != _settings_of(run, seed):
-            reason = f"must have the settings of {run.path / 'config.json'}, with seed {seed}"
-            raise ConfigError("resume", str(path), reason)
-
-
-def _settings_of(run: RunDirectory, seed: int) -> Settings:
-    """The settings of one of several seeds."""
-    return dataclasses.replace(run.settings, seed=seed, num_seeds=1)
-
-
-def _of_seed(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager[RunDirectory]:
-    """The run directory of one seed, like a run of that seed alone."""
-    if path == run.path:
-        return contextlib.nullcontext(run)
-    if (path / "config.json").exists():
-        return RunDirectory.resume(path, trust=True)
-    return RunDirectory.create(path, _settings_of(run, seed))
-
-
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
-    sound = {str(seed): path for seed, path in _paths(run).items() if seed not in failed}
-    found = {seed: rundir.read_summary(path) for seed, path in sound.items()}
-    blocks = [{name: one[name] for name in rundir.BLOCKS} for one in found.values()]
-    timing = {
-        "total_s": sum(one["timing"]["total_s"] for one in found.values()),
-        "stages": seeds.totals([one["timing"]["stages"] for one in found.values()]),
-    }
-    summary = {**_header(run, timing), "seeds": dict(zip(found, blocks, strict=True))}
+    paths = [path for seed, path in seeds.paths(run).items() if seed not in failed]
+    timing, blocks = seeds.summarise(paths)
+    summary = {**_header(run, timing), **blocks}
     if failed:
         summary["failed"] = {str(seed): reason for seed, reason in failed.items()}
-    summary |= seeds.statistics(blocks)
-    curves = seeds.rewards(list(sound.values()), run.settings.config)
+    curves = seeds.rewards(paths, run.settings.config)
     plots.write_rewards(run.path, curves, summary["dqn"])
     page.write_seeds(run.path, run.settings.config, summary)
     run.write_json("summary.json", summary)
@@ -392,11 +344,11 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     """Prints the main metrics; of several seeds, mean and 95% interval."""
     summary = rundir.read_summary(run.path)
     settings, policies = run.settings, summary["dqn"]
-    seeds = f", seed {settings.seed}"
+    which = f", seed {settings.seed}"
     if settings.num_seeds > 1:
         last = settings.seed + settings.num_seeds - 1
-        seeds = f", seeds {settings.seed} to {last}: mean, 95% interval"
-    table = rich.table.Table("metric", *policies, title=f"{settings.preset} preset{seeds}")
+        which = f", seeds {settings.seed} to {last}: mean, 95% interval"
+    table = rich.table.Table("metric", *policies, title=f"{settings.preset} preset{which}")
     detectors = [summary["detectors"][modality] for modality in policies]
     blocks = [*((metric, detectors) for metric in metrics.DETECTORS)]
     blocks += [(metric, [*policies.values()]) for metric in metrics.headline()]

@@ -11,7 +11,7 @@ from jaxsense.run import loop, pipeline, programs
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.stages import Progress, Stage
+from jaxsense.stages import Progress, Stage, Steps
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
 
@@ -61,7 +61,8 @@ def counting(name, bad_from=jnp.inf, **settings):
         metrics = {"double": jnp.where(steps == 2, jnp.nan, 2 * steps)}
         return state + 2, Progress(loss, metrics)
 
-    return Stage(name, begin, advance=advance, steps=5, chunks=3, program=name, **settings)
+    settings = {"finish": lambda config, state, *inputs: state, "is_saved": False} | settings
+    return Steps(name, begin, advance=advance, steps=5, chunks=3, program=name, **settings)
 
 
 def test_a_stage_reports_its_steps_and_none_beyond_the_last(toy):

@@ -48,10 +48,10 @@ def trained(request):
 
 def first_chunk(stage, config, key, inputs):
     """What `learn` does of a stage at first."""
-    begin_key, chunk_keys = stage.keys(key)
-    state = stage.begin(begin_key, config, *inputs)
-    if not stage.steps:
+    state = stage.begin(stage.key(key), config, *inputs)
+    if not isinstance(stage, stages.Steps):
         return state
+    chunk_keys = stage.chunk_keys(key)
     return jax.lax.scan(
         lambda state, key: stage.advance(key, config, state, *inputs), state, chunk_keys[:1]
     )
@@ -62,13 +62,12 @@ def test_every_stage_of_learn_is_that_of_a_run(trained):
     keys, config = jnp.stack([KEY, jax.random.key(8)]), programs.config
     for stage in programs.stages:
         inputs, compiled = stage.select(found.outputs), programs.of(stage)
-        begin_key, chunk_keys = stage.keys(KEY)
         if stage.has_rows:
             inputs = jax.tree.map(lambda x: x[:2], inputs)
             of_run = jax.tree.map(lambda x: x[:2], found.outputs[stage.name])
-        elif stage.steps:
-            state = compiled.begin(begin_key, config, *inputs)
-            of_run = compiled.advance(chunk_keys[0], config, state, *inputs)
+        elif isinstance(stage, stages.Steps):
+            state = compiled.begin(stage.key(KEY), config, *inputs)
+            of_run = compiled.advance(stage.chunk_keys(KEY)[0], config, state, *inputs)
             of_run = of_run[0], jax.tree.map(lambda x: np.asarray(x)[None], of_run[1])
         else:
             of_run = found.outputs[stage.name]
@@ -149,16 +148,21 @@ def test_steps_are_cut_into_chunks_also_if_their_number_is_prime(steps, expected
     assert (stage.chunks - 1) * size < stage.steps <= stage.chunks * size
 
 
+def keys_of(stage):
+    chunks = list(stage.chunk_keys(KEY)) if isinstance(stage, stages.Steps) else []
+    return [stage.key(KEY), *chunks]
+
+
+def data(keys):
+    return [tuple(jax.random.key_data(key).tolist()) for key in keys]
+
+
 def test_keys_follow_from_the_names_of_stages_alone():
     more = dataclasses.replace(TINY, jmvae=dataclasses.replace(TINY.jmvae, restarts=5))
-    few, many = ({s.name: s.keys(KEY) for s in stages.stages(c)} for c in (TINY, more))
-    for name, (begin, chunks) in few.items():
-        assert begin == many[name][0]
-        assert jnp.array_equal(chunks, many[name][1])
-    used = [begin for begin, _ in few.values()] + [k for _, chunks in few.values() for k in chunks]
-    used.append(stages.mission_key(KEY))
-    data = {tuple(jax.random.key_data(key).tolist()) for key in used}
-    assert len(data) == len(used)
+    few, many = ({s.name: data(keys_of(s)) for s in stages.stages(c)} for c in (TINY, more))
+    assert all(many[name] == keys for name, keys in few.items())
+    used = [key for keys in few.values() for key in keys] + data([stages.mission_key(KEY)])
+    assert len(set(used)) == len(used)
 
 
 def test_the_last_chunk_makes_no_step_too_many():

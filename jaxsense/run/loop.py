@@ -13,7 +13,7 @@ from jaxsense.config import Config
 from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import Programs, padded
-from jaxsense.stages import Progress, Stage
+from jaxsense.stages import Progress, Stage, Steps
 from jaxsense.types import Key
 
 _SAVE_PERIOD = 60.0  # s
@@ -111,8 +111,10 @@ class _Loop:
                 return found
             inputs = stage.select({name: future.result() for name, future in before.items()})
             self._monitor.check_stop()
-            output = self._train(stage, inputs) if stage.steps else self._begin(stage, inputs)
-            if not stage.is_optional:
+            output = self._begin(stage, inputs)
+            if isinstance(stage, Steps):
+                output = self._train(stage, output, inputs)
+            if not (isinstance(stage, Steps) and stage.is_optional):
                 self._monitor.check_finite(stage.name, "results", output)
             if stage.is_saved:
                 self._save(stage, output)
@@ -123,7 +125,7 @@ class _Loop:
 
     def _begin(self, stage: Stage, inputs: tuple[Any, ...]) -> Any:
         """The first state, or the output of a stage without steps."""
-        key, _ = stage.keys(self._key)
+        key = stage.key(self._key)
         program, config = self._programs.of(stage).begin, self._config
         if not stage.has_rows:
             return program(key, config, *inputs)
@@ -132,10 +134,10 @@ class _Loop:
         # Joined parts lie on the host, and every program would transfer them again.
         return jax.device_put(jax.tree.map(lambda x: x[:number], found))
 
-    def _train(self, stage: Stage, inputs: tuple[Any, ...]) -> Any:
-        """The output of a stage with steps."""
+    def _train(self, stage: Steps, state: Any, inputs: tuple[Any, ...]) -> Any:
+        """The output of a stage with steps, from its first state."""
         programs, config = self._programs.of(stage), self._config
-        _, keys = stage.keys(self._key)
+        keys = stage.chunk_keys(self._key)
         # The rate must not include compilation.
         programs.advance.wait()
 
@@ -146,7 +148,6 @@ class _Loop:
             curves = self._report(stage, chunk, progress, programs.finish(config, state, *inputs))
             return state, {**curves, "seconds": [seconds]}
 
-        state = self._begin(stage, inputs)
         try:
             state, curves = run_chunks(
                 stage.name, state, stage.chunks, advance, self._monitor, self._checkpoints
@@ -159,7 +160,7 @@ class _Loop:
         self._curves[stage.name] = curves
         return programs.finish(config, state, *inputs)
 
-    def _report(self, stage: Stage, chunk: int, progress: Progress, output: Any) -> Curves:
+    def _report(self, stage: Steps, chunk: int, progress: Progress, output: Any) -> Curves:
         """Reports a chunk, checks the output so far, and returns the steps' metrics."""
         size = len(progress.loss)
         done = min((chunk + 1) * size, stage.steps)
@@ -176,7 +177,7 @@ class _Loop:
 
     def _load(self, stage: Stage) -> Any:
         """The saved output of a finished stage; None if there is none."""
-        if stage.steps:
+        if isinstance(stage, Steps):
             shapes = _as_arrays(self._no_curves(stage))
             curves = self._checkpoints.load_or_forget(f"curves_{stage.name}", shapes)
             if curves is None:
@@ -185,7 +186,7 @@ class _Loop:
         output = self._programs.of(stage).shapes.result().output
         return self._checkpoints.load_or_forget(stage.name, output)
 
-    def _no_curves(self, stage: Stage) -> Curves:
+    def _no_curves(self, stage: Steps) -> Curves:
         """The curves of a failed training."""
         metrics = self._programs.of(stage).shapes.result().progress.metrics
         return {**dict.fromkeys(metrics, [np.nan] * stage.steps), "seconds": [0.0] * stage.chunks}
@@ -199,7 +200,7 @@ class _Loop:
             return
 
         def save() -> None:
-            if stage.steps:
+            if isinstance(stage, Steps):
                 curves = _as_arrays(self._curves[stage.name])
                 self._checkpoints.save(f"curves_{stage.name}", curves)
             self._checkpoints.save(stage.name, output)

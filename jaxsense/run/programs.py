@@ -18,7 +18,7 @@ from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.together import Team, TeamProgram
 from jaxsense.sim.world import World
-from jaxsense.stages import Stage, stages
+from jaxsense.stages import Stage, Steps, stages
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,7 +185,7 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
         compiled.shapes.set_result(Shapes(jax.tree.map(lambda x: _with_rows(x, number), output)))
         return
     state = compiled.begin.compile(stage.begin, key, config, *inputs, whole=(1,))
-    if not stage.steps:
+    if not isinstance(stage, Steps):
         compiled.shapes.set_result(Shapes(state))
         return
     runs_long = stage.is_dense and _on_cpu()

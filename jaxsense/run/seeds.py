@@ -1,16 +1,79 @@
-"""Means and confidence intervals of the metrics of several seeds."""
+"""Several seeds of a run: their directories, and means and intervals of their metrics."""
 
+import contextlib
+import dataclasses
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.stats
 
-from jaxsense.config import Config
+from jaxsense.config import Config, ConfigError
+from jaxsense.run import rundir
 from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run.rundir import RunDirectory, Settings
+
+Timing = dict[str, dict[str, float]]
+"""Seconds of each stage, `compile_s` and `run_s`."""
 
 _CONFIDENCE = 0.95
+
+
+def paths(run: RunDirectory) -> dict[int, Path]:
+    """The directory of each seed of a run."""
+    if run.settings.num_seeds == 1:
+        return {run.settings.seed: run.path}
+    return {seed: run.path / f"seed-{seed}" for seed in run.settings.seeds}
+
+
+def check(run: RunDirectory) -> None:
+    """Raises `ConfigError` if the directory of one of several seeds holds another run."""
+    for seed, path in paths(run).items():
+        if path == run.path or not (path / "config.json").exists():
+            continue
+        # Only compared: no code that they name runs.
+        if rundir.read_settings(path / "config.json", trust=True) != _settings_of(run, seed):
+            reason = f"must have the settings of {run.path / 'config.json'}, with seed {seed}"
+            raise ConfigError("resume", str(path), reason)
+
+
+def open_run(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager[RunDirectory]:
+    """The run directory of one seed, like a run of that seed alone."""
+    if path == run.path:
+        return contextlib.nullcontext(run)
+    if (path / "config.json").exists():
+        return RunDirectory.resume(path, trust=True)
+    return RunDirectory.create(path, _settings_of(run, seed))
+
+
+def _settings_of(run: RunDirectory, seed: int) -> Settings:
+    return dataclasses.replace(run.settings, seed=seed, num_seeds=1)
+
+
+def share(total: float, stages: Timing, number: int) -> dict[str, Any]:
+    """The block `timing` of each of `number` runs side by side."""
+    shared = {
+        stage: {kind: value / number for kind, value in seconds.items()}
+        for stage, seconds in stages.items()
+    }
+    return {"total_s": total / number, "stages": shared}
+
+
+def summarise(runs: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The block `timing` of several finished runs together, and all other blocks."""
+    found = [rundir.read_summary(path) for path in runs]
+    blocks = [{name: one[name] for name in rundir.BLOCKS} for one in found]
+    stages: Timing = {}
+    for one in found:
+        for stage, seconds in one["timing"]["stages"].items():
+            entry = stages.setdefault(stage, dict.fromkeys(seconds, 0.0))
+            for kind, value in seconds.items():
+                entry[kind] += value
+    timing = {"total_s": sum(one["timing"]["total_s"] for one in found), "stages": stages}
+    of_seeds = {str(one["seed"]): block for one, block in zip(found, blocks, strict=True)}
+    return timing, {"seeds": of_seeds, **statistics(blocks)}
 
 
 def statistics(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -40,17 +103,6 @@ def rewards(runs: Sequence[Path], config: Config) -> dict[str, np.ndarray]:
         return Checkpoints(run / "checkpoints").load(name, shapes)["reward"]
 
     return {name: np.stack([load(run, name) for run in runs]) for name in config.modalities}
-
-
-def totals(timings: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    """Total seconds of each stage over several runs."""
-    found: dict[str, dict[str, float]] = {}
-    for timing in timings:
-        for stage, seconds in timing.items():
-            entry = found.setdefault(stage, dict.fromkeys(seconds, 0.0))
-            for kind, value in seconds.items():
-                entry[kind] += value
-    return found
 
 
 def _statistics(values: list[Any]) -> Any:
