@@ -218,7 +218,8 @@ def _train(
 
     paths = seeds.paths(run).items()
     left = [(seed, path) for seed, path in paths if not (path / "summary.json").exists()]
-    size = min(len(left), 1 if jax.default_backend() == "cpu" else _MOST_TOGETHER)
+    most = 1 if jax.default_backend() == "cpu" else _MOST_TOGETHER
+    size = max(1, min(len(left), most))  # of seeds that are all finished none is left
     try:
         with (
             on_interrupt(stop),

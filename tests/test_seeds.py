@@ -11,6 +11,7 @@ from smoke import error_line, interrupting, without_times
 
 import jaxsense
 from jaxsense import evaluate, train
+from jaxsense.run import pipeline
 from jaxsense.run import seeds as of_seeds
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.compilation import Program
@@ -78,6 +79,15 @@ def test_the_summary_of_several_seeds_is_over_all_of_them(seeds, capsys):
         evaluate.main([str(seeds)])
     assert "holds several seeds; choose one" in capsys.readouterr().err
     assert "is finished" in error_line(["--resume", str(seeds)], capsys)
+
+
+def test_seeds_that_are_all_finished_are_only_summed_up(seeds, tmp_path, monkeypatch):
+    path = tmp_path / "seeds"
+    shutil.copytree(seeds, path)
+    (path / "summary.json").unlink()  # as if killed just before it was written
+    monkeypatch.setattr(pipeline, "run", lambda *_: pytest.fail("trained again"))
+    train.main(["--resume", str(path), "--quiet", "--cache", "None"])
+    assert (path / "summary.json").read_text() == (seeds / "summary.json").read_text()
 
 
 def test_a_seed_that_fails_leaves_the_others(seeds, cache, tmp_path, monkeypatch, capsys):
