@@ -187,6 +187,13 @@ def test_options_of_jax_are_other_settings(tmp_path):
     finally:
         jax.config.update("jax_threefry_partitionable", True)
     assert is_there()
+    # A run that sets where JAX keeps what it compiles finds what it has kept before.
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "elsewhere"))
+    try:
+        assert is_there()
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
 
 
 def test_a_kept_program_finds_the_functions_that_it_calls(tmp_path):

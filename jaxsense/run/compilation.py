@@ -318,12 +318,18 @@ def _surroundings() -> list[Any]:
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         features = {line for line in lines if line.startswith(("flags", "model name", "Features"))}
+    variables = [item for item in os.environ.items() if item[0].startswith(("JAX_", "XLA_"))]
     return [
         versions(),
-        sorted((k, v) for k, v in os.environ.items() if k.startswith(("JAX_", "XLA_"))),
-        sorted((name, str(value)) for name, value in jax.config.values.items()),
+        sorted((name, value) for name, value in variables if not _sets_cache(name)),
+        sorted((name, str(x)) for name, x in jax.config.values.items() if not _sets_cache(name)),
         jax.devices()[0].client.platform_version,
         [(device.platform, device.device_kind) for device in jax.devices()],
         sorted(features),
         platform.python_version(),
     ]
+
+
+def _sets_cache(option: str) -> bool:
+    """Whether an option sets where and how JAX keeps what it compiles: it changes no program."""
+    return "cache" in option.lower()

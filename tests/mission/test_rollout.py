@@ -19,11 +19,11 @@ FAULT_TIME = 4.0  # s
 NEVER = (np.inf, np.inf)
 # For each case: when robots stop and go blind, and the number of its arenas.
 CASES = {
-    "healthy": (NEVER, NEVER, 12),
-    "0 stops": ((FAULT_TIME, np.inf), NEVER, 4),
-    "1 stops": ((np.inf, FAULT_TIME), NEVER, 4),
-    "0 blind": (NEVER, (FAULT_TIME, np.inf), 4),
-    "1 blind": (NEVER, (np.inf, FAULT_TIME), 4),
+    "healthy": (NEVER, NEVER, 8),
+    "0 stops": ((FAULT_TIME, np.inf), NEVER, 3),
+    "1 stops": ((np.inf, FAULT_TIME), NEVER, 3),
+    "0 blind": (NEVER, (FAULT_TIME, np.inf), 3),
+    "1 blind": (NEVER, (np.inf, FAULT_TIME), 3),
     "nobody": ((0.0, 0.0), NEVER, 2),
 }
 NUM_ARENAS = CASES["healthy"][2]
