@@ -9,9 +9,11 @@ from types import ModuleType
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
 from sphinx.writers.html5 import HTML5Translator
 
 import jaxsense
+from jaxsense.show import metrics
 
 project = "jaxsense"
 author = "the jaxsense authors"
@@ -100,7 +102,21 @@ def block_math(translator: HTML5Translator, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+class MetricsTable(SphinxDirective):
+    """The table of metrics that the terminal and the report page show as well."""
+
+    def run(self) -> list[nodes.Node]:
+        """Writes one row for each metric."""
+        rows = ["| key | name | meaning | paper |", "| --- | --- | --- | --- |"]
+        for block, listed in metrics.BLOCKS.items():
+            for metric in listed:
+                cells = f"`{block}.{metric.key}`", metric.label, metric.meaning, metric.paper
+                rows.append("| " + " | ".join(cell.replace("*", r"\*") for cell in cells) + " |")
+        return self.parse_text_to_nodes("\n".join(rows))
+
+
 def setup(app: Sphinx) -> None:
     """Registers what this file adds to Sphinx."""
+    app.add_directive("metrics", MetricsTable)
     app.connect("autodoc-process-docstring", keep_colons, priority=400)
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))

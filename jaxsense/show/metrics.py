@@ -139,6 +139,14 @@ MISSIONS = (
 )
 """`summary["mission"][POLICY]`."""
 
+BLOCKS = {
+    "detectors.MODALITY": DETECTORS,
+    "jmvae": LATENT_SPACE,
+    "dqn.MODALITY": AGENTS,
+    "mission.POLICY": MISSIONS,
+}
+"""The metrics by their block of `summary.json`."""
+
 _PAGE_ONLY = {"one_step.policy", "one_step.optimal", "one_step.random", "env_steps"}
 
 
