@@ -1,4 +1,4 @@
-"""How fast each stage is, beside others who do the same: `python -m benchmarks --help`."""
+"""The speed of each stage, compared with other libraries: `python -m benchmarks --help`."""
 
 from collections.abc import Callable
 

@@ -105,7 +105,8 @@ class Examiner:
         self.target = SHARE * float(jax.jit(optimal_return)(table_key, starts))
         self._starts = starts
         map_size = 2 * config.jmvae.latent_size * config.arena.num_pois
-        example = policies.q_network(mdp, config.dqn.hidden).init(table_key, jnp.zeros(map_size))
+        network = policies.q_network(mdp.num_pois, config.dqn.hidden)
+        example = network.init(table_key, jnp.zeros(map_size))
         self._greedy_return = jax.jit(greedy_return).lower(example, starts).compile()
 
     def passes(self, params: Params) -> bool:

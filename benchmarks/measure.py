@@ -85,7 +85,7 @@ class Row:
     is_bound: bool = False
 
     def as_json(self) -> dict[str, Any]:
-        """The public keys; that a peer was stopped is told beside its name."""
+        """The public keys; the name of a peer that was stopped says so."""
         values = dataclasses.asdict(self)
         if values.pop("is_bound"):
             values["peer"] = f"{self.peer} (stopped)"

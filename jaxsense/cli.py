@@ -22,6 +22,11 @@ from jaxsense.sim import sensors
 
 T = TypeVar("T")
 
+CACHE = Path("~/.cache/jaxsense")
+# Exit statuses, as in shells.
+INTERRUPTED = 130
+_CLOSED = 141
+
 
 def parse(program: str, arguments: type[T], argv: list[str], default: T | None = None) -> T:
     """Reads a command line; ends the program with status 2 and one line if it is wrong.
@@ -67,7 +72,9 @@ def run(main: Callable[[], None]) -> None:
         main()
     except KeyboardInterrupt:
         complain("Interrupted.")
-        _exit(130)
+        _exit(INTERRUPTED)
+    except BrokenPipeError:  # for example `--help | head`
+        _exit(_CLOSED)
     except SystemExit as stop:
         _exit(stop.code if isinstance(stop.code, int) else int(stop.code is not None))
 

@@ -45,7 +45,7 @@ class Arguments:
     devices: int | None = None
     """Accelerators, or threads on a CPU, that share the missions. By default all accelerators, or
     as many threads as cores, at most 8."""
-    cache: Path | None = Path("~/.cache/jaxsense")
+    cache: Path | None = cli.CACHE
     """Directory to keep compiled programs in for later runs; `None` keeps none."""
     animate: bool = False
     """Also write an animation of the first mission as `mission-POLICY-SEED.svg`."""

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 
 from jaxsense import networks
 from jaxsense.config import Config
-from jaxsense.networks import MLP, Params
+from jaxsense.dqn import policies
+from jaxsense.networks import Params
 from jaxsense.sim import sensors
 from jaxsense.types import Belief, Key, pytree
 from jaxsense.vae import detectors, jmvae
@@ -46,7 +47,7 @@ def init(key: Key, config: Config) -> Models:
         for k, s, size in zip(keys, sensors.make(config), num_labels, strict=True)
     )
     size = 2 * config.jmvae.latent_size * config.arena.num_pois
-    q_network = MLP(config.dqn.hidden, config.arena.num_pois + 1)
+    q_network = policies.q_network(config.arena.num_pois, config.dqn.hidden)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
     shape = (len(config.arena.classes), config.jmvae.latent_size)
     return Models(

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import re
 import shlex
 import sys
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
+import numpy as np
 import rich.console
 import rich.table
 import tyro
@@ -35,7 +37,7 @@ from jaxsense.sim import sensors
 PROGRAM = "jaxsense.train"
 _MOST_SEEDS = 10_000
 _MOST_TOGETHER = 16  # seeds in one program on an accelerator
-_INTERRUPTED = 130  # exit status, as in shells
+_LEAVE_TIMEOUT = 10.0  # s
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +62,7 @@ class Arguments:
     """Run the functions that the `config.json` of `--config` or `--resume` names for your own
     sensors."""
     quiet: bool = False
-    """Show only errors and the path of the results."""
+    """Show only errors, the path of the results and the next command."""
     tensorboard: bool = False
     """Also write event files for TensorBoard to `tensorboard/` in the run."""
     devices: int | None = None
@@ -73,7 +75,7 @@ class Arguments:
     """Number of processes that share the run."""
     process_index: int | None = None
     """Index of this process, from 0."""
-    cache: Path | None = Path("~/.cache/jaxsense")
+    cache: Path | None = cli.CACHE
     """Directory to keep compiled programs in for later runs; `None` keeps none."""
 
     def __post_init__(self):
@@ -101,6 +103,8 @@ def main(
     arguments = parse(sys.argv[1:] if argv is None else argv, change)
     console = rich.console.Console(quiet=arguments.quiet)
     try:
+        if arguments.coordinator is not None and not arguments.quiet:
+            say(f"Waiting for the other processes at {arguments.coordinator}.")
         devices.join(arguments.coordinator, arguments.num_processes, arguments.process_index)
         workers = devices.start(arguments.devices)
         if jax.process_index() > 0:
@@ -120,7 +124,7 @@ def main(
         with contextlib.suppress(OSError):  # as in `say`
             _print_summary(console, run)
     first = next(path for path in seeds.paths(run).values() if (path / "report.html").exists())
-    # A quiet run prints only this.
+    # A quiet run prints only these two lines.
     say(f"Everything is in {run.path}; open {run.path / 'report.html'} first.")
     trust = " --trust" if arguments.config.sensors else ""
     say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
@@ -217,7 +221,8 @@ def _train(
             say("Stopping once everything is saved; Ctrl-C again stops at once.")
 
     paths = seeds.paths(run).items()
-    left = [(seed, path) for seed, path in paths if not (path / "summary.json").exists()]
+    is_left = np.array([not (path / "summary.json").exists() for _, path in paths])
+    left = list(itertools.compress(paths, devices.of_first_process(is_left)))
     most = 1 if jax.default_backend() == "cpu" else _MOST_TOGETHER
     size = max(1, min(len(left), most))  # of seeds that are all finished none is left
     try:
@@ -234,13 +239,18 @@ def _train(
                     failed |= _train_together(begin, arguments, runs, programs, monitor, console)
                 begin = time.perf_counter()
     except Stopped:
-        trust = " --trust" if settings.config.sensors else ""
-        go_on = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}{trust}"
-        cli.complain(f"Stopped; all training so far is saved. To resume: {go_on}")
-        sys.exit(_INTERRUPTED)
+        if jax.process_index() == 0:
+            again = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}"
+            again += " --trust" if settings.config.sensors else ""
+            again += " with the same processes" if jax.process_count() > 1 else ""
+            cli.complain(f"Stopped; all training so far is saved. To resume: {again}")
+        # Another process may wait for this one, where it is not to be stopped.
+        devices.leave(timeout=_LEAVE_TIMEOUT)
+        sys.exit(cli.INTERRUPTED)
     if len(failed) == settings.num_seeds:
         sys.exit(2)
-    if settings.num_seeds > 1:
+    # Another process has none of the seeds that were finished before.
+    if settings.num_seeds > 1 and jax.process_index() == 0:
         _summarise_seeds(run, failed)
 
 
@@ -305,7 +315,7 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     summary = {**_header(run, timing), **blocks}
     if failed:
         summary["failed"] = {str(seed): reason for seed, reason in failed.items()}
-    curves = seeds.rewards(paths, run.settings.config)
+    curves = seeds.rewards(paths, run.settings.config, _warn)
     plots.write_rewards(run.path, curves, summary["dqn"])
     page.write_seeds(run.path, run.settings.config, summary)
     run.write_json("summary.json", summary)

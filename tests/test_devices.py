@@ -2,9 +2,11 @@
 
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import chex
@@ -87,25 +89,31 @@ def test_options_that_the_compiler_does_not_know_are_left_out():
     jax.jit(lambda x: x).lower(1.0).compile(compiler_options=known)
 
 
-@pytest.mark.slow  # two processes compile a whole run
-def test_two_processes_share_a_run(tmp_path):
+TRAIN = [sys.executable, "-m", "jaxsense.train", "--quiet", "--cache", "None"]
+
+
+def two_processes(options):
+    """Two processes that share a run."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
-    command = [sys.executable, "-m", "jaxsense.train", "--preset", "smoke", "--quiet"]
-    command += ["--cache", "None"]
-    alone = tmp_path / "alone"
-    subprocess.run([*command, "--out", str(alone)], check=True, stdout=subprocess.DEVNULL)
-    shared = [*command, "--out", str(tmp_path / "shared"), "--coordinator", address]
-    processes = [
+    shared = [*TRAIN, *options, "--coordinator", address, "--num-processes", "2"]
+    return [
         subprocess.Popen(
-            [*shared, "--num-processes", "2", "--process-index", str(i)],
+            [*shared, "--process-index", str(i)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
         for i in range(2)
     ]
+
+
+@pytest.mark.slow  # two processes compile a whole run
+def test_two_processes_share_a_run(tmp_path):
+    alone, smoke = tmp_path / "alone", ["--preset", "smoke"]
+    subprocess.run([*TRAIN, *smoke, "--out", str(alone)], check=True, stdout=subprocess.DEVNULL)
+    processes = two_processes([*smoke, "--out", str(tmp_path / "shared")])
     ended = [process.communicate(timeout=600) for process in processes]
     assert [process.returncode for process in processes] == [0, 0], ended
     assert "Everything is in" in ended[0][0]
@@ -115,12 +123,39 @@ def test_two_processes_share_a_run(tmp_path):
     assert found["mission"]["naive"]["episodes"] == 4
 
 
+@pytest.mark.slow  # two processes compile three runs
+def test_two_processes_stop_and_resume_several_seeds(tmp_path):
+    seeds = tmp_path / "seeds"
+    processes = two_processes(["--preset", "smoke", "--num-seeds", "2", "--out", str(seeds)])
+    # The first seed is finished, the second one not, when both are asked to stop.
+    metrics = seeds / "seed-1" / "metrics.jsonl"
+    while not (metrics.exists() and "dqn" in metrics.read_text()):
+        assert [process.poll() for process in processes] == [None, None]
+        time.sleep(0.05)
+    for process in processes:
+        process.send_signal(signal.SIGTERM)
+    ended = [process.communicate(timeout=100) for process in processes]
+    assert [process.returncode for process in processes] == [130, 130], ended
+    assert ended[0][1].startswith("Stopped; all training so far is saved.")
+    assert ended[1][1] == ""
+    assert (seeds / "seed-0" / "summary.json").exists()
+    processes = two_processes(["--resume", str(seeds)])
+    ended = [process.communicate(timeout=600) for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], ended
+    alone = tmp_path / "alone"
+    smoke = ["--preset", "smoke", "--seed", "1", "--out", str(alone)]
+    subprocess.run([*TRAIN, *smoke], check=True, stdout=subprocess.DEVNULL)
+    assert not different_across_compilers(without_times(seeds / "seed-1"), without_times(alone))
+
+
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        (("localhost:1", None, None), "num_processes = None: must be given with"),
+        (("localhost:1", None, 0), "None: must be given with coordinator and process_index"),
         ((None, 2, 0), "coordinator = None: must be given with"),
         (("localhost", 2, 0), "coordinator = 'localhost': must be HOST:PORT"),
+        (("localhost:99999", 2, 0), "must be HOST:PORT, with a port from 1 to 65535"),
+        (("no.host.invalid:1", 2, 1), "coordinator = 'no.host.invalid:1': cannot be found"),
         (("localhost:1", 2, 2), "process_index = 2: must be within 0 and 1"),
         (("localhost:1", 0, 0), "num_processes = 0: must be greater than 0"),
     ],

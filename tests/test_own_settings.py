@@ -135,7 +135,7 @@ def test_a_sensor_is_made_by_the_function_that_is_named(own_sensors):
     ("function", "expected"),
     [
         (None, "sensors.thermal.make = 'own_sensors:thermal': must be a function that can be impo"),
-        (lambda config: 3, "must give a jaxsense.sim.Sensor, not int"),
+        (lambda config: 3, "must return a jaxsense.sim.Sensor, not int"),
         (lambda config: thermal(config, height=0.3), "sensors.thermal: height = 0.3: must be abo"),
         (lambda config: thermal(config, window=40), "window = 40: must be 1 to 32: it has 32 rays"),
         (lambda config: thermal(config, stride=5), "window = 8: must be 1 to 7: it has 32 rays"),

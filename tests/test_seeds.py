@@ -48,7 +48,8 @@ def test_a_seed_of_several_is_the_run_of_that_seed(seeds, smoke_run):
 
 def test_curves_are_those_of_all_seeds(seeds):
     config = read_settings(seeds / "config.json").config
-    curves = of_seeds.rewards([seeds / "seed-4", seeds / "seed-5"], config)
+    runs = [seeds / "seed-4", seeds / "seed-5"]
+    curves = of_seeds.rewards(runs, config, pytest.fail)
     saved = {name: np.full(60, np.nan, np.float32) for name in ("reward", "epsilon")}
     saved["seconds"] = np.zeros(3, np.float32)
     of_5 = Checkpoints(seeds / "seed-5" / "checkpoints").load("curves_dqn_lidar", saved)
@@ -88,6 +89,27 @@ def test_seeds_that_are_all_finished_are_only_summed_up(seeds, tmp_path, monkeyp
     monkeypatch.setattr(pipeline, "run", lambda *_: pytest.fail("trained again"))
     train.main(["--resume", str(path), "--quiet", "--cache", "None"])
     assert (path / "summary.json").read_text() == (seeds / "summary.json").read_text()
+
+
+@pytest.mark.parametrize("damage", ["altered", "missing", "all missing"])
+def test_seeds_are_summed_up_without_a_damaged_curve(seeds, tmp_path, capsys, damage):
+    path = tmp_path / "seeds"
+    shutil.copytree(seeds, path)
+    (path / "summary.json").unlink()
+    curve = path / "seed-4" / "checkpoints" / "curves_dqn_camera.msgpack"
+    if damage == "altered":
+        curve.write_bytes(curve.read_bytes()[:-1])
+    elif damage == "missing":
+        curve.unlink()
+    else:
+        for seed in (4, 5):
+            shutil.rmtree(path / f"seed-{seed}" / "checkpoints")
+    train.main(["--resume", str(path), "--quiet", "--cache", "None"])
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == (4 if damage == "all missing" else 1)
+    assert all("curves_dqn" in line and line.endswith("left out of reward.png") for line in said)
+    assert (path / "summary.json").read_text() == (seeds / "summary.json").read_text()
+    assert (path / "reward.png").exists()
 
 
 def test_a_seed_that_fails_leaves_the_others(seeds, cache, tmp_path, monkeypatch, capsys):

@@ -10,6 +10,8 @@ from jaxsense.config.learning import DqnConfig as DqnConfig
 from jaxsense.config.learning import EvaluationConfig as EvaluationConfig
 from jaxsense.config.learning import JmvaeConfig as JmvaeConfig
 from jaxsense.config.learning import MdpConfig as MdpConfig
+from jaxsense.config.mission import MISSIONS_AT_ONCE as MISSIONS_AT_ONCE
+from jaxsense.config.mission import NODES_PER_POI as NODES_PER_POI
 from jaxsense.config.mission import MissionConfig as MissionConfig
 from jaxsense.config.mission import NavigationConfig as NavigationConfig
 from jaxsense.config.objects import COLOURS as COLOURS

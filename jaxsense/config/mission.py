@@ -13,6 +13,11 @@ from jaxsense.config.section import Traced, section
 MOST_EPISODES = 100_000
 """Most missions of one policy whose states fit a computer's memory."""
 
+MISSIONS_AT_ONCE = 384
+"""Most missions that are played side by side."""
+NODES_PER_POI = 10
+"""Waypoints of the roadmap around each PoI."""
+
 
 @section
 class NavigationConfig:

@@ -15,7 +15,12 @@ from jaxsense.config.learning import (
     JmvaeConfig,
     MdpConfig,
 )
-from jaxsense.config.mission import MissionConfig, NavigationConfig
+from jaxsense.config.mission import (
+    MISSIONS_AT_ONCE,
+    NODES_PER_POI,
+    MissionConfig,
+    NavigationConfig,
+)
 from jaxsense.config.objects import require_words
 from jaxsense.config.scene import (
     MODALITIES,
@@ -31,8 +36,6 @@ from jaxsense.config.section import section
 _MOST_NUMBERS = 2**32
 """Numbers of 32 bits in an array or a network, 16 GiB."""
 _MOST_MODALITIES = 8  # the JMVAE has an encoder for each subset
-_PLANNED_AT_ONCE = 384  # missions side by side, see `run.missions`
-_NODES_PER_POI = 10  # of the roadmap
 
 
 @section
@@ -193,8 +196,8 @@ class Config:
             "evaluation.num_starts evaluation.num_repeats": evaluation.num_starts
             * evaluation.num_repeats
             * state,
-            "navigation.turn_samples": trajectories * num_pois * _PLANNED_AT_ONCE,
-            "mission.episodes": self.mission.episodes * views * num_pois * _NODES_PER_POI,
+            "navigation.turn_samples": trajectories * num_pois * MISSIONS_AT_ONCE,
+            "mission.episodes": self.mission.episodes * views * num_pois * NODES_PER_POI,
         }
         for fields, number in numbers.items():
             if number > _MOST_NUMBERS:

@@ -17,9 +17,9 @@ from jaxsense.types import Index, Key
 Policy = Callable[[Key, MapState], jax.Array]
 
 
-def q_network(mdp: MapMdp, hidden: tuple[int, ...]) -> MLP:
+def q_network(num_pois: int, hidden: tuple[int, ...]) -> MLP:
     """The Q-network: `[N * 2D]` map to `[N + 1]` values, NOP's last."""
-    return MLP(hidden, mdp.num_pois + 1)
+    return MLP(hidden, num_pois + 1)
 
 
 def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
@@ -28,7 +28,7 @@ def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
     def act(key: Key, state: MapState) -> jax.Array:
         del key
         seen = belief_mdp.observation(state.belief)
-        return _best(networks.apply(q_network(mdp, hidden), params, seen))
+        return _best(networks.apply(q_network(mdp.num_pois, hidden), params, seen))
 
     return act
 

@@ -95,7 +95,7 @@ def init(key: Key, mdp: MapMdp, config: DqnConfig, prepared: MapState) -> DqnSta
     """
     envs = jax.tree.map(lambda x: jnp.zeros((config.num_envs, *x.shape[1:]), x.dtype), prepared)
     size = 2 * math.prod(prepared.belief.mean.shape[1:])
-    params = networks.init(key, q_network(mdp, config.hidden), size)
+    params = networks.init(key, q_network(mdp.num_pois, config.hidden), size)
     rounds, blocks = config.replay_capacity // config.num_envs, config.num_envs // config.block
     return DqnState(
         params=params,
@@ -199,7 +199,7 @@ def _epoch(
         config.epsilon_min, config.epsilon_start * config.epsilon_decay**state.epoch
     )
     started = _restart(draws.start, state.envs, shares, state.needs_start)
-    network = q_network(mdp, config.hidden)
+    network = q_network(mdp.num_pois, config.hidden)
     envs, has_ended, transitions, values = _explore(
         mdp, modality, network, state.params, started, epsilon, draws
     )

@@ -9,9 +9,8 @@ import numpy as np
 
 from jaxsense import networks
 from jaxsense.config import Config
-from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import belief_mdp, policies
 from jaxsense.models import Models, make_jmvae
-from jaxsense.networks import MLP
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
 from jaxsense.vae import detectors, fusion, jmvae, metrics
@@ -102,7 +101,7 @@ def _encode(models: Models, model: jmvae.Jmvae, subset: tuple[int, ...]) -> Func
 
 def _decide(config: Config, models: Models, m: int) -> Function:
     num_pois = config.arena.num_pois
-    q_network = MLP(config.dqn.hidden, num_pois + 1)
+    q_network = policies.q_network(num_pois, config.dqn.hidden)
 
     def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
         state = belief_mdp.observation(Belief(mean, std))

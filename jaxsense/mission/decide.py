@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxsense import networks
 from jaxsense.config import ROBOT_RADIUS, Config
-from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import belief_mdp, policies
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
@@ -22,7 +22,6 @@ from jaxsense.mission.state import (
     with_robot,
 )
 from jaxsense.models import Models
-from jaxsense.networks import MLP
 from jaxsense.sim import roadmap, viewpoints
 from jaxsense.types import Belief, Index, Key, others
 
@@ -77,7 +76,7 @@ def _choose(
     config, robots = mission.config, state.robots
     num_pois = config.arena.num_pois
     given_up = robots.unreachable[robot] | robots.undetected[robot]
-    network = MLP(config.dqn.hidden, num_pois + 1)
+    network = policies.q_network(num_pois, config.dqn.hidden)
     q_network = jax.tree.map(lambda *x: jnp.stack(x)[robot], *models.q_networks)
 
     def values_if(sure: Belief) -> jax.Array:

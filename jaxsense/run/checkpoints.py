@@ -3,7 +3,6 @@
 A checkpoint is one file: a SHA-256 digest, then arrays in the format of `flax.serialization`.
 """
 
-import hashlib
 import shutil
 import sys
 import threading
@@ -20,7 +19,6 @@ from jaxsense.run import files
 
 T = TypeVar("T")
 
-_DIGEST = hashlib.sha256().digest_size
 _SUFFIX = ".msgpack"
 _AGAIN = "its content is trained again"
 _LIST = "saved"
@@ -184,7 +182,7 @@ class Checkpoints:
 
     def _write(self, name: str, content: Any) -> None:
         packed = serialization.msgpack_serialize(content)
-        files.write(self._file(name), hashlib.sha256(packed).digest() + packed)
+        files.write(self._file(name), files.with_digest(packed))
 
     def _load(self, name: str, restore: Callable[[Any], T]) -> T | None:
         """Applies `restore` to a checkpoint's content; see `load`."""
@@ -228,11 +226,7 @@ def _unfinished(stage: str) -> str:
 
 def _read(file: Path) -> Any:
     """A checkpoint's content as nested dictionaries; raises `ValueError` if it is damaged."""
-    whole = file.read_bytes()
-    content = whole[_DIGEST:]
-    if hashlib.sha256(content).digest() != whole[:_DIGEST]:
-        raise ValueError("its content does not have its digest")
-    return serialization.msgpack_restore(content)
+    return serialization.msgpack_restore(files.without_digest(file.read_bytes()))
 
 
 def _what_is_wrong(error: Exception) -> str:

@@ -23,8 +23,6 @@ from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.version import versions
 
-_THREADS = min(os.cpu_count() or 1, 8)
-_DIGEST = hashlib.sha256().digest_size
 # Read at import, so that it matches the code that runs.
 _SOURCE = [
     (path.name, hashlib.sha256(path.read_bytes()).hexdigest())
@@ -97,12 +95,10 @@ class Kept:
                 if not _is_private(os.fstat(file.fileno()), 0o022):
                     return None
                 content = file.read()
-            digest, program = content[:_DIGEST], content[_DIGEST:]
             # A single wrong bit could end the process.
-            if hashlib.sha256(program).digest() == digest:
-                found = export.deserialize(bytearray(program))
-                path.touch()
-                return found
+            found = export.deserialize(bytearray(files.without_digest(content)))
+            path.touch()
+            return found
         return None
 
     def find_or_trace(
@@ -118,8 +114,7 @@ class Kept:
         # sensor calls something that JAX cannot export.
         with contextlib.suppress(Exception):
             traced = export.export(flat)(*shapes_of(leaves))
-            program = bytes(traced.serialize())
-            content = hashlib.sha256(program).digest() + program
+            content = files.with_digest(bytes(traced.serialize()))
             files.write(self._file(name, args), content, mode=0o600)
             return traced
         return None
@@ -153,7 +148,7 @@ class Compiler:
 
     def __init__(self, monitor: Monitor, kept: Kept | None = None):
         self.monitor, self.kept = monitor, kept
-        self._threads = ThreadPoolExecutor(_THREADS)
+        self._threads = ThreadPoolExecutor(devices.NUM_THREADS)
         self._is_closed = False
 
     def __enter__(self) -> "Compiler":

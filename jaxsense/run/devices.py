@@ -3,7 +3,8 @@
 import dataclasses
 import functools
 import os
-import re
+import socket
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any, TypeVar
@@ -11,6 +12,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxsense.config import ConfigError
@@ -18,7 +20,7 @@ from jaxsense.config import ConfigError
 T = TypeVar("T")
 
 AXIS = "devices"
-_MOST_THREADS = 8
+NUM_THREADS = min(os.cpu_count() or 1, 8)
 _MOST_DEVICES = 256
 
 
@@ -94,7 +96,7 @@ def start(number: int | None) -> Workers:
     if number is not None and not 1 <= number <= _MOST_DEVICES:
         raise ConfigError("devices", number, f"must be within 1 and {_MOST_DEVICES}")
     if jax.default_backend() == "cpu" and jax.process_count() == 1:
-        return Workers(threads=number or min(os.cpu_count() or 1, _MOST_THREADS))
+        return Workers(threads=number or NUM_THREADS)
     there = jax.device_count()
     number = there if number is None else number
     if number > there:
@@ -139,16 +141,23 @@ def join(coordinator: str | None, number: int | None, index: int | None) -> None
         return
     for name, value in given.items():
         if value is None:
-            raise ConfigError(name, value, f"must be given with {', '.join({*given} - {name})}")
+            others = " and ".join(other for other, x in given.items() if x is not None)
+            raise ConfigError(name, value, f"must be given with {others}")
     assert coordinator is not None
     assert number is not None
     assert index is not None
-    if not re.fullmatch(r"\S+:\d+", coordinator):
-        raise ConfigError("coordinator", coordinator, "must be HOST:PORT")
+    host, _, port = coordinator.rpartition(":")
+    if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 2**16):
+        reason = "must be HOST:PORT, with a port from 1 to 65535"
+        raise ConfigError("coordinator", coordinator, reason)
     if number < 1:
         raise ConfigError("num_processes", number, "must be greater than 0")
     if not 0 <= index < number:
         raise ConfigError("process_index", index, f"must be within 0 and {number - 1}")
+    try:
+        socket.getaddrinfo(host.strip("[]"), int(port))
+    except OSError as error:
+        raise ConfigError("coordinator", coordinator, f"cannot be found ({error})") from None
     try:
         jax.distributed.initialize(coordinator, number, index)
     except (RuntimeError, ValueError) as error:
@@ -156,10 +165,21 @@ def join(coordinator: str | None, number: int | None, index: int | None) -> None
         raise ConfigError("coordinator", coordinator, reason) from None
 
 
-def leave() -> None:
-    """Waits for the other processes of the run, if any, and disconnects."""
+def of_first_process(values: np.ndarray) -> np.ndarray:
+    """The first process's values, in all processes; blocks until all have called it."""
+    return np.asarray(multihost_utils.broadcast_one_to_all(values))
+
+
+def leave(timeout: float | None = None) -> None:
+    """Waits for the other processes of the run, if any, and disconnects.
+
+    Args:
+      timeout: seconds to wait for processes that may not end; without it, as long as they need.
+    """
     if jax.process_count() > 1:
-        jax.distributed.shutdown()
+        waiting = threading.Thread(target=jax.distributed.shutdown, daemon=True)
+        waiting.start()
+        waiting.join(timeout)
 
 
 def shardings(mesh: Mesh, number: int, whole: tuple[int, ...]) -> tuple[NamedSharding, ...]:

@@ -1,6 +1,7 @@
 """Writes files as a whole or not at all, and locks directories."""
 
 import contextlib
+import hashlib
 import os
 import re
 import secrets
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import filelock
 
+_DIGEST = hashlib.sha256().digest_size
 _UNFINISHED_NAME = re.compile(r"\.(.+)\.[0-9a-f]{16}\.unfinished")
 """Names of partial files."""
 
@@ -116,3 +118,16 @@ def locked(directory: Path, *, waits: bool) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def with_digest(content: bytes) -> bytes:
+    """A file's content after its SHA-256 digest."""
+    return hashlib.sha256(content).digest() + content
+
+
+def without_digest(whole: bytes) -> bytes:
+    """The content of a file from `with_digest`; raises `ValueError` if it is damaged."""
+    content = whole[_DIGEST:]
+    if hashlib.sha256(content).digest() != whole[:_DIGEST]:
+        raise ValueError("its content does not have its digest")
+    return content

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense.config import Config, values
+from jaxsense.config import MISSIONS_AT_ONCE, Config, values
 from jaxsense.mission.cases import Case
 from jaxsense.mission.outcome import bytes_per_detection, measure, summarise
 from jaxsense.mission.rollout import rollout_batch
@@ -28,7 +28,6 @@ from jaxsense.run.devices import ALONE, Workers
 from jaxsense.types import Key
 
 _CHUNK_TIME = 2.5  # s
-_MOST_AT_ONCE = 384
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,17 +58,15 @@ class Played:
     control_steps: int
 
 
-def chunks(config: Config) -> tuple[int, int]:
-    """Control periods of a chunk, and chunks of the longest mission."""
-    settings = config.mission
-    chunk = math.ceil(min(_CHUNK_TIME, settings.time_limit) / settings.control_period)
-    return chunk, math.ceil(settings.time_limit / settings.control_period / chunk)
+def chunk_of(config: Config) -> int:
+    """Control periods between two reports; no number that may change without compiling enters."""
+    return math.ceil(_CHUNK_TIME / config.mission.control_period)
 
 
 def batch_of(total: int) -> int:
     """How many missions to play side by side: fewer than `total`, as some last long."""
     values.require_number("total", total)
-    return min(_MOST_AT_ONCE, -(-total // 3))
+    return min(MISSIONS_AT_ONCE, -(-total // 3))
 
 
 def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
@@ -92,7 +89,7 @@ class Player:
         batch = -(-batch // workers.number) * workers.number
         self.mission, self._monitor, self._batch = mission, compiler.monitor, batch
         config, share = mission.config, batch // workers.number
-        chunk, _ = chunks(config)
+        chunk = chunk_of(config)
         self._lock = threading.Lock()
 
         def begin(

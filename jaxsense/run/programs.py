@@ -182,7 +182,8 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
         whole = {"workers": programs.workers, "whole": (0, 1)}
         output = compiled.begin.compile(stage.begin, key, config, *inputs, **whole)
         number = len(jax.tree.leaves(outputs)[0])
-        compiled.shapes.set_result(Shapes(jax.tree.map(lambda x: _with_rows(x, number), output)))
+        output = jax.tree.map(lambda x: x.update(shape=(number, *x.shape[1:])), output)
+        compiled.shapes.set_result(Shapes(output))
         return
     state = compiled.begin.compile(stage.begin, key, config, *inputs, whole=(1,))
     if not isinstance(stage, Steps):
@@ -202,11 +203,7 @@ def padded(inputs: Any, number: int) -> Any:
     def pad(x: Any) -> Any:
         rows = -(-x.shape[0] // number) * number
         if isinstance(x, jax.ShapeDtypeStruct):
-            return _with_rows(x, rows)
+            return x.update(shape=(rows, *x.shape[1:]))
         return x if rows == len(x) else x[jax.numpy.arange(rows) % len(x)]
 
     return jax.tree.map(pad, inputs)
-
-
-def _with_rows(x: jax.ShapeDtypeStruct, rows: int) -> jax.ShapeDtypeStruct:
-    return x.update(shape=(rows, *x.shape[1:]))

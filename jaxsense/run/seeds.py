@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -90,19 +90,36 @@ def statistics(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return _statistics(list(summaries)) or {}
 
 
-def rewards(runs: Sequence[Path], config: Config) -> dict[str, np.ndarray]:
-    """`[K, epochs]` mean total rewards for each modality, from the checkpoints of several runs."""
+def rewards(
+    runs: Sequence[Path], config: Config, warn: Callable[[str], None]
+) -> dict[str, np.ndarray]:
+    """`[K, epochs]` mean total rewards for each modality, from the checkpoints of several runs.
+
+    Warns of a run whose checkpoint is damaged or missing, and leaves out its curve.
+    """
     shapes = {
         "reward": np.zeros(config.dqn.epochs, np.float32),
         "epsilon": np.zeros(config.dqn.epochs, np.float32),
         "seconds": np.zeros(config.dqn.epochs // config.dqn.chunk, np.float32),
     }
 
-    def load(run: Path, modality: str) -> np.ndarray:
-        name = f"curves_dqn_{modality}"
-        return Checkpoints(run / "checkpoints").load(name, shapes)["reward"]
+    def load(run: Path, modality: str) -> list[np.ndarray]:
+        directory, name = run / "checkpoints", f"curves_dqn_{modality}"
+        try:
+            found = Checkpoints(directory).load(name, shapes)
+        except ConfigError as error:
+            warn(f"{error}; left out of reward.png")
+            return []
+        if found is None:
+            warn(f"{directory}: holds no {name}; left out of reward.png")
+            return []
+        return [found["reward"]]
 
-    return {name: np.stack([load(run, name) for run in runs]) for name in config.modalities}
+    def load_all(modality: str) -> np.ndarray:
+        rows = [row for run in runs for row in load(run, modality)]
+        return np.stack(rows) if rows else np.zeros((0, config.dqn.epochs), np.float32)
+
+    return {name: load_all(name) for name in config.modalities}
 
 
 def _statistics(values: list[Any]) -> Any:

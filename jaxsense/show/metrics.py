@@ -107,6 +107,22 @@ LATENT_SPACE = (
 )
 """`summary["jmvae"]`."""
 
+SIGMA_NORM = (
+    Metric(
+        "unambiguous",
+        "sigma norm, unambiguous",
+        "Uncertainty of beliefs in a single class; smaller is better (Fig. 4).",
+        "from 1.05",
+    ),
+    Metric(
+        "ambiguous",
+        "sigma norm, ambiguous",
+        "Uncertainty of beliefs between classes that a sensor cannot distinguish.",
+        "to 1.25",
+    ),
+)
+"""The range of `summary["jmvae"]["sigma_norm"]`."""
+
 MISSIONS = (
     Metric(
         "accuracy",
@@ -129,11 +145,15 @@ MISSIONS = (
         "Share of chosen viewpoints that robots reached.",
     ),
     Metric("information", "information", "Sum of 1 / sigma norm over the finished map.", digits=2),
-    Metric("told", "told", "Accuracy where one robot alone can distinguish the class."),
+    Metric(
+        "told",
+        "right labels",
+        "One robot alone: share of points whose colour, or shape, the map shows rightly.",
+    ),
     Metric(
         "ambiguous_reported",
         "ambiguous",
-        "Share of the other points that the map shows as ambiguous.",
+        "One robot alone: of the points that it cannot tell apart, the share shown as ambiguous.",
     ),
     Metric("episodes", "missions", digits=0),
 )

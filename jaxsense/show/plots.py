@@ -171,9 +171,10 @@ def rewards(per_epoch: dict[str, np.ndarray], agents: dict[str, Any]) -> Figure:
     for ax, (name, reward) in zip(axes[0], per_epoch.items(), strict=True):
         if reward.ndim == 1:
             ax.plot(reward, color="C0", alpha=0.25, linewidth=0.8)
-        smooth = np.stack([_smoothed(of_seed) for of_seed in np.atleast_2d(reward)])
+        smooth = np.array([_smoothed(of_seed) for of_seed in np.atleast_2d(reward)])
         epochs = np.arange(reward.shape[-1] - smooth.shape[-1], reward.shape[-1])
-        ax.plot(epochs, smooth.mean(axis=0), color="C0", label="DQN, exploring")
+        if len(smooth) > 0:
+            ax.plot(epochs, smooth.mean(axis=0), color="C0", label="DQN, exploring")
         if len(smooth) > 1:
             ax.fill_between(epochs, *interval(smooth), color="C0", alpha=0.2, linewidth=0)
         for i, key in enumerate(("return", "optimal", "naive", "random")):

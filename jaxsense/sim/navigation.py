@@ -163,13 +163,11 @@ def drive_to(
     moving = zip(others(poses, robot), others(commands, robot), strict=True)
     room, room_now = _room_beside(settings, frame, arcs, moving, *room_of_map)
     least = jax.lax.cummin(room, axis=1)
-
     beside = sidestep(settings, arena, layout, pose[:2], waypoint, others(poses[:, :2], robot))
     arrival = _arrival(settings, arcs, *frame.of(beside), room_of_map[0])
     is_safe = least >= jnp.minimum(room_now - 1e-4, -_GRAZE)
     value = jnp.min(jnp.where(is_safe, arrival, jnp.inf)[:, _MAY_LEAVE:], axis=1)
     value = jnp.where(backs_off, -room[:, _MAY_LEAVE], value)
-    # The first part of the arc must be safe: it will be driven.
     return _best(arcs, present, seconds, value, may_start=is_safe[:, 0])
 
 

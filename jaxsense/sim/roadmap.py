@@ -12,12 +12,11 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import Config
+from jaxsense.config import NODES_PER_POI, Config
 from jaxsense.sim import amiro, viewpoints
 from jaxsense.sim.arena import Layout
 from jaxsense.types import pytree
 
-NODES_PER_POI = 10
 _LEEWAY = 0.035  # m, within which of a node the next one stays in view
 _MARGIN = 0.02  # m, extra distance of ways between nodes from PoIs
 _SLACK = 1e-3  # m, a way may cut an obstacle: nodes touch their own circle

@@ -229,7 +229,7 @@ def _own(name: str, config: Config) -> Sensor:
     sensor = make(config)
     if not isinstance(sensor, Sensor):
         kind = type(sensor).__name__
-        raise ConfigError(f"{field}.make", entry, f"must give a jaxsense.sim.Sensor, not {kind}")
+        raise ConfigError(f"{field}.make", entry, f"must return a jaxsense.sim.Sensor, not {kind}")
     if not 0 < sensor.height < config.arena.poi_height:
         reason = f"must be above 0 and below arena.poi_height = {config.arena.poi_height} m"
         raise ConfigError(f"{field}: height", sensor.height, reason)

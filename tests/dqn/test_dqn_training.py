@@ -73,7 +73,7 @@ def probe():
 def test_values_are_those_worked_by_hand(probe, seed):
     params = jax.tree.map(lambda x: x[seed], probe[0].params)
     inputs = jax.vmap(belief_mdp.observation)(states().belief)
-    values = networks.apply(policies.q_network(MDP, PROBE.hidden), params, inputs.T)
+    values = networks.apply(policies.q_network(MDP.num_pois, PROBE.hidden), params, inputs.T)
     np.testing.assert_allclose(values.T, Q, atol=0.05)
 
 

@@ -40,7 +40,7 @@ def test_a_belief_that_is_not_a_number_pays_nan_and_not_a_look_in_vain():
 
 @pytest.mark.parametrize("worst", [0, 2, 3])
 def test_values_that_are_not_numbers_choose_no_action_and_total_nan(worst):
-    params = policies.q_network(MDP, (4,)).init(KEY, jnp.zeros(12))["params"]
+    params = policies.q_network(MDP.num_pois, (4,)).init(KEY, jnp.zeros(12))["params"]
     bias = jnp.array([0.0, 1.0, 2.0, 9.0]).at[worst].set(jnp.nan)
     greedy = policies.greedy(
         MDP, {"params": {**params, "Dense_1": {**params["Dense_1"], "bias": bias}}}, (4,)

@@ -82,7 +82,7 @@ def test_uniform_takes_every_action_equally_often():
 
 
 def test_greedy_takes_the_action_of_highest_value():
-    network = policies.q_network(MDP, (4,))
+    network = policies.q_network(MDP.num_pois, (4,))
     params = network.init(KEY, jnp.zeros(12))
     state = start(np.zeros((3, 2)))
     for best in range(4):

@@ -20,7 +20,7 @@ from jaxsense.run.monitor import Monitor
 # The package gives its function this name.
 ROLLOUT = importlib.import_module("jaxsense.mission.rollout")
 KEY = jax.random.key(5)
-CHUNK, _ = missions.chunks(CONFIG)
+CHUNK = missions.chunk_of(CONFIG)
 LAST = 2 * CHUNK - 3  # control periods, within the second chunk
 
 

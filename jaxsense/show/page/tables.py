@@ -27,10 +27,10 @@ class Row:
     """A row of a table.
 
     Attributes:
-      name: of the figure.
+      name: of the metric.
       values: one for each column.
       paper: the paper's value.
-      meaning: what the figure measures.
+      meaning: what the metric measures.
     """
 
     name: str
@@ -62,22 +62,16 @@ def latent_space(summary: Summary) -> list[Row]:
         for norm, is_clear in zip(norms, block["unambiguous"][name], strict=True)
     ]
     units, *others = (_row(metric, [block]) for metric in metrics.LATENT_SPACE)
-    return [
-        units,
+    norms = [
         Row(
-            "sigma norm, unambiguous",
-            [_range([norm for norm, is_clear in pairs if is_clear])],
-            "from 1.05",
-            "Uncertainty of beliefs in a single class; smaller is better (Fig. 4).",
-        ),
-        Row(
-            "sigma norm, ambiguous",
-            [_range([norm for norm, is_clear in pairs if not is_clear])],
-            "to 1.25",
-            "Uncertainty of beliefs between classes that a sensor cannot distinguish.",
-        ),
-        *others,
+            metric.label,
+            [_range([norm for norm, is_clear in pairs if is_clear == (i == 0)])],
+            metric.paper,
+            metric.meaning,
+        )
+        for i, metric in enumerate(metrics.SIGMA_NORM)
     ]
+    return [units, *norms, *others]
 
 
 def _range(values: list[float]) -> str:

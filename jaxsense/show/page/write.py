@@ -4,6 +4,7 @@ import base64
 import contextlib
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,8 @@ def _render(run: Path, config: Config, summary: dict[str, Any], template: str) -
     mission_columns, missions = tables.missions(summary)
     return environment.get_template(template).render(
         run=run,
+        argument=lambda path: shlex.quote(str(path)),
+        trust=bool(config.sensors),
         summary=summary,
         modalities=[*summary["dqn"]],
         mean=metrics.mean,
