@@ -4,6 +4,7 @@ import dataclasses
 import html
 import json
 import re
+import shlex
 import shutil
 import subprocess
 from html.parser import HTMLParser
@@ -132,7 +133,7 @@ def test_what_was_run_is_told_and_escaped(run, read):
     text = " ".join(" ".join(read.words).split())
     for words in ("smoke preset, seed 3", "0 in theory", "0123abc", "jax <0.10>", "nothing: all"):
         assert words in text
-    assert f"evaluate {run}" in text
+    assert f"evaluate {shlex.quote(str(run))} --episodes" in text
     assert ("html", {"lang": "en"}) in read.tags
     images = [attributes for tag, attributes in read.tags if tag == "img"]
     assert len(images) == 2
