@@ -167,7 +167,14 @@ class LidarConfig:
     max_range: Traced[float] = 5.0
     """Longest measured distance, in metres; also the reading of a beam without a return."""
     range_noise: Traced[float] = 0.01
-    """Standard deviation of a measured distance, in metres."""
+    """Standard deviation of a measured distance, in metres; see `range_noise_growth`."""
+    range_noise_growth: Traced[float] = 0.0
+    """Growth of that standard deviation with the distance, in metres per metre."""
+    mixed_pixels: Traced[float] = 0.0
+    """Probability that a beam also meets the surface that the next beam meets, and measures a
+    distance between the two: at edges, one where nothing is."""
+    dropout: Traced[float] = 0.0
+    """Probability that a beam has no return."""
     window: int = 128
     """Beams around the PoI's bearing that the detector reads."""
     stride: int = 1
@@ -181,8 +188,9 @@ class LidarConfig:
         require_positive(
             self, "num_beams", "field_of_view", "min_range", "max_range", "window_range"
         )
-        require_not_negative(self, "range_noise")
+        require_not_negative(self, "range_noise", "range_noise_growth", "mixed_pixels", "dropout")
         require_at_most(self, num_beams=100_000, max_range=1000, range_noise=self.max_range)
+        require_at_most(self, range_noise_growth=1, mixed_pixels=1, dropout=1)
         require(self.field_of_view <= 360.0, self, "field_of_view", "must be at most 360 degrees")
         require(self.max_range > self.min_range, self, "max_range", "must be above min_range")
         require(self.window_range > self.min_range, self, "window_range", "must be above min_range")
@@ -199,6 +207,16 @@ class CameraConfig:
     """Horizontal field of view, in degrees."""
     pixel_noise: Traced[float] = 0.007
     """Standard deviation of a pixel's value, where 1 is full scale."""
+    exposure_error: Traced[float] = 0.0
+    """Standard deviation of the natural logarithm of an image's brightness."""
+    colour_cast: Traced[float] = 0.0
+    """Standard deviation of the natural logarithm of each channel's brightness in an image."""
+    low_light: Traced[float] = 0.0
+    """Largest share of the light that may be missing in an image, within 0 and 1; the share is
+    uniform."""
+    shadow: Traced[float] = 0.0
+    """Probability that a shadow falls into the view. One of its sides has ambient light only, from
+    a random pixel on."""
     window: int = 80
     """Pixels around the PoI's bearing that the detector reads."""
     stride: int = 4
@@ -208,8 +226,10 @@ class CameraConfig:
         """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(self, "num_pixels", "field_of_view")
-        require_not_negative(self, "pixel_noise")
-        require_at_most(self, num_pixels=100_000, pixel_noise=1)
+        require_not_negative(self, "pixel_noise", "exposure_error", "colour_cast")
+        require_not_negative(self, "low_light", "shadow")
+        require_at_most(self, num_pixels=100_000, pixel_noise=1, exposure_error=10, colour_cast=10)
+        require_at_most(self, low_light=1, shadow=1)
         require(self.field_of_view < 180.0, self, "field_of_view", "must be below 180 degrees")
         require_window(self, self.num_pixels)
 

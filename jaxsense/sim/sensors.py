@@ -24,7 +24,7 @@ from jaxsense.config import (
     LidarConfig,
 )
 from jaxsense.config import values as checks
-from jaxsense.sim import amiro, raycast
+from jaxsense.sim import amiro, disturbances, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
 from jaxsense.types import Key, pytree
 
@@ -77,6 +77,7 @@ class Sensor:
       window_limit: highest reading in the detector's input.
       shows: `(readings [B, ...], distance [], extent) -> [B]` bool, which rays can have met a PoI
         of that extent [m] with its centre at that distance [m]; by default all.
+      lost: share of the rays that may read wrongly, on average.
       blind: reading of every ray when the sensor has failed.
       ray_bytes: size of one ray's reading in a ROS message.
     """
@@ -91,6 +92,7 @@ class Sensor:
     stride: int = 1
     window_limit: float = np.inf
     shows: Callable[[jax.Array, jax.Array, float], jax.Array] = _shows_all
+    lost: float | jax.Array = 0.0
     blind: float = 0.0
     ray_bytes: int = 4  # float32
 
@@ -145,12 +147,11 @@ def lidar(config: LidarConfig) -> Sensor:
 
     def read(key, hits, surfaces, light):
         del surfaces, light
-        noise = config.range_noise * jax.random.normal(key, hits.distance.shape)
-        measured = jnp.clip(hits.distance + noise, config.min_range, config.max_range)
-        return jnp.where(hits.distance <= config.max_range, measured, config.max_range)
+        return disturbances.measured_ranges(key, hits.distance, config)
 
     def shows(readings, distance, extent):
-        tolerance = jnp.maximum(_RANGE_TOLERANCE * config.range_noise, _LEAST_RANGE_TOLERANCE)
+        noise = config.range_noise + config.range_noise_growth * distance
+        tolerance = jnp.maximum(_RANGE_TOLERANCE * noise, _LEAST_RANGE_TOLERANCE)
         return jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + tolerance
 
     return Sensor(
@@ -163,6 +164,7 @@ def lidar(config: LidarConfig) -> Sensor:
         stride=config.stride,
         window_limit=config.window_range,
         shows=shows,
+        lost=1 - (1 - config.dropout) * (1 - config.mixed_pixels),
         blind=config.max_range,
     )
 
@@ -177,18 +179,18 @@ def camera(config: CameraConfig) -> Sensor:
     def read(key, hits, surfaces, light):
         normal_x, normal_y = hits.normal
         facing = normal_x * light.direction[0] + normal_y * light.direction[1]
-        shade = light.ambient + light.diffuse * jnp.maximum(facing, 0.0)
-
+        gain, is_lit = disturbances.lighting(key, len(facing), config)
+        shade = light.ambient + light.diffuse * is_lit * jnp.maximum(facing, 0.0)
         noise = config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape))
 
-        def channel(of_geom, of_background, noise):
+        def channel(of_geom, of_background, gain, noise):
             lit = shade * raycast.choose(of_geom, hits.geom)
-            seen = jnp.where(hits.geom >= 0, lit, of_background)
+            seen = gain * jnp.where(hits.geom >= 0, lit, of_background)
             return jnp.clip(seen + noise, 0.0, 1.0)
 
         # A loop over the channels makes the compiler finish hits and noise before it shades them;
         # fused with the ray-caster, each channel would cast the rays many times over.
-        inputs = surfaces["colour"].T, jnp.array(_BACKGROUND), noise
+        inputs = surfaces["colour"].T, jnp.array(_BACKGROUND), gain, noise
         return jax.lax.map(lambda c: channel(*c), inputs).T
 
     return Sensor(
@@ -389,13 +391,14 @@ def shows_poi(
       arena: sizes of PoIs.
 
     Returns:
-      `[]` bool: all rays that must meet a PoI of this size can have met one. False for a covered or
-      absent PoI, or a failed sensor.
+      `[]` bool: all rays that must meet a PoI of this size can have met one, except for twice the
+      share that the sensor loses on average. False for a covered or absent PoI, or a failed sensor.
     """
     angles = window_of(sensor, sensor.angles, bearing) - bearing
     half_width = jnp.arcsin(jnp.minimum(arena.poi_half_width / distance, 1.0))
     is_within = jnp.abs(angles) <= _SHARE_OF_WIDTH * half_width
-    return jnp.all(sensor.shows(readings, distance, arena.poi_extent) | ~is_within)
+    misses = is_within & ~sensor.shows(readings, distance, arena.poi_extent)
+    return jnp.sum(misses) <= 2 * sensor.lost * jnp.sum(is_within)
 
 
 def as_window(sensor: Sensor, readings: jax.Array) -> jax.Array:

@@ -1,0 +1,119 @@
+"""Disturbances of the sensors: hand-worked cases, and nothing at all while they are off."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense.config import CameraConfig, LidarConfig
+from jaxsense.sim import disturbances, sensors
+from jaxsense.sim.raycast import Hit
+from jaxsense.sim.sensors import Light
+
+NUMBER = 20_000
+KEYS = jax.random.split(jax.random.key(0), NUMBER)
+EXACT = {"range_noise": 0.0, "max_range": 5.0}
+
+
+def ranges(distance, **settings):
+    """`[NUMBER, B]` measurements of the same distances."""
+    config, distance = LidarConfig(**settings), jnp.array(distance, jnp.float32)
+    measure = jax.vmap(lambda key: disturbances.measured_ranges(key, distance, config))
+    return np.asarray(measure(KEYS))
+
+
+def lighting(**settings):
+    config = CameraConfig(**settings)
+    gain, is_lit = jax.vmap(lambda key: disturbances.lighting(key, 10, config))(KEYS)
+    return np.asarray(gain), np.asarray(is_lit)
+
+
+def test_a_lidar_without_disturbances_has_noise_alone():
+    config, key = LidarConfig(range_noise=0.02), KEYS[0]
+    distance = jnp.array([1.0, 2.0, jnp.inf, 4.999])
+    noise = 0.02 * jax.random.normal(key, (4,))
+    expected = jnp.array([1.0 + noise[0], 2.0 + noise[1], 5.0, jnp.minimum(4.999 + noise[3], 5.0)])
+    np.testing.assert_array_equal(disturbances.measured_ranges(key, distance, config), expected)
+
+
+def test_noise_grows_with_the_distance():
+    found = ranges([1.0, 4.0, np.inf], range_noise=0.01, range_noise_growth=0.02)
+    np.testing.assert_allclose(found[:, :2].std(axis=0), [0.03, 0.09], rtol=0.03)
+    np.testing.assert_array_equal(found[:, 2], 5.0)
+
+
+def test_a_mixed_pixel_lies_between_its_surface_and_the_next():
+    found = ranges([1.0, 1.0, 3.0, np.inf, np.inf], mixed_pixels=0.25, **EXACT)
+    np.testing.assert_array_equal(found[:, [0, 4]], np.broadcast_to([1.0, 5.0], (NUMBER, 2)))
+    for beam, low, high in ((1, 1.0, 3.0), (2, 3.0, 5.0)):
+        mixed = found[:, beam][found[:, beam] != low]
+        assert len(mixed) / NUMBER == pytest.approx(0.25, abs=0.015)
+        assert mixed.min() > low
+        assert mixed.max() < high
+        assert mixed.mean() == pytest.approx((low + high) / 2, abs=0.05)
+
+
+def test_a_beam_that_drops_out_reads_as_one_without_a_return():
+    found = ranges([1.0, 2.0], dropout=0.3, **EXACT)
+    assert np.mean(found == 5.0) == pytest.approx(0.3, abs=0.01)
+    assert set(np.unique(found)) == {1.0, 2.0, 5.0}
+    # Each beam by itself.
+    assert np.mean(np.all(found == 5.0, axis=1)) == pytest.approx(0.09, abs=0.01)
+
+
+def test_a_camera_without_disturbances_changes_nothing():
+    gain, is_lit = lighting()
+    np.testing.assert_array_equal(gain, 1.0)
+    np.testing.assert_array_equal(is_lit, 1.0)
+
+
+def test_exposure_is_that_of_all_channels_and_a_cast_that_of_each():
+    logarithm = np.log(lighting(exposure_error=0.5)[0])
+    np.testing.assert_allclose(logarithm, logarithm[:, :1] * [1.0, 1.0, 1.0], atol=1e-6)
+    assert logarithm.std() == pytest.approx(0.5, rel=0.02)
+    logarithm = np.log(lighting(colour_cast=0.2)[0])
+    np.testing.assert_allclose(np.cov(logarithm.T), 0.04 * np.eye(3), atol=0.002)
+
+
+def test_missing_light_is_uniform():
+    gain, _ = lighting(low_light=0.8)
+    np.testing.assert_array_equal(gain[:, 0], gain[:, 1])
+    assert gain.min() == pytest.approx(0.2, abs=0.001)
+    assert gain.max() == pytest.approx(1.0, abs=0.001)
+    assert gain.mean() == pytest.approx(0.6, abs=0.01)
+
+
+def test_a_shadow_covers_one_side_from_a_random_pixel_on():
+    _, is_lit = lighting(shadow=0.4)
+    # One edge at most; half of all shadows in each pixel.
+    assert np.abs(np.diff(is_lit, axis=1)).sum(axis=1).max() == 1
+    np.testing.assert_allclose(np.mean(is_lit == 0, axis=0), 0.2, atol=0.015)
+
+
+def test_a_shadow_leaves_the_ambient_light():
+    camera = sensors.camera(CameraConfig(pixel_noise=0.0, shadow=1.0))
+    light = Light(jnp.array([1.0, 0.0, 0.0]), jnp.float32(0.5), jnp.float32(0.25))
+    rays = jnp.ones(80)
+    hits = Hit(rays, jnp.zeros(80, jnp.int32), (rays, 0 * rays))
+    colour = {"colour": jnp.array([[0.8, 0.4, 0.2]])}
+    image = np.asarray(camera.read(KEYS[0], hits, colour, light))
+    lit, dark = 0.75 * np.array([0.8, 0.4, 0.2]), 0.25 * np.array([0.8, 0.4, 0.2])
+    is_lit = np.isclose(image, lit).all(axis=1)
+    assert 0 < is_lit.sum() < 80
+    np.testing.assert_allclose(image[~is_lit], np.broadcast_to(dark, (80 - is_lit.sum(), 3)))
+
+
+def test_a_scan_with_lost_beams_may_still_show_a_poi():
+    lidar = sensors.lidar(LidarConfig(range_noise=0.0, dropout=0.1))
+    arena = sensors.ArenaConfig()
+    bearing, distance = jnp.float32(0.0), jnp.float32(1.0)
+    angles = sensors.window_of(lidar, lidar.angles, bearing)
+    # 23 beams lie within 0.7 of the half width, .1 rad; twice a tenth of them may be lost.
+    within = np.flatnonzero(np.abs(angles) <= 0.7 * np.arcsin(0.1))
+    assert len(within) == 23
+    readings = np.full(128, 0.9, np.float32)
+    for lost, expected in ((0, True), (4, True), (5, False)):
+        readings[within] = 0.9
+        readings[within[:lost]] = 5.0
+        shown = sensors.shows_poi(lidar, jnp.array(readings), bearing, distance, arena)
+        assert bool(shown) is expected, lost
