@@ -16,13 +16,14 @@ from jaxsense.dqn.belief_mdp import MapMdp, MapState, random_start, reset
 from jaxsense.models import make_jmvae
 from jaxsense.networks import Params
 from jaxsense.observe import Bank
-from jaxsense.types import Belief, Key
-from jaxsense.vae import fusion, jmvae, metrics
+from jaxsense.types import Belief, Key, call
+from jaxsense.vae import filtering, fusion, jmvae, metrics, peers
 from jaxsense.vae.jmvae import Jmvae
 
 POLICIES = ("return", "optimal", "naive", "random")
 """The greedy policy of a Q-network, and its baselines."""
 _EXPECTATION_DRAWS = 1024
+_LOOKS, _HISTORIES = 6, 8190  # of random histories of looks at one PoI
 
 
 def latent_space(
@@ -99,6 +100,73 @@ def _fusion(
     return {
         "accuracy": jnp.mean(jnp.array(is_right)) if is_right else None,
         "mean_error": jnp.mean(jnp.array(distances)) if distances else None,
+    }
+
+
+def beliefs(
+    key: Key, params: Params, classes: Belief, bank: Bank, config: Config
+) -> dict[str, jax.Array]:
+    """Reads the map after random histories of looks, and compares it with exact Bayes.
+
+    A history looks at one PoI, each time with a random modality.
+
+    Args:
+      key: random key.
+      params: of the JMVAE, with those of the filter if there is one.
+      classes: `[C, D]` mean joint posterior of each class.
+      bank: for each modality `[C, S, D_m]` held-out detections.
+      config: all settings.
+
+    Returns:
+      The block `belief` of the summary as arrays: `[K]` negative log-likelihood of the true class
+      and accuracy after 1 to K looks, of the map and of the exact Bayes filter on the same
+      detections; and Pearson's correlation of `||sigma||` with the entropy of the exact posterior.
+    """
+    model, number = make_jmvae(config), len(classes.mean)
+    readout = {"classes": classes, "inverse": filtering.moments_inverse(classes)}
+    labels = [jnp.array(config.label_of_class(m)) for m in config.modalities]
+    unseen = fusion.unseen(model, config.mdp.unseen_variance)
+
+    def look(carry, drawn):
+        belief, exact, seen = carry
+        modality, features = drawn
+
+        def write(m: int):
+            update = fusion.write(params, model, belief, seen, features[m], m)
+            return update, peers.bayes_update(exact, features[m], labels[m])
+
+        belief, exact = call(write, modality, len(bank))
+        seen = seen.at[modality].set(True)
+        shares = jnp.log(filtering.weights(readout, belief))
+        return (belief, exact, seen), (shares, exact, jnp.linalg.norm(belief.std))
+
+    def history(key: Key, true_class: jax.Array):
+        modality_key, *row_keys = jax.random.split(key, 1 + len(bank))
+        modalities = jax.random.randint(modality_key, (_LOOKS,), 0, len(bank))
+        looks = tuple(
+            x[true_class, jax.random.randint(k, (_LOOKS,), 0, x.shape[1])]
+            for x, k in zip(bank, row_keys, strict=True)
+        )
+        start = unseen, jnp.full(number, -jnp.log(number)), jnp.zeros(len(bank), bool)
+        return jax.lax.scan(look, start, (modalities, looks))[1]
+
+    truth = jnp.arange(_HISTORIES) % number
+    shares, exact, norms = jax.vmap(history)(jax.random.split(key, _HISTORIES), truth)
+    right = jnp.arange(number)[None, None] == truth[:, None, None]
+    entropy = -jnp.sum(jnp.exp(exact) * exact, axis=-1)
+
+    def measured(logarithms: jax.Array) -> tuple[jax.Array, jax.Array]:
+        nll = -jnp.mean(jnp.sum(jnp.where(right, logarithms, 0.0), axis=-1), axis=0)
+        return nll, jnp.mean(jnp.argmax(logarithms, axis=-1) == truth[:, None], axis=0)
+
+    (nll, accuracy), (bayes_nll, bayes_accuracy) = measured(shares), measured(exact)
+    return {
+        "looks": 1 + jnp.arange(_LOOKS),
+        "nll": nll,
+        "bayes_nll": bayes_nll,
+        "accuracy": accuracy,
+        "bayes_accuracy": bayes_accuracy,
+        "doubt_correlation": jnp.corrcoef(norms.reshape(-1), entropy.reshape(-1))[0, 1],
     }
 
 

@@ -9,8 +9,9 @@ from jaxsense.dqn import policies
 from jaxsense.networks import Params
 from jaxsense.sim import sensors
 from jaxsense.types import Belief, Key, pytree
-from jaxsense.vae import detectors, jmvae
+from jaxsense.vae import detectors, filtering, jmvae
 from jaxsense.vae.detectors import Detector
+from jaxsense.vae.fusion import FILTER
 from jaxsense.vae.jmvae import Jmvae
 
 
@@ -20,7 +21,7 @@ class Models:
 
     Attributes:
       detectors: one for each modality.
-      jmvae: parameters of the JMVAE.
+      jmvae: parameters of the JMVAE; those of the filter, if there is one, are its entry `filter`.
       class_beliefs: `[C, D]` mean joint posterior of each class, to read the map with.
       q_networks: parameters of one Q-network for each modality.
     """
@@ -40,6 +41,7 @@ def make_jmvae(config: Config) -> Jmvae:
 def init(key: Key, config: Config) -> Models:
     """Models with random parameters, to try the functions before training."""
     detector_key, jmvae_key, dqn_key = jax.random.split(key, 3)
+    filter_key = jax.random.fold_in(jmvae_key, 1)
     num_labels = make_jmvae(config).feature_sizes
     keys = jax.random.split(detector_key, len(config.modalities))
     trained = tuple(
@@ -50,9 +52,15 @@ def init(key: Key, config: Config) -> Models:
     q_network = policies.q_network(config.arena.num_pois, config.dqn.hidden)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
     shape = (len(config.arena.classes), config.jmvae.latent_size)
+    params, classes = (
+        jmvae.init(jmvae_key, make_jmvae(config)),
+        Belief(jnp.zeros(shape), jnp.ones(shape)),
+    )
+    if config.jmvae.fusion == "filter":
+        params[FILTER] = filtering.init(filter_key, make_jmvae(config), classes, config.filter)
     return Models(
         detectors=trained,
-        jmvae=jmvae.init(jmvae_key, make_jmvae(config)),
-        class_beliefs=Belief(jnp.zeros(shape), jnp.ones(shape)),
+        jmvae=params,
+        class_beliefs=classes,
         q_networks=tuple(networks.init(k, q_network, size) for k in dqn_keys),
     )

@@ -27,8 +27,9 @@ from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene, World
 from jaxsense.types import Belief, Key, pytree
-from jaxsense.vae import detectors, jmvae
+from jaxsense.vae import detectors, filtering, jmvae
 from jaxsense.vae.detectors import Detector
+from jaxsense.vae.fusion import FILTER
 from jaxsense.vae.minibatch import FitState
 
 _MOST_CHUNKS = 20
@@ -170,7 +171,9 @@ def stages(config: Config, world: World | None = None) -> list[Stage]:
     world = worlds.make_world(config) if world is None else world
     detector_names = tuple(f"detector_{name}" for name in config.modalities)
     restarts = tuple(f"jmvae_{i + 1}" for i in range(config.jmvae.restarts))
-    learned = "detections", "jmvae", *detector_names
+    with_filter = _filter_stages(config) if config.jmvae.fusion == "filter" else []
+    params = with_filter[-1].name if with_filter else "jmvae"
+    learned = "detections", params, *detector_names
     return [
         Stage("scenes", _draw_scenes),
         Stage("survey", functools.partial(_survey, world), ("scenes",), has_rows=True),
@@ -181,9 +184,11 @@ def stages(config: Config, world: World | None = None) -> list[Stage]:
         Stage("jmvae", _best_jmvae, restarts, program="best_jmvae", is_saved=True),
         Stage("latent_space", _latent_space, ("jmvae", "detections")),
         Stage("class_beliefs", _class_beliefs, ("latent_space",), is_saved=True),
+        *with_filter,
+        Stage("beliefs", _measure_beliefs, (params, "class_beliefs", "detections")),
         Stage("starts", functools.partial(_starts, world), learned),
         *(_agent_stage(m, world, config, learned) for m in range(len(config.modalities))),
-        *(_policies_stage(m, name) for m, name in enumerate(config.modalities)),
+        *(_policies_stage(m, name, params) for m, name in enumerate(config.modalities)),
     ]
 
 
@@ -244,9 +249,10 @@ def _run_steps(
 
 def models(outputs: Mapping[str, Any], config: Config) -> Models:
     """The networks among the outputs of all stages."""
+    trained = {FILTER: outputs[FILTER]} if FILTER in outputs else {}
     return Models(
         detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
-        jmvae=outputs["jmvae"],
+        jmvae={**outputs["jmvae"], **trained},
         class_beliefs=outputs["class_beliefs"],
         q_networks=tuple(outputs[f"dqn_{name}"] for name in config.modalities),
     )
@@ -474,6 +480,57 @@ def _class_beliefs(
     return jax.tree.map(lambda x: x.mean(axis=1), posteriors["joint"])
 
 
+def _filter_stages(config: Config) -> list[Stage]:
+    """The training of the filter, and its parameters among those of the JMVAE."""
+    settings, model = config.filter, make_jmvae(config)
+    size = _chunk_size(settings.steps)
+
+    def begin(
+        key: Key, config: Config, classes: Belief, detections: Detections
+    ) -> tuple[Params, FitState]:
+        params = filtering.init(key, model, classes, config.filter)
+        return params, filtering.start(params, config.filter)
+
+    def advance(
+        key: Key,
+        config: Config,
+        state: tuple[Params, FitState],
+        classes: Belief,
+        detections: Detections,
+    ) -> tuple[tuple[Params, FitState], Progress]:
+        params, fit = state
+        fit, losses = filtering.train(key, fit, params, model, detections.bank, config.filter, size)
+        return (params, fit), Progress(losses, {})
+
+    def finish(config: Config, state: tuple[Params, FitState], *inputs: Any) -> Params:
+        params, fit = state
+        return {**params, "networks": fit.params}
+
+    training = Steps(
+        FILTER,
+        begin,
+        ("class_beliefs", "detections"),
+        advance=advance,
+        finish=finish,
+        steps=settings.steps,
+        chunks=_num_chunks(settings.steps),
+    )
+    return [training, Stage("fusion", _with_filter, ("jmvae", FILTER))]
+
+
+def _with_filter(key: Key, config: Config, params: Params, trained: Params) -> Params:
+    """The parameters that write looks into the map."""
+    del key, config
+    return {**params, FILTER: trained}
+
+
+def _measure_beliefs(
+    key: Key, config: Config, params: Params, classes: Belief, detections: Detections
+) -> dict[str, jax.Array]:
+    """See `examine.beliefs`."""
+    return examine.beliefs(key, params, classes, detections.held_out, config)
+
+
 def _starts(
     world: World,
     key: Key,
@@ -549,9 +606,9 @@ def _finish_dqn(config: Config, state: DqnState, *inputs: Any) -> Params:
     return state.params
 
 
-def _policies_stage(modality: int, name: str) -> Stage:
-    """The comparison of one modality's policies."""
-    inputs = f"dqn_{name}", "jmvae", "detections"
+def _policies_stage(modality: int, name: str, params: str) -> Stage:
+    """The comparison of one modality's policies; `params` names the stage that the map needs."""
+    inputs = f"dqn_{name}", params, "detections"
     return Stage(f"policies_{name}", _play_policies, inputs, modality, program="policies")
 
 

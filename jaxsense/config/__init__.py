@@ -8,6 +8,7 @@ from jaxsense.config.checks import ConfigError as ConfigError
 from jaxsense.config.learning import DetectorConfig as DetectorConfig
 from jaxsense.config.learning import DqnConfig as DqnConfig
 from jaxsense.config.learning import EvaluationConfig as EvaluationConfig
+from jaxsense.config.learning import FilterConfig as FilterConfig
 from jaxsense.config.learning import JmvaeConfig as JmvaeConfig
 from jaxsense.config.learning import MdpConfig as MdpConfig
 from jaxsense.config.mission import MISSIONS_AT_ONCE as MISSIONS_AT_ONCE

@@ -60,6 +60,9 @@ class JmvaeConfig:
     """Share of the training during which beta falls from initial_beta to beta."""
     reconstruction_weights: Traced[tuple[float, ...]] = (10.0, 10.0)
     """Weight of each modality's reconstruction, in the order of `modalities`."""
+    fusion: Literal["in_place", "filter"] = "in_place"
+    """How a look is written into the map. `in_place` is the paper's: it replaces the entry.
+    `filter` accumulates looks, see the section filter."""
     restarts: int = 3
     """Trainings from different random parameters; the one with the lowest loss is kept."""
     samples_per_class: int = 10000
@@ -88,6 +91,29 @@ class JmvaeConfig:
             "reconstruction_weights",
             f"must be numbers within 0 and {_MOST_WEIGHT:,}",
         )
+
+
+@section
+class FilterConfig:
+    """The filter, trained after the JMVAE if `jmvae.fusion` is `filter`."""
+
+    hidden: tuple[int, ...] = (32,)
+    """Sizes of the hidden layers of each modality's network."""
+    looks: int = 6
+    """Looks of a history in training."""
+    steps: int = 2000
+    """Gradient steps."""
+    batch: int = 256
+    """Histories per gradient step."""
+    learning_rate: Traced[float] = 5e-3
+    """Highest learning rate of Adam; decays to zero by a cosine."""
+
+    def check(self) -> None:
+        """Raises `ConfigError` for an invalid field."""
+        require_types(self)
+        require_sizes(self, "hidden")
+        require_positive(self, "looks", "steps", "batch", "learning_rate")
+        require_at_most(self, looks=100, learning_rate=1)
 
 
 @section

@@ -12,6 +12,7 @@ from jaxsense.config.learning import (
     DetectorConfig,
     DqnConfig,
     EvaluationConfig,
+    FilterConfig,
     JmvaeConfig,
     MdpConfig,
 )
@@ -52,6 +53,7 @@ class Config:
     viewpoint: ViewpointConfig = ViewpointConfig()
     detector: DetectorConfig = DetectorConfig()
     jmvae: JmvaeConfig = JmvaeConfig()
+    filter: FilterConfig = FilterConfig()
     mdp: MdpConfig = MdpConfig()
     dqn: DqnConfig = DqnConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
@@ -188,6 +190,11 @@ class Config:
             "jmvae.hidden": encoders * _weights(num_labels, *jmvae.hidden, 2 * jmvae.latent_size),
             "jmvae.samples_per_class": jmvae.samples_per_class * num_classes * window,
             "jmvae.batch jmvae.steps": jmvae.batch * jmvae.steps * (jmvae.latent_size + num_labels),
+            "filter.hidden": _weights(num_labels, *self.filter.hidden, num_classes),
+            "filter.batch filter.looks filter.steps": self.filter.batch
+            * self.filter.looks
+            * self.filter.steps
+            * num_labels,
             "dqn.hidden": _weights(state, *dqn.hidden, num_pois + 1),
             "dqn.replay_capacity": dqn.replay_capacity * (2 * state + 3),
             "dqn.num_starts": dqn.num_starts * max(state, scene),

@@ -103,6 +103,7 @@ def run(
         summary={
             "detectors": {name: {"accuracy": value} for name, value in accuracy},
             "jmvae": _as_lists(latent),
+            "belief": jax.tree.map(lambda x: np.asarray(x).tolist(), trained.outputs["beliefs"]),
             "dqn": {name: _of_agent(config, name, trained) for name in config.modalities},
             "mission": missions.summary(player.mission, found),
         },

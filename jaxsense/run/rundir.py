@@ -26,8 +26,9 @@ from jaxsense.models import Models
 from jaxsense.run import files
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.version import __version__, versions
+from jaxsense.vae.fusion import FILTER
 
-BLOCKS = ("detectors", "jmvae", "dqn", "mission")
+BLOCKS = ("detectors", "jmvae", "belief", "dqn", "mission")
 """The blocks of a summary that hold results."""
 _METRICS = "metrics.jsonl"
 
@@ -284,9 +285,12 @@ def _named(models: Models, config: Config) -> dict[str, Any]:
     """The parts of the models, by the names of their stages and checkpoints."""
     detectors = zip(config.modalities, models.detectors, strict=True)
     q_networks = zip(config.modalities, models.q_networks, strict=True)
+    params = dict(models.jmvae)
+    filters = {FILTER: params.pop(FILTER)} if FILTER in params else {}
     return {
         **{f"detector_{name}": detector for name, detector in detectors},
-        "jmvae": models.jmvae,
+        "jmvae": params,
+        **filters,
         "class_beliefs": models.class_beliefs,
         **{f"dqn_{name}": q_network for name, q_network in q_networks},
     }

@@ -1,4 +1,4 @@
-"""Writing a detection into the map: first looks, and fusion in place.
+"""Writing a detection into the map: fusion in place, or by a filter.
 
 Korthals et al. 2018, Sec. III and Fig. 3.
 """
@@ -13,8 +13,11 @@ import numpy as np
 from jaxsense.config import values
 from jaxsense.networks import Params
 from jaxsense.types import Belief, Features
-from jaxsense.vae import jmvae
+from jaxsense.vae import filtering, jmvae
 from jaxsense.vae.jmvae import Jmvae
+
+FILTER = "filter"
+"""Name of the filter among the parameters of a JMVAE."""
 
 
 def fuse(
@@ -69,11 +72,15 @@ def write(
     features: jax.Array,
     modality: int,
 ) -> Belief:
-    """Fuses a look by one sensor, `modality` its index, with its `[D_m]` features.
+    """Writes a look by one sensor, `modality` its index, with its `[D_m]` features.
+
+    In place, or by the filter if `params` has one: it needs no `seen`.
 
     Raises:
       ValueError: if there is no such modality.
     """
+    if FILTER in params:
+        return filtering.update(params[FILTER], model, belief, features, modality)
     if not 0 <= modality < len(model.modalities):
         raise ValueError(f"modality = {modality}: must be an index of {model.modalities}")
     of_all = tuple(features if m == modality else None for m in range(len(model.modalities)))

@@ -1,0 +1,222 @@
+"""Fusion as a filter: one update for each look, any number of looks in any order.
+
+The JMVAE's alpha term draws the posterior of each subset of the modalities to the joint one. Taken
+from subsets to whole histories of looks, it is `E[sum_t KL(q*_c || q_t)]`: q*_c is the joint
+posterior of the true class c, and q_t the belief after t looks. Among Gaussians this divergence is
+least where q_t has the moments of the mixture `sum_c w_c q*_c` whose weights are the classes'
+probabilities after the looks. So the mean shows which classes are open, and the width how much
+doubt there is. The weights follow from the moments again: a belief is a sufficient memory.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxsense import networks
+from jaxsense.config import FilterConfig, values
+from jaxsense.networks import MLP, Params
+from jaxsense.types import Belief, Key
+from jaxsense.vae import gaussian, minibatch
+from jaxsense.vae.jmvae import Jmvae
+from jaxsense.vae.minibatch import FitState
+
+LEAST_WEIGHT = 1e-5
+"""Least probability of a class that a belief can hold in float32."""
+_LEAST_FEATURE = 1e-6
+
+
+def init(key: Key, model: Jmvae, classes: Belief, config: FilterConfig) -> Params:
+    """Parameters of an untrained filter.
+
+    Args:
+      key: random key.
+      model: shape of the JMVAE.
+      classes: `[C, D]` joint posterior of each class.
+      config: sizes of the networks.
+
+    Returns:
+      `{"classes": ..., "inverse": ..., "networks": {NAME: ...}}`. The inverse turns the moments of
+      a mixture of the classes into its weights.
+    """
+    chex.assert_shape(classes.mean, (None, model.latent_size), custom_message="classes.mean")
+    chex.assert_shape(classes.std, classes.mean.shape, custom_message="classes.std")
+    number = len(classes.mean)
+    return {
+        "classes": classes,
+        "inverse": moments_inverse(classes),
+        "networks": {
+            name: networks.init(k, MLP(config.hidden, number), size)
+            for k, name, size in zip(
+                jax.random.split(key, len(model.modalities)),
+                model.modalities,
+                model.feature_sizes,
+                strict=True,
+            )
+        },
+    }
+
+
+def update(
+    params: Params, model: Jmvae, belief: Belief, features: jax.Array, modality: int
+) -> Belief:
+    """The belief after one more look.
+
+    Args:
+      params: of the filter.
+      model: shape of the JMVAE.
+      belief: `[D]` before the look, from `fusion.unseen` or an earlier update.
+      features: `[D_m]` probabilities of the labels.
+      modality: index of the sensor.
+
+    Raises:
+      ValueError: if there is no such modality, features are no probabilities, or a belief is not
+        finite or not positive.
+    """
+    if not 0 <= modality < len(model.modalities):
+        raise ValueError(f"modality = {modality}: must be an index of {model.modalities}")
+    size = (model.feature_sizes[modality],)
+    chex.assert_shape(features, size, custom_message=f"features of {model.modalities[modality]}")
+    is_share = "must be probabilities, within 0 and 1"
+    values.require("features", features, lambda x: (x >= 0) & (x <= 1), is_share)
+    values.require("sum of features", jnp.sum(features), lambda x: abs(x - 1) < 1e-3, "must be 1")
+    chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
+    chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
+    values.require_finite("belief.mean", belief.mean)
+    values.require_positive("belief.std", belief.std)
+    found = evidence(params, model, features, modality)
+    prior = jnp.log(weights(params, belief))
+    return mixture(params["classes"], jax.nn.softmax(prior + found))
+
+
+def evidence(params: Params, model: Jmvae, features: jax.Array, modality: int) -> jax.Array:
+    """What a look adds to the logarithm of each class's weight, `[C]` of `[D_m]` features.
+
+    Or `[C, B]` of `[D_m, B]`.
+    """
+    hidden = tuple(
+        layer["bias"].shape[0]
+        for name, layer in sorted(_layers(params, model, modality).items())[:-1]
+    )
+    network = MLP(hidden, len(params["classes"].mean))
+    logarithm = jnp.log(jnp.maximum(features, _LEAST_FEATURE))
+    return networks.apply(network, params["networks"][model.modalities[modality]], logarithm)
+
+
+def _layers(params: Params, model: Jmvae, modality: int) -> Params:
+    return params["networks"][model.modalities[modality]]["params"]
+
+
+def mixture(classes: Belief, weights: jax.Array) -> Belief:
+    """The Gaussian with the moments of a mixture of the classes.
+
+    Args:
+      classes: `[C, D]` joint posterior of each class.
+      weights: `[C]` of sum 1.
+    """
+    mean = weights @ classes.mean
+    spread = classes.std**2 + (classes.mean - mean[None]) ** 2
+    return Belief(mean, jnp.sqrt(weights @ spread))
+
+
+def _moments(belief: Belief) -> jax.Array:
+    """`[..., 2D + 1]` mean, mean square, and 1, all linear in the weights of a mixture."""
+    square = belief.std**2 + belief.mean**2
+    one = jnp.ones((*belief.mean.shape[:-1], 1))
+    return jnp.concatenate([belief.mean, square, one], axis=-1)
+
+
+def moments_inverse(classes: Belief) -> jax.Array:
+    """`[C, 2D + 1]` linear map from the moments of a mixture of `[C, D]` classes to its weights.
+
+    With more than `2D + 1` classes the weights do not follow from the moments; the map takes those
+    of least squares.
+    """
+    return jnp.linalg.pinv(_moments(classes).T)
+
+
+def weights(params: Params, belief: Belief) -> jax.Array:
+    """The classes' probabilities that a belief holds.
+
+    Args:
+      params: of the filter; only `classes` and `inverse` are used.
+      belief: `[D]`. One that is wider than every mixture of the classes in each dimension, as that
+        of an unseen PoI is, leaves all classes equally likely.
+
+    Returns:
+      `[C]` probabilities of `LEAST_WEIGHT` at least.
+    """
+    found = jnp.maximum(params["inverse"] @ _moments(belief), LEAST_WEIGHT)
+    classes = params["classes"]
+    widest = jnp.max(classes.std**2 + classes.mean**2, axis=0)
+    is_unseen = jnp.all(belief.std**2 + belief.mean**2 > 1.01 * widest)
+    return jnp.where(is_unseen, 1 / len(found), found / jnp.sum(found))
+
+
+def start(params: Params, config: FilterConfig) -> FitState:
+    """The state before the first gradient step: the networks alone are trained."""
+    return minibatch.start(params["networks"], minibatch.adam(config.learning_rate, config.steps))
+
+
+def train(
+    key: Key,
+    state: FitState,
+    params: Params,
+    model: Jmvae,
+    bank: tuple[jax.Array, ...],
+    config: FilterConfig,
+    steps: int,
+) -> tuple[FitState, jax.Array]:
+    """Trains a filter on random histories of looks for some gradient steps.
+
+    Args:
+      key: random key.
+      state: from `start` or an earlier call; its parameters are the filter's `networks`.
+      params: from `init`.
+      model: shape of the JMVAE.
+      bank: for each modality `[C, S, D_m]` detections of every class.
+      config: looks of a history, batch, learning rate, and the steps of the whole training.
+      steps: how many of them to take.
+
+    Returns:
+      The next state and the `[steps]` losses.
+    """
+    values.require_one_each("bank", bank, model.modalities)
+    classes = params["classes"]
+
+    def loss(of_networks: Params, drawn, step: jax.Array) -> jax.Array:
+        del step
+        true_class, sensor, looks = drawn
+        trained = {**params, "networks": of_networks}
+        flat = [evidence(trained, model, x.reshape(len(x), -1), m) for m, x in enumerate(looks)]
+        found = jnp.stack(flat).reshape(len(bank), -1, *sensor.shape)
+        is_used = sensor[None, None] == jnp.arange(len(bank))[:, None, None, None]
+        added = jnp.sum(jnp.where(is_used, found, 0.0), axis=0)
+        shares = jax.nn.softmax(jnp.cumsum(added, axis=1), axis=0)
+        beliefs = jax.vmap(jax.vmap(lambda w: mixture(classes, w), -1, -1), -1, -1)(shares)
+        truth = jax.tree.map(lambda x: x[true_class].T[:, None], classes)
+        return jnp.mean(_divergence(truth, beliefs))
+
+    drawn = _draw(key, bank, (steps, config.looks, config.batch))
+    optimiser = minibatch.adam(config.learning_rate, config.steps)
+    return minibatch.fit(state, loss, drawn, optimiser, config.steps)
+
+
+def _divergence(truth: Belief, beliefs: Belief) -> jax.Array:
+    """`[T, B]` `KL(truth || belief)` of `[D, 1, B]` and `[D, T, B]` Gaussians."""
+    shape = beliefs.mean.shape
+    parts = (truth.mean, 2 * jnp.log(truth.std), beliefs.mean, 2 * jnp.log(beliefs.std))
+    flat = [jnp.broadcast_to(part, shape) for part in parts]
+    return jax.vmap(jax.vmap(gaussian.kl_divergence, -1, -1), -1, -1)(*flat)
+
+
+def _draw(key: Key, bank: tuple[jax.Array, ...], shape: tuple[int, int, int]):
+    """Classes `[steps, B]`, sensors `[steps, T, B]`, and each modality's `[steps, D_m, T, B]`."""
+    class_key, sensor_key, *row_keys = jax.random.split(key, 2 + len(bank))
+    steps, _, batch = shape
+    classes = jax.random.randint(class_key, (steps, batch), 0, bank[0].shape[0])
+    sensors = jax.random.randint(sensor_key, shape, 0, len(bank))
+    looks = tuple(
+        jnp.moveaxis(x[classes[:, None], jax.random.randint(k, shape, 0, x.shape[1])], -1, 1)
+        for x, k in zip(bank, row_keys, strict=True)
+    )
+    return classes, sensors, looks

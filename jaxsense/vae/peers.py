@@ -1,0 +1,56 @@
+"""Other ways to fuse looks, to compare with: exact Bayes over the classes, product of experts."""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxsense.config import values
+from jaxsense.types import Belief
+
+_LEAST_PRECISION = 1e-6
+
+
+def bayes_update(
+    log_weights: jax.Array, features: jax.Array, label_of_class: jax.Array
+) -> jax.Array:
+    """Exact Bayes filter over classes, from a detector's probabilities.
+
+    Labels were as frequent in the detector's training as classes that have them, so
+    `p(x | class) ~ p(label | x) / p(label)`.
+
+    Args:
+      log_weights: `[C]` logarithms of the classes' probabilities before the look.
+      features: `[D_m]` probabilities of the labels.
+      label_of_class: `[C]` int32, the label of each class in this modality.
+
+    Returns:
+      `[C]` logarithms after the look, normalised.
+    """
+    chex.assert_rank(log_weights, 1, custom_message="log_weights")
+    chex.assert_shape(label_of_class, log_weights.shape, custom_message="label_of_class")
+    values.require_index("label_of_class", label_of_class, len(features))
+    values.require_finite("features", features)
+    label_of_class = jnp.asarray(label_of_class)
+    prior = jnp.zeros(len(features)).at[label_of_class].add(1 / len(label_of_class))
+    ratio = jnp.maximum(features[label_of_class], 1e-12) / prior[label_of_class]
+    return jax.nn.log_softmax(log_weights + jnp.log(ratio))
+
+
+def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Belief:
+    """Multiplies a belief with the posterior of one more look, and divides by the prior.
+
+    Args:
+      belief: `[D]` before the look.
+      posterior: `[D]` `q(z | x)` of the look alone.
+      prior: `[D]`, contained in both.
+
+    Returns:
+      `[D]` normalised product; dimensions of no precision keep a little.
+    """
+    for name, each in (("belief", belief), ("posterior", posterior), ("prior", prior)):
+        chex.assert_shape(each.std, each.mean.shape, custom_message=name)
+        values.require_positive(f"{name}.std", each.std)
+    of_belief, of_posterior, of_prior = (x.std**-2 for x in (belief, posterior, prior))
+    precision = jnp.maximum(of_belief + of_posterior - of_prior, _LEAST_PRECISION)
+    total = of_belief * belief.mean + of_posterior * posterior.mean - of_prior * prior.mean
+    return Belief(total / precision, precision**-0.5)
