@@ -26,6 +26,26 @@ _EXPECTATION_DRAWS = 1024
 _LOOKS, _HISTORIES = 6, 8190  # of random histories of looks at one PoI
 
 
+def detector(looks: jax.Array, label_of_class: jax.Array) -> dict[str, jax.Array]:
+    """Measures a detector.
+
+    Args:
+      looks: `[C, S, D_m]` held-out detections.
+      label_of_class: `[C]` int32 the right label of each class.
+
+    Returns:
+      `accuracy`, `ece` and `nll`, `[]` each: the share of right labels, the expected calibration
+      error and the negative log-likelihood in nats.
+    """
+    labels = jnp.repeat(label_of_class, looks.shape[1])
+    flat = looks.reshape(-1, looks.shape[-1])
+    return {
+        "accuracy": jnp.mean(looks.argmax(axis=-1) == label_of_class[:, None]),
+        "ece": metrics.calibration_error(flat, labels),
+        "nll": metrics.negative_log_likelihood(flat, labels),
+    }
+
+
 def latent_space(
     params: Params, bank: Bank, config: Config
 ) -> tuple[dict[str, Belief], dict[str, Any]]:

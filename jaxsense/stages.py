@@ -135,14 +135,14 @@ class Detections:
       held_out: the same from other scenes, to measure on.
       starts: classes, scenes and for each modality `[S, N, D_m]` features, where episodes start;
         empty with a bank.
-      accuracy: `[M]` of each detector on the held-out looks.
+      metrics: of each detector on the held-out looks, see `examine.detector`.
       windows: for each modality `[C, 1, F]` one held-out look at each class.
     """
 
     bank: Bank
     held_out: Bank
     starts: tuple[jax.Array, Scene, tuple[jax.Array, ...]]
-    accuracy: jax.Array
+    metrics: dict[str, dict[str, jax.Array]]
     windows: tuple[jax.Array, ...]
 
 
@@ -391,16 +391,15 @@ def _detect(key: Key, config: Config, surveys: Surveys, *trained: Detector) -> D
     for_bank, for_measuring = slice(None, num_bank), slice(num_bank, None)
     held_out = tuple(by_class(f, for_measuring, _held_out_per_class(config)) for f in features)
     labels = [jnp.array(config.label_of_class(name)) for name in config.modalities]
-    is_right = [
-        jnp.mean(looks.argmax(axis=-1) == of_class[:, None])
-        for looks, of_class in zip(held_out, labels, strict=True)
-    ]
     starts = others.classes, others.scenes, features
     return Detections(
         bank=tuple(by_class(f, for_bank, config.jmvae.samples_per_class) for f in features),
         held_out=held_out,
         starts=jax.tree.map(lambda x: x[: _num_scene_starts(config)], starts),
-        accuracy=jnp.stack(is_right),
+        metrics={
+            name: examine.detector(looks, of_class)
+            for name, looks, of_class in zip(config.modalities, held_out, labels, strict=True)
+        },
         windows=tuple(by_class(w, for_measuring, 1) for w in others.windows),
     )
 

@@ -83,7 +83,7 @@ def test_new_modality(example, tmp_path):
 
 def test_the_thermal_camera_tells_what_is_hot(learned):
     _, outputs = learned
-    assert outputs["detections"].accuracy[1] >= 0.95
+    assert outputs["detections"].metrics["thermal"]["accuracy"] >= 0.95
     _, latent = outputs["latent_space"]
     # Only what is hot is told by the thermal camera alone.
     thermal = np.asarray(latent["sigma_norm"]["thermal"])

@@ -48,7 +48,7 @@ def test_run_directory_holds_everything(smoke_run):
 def test_summary_keeps_its_contract(smoke_run):
     summary = json.loads((smoke_run / "summary.json").read_text())
     assert set(summary) == {
-        "preset", "seed", "versions", "devices", "timing", "detectors", "jmvae", "dqn",
+        "preset", "seed", "versions", "devices", "timing", "detectors", "jmvae", "belief", "dqn",
         "mission",
     }  # fmt: skip
     assert summary["preset"] == "smoke"
@@ -57,7 +57,14 @@ def test_summary_keeps_its_contract(smoke_run):
     for stage in summary["timing"]["stages"].values():
         assert set(stage) == {"compile_s", "run_s"}
     assert set(summary["detectors"]) == {"camera", "lidar"}
-    assert set(summary["detectors"]["camera"]) == {"accuracy"}
+    assert set(summary["detectors"]["camera"]) == {"accuracy", "ece", "nll"}
+    belief = summary["belief"]
+    assert belief["looks"] == [1, 2, 3, 4, 5, 6]
+    for curve in ("nll", "accuracy", "bayes_nll", "bayes_accuracy"):
+        assert len(belief[curve]) == 6
+    assert set(belief) == {"looks", *["nll", "accuracy", "bayes_nll", "bayes_accuracy"],
+                           "doubt_correlation"}  # fmt: skip
+    assert -1 <= belief["doubt_correlation"] <= 1
     latent = summary["jmvae"]
     assert set(latent) == {
         "active_units", "sigma_norm", "unambiguous", "moment_matching_error", "fusion"

@@ -168,12 +168,12 @@ class LidarConfig:
     """Longest measured distance, in metres; also the reading of a beam without a return."""
     range_noise: Traced[float] = 0.01
     """Standard deviation of a measured distance, in metres; see `range_noise_growth`."""
-    range_noise_growth: Traced[float] = 0.0
+    range_noise_growth: float = 0.0
     """Growth of that standard deviation with the distance, in metres per metre."""
-    mixed_pixels: Traced[float] = 0.0
+    mixed_pixels: float = 0.0
     """Probability that a beam also meets the surface that the next beam meets, and measures a
     distance between the two: at edges, one where nothing is."""
-    dropout: Traced[float] = 0.0
+    dropout: float = 0.0
     """Probability that a beam has no return."""
     window: int = 128
     """Beams around the PoI's bearing that the detector reads."""
@@ -207,14 +207,14 @@ class CameraConfig:
     """Horizontal field of view, in degrees."""
     pixel_noise: Traced[float] = 0.007
     """Standard deviation of a pixel's value, where 1 is full scale."""
-    exposure_error: Traced[float] = 0.0
+    exposure_error: float = 0.0
     """Standard deviation of the natural logarithm of an image's brightness."""
-    colour_cast: Traced[float] = 0.0
+    colour_cast: float = 0.0
     """Standard deviation of the natural logarithm of each channel's brightness in an image."""
-    low_light: Traced[float] = 0.0
+    low_light: float = 0.0
     """Largest share of the light that may be missing in an image, within 0 and 1; the share is
     uniform."""
-    shadow: Traced[float] = 0.0
+    shadow: float = 0.0
     """Probability that a shadow falls into the view. One of its sides has ambient light only, from
     a random pixel on."""
     window: int = 80

@@ -93,7 +93,6 @@ def run(
     checkpoints.forget_unfinished()
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
-    accuracy = zip(config.modalities, detections.accuracy.tolist(), strict=True)
     return RunResult(
         models=networks,
         windows=dict(zip(config.modalities, detections.windows, strict=True)),
@@ -101,7 +100,7 @@ def run(
         rewards={n: np.array(trained.curves[f"dqn_{n}"]["reward"]) for n in config.modalities},
         recording=found.recording,
         summary={
-            "detectors": {name: {"accuracy": value} for name, value in accuracy},
+            "detectors": jax.tree.map(lambda x: x.tolist(), detections.metrics),
             "jmvae": _as_lists(latent),
             "belief": jax.tree.map(lambda x: np.asarray(x).tolist(), trained.outputs["beliefs"]),
             "dqn": {name: _of_agent(config, name, trained) for name in config.modalities},

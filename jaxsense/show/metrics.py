@@ -38,6 +38,18 @@ DETECTORS = (
         "Share of scans, from scenes it was not trained on, that it labels correctly.",
         digits=4,
     ),
+    Metric(
+        "ece",
+        "detector: calibration error",
+        "Expected difference between a detector's confidence and its accuracy.",
+        digits=4,
+    ),
+    Metric(
+        "nll",
+        "detector: NLL",
+        "Mean negative logarithm of the right label's probability, in nats.",
+        digits=4,
+    ),
 )
 """`summary["detectors"][MODALITY]`."""
 
@@ -123,6 +135,15 @@ SIGMA_NORM = (
 )
 """The range of `summary["jmvae"]["sigma_norm"]`."""
 
+BELIEFS = (
+    Metric(
+        "doubt_correlation",
+        "doubt",
+        "Correlation of the norm of sigma with the entropy of the exact posterior.",
+    ),
+)
+"""`summary["belief"]`."""
+
 MISSIONS = (
     Metric(
         "accuracy",
@@ -162,6 +183,7 @@ MISSIONS = (
 BLOCKS = {
     "detectors.MODALITY": DETECTORS,
     "jmvae": LATENT_SPACE,
+    "belief": BELIEFS,
     "dqn.MODALITY": AGENTS,
     "mission.POLICY": MISSIONS,
 }

@@ -1,6 +1,7 @@
 """What makes sensors unsure, beside the noise of single readings: light, edges, lost beams.
 
-All of it is off by default. A disturbance that is off changes no bit of a reading.
+All of it is off by default. A disturbance that is off is no part of the program: it takes no time,
+and changes no bit of a reading.
 """
 
 import chex
@@ -23,12 +24,11 @@ def measured_ranges(key: Key, distance: jax.Array, config: LidarConfig) -> jax.A
       `[B]` measured distances, in metres; `max_range` without a return.
     """
     chex.assert_rank(distance, 1, custom_message="distance")
-    met = jax.lax.cond(
-        (config.mixed_pixels > 0) | (config.dropout > 0),
-        lambda: _disturbed(key, distance, config),
-        lambda: distance,
-    )
-    spread = config.range_noise + config.range_noise_growth * jnp.minimum(met, config.max_range)
+    is_disturbed = config.mixed_pixels > 0 or config.dropout > 0
+    met = _disturbed(key, distance, config) if is_disturbed else distance
+    spread = config.range_noise
+    if config.range_noise_growth > 0:
+        spread += config.range_noise_growth * jnp.minimum(met, config.max_range)
     noise = spread * jax.random.normal(key, met.shape)
     measured = jnp.clip(met + noise, config.min_range, config.max_range)
     return jnp.where(met <= config.max_range, measured, config.max_range)
@@ -43,6 +43,12 @@ def _disturbed(key: Key, distance: jax.Array, config: LidarConfig) -> jax.Array:
     between = within + uniform[0] * (following - within)
     met = jnp.where(uniform[1] < config.mixed_pixels, between, distance)
     return jnp.where(uniform[2] < config.dropout, jnp.inf, met)
+
+
+def changes_light(config: CameraConfig) -> bool:
+    """Whether any disturbance of the camera is on."""
+    amounts = config.exposure_error, config.colour_cast, config.low_light, config.shadow
+    return any(amount > 0 for amount in amounts)
 
 
 def lighting(key: Key, num_pixels: int, config: CameraConfig) -> tuple[jax.Array, jax.Array]:

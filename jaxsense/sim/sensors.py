@@ -7,6 +7,7 @@ names functions that make custom sensors; nothing else in the package names a se
 import dataclasses
 import hashlib
 import importlib
+import math
 from collections.abc import Callable
 
 import chex
@@ -92,7 +93,7 @@ class Sensor:
     stride: int = 1
     window_limit: float = np.inf
     shows: Callable[[jax.Array, jax.Array, float], jax.Array] = _shows_all
-    lost: float | jax.Array = 0.0
+    lost: float = 0.0
     blind: float = 0.0
     ray_bytes: int = 4  # float32
 
@@ -179,18 +180,21 @@ def camera(config: CameraConfig) -> Sensor:
     def read(key, hits, surfaces, light):
         normal_x, normal_y = hits.normal
         facing = normal_x * light.direction[0] + normal_y * light.direction[1]
-        gain, is_lit = disturbances.lighting(key, len(facing), config)
-        shade = light.ambient + light.diffuse * is_lit * jnp.maximum(facing, 0.0)
+        direct, gains = light.diffuse * jnp.maximum(facing, 0.0), ()
+        if disturbances.changes_light(config):
+            gain, is_lit = disturbances.lighting(key, len(facing), config)
+            direct, gains = direct * is_lit, (gain,)
+        shade = light.ambient + direct
         noise = config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape))
 
-        def channel(of_geom, of_background, gain, noise):
+        def channel(of_geom, of_background, noise, *gain):
             lit = shade * raycast.choose(of_geom, hits.geom)
-            seen = gain * jnp.where(hits.geom >= 0, lit, of_background)
-            return jnp.clip(seen + noise, 0.0, 1.0)
+            seen = jnp.where(hits.geom >= 0, lit, of_background)
+            return jnp.clip(math.prod(gain, start=seen) + noise, 0.0, 1.0)
 
         # A loop over the channels makes the compiler finish hits and noise before it shades them;
         # fused with the ray-caster, each channel would cast the rays many times over.
-        inputs = surfaces["colour"].T, jnp.array(_BACKGROUND), gain, noise
+        inputs = surfaces["colour"].T, jnp.array(_BACKGROUND), noise, *gains
         return jax.lax.map(lambda c: channel(*c), inputs).T
 
     return Sensor(
@@ -397,8 +401,8 @@ def shows_poi(
     angles = window_of(sensor, sensor.angles, bearing) - bearing
     half_width = jnp.arcsin(jnp.minimum(arena.poi_half_width / distance, 1.0))
     is_within = jnp.abs(angles) <= _SHARE_OF_WIDTH * half_width
-    misses = is_within & ~sensor.shows(readings, distance, arena.poi_extent)
-    return jnp.sum(misses) <= 2 * sensor.lost * jnp.sum(is_within)
+    is_missed = is_within & ~sensor.shows(readings, distance, arena.poi_extent)
+    return jnp.sum(is_missed) <= 2 * sensor.lost * jnp.sum(is_within)
 
 
 def as_window(sensor: Sensor, readings: jax.Array) -> jax.Array:

@@ -11,6 +11,8 @@ from jaxsense.vae.gaussian import moment_match
 
 ACTIVE_VARIANCE = 0.01
 PLAUSIBLE_DISTANCE = 2.0
+LEAST_PROBABILITY = 1e-12
+_BINS = 15
 
 
 def sigma_norm(std: jax.Array) -> jax.Array:
@@ -65,6 +67,38 @@ def unambiguous(belief: Belief, class_means: jax.Array, true_class: jax.Array) -
     """Whether a belief leaves only its true class open, `[]` bool (the paper's Table I)."""
     plausible = plausible_classes(belief, class_means)
     return plausible[true_class] & (jnp.sum(plausible) == 1)
+
+
+def negative_log_likelihood(probabilities: jax.Array, labels: jax.Array) -> jax.Array:
+    """Mean of `-log p(label)`, `[]` in nats.
+
+    Args:
+      probabilities: `[S, L]` of each label.
+      labels: `[S]` int32 true labels.
+    """
+    chex.assert_rank(probabilities, 2, custom_message="probabilities")
+    chex.assert_shape(labels, (len(probabilities),), custom_message="labels")
+    right = jnp.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
+    return -jnp.mean(jnp.log(jnp.maximum(right, LEAST_PROBABILITY)))
+
+
+def calibration_error(probabilities: jax.Array, labels: jax.Array) -> jax.Array:
+    """Expected calibration error of the most likely labels, `[]` (Guo et al. 2017, Sec. 2).
+
+    Fifteen bins of equal width hold the looks by their confidence. The error is the mean over all
+    looks of the difference between a bin's mean confidence and its share of right labels.
+
+    Args:
+      probabilities: `[S, L]` of each label.
+      labels: `[S]` int32 true labels.
+    """
+    chex.assert_rank(probabilities, 2, custom_message="probabilities")
+    chex.assert_shape(labels, (len(probabilities),), custom_message="labels")
+    confidence = jnp.max(probabilities, axis=1)
+    is_right = jnp.argmax(probabilities, axis=1) == labels
+    bins = jnp.clip(jnp.ceil(confidence * _BINS).astype(jnp.int32) - 1, 0, _BINS - 1)
+    surplus = jnp.zeros(_BINS).at[bins].add(confidence - is_right)
+    return jnp.sum(jnp.abs(surplus)) / len(labels)
 
 
 def moment_matching_error(belief: Belief, components: Belief) -> jax.Array:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 from jaxsense.config import values
 from jaxsense.types import Belief
+from jaxsense.vae.metrics import LEAST_PROBABILITY
 
 _LEAST_PRECISION = 1e-6
 
@@ -32,7 +33,7 @@ def bayes_update(
     values.require_finite("features", features)
     label_of_class = jnp.asarray(label_of_class)
     prior = jnp.zeros(len(features)).at[label_of_class].add(1 / len(label_of_class))
-    ratio = jnp.maximum(features[label_of_class], 1e-12) / prior[label_of_class]
+    ratio = jnp.maximum(features[label_of_class], LEAST_PROBABILITY) / prior[label_of_class]
     return jax.nn.log_softmax(log_weights + jnp.log(ratio))
 
 
