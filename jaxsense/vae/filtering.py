@@ -35,8 +35,8 @@ def init(key: Key, model: Jmvae, classes: Belief, config: FilterConfig) -> Param
       config: sizes of the networks.
 
     Returns:
-      `{"classes": ..., "inverse": ..., "networks": {NAME: ...}}`. The inverse turns the moments of
-      a mixture of the classes into its weights.
+      A dictionary of the `classes`, the `inverse` of `moments_inverse`, and for each modality one of
+      the `networks`.
     """
     chex.assert_shape(classes.mean, (None, model.latent_size), custom_message="classes.mean")
     chex.assert_shape(classes.std, classes.mean.shape, custom_message="classes.std")
