@@ -35,8 +35,8 @@ def init(key: Key, model: Jmvae, classes: Belief, config: FilterConfig) -> Param
       config: sizes of the networks.
 
     Returns:
-      A dictionary of the `classes`, the `inverse` of `moments_inverse`, and for each modality one of
-      the `networks`.
+      A dictionary of the `classes`, the `inverse` of `moments_inverse`, and one of the `networks`
+      for each modality.
     """
     chex.assert_shape(classes.mean, (None, model.latent_size), custom_message="classes.mean")
     chex.assert_shape(classes.std, classes.mean.shape, custom_message="classes.std")
