@@ -75,3 +75,8 @@ def test_the_whole_first_mission_is_recorded(split, team, monkeypatch):
     np.testing.assert_array_equal(records.poses[LAST:], records.poses[LAST - 1 : -1])
     np.testing.assert_array_equal(end.scene.poses, records.poses[-1])
     assert end.done
+
+
+def test_a_short_time_limit_changes_no_program():
+    short = dataclasses.replace(CONFIG.mission, time_limit=1.0)
+    assert missions.chunk_of(dataclasses.replace(CONFIG, mission=short)) == CHUNK
