@@ -182,12 +182,6 @@ class Program:
         self._compiled: Future[Callable[..., Any]] = Future()
         self._workers, self._whole = ALONE, ()
 
-    @property
-    def num_workers(self) -> int:
-        """Number of workers that share the rows of the arguments; blocks until compiled."""
-        self.wait()
-        return self._workers.number
-
     def compile(
         self,
         function: Callable[..., Any],

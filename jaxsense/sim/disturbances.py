@@ -36,6 +36,7 @@ def measured_ranges(key: Key, distance: jax.Array, config: LidarConfig) -> jax.A
 
 def _disturbed(key: Key, distance: jax.Array, config: LidarConfig) -> jax.Array:
     """`[B]` distances with mixed pixels and without the beams that drop out."""
+    # The key itself draws the noise, as it does without disturbances.
     uniform = jax.random.uniform(jax.random.fold_in(key, 1), (3, *distance.shape))
     # The last beam has no next one. Beyond its range, the scanner meets nothing.
     within = jnp.minimum(distance, config.max_range)
@@ -63,6 +64,7 @@ def lighting(key: Key, num_pixels: int, config: CameraConfig) -> tuple[jax.Array
       `[3]` factors on the brightness of red, green and blue, and `[B]` which pixels the distant
       light reaches, 0 or 1.
     """
+    # The key itself draws the noise, as it does without disturbances.
     normal_key, uniform_key = jax.random.split(jax.random.fold_in(key, 1))
     brightness, *casts = jax.random.normal(normal_key, (4,))
     missing, falls, edge, side = jax.random.uniform(uniform_key, (4,))
