@@ -13,6 +13,7 @@ from jaxsense import observe
 from jaxsense.config import Config
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn.belief_mdp import MapMdp, MapState, random_start, reset
+from jaxsense.dqn.optimum import LookValues
 from jaxsense.models import make_jmvae
 from jaxsense.networks import Params
 from jaxsense.observe import Bank
@@ -46,13 +47,20 @@ def detector(looks: jax.Array, label_of_class: jax.Array) -> dict[str, jax.Array
     }
 
 
+def class_beliefs(params: Params, bank: Bank, config: Config) -> Belief:
+    """`[C, D]` mean joint posterior of each class, from detections for training."""
+    joint = _encode(params, make_jmvae(config), bank, range(len(bank)))
+    return jax.tree.map(lambda x: x.mean(axis=1), joint)
+
+
 def latent_space(
-    params: Params, bank: Bank, config: Config
+    params: Params, class_means: jax.Array, bank: Bank, config: Config
 ) -> tuple[dict[str, Belief], dict[str, Any]]:
     """Encodes detections, alone and together, and measures the latent space.
 
     Args:
       params: of the JMVAE.
+      class_means: `[C, D]` of `class_beliefs`.
       bank: for each modality `[C, S, D_m]` held-out detections; the s-th of a class in one modality
         goes with the s-th in another.
       config: all settings.
@@ -65,14 +73,25 @@ def latent_space(
     joint = _encode(params, model, bank, range(num_modalities))
     alone = [_encode(params, model, bank, [m]) for m in range(num_modalities)]
     posteriors = {"joint": joint, **dict(zip(model.modalities, alone, strict=True))}
-    class_means = joint.mean.mean(axis=1)
-    is_unambiguous = jax.vmap(jax.vmap(metrics.unambiguous, (0, None, None)), (0, None, 0))
     classes = jnp.arange(bank[0].shape[0])
+    consistent = {
+        "joint": np.eye(len(classes), dtype=bool),
+        **{m: metrics.consistent_classes(config.label_of_class(m)) for m in config.modalities},
+    }
+    plausible = {
+        n: jax.vmap(jax.vmap(metrics.plausible_classes, (0, None)), (0, None))(b, class_means)
+        for n, b in posteriors.items()
+    }
     return posteriors, {
         "active_units": metrics.active_units(joint.mean.reshape(-1, joint.mean.shape[-1])),
         "sigma_norm": {n: metrics.sigma_norm(b.std).mean(axis=1) for n, b in posteriors.items()},
         "unambiguous": {
-            n: is_unambiguous(b, class_means, classes).mean(axis=1) for n, b in posteriors.items()
+            n: jnp.all(p == np.eye(len(classes), dtype=bool)[:, None], axis=-1).mean(axis=1)
+            for n, p in plausible.items()
+        },
+        "consistent": {
+            n: jnp.all(p == consistent[n][:, None], axis=-1).mean(axis=1)
+            for n, p in plausible.items()
         },
         "moment_matching_error": _moment_matching_error(joint, alone, config),
         "fusion": _fusion(params, model, bank, alone, class_means),
@@ -107,7 +126,7 @@ def _fusion(
     params: Params, model: Jmvae, bank: Bank, alone: list[Belief], class_means: jax.Array
 ) -> dict[str, jax.Array | None]:
     """Quality of map entries after one modality's look and then another's."""
-    is_right, distances = [], []
+    is_right, distances, widths = [], [], []
     nearest = jax.vmap(jax.vmap(lambda belief: metrics.nearest_class(belief, class_means)))
     for first, second in itertools.permutations(range(len(bank)), 2):
         seen = jnp.arange(len(bank)) == first
@@ -116,10 +135,12 @@ def _fusion(
         both = _encode(params, model, bank, (first, second))
         is_right.append(nearest(fused) == jnp.arange(len(class_means))[:, None])
         distances.append(jnp.linalg.norm((fused.mean - both.mean) / both.std, axis=-1))
+        widths.append(jnp.mean(jnp.abs(jnp.log(fused.std / both.std)), axis=-1))
     # One modality fuses nothing.
     return {
         "accuracy": jnp.mean(jnp.array(is_right)) if is_right else None,
         "mean_error": jnp.mean(jnp.array(distances)) if distances else None,
+        "std_error": jnp.mean(jnp.array(widths)) if widths else None,
     }
 
 
@@ -190,11 +211,35 @@ def beliefs(
     }
 
 
+def greedy_return(
+    key: Key,
+    modality: jax.Array,
+    q_network: Params,
+    params: Params,
+    bank: Bank,
+    config: Config,
+) -> jax.Array:
+    """`[]` mean total reward of the greedy policy, in one episode from each of random starts.
+
+    See `compare_policies` for the arguments.
+    """
+    mdp = observe.bank_mdp(config, bank, params, make_jmvae(config))
+    act = policies.greedy(mdp, q_network, config.dqn.hidden)
+
+    def episode(key: Key) -> jax.Array:
+        reset_key, episode_key = jax.random.split(key)
+        start = reset(reset_key, mdp)
+        return episodes.run_episode(episode_key, mdp, act, start, modality)[0]
+
+    return jnp.mean(jax.vmap(episode)(jax.random.split(key, config.evaluation.num_starts)))
+
+
 def compare_policies(
     key: Key,
     modality: jax.Array,
     q_network: Params,
     params: Params,
+    look_values: tuple[LookValues, ...],
     bank: Bank,
     config: Config,
 ) -> tuple[jax.Array, jax.Array]:
@@ -204,7 +249,8 @@ def compare_policies(
       key: random key.
       modality: `[]` int32 index of the agent's own sensor.
       q_network: parameters of its Q-network.
-      params: of the JMVAE.
+      params: of the JMVAE, with those of the filter if there is one.
+      look_values: of each modality, from detections for training.
       bank: held-out detections.
       config: all settings.
 
@@ -217,11 +263,19 @@ def compare_policies(
     mdp = observe.bank_mdp(config, bank, params, make_jmvae(config))
     start_key, table_key, play_key = jax.random.split(key, 3)
     starts = _every_start(start_key, mdp, settings.num_starts)
-    labels = jnp.array([config.label_of_class(m) for m in config.modalities])
-    expected = policies.expected_rewards(table_key, mdp, modality, _EXPECTATION_DRAWS)
+    if config.jmvae.fusion == "filter":
+        total = jnp.stack([values.total for values in look_values])[modality]
+        optimal = policies.by_posterior(
+            total, functools.partial(filtering.weights, params[fusion.FILTER])
+        )
+    else:
+        # A second look by the same sensor replaces the first, so that it never pays.
+        labels = jnp.array([config.label_of_class(m) for m in config.modalities])
+        expected = policies.expected_rewards(table_key, mdp, modality, _EXPECTATION_DRAWS)
+        optimal = policies.optimal(mdp, expected, labels)
     compared = (
         policies.greedy(mdp, q_network, config.dqn.hidden),
-        policies.optimal(mdp, expected, labels),
+        optimal,
         policies.naive(mdp, modality),
         policies.random(mdp),
     )
@@ -268,23 +322,30 @@ def _every_start(key: Key, mdp: MapMdp, number: int) -> tuple[jax.Array, jax.Arr
     drawn = jax.vmap(lambda key: random_start(key, mdp))(jax.random.split(key, number))
     classes, seen = (
         jnp.concatenate([jnp.asarray(every), some])
-        for every, some in zip(episodes.every_state(mdp), drawn, strict=True)
+        for every, some in zip(_states(mdp), drawn, strict=True)
     )
     return classes, seen
 
 
-def policy_metrics(total: np.ndarray, first: np.ndarray, num_random: int) -> dict[str, Any]:
+def _states(mdp: MapMdp) -> tuple[np.ndarray, np.ndarray]:
+    return episodes.every_state(mdp.num_pois, mdp.num_classes, mdp.num_modalities)
+
+
+def policy_metrics(total: np.ndarray, first: np.ndarray, config: Config) -> dict[str, Any]:
     """One modality's block in the summary's `dqn`, without the speed.
 
     Args:
       total: `[P, S]` from `compare_policies`.
       first: `[P, S]` from `compare_policies`.
-      num_random: how many starts, at the end, are random; the others are every state.
+      config: all settings.
     """
-    num_states = total.shape[1] - num_random
+    num_states = total.shape[1] - config.evaluation.num_starts
     whole = dict(zip(POLICIES, total[:, num_states:].mean(axis=1).tolist(), strict=True))
     one_step = dict(zip(POLICIES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
     missed = total[POLICIES.index("optimal"), :num_states] - total[0, :num_states]
+    is_optimal = missed <= 0.01
+    sizes = config.arena.num_pois, len(config.arena.classes), len(config.modalities)
+    is_permutation = episodes.are_different(episodes.every_state(*sizes)[0])
     return {
         **whole,
         # Where no look pays, the optimum is 0.
@@ -294,6 +355,8 @@ def policy_metrics(total: np.ndarray, first: np.ndarray, num_random: int) -> dic
             "optimal": one_step["optimal"],
             "random": one_step["random"],
         },
-        "optimal_states": int(np.sum(missed <= 0.01)),
+        "optimal_states": int(np.sum(is_optimal)),
         "num_states": num_states,
+        "optimal_permutations": int(np.sum(is_optimal & is_permutation)),
+        "num_permutations": int(np.sum(is_permutation)),
     }

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 
 from jaxsense import networks
 from jaxsense.config import Config
-from jaxsense.dqn import policies
+from jaxsense.dqn import optimum, policies
+from jaxsense.dqn.optimum import LookValues
 from jaxsense.networks import Params
 from jaxsense.sim import sensors
 from jaxsense.types import Belief, Key, pytree
@@ -23,13 +24,23 @@ class Models:
       detectors: one for each modality.
       jmvae: parameters of the JMVAE; those of the filter, if there is one, are its entry `filter`.
       class_beliefs: `[C, D]` mean joint posterior of each class, to read the map with.
+      moments_inverse: `[C, 2D + 1]` from `filtering.moments_inverse`, to read the classes'
+        probabilities from the map with.
+      look_values: for each modality, what a look is worth by dynamic programming.
       q_networks: parameters of one Q-network for each modality.
     """
 
     detectors: tuple[Detector, ...]
     jmvae: Params
     class_beliefs: Belief
+    moments_inverse: jax.Array
+    look_values: tuple[LookValues, ...]
     q_networks: tuple[Params, ...]
+
+    @property
+    def readout(self) -> Params:
+        """What `filtering.weights` reads the map with."""
+        return {"classes": self.class_beliefs, "inverse": self.moments_inverse}
 
 
 def make_jmvae(config: Config) -> Jmvae:
@@ -56,11 +67,14 @@ def init(key: Key, config: Config) -> Models:
         jmvae.init(jmvae_key, make_jmvae(config)),
         Belief(jnp.zeros(shape), jnp.ones(shape)),
     )
+    no_values = jnp.zeros(len(optimum.lattice(len(config.arena.classes))))
     if config.jmvae.fusion == "filter":
         params[FILTER] = filtering.init(filter_key, make_jmvae(config), classes, config.filter)
     return Models(
         detectors=trained,
         jmvae=params,
         class_beliefs=classes,
+        moments_inverse=filtering.moments_inverse(classes),
+        look_values=(LookValues(no_values, no_values),) * len(config.modalities),
         q_networks=tuple(networks.init(k, q_network, size) for k in dqn_keys),
     )

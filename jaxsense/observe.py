@@ -12,8 +12,8 @@ from jaxsense.config import Config, values
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.networks import Params
 from jaxsense.sim import world as worlds
-from jaxsense.types import Key
-from jaxsense.vae import detectors, fusion
+from jaxsense.types import Belief, Key
+from jaxsense.vae import detectors, filtering, fusion
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.jmvae import Jmvae
 
@@ -60,6 +60,10 @@ def bank_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> MapMdp
 
 
 def _mdp(config: Config, params: Params, model: Jmvae, new_scene, observe) -> MapMdp:
+    def nats(belief: Belief) -> jax.Array:
+        return -filtering.entropy(filtering.weights(params[fusion.FILTER], belief))
+
+    rewarded = {"information": nats} if config.mdp.reward == "nats" else {}
     return MapMdp(
         config=config.mdp,
         num_pois=config.arena.num_pois,
@@ -71,6 +75,7 @@ def _mdp(config: Config, params: Params, model: Jmvae, new_scene, observe) -> Ma
         write=lambda belief, seen, features, modality: fusion.write(
             params, model, belief, seen, features, modality
         ),
+        **rewarded,
     )
 
 

@@ -8,6 +8,7 @@ same keys.
 
 import dataclasses
 import functools
+import math
 import zlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -17,9 +18,10 @@ import jax.numpy as jnp
 
 from jaxsense import examine, observe
 from jaxsense.config import Config
-from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import belief_mdp, optimum
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
+from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.training import DqnState
 from jaxsense.models import Models, make_jmvae
 from jaxsense.networks import Params
@@ -27,12 +29,14 @@ from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene, World
 from jaxsense.types import Belief, Key, pytree
-from jaxsense.vae import detectors, filtering, jmvae
+from jaxsense.vae import detectors, filtering, jmvae, peers
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.fusion import FILTER
 from jaxsense.vae.minibatch import FitState
 
 _MOST_CHUNKS = 20
+_LOOKS_PER_CLASS = 128  # that stand for all others in the values of looks
+_MOST_LOOKS = 20  # at one PoI, in the values of looks
 
 
 Examples = tuple[jax.Array, jax.Array]
@@ -182,9 +186,10 @@ def stages(config: Config, world: World | None = None) -> list[Stage]:
         Stage("detections", _detect, ("survey", *detector_names)),
         *(_restart_stage(name, config) for name in restarts),
         Stage("jmvae", _best_jmvae, restarts, program="best_jmvae", is_saved=True),
-        Stage("latent_space", _latent_space, ("jmvae", "detections")),
-        Stage("class_beliefs", _class_beliefs, ("latent_space",), is_saved=True),
+        Stage("class_beliefs", _class_beliefs, ("jmvae", "detections"), is_saved=True),
+        Stage("latent_space", _latent_space, ("jmvae", "class_beliefs", "detections")),
         *with_filter,
+        Stage("look_values", _look_values, ("class_beliefs", "detections"), is_saved=True),
         Stage("beliefs", _measure_beliefs, (params, "class_beliefs", "detections")),
         Stage("starts", functools.partial(_starts, world), learned),
         *(_agent_stage(m, world, config, learned) for m in range(len(config.modalities))),
@@ -254,6 +259,8 @@ def models(outputs: Mapping[str, Any], config: Config) -> Models:
         detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
         jmvae={**outputs["jmvae"], **trained},
         class_beliefs=outputs["class_beliefs"],
+        moments_inverse=filtering.moments_inverse(outputs["class_beliefs"]),
+        look_values=outputs["look_values"],
         q_networks=tuple(outputs[f"dqn_{name}"] for name in config.modalities),
     )
 
@@ -346,24 +353,35 @@ def _detector_stage(modality: int, name: str, config: Config) -> Steps:
     """The training of one modality's detector."""
     size = _chunk_size(config.detector.steps)
 
+    def split(examples: tuple[Examples, ...]) -> tuple[Examples, Examples]:
+        """The looks to train on, and those to calibrate with."""
+        windows, labels = examples[modality]
+        number = len(labels) - math.ceil(config.detector.calibration * len(labels))
+        return (windows[:number], labels[:number]), (windows[number:], labels[number:])
+
     def begin(
         key: Key, config: Config, examples: tuple[Examples, ...]
     ) -> tuple[Detector, FitState]:
         num_labels = len(config.labels(config.modalities[modality]))
-        detector = detectors.init(key, examples[modality][0], num_labels, config.detector)
+        windows, _ = split(examples)[0]
+        detector = detectors.init(key, windows, num_labels, config.detector)
         return detector, detectors.start(detector, config.detector)
 
     def advance(
         key: Key, config: Config, state: tuple[Detector, FitState], examples: tuple[Examples, ...]
     ) -> tuple[tuple[Detector, FitState], Progress]:
         detector, fit = state
-        inputs = *examples[modality], config.detector, size
+        inputs = *split(examples)[0], config.detector, size
         fit, losses = detectors.train(key, fit, detector, *inputs)
         return (detector, fit), Progress(losses, {})
 
-    def finish(config: Config, state: tuple[Detector, FitState], *inputs: Any) -> Detector:
+    def finish(
+        config: Config, state: tuple[Detector, FitState], examples: tuple[Examples, ...]
+    ) -> Detector:
         detector, fit = state
-        return dataclasses.replace(detector, params=fit.params)
+        trained = dataclasses.replace(detector, params=fit.params)
+        windows, labels = split(examples)[1]
+        return detectors.calibrate(trained, windows, labels) if len(labels) else trained
 
     return Steps(
         name,
@@ -463,20 +481,17 @@ def _best_jmvae(key: Key, config: Config, *restarts: tuple[Params, jax.Array]) -
 
 
 def _latent_space(
-    key: Key, config: Config, params: Params, detections: Detections
+    key: Key, config: Config, params: Params, classes: Belief, detections: Detections
 ) -> tuple[dict[str, Belief], dict[str, Any]]:
     """See `examine.latent_space`."""
     del key
-    return examine.latent_space(params, detections.held_out, config)
+    return examine.latent_space(params, classes.mean, detections.held_out, config)
 
 
-def _class_beliefs(
-    key: Key, config: Config, latent_space: tuple[dict[str, Belief], dict[str, Any]]
-) -> Belief:
-    """`[C, D]` mean joint posterior of each class."""
-    del key, config
-    posteriors, _ = latent_space
-    return jax.tree.map(lambda x: x.mean(axis=1), posteriors["joint"])
+def _class_beliefs(key: Key, config: Config, params: Params, detections: Detections) -> Belief:
+    """See `examine.class_beliefs`."""
+    del key
+    return examine.class_beliefs(params, detections.bank, config)
 
 
 def _filter_stages(config: Config) -> list[Stage]:
@@ -528,6 +543,26 @@ def _measure_beliefs(
 ) -> dict[str, jax.Array]:
     """See `examine.beliefs`."""
     return examine.beliefs(key, params, classes, detections.held_out, config)
+
+
+def _look_values(
+    key: Key, config: Config, classes: Belief, detections: Detections
+) -> tuple[LookValues, ...]:
+    """What a look with each modality is worth, from the detections for training."""
+    del key
+
+    def information(weights: jax.Array) -> jax.Array:
+        if config.mdp.reward == "nats":
+            return -filtering.entropy(weights)
+        return belief_mdp.information(filtering.mixture(classes, weights).std)
+
+    def of_modality(features: jax.Array, labels: tuple[int, ...]) -> LookValues:
+        of_look = functools.partial(peers.log_likelihoods, label_of_class=jnp.array(labels))
+        likelihoods = jax.vmap(jax.vmap(of_look))(features[:, :_LOOKS_PER_CLASS])
+        return optimum.solve(likelihoods, information, config.mdp, _MOST_LOOKS)
+
+    labels = [config.label_of_class(name) for name in config.modalities]
+    return tuple(map(of_modality, detections.bank, labels))
 
 
 def _starts(
@@ -595,10 +630,15 @@ def _advance_dqn(
     *trained: Detector,
 ) -> tuple[DqnState, Progress]:
     mdp = make_map_mdp(world, config, detections.bank, params, trained)
-    state, info = dqn.train_chunk(key, mdp, modality, config.dqn, state, starts)
+
+    def evaluate(key: Key, q_network: Params) -> jax.Array:
+        return examine.greedy_return(key, modality, q_network, params, detections.held_out, config)
+
+    state, info = dqn.train_chunk(key, mdp, modality, config.dqn, state, starts, evaluate)
     reward = jnp.where(info.episodes > 0, info.episode_return, jnp.nan)
     loss = jnp.where(info.is_finite, info.loss, jnp.nan)
-    return state, Progress(loss, {"reward": reward, "epsilon": info.epsilon})
+    metrics = {"reward": reward, "greedy": info.greedy_return, "epsilon": info.epsilon}
+    return state, Progress(loss, metrics)
 
 
 def _finish_dqn(config: Config, state: DqnState, *inputs: Any) -> Params:
@@ -607,7 +647,7 @@ def _finish_dqn(config: Config, state: DqnState, *inputs: Any) -> Params:
 
 def _policies_stage(modality: int, name: str, params: str) -> Stage:
     """The comparison of one modality's policies; `params` names the stage that the map needs."""
-    inputs = f"dqn_{name}", params, "detections"
+    inputs = f"dqn_{name}", params, "look_values", "detections"
     return Stage(f"policies_{name}", _play_policies, inputs, modality, program="policies")
 
 
@@ -617,7 +657,9 @@ def _play_policies(
     modality: jax.Array,
     q_network: Params,
     params: Params,
+    look_values: tuple[LookValues, ...],
     detections: Detections,
 ) -> tuple[jax.Array, jax.Array]:
     """See `examine.compare_policies`."""
-    return examine.compare_policies(key, modality, q_network, params, detections.held_out, config)
+    trained = q_network, params, look_values
+    return examine.compare_policies(key, modality, *trained, detections.held_out, config)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -21,7 +21,7 @@ import rich.table
 import tyro
 
 from jaxsense import cli
-from jaxsense.config import PRESETS, Config, ConfigError
+from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import require_types
 from jaxsense.run import devices, files, pipeline, rundir, seeds
 from jaxsense.run.devices import Workers
@@ -45,7 +45,7 @@ class Arguments:
     """Train detectors, the JMVAE and one Q-network per modality, and write a run directory."""
 
     config: Annotated[Config, tyro.conf.arg(name="")]
-    preset: Literal["default", "paper", "smoke"] = "default"
+    preset: PresetName = "default"
     """Settings to start from; every option below changes one of them."""
     seed: int = 0
     """Seed of all randomness, from 0 to 2^32 - 1."""

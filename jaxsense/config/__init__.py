@@ -13,6 +13,7 @@ from jaxsense.config.learning import JmvaeConfig as JmvaeConfig
 from jaxsense.config.learning import MdpConfig as MdpConfig
 from jaxsense.config.mission import MISSIONS_AT_ONCE as MISSIONS_AT_ONCE
 from jaxsense.config.mission import NODES_PER_POI as NODES_PER_POI
+from jaxsense.config.mission import POLICIES as POLICIES
 from jaxsense.config.mission import MissionConfig as MissionConfig
 from jaxsense.config.mission import NavigationConfig as NavigationConfig
 from jaxsense.config.objects import COLOURS as COLOURS
@@ -20,6 +21,7 @@ from jaxsense.config.objects import SHAPES as SHAPES
 from jaxsense.config.objects import Attribute as Attribute
 from jaxsense.config.objects import Shape as Shape
 from jaxsense.config.presets import PRESETS as PRESETS
+from jaxsense.config.presets import PresetName as PresetName
 from jaxsense.config.scene import LIDAR_HEIGHT as LIDAR_HEIGHT
 from jaxsense.config.scene import MODALITIES as MODALITIES
 from jaxsense.config.scene import ROBOT_RADIUS as ROBOT_RADIUS

@@ -25,6 +25,9 @@ class DetectorConfig:
     """Sizes of the hidden layers."""
     num_scans: int = 98304
     """Simulated scans to train on, per modality."""
+    calibration: float = 0.0
+    """Share of these scans that calibrates the detector instead: their likelihood sets the
+    temperature of its probabilities."""
     num_held_out: int = 8192
     """Held-out simulated scans, to measure accuracy."""
     steps: int = 4000
@@ -40,6 +43,8 @@ class DetectorConfig:
         require_sizes(self, "hidden")
         require_positive(self, "num_scans", "num_held_out", "steps", "batch", "learning_rate")
         require_at_most(self, learning_rate=1)
+        reason = "must be at least 0, at most 0.5"
+        require(0 <= self.calibration <= 0.5, self, "calibration", reason)
 
 
 @section
@@ -122,6 +127,11 @@ class MdpConfig:
 
     unseen_variance: Traced[float] = 20.0
     """Variance of each latent dimension of an unseen PoI."""
+    reward: Literal["paper", "nats"] = "paper"
+    """What a look is rewarded for. `paper`: the gain of 1 / ||sigma||, or -1, see `min_increase`.
+    `nats`: the entropy of the classes that it removes, less `look_cost`; needs the filter."""
+    look_cost: Traced[float] = 0.05
+    """Cost of a look with the reward in nats."""
     min_increase: Traced[float] = 0.05
     """Gain of information, in inverse latent units, up to which a look's reward is -1."""
     max_steps: Traced[int] = 20
@@ -133,8 +143,10 @@ class MdpConfig:
         """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(self, "unseen_variance", "max_steps")
-        require_not_negative(self, "min_increase")
-        require_at_most(self, unseen_variance=_MOST_WEIGHT, max_steps=10_000)
+        require_not_negative(self, "min_increase", "look_cost")
+        require_at_most(
+            self, look_cost=_MOST_WEIGHT, unseen_variance=_MOST_WEIGHT, max_steps=10_000
+        )
 
 
 @section

@@ -13,6 +13,12 @@ from jaxsense.config.section import Traced, section
 MOST_EPISODES = 100_000
 """Most missions of one policy whose states fit a computer's memory."""
 
+POLICIES = ("latent", "greedy", "bayes", "optimal", "naive", "naive_2", "naive_3", "random")
+"""Policies of robots in missions; the index is the policy's code. `latent` asks the Q-networks.
+`greedy` takes the look of the highest expected gain on the map, `bayes` on the exact posterior over
+the classes, and `optimal` the look of the highest total gain by dynamic programming; `naive` visits
+every PoI once, `naive_2` twice, `naive_3` three times; `random` takes any PoI, or ends."""
+
 MISSIONS_AT_ONCE = 384
 """Most missions that are played side by side."""
 NODES_PER_POI = 10
@@ -75,6 +81,8 @@ class NavigationConfig:
 class MissionConfig:
     """The closed loop of all robots in one arena."""
 
+    policies: tuple[str, ...] = ("latent", "naive", "random")
+    """Policies to play missions with at the end of a run; `jaxsense.evaluate` plays all."""
     episodes: int = 128
     """Missions per policy at the end of a run."""
     time_limit: Traced[float] = 120.0
@@ -83,7 +91,13 @@ class MissionConfig:
     """Seconds between a robot's decisions, and between its scans."""
     equal_values: Traced[float] = 0.1
     """Actions whose values are this close to the best, in inverse latent units, count as equally
-    good; of these the robot prefers PoIs that no other robot heads for, then the nearest."""
+    good; see `nearest_first` and `avoids_targets`."""
+    nearest_first: Traced[bool] = True
+    """Whether a robot takes the nearest of equally good PoIs; otherwise the first."""
+    redecides: Traced[bool] = True
+    """Whether a robot under way decides again when the map changes."""
+    avoids_targets: Traced[bool] = True
+    """Whether a robot prefers, of equally good PoIs, those that no other robot heads for."""
     least_confidence: Traced[float] = 0.98
     """Lowest probability of a detected label for a scan to enter the map."""
     attempts: Traced[int] = 3
@@ -93,6 +107,9 @@ class MissionConfig:
         """Raises `ConfigError` for an invalid field."""
         require_types(self)
         require_positive(self, "episodes", "time_limit", "control_period", "attempts")
+        known = f"must name some of {', '.join(POLICIES)}"
+        is_known = len(self.policies) > 0 and set(self.policies) <= set(POLICIES)
+        require(is_known, self, "policies", known)
         require_at_most(self, episodes=MOST_EPISODES, time_limit=3600)
         steps = self.control_period / TIMESTEP
         require(

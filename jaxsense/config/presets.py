@@ -1,5 +1,7 @@
 """Presets: settings to start a run from."""
 
+from typing import Literal
+
 from jaxsense.config.learning import (
     DetectorConfig,
     DqnConfig,
@@ -7,7 +9,8 @@ from jaxsense.config.learning import (
     JmvaeConfig,
     MdpConfig,
 )
-from jaxsense.config.mission import MissionConfig
+from jaxsense.config.mission import POLICIES, MissionConfig, NavigationConfig
+from jaxsense.config.scene import ArenaConfig, CameraConfig, LidarConfig, ViewpointConfig
 from jaxsense.config.whole import Config
 
 _PAPER = Config(
@@ -46,6 +49,42 @@ _SMOKE = Config(
     mission=MissionConfig(episodes=4, time_limit=60.0),
 )
 
-PRESETS: dict[str, Config] = {"default": Config(), "paper": _PAPER, "smoke": _SMOKE}
+_NOISY = Config(
+    arena=ArenaConfig(side=8.0),
+    lidar=LidarConfig(
+        range_noise=0.02,
+        range_noise_growth=0.01,
+        mixed_pixels=0.05,
+        dropout=0.01,
+        window_range=5.0,
+    ),
+    camera=CameraConfig(
+        pixel_noise=0.1,
+        exposure_error=0.3,
+        colour_cast=0.3,
+        low_light=0.95,
+        shadow=0.3,
+        stride=2,
+    ),
+    viewpoint=ViewpointConfig(max_distance=4.0),
+    detector=DetectorConfig(
+        hidden=(64, 64, 64), num_scans=131072, calibration=0.1, num_held_out=32768
+    ),
+    jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000, restarts=1),
+    mdp=MdpConfig(reward="nats"),
+    dqn=DqnConfig(observe="bank", discount=0.5),
+    navigation=NavigationConfig(view_distances=(0.5, 0.9), view_range=4.0),
+    mission=MissionConfig(policies=POLICIES, episodes=64, least_confidence=0.0, equal_values=0.05),
+)
+
+PresetName = Literal["default", "paper", "noisy", "smoke"]
+
+PRESETS: dict[str, Config] = {
+    "default": Config(),
+    "paper": _PAPER,
+    "noisy": _NOISY,
+    "smoke": _SMOKE,
+}
 """`default`: the best settings we know. `paper`: those of the paper, and those of its authors' code
-where the paper is silent. `smoke`: the whole pipeline in seconds, for tests."""
+where the paper is silent. `noisy`: sensors that are often unsure, and beliefs that accumulate
+looks. `smoke`: the whole pipeline in seconds, for tests."""

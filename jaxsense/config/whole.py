@@ -72,6 +72,9 @@ class Config:
                 weights,
                 f"must hold one weight for each of modalities = {self.modalities}",
             )
+        if self.mdp.reward == "nats" and self.jmvae.fusion != "filter":
+            reason = f"needs jmvae.fusion = 'filter', not {self.jmvae.fusion!r}"
+            raise ConfigError("mdp.reward", self.mdp.reward, reason)
         self._check_viewpoints()
         self._check_views()
         looks = self.arena.num_pois * len(self.modalities)

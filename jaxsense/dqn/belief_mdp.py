@@ -34,6 +34,7 @@ class MapMdp:
       new_scene: `(key, classes [N]) -> scene`.
       observe: `(key, scene, poi, modality) -> (features [D_m], scene)`.
       write: `(belief [D], seen [M], features [D_m], modality) -> belief [D]`.
+      information: `belief [D] -> []`, what a look is rewarded for; by default the paper's.
     """
 
     config: MdpConfig
@@ -44,6 +45,7 @@ class MapMdp:
     new_scene: Callable[[Key, jax.Array], Scene]
     observe: Callable[[Key, Scene, jax.Array, int], tuple[jax.Array, Scene]]
     write: Callable[[Belief, jax.Array, jax.Array, int], Belief]
+    information: Callable[[Belief], jax.Array] = lambda belief: information(belief.std)
 
 
 @pytree
@@ -92,6 +94,22 @@ def information(std: jax.Array) -> jax.Array:
     chex.assert_shape(std, (..., None), custom_message="std")
     values.require_positive("std", std)
     return 1.0 / jnp.linalg.norm(std, axis=-1)
+
+
+def reward(gain: jax.Array, config: MdpConfig) -> jax.Array:
+    """Reward of a look.
+
+    Args:
+      gain: `[...]` of information.
+      config: which reward, and its numbers.
+
+    Returns:
+      `[...]` the gain, with the paper's reward -1 in place of one that is not above `min_increase`,
+      and in nats less the cost of a look.
+    """
+    if config.reward == "nats":
+        return gain - config.look_cost
+    return jnp.where(gain <= config.min_increase, -1.0, gain)
 
 
 def observation(belief: Belief) -> jax.Array:
@@ -181,8 +199,8 @@ def step(
         modalities, and its range is not checked.
 
     Returns:
-      The next state and the outcome. The reward is the gain of information; -1 if that is not above
-      `min_increase`; 0 for NOP; NaN if the gain is NaN or the action does not exist.
+      The next state and the outcome. The reward is that of the look, see `reward`; 0 for NOP; NaN
+      if the gain is NaN or the action does not exist.
 
     Raises:
       ValueError: if there is no such modality.
@@ -197,8 +215,7 @@ def step(
         return mdp.write(old, state.seen[poi], features, modality), scene
 
     new, scene = call(look, modality, mdp.num_modalities)
-    gain = information(new.std) - information(old.std)
-    reward = jnp.where(gain <= mdp.config.min_increase, -1.0, gain)
+    of_look = reward(mdp.information(new) - mdp.information(old), mdp.config)
     exists = (action >= 0) & (action <= mdp.num_pois)
 
     looked = dataclasses.replace(
@@ -210,7 +227,7 @@ def step(
     after = jax.tree.map(lambda x, y: jnp.where(is_nop, x, y), state, looked)
     after = dataclasses.replace(after, steps=state.steps + 1)
     outcome = Outcome(
-        reward=jnp.where(exists, jnp.where(is_nop, 0.0, reward), jnp.nan),
+        reward=jnp.where(exists, jnp.where(is_nop, 0.0, of_look), jnp.nan),
         terminated=is_nop,
         truncated=~is_nop & (after.steps >= mdp.config.max_steps),
     )

@@ -1,7 +1,6 @@
 """Whole episodes of policies, from random starts and from every state of the map."""
 
 import itertools
-import math
 import random
 
 import jax
@@ -55,22 +54,19 @@ def run_episode(
     return total, first
 
 
-def every_state(mdp: MapMdp) -> tuple[np.ndarray, np.ndarray]:
-    """Lists the paper's `N! 2^(N M)` states: classes in every order, every set of looks.
+def every_state(
+    num_pois: int, num_classes: int, num_modalities: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lists the `C^N 2^(N M)` states of the map: every combination of classes, every set of looks.
 
-    With fewer PoIs than classes, every order of N of the classes; with more, all combinations. Of
-    more than 4096 states, one random state, always the same, of each of 4096 equal parts.
+    Of more than 4096 states, one random state, always the same, of each of 4096 equal parts.
 
     Returns:
       `[S, N]` int32 classes and `[S, N, M]` bool looks.
     """
-    num_pois, num_classes = mdp.num_pois, mdp.num_classes
-    is_order = num_pois <= num_classes
-    # A state is a number: a digit for the class of each PoI (in an order, among those left), then
-    # a bit for each look.
-    radices = [num_classes - n if is_order else num_classes for n in range(num_pois)]
-    num_bits = num_pois * mdp.num_modalities
-    number = math.prod(radices) << num_bits
+    # A state is a number: a digit for the class of each PoI, then a bit for each look.
+    num_bits = num_pois * num_modalities
+    number = num_classes**num_pois << num_bits
     parts = min(number, MOST_STATES)
     edges = [i * number // parts for i in range(parts + 1)]
     draw = random.Random(0)
@@ -78,12 +74,11 @@ def every_state(mdp: MapMdp) -> tuple[np.ndarray, np.ndarray]:
     states = np.array([draw.randrange(*part) for part in itertools.pairwise(edges)], object)
     bits = states[:, None] >> np.arange(num_bits, dtype=object) & 1
     states >>= num_bits
-    classes = np.zeros((parts, num_pois), np.int32)
-    for n in reversed(range(num_pois)):
-        classes[:, n] = states % radices[n]
-        states //= radices[n]
-    if is_order:
-        for row in classes:
-            left = list(range(num_classes))
-            row[:] = [left.pop(digit) for digit in row]
-    return classes, bits.astype(bool).reshape(-1, num_pois, mdp.num_modalities)
+    places = np.array([num_classes**n for n in reversed(range(num_pois))], object)
+    classes = (states[:, None] // places % num_classes).astype(np.int32)
+    return classes, bits.astype(bool).reshape(-1, num_pois, num_modalities)
+
+
+def are_different(classes: np.ndarray) -> np.ndarray:
+    """`[S]` bool, whether all of `[S, N]` classes differ, as in the paper's `N! 2^(N M)` states."""
+    return np.all(np.diff(np.sort(classes, axis=1), axis=1) > 0, axis=1)

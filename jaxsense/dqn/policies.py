@@ -9,10 +9,10 @@ import jax.numpy as jnp
 
 from jaxsense import networks
 from jaxsense.config import values
-from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import belief_mdp, optimum
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.networks import MLP, Params
-from jaxsense.types import Index, Key
+from jaxsense.types import Belief, Index, Key
 
 Policy = Callable[[Key, MapState], jax.Array]
 
@@ -109,6 +109,25 @@ def optimal(mdp: MapMdp, rewards: jax.Array, label_of_class: jax.Array) -> Polic
     def act(key: Key, state: MapState) -> jax.Array:
         del key
         return _best(jnp.append(jax.vmap(of_poi)(state.seen, state.classes), 0.0))
+
+    return act
+
+
+def by_posterior(table: jax.Array, weights: Callable[[Belief], jax.Array]) -> Policy:
+    """Takes the look of the highest value, by what the map shows; NOP if none is above 0.
+
+    Args:
+      table: `[P]` values of a look, one of `optimum.LookValues`: with `total` the optimal policy,
+        with `gain` one that does not look ahead.
+      weights: `belief [D] -> [C]`, the classes' probabilities that an entry of the map holds.
+    """
+
+    def of_poi(belief: Belief) -> jax.Array:
+        return optimum.interpolate(table, weights(belief))
+
+    def act(key: Key, state: MapState) -> jax.Array:
+        del key
+        return _best(jnp.append(jax.vmap(of_poi)(state.belief), 0.0))
 
     return act
 

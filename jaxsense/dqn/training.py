@@ -4,8 +4,10 @@ Random numbers are drawn for a whole chunk of epochs at once: in the loop they w
 cost.
 """
 
+import dataclasses
 import functools
 import math
+from collections.abc import Callable
 
 import chex
 import jax
@@ -19,6 +21,8 @@ from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.policies import q_network
 from jaxsense.networks import MLP, Params
 from jaxsense.types import Index, Key, Transition, pytree
+
+_EVALUATED = 10  # epochs
 
 
 @pytree
@@ -54,6 +58,7 @@ class EpochInfo:
       loss: `[]` mean over the gradient steps.
       episode_return: `[]` mean total reward of the exploring policy's episodes that ended.
       episodes: `[]` int32 episodes that ended.
+      greedy_return: `[]` mean total reward of the greedy policy after the epoch; NaN after most.
       epsilon: `[]` chance of a random action.
       is_finite: `[]` bool, whether values, rewards, loss and new parameters are.
     """
@@ -61,6 +66,7 @@ class EpochInfo:
     loss: jax.Array
     episode_return: jax.Array
     episodes: jax.Array
+    greedy_return: jax.Array
     epsilon: jax.Array
     is_finite: jax.Array
 
@@ -150,6 +156,7 @@ def train_chunk(
     config: DqnConfig,
     state: DqnState,
     prepared: MapState,
+    evaluate: Callable[[Key, Params], jax.Array] | None = None,
 ) -> tuple[DqnState, EpochInfo]:
     """Trains for `config.chunk` epochs.
 
@@ -161,6 +168,8 @@ def train_chunk(
       state: the current state.
       prepared: `[num_starts]` from `starts`. Each environment has a share of them, and starts every
         episode from a random one of its share.
+      evaluate: `(key, parameters) -> []` total reward of the greedy policy, called after every
+        tenth epoch, or after the last if ten do not divide the chunk.
 
     Returns:
       The next state and the `[chunk]` infos.
@@ -169,7 +178,21 @@ def train_chunk(
     shares = jax.tree.map(lambda x: x.reshape(config.num_envs, -1, *x.shape[1:]), prepared)
     draws = _draw(key, mdp, config)
     epoch = functools.partial(_epoch, mdp, modality, config, shares)
-    return jax.lax.scan(epoch, state, draws)
+    if evaluate is None:
+        return jax.lax.scan(epoch, state, draws)
+    every = _EVALUATED if config.chunk % _EVALUATED == 0 else config.chunk
+
+    def advance(state: DqnState, of_group: tuple[Key, _Draws]) -> tuple[DqnState, EpochInfo]:
+        key, draws = of_group
+        state, infos = jax.lax.scan(epoch, state, draws)
+        found = infos.greedy_return.at[-1].set(evaluate(key, state.params))
+        return state, dataclasses.replace(infos, greedy_return=found)
+
+    # The key itself draws what a training without evaluation draws.
+    keys = jax.random.split(jax.random.fold_in(key, 1), config.chunk // every)
+    groups = jax.tree.map(lambda x: x.reshape(-1, every, *x.shape[1:]), draws)
+    state, infos = jax.lax.scan(advance, state, (keys, groups))
+    return state, jax.tree.map(lambda x: x.reshape(-1), infos)
 
 
 def _draw(key: Key, mdp: MapMdp, config: DqnConfig) -> _Draws:
@@ -218,6 +241,7 @@ def _epoch(
         loss=loss,
         episode_return=ended_reward / jnp.maximum(episodes, 1),
         episodes=episodes,
+        greedy_return=jnp.float32(jnp.nan),
         epsilon=epsilon,
         is_finite=is_finite,
     )

@@ -25,7 +25,7 @@ from jaxsense.sim import navigation, roadmap, sensors, viewpoints
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene
 from jaxsense.types import Belief, Index, Key, call, others, pytree
-from jaxsense.vae import detectors, fusion
+from jaxsense.vae import detectors, fusion, peers
 
 _PROGRESS = 0.02  # m, least shortening of a way that counts as progress
 _PATIENCE = 2.0  # s without progress of another robot, then one that has ended makes room
@@ -194,15 +194,16 @@ def scan(
     """
     aims = jax.vmap(lambda key, state: _aim(key, mission, state, robot))(keys, states)
 
-    def look(robot: int) -> tuple[jax.Array, Belief]:
+    def look(robot: int) -> tuple[jax.Array, Belief, jax.Array]:
         return jax.vmap(lambda state, aim: _look(mission, models, state, aim, robot))(states, aims)
 
     # The choice of the sensor outside the batch: inside, it would be traced over and over.
-    is_seen, entries = call(look, robot, len(mission.world.sensors))
-    write = jax.vmap(
-        lambda state, aim, seen, entry: _write(mission, state, aim, seen, entry, robot)
-    )
-    return write(states, aims, is_seen, entries)
+    is_seen, entries, posteriors = call(look, robot, len(mission.world.sensors))
+
+    def write(state: MissionState, aim: _Aim, seen: jax.Array, entry: Belief, posterior: jax.Array):
+        return _write(mission, state, aim, seen, entry, posterior, robot)
+
+    return jax.vmap(write)(states, aims, is_seen, entries, posteriors)
 
 
 def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
@@ -233,8 +234,8 @@ def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
 
 def _look(
     mission: Mission, models: Models, state: MissionState, aim: _Aim, robot: int
-) -> tuple[jax.Array, Belief]:
-    """Whether the PoI is seen, `[]` bool, and the map's new entry if it is."""
+) -> tuple[jax.Array, Belief, jax.Array]:
+    """Whether the PoI is seen, `[]` bool, and its new entry and `[C]` posterior if it is."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[robot]
     data = arenas.place(world.arena, scene.layout, scene.poses)
     readings = worlds.scan_around(aim.noise_key, world, scene, data, robot, aim.bearing)
@@ -245,7 +246,10 @@ def _look(
     is_sure = jnp.max(features) >= mission.config.mission.least_confidence
     old = jax.tree.map(lambda x: x[aim.poi], state.belief)
     shape, seen = make_jmvae(mission.config), state.seen[aim.poi]
-    return shows & is_sure, fusion.write(models.jmvae, shape, old, seen, features, robot)
+    entry = fusion.write(models.jmvae, shape, old, seen, features, robot)
+    labels = jnp.array(mission.config.label_of_class(mission.config.modalities[robot]))
+    posterior = peers.bayes_update(state.log_posterior[aim.poi], features, labels)
+    return shows & is_sure, entry, posterior
 
 
 def _write(
@@ -254,9 +258,10 @@ def _write(
     aim: _Aim,
     is_seen: jax.Array,
     entry: Belief,
+    posterior: jax.Array,
     robot: Index,
 ) -> MissionState:
-    """Records a scan, and writes the entry into the map if the PoI was seen."""
+    """Records a scan, and writes its entry and posterior if the PoI was seen."""
     poi, detects = aim.poi, aim.scans & is_seen
     own = robot_of(state, robot)
     failed, gives_up = _fail(own, aim.scans & ~detects, mission.config.mission.attempts)
@@ -270,14 +275,16 @@ def _write(
         detections=own.detections + detects,
     )
     state = with_robot(state, robot, own, after)
+    belief, log_posterior = jax.tree.map(
+        lambda rows, new: rows.at[poi].set(jnp.where(detects, new, rows[poi])),
+        (state.belief, state.log_posterior),
+        (entry, posterior),
+    )
     return dataclasses.replace(
         state,
-        belief=jax.tree.map(
-            lambda map_, new: map_.at[poi].set(jnp.where(detects, new, map_[poi])),
-            state.belief,
-            entry,
-        ),
-        seen=state.seen.at[poi, robot].set(state.seen[poi, robot] | detects),
+        belief=belief,
+        log_posterior=log_posterior,
+        times_seen=state.times_seen.at[poi, robot].add(detects),
         version=state.version + detects,
     )
 

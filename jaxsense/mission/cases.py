@@ -4,8 +4,8 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from jaxsense.config import Config
-from jaxsense.mission.state import LATENT, POLICIES, Faults, no_faults
+from jaxsense.config import POLICIES, Config
+from jaxsense.mission.state import LATENT, Faults, no_faults
 
 FAULT_TIME = 6.0  # s
 
@@ -26,7 +26,7 @@ class Case:
 def cases(config: Config) -> dict[str, Case]:
     """Lists the policies, each robot alone, and each robot failing in mid-mission.
 
-    `latent`, `naive` and `random` are the policies; in `MODALITY_alone` all other robots stand
+    Each of `POLICIES` is a case; in `MODALITY_alone` all other robots stand
     still from the start; in `MODALITY_stops` and `MODALITY_blind` the robot stops or its sensor
     goes blind after 6 s. Cases with faults use the latent policy.
     """

@@ -1,20 +1,20 @@
 """Choosing the PoI that a robot looks at next, and the viewpoint."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 
 from jaxsense import networks
-from jaxsense.config import ROBOT_RADIUS, Config
-from jaxsense.dqn import belief_mdp, policies
+from jaxsense.config import POLICIES, ROBOT_RADIUS, Config
+from jaxsense.dqn import belief_mdp, optimum, policies
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
     ENDED,
     FACING,
     IDLE,
-    LATENT,
     Mission,
     MissionState,
     now,
@@ -24,6 +24,7 @@ from jaxsense.mission.state import (
 from jaxsense.models import Models
 from jaxsense.sim import roadmap, viewpoints
 from jaxsense.types import Belief, Index, Key, others
+from jaxsense.vae import filtering
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
@@ -36,7 +37,7 @@ def decide(
     own, config = robot_of(state, robot), mission.config
     is_idle = own.phase == IDLE
     is_under_way = (own.phase == DRIVING) | (own.phase == FACING)
-    has_news = (state.version != own.decided_on) & (state.policy == LATENT)
+    has_news = (state.version != own.decided_on) & config.mission.redecides
     decides = is_idle | (is_under_way & has_news)
     action = jnp.where(decides, _choose(key, mission, models, state, robot), own.target)
     is_new = action != own.target
@@ -74,9 +75,63 @@ def _choose(
 ) -> jax.Array:
     """PoI that a robot's policy chooses, `[]` int32, or N for NOP."""
     config, robots = mission.config, state.robots
-    num_pois = config.arena.num_pois
+    settings, num_pois = config.mission, config.arena.num_pois
     given_up = robots.unreachable[robot] | robots.undetected[robot]
-    network = policies.q_network(num_pois, config.dqn.hidden)
+    values = _values(key, mission, models, state, robot, given_up)
+    of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
+    is_best = (of_pois >= jnp.max(of_pois) - settings.equal_values) & (of_pois > values[num_pois])
+
+    place = state.scene.poses[robot, :2]
+    distance = jnp.linalg.norm(state.scene.layout.position - place[None], axis=-1)
+    is_kept = jnp.arange(num_pois) == robots.target[robot]
+    targets = others(robots.target, robot)
+    is_others = jnp.any(jnp.arange(num_pois)[:, None] == targets[None], axis=-1)
+    # First the PoI that the robot heads for already, then those no other heads for, then distance.
+    rank = jnp.where(settings.nearest_first, distance, jnp.arange(num_pois))
+    rank += _KEPT * is_kept + _HEADED_FOR * (is_others & settings.avoids_targets)
+    poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
+    return jnp.where(jnp.any(is_best), poi, num_pois)
+
+
+def _values(
+    key: Key,
+    mission: Mission,
+    models: Models,
+    state: MissionState,
+    robot: Index,
+    given_up: jax.Array,
+) -> jax.Array:
+    """`[N + 1]` values of the policy's actions, NOP's last."""
+    num_pois = mission.config.arena.num_pois
+    on_map = jax.vmap(functools.partial(filtering.weights, models.readout))(state.belief)
+    exact = jnp.exp(state.log_posterior)
+    looks = jax.tree.map(lambda *x: jnp.stack(x)[robot], *models.look_values)
+    times = state.times_seen[:, robot]
+
+    def expected(table: jax.Array, weights: jax.Array) -> jax.Array:
+        return jax.vmap(lambda weights: optimum.interpolate(table, weights))(weights)
+
+    of_pois = {
+        "greedy": expected(looks.gain, on_map),
+        "bayes": expected(looks.gain, exact),
+        "optimal": expected(looks.total, exact),
+        "naive": jnp.where(times < 1, 1.0, -1.0),
+        "naive_2": jnp.where(times < 2, 1.0, -1.0),
+        "naive_3": jnp.where(times < 3, 1.0, -1.0),
+    }
+    values = {
+        "latent": _q_values(mission, models, state, robot, given_up),
+        **{name: jnp.append(each, 0.0) for name, each in of_pois.items()},
+        "random": jax.nn.one_hot(jax.random.randint(key, (), 0, num_pois + 1), num_pois + 1),
+    }
+    return jnp.stack([values[name] for name in POLICIES])[state.policy]
+
+
+def _q_values(
+    mission: Mission, models: Models, state: MissionState, robot: Index, given_up: jax.Array
+) -> jax.Array:
+    """`[N + 1]` values of the Q-network."""
+    network = policies.q_network(mission.config.arena.num_pois, mission.config.dqn.hidden)
     q_network = jax.tree.map(lambda *x: jnp.stack(x)[robot], *models.q_networks)
 
     def values_if(sure: Belief) -> jax.Array:
@@ -88,24 +143,7 @@ def _choose(
 
     # The network would count on learning more about a PoI given up. Of a known one nothing is left
     # to learn; since its class is unknown, all classes count alike.
-    q = jnp.mean(jax.vmap(values_if)(models.class_beliefs), axis=0)
-    naive = jnp.append(jnp.where(state.seen[:, robot], -1.0, 1.0), 0.0)
-    random = jax.nn.one_hot(jax.random.randint(key, (), 0, num_pois + 1), num_pois + 1)
-    values = jnp.stack([q, naive, random])[state.policy]
-    of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
-    is_latent = state.policy == LATENT
-    tolerance = jnp.where(is_latent, config.mission.equal_values, 0.0)
-    is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > values[num_pois])
-
-    place = state.scene.poses[robot, :2]
-    distance = jnp.linalg.norm(state.scene.layout.position - place[None], axis=-1)
-    is_kept = jnp.arange(num_pois) == robots.target[robot]
-    targets = others(robots.target, robot)
-    is_others = jnp.any(jnp.arange(num_pois)[:, None] == targets[None], axis=-1)
-    # First the PoI that the robot heads for already, then those no other heads for, then distance.
-    rank = distance + _KEPT * is_kept + _HEADED_FOR * (is_others & is_latent)
-    poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
-    return jnp.where(jnp.any(is_best), poi, num_pois)
+    return jnp.mean(jax.vmap(values_if)(models.class_beliefs), axis=0)
 
 
 def _best_view(

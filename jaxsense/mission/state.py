@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import Config
+from jaxsense.config import POLICIES, Config
 from jaxsense.config import values as checks
 from jaxsense.models import make_jmvae
 from jaxsense.sim import arena as arenas
@@ -18,10 +18,7 @@ from jaxsense.sim.world import Scene, World
 from jaxsense.types import Belief, Index, Key, pytree
 from jaxsense.vae import fusion
 
-POLICIES = ("latent", "naive", "random")
-"""`latent` asks the Q-networks; `naive` visits every PoI once, the nearest first; `random` takes
-any PoI, or ends. The index is the policy's code."""
-LATENT, NAIVE, RANDOM = range(3)
+LATENT = POLICIES.index("latent")
 
 IDLE, DRIVING, FACING, BACKING, ENDED, FAILED = range(6)
 """Phases of a robot: asking its policy, driving to a viewpoint, turning to a PoI and scanning it,
@@ -118,7 +115,9 @@ class MissionState:
       velocity: `[R, 3]` time derivative of the poses.
       warmstart: `[3 R]` MJX's last accelerations.
       belief: `[N, D]` the shared map.
-      seen: `[N, R]` bool, which robots have written which PoI.
+      log_posterior: `[N, C]` logarithms of the classes' probabilities by exact Bayes, for the
+        policies `bayes` and `optimal`.
+      times_seen: `[N, R]` int32, how often each robot has written each PoI.
       version: `[]` int32, writes into the map so far.
       robots: their state.
       steps: `[]` int32 control periods so far.
@@ -135,13 +134,19 @@ class MissionState:
     velocity: jax.Array
     warmstart: jax.Array
     belief: Belief
-    seen: jax.Array
+    log_posterior: jax.Array
+    times_seen: jax.Array
     version: jax.Array
     robots: Robots
     steps: jax.Array
     contacts: jax.Array
     least_clearance: jax.Array
     done: jax.Array
+
+    @property
+    def seen(self) -> jax.Array:
+        """`[..., N, R]` bool, which robots have written which PoI."""
+        return self.times_seen > 0
 
 
 @pytree
@@ -236,8 +241,9 @@ def start(
     """Starts a mission in a given arena with an empty map; see `reset` for the arguments."""
     config = mission.config
     num_robots, num_pois = len(config.modalities), config.arena.num_pois
+    num_classes = len(config.arena.classes)
     chex.assert_shape(classes, (num_pois,), custom_message="classes")
-    checks.require_index("classes", classes, len(config.arena.classes))
+    checks.require_index("classes", classes, num_classes)
     checks.require_index("policy", policy, len(POLICIES))
     chex.assert_shape(scene.poses, (num_robots, 3), custom_message="scene.poses")
     _check_faults(faults, num_robots)
@@ -252,7 +258,8 @@ def start(
         velocity=jnp.zeros((num_robots, 3)),
         warmstart=jnp.zeros(3 * num_robots),
         belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), entry),
-        seen=jnp.zeros((num_pois, num_robots), bool),
+        log_posterior=jnp.full((num_pois, num_classes), -jnp.log(num_classes)),
+        times_seen=jnp.zeros((num_pois, num_robots), jnp.int32),
         version=jnp.int32(0),
         robots=_idle_robots(num_robots, *ways.is_free.shape),
         steps=jnp.int32(0),

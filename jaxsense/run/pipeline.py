@@ -87,7 +87,8 @@ def run(
     checkpoints = checkpoints or Checkpoints()
     trained = train(key, config, programs, monitor, checkpoints)
     networks = models(trained.outputs, config)
-    played = {n: case for n, case in mission.cases(config).items() if n in mission.POLICIES}
+    cases = mission.cases(config)
+    played = {name: cases[name] for name in config.mission.policies}
     player, episodes = programs.player.result(), config.mission.episodes
     found = player.play(mission_key(key), networks, played, episodes)
     checkpoints.forget_unfinished()
@@ -115,7 +116,7 @@ def _of_agent(config: Config, modality: str, trained: Trained) -> dict[str, Any]
     env_steps = config.dqn.epochs * config.dqn.num_envs
     seconds = sum(trained.curves[f"dqn_{modality}"]["seconds"])
     return {
-        **examine.policy_metrics(total, first, config.evaluation.num_starts),
+        **examine.policy_metrics(total, first, config),
         "env_steps": env_steps,
         "env_steps_per_s": env_steps / seconds,
     }

@@ -161,7 +161,7 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
 
 def _trace_missions(programs: Programs, compiler: Compiler) -> None:
     config = programs.config
-    batch = missions.batch_of(len(mission.POLICIES) * config.mission.episodes)
+    batch = missions.batch_of(len(config.mission.policies) * config.mission.episodes)
     team = mission.make_mission(config)
     programs.player.set_result(missions.Player(team, compiler, batch, programs.workers))
 

@@ -292,6 +292,7 @@ def _named(models: Models, config: Config) -> dict[str, Any]:
         "jmvae": params,
         **filters,
         "class_beliefs": models.class_beliefs,
+        "look_values": models.look_values,
         **{f"dqn_{name}": q_network for name, q_network in q_networks},
     }
 

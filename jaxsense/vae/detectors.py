@@ -1,5 +1,7 @@
 """The scanline detectors f_x and f_w: what a sensor alone can tell of a point of interest."""
 
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,8 @@ from jaxsense.networks import MLP, Params
 from jaxsense.types import Key, pytree
 from jaxsense.vae import minibatch
 from jaxsense.vae.minibatch import FitState
+
+_MOST_TEMPERATURE = 4.0
 
 
 @pytree
@@ -101,6 +105,33 @@ def train(
         return optax.softmax_cross_entropy_with_integer_labels(predicted, labels[rows], 0).mean()
 
     return minibatch.fit(state, loss, rows, _optimiser(config), config.steps)
+
+
+def calibrate(detector: Detector, windows: jax.Array, labels: jax.Array) -> Detector:
+    """Divides logits by the temperature that suits other looks best (Guo et al. 2017, Sec. 4.2).
+
+    Args:
+      detector: a trained detector.
+      windows: `[S, F]` looks that it was not trained on.
+      labels: `[S]` int32.
+
+    Returns:
+      The detector whose probabilities make these labels most likely.
+    """
+    chex.assert_equal_shape_prefix([windows, labels], 1)
+    standard = (windows - detector.offset[None]) / detector.scale
+    predicted = networks.apply(_network(detector), detector.params, standard.T)
+
+    def loss(sharpness: jax.Array) -> jax.Array:
+        scaled = sharpness * predicted
+        return optax.softmax_cross_entropy_with_integer_labels(scaled, labels, 0).mean()
+
+    each = jnp.geomspace(1 / _MOST_TEMPERATURE, _MOST_TEMPERATURE, 257)
+    best = each[jnp.argmin(jax.lax.map(loss, each))]
+    layers = dict(detector.params["params"])
+    last = f"Dense_{len(detector.hidden)}"
+    layers[last] = jax.tree.map(lambda x: best * x, layers[last])
+    return dataclasses.replace(detector, params={**detector.params, "params": layers})
 
 
 def _network(detector: Detector) -> MLP:

@@ -152,6 +152,11 @@ def weights(params: Params, belief: Belief) -> jax.Array:
     return jnp.where(is_unseen, 1 / len(found), found / jnp.sum(found))
 
 
+def entropy(weights: jax.Array) -> jax.Array:
+    """Entropy of `[..., C]` probabilities, `[...]` in nats."""
+    return -jnp.sum(jax.scipy.special.xlogy(weights, weights), axis=-1)
+
+
 def start(params: Params, config: FilterConfig) -> FitState:
     """The state before the first gradient step: the networks alone are trained."""
     return minibatch.start(params["networks"], minibatch.adam(config.learning_rate, config.steps))

@@ -1,0 +1,155 @@
+"""The value of looks at a PoI, by dynamic programming on the posterior over its classes.
+
+Points of interest are independent, and looks cost no time in the map MDP: so an agent may decide
+for each of them alone whether another look pays. What it knows of one is the posterior over the
+classes, a point of a simplex. The values stand on a lattice in that simplex; between its points
+they are interpolated linearly over the simplices of Freudenthal's triangulation (Lovejoy 1991,
+Operations Research 39(1), Sec. 3).
+"""
+
+import itertools
+import math
+from collections.abc import Callable
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsense.config import MdpConfig, values
+from jaxsense.dqn.belief_mdp import reward
+from jaxsense.types import pytree
+
+_MOST_POINTS = 2**13
+_MOST_STEPS = 512
+_POINTS_AT_ONCE = 256
+
+
+@pytree
+class LookValues:
+    """Expected rewards of one modality's looks at a PoI.
+
+    Attributes:
+      gain: `[P]` of the next look alone.
+      total: `[P]` of the next look and of all that pay after it.
+    """
+
+    gain: jax.Array
+    total: jax.Array
+
+
+def steps_of_lattice(num_classes: int) -> int:
+    """Steps of the lattice along each edge of the simplex; the more classes, the fewer."""
+    values.require_number("num_classes", num_classes)
+    fits = [n for n in range(1, _MOST_STEPS + 1) if _num_points(n, num_classes) <= _MOST_POINTS]
+    return max(fits, default=1)
+
+
+def _num_points(steps: int, num_classes: int) -> int:
+    return math.comb(steps + num_classes - 1, num_classes - 1)
+
+
+def lattice(num_classes: int) -> np.ndarray:
+    """`[P, C]` class probabilities at the points of the lattice, in the order of their rows."""
+    steps = steps_of_lattice(num_classes)
+    each = itertools.combinations(range(steps + num_classes - 1), num_classes - 1)
+    # Between the ends, C - 1 bars divide the steps among the classes.
+    bars = np.array(list(each), int).reshape(_num_points(steps, num_classes), num_classes - 1)[
+        :, ::-1
+    ]
+    sums = bars - np.arange(num_classes - 1)[::-1]
+    ends = np.full((len(sums), 1), steps), sums, np.zeros((len(sums), 1), int)
+    weights = -np.diff(np.concatenate(ends, axis=1), axis=1) / steps
+    return weights[np.argsort(_rows(sums, steps))]
+
+
+def _rows(sums, steps: int):
+    """Row of each point: its number in the combinatorial number system.
+
+    Args:
+      sums: `[..., C - 1]` steps of all classes but the first, of all but the first two, and so on.
+      steps: of the lattice.
+    """
+    size = sums.shape[-1]
+    table = [[math.comb(n, k) for k in range(size + 1)] for n in range(steps + size)]
+    ranks = np.arange(size, 0, -1)
+    choose = np.array(table, np.int32) if isinstance(sums, np.ndarray) else jnp.array(table)
+    return choose[sums + ranks - 1, ranks].sum(axis=-1)
+
+
+def interpolate(table: jax.Array, weights: jax.Array) -> jax.Array:
+    """Reads a table between the points of the lattice.
+
+    Args:
+      table: `[P]` values at the points of `lattice`.
+      weights: `[C]` class probabilities.
+
+    Returns:
+      `[]` the value.
+    """
+    chex.assert_rank(weights, 1, custom_message="weights")
+    rows, shares = _corners(weights)
+    return jnp.sum(shares * table[rows])
+
+
+def _corners(weights: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`[C]` rows of the points of the lattice around a posterior, and their shares in it."""
+    steps = steps_of_lattice(len(weights))
+    sums = steps * jnp.cumsum(weights[::-1])[::-1][1:]
+    base = jnp.clip(jnp.floor(sums), 0, steps - 1)
+    rest = jnp.clip(sums - base, 0.0, 1.0)
+    # From the base one step along each axis, the one with the largest rest first.
+    order = jnp.argsort(-rest)
+    falling = jnp.concatenate([jnp.ones(1), rest[order], jnp.zeros(1)])
+    walk = jnp.argsort(order)[None, :] < jnp.arange(len(weights))[:, None]
+    return _rows(base.astype(jnp.int32)[None, :] + walk, steps), falling[:-1] - falling[1:]
+
+
+def solve(
+    likelihoods: jax.Array,
+    information: Callable[[jax.Array], jax.Array],
+    config: MdpConfig,
+    horizon: int,
+) -> LookValues:
+    """The values of one modality's looks.
+
+    Args:
+      likelihoods: `[C, K, C]` logarithms of the likelihoods of all classes, up to a constant, in
+        each of K equally likely looks at a PoI of each class.
+      information: `[C]` class probabilities to the `[]` information of the map's entry.
+      config: the rewards.
+      horizon: most looks at one PoI; static.
+
+    Returns:
+      The values at the points of the lattice. The optimal policy takes every look whose `total` is
+      above 0, that of no operation.
+    """
+    number, num_looks, _ = likelihoods.shape
+    chex.assert_shape(likelihoods, (number, num_looks, number), custom_message="likelihoods")
+    values.require_finite("likelihoods", likelihoods)
+    values.require_number("horizon", horizon)
+    points = jnp.asarray(lattice(number), jnp.float32)
+
+    def looks(weights: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """`[C, K]` rewards of the looks, and the corners around the posteriors after them."""
+        before = information(weights)
+
+        def look(likelihood: jax.Array):
+            after = weights * jnp.exp(likelihood - jnp.max(likelihood))
+            # Where no class is possible that the look may show.
+            after = jnp.where(jnp.sum(after) > 0, after, weights)
+            after /= jnp.sum(after)
+            return reward(information(after) - before, config), *_corners(after)
+
+        return jax.vmap(jax.vmap(look))(likelihoods)
+
+    rewards, rows, shares = jax.lax.map(looks, points, batch_size=_POINTS_AT_ONCE)
+    chances = points[:, :, None] / num_looks
+    gain = jnp.sum(chances * rewards, axis=(1, 2))
+
+    def earlier(total: jax.Array, _) -> tuple[jax.Array, None]:
+        following = jnp.sum(shares * jnp.maximum(total, 0.0)[rows], axis=-1)
+        return gain + jnp.sum(chances * following, axis=(1, 2)), None
+
+    total, _ = jax.lax.scan(earlier, gain, None, length=horizon - 1)
+    return LookValues(gain, total)
