@@ -71,8 +71,8 @@ _NOISY = Config(
         hidden=(64, 64, 64), num_scans=131072, calibration=0.1, num_held_out=32768
     ),
     jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000, restarts=1),
-    mdp=MdpConfig(reward="nats"),
-    dqn=DqnConfig(observe="bank", discount=0.5),
+    mdp=MdpConfig(reward="nats", look_cost=0.1),
+    dqn=DqnConfig(observe="bank", discount=0.2),
     navigation=NavigationConfig(view_distances=(0.5, 0.9), view_range=4.0),
     mission=MissionConfig(policies=POLICIES, episodes=64, least_confidence=0.0, equal_values=0.05),
 )

@@ -241,7 +241,9 @@ def _look(
     readings = worlds.scan_around(aim.noise_key, world, scene, data, robot, aim.bearing)
     is_blind = now(mission, state) >= state.faults.blind_at[robot]
     readings = jnp.where(is_blind, sensor.blind, readings)
-    shows = sensors.shows_poi(sensor, readings, aim.bearing, aim.distance, mission.config.arena)
+    error = jnp.radians(mission.config.viewpoint.bearing_error)
+    arena = mission.config.arena
+    shows = sensors.shows_poi(sensor, readings, aim.bearing, aim.distance, arena, error)
     features = detectors.detect(models.detectors[robot], sensors.as_window(sensor, readings))
     is_sure = jnp.max(features) >= mission.config.mission.least_confidence
     old = jax.tree.map(lambda x: x[aim.poi], state.belief)

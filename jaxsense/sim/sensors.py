@@ -32,7 +32,7 @@ from jaxsense.types import Key, pytree
 _LEAST_CHROMA = 0.1  # difference of a pixel's channels, 0 on walls, robots and in the dark
 _RANGE_TOLERANCE = 5.0  # standard deviations of the LiDAR's noise
 _LEAST_RANGE_TOLERANCE = 0.001  # m, above the rounding of a distance
-_SHARE_OF_WIDTH = 0.7  # of a PoI, in view at any error of its bearing
+_SHARE_OF_WIDTH = 0.7  # of a PoI, that a ray must meet
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour where a ray leaves the arena
 
 
@@ -210,6 +210,8 @@ def camera(config: CameraConfig) -> Sensor:
         shows=lambda readings, distance, extent: (
             readings.max(axis=-1) - readings.min(axis=-1) >= _LEAST_CHROMA
         ),
+        # In little light, it cannot tell a PoI from what covers it.
+        lost=0.5 if disturbances.changes_light(config) else 0.0,
         ray_bytes=3,  # rgb8
     )
 
@@ -381,6 +383,7 @@ def shows_poi(
     bearing: jax.Array,
     distance: jax.Array,
     arena: ArenaConfig,
+    bearing_error: jax.Array | float = 0.0,
 ) -> jax.Array:
     """Whether readings may show a PoI where it is expected.
 
@@ -393,16 +396,19 @@ def shows_poi(
       bearing: `[]` at which the PoI is expected, in radians in the robot's frame.
       distance: `[]` at which its centre is expected, in metres.
       arena: sizes of PoIs.
+      bearing_error: `[]` largest error of the bearing, in radians.
 
     Returns:
-      `[]` bool: all rays that must meet a PoI of this size can have met one, except for twice the
-      share that the sensor loses on average. False for a covered or absent PoI, or a failed sensor.
+      `[]` bool: a ray that may meet a PoI of this size can have met one, and so can all that must,
+      except for twice the share that the sensor loses on average. False for a covered or absent
+      PoI, or a failed sensor.
     """
-    angles = window_of(sensor, sensor.angles, bearing) - bearing
+    angles = jnp.abs(window_of(sensor, sensor.angles, bearing) - bearing)
     half_width = jnp.arcsin(jnp.minimum(arena.poi_half_width / distance, 1.0))
-    is_within = jnp.abs(angles) <= _SHARE_OF_WIDTH * half_width
-    is_missed = is_within & ~sensor.shows(readings, distance, arena.poi_extent)
-    return jnp.sum(is_missed) <= 2 * sensor.lost * jnp.sum(is_within)
+    shows = sensor.shows(readings, distance, arena.poi_extent)
+    must = angles <= jnp.minimum(_SHARE_OF_WIDTH * half_width, half_width - bearing_error)
+    may = angles <= half_width + bearing_error
+    return jnp.any(may & shows) & (jnp.sum(must & ~shows) <= 2 * sensor.lost * jnp.sum(must))
 
 
 def as_window(sensor: Sensor, readings: jax.Array) -> jax.Array:
