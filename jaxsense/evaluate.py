@@ -20,7 +20,7 @@ from jaxsense.config.mission import MOST_EPISODES
 from jaxsense.run import devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError
-from jaxsense.show import animation, metrics, page
+from jaxsense.show import animation, metrics, page, plots
 from jaxsense.show.terminal import Display
 from jaxsense.sim.arena import TIMESTEP
 from jaxsense.types import Belief
@@ -39,9 +39,10 @@ class Arguments:
     seed: int = 0
     """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
     policy: str = "all"
-    """`latent`, `naive` or `random`; `policies` for these three; `MODALITY_alone`,
-    `MODALITY_stops` or `MODALITY_blind`, for example `camera_alone`, for the latent policy where
-    that robot is alone, stops or goes blind after 6 s; or `all`."""
+    """`latent`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3` or `random`; `policies`
+    for all of these; `MODALITY_alone`, `MODALITY_stops` or `MODALITY_blind`, for example
+    `camera_alone`, for the latent policy where that robot is alone, stops or goes blind after 6 s;
+    or `all`."""
     devices: int | None = None
     """Accelerators, or threads on a CPU, that share the missions. By default all accelerators, or
     as many threads as cores, at most 8."""
@@ -133,6 +134,7 @@ def _write(
         summary = rundir.read_summary(arguments.run)
         summary["mission"] = _merge(summary["mission"], found, arguments)
         rundir.write_json(path, summary)
+        plots.write_missions(arguments.run, summary)
         report = page.write(arguments.run, config, summary)
     return [*written, f"The metrics are in {path}, and with all others in {report}."]
 
@@ -162,13 +164,14 @@ def _cases(arguments: Arguments, config: Config) -> dict[str, mission.Case]:
 
 def _print_table(console: rich.console.Console, found: dict[str, Any]) -> None:
     """Prints the metrics of all cases."""
-    columns = [metric.label for metric in metrics.MISSIONS]
-    table = rich.table.Table("policy", *columns, box=rich.box.SIMPLE, pad_edge=False)
+    columns = metrics.headline(metrics.MISSIONS)
+    labels = [metric.label for metric in columns]
+    table = rich.table.Table("policy", *labels, box=rich.box.SIMPLE, pad_edge=False)
     blocks = metrics.cases(found)
     for name, block in blocks.items():
-        table.add_row(name, *(metric.text(block) for metric in metrics.MISSIONS))
+        table.add_row(name, *(metric.text(block) for metric in columns))
     console.print(table)
-    for metric in metrics.MISSIONS:
+    for metric in columns:
         if metric.meaning:
             console.print(f"{metric.label}: {metric.meaning}", markup=False, style="dim")
     if {"latent", "naive"} <= set(blocks):

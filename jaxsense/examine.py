@@ -56,22 +56,22 @@ def class_beliefs(params: Params, bank: Bank, config: Config) -> Belief:
 def latent_space(
     params: Params, class_means: jax.Array, bank: Bank, config: Config
 ) -> tuple[dict[str, Belief], dict[str, Any]]:
-    """Encodes detections, alone and together, and measures the latent space.
+    """Writes detections into the map, alone and together, and measures the latent space.
 
     Args:
-      params: of the JMVAE.
+      params: of the JMVAE, with those of the filter if there is one.
       class_means: `[C, D]` of `class_beliefs`.
       bank: for each modality `[C, S, D_m]` held-out detections; the s-th of a class in one modality
         goes with the s-th in another.
       config: all settings.
 
     Returns:
-      `[C, S, D]` beliefs for `joint` and for each modality, and the block `jmvae` of the summary as
+      `[C, S, D]` beliefs for `joint` and for each modality alone, and the block `jmvae` of the summary as
       arrays. Parameters and detections that are not finite are not caught: check the beliefs.
     """
     model, num_modalities = make_jmvae(config), len(bank)
-    joint = _encode(params, model, bank, range(num_modalities))
-    alone = [_encode(params, model, bank, [m]) for m in range(num_modalities)]
+    joint = _entries(params, bank, range(num_modalities), config)
+    alone = [_entries(params, bank, [m], config) for m in range(num_modalities)]
     posteriors = {"joint": joint, **dict(zip(model.modalities, alone, strict=True))}
     classes = jnp.arange(bank[0].shape[0])
     consistent = {
@@ -94,8 +94,24 @@ def latent_space(
             for n, p in plausible.items()
         },
         "moment_matching_error": _moment_matching_error(joint, alone, config),
-        "fusion": _fusion(params, model, bank, alone, class_means),
+        "fusion": _fusion(params, bank, alone, class_means, config),
     }
+
+
+def _entries(params: Params, bank: Bank, members: Iterable[int], config: Config) -> Belief:
+    """`[C, S, D]` entries of the map after looks by some of the modalities."""
+    model = make_jmvae(config)
+    if fusion.FILTER not in params:
+        return _encode(params, model, bank, members)
+    unseen = fusion.unseen(model, config.mdp.unseen_variance)
+
+    def write(*features: jax.Array) -> Belief:
+        entry = unseen
+        for m in members:
+            entry = filtering.update(params[fusion.FILTER], model, entry, features[m], m)
+        return entry
+
+    return jax.vmap(jax.vmap(write))(*bank)
 
 
 def _encode(params: Params, model: Jmvae, bank: Bank, members: Iterable[int]) -> Belief:
@@ -123,16 +139,17 @@ def _moment_matching_error(joint: Belief, alone: list[Belief], config: Config) -
 
 
 def _fusion(
-    params: Params, model: Jmvae, bank: Bank, alone: list[Belief], class_means: jax.Array
+    params: Params, bank: Bank, alone: list[Belief], class_means: jax.Array, config: Config
 ) -> dict[str, jax.Array | None]:
     """Quality of map entries after one modality's look and then another's."""
+    model = make_jmvae(config)
     is_right, distances, widths = [], [], []
     nearest = jax.vmap(jax.vmap(lambda belief: metrics.nearest_class(belief, class_means)))
     for first, second in itertools.permutations(range(len(bank)), 2):
         seen = jnp.arange(len(bank)) == first
         write = lambda old, new: fusion.write(params, model, old, seen, new, second)  # noqa: B023, E731
         fused = jax.vmap(jax.vmap(write))(alone[first], bank[second])
-        both = _encode(params, model, bank, (first, second))
+        both = _entries(params, bank, (first, second), config)
         is_right.append(nearest(fused) == jnp.arange(len(class_means))[:, None])
         distances.append(jnp.linalg.norm((fused.mean - both.mean) / both.std, axis=-1))
         widths.append(jnp.mean(jnp.abs(jnp.log(fused.std / both.std)), axis=-1))

@@ -315,8 +315,7 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     summary = {**_header(run, timing), **blocks}
     if failed:
         summary["failed"] = {str(seed): reason for seed, reason in failed.items()}
-    curves = seeds.rewards(paths, run.settings.config, _warn)
-    plots.write_rewards(run.path, curves, summary["dqn"])
+    plots.write_seeds(run.path, seeds.rewards(paths, run.settings.config, _warn), summary)
     page.write_seeds(run.path, run.settings.config, summary)
     run.write_json("summary.json", summary)
 
@@ -362,7 +361,7 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     table = rich.table.Table("metric", *policies, title=f"{settings.preset} preset{which}")
     detectors = [summary["detectors"][modality] for modality in policies]
     blocks = [*((metric, detectors) for metric in metrics.DETECTORS)]
-    blocks += [(metric, [*policies.values()]) for metric in metrics.headline()]
+    blocks += [(metric, [*policies.values()]) for metric in metrics.headline(metrics.AGENTS)]
     for metric, columns in blocks:
         table.add_row(metric.label, *map(metric.text, columns))
     console.print(table)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense.config import MISSIONS_AT_ONCE, Config, values
+from jaxsense.mission import compare
 from jaxsense.mission.cases import Case
 from jaxsense.mission.outcome import bytes_per_detection, measure, summarise
 from jaxsense.mission.rollout import rollout_batch
@@ -26,6 +27,9 @@ from jaxsense.models import Models, init
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.types import Key
+
+REFERENCE = "latent"
+"""The policy that the others are compared with."""
 
 _CHUNK_TIME = 2.5  # s
 
@@ -226,6 +230,12 @@ def summary(mission: Mission, played: Played) -> dict[str, Any]:
     """The summary's block `mission`."""
     config = mission.config
     blocks = {name: summarise(config, name, found) for name, found in played.metrics.items()}
+    reference = played.metrics.get(REFERENCE)
+    for name, found in played.metrics.items():
+        if reference is not None and name != REFERENCE:
+            blocks[name]["intervals"] = compare.differences(found, reference)
+        if (ratios := compare.of_naive(blocks, name)) is not None:
+            blocks[name]["of_naive"] = ratios
     detections = sum(found["detections"].sum(axis=0) for found in played.metrics.values())
     size = bytes_per_detection(mission, np.asarray(detections))
     return {**blocks, "bytes_per_detection": size}

@@ -30,16 +30,19 @@ class RunResult:
     Attributes:
       models: the trained networks.
       windows: for each modality `[C, 1, F]` one look at each class.
-      posteriors: `[C, S', D]` beliefs of held-out detections, `joint` and for each modality.
-      rewards: for each modality `[epochs]` mean total reward of the episodes that ended, or NaN.
+      detections: for each modality `[C, S', D_m]` held-out detections.
+      posteriors: `[C, S', D]` beliefs of these, `joint` and for each modality.
+      rewards: for each modality the `[epochs]` mean total reward of the episodes that ended, as
+        `reward`, and of the greedy policy, as `greedy`; NaN in other epochs.
       recording: the first mission of the latent policy.
       summary: the blocks `detectors`, `jmvae`, `dqn` and `mission` of `summary.json`.
     """
 
     models: Models
     windows: dict[str, np.ndarray]
+    detections: dict[str, np.ndarray]
     posteriors: dict[str, Belief]
-    rewards: dict[str, np.ndarray]
+    rewards: dict[str, dict[str, np.ndarray]]
     recording: missions.Recording
     summary: dict[str, Any]
 
@@ -97,8 +100,12 @@ def run(
     return RunResult(
         models=networks,
         windows=dict(zip(config.modalities, detections.windows, strict=True)),
+        detections=dict(zip(config.modalities, detections.held_out, strict=True)),
         posteriors=posteriors,
-        rewards={n: np.array(trained.curves[f"dqn_{n}"]["reward"]) for n in config.modalities},
+        rewards={
+            n: {name: np.array(trained.curves[f"dqn_{n}"][name]) for name in ("reward", "greedy")}
+            for n in config.modalities
+        },
         recording=found.recording,
         summary={
             "detectors": jax.tree.map(lambda x: x.tolist(), detections.metrics),

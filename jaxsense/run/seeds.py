@@ -8,17 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.stats
 
 from jaxsense.config import Config, ConfigError
+from jaxsense.mission.compare import described
 from jaxsense.run import rundir
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.rundir import RunDirectory, Settings
 
 Timing = dict[str, dict[str, float]]
 """Seconds of each stage, `compile_s` and `run_s`."""
-
-_CONFIDENCE = 0.95
 
 
 def paths(run: RunDirectory) -> dict[int, Path]:
@@ -92,18 +90,21 @@ def statistics(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def rewards(
     runs: Sequence[Path], config: Config, warn: Callable[[str], None]
-) -> dict[str, np.ndarray]:
-    """`[K, epochs]` mean total rewards for each modality, from the checkpoints of several runs.
+) -> dict[str, dict[str, np.ndarray]]:
+    """`[K, epochs]` total rewards for each modality, from the checkpoints of several runs.
+
+    See `RunResult.rewards`.
 
     Warns of a run whose checkpoint is damaged or missing, and leaves out its curve.
     """
     shapes = {
         "reward": np.zeros(config.dqn.epochs, np.float32),
+        "greedy": np.zeros(config.dqn.epochs, np.float32),
         "epsilon": np.zeros(config.dqn.epochs, np.float32),
         "seconds": np.zeros(config.dqn.epochs // config.dqn.chunk, np.float32),
     }
 
-    def load(run: Path, modality: str) -> list[np.ndarray]:
+    def load(run: Path, modality: str) -> list[dict[str, np.ndarray]]:
         directory, name = run / "checkpoints", f"curves_dqn_{modality}"
         try:
             found = Checkpoints(directory).load(name, shapes)
@@ -113,11 +114,14 @@ def rewards(
         if found is None:
             warn(f"{directory}: holds no {name}; left out of reward.png")
             return []
-        return [found["reward"]]
+        return [found]
 
-    def load_all(modality: str) -> np.ndarray:
-        rows = [row for run in runs for row in load(run, modality)]
-        return np.stack(rows) if rows else np.zeros((0, config.dqn.epochs), np.float32)
+    def load_all(modality: str) -> dict[str, np.ndarray]:
+        found = [curves for run in runs for curves in load(run, modality)]
+        return {
+            name: np.array([curves[name] for curves in found]).reshape(-1, config.dqn.epochs)
+            for name in ("reward", "greedy")
+        }
 
     return {name: load_all(name) for name in config.modalities}
 
@@ -131,19 +135,5 @@ def _statistics(values: list[Any]) -> Any:
     if isinstance(first, list):
         return [_statistics(list(row)) for row in zip(*values, strict=True)]
     if isinstance(first, bool | int | float):
-        return None if None in values else _described(np.array(values, float))
+        return None if None in values else described(np.array(values, float))
     return None
-
-
-def interval(values: np.ndarray) -> tuple[Any, Any]:
-    """The 95% interval of the mean of `[K, ...]` values, by Student's t."""
-    average = values.mean(axis=0)
-    if len(values) == 1:
-        return average, average
-    error = scipy.stats.sem(values) * scipy.stats.t.ppf((1 + _CONFIDENCE) / 2, len(values) - 1)
-    return average - error, average + error
-
-
-def _described(values: np.ndarray) -> dict[str, float]:
-    low, high = interval(values)
-    return {"mean": float(values.mean()), "low": float(low), "high": float(high)}

@@ -1,7 +1,7 @@
 """The table of metrics, shared by the terminal, the page, the plots and the docs."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable
 from typing import Any
 
 
@@ -76,7 +76,19 @@ AGENTS = (
         "States of the map where the policy's reward is within 0.01 of the optimum.",
         digits=1,
     ),
-    Metric("num_states", "states of the map", "At most 4,096 are examined.", "384", 0),
+    Metric(
+        "num_states",
+        "states of the map",
+        "Every combination of classes and looks; at most 4,096 are examined.",
+        digits=0,
+    ),
+    Metric(
+        "optimal_permutations",
+        "optimal in permutations",
+        "Of these states, those in which all points are of different classes.",
+        digits=1,
+    ),
+    Metric("num_permutations", "permutations", paper="384", digits=0),
     Metric(
         "one_step.policy",
         "one step: DQN",
@@ -108,6 +120,11 @@ LATENT_SPACE = (
         "fusion.mean_error",
         "fusion: error",
         "Distance of these entries from both sensors' joint belief, in standard deviations.",
+    ),
+    Metric(
+        "fusion.std_error",
+        "fusion: error of sigma",
+        "Mean of |log(sigma ratio)| between these entries and the joint belief.",
     ),
     Metric(
         "moment_matching_error",
@@ -158,6 +175,14 @@ MISSIONS = (
     ),
     Metric("time_s", "time [s]", "Median time until all robots have ended.", digits=1),
     Metric(
+        "of_naive.observations_per_poi",
+        "looks of naive's",
+        "Looks over those that naive exploration needs for the same accuracy, between its one, two "
+        "and three looks of each robot at each point; over three if these are less accurate.",
+        digits=2,
+    ),
+    Metric("of_naive.time_s", "time of naive's", "The same for the time.", digits=2),
+    Metric(
         "collisions", "collisions", "Control periods in which a robot touched something.", digits=0
     ),
     Metric(
@@ -165,6 +190,13 @@ MISSIONS = (
         "goals reached",
         "Share of chosen viewpoints that robots reached.",
     ),
+    Metric(
+        "intervals.accuracy",
+        "accuracy, difference",
+        "From the latent policy, arena by arena: mean and 95% interval.",
+    ),
+    Metric("intervals.observations_per_poi", "looks, difference", "The same.", digits=2),
+    Metric("intervals.time_s", "time, difference [s]", "The same, of the mean.", digits=1),
     Metric("information", "information", "Sum of 1 / sigma norm over the finished map.", digits=2),
     Metric(
         "told",
@@ -189,12 +221,16 @@ BLOCKS = {
 }
 """The metrics by their block of `summary.json`."""
 
-_PAGE_ONLY = {"one_step.policy", "one_step.optimal", "one_step.random", "env_steps"}
+_PAGE_ONLY = {
+    *("one_step.policy", "one_step.optimal", "one_step.random", "env_steps"),
+    *("intervals.accuracy", "intervals.observations_per_poi", "intervals.time_s"),
+    *("information", "told", "ambiguous_reported", "episodes"),
+}
 
 
-def headline() -> Iterator[Metric]:
-    """The metrics of `AGENTS` that fit into a terminal."""
-    return (metric for metric in AGENTS if metric.key not in _PAGE_ONLY)
+def headline(metrics: Iterable[Metric]) -> list[Metric]:
+    """The metrics that fit into a terminal."""
+    return [metric for metric in metrics if metric.key not in _PAGE_ONLY]
 
 
 def label(key: str) -> str:
@@ -217,6 +253,6 @@ def text(value: Any, digits: int = 3) -> str:
     if value is None:
         return "-"
     if isinstance(value, dict):
-        average, low, high = (text(float(value[n]), digits) for n in ("mean", "low", "high"))
+        average, low, high = (text(float(mean(value[n])), digits) for n in ("mean", "low", "high"))
         return average if low == high else f"{average} ({low} to {high})"
     return f"{value:,}" if isinstance(value, int) else f"{value:,.{digits}f}"

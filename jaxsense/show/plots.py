@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib import cm, colormaps
 from matplotlib.collections import PatchCollection
@@ -13,34 +14,47 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
-from jaxsense.config import Config
+from jaxsense.config import POLICIES, Config
+from jaxsense.mission.compare import interval
 from jaxsense.run import files
 from jaxsense.run.pipeline import RunResult
-from jaxsense.run.seeds import interval
 from jaxsense.show import metrics
 from jaxsense.show.colours import RGB, as_srgb, class_colour
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
+from jaxsense.vae.metrics import reliability
 
 _MOST_ELLIPSES = 40
 _SMOOTHING = 20  # epochs
+_LEAST_SHARE = 1e-4
 _FAR = 0.2  # sigma from the median of its class, beyond which a detection is an outlier
 
 
 def write_plots(path: Path, config: Config, result: RunResult) -> None:
-    """Writes `latent_space.png`, `reward.png` and `scanlines.png` into a directory."""
+    """Writes the plots of a run into a directory, as `NAME.png`."""
+    summary = result.summary
     plots = {
         "latent_space": latent_space(config, result.posteriors),
-        "reward": rewards(result.rewards, result.summary["dqn"]),
+        "reward": rewards(result.rewards, summary["dqn"]),
         "scanlines": scanlines(config, result.windows),
+        "calibration": calibration(config, result.detections, summary["belief"]),
     }
     for name, figure in plots.items():
         _write(path / f"{name}.png", figure)
+    write_missions(path, summary)
 
 
-def write_rewards(path: Path, curves: dict[str, np.ndarray], agents: dict[str, Any]) -> None:
-    """Writes `reward.png` of several seeds into a directory, see `rewards`."""
-    _write(path / "reward.png", rewards(curves, agents))
+def write_seeds(
+    path: Path, curves: dict[str, dict[str, np.ndarray]], summary: dict[str, Any]
+) -> None:
+    """Writes the plots of several seeds into a directory; for `curves` see `rewards`."""
+    _write(path / "reward.png", rewards(curves, summary["dqn"]))
+    write_missions(path, summary)
+
+
+def write_missions(path: Path, summary: dict[str, Any]) -> None:
+    """Writes `policies.png` of one run or several seeds into a directory."""
+    _write(path / "policies.png", missions(summary["mission"]))
 
 
 def _write(path: Path, figure: Figure) -> None:
@@ -158,25 +172,25 @@ def _name_classes(axes: Any, centre: np.ndarray, spread: np.ndarray) -> None:
         )
 
 
-def rewards(per_epoch: dict[str, np.ndarray], agents: dict[str, Any]) -> Figure:
+def rewards(per_epoch: dict[str, dict[str, np.ndarray]], agents: dict[str, Any]) -> Figure:
     """The paper's Fig. 5: reward of whole episodes over the epochs, with baselines as lines.
 
     Args:
-      per_epoch: for each modality `[epochs]` rewards, NaN where no episode ended; or `[K, epochs]`
-        of several seeds, to show their mean and its 95% interval.
+      per_epoch: for each modality the `[epochs]` rewards of the exploring policy, `reward`, and of
+        the greedy one, `greedy`, NaN where there are none; or `[K, epochs]` of several seeds, to
+        show their mean and its 95% interval.
       agents: the block `dqn` of the summary.
     """
     figure = Figure(figsize=(5 * len(per_epoch), 4), layout="constrained")
     axes = figure.subplots(1, len(per_epoch), squeeze=False)
-    for ax, (name, reward) in zip(axes[0], per_epoch.items(), strict=True):
-        if reward.ndim == 1:
-            ax.plot(reward, color="C0", alpha=0.25, linewidth=0.8)
-        smooth = np.array([_smoothed(of_seed) for of_seed in np.atleast_2d(reward)])
-        epochs = np.arange(reward.shape[-1] - smooth.shape[-1], reward.shape[-1])
+    for ax, (name, curves) in zip(axes[0], per_epoch.items(), strict=True):
+        exploring, greedy = (np.atleast_2d(curves[kind]) for kind in ("reward", "greedy"))
+        smooth = np.array([_smoothed(of_seed) for of_seed in exploring])
         if len(smooth) > 0:
-            ax.plot(epochs, smooth.mean(axis=0), color="C0", label="DQN, exploring")
-        if len(smooth) > 1:
-            ax.fill_between(epochs, *interval(smooth), color="C0", alpha=0.2, linewidth=0)
+            epochs = np.arange(exploring.shape[1] - smooth.shape[1], exploring.shape[1])
+            _curve(ax, epochs, smooth, "0.6", "DQN, exploring")
+            measured = np.flatnonzero(np.isfinite(greedy).any(axis=0))
+            _curve(ax, measured, greedy[:, measured], "C0", "DQN, greedy")
         for i, key in enumerate(("return", "optimal", "naive", "random")):
             style = ("-.", "--", ":", (0, (1, 4)))[i]
             value = metrics.mean(agents[name][key])
@@ -186,6 +200,13 @@ def rewards(per_epoch: dict[str, np.ndarray], agents: dict[str, Any]) -> Figure:
         ax.grid(alpha=0.3)
     axes[0, 0].legend(loc="lower right")
     return figure
+
+
+def _curve(ax: Any, epochs: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:
+    """The mean of `[K, E]` values; with several seeds also its 95% interval."""
+    ax.plot(epochs, values.mean(axis=0), color=colour, label=label, linewidth=1.2)
+    if len(values) > 1:
+        ax.fill_between(epochs, *interval(values), color=colour, alpha=0.2, linewidth=0)
 
 
 def _smoothed(reward: np.ndarray) -> np.ndarray:
@@ -215,3 +236,64 @@ def scanlines(config: Config, windows: dict[str, np.ndarray]) -> Figure:
             if name == "lidar":
                 ax.set(ylabel="distance [m]", ylim=(0, None))
     return figure
+
+
+def calibration(
+    config: Config, detections: dict[str, np.ndarray], belief: dict[str, Any]
+) -> Figure:
+    """Whether probabilities are right: of the detectors, and of the map after several looks.
+
+    Args:
+      config: all settings.
+      detections: for each modality `[C, S, D_m]` held-out detections.
+      belief: the block `belief` of the summary.
+    """
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot([0, 1], [0, 1], ":", color="0.5", label="calibrated")
+    for i, (name, looks) in enumerate(detections.items()):
+        labels = jnp.repeat(jnp.array(config.label_of_class(name)), looks.shape[1])
+        flat = jnp.asarray(looks.reshape(-1, looks.shape[-1]))
+        confidence, accuracy, share = map(np.asarray, reliability(flat, labels))
+        left.plot(confidence, accuracy, color=f"C{i}", linewidth=1)
+        left.scatter(confidence, accuracy, s=10 + 300 * share, color=f"C{i}", label=name)
+    lowest = 1 / max(looks.shape[-1] for looks in detections.values())
+    left.set(xlabel="confidence", ylabel="share of right labels", title="detectors")
+    left.set(xlim=(lowest - 0.02, 1.02), ylim=(min(lowest, 0.5) - 0.1, 1.02))
+    looks = [metrics.mean(number) for number in belief["looks"]]
+    right.plot(looks, [*map(metrics.mean, belief["nll"])], "o-", label="map")
+    right.plot(looks, [*map(metrics.mean, belief["bayes_nll"])], "x--", label="exact Bayes")
+    right.set(xlabel="looks", ylabel="NLL of the true class [nats]", title="beliefs", yscale="log")
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+        ax.legend()
+    return figure
+
+
+def missions(block: dict[str, Any]) -> Figure:
+    """Share of wrong points in finished maps against looks and time, of every policy.
+
+    Args:
+      block: the block `mission` of the summary.
+    """
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    found = {name: case for name, case in metrics.cases(block).items() if name in POLICIES}
+    naive = [case for name, case in found.items() if name.startswith("naive")]
+    for ax, key in zip(axes, ("observations_per_poi", "time_s"), strict=True):
+        line = [metrics.mean(case[key]) for case in naive], [*map(_wrong, naive)]
+        ax.plot(*line, color="0.7", linewidth=1)
+        for i, (name, case) in enumerate(found.items()):
+            place = metrics.mean(case[key]), _wrong(case)
+            ax.plot(*place, "oDs^"[i % 4], color=f"C{i}", label=name.replace("_", " "))
+        metric = next(metric for metric in metrics.MISSIONS if metric.key == key)
+        ax.set(xlabel=metric.label, xlim=(0, None), yscale="log")
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("share of wrong points")
+    axes[1].legend(loc="upper left")
+    return figure
+
+
+def _wrong(case: dict[str, Any]) -> float:
+    """The share of wrong points of a case, above 0 for an axis of logarithms."""
+    return max(1 - metrics.mean(case["accuracy"]), _LEAST_SHARE)

@@ -91,22 +91,25 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
 
     Returns:
       The columns, and a row for each class: the result here, and in the paper's Table I if that
-      has the same classes and sensors.
+      has the same classes and sensors; in brackets, the share of looks that leave open just those
+      classes that the sensors cannot distinguish.
     """
-    shares = summary["jmvae"]["unambiguous"]
+    shares, consistent = summary["jmvae"]["unambiguous"], summary["jmvae"]["consistent"]
     alone = [name for name in shares if name != "joint"]
     is_paper = set(classes) == PAPER_CLASSES and set(alone) == PAPER_MODALITIES
 
-    def cell(label: str, name: str, holds: float) -> str:
+    def cell(c: int, label: str, name: str) -> str:
+        holds = mean(shares[name][c])
         here = _YES_OR_NO.get(holds, f"{holds:.0%}")  # of several seeds
+        just = f"\u00a0({mean(consistent[name][c]):.1%})"
         if not is_paper:
-            return here
+            return f"{here}{just}"
         there = _YES_OR_NO[name == "joint" or PAPER_TABLE[label, name]]
-        return f"{here}\u00a0/\u00a0{there}"
+        return f"{here}\u00a0/\u00a0{there}{just}"
 
     columns = [*alone, "joint"]
     rows = [
-        Row(label, [cell(label, name, mean(shares[name][c])) for name in columns], "", "")
+        Row(label, [cell(c, label, name) for name in columns], "", "")
         for c, label in enumerate(classes)
     ]
     return [*alone, "together"], rows
@@ -115,8 +118,9 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
 def missions(summary: Summary) -> tuple[list[str], list[Row]]:
     """Missions: policies and failures as columns, and their metrics as rows."""
     blocks = cases(summary["mission"])
-    # Some metrics exist only where a robot is alone.
-    measured = [m for m in metrics.MISSIONS if any(m.key in block for block in blocks.values())]
+    # Some metrics exist only where a robot is alone, or beside other policies.
+    every = blocks.values()
+    measured = [m for m in metrics.MISSIONS if any(m.text(block) != "-" for block in every)]
     rows = [_row(metric, blocks.values()) for metric in measured]
     reasons = {reason for block in blocks.values() for reason in block["ended"]} - {"finished"}
     for reason in sorted(reasons):

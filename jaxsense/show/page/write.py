@@ -27,8 +27,20 @@ PLOTS = {
     "reward": (
         "Total reward of an episode over the epochs of training, for each Q-network, with lines "
         "for the optimal, the naive and the random policy",
-        "The paper's Fig. 5. A Q-network still explores while it trains; the greedy line is what "
-        "it has learned.",
+        "The paper's Fig. 5: the greedy policy of each Q-network, played from random starts after "
+        "every tenth epoch. Beside it the episodes with which it trains, in which it explores.",
+    ),
+    "policies": (
+        "Share of wrong points in finished maps against looks and against time, for each policy",
+        "What a look is worth: policies that choose looks by what they reveal, and naive "
+        "exploration with one, two and three looks at each point, joined by a line.",
+    ),
+    "calibration": (
+        "Share of right labels against the detectors' confidence, and the likelihood of the true "
+        "class in the map against the number of looks, beside exact Bayes",
+        "Whether beliefs are right. Left: a detector is calibrated where its points lie on the "
+        "diagonal; larger points hold more looks. Right: the map after one to six looks, beside "
+        "the exact Bayes filter over classes on the same detections.",
     ),
     "scanlines": (
         "One look at each class, as each detector reads it",

@@ -1,0 +1,72 @@
+"""Comparisons of policies that played in the same arenas."""
+
+from typing import Any
+
+import numpy as np
+import scipy.stats
+
+_CONFIDENCE = 0.95
+_NAIVE = ("naive", "naive_2", "naive_3")
+
+
+def interval(values: np.ndarray) -> tuple[Any, Any]:
+    """The 95% interval of the mean of `[K, ...]` values, by Student's t."""
+    average = values.mean(axis=0)
+    if len(values) == 1:
+        return average, average
+    error = scipy.stats.sem(values) * scipy.stats.t.ppf((1 + _CONFIDENCE) / 2, len(values) - 1)
+    return average - error, average + error
+
+
+def described(values: np.ndarray) -> dict[str, float]:
+    """The mean of `[K]` values and its 95% interval."""
+    low, high = interval(values)
+    return {"mean": float(values.mean()), "low": float(low), "high": float(high)}
+
+
+def differences(found: dict[str, Any], reference: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """Mean differences of one case from another, arena by arena, with their 95% intervals.
+
+    Args:
+      found: `[E, ...]` metrics of the case, see `mission.measure`.
+      reference: of the other case, in the same arenas.
+    """
+
+    def of_missions(metrics: dict[str, Any]) -> dict[str, np.ndarray]:
+        return {
+            "accuracy": metrics["is_right"].mean(axis=-1),
+            "observations_per_poi": metrics["observations_per_poi"],
+            "time_s": metrics["time_s"],
+        }
+
+    own, other = of_missions(found), of_missions(reference)
+    return {name: described(np.asarray(own[name] - other[name], float)) for name in own}
+
+
+def of_naive(blocks: dict[str, dict[str, Any]], name: str) -> dict[str, float] | None:
+    """Looks and time of a policy over those of naive exploration of the same accuracy.
+
+    Between one, two and three looks of each robot at each PoI, naive exploration is interpolated
+    linearly. A policy that is more accurate than all of these is compared with the most accurate
+    one, which is no flattery: naive exploration would need even more.
+
+    Args:
+      blocks: of the summary, for every case that was played.
+      name: of the policy.
+
+    Returns:
+      The ratios; None if naive exploration was not played, or is more accurate with fewer looks.
+    """
+    if not {name, *_NAIVE} <= set(blocks):
+        return None
+    naive = sorted((blocks[each] for each in _NAIVE), key=lambda block: block["accuracy"])
+    accuracies = [block["accuracy"] for block in naive]
+    if blocks[name]["accuracy"] < accuracies[0]:
+        return None
+    return {
+        key: float(
+            blocks[name][key]
+            / np.interp(blocks[name]["accuracy"], accuracies, [block[key] for block in naive])
+        )
+        for key in ("observations_per_poi", "time_s")
+    }
