@@ -66,8 +66,9 @@ def latent_space(
       config: all settings.
 
     Returns:
-      `[C, S, D]` beliefs for `joint` and for each modality alone, and the block `jmvae` of the summary as
-      arrays. Parameters and detections that are not finite are not caught: check the beliefs.
+      `[C, S, D]` beliefs for `joint` and for each modality alone, and the block `jmvae` of the
+      summary as arrays. Parameters and detections that are not finite are not caught: check the
+      beliefs.
     """
     model, num_modalities = make_jmvae(config), len(bank)
     joint = _entries(params, bank, range(num_modalities), config)

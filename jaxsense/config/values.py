@@ -42,6 +42,14 @@ def require_finite(name: str, value: Any) -> None:
     require(name, value, np.isfinite, "must be finite")
 
 
+def require_probabilities(name: str, value: Any) -> None:
+    """Raises a `ValueError` unless all numbers are within 0 and 1, and their sum is 1."""
+    require(name, value, lambda x: (x >= 0) & (x <= 1), "must be probabilities, within 0 and 1")
+    if not isinstance(value, Tracer):
+        total = np.sum(np.asarray(value), axis=-1)
+        require(f"sum of {name}", total, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
+
+
 def require_index(name: str, value: Any, number: int) -> None:
     """Raises a `ValueError` unless all numbers are whole and within 0 and `number - 1`."""
     expected = f"must be a whole number from 0 to {number - 1}"

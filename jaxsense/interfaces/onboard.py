@@ -10,7 +10,7 @@ import numpy as np
 from jaxsense import networks
 from jaxsense.config import Config
 from jaxsense.dqn import belief_mdp, policies
-from jaxsense.models import Models, make_jmvae
+from jaxsense.models import Models, make_jmvae, most_likely_class
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
 from jaxsense.vae import detectors, fusion, jmvae, metrics
@@ -119,12 +119,12 @@ def _classify(models: Models) -> Function:
     def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
         entry = Belief(mean, std)
         return {
-            "nearest": metrics.nearest_class(entry, means).astype(jnp.int32),
+            "nearest": most_likely_class(models, entry).astype(jnp.int32),
             "plausible": metrics.plausible_classes(entry, means),
         }
 
     inputs = {"mean": _floats(means.shape[1]), "std": _floats(means.shape[1])}
-    return Function("the nearest class, and those that a belief leaves open", inputs, apply)
+    return Function("the most likely class, and those that a belief leaves open", inputs, apply)
 
 
 def _floats(*shape: int) -> jax.ShapeDtypeStruct:

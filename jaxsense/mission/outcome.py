@@ -1,5 +1,6 @@
 """Ends and results of missions."""
 
+import functools
 from typing import Any
 
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 from jaxsense.config import Config
 from jaxsense.dqn import belief_mdp
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
-from jaxsense.models import Models
+from jaxsense.models import Models, most_likely_class
 from jaxsense.vae import metrics
 
 REASONS = (
@@ -56,16 +57,16 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
       and `reason`.
     """
     config = mission.config
-    nearest = jax.vmap(lambda b: metrics.nearest_class(b, models.class_beliefs.mean))(state.belief)
+    shown = jax.vmap(functools.partial(most_likely_class, models))(state.belief)
     plausible = jax.vmap(lambda b: metrics.plausible_classes(b, models.class_beliefs.mean))(
         state.belief
     )
     is_seen = jnp.any(state.seen, axis=-1)
-    is_right = is_seen & (nearest == state.classes)
+    is_right = is_seen & (shown == state.classes)
     told = {}
     for modality in config.modalities:
         labels = jnp.array(config.label_of_class(modality))
-        told[modality] = jnp.mean(is_seen & (labels[nearest] == labels[state.classes]))
+        told[modality] = jnp.mean(is_seen & (labels[shown] == labels[state.classes]))
     robots = state.robots
     return {
         "classes": state.classes,

@@ -76,9 +76,7 @@ def update(
         raise ValueError(f"modality = {modality}: must be an index of {model.modalities}")
     size = (model.feature_sizes[modality],)
     chex.assert_shape(features, size, custom_message=f"features of {model.modalities[modality]}")
-    is_share = "must be probabilities, within 0 and 1"
-    values.require("features", features, lambda x: (x >= 0) & (x <= 1), is_share)
-    values.require("sum of features", jnp.sum(features), lambda x: abs(x - 1) < 1e-3, "must be 1")
+    values.require_probabilities("features", features)
     chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
     chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
     values.require_finite("belief.mean", belief.mean)

@@ -27,7 +27,7 @@ def log_likelihoods(features: jax.Array, label_of_class: jax.Array) -> jax.Array
     chex.assert_rank(features, 1, custom_message="features")
     chex.assert_rank(label_of_class, 1, custom_message="label_of_class")
     values.require_index("label_of_class", label_of_class, len(features))
-    values.require_finite("features", features)
+    values.require_probabilities("features", features)
     label_of_class = jnp.asarray(label_of_class)
     prior = jnp.zeros(len(features)).at[label_of_class].add(1 / len(label_of_class))
     ratio = jnp.maximum(features[label_of_class], LEAST_PROBABILITY) / prior[label_of_class]
