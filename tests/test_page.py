@@ -21,8 +21,8 @@ BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None
 
 POLICY = {
     "return": 1.2345, "optimal": 1.25, "naive": 1.0, "random": -1.5, "fraction_of_optimal": 0.9876,
-    "one_step": {"policy": 0.86, "optimal": 0.87, "random": -0.1}, "optimal_states": 380,
-    "num_states": 384, "env_steps": 409600, "env_steps_per_s": 50000.4,
+    "one_step": {"policy": 0.86, "optimal": 0.87, "random": -0.1}, "optimal_states": 1700,
+    "num_states": 1728, "optimal_permutations": 380, "num_permutations": 384, "env_steps": 409600, "env_steps_per_s": 50000.4,
 }  # fmt: skip
 MISSION = {
     "accuracy": 0.998, "observations_per_poi": 1.68, "time_s": 13.8, "collisions": 0,
@@ -43,6 +43,7 @@ SUMMARY = {
         "moment_matching_error": 0.0067,
         "sigma_norm": {name: [0.5, 1.25, 1.5] for name in TABLE},
         "unambiguous": TABLE,
+        "consistent": {name: [0.995, 1.0, 0.5] for name in TABLE},
     },
     "dqn": {"camera": POLICY, "lidar": POLICY},
     "mission": {
@@ -116,13 +117,17 @@ def test_figures_stand_beside_those_of_the_paper(read):
     rows = {row[0]: row[1:] for row in read.rows if len(row) > 1}
     assert rows["episode: DQN, greedy"] == ["1.234", "1.234", "Fig. 5"]
     assert rows["one step: optimal"] == ["0.870", "0.870", "0.426*"]
-    assert rows["optimal in states"] == ["380", "380", "-"]
-    assert rows["states of the map"] == ["384", "384", "384"]
+    assert rows["optimal in states"] == ["1,700", "1,700", "-"]
+    assert rows["states of the map"] == ["1,728", "1,728", "-"]
+    assert rows["optimal in permutations"] == ["380", "380", "-"]
+    assert rows["permutations"] == ["384", "384", "384"]
     assert rows["sigma norm, unambiguous"] == ["0.50 to 1.50", "from 1.05"]
     assert rows["dimensions in use"] == ["2", "1"]
     # Camera, LiDAR and both; the paper's LiDAR cannot tell a red cylinder.
-    assert rows["red cylinder"] == ["no / no", "yes / no", "yes / yes"]
-    assert rows["red cube"] == ["no / no", "yes / yes", "yes / yes"]
+    # In brackets the looks after which just the right classes are plausible.
+    red = ["no / no (100.0%)", "yes / no (100.0%)", "yes / yes (100.0%)"]
+    assert rows["red cylinder"] == red
+    assert rows["red cube"] == ["no / no (50.0%)", "yes / yes (50.0%)", "yes / yes (50.0%)"]
     assert rows["accuracy"] == ["0.998", "0.998"]
     assert rows["goals reached"] == ["-", "-"]
     assert rows["time limit"] == ["1", "1"]
@@ -152,7 +157,7 @@ def test_with_other_classes_there_is_nothing_to_compare(tmp_path):
     arena = dataclasses.replace(CONFIG.arena, classes=classes)
     path = page.write(write_run(tmp_path), dataclasses.replace(CONFIG, arena=arena), SUMMARY)
     rows = {row[0]: row[1:] for row in Reader(path.read_text()).rows if row}
-    assert rows["blue cylinder"] == ["yes", "no", "yes"]
+    assert rows["blue cylinder"] == ["yes (99.5%)", "no (99.5%)", "yes (99.5%)"]
 
 
 @pytest.mark.parametrize(

@@ -123,3 +123,51 @@ def test_every_class_has_a_colour_of_its_own(arena):
 def test_a_class_is_drawn_in_the_colour_of_its_pois_or_else_darker():
     found = [colours.class_colour(CONFIG.arena, label) for label in CONFIG.arena.classes]
     np.testing.assert_allclose(found, [[0.1, 0.7, 0.1], [0.8, 0.1, 0.1], [0.4, 0.05, 0.05]])
+
+
+def test_the_greedy_policy_is_drawn_where_it_was_played():
+    curves = {"reward": np.arange(40.0), "greedy": np.full(40, np.nan)}
+    curves["greedy"][[9, 19, 29, 39]] = [1.0, 2.0, 3.0, 4.0]
+    agent = {"return": 4.0, "optimal": 4.5, "naive": 1.0, "random": -1.0}
+    figure = plots.rewards({"camera": curves}, {"camera": agent})
+    lines = {line.get_label(): line for line in figure.axes[0].lines}
+    np.testing.assert_array_equal(lines["DQN, greedy"].get_xdata(), [9, 19, 29, 39])
+    np.testing.assert_array_equal(lines["DQN, greedy"].get_ydata(), [1, 2, 3, 4])
+    # The mean of the last 20 epochs, from 20 to 39.
+    assert lines["DQN, exploring"].get_ydata()[-1] == 29.5
+
+
+def test_every_policy_stands_at_its_looks_and_its_share_of_wrong_points():
+    def case(accuracy, looks, seconds):
+        return {"accuracy": accuracy, "observations_per_poi": looks, "time_s": seconds}
+
+    block = {
+        "latent": case(0.98, 2.5, 40.0),
+        "naive": case(0.9, 2.0, 42.0),
+        "naive_2": case(0.95, 4.0, 50.0),
+        "naive_3": case(1.0, 6.0, 55.0),
+        "camera_alone": case(0.5, 1.0, 20.0),
+        "bytes_per_detection": {"latent": 16, "raw": 2000},
+    }
+    by_looks, by_time = plots.missions(block).axes
+    line, latent, *naive = by_looks.lines
+    np.testing.assert_array_equal(line.get_xdata(), [2, 4, 6])
+    # All right is below every share of wrong points, at the end of the axis.
+    np.testing.assert_allclose(line.get_ydata(), [0.1, 0.05, 1e-4])
+    assert (latent.get_label(), latent.get_xdata()) == ("latent", [2.5])
+    np.testing.assert_allclose(latent.get_ydata(), [0.02])
+    assert [point.get_label() for point in naive] == ["naive", "naive 2", "naive 3"]
+    assert by_time.lines[1].get_xdata() == [40.0]
+
+
+def test_a_detector_that_is_calibrated_lies_on_the_diagonal():
+    # Of ten looks at a class, nine say so with .9, and one says the opposite.
+    right, wrong = [0.9, 0.1], [0.1, 0.9]
+    looks = np.array([[right] * 9 + [wrong], [right] * 9 + [wrong], [wrong] * 9 + [right]])
+    belief = {"looks": [1, 2], "nll": [0.5, 0.2], "bayes_nll": [0.4, 0.1]}
+    detectors, beliefs = plots.calibration(CONFIG, {"lidar": looks}, belief).axes
+    confidence, accuracy = detectors.lines[1].get_data()
+    np.testing.assert_allclose(confidence[np.isfinite(confidence)], [0.9], rtol=1e-6)
+    np.testing.assert_allclose(accuracy[np.isfinite(accuracy)], [0.9], rtol=1e-6)
+    assert [line.get_label() for line in beliefs.lines] == ["map", "exact Bayes"]
+    np.testing.assert_array_equal(beliefs.lines[0].get_ydata(), [0.5, 0.2])

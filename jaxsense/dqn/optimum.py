@@ -72,7 +72,7 @@ def _rows(sums, steps: int):
     """
     size = sums.shape[-1]
     table = [[math.comb(n, k) for k in range(size + 1)] for n in range(steps + size)]
-    ranks = np.arange(size, 0, -1)
+    ranks = np.broadcast_to(np.arange(size, 0, -1), sums.shape)
     choose = np.array(table, np.int32) if isinstance(sums, np.ndarray) else jnp.array(table)
     return choose[sums + ranks - 1, ranks].sum(axis=-1)
 

@@ -23,6 +23,11 @@ class Metric:
     paper: str = ""
     digits: int = 3
 
+    @property
+    def block(self) -> str:
+        """The first part of its key."""
+        return self.key.split(".")[0]
+
     def text(self, block: dict[str, Any]) -> str:
         """Its value in a block, or of several seeds the mean and its 95% interval."""
         value: Any = block

@@ -43,7 +43,7 @@ def test_figures_as_worked_by_hand(team, known, ended):
         detections=jnp.array([3, 1]),
     )
     state = replace(ended, belief=Belief(mean, std), robots=robots, contacts=jnp.int32(4))
-    state = replace(state, seen=jnp.array([[True, False]] * 3))
+    state = replace(state, times_seen=jnp.array([[1, 0]] * 3))
     found = mission.measure(team, known, state)
     np.testing.assert_array_equal(found["is_right"], [True, True, False])
     np.testing.assert_array_equal(found["ambiguous"], [False, True, False])
@@ -56,7 +56,7 @@ def test_figures_as_worked_by_hand(team, known, ended):
     # 1 / .5 + 1 / sqrt(.09 + 1.44) + 1 / .5
     np.testing.assert_allclose(found["information"], 4 + 1 / np.sqrt(1.53), rtol=1e-5)
     # What nobody has seen is neither right nor reported.
-    unseen = mission.measure(team, known, replace(state, seen=jnp.zeros((3, 2), bool)))
+    unseen = mission.measure(team, known, replace(state, times_seen=jnp.zeros((3, 2), int)))
     assert not np.any(unseen["is_right"])
     assert not np.any(unseen["ambiguous"])
     assert unseen["told"]["camera"] == 0
@@ -144,7 +144,7 @@ def test_bytes_of_a_detection_as_worked_by_hand(team):
 def test_cases_are_the_policies_and_every_failure_of_every_robot():
     cases = mission.cases(CONFIG)
     assert list(cases) == [
-        "latent", "naive", "random",
+        *mission.POLICIES,
         "camera_alone", "camera_stops", "camera_blind",
         "lidar_alone", "lidar_stops", "lidar_blind",
     ]  # fmt: skip
@@ -154,7 +154,7 @@ def test_cases_are_the_policies_and_every_failure_of_every_robot():
     np.testing.assert_array_equal(cases["naive"].faults.stops_at, [np.inf, np.inf])
     settings = replace(CONFIG.jmvae, reconstruction_weights=(1.0,))
     single = replace(CONFIG, modalities=("camera",), jmvae=settings)
-    assert list(mission.cases(single)) == ["latent", "naive", "random"]
+    assert list(mission.cases(single)) == list(mission.POLICIES)
 
 
 def test_a_mission_of_another_size_is_named(team, arena_of):

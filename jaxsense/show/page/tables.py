@@ -120,7 +120,7 @@ def missions(summary: Summary) -> tuple[list[str], list[Row]]:
     blocks = cases(summary["mission"])
     # Some metrics exist only where a robot is alone, or beside other policies.
     every = blocks.values()
-    measured = [m for m in metrics.MISSIONS if any(m.text(block) != "-" for block in every)]
+    measured = [m for m in metrics.MISSIONS if any(m.block in block for block in every)]
     rows = [_row(metric, blocks.values()) for metric in measured]
     reasons = {reason for block in blocks.values() for reason in block["ended"]} - {"finished"}
     for reason in sorted(reasons):

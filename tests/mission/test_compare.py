@@ -1,0 +1,74 @@
+"""Differences between policies, and looks and time at equal accuracy, as worked by hand."""
+
+import numpy as np
+import pytest
+
+from jaxsense.mission import compare
+
+
+def test_the_interval_is_that_of_student():
+    # 1 and 3: the mean 2, its error 1, and t(.975, 1 degree of freedom) 12.706; 2 and 2 have none.
+    low, high = compare.interval(np.array([[1.0, 2.0], [3.0, 2.0]]))
+    np.testing.assert_allclose(low, [2 - 12.706, 2], atol=1e-3)
+    np.testing.assert_allclose(high, [2 + 12.706, 2], atol=1e-3)
+
+
+def test_differences_are_taken_arena_by_arena():
+    # Of two PoIs: half, both and both right, against none, half and half.
+    found = {
+        "is_right": np.array([[True, False], [True, True], [True, True]]),
+        "observations_per_poi": np.array([2.0, 1.0, 3.0]),
+        "time_s": np.array([10.0, 20.0, 30.0]),
+    }
+    other = {
+        "is_right": np.array([[False, False], [True, False], [False, True]]),
+        "observations_per_poi": np.array([3.0, 1.0, 5.0]),
+        "time_s": np.array([11.0, 22.0, 33.0]),
+    }
+    differences = compare.differences(found, other)
+    assert differences["accuracy"] == {"mean": 0.5, "low": 0.5, "high": 0.5}
+    # -1, 0 and -2: the mean -1, its error 1 / sqrt(3), and t(.975, 2) 4.303. Unpaired, the large
+    # differences between arenas would count.
+    half = 4.303 / np.sqrt(3)
+    expected = {"mean": -1.0, "low": -1 - half, "high": -1 + half}
+    assert differences["observations_per_poi"] == pytest.approx(expected, abs=1e-3)
+    assert differences["time_s"]["mean"] == -2
+
+
+def block(accuracy, looks, seconds):
+    return {"accuracy": accuracy, "observations_per_poi": looks, "time_s": seconds}
+
+
+NAIVE = {
+    "naive": block(0.90, 2.0, 40.0),
+    "naive_2": block(0.96, 4.0, 50.0),
+    "naive_3": block(0.98, 6.0, 60.0),
+}
+
+
+@pytest.mark.parametrize(
+    ("accuracy", "looks", "seconds"),
+    [
+        (0.93, 3.0, 45.0),  # half way from one look to two
+        (0.97, 5.0, 55.0),
+        (0.98, 6.0, 60.0),
+        (0.99, 6.0, 60.0),  # no better than three looks
+    ],
+)
+def test_naive_exploration_of_the_same_accuracy_is_interpolated(accuracy, looks, seconds):
+    found = compare.of_naive({**NAIVE, "latent": block(accuracy, 1.5, 30.0)}, "latent")
+    expected = {"observations_per_poi": 1.5 / looks, "time_s": 30 / seconds}
+    assert found == pytest.approx(expected)
+
+
+def test_a_third_look_that_makes_it_worse_counts_at_its_accuracy():
+    worse = {**NAIVE, "naive_3": block(0.95, 6.0, 60.0), "latent": block(0.99, 2.0, 30.0)}
+    # The most accurate is naive_2, with 4 looks.
+    assert compare.of_naive(worse, "latent")["observations_per_poi"] == 0.5
+
+
+def test_there_is_nothing_to_compare_with_below_one_look_or_without_all_three():
+    assert compare.of_naive({**NAIVE, "latent": block(0.89, 1.0, 9.0)}, "latent") is None
+    two = {name: NAIVE[name] for name in ("naive", "naive_2")}
+    assert compare.of_naive({**two, "latent": block(0.97, 1.0, 9.0)}, "latent") is None
+    assert compare.of_naive(NAIVE, "latent") is None
