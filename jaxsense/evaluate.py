@@ -184,8 +184,8 @@ def _print_table(console: rich.console.Console, found: dict[str, Any]) -> None:
             console.print(f"{name}: of {block['episodes']} missions {reasons}")
     size = found["bytes_per_detection"]
     console.print(
-        f"A detection takes {size['latent']:.0f} bytes in the map and {size['raw']:.0f} as a raw "
-        f"scan, {size['raw'] / size['latent']:.0f} times as much."
+        f"A detection takes {size['latent']:.0f} bytes in the map, {size['features']:.0f} as the "
+        f"detector's features and {size['raw']:.0f} as a raw scan."
     )
 
 

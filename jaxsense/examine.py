@@ -24,7 +24,7 @@ from jaxsense.vae.jmvae import Jmvae
 POLICIES = ("return", "optimal", "naive", "random")
 """The greedy policy of a Q-network, and its baselines."""
 _EXPECTATION_DRAWS = 1024
-_LOOKS, _HISTORIES = 6, 8190  # of random histories of looks at one PoI
+_LOOKS, _HISTORIES = 6, 65520  # of random histories of looks at one PoI
 
 
 def detector(looks: jax.Array, label_of_class: jax.Array) -> dict[str, jax.Array]:
@@ -145,13 +145,13 @@ def _fusion(
     """Quality of map entries after one modality's look and then another's."""
     model = make_jmvae(config)
     is_right, distances, widths = [], [], []
-    nearest = jax.vmap(jax.vmap(lambda belief: metrics.nearest_class(belief, class_means)))
+    shown = jax.vmap(jax.vmap(lambda b: fusion.most_likely_class(params, class_means, b)))
     for first, second in itertools.permutations(range(len(bank)), 2):
         seen = jnp.arange(len(bank)) == first
         write = lambda old, new: fusion.write(params, model, old, seen, new, second)  # noqa: B023, E731
         fused = jax.vmap(jax.vmap(write))(alone[first], bank[second])
         both = _entries(params, bank, (first, second), config)
-        is_right.append(nearest(fused) == jnp.arange(len(class_means))[:, None])
+        is_right.append(shown(fused) == jnp.arange(len(class_means))[:, None])
         distances.append(jnp.linalg.norm((fused.mean - both.mean) / both.std, axis=-1))
         widths.append(jnp.mean(jnp.abs(jnp.log(fused.std / both.std)), axis=-1))
     # One modality fuses nothing.

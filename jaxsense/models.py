@@ -10,7 +10,7 @@ from jaxsense.dqn.optimum import LookValues
 from jaxsense.networks import Params
 from jaxsense.sim import sensors
 from jaxsense.types import Belief, Key, pytree
-from jaxsense.vae import detectors, filtering, jmvae, metrics
+from jaxsense.vae import detectors, filtering, jmvae
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.fusion import FILTER
 from jaxsense.vae.jmvae import Jmvae
@@ -41,16 +41,6 @@ class Models:
     def readout(self) -> Params:
         """What `filtering.weights` reads the map with."""
         return {"classes": self.class_beliefs, "inverse": self.moments_inverse}
-
-
-def most_likely_class(models: Models, belief: Belief) -> jax.Array:
-    """Class that a `[D]` entry of the map shows, `[]` int32.
-
-    Of a map that a filter writes, that of the highest weight; otherwise the nearest.
-    """
-    if FILTER in models.jmvae:
-        return jnp.argmax(filtering.weights(models.readout, belief))
-    return metrics.nearest_class(belief, models.class_beliefs.mean)
 
 
 def make_jmvae(config: Config) -> Jmvae:

@@ -1,7 +1,8 @@
 """Two ways for the map MDP to look at a point of interest.
 
 `live` casts a scan in the environment's own MJX arena and runs the detector on it; `bank` draws
-from stored detections of those scans. Their features have the same distribution.
+from stored detections of those scans. Features of single looks have the same distribution; live
+looks of one scene share its light.
 """
 
 import chex

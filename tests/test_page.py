@@ -49,7 +49,7 @@ SUMMARY = {
     "mission": {
         "latent": MISSION,
         "camera_alone": MISSION,
-        "bytes_per_detection": {"latent": 16.0, "raw": 2326.5},
+        "bytes_per_detection": {"latent": 16.0, "features": 8.0, "raw": 2326.5},
     },
 }
 

@@ -43,8 +43,8 @@ def test_classes_are_named_above_their_ellipses_and_together_where_they_look_ali
 @pytest.mark.parametrize(("outlier", "number"), [(None, 0), ((2.2, 0.3), 3)])
 def test_outliers_are_counted_and_crossed(outlier, number):
     axes, labels = drawn(outlier)
-    told = [label for label in labels if "not sure" in label]
-    assert told == ([f"{number} of 90 detections, where a detector was not sure"] if number else [])
+    told = [label for label in labels if "far from" in label]
+    assert told == ([f"{number} of 90 detections, far from most of their class"] if number else [])
     crosses = [c.get_offsets() for c in axes.collections[1::2] if len(c.get_paths()[0].codes) == 4]
     assert sum(map(len, crosses)) == number / 3
 

@@ -16,8 +16,9 @@ MOST_EPISODES = 100_000
 POLICIES = ("latent", "greedy", "bayes", "optimal", "naive", "naive_2", "naive_3", "random")
 """Policies of robots in missions; the index is the policy's code. `latent` asks the Q-networks.
 `greedy` takes the look of the highest expected gain on the map, `bayes` on the exact posterior over
-the classes, and `optimal` the look of the highest total gain by dynamic programming; `naive` visits
-every PoI once, `naive_2` twice, `naive_3` three times; `random` takes any PoI, or ends."""
+the classes, and `optimal` the look of the highest total gain by dynamic programming. With `naive`
+every robot looks at every PoI once, with `naive_2` twice, with `naive_3` three times. `random`
+takes any PoI, or ends."""
 
 MISSIONS_AT_ONCE = 384
 """Most missions that are played side by side."""
@@ -90,7 +91,7 @@ class MissionConfig:
     control_period: float = 0.1
     """Seconds between a robot's decisions, and between its scans."""
     equal_values: Traced[float] = 0.1
-    """Actions whose values are this close to the best, in inverse latent units, count as equally
+    """Actions whose values are this close to the best, in units of the reward, count as equally
     good; see `nearest_first` and `avoids_targets`."""
     nearest_first: Traced[bool] = True
     """Whether a robot takes the nearest of equally good PoIs; otherwise the first."""

@@ -85,6 +85,6 @@ PRESETS: dict[str, Config] = {
     "noisy": _NOISY,
     "smoke": _SMOKE,
 }
-"""`default`: the best settings we know. `paper`: those of the paper, and those of its authors' code
-where the paper is silent. `noisy`: sensors that are often unsure, and beliefs that accumulate
-looks. `smoke`: the whole pipeline in seconds, for tests."""
+"""`default`: the best settings we know. `paper`: those of the paper where it states them, otherwise
+chosen to reproduce its figures, see `docs/differences.md`. `noisy`: sensors that are often unsure,
+and beliefs that accumulate looks. `smoke`: the whole pipeline in seconds, for tests."""

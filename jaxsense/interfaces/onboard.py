@@ -10,7 +10,7 @@ import numpy as np
 from jaxsense import networks
 from jaxsense.config import Config
 from jaxsense.dqn import belief_mdp, policies
-from jaxsense.models import Models, make_jmvae, most_likely_class
+from jaxsense.models import Models, make_jmvae
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
 from jaxsense.vae import detectors, fusion, jmvae, metrics
@@ -119,7 +119,7 @@ def _classify(models: Models) -> Function:
     def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
         entry = Belief(mean, std)
         return {
-            "nearest": most_likely_class(models, entry).astype(jnp.int32),
+            "nearest": fusion.most_likely_class(models.jmvae, means, entry).astype(jnp.int32),
             "plausible": metrics.plausible_classes(entry, means),
         }
 

@@ -47,8 +47,8 @@ def of_naive(blocks: dict[str, dict[str, Any]], name: str) -> dict[str, float] |
     """Looks and time of a policy over those of naive exploration of the same accuracy.
 
     Between one, two and three looks of each robot at each PoI, naive exploration is interpolated
-    linearly. A policy that is more accurate than all of these is compared with the most accurate
-    one, which is no flattery: naive exploration would need even more.
+    linearly. More looks that are no more accurate do not count. A policy that is more accurate than
+    all of these is compared with the most accurate one: naive exploration would need even more.
 
     Args:
       blocks: of the summary, for every case that was played.
@@ -59,7 +59,10 @@ def of_naive(blocks: dict[str, dict[str, Any]], name: str) -> dict[str, float] |
     """
     if not {name, *_NAIVE} <= set(blocks):
         return None
-    naive = sorted((blocks[each] for each in _NAIVE), key=lambda block: block["accuracy"])
+    naive = [blocks[_NAIVE[0]]]
+    for each in _NAIVE[1:]:
+        if blocks[each]["accuracy"] > naive[-1]["accuracy"]:
+            naive.append(blocks[each])
     accuracies = [block["accuracy"] for block in naive]
     if blocks[name]["accuracy"] < accuracies[0]:
         return None

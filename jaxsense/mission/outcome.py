@@ -1,6 +1,5 @@
 """Ends and results of missions."""
 
-import functools
 from typing import Any
 
 import jax
@@ -10,8 +9,8 @@ import numpy as np
 from jaxsense.config import Config
 from jaxsense.dqn import belief_mdp
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
-from jaxsense.models import Models, most_likely_class
-from jaxsense.vae import metrics
+from jaxsense.models import Models
+from jaxsense.vae import fusion, metrics
 
 REASONS = (
     "running",
@@ -57,7 +56,8 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
       and `reason`.
     """
     config = mission.config
-    shown = jax.vmap(functools.partial(most_likely_class, models))(state.belief)
+    means = models.class_beliefs.mean
+    shown = jax.vmap(lambda b: fusion.most_likely_class(models.jmvae, means, b))(state.belief)
     plausible = jax.vmap(lambda b: metrics.plausible_classes(b, models.class_beliefs.mean))(
         state.belief
     )
@@ -136,10 +136,15 @@ def bytes_per_detection(mission: Mission, detections: np.ndarray) -> dict[str, f
       detections: `[R]` number of each robot's detections.
 
     Returns:
-      `latent`, the size of an entry of the map, and `raw`, the mean size of the detections' scans;
-      without detections the mean over the sensors.
+      `latent`, the size of an entry of the map; `features` and `raw`, the mean sizes of the
+      detections' features and scans; without detections the mean over the sensors.
     """
     detections = np.maximum(detections, 0 if np.any(detections) else 1)
+    config, size = mission.config, np.dtype(np.float32).itemsize
     scans = np.array([sensor.scan_bytes for sensor in mission.world.sensors])
-    entry = 2 * mission.config.jmvae.latent_size * np.dtype(np.float32).itemsize
-    return {"latent": float(entry), "raw": float(np.average(scans, weights=detections))}
+    features = np.array([size * len(config.labels(name)) for name in config.modalities])
+    return {
+        "latent": float(2 * size * config.jmvae.latent_size),
+        "features": float(np.average(features, weights=detections)),
+        "raw": float(np.average(scans, weights=detections)),
+    }

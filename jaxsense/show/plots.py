@@ -88,7 +88,7 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
         axes[0, 0].plot([], [], "o", color=colour, label=f"({c + 1}) {label}")
     if num_far:
         total = sum(norm.size for norm in norms.values())
-        label = f"{num_far} of {total} detections, where a detector was not sure"
+        label = f"{num_far} of {total} detections, far from most of their class"
         axes[0, 0].plot([], [], "x", color="0.3", label=label)
     axes[0, 0].set_ylabel("class\n$\\mu_2$")
     axes[1, 0].set_ylabel("uncertainty\n$\\mu_2$")

@@ -13,7 +13,7 @@ import numpy as np
 from jaxsense.config import values
 from jaxsense.networks import Params
 from jaxsense.types import Belief, Features
-from jaxsense.vae import filtering, jmvae
+from jaxsense.vae import filtering, jmvae, metrics
 from jaxsense.vae.jmvae import Jmvae
 
 FILTER = "filter"
@@ -85,6 +85,22 @@ def write(
         raise ValueError(f"modality = {modality}: must be an index of {model.modalities}")
     of_all = tuple(features if m == modality else None for m in range(len(model.modalities)))
     return fuse(params, model, belief, seen, of_all)
+
+
+def most_likely_class(params: Params, class_means: jax.Array, belief: Belief) -> jax.Array:
+    """Class that an entry of the map shows, `[]` int32.
+
+    Args:
+      params: of the JMVAE, with those of the filter if there is one.
+      class_means: `[C, D]` mean of the joint posterior of each class.
+      belief: `[D]`.
+
+    Returns:
+      The nearest class; of a map that a filter writes, that of the highest weight.
+    """
+    if FILTER in params:
+        return jnp.argmax(filtering.weights(params[FILTER], belief))
+    return metrics.nearest_class(belief, class_means)
 
 
 def unseen(model: Jmvae, variance: float) -> Belief:

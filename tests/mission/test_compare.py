@@ -61,10 +61,13 @@ def test_naive_exploration_of_the_same_accuracy_is_interpolated(accuracy, looks,
     assert found == pytest.approx(expected)
 
 
-def test_a_third_look_that_makes_it_worse_counts_at_its_accuracy():
+def test_looks_of_naive_exploration_that_do_not_help_are_left_out():
     worse = {**NAIVE, "naive_3": block(0.95, 6.0, 60.0), "latent": block(0.99, 2.0, 30.0)}
     # The most accurate is naive_2, with 4 looks.
     assert compare.of_naive(worse, "latent")["observations_per_poi"] == 0.5
+    alike = {f"naive{k}": block(1.0, looks, 40.0) for k, looks in (("", 2), ("_2", 4), ("_3", 6))}
+    found = compare.of_naive({**alike, "latent": block(1.0, 1.6, 30.0)}, "latent")
+    assert found["observations_per_poi"] == 0.8
 
 
 def test_there_is_nothing_to_compare_with_below_one_look_or_without_all_three():

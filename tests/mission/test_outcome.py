@@ -135,7 +135,7 @@ def test_summary_of_a_case_as_worked_by_hand():
 def test_bytes_of_a_detection_as_worked_by_hand(team):
     # Two float32 for each of two latent dimensions; 640 pixels of 3 bytes, 683 beams of 4.
     size = outcome.bytes_per_detection(team, np.array([1, 3]))
-    assert size["latent"] == 16
+    assert (size["latent"], size["features"]) == (16, 8)
     assert size["raw"] == pytest.approx((1 * 1920 + 3 * 2732) / 4)
     # Without any detection, the mean of both.
     assert outcome.bytes_per_detection(team, np.zeros(2))["raw"] == (1920 + 2732) / 2

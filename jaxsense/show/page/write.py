@@ -21,8 +21,10 @@ PLOTS = {
     "latent_space": (
         "Posteriors of detections as ellipses in the latent space, for all sensors together and "
         "for each alone, by class and by uncertainty",
-        "The paper's Fig. 4. All sensors together identify one class; classes that one sensor "
-        "cannot distinguish share a place between them, with a larger sigma.",
+        "The paper's Fig. 4: entries of the map after a look by all sensors, and by each alone. "
+        "Classes that one sensor cannot distinguish share a place between them, with a larger "
+        "sigma; so do classes between which an unsure look leaves doubt, if a filter writes the "
+        "map.",
     ),
     "reward": (
         "Total reward of an episode over the epochs of training, for each Q-network, with lines "
