@@ -237,7 +237,7 @@ class EvaluationConfig:
 
     num_starts: int = 512
     """Start states of the episodes."""
-    num_repeats: Traced[int] = 192
+    num_repeats: Traced[int] = 96
     """Episodes per start state, to average over the noise of detections; an eighth as many for the
     naive and the random policy."""
 
