@@ -24,7 +24,7 @@ from jaxsense.vae.jmvae import Jmvae
 POLICIES = ("return", "optimal", "naive", "random")
 """The greedy policy of a Q-network, and its baselines."""
 _EXPECTATION_DRAWS = 1024
-_LOOKS, _HISTORIES = 6, 65520  # of random histories of looks at one PoI
+_LOOKS = 6  # of a random history at one PoI
 
 
 def detector(looks: jax.Array, label_of_class: jax.Array) -> dict[str, jax.Array]:
@@ -209,8 +209,9 @@ def beliefs(
         start = unseen, jnp.full(number, -jnp.log(number)), jnp.zeros(len(bank), bool)
         return jax.lax.scan(look, start, (modalities, looks))[1]
 
-    truth = jnp.arange(_HISTORIES) % number
-    shares, exact, norms = jax.vmap(history)(jax.random.split(key, _HISTORIES), truth)
+    num_histories = config.evaluation.num_histories
+    truth = jnp.arange(num_histories) % number
+    shares, exact, norms = jax.vmap(history)(jax.random.split(key, num_histories), truth)
     right = jnp.arange(number)[None, None] == truth[:, None, None]
     entropy = -jnp.sum(jnp.exp(exact) * exact, axis=-1)
 
@@ -280,7 +281,7 @@ def compare_policies(
     settings = config.evaluation
     mdp = observe.bank_mdp(config, bank, params, make_jmvae(config))
     start_key, table_key, play_key = jax.random.split(key, 3)
-    starts = _every_start(start_key, mdp, settings.num_starts)
+    starts = _every_start(start_key, mdp, config)
     if config.jmvae.fusion == "filter":
         total = jnp.stack([values.total for values in look_values])[modality]
         optimal = policies.by_posterior(
@@ -335,18 +336,20 @@ def _mean_rewards(
     return total / number, first / number
 
 
-def _every_start(key: Key, mdp: MapMdp, number: int) -> tuple[jax.Array, jax.Array]:
+def _every_start(key: Key, mdp: MapMdp, config: Config) -> tuple[jax.Array, jax.Array]:
     """`[S, N]` classes and `[S, N, M]` looks of every state of the map, then of random starts."""
-    drawn = jax.vmap(lambda key: random_start(key, mdp))(jax.random.split(key, number))
+    keys = jax.random.split(key, config.evaluation.num_starts)
+    drawn = jax.vmap(lambda key: random_start(key, mdp))(keys)
     classes, seen = (
         jnp.concatenate([jnp.asarray(every), some])
-        for every, some in zip(_states(mdp), drawn, strict=True)
+        for every, some in zip(_states(config), drawn, strict=True)
     )
     return classes, seen
 
 
-def _states(mdp: MapMdp) -> tuple[np.ndarray, np.ndarray]:
-    return episodes.every_state(mdp.num_pois, mdp.num_classes, mdp.num_modalities)
+def _states(config: Config) -> tuple[np.ndarray, np.ndarray]:
+    sizes = config.arena.num_pois, len(config.arena.classes), len(config.modalities)
+    return episodes.every_state(*sizes, config.evaluation.num_states)
 
 
 def policy_metrics(total: np.ndarray, first: np.ndarray, config: Config) -> dict[str, Any]:
@@ -362,8 +365,7 @@ def policy_metrics(total: np.ndarray, first: np.ndarray, config: Config) -> dict
     one_step = dict(zip(POLICIES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
     missed = total[POLICIES.index("optimal"), :num_states] - total[0, :num_states]
     is_optimal = missed <= 0.01
-    sizes = config.arena.num_pois, len(config.arena.classes), len(config.modalities)
-    is_permutation = episodes.are_different(episodes.every_state(*sizes)[0])
+    is_permutation = episodes.are_different(_states(config)[0])
     return {
         **whole,
         # Where no look pays, the optimum is 0.

@@ -67,7 +67,9 @@ def init(key: Key, config: Config) -> Models:
         jmvae.init(jmvae_key, make_jmvae(config)),
         Belief(jnp.zeros(shape), jnp.ones(shape)),
     )
-    no_values = jnp.zeros(len(optimum.lattice(len(config.arena.classes))))
+    no_values = jnp.zeros(
+        len(optimum.lattice(len(config.arena.classes), config.evaluation.value_points))
+    )
     if config.jmvae.fusion == "filter":
         params[FILTER] = filtering.init(filter_key, make_jmvae(config), classes, config.filter)
     return Models(

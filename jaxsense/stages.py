@@ -35,7 +35,6 @@ from jaxsense.vae.fusion import FILTER
 from jaxsense.vae.minibatch import FitState
 
 _MOST_CHUNKS = 20
-_LOOKS_PER_CLASS = 128  # that stand for all others in the values of looks
 _MOST_LOOKS = 20  # at one PoI, in the values of looks
 
 
@@ -550,6 +549,7 @@ def _look_values(
 ) -> tuple[LookValues, ...]:
     """What a look with each modality is worth, from the detections for training."""
     del key
+    settings = config.evaluation
 
     def information(weights: jax.Array) -> jax.Array:
         if config.mdp.reward == "nats":
@@ -558,8 +558,9 @@ def _look_values(
 
     def of_modality(features: jax.Array, labels: tuple[int, ...]) -> LookValues:
         of_look = functools.partial(peers.log_likelihoods, label_of_class=jnp.array(labels))
-        likelihoods = jax.vmap(jax.vmap(of_look))(features[:, :_LOOKS_PER_CLASS])
-        return optimum.solve(likelihoods, information, config.mdp, _MOST_LOOKS)
+        likelihoods = jax.vmap(jax.vmap(of_look))(features[:, : settings.value_looks])
+        sizes = _MOST_LOOKS, settings.value_points
+        return optimum.solve(likelihoods, information, config.mdp, *sizes)
 
     labels = [config.label_of_class(name) for name in config.modalities]
     return tuple(map(of_modality, detections.bank, labels))

@@ -1,12 +1,27 @@
 """The figures of a latent space and of policies, on networks whose weights are set by hand."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxsense import examine
-from jaxsense.config import Config, DqnConfig, EvaluationConfig, JmvaeConfig, MdpConfig
+from jaxsense.config import (
+    ArenaConfig,
+    Config,
+    DqnConfig,
+    EvaluationConfig,
+    FilterConfig,
+    JmvaeConfig,
+    MdpConfig,
+)
+from jaxsense.dqn import optimum
+from jaxsense.dqn.optimum import LookValues
+from jaxsense.models import make_jmvae
+from jaxsense.types import Belief
+from jaxsense.vae import filtering
 
 # Classes: green cylinder, red cylinder, red cube. Three latent dimensions, of which one is unused.
 CONFIG = Config(
@@ -60,11 +75,12 @@ PARAMS = {
 CAMERA = jnp.array([[[0, 1], [0, 1]], [[1, 0], [1, 0]], [[1, 0], [1, 0]]], jnp.float32)
 LIDAR = jnp.array([[[1, 0], [0.5, 0]], [[1, 0], [1, 0]], [[0, 1], [0, 1]]], jnp.float32)
 BANK = (CAMERA, LIDAR)
+CLASS_MEANS = jnp.array([[10.0, 0, 0], [0, 0, 0], [0, 10, 0]])
 
 
 @pytest.fixture(scope="module")
 def latent():
-    return jax.jit(lambda bank: examine.latent_space(PARAMS, bank, CONFIG))
+    return jax.jit(lambda bank: examine.latent_space(PARAMS, CLASS_MEANS, bank, CONFIG))
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +121,37 @@ def test_figures_of_the_latent_space_as_worked_by_hand(found):
         np.testing.assert_array_equal(figures["unambiguous"][name], expected)
 
 
+def test_what_a_look_leaves_open_is_as_worked_by_hand(found):
+    # Red leaves the classes 1 and 2 open, each 5 / 5 deviations off, a cylinder 0 and 1, each
+    # 5 / sqrt(26); only the second look at class 0 leaves too few.
+    shares = {"joint": [1, 1, 1], "camera": [1, 1, 1], "lidar": [0.5, 1, 1]}
+    for name, expected in shares.items():
+        np.testing.assert_array_equal(found[1]["consistent"][name], expected)
+
+
+def test_classes_are_told_apart_by_the_means_that_are_given():
+    # Class 1 where class 2 was, which lies far away: looks at class 2 leave class 1 open, and those
+    # at class 1 also class 0, which is as far away as that.
+    moved = jnp.array([[10.0, 0, 0], [0, 10, 0], [0, 100, 0]])
+    figures = jax.jit(lambda: examine.latent_space(PARAMS, moved, BANK, CONFIG))()[1]
+    for name in ("joint", "lidar"):
+        assert figures["unambiguous"][name][2] == 0
+    np.testing.assert_array_equal(figures["unambiguous"]["joint"], [1, 0, 0])
+
+
+def test_beliefs_of_classes_are_means_over_the_bank_that_is_given():
+    beliefs = jax.jit(lambda bank: examine.class_beliefs(PARAMS, bank, CONFIG))
+    found = beliefs(BANK)
+    np.testing.assert_allclose(found.mean, CLASS_MEANS, atol=1e-5)
+    np.testing.assert_allclose(found.std, [[1, 1, 1], [1, 1, 1], [2, 2, 1]], rtol=1e-5)
+    # One of two looks at class 1 is green, and one at class 2 a cylinder: (10 + 0) / 2 each, and
+    # deviations of (1 + 2) / 2.
+    other = CAMERA.at[1, 1].set(jnp.array([0.0, 1.0])), LIDAR.at[2, 1].set(jnp.array([1.0, 0.0]))
+    found = beliefs(other)
+    np.testing.assert_allclose(found.mean, [[10, 0, 0], [5, 0, 0], [0, 5, 0]], atol=1e-5)
+    np.testing.assert_allclose(found.std, [[1, 1, 1], [1, 1, 1], [1.5, 1.5, 1]], rtol=1e-5)
+
+
 def test_moment_matching_as_worked_by_hand(found):
     # Mean over three dimensions, then looks, classes and sensors.
     # Camera, green: itself. Red: classes 1 and 2, mean 5, variances (1 + 4) / 2 = 2.5 and 2.5 + 25.
@@ -121,10 +168,12 @@ def test_moment_matching_as_worked_by_hand(found):
 def test_fusion_as_worked_by_hand(found):
     # The LiDAR's look after the camera's is exact. The camera's after the LiDAR's is encoded with a
     # cube of .6 more, and so lies 6 further along the second dimension: class 1 at (0, 6) is nearer
-    # to class 2 at (0, 10), class 2 lies 6 / 2 deviations off. Cubes of .6 also widen, which does
-    # not count.
+    # to class 2 at (0, 10), class 2 lies 6 / 2 deviations off.
     np.testing.assert_allclose(found[1]["fusion"]["accuracy"], 5 / 6, rtol=1e-6)
     np.testing.assert_allclose(found[1]["fusion"]["mean_error"], (6 + 6 + 3) / 6, rtol=1e-4)
+    # A cube of .6 more also widens two of three dimensions, by 4^(.6 / 2), after one of two orders.
+    widening = 0.6 * np.log(2.0) * 2 / 3
+    np.testing.assert_allclose(found[1]["fusion"]["std_error"], widening / 2, rtol=1e-4)
 
 
 @pytest.mark.parametrize("modality", [0, 1])
@@ -139,18 +188,31 @@ def test_one_detection_that_is_not_a_number_shows_in_the_beliefs(latent, modalit
 
 # One look at each class, so that nothing is left to chance but the starts.
 EXACT = tuple(x[:, :1] for x in BANK)
+NUM_STATES = 1728  # 3^3 x 2^6
+
+
+def with_bias(bias):
+    """A Q-network whose values are the same for every map."""
+    layers = {
+        "Dense_0": {"kernel": jnp.zeros((2 * 3 * 3, 2)), "bias": jnp.zeros(2)},
+        "Dense_1": {"kernel": jnp.zeros((2, 4)), "bias": bias},
+    }
+    return {"params": layers}
+
+
+def constant(gain, total):
+    """The same values of looks at every posterior."""
+    points = len(optimum.lattice(3))
+    return LookValues(jnp.full(points, gain), jnp.full(points, total))
 
 
 @pytest.fixture(scope="module")
 def played():
-    shape = 2 * 3 * CONFIG.arena.num_pois
+    # Values of looks are of no importance without a filter.
+    unused = (constant(9.0, 9.0),) * 2
 
     def play(bias, bank):
-        layers = {
-            "Dense_0": {"kernel": jnp.zeros((shape, 2)), "bias": jnp.zeros(2)},
-            "Dense_1": {"kernel": jnp.zeros((2, 4)), "bias": bias},
-        }
-        inputs = jnp.int32(0), {"params": layers}, PARAMS, bank, CONFIG
+        inputs = jnp.int32(0), with_bias(bias), PARAMS, unused, bank, CONFIG
         return examine.compare_policies(jax.random.key(0), *inputs)
 
     return jax.jit(play)
@@ -158,14 +220,18 @@ def played():
 
 def test_policies_are_played_from_every_state_and_from_random_starts(played):
     total, first = map(np.asarray, played(jnp.array([0.0, 0.0, 0.0, 1.0]), EXACT))
-    assert total.shape == first.shape == (4, 384 + 16)
+    assert total.shape == first.shape == (4, NUM_STATES + 16)
     of = dict(zip(examine.POLICIES, total, strict=True))
     np.testing.assert_array_equal(of["return"], 0.0)  # always NOP
     # The means over all states; a policy is at best as good.
-    assert of["optimal"][:384].mean() > of["naive"][:384].mean() > of["random"][:384].mean()
+    optimal, naive, uniform = (
+        of[name][:NUM_STATES].mean() for name in ("optimal", "naive", "random")
+    )
+    assert optimal > naive > uniform
     # It goes on where the camera has not seen all: bits 0, 2 and 4 of the number of a state.
-    goes_on = np.arange(384) % 64 & 0b010101 != 0b010101
-    np.testing.assert_array_equal(first[examine.POLICIES.index("naive"), :384] != 0, goes_on)
+    goes_on = np.arange(NUM_STATES) % 64 & 0b010101 != 0b010101
+    of_naive = first[examine.POLICIES.index("naive"), :NUM_STATES]
+    np.testing.assert_array_equal(of_naive != 0, goes_on)
     # The camera's own looks alone: no state pays more than three of the best, from a variance of
     # 20 in three dimensions to sqrt(3).
     most = 3 * (1 / 3**0.5 - 1 / 60**0.5)
@@ -179,25 +245,67 @@ def test_values_that_are_not_numbers_give_totals_that_are_none(played):
     assert np.isfinite(total[1:]).all()
 
 
-def test_figures_of_policies_as_worked_by_hand():
-    # Two states and three random starts, of which the figures are means.
-    total = np.array(
-        [
-            [1.0, 2.0, 0.9, 1.0, 1.1],
-            [1.02, 2.009, 1.0, 1.1, 1.2],
-            [0.0, 0.0, 0.5, 0.5, 0.8],
-            [0.0, 0.0, -1.0, 0.0, -0.5],
-        ]
+def test_with_a_filter_the_optimum_is_by_the_total_of_the_own_sensors_looks():
+    filtered = replace(CONFIG, jmvae=replace(CONFIG.jmvae, fusion="filter"))
+    classes = Belief(CLASS_MEANS, jnp.ones((3, 3)))
+    of_filter = filtering.init(
+        jax.random.key(0), make_jmvae(filtered), classes, FilterConfig(hidden=(1,))
     )
-    figures = examine.policy_metrics(total, total / 2, 3)
+    # No look of the camera pays by its total, and every look of the LiDAR does.
+    values = constant(1.0, -1.0), constant(-1.0, 1.0)
+
+    @jax.jit
+    def play(modality):
+        params = {**PARAMS, "filter": of_filter}
+        inputs = modality, with_bias(jnp.zeros(4)), params, values, EXACT, filtered
+        return examine.compare_policies(jax.random.key(0), *inputs)
+
+    optimal = examine.POLICIES.index("optimal")
+    total, first = play(jnp.int32(0))
+    np.testing.assert_array_equal(total[optimal], 0.0)
+    total, first = play(jnp.int32(1))
+    assert np.all(first[optimal] != 0)
+
+
+def test_the_return_of_the_greedy_policy_is_the_mean_over_random_starts():
+    @jax.jit
+    def returned(bias):
+        inputs = jnp.int32(0), with_bias(bias), PARAMS, EXACT, CONFIG
+        return examine.greedy_return(jax.random.key(0), *inputs)
+
+    assert returned(jnp.array([0.0, 0.0, 0.0, 1.0])) == 0.0
+    # Eight looks at PoI 0, of which all but the first are in vain, and that one in some starts: it
+    # pays at most what a class that is known for sure is worth.
+    total = returned(jnp.array([1.0, 0.0, 0.0, 0.0]))
+    assert -8 < total < -7 + 1 / 3**0.5
+    assert np.isnan(returned(jnp.array([jnp.nan, 0.0, 0.0, 1.0])))
+
+
+# Two PoIs of two classes and one sensor: 2^2 x 2^2 states, of which half hold both classes.
+SMALL = Config(
+    modalities=("camera",),
+    arena=ArenaConfig(num_pois=2, classes=("green cylinder", "red cylinder")),
+    jmvae=JmvaeConfig(reconstruction_weights=(1.0,)),
+    evaluation=EvaluationConfig(num_starts=3),
+)
+
+
+def test_figures_of_policies_as_worked_by_hand():
+    # Sixteen states and three random starts, of which the figures are means.
+    of_states = np.zeros((4, 16))
+    # .02 and .009 below the optimum, of which .01 is let pass; more than the optimum is too. The
+    # classes of the first and last four states are equal, of the others different.
+    of_states[1, [0, 1, 4, 5, 10]] = 0.02, 0.009, 0.02, 0.009, 0.5
+    of_states[0, 15] = 1.0
+    of_starts = np.array([[0.9, 1.0, 1.1], [1.0, 1.1, 1.2], [0.5, 0.5, 0.8], [-1.0, 0.0, -0.5]])
+    total = np.concatenate([of_states, of_starts], axis=1)
+    figures = examine.policy_metrics(total, total / 2, SMALL)
     expected = {"return": 1.0, "optimal": 1.1, "naive": 0.6, "random": -0.5}
     assert {name: figures[name] for name in expected} == pytest.approx(expected)
     assert figures["fraction_of_optimal"] == pytest.approx(1 / 1.1)
     one_step = {"policy": 0.5, "optimal": 0.55, "random": -0.25}
     assert figures["one_step"] == pytest.approx(one_step)
-    # .02 and .009 below the optimum, of which .01 is let pass; more than the optimum is too.
-    assert (figures["optimal_states"], figures["num_states"]) == (1, 2)
-    total[0, 0] = 5.0
-    assert examine.policy_metrics(total, total, 3)["optimal_states"] == 2
-    nothing = examine.policy_metrics(np.zeros((4, 5)), np.zeros((4, 5)), 3)
+    assert (figures["optimal_states"], figures["num_states"]) == (13, 16)
+    assert (figures["optimal_permutations"], figures["num_permutations"]) == (6, 8)
+    nothing = examine.policy_metrics(np.zeros((4, 19)), np.zeros((4, 19)), SMALL)
     assert nothing["fraction_of_optimal"] is None

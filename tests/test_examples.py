@@ -39,7 +39,7 @@ def learned():
         config = train.parse([*SMALL, *THERMAL], change).config
         world = sim.make_world(config)
 
-    perceive = jax.jit(lambda key: learn(key, config, world, until="class_beliefs").outputs)
+    perceive = jax.jit(lambda key: learn(key, config, world, until="look_values").outputs)
     return config, perceive(jax.random.key(0))
 
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from jaxsense import observe
-from jaxsense.config import MODALITIES, PRESETS
+from jaxsense.config import MODALITIES, PRESETS, FilterConfig
 from jaxsense.dqn import belief_mdp
 from jaxsense.sim import world as worlds
-from jaxsense.vae import detectors, jmvae
+from jaxsense.types import Belief
+from jaxsense.vae import detectors, filtering, jmvae
 from jaxsense.vae.jmvae import Jmvae
 
 CONFIG = PRESETS["smoke"]
@@ -52,6 +53,34 @@ def test_bank_mdp_writes_by_the_jmvae():
     encode = jax.vmap(lambda x: jmvae.encode(params, MODEL, (None, x))[0])
     distances = np.abs(np.asarray(encode(numbered_bank()[1][0])) - state.belief.mean[1][None])
     assert np.min(np.max(distances, axis=1)) < 1e-5
+
+
+def test_the_reward_in_nats_is_the_fall_of_entropy_of_the_map_less_the_cost():
+    # Green is class 0, red the others. The filter adds the logarithm of the label's probability.
+    classes = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
+    params = filtering.init(jax.random.key(0), MODEL, classes, FilterConfig(hidden=(1,)))
+    layer = {"kernel": jnp.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0]]), "bias": jnp.zeros(3)}
+    params["networks"] = {m: {"params": {"Dense_0": layer}} for m in MODEL.modalities}
+    config = replace(
+        CONFIG,
+        jmvae=replace(CONFIG.jmvae, fusion="filter"),
+        mdp=replace(CONFIG.mdp, reward="nats", look_cost=0.0625),
+    )
+    looks_red = (jnp.broadcast_to(jnp.array([0.8, 0.2]), (3, 1, 2)),) * 2
+    mdp = observe.bank_mdp(config, looks_red, {"filter": params}, MODEL)
+    unseen = jnp.zeros((3, 2), bool)
+    state = belief_mdp.reset(jax.random.key(0), mdp, jnp.array([1, 1, 1]), unseen)
+
+    @jax.jit
+    def look(state, modality):
+        return belief_mdp.step(jax.random.key(0), mdp, state, jnp.int32(1), modality)
+
+    # .2 to .8 to .8 after one look, and .04 to .64 to .64 after two.
+    one, two = np.array([1, 4, 4]) / 9, np.array([1, 16, 16]) / 33
+    entropies = [np.log(3), *(-np.sum(w * np.log(w)) for w in (one, two))]
+    for modality, before, after in ((0, *entropies[:2]), (1, *entropies[1:])):
+        state, outcome = look(state, jnp.int32(modality))
+        assert outcome.reward == pytest.approx(before - after - 0.0625, abs=1e-4)
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,8 @@ BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None
 POLICY = {
     "return": 1.2345, "optimal": 1.25, "naive": 1.0, "random": -1.5, "fraction_of_optimal": 0.9876,
     "one_step": {"policy": 0.86, "optimal": 0.87, "random": -0.1}, "optimal_states": 1700,
-    "num_states": 1728, "optimal_permutations": 380, "num_permutations": 384, "env_steps": 409600, "env_steps_per_s": 50000.4,
+    "num_states": 1728, "optimal_permutations": 380, "num_permutations": 384,
+    "env_steps": 409600, "env_steps_per_s": 50000.4,
 }  # fmt: skip
 MISSION = {
     "accuracy": 0.998, "observations_per_poi": 1.68, "time_s": 13.8, "collisions": 0,

@@ -36,7 +36,7 @@ MISSION_KEYS = {
 
 def test_run_directory_holds_everything(smoke_run):
     names = {path.name for path in smoke_run.iterdir()} | {".lock"}  # which may be gone
-    plots = {"latent_space.png", "reward.png", "scanlines.png"}
+    plots = {"latent_space.png", "reward.png", "scanlines.png", "calibration.png", "policies.png"}
     others = {"config.json", "metrics.jsonl", "summary.json", "checkpoints"}
     assert names == {*others, *plots, "mission.svg", "report.html", ".lock"}
     for plot in plots:
@@ -67,17 +67,18 @@ def test_summary_keeps_its_contract(smoke_run):
     assert -1 <= belief["doubt_correlation"] <= 1
     latent = summary["jmvae"]
     assert set(latent) == {
-        "active_units", "sigma_norm", "unambiguous", "moment_matching_error", "fusion"
+        "active_units", "sigma_norm", "unambiguous", "consistent", "moment_matching_error", "fusion"
     }  # fmt: skip
-    for block, kind in (("sigma_norm", float), ("unambiguous", bool)):
+    for block, kind in (("sigma_norm", float), ("unambiguous", bool), ("consistent", float)):
         assert set(latent[block]) == {"joint", "camera", "lidar"}
         for values in latent[block].values():
             assert [type(value) for value in values] == [kind] * 3
-    assert set(latent["fusion"]) == {"accuracy", "mean_error"}
+    assert set(latent["fusion"]) == {"accuracy", "mean_error", "std_error"}
     for block in summary["dqn"].values():
         assert set(block) == {
             "return", "optimal", "naive", "random", "fraction_of_optimal", "one_step",
-            "optimal_states", "num_states", "env_steps", "env_steps_per_s",
+            "optimal_states", "num_states", "optimal_permutations", "num_permutations", "env_steps",
+            "env_steps_per_s",
         }  # fmt: skip
         assert set(block["one_step"]) == {"policy", "optimal", "random"}
         assert block["num_states"] == 384
@@ -86,12 +87,14 @@ def test_summary_keeps_its_contract(smoke_run):
     assert set(summary["mission"]) == {"latent", "naive", "random", "bytes_per_detection"}
     for policy in ("latent", "naive", "random"):
         block = summary["mission"][policy]
-        assert set(block) == MISSION_KEYS
+        assert set(block) == MISSION_KEYS | ({"intervals"} if policy != "latent" else set())
         assert block["episodes"] == 4
         assert sum(block["ended"].values()) == 4
         assert block["collisions"] == 0
-    # Two float32 for each of two dimensions, against more than 1920 bytes of pixels or beams.
+    # Two float32 for each of two dimensions, and one for each of two labels, against more than 1920
+    # bytes of pixels or beams.
     assert summary["mission"]["bytes_per_detection"]["latent"] == 16
+    assert summary["mission"]["bytes_per_detection"]["features"] == 8
     assert 1920 <= summary["mission"]["bytes_per_detection"]["raw"] <= 2732
 
 
@@ -139,7 +142,7 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        (["--preset", "best"], "preset = 'best': must be one of default, paper, smoke"),
+        (["--preset", "best"], "preset = 'best': must be one of default, paper, noisy, smoke"),
         (["--taste", "sweet"], "train: option = '--taste': must be one of the program"),
         (["--jmvae.hiden", "3"], "of the program; perhaps --jmvae.hidden (--help"),
         (["--arena.side", "x"], "arena.side = 'x': must be a finite number"),
@@ -204,7 +207,7 @@ def test_every_setting_has_a_sentence_of_help():
 
 
 def test_presets_are_configurations():
-    assert set(PRESETS) == {"default", "paper", "smoke"}
+    assert set(PRESETS) == {"default", "paper", "noisy", "smoke"}
     assert all(isinstance(preset, Config) for preset in PRESETS.values())
     assert PRESETS["default"].dqn.observe == "live"
     assert PRESETS["paper"].dqn.observe == "bank"
@@ -230,9 +233,12 @@ def test_evaluate_writes_the_mission_block_of_the_summary_and_no_other(evaluated
     blocks = after.pop("mission")
     before.pop("mission")
     assert after == before
-    assert set(blocks) == {"latent", "naive", "random", "bytes_per_detection"}
-    for policy in ("latent", "naive", "random"):
-        assert set(blocks[policy]) == MISSION_KEYS | {"seed"}
+    assert set(blocks) == {*mission.POLICIES, "bytes_per_detection"}
+    for policy in mission.POLICIES:
+        # The policies of an untrained team may be less accurate than naive exploration.
+        compared = {"of_naive"} | ({"intervals"} if policy != "latent" else set())
+        assert set(blocks[policy]) | compared == MISSION_KEYS | {"seed"} | compared
+        assert ("intervals" in blocks[policy]) == (policy != "latent")
         assert (blocks[policy]["episodes"], blocks[policy]["seed"]) == (3, 0)
 
 
@@ -251,11 +257,8 @@ def test_an_evaluation_keeps_what_another_one_has_written_meanwhile(
     monkeypatch.setattr(missions.Player, "play", meanwhile)
     evaluate.main([str(path), "--policy", "latent", "--seed", "4", *begin])
     blocks = json.loads((path / "summary.json").read_text(encoding="utf-8"))["mission"]
-    assert {n: blocks[n]["seed"] for n in mission.POLICIES} == {
-        "latent": 4,
-        "naive": 3,
-        "random": 0,
-    }
+    expected = {**dict.fromkeys(mission.POLICIES, 0), "latent": 4, "naive": 3}
+    assert {name: blocks[name]["seed"] for name in mission.POLICIES} == expected
 
 
 def test_an_evaluation_waits_for_another_one_that_writes(evaluated, tmp_path):
@@ -311,7 +314,7 @@ def test_evaluate_prints_the_comparison(evaluated):
         "accuracy",
         "goals",
         "control steps/s",
-        "9 missions",
+        "24 missions",
     ):
         assert words in printed
 
@@ -320,7 +323,7 @@ def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(smoke_run
     path, _, _ = evaluated
     for report, episodes, films in ((smoke_run, 4, 1), (path, 3, 2)):
         text = (report / "report.html").read_text()
-        assert text.count("<img") == 3
+        assert text.count("<img") == 5
         assert text.count("<use") == films
         assert f"<td>{episodes}</td>" in text
 
@@ -350,7 +353,7 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--policy", "best"], "policy = 'best': must be one of all, policies, latent, naive"),
+        (["--policy", "best"], "policy = 'best': must be one of all, policies, latent, greedy"),
         (["--episodes", "0"], "episodes = 0: must be within 1 and 100,000"),
         (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
         (["--episode", "3"], "'--episode': must be one of the program; perhaps --episodes"),

@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import observe, stages
-from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig, MissionConfig
+from jaxsense import examine, observe, stages
+from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig, MdpConfig, MissionConfig
+from jaxsense.dqn import optimum
 from jaxsense.run import loop, missions, pipeline
 from jaxsense.run.monitor import Monitor
 from jaxsense.sim.world import make_world
 from jaxsense.stages import learn
+from jaxsense.types import Belief
 from jaxsense.vae import detectors, jmvae
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(7)
@@ -188,6 +190,99 @@ def test_the_last_chunk_makes_no_step_too_many():
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5), one, states[3])
     moved = jax.tree.map(lambda x, y: np.abs(x - y).max(), states[3].params, states[2].params)
     assert max(jax.tree.leaves(moved)) > 0
+
+
+def of_stage(name, config):
+    return next(stage for stage in stages.stages(config) if stage.name == name)
+
+
+@pytest.mark.parametrize(("share", "trained_on"), [(0.0, 10), (0.1, 9), (0.25, 7), (0.5, 5)])
+def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, monkeypatch):
+    config = dataclasses.replace(TINY.detector, calibration=share)
+    config = dataclasses.replace(TINY, detector=config)
+    # Of .25 of ten looks, three calibrate.
+    windows, labels = jnp.arange(20.0).reshape(10, 2), jnp.arange(10) % 2
+    examples, used = ((windows, labels),) * 2, {}
+
+    def train(key, fit, detector, windows, labels, config, steps):
+        used["train"], used["labels"] = windows, labels
+        return fit, jnp.zeros(steps)
+
+    def calibrate(detector, windows, labels):
+        used["calibrate"] = windows
+        np.testing.assert_array_equal(labels, (windows[:, 0] / 2) % 2)
+        return "calibrated"
+
+    monkeypatch.setattr(detectors, "train", train)
+    monkeypatch.setattr(detectors, "calibrate", calibrate)
+    stage = of_stage("detector_lidar", config)
+    state = stage.begin(KEY, config, examples)
+    state, _ = stage.advance(KEY, config, state, examples)
+    found = stage.finish(config, state, examples)
+    np.testing.assert_allclose(state[0].offset, windows[:trained_on].mean(axis=0))
+    np.testing.assert_array_equal(used["train"], windows[:trained_on])
+    np.testing.assert_array_equal(used["labels"], labels[:trained_on])
+    if share:
+        np.testing.assert_array_equal(used["calibrate"], windows[trained_on:])
+        assert found == "calibrated"
+    else:
+        assert "calibrate" not in used
+
+
+def test_without_calibration_a_detector_is_what_was_trained():
+    windows, labels = jax.random.normal(KEY, (48, 6)), jnp.arange(48) % 2
+    examples, config = ((windows, labels),) * 2, TINY.detector
+    assert config.calibration == 0
+    stage = of_stage("detector_camera", TINY)
+    state = stage.begin(KEY, TINY, examples)
+    detector = detectors.init(KEY, windows, 2, config)
+    fit = detectors.start(detector, config)
+    for key in stage.chunk_keys(KEY)[:2]:
+        state, _ = stage.advance(key, TINY, state, examples)
+        fit, _ = detectors.train(key, fit, detector, windows, labels, config, 3)
+    found = stage.finish(TINY, state, examples)
+    expected = dataclasses.replace(detector, params=fit.params)
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+def detections_of(bank):
+    """Detections for training, without any to measure on."""
+    nothing: Any = ()
+    return stages.Detections(bank, nothing, nothing, nothing, nothing)
+
+
+def test_a_class_is_read_by_its_detections_for_training(monkeypatch):
+    monkeypatch.setattr(examine, "class_beliefs", lambda params, bank, config: (params, bank))
+    stage, bank = of_stage("class_beliefs", TINY), (jnp.zeros((3, 2, 2)),) * 2
+    assert stage.begin(KEY, TINY, {}, detections_of(bank)) == ({}, bank)
+
+
+@pytest.mark.parametrize("reward", ["nats", "paper"])
+def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(reward):
+    mdp = MdpConfig(reward=reward, look_cost=0.125, min_increase=0.01)
+    fusion = dataclasses.replace(TINY.jmvae, fusion="filter")
+    config = dataclasses.replace(TINY, jmvae=fusion, mdp=mdp)
+    # The camera is sure, red or green; the LiDAR knows nothing: two cylinders to one cube.
+    camera, lidar = jnp.array([[0, 1], [1, 0], [1, 0]]), jnp.full((3, 2), 1 / 3).at[:, 0].set(2 / 3)
+    bank = tuple(jnp.repeat(x[:, None].astype(jnp.float32), 4, axis=1) for x in (camera, lidar))
+    # Classes in one dimension of deviation 1, at 0, 3 and 3 + sqrt(12).
+    mean = jnp.array([[0.0], [3.0], [3.0 + 12**0.5]])
+    classes = Belief(mean, jnp.ones((3, 1)))
+    stage = of_stage("look_values", config)
+    camera, lidar = stage.begin(KEY, config, classes, detections_of(bank))
+    even = jnp.full(3, 1 / 3)
+    if reward == "nats":
+        # ln 3 before; nothing after a green one, and ln 2 after each of two red ones.
+        expected = [np.log(3) - np.log(2) * 2 / 3 - 0.125, -0.125]
+    else:
+        # Before, a variance of 1 + that of the three means. After a green one 1, and after a red
+        # one 1 + 12 / 4 = 4.
+        before = 1 / np.sqrt(1 + np.var(mean))
+        expected = [((1 - before) + 2 * (1 / 2 - before)) / 3, -1.0]
+    found = [optimum.interpolate(values.gain, even) for values in (camera, lidar)]
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    # A second look of the camera adds nothing, and so costs more than it pays.
+    np.testing.assert_allclose(optimum.interpolate(camera.total, even), expected[0], atol=1e-4)
 
 
 def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):

@@ -10,9 +10,11 @@ import pytest
 
 from jaxsense import observe
 from jaxsense.config import Config, DetectorConfig, DqnConfig, JmvaeConfig, MdpConfig
+from jaxsense.dqn import belief_mdp
 from jaxsense.dqn import training as dqn
 from jaxsense.models import make_jmvae
-from jaxsense.vae import detectors, jmvae
+from jaxsense.types import Belief
+from jaxsense.vae import detectors, filtering, jmvae
 
 CONFIG = Config(
     detector=DetectorConfig(hidden=(2,), steps=3, batch=4),
@@ -93,7 +95,8 @@ def test_the_table_has_all_numbers_of_learning_that_may_be_traced():
     learning = {
         name for name in names if name.partition(".")[0] in ("detector", "jmvae", "mdp", "dqn")
     }
-    assert set(VALUES) == learning - {"jmvae.reconstruction_weights"}  # several numbers
+    # The first are several numbers, and the second needs a filter.
+    assert set(VALUES) == learning - {"jmvae.reconstruction_weights", "mdp.look_cost"}
 
 
 def test_all_settings_together_do_what_the_constants_do(together):
@@ -114,6 +117,25 @@ def test_each_setting_changes_its_training_and_no_other(together, name):
         }
         assert differ.pop(part) > 1e-3
         assert max(differ.values()) < 1e-6
+
+
+def test_the_cost_of_a_look_may_be_traced():
+    with_filter = dataclasses.replace(CONFIG.jmvae, fusion="filter")
+    model, keys = make_jmvae(CONFIG), jax.random.split(jax.random.key(0), 4)
+    classes = Belief(jax.random.normal(keys[0], (3, 2)), jnp.full((3, 2), 0.2))
+    params = {"filter": filtering.init(keys[1], model, classes, CONFIG.filter)}
+    bank = (jnp.full((3, 1, 2), 0.5),) * 2
+
+    def rewarded(cost):
+        settings = MdpConfig(reward="nats", look_cost=cost)
+        config = dataclasses.replace(CONFIG, jmvae=with_filter, mdp=settings)
+        mdp = observe.bank_mdp(config, bank, params, model)
+        start = belief_mdp.reset(keys[2], mdp)
+        return belief_mdp.step(keys[3], mdp, start, jnp.int32(0), 0)[1].reward
+
+    free, dear = jax.jit(jax.vmap(rewarded))(jnp.array([0.0, 0.25]))
+    assert free - dear == pytest.approx(0.25, abs=1e-6)
+    assert rewarded(0.25) == pytest.approx(float(dear), abs=1e-5)
 
 
 def test_weights_of_reconstruction_may_be_traced():

@@ -241,7 +241,25 @@ class EvaluationConfig:
     """Episodes per start state, to average over the noise of detections; an eighth as many for the
     naive and the random policy."""
 
+    num_histories: int = 65520
+    """Random histories of looks at a PoI, after which the map is compared with exact Bayes."""
+    num_states: int = 4096
+    """Most states of the map in which policies are compared, one by one; of more, as many at even
+    distances."""
+    value_points: int = 8192
+    """Most points of the lattice on which the values of looks stand, see `dqn.optimum`."""
+    value_looks: int = 128
+    """Looks at each class that stand for all looks in these values."""
+
     def check(self) -> None:
         """Raises `ConfigError` for an invalid field."""
         require_types(self)
-        require_positive(self, "num_starts", "num_repeats")
+        require_positive(self, "num_starts", "num_repeats", "num_states", "num_histories")
+        require_positive(self, "value_points", "value_looks")
+        require_at_most(
+            self,
+            num_histories=10_000_000,
+            num_states=100_000,
+            value_points=100_000,
+            value_looks=10_000,
+        )

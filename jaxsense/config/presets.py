@@ -45,7 +45,14 @@ _SMOKE = Config(
         replay_capacity=2048,
         num_starts=64,
     ),
-    evaluation=EvaluationConfig(num_starts=32, num_repeats=1),
+    evaluation=EvaluationConfig(
+        num_starts=32,
+        num_repeats=1,
+        num_histories=1020,
+        num_states=384,
+        value_points=256,
+        value_looks=16,
+    ),
     mission=MissionConfig(episodes=4, time_limit=60.0),
 )
 

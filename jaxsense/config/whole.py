@@ -206,6 +206,10 @@ class Config:
             "evaluation.num_starts evaluation.num_repeats": evaluation.num_starts
             * evaluation.num_repeats
             * state,
+            "evaluation.value_points evaluation.value_looks": 2
+            * evaluation.value_points
+            * evaluation.value_looks
+            * len(arena.classes) ** 2,
             "navigation.turn_samples": trajectories * num_pois * MISSIONS_AT_ONCE,
             "mission.episodes": self.mission.episodes * views * num_pois * NODES_PER_POI,
         }

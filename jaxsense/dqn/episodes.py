@@ -55,11 +55,11 @@ def run_episode(
 
 
 def every_state(
-    num_pois: int, num_classes: int, num_modalities: int
+    num_pois: int, num_classes: int, num_modalities: int, most: int = MOST_STATES
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lists the `C^N 2^(N M)` states of the map: every combination of classes, every set of looks.
 
-    Of more than 4096 states, one random state, always the same, of each of 4096 equal parts.
+    Of more than `most` states, one random state, always the same, of each of that many equal parts.
 
     Returns:
       `[S, N]` int32 classes and `[S, N, M]` bool looks.
@@ -67,7 +67,7 @@ def every_state(
     # A state is a number: a digit for the class of each PoI, then a bit for each look.
     num_bits = num_pois * num_modalities
     number = num_classes**num_pois << num_bits
-    parts = min(number, MOST_STATES)
+    parts = min(number, most)
     edges = [i * number // parts for i in range(parts + 1)]
     draw = random.Random(0)
     # Python's integers: the states of 25 PoIs overflow an int64.

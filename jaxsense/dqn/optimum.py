@@ -20,7 +20,7 @@ from jaxsense.config import MdpConfig, values
 from jaxsense.dqn.belief_mdp import reward
 from jaxsense.types import pytree
 
-_MOST_POINTS = 2**13
+MOST_POINTS = 2**13
 _MOST_STEPS = 512
 _POINTS_AT_ONCE = 256
 
@@ -38,10 +38,11 @@ class LookValues:
     total: jax.Array
 
 
-def steps_of_lattice(num_classes: int) -> int:
+def steps_of_lattice(num_classes: int, most_points: int = MOST_POINTS) -> int:
     """Steps of the lattice along each edge of the simplex; the more classes, the fewer."""
     values.require_number("num_classes", num_classes)
-    fits = [n for n in range(1, _MOST_STEPS + 1) if _num_points(n, num_classes) <= _MOST_POINTS]
+    values.require_number("most_points", most_points)
+    fits = [n for n in range(1, _MOST_STEPS + 1) if _num_points(n, num_classes) <= most_points]
     return max(fits, default=1)
 
 
@@ -49,9 +50,9 @@ def _num_points(steps: int, num_classes: int) -> int:
     return math.comb(steps + num_classes - 1, num_classes - 1)
 
 
-def lattice(num_classes: int) -> np.ndarray:
+def lattice(num_classes: int, most_points: int = MOST_POINTS) -> np.ndarray:
     """`[P, C]` class probabilities at the points of the lattice, in the order of their rows."""
-    steps = steps_of_lattice(num_classes)
+    steps = steps_of_lattice(num_classes, most_points)
     each = itertools.combinations(range(steps + num_classes - 1), num_classes - 1)
     # Between the ends, C - 1 bars divide the steps among the classes.
     bars = np.array(list(each), int).reshape(_num_points(steps, num_classes), num_classes - 1)[
@@ -71,7 +72,10 @@ def _rows(sums, steps: int):
       steps: of the lattice.
     """
     size = sums.shape[-1]
-    table = [[math.comb(n, k) for k in range(size + 1)] for n in range(steps + size)]
+    # What no row needs may be too large for an integer.
+    table = [
+        [min(math.comb(n, k), 2**31 - 1) for k in range(size + 1)] for n in range(steps + size)
+    ]
     ranks = np.broadcast_to(np.arange(size, 0, -1), sums.shape)
     choose = np.array(table, np.int32) if isinstance(sums, np.ndarray) else jnp.array(table)
     return choose[sums + ranks - 1, ranks].sum(axis=-1)
@@ -88,13 +92,12 @@ def interpolate(table: jax.Array, weights: jax.Array) -> jax.Array:
       `[]` the value.
     """
     chex.assert_rank(weights, 1, custom_message="weights")
-    rows, shares = _corners(weights)
+    rows, shares = _corners(weights, steps_of_lattice(len(weights), len(table)))
     return jnp.sum(shares * table[rows])
 
 
-def _corners(weights: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _corners(weights: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
     """`[C]` rows of the points of the lattice around a posterior, and their shares in it."""
-    steps = steps_of_lattice(len(weights))
     sums = steps * jnp.cumsum(weights[::-1])[::-1][1:]
     base = jnp.clip(jnp.floor(sums), 0, steps - 1)
     rest = jnp.clip(sums - base, 0.0, 1.0)
@@ -110,6 +113,7 @@ def solve(
     information: Callable[[jax.Array], jax.Array],
     config: MdpConfig,
     horizon: int,
+    most_points: int = MOST_POINTS,
 ) -> LookValues:
     """The values of one modality's looks.
 
@@ -119,16 +123,19 @@ def solve(
       information: `[C]` class probabilities to the `[]` information of the map's entry.
       config: the rewards.
       horizon: most looks at one PoI; static.
+      most_points: of the lattice; static.
 
     Returns:
       The values at the points of the lattice. The optimal policy takes every look whose `total` is
       above 0, that of no operation.
     """
+    chex.assert_rank(likelihoods, 3, custom_message="likelihoods")
     number, num_looks, _ = likelihoods.shape
     chex.assert_shape(likelihoods, (number, num_looks, number), custom_message="likelihoods")
     values.require_finite("likelihoods", likelihoods)
     values.require_number("horizon", horizon)
-    points = jnp.asarray(lattice(number), jnp.float32)
+    points = jnp.asarray(lattice(number, most_points), jnp.float32)
+    steps = steps_of_lattice(number, len(points))
 
     def looks(weights: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """`[C, K]` rewards of the looks, and the corners around the posteriors after them."""
@@ -139,7 +146,7 @@ def solve(
             # Where no class is possible that the look may show.
             after = jnp.where(jnp.sum(after) > 0, after, weights)
             after /= jnp.sum(after)
-            return reward(information(after) - before, config), *_corners(after)
+            return reward(information(after) - before, config), *_corners(after, steps)
 
         return jax.vmap(jax.vmap(look))(likelihoods)
 

@@ -188,8 +188,8 @@ def train_chunk(
         found = infos.greedy_return.at[-1].set(evaluate(key, state.params))
         return state, dataclasses.replace(infos, greedy_return=found)
 
-    # The key itself draws what a training without evaluation draws.
-    keys = jax.random.split(jax.random.fold_in(key, 1), config.chunk // every)
+    # `_draw` splits the key itself in three, as without evaluation.
+    keys = jax.random.split(jax.random.fold_in(key, 3), config.chunk // every)
     groups = jax.tree.map(lambda x: x.reshape(-1, every, *x.shape[1:]), draws)
     state, infos = jax.lax.scan(advance, state, (keys, groups))
     return state, jax.tree.map(lambda x: x.reshape(-1), infos)

@@ -401,7 +401,7 @@ def shows_poi(
     Returns:
       `[]` bool: a ray that may meet a PoI of this size can have met one, and so can all that must,
       except for twice the share that the sensor loses on average. False for a covered or absent
-      PoI, or a failed sensor.
+      PoI, or a failed sensor; of a camera whose light changes, for a failed one only.
     """
     angles = jnp.abs(window_of(sensor, sensor.angles, bearing) - bearing)
     half_width = jnp.arcsin(jnp.minimum(arena.poi_half_width / distance, 1.0))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from toys import classes_mdp, noisy_mdp
 
+from jaxsense.config import MdpConfig
 from jaxsense.dqn import belief_mdp
 from jaxsense.types import Belief
 
@@ -112,6 +113,33 @@ def test_no_gain_costs_one_even_without_a_threshold():
     mdp = classes_mdp(min_increase=0.0)
     _, outcome = belief_mdp.step(jax.random.key(0), mdp, start(), jnp.int32(2), 1)
     assert outcome.reward == -1.0
+
+
+def test_the_reward_of_the_paper_is_a_gain_above_the_threshold_or_minus_one():
+    config = MdpConfig(min_increase=0.25, look_cost=0.1)
+    gains = jnp.array([[0.5, 0.26, 0.25], [0.1, 0.0, -2.0]])
+    expected = [[0.5, 0.26, -1.0], [-1.0, -1.0, -1.0]]
+    np.testing.assert_allclose(belief_mdp.reward(gains, config), expected)
+    assert np.isnan(belief_mdp.reward(jnp.float32(jnp.nan), config))
+
+
+def test_the_reward_in_nats_is_every_gain_less_the_cost_of_a_look():
+    config = MdpConfig(reward="nats", min_increase=0.25, look_cost=0.125)
+    gains = jnp.array([0.5, 0.25, 0.0, -2.0])
+    np.testing.assert_array_equal(belief_mdp.reward(gains, config), [0.375, 0.125, -0.125, -2.125])
+
+
+def test_a_step_is_rewarded_by_the_information_of_its_mdp():
+    # An entry's mean is (class, last modality), and (0, 0) before; the LiDAR is modality 1.
+    base = classes_mdp(reward="nats", look_cost=0.5)
+    mdp = replace(base, information=lambda belief: 10 * belief.mean[0] + 2 * belief.mean[1])
+    # PoI 0 unseen, of class 0: 2 - 0. PoI 1 of class 1, seen by the camera: 12 - 10. Of PoI 2 in
+    # class 2, seen by the LiDAR, no more is left.
+    seen = jnp.array([[0, 0], [1, 0], [0, 1]], bool)
+    state = belief_mdp.reset(jax.random.key(0), mdp, CLASSES, seen)
+    for action, expected in ((0, 1.5), (1, 1.5), (2, -0.5), (NOP, 0.0)):
+        _, outcome = belief_mdp.step(jax.random.key(0), mdp, state, jnp.int32(action), 1)
+        assert outcome.reward == expected
 
 
 def test_a_look_changes_the_entry_and_the_seen_bit_of_its_poi_alone():

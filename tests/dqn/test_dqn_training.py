@@ -272,3 +272,52 @@ def test_the_learning_rate_falls_to_its_last_value_over_all_gradient_steps():
     middle = (PROBE.learning_rate + PROBE.final_learning_rate) / 2
     expected = [PROBE.learning_rate, middle, PROBE.final_learning_rate]
     np.testing.assert_allclose(rates[jnp.array([0, steps // 2, -1])], expected, rtol=2e-3)
+
+
+def length_of(key, params):
+    """A number that any change of the parameters changes."""
+    return sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(params))
+
+
+def trained_for(chunk, evaluate, **settings):
+    """The state and the infos after one chunk of a small training, which begins at epoch 5."""
+    config = replace(SMALL, epochs=chunk, chunk=chunk, **settings)
+    prepared = training.starts(jax.random.key(2), MDP, config.num_starts)
+    state = training.init(jax.random.key(0), MDP, config, prepared)
+    train = jax.jit(
+        lambda key, state: training.train_chunk(key, MDP, 0, config, state, prepared, evaluate),
+        compiler_options=FAST_TO_COMPILE,
+    )
+    return train(jax.random.key(1), replace(state, epoch=jnp.int32(5)))
+
+
+def test_an_evaluation_changes_nothing_that_is_learnt():
+    evaluated, infos = trained_for(20, length_of)
+    alone, infos_alone = trained_for(20, None)
+    jax.tree.map(np.testing.assert_array_equal, evaluated, alone)
+    assert np.all(np.isnan(infos_alone.greedy_return))
+    same = replace(infos, greedy_return=infos_alone.greedy_return)
+    jax.tree.map(np.testing.assert_array_equal, same, infos_alone)
+
+
+def test_the_greedy_policy_is_evaluated_after_every_tenth_epoch():
+    # The target network is a copy of the parameters after epochs 15, 30 and so on: in a chunk that
+    # begins after epoch 5 and ends after epoch 25, of those after its tenth.
+    state, infos = trained_for(20, length_of, target_period=15)
+    np.testing.assert_array_equal(np.flatnonzero(~np.isnan(infos.greedy_return)), [9, 19])
+    found = infos.greedy_return[jnp.array([9, 19])]
+    expected = [length_of(None, params) for params in (state.target, state.params)]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert found[0] != found[1]
+
+
+def test_a_chunk_that_ten_does_not_divide_is_evaluated_at_its_end():
+    state, infos = trained_for(12, length_of)
+    np.testing.assert_array_equal(np.flatnonzero(~np.isnan(infos.greedy_return)), [11])
+    np.testing.assert_allclose(infos.greedy_return[11], length_of(None, state.params), rtol=1e-6)
+
+
+def test_every_evaluation_has_its_own_key():
+    _, infos = trained_for(20, lambda key, params: jax.random.uniform(key))
+    found = np.asarray(infos.greedy_return)
+    assert found[9] != found[19]

@@ -1,7 +1,6 @@
 """Whole episodes with known totals, and the count of the map's states."""
 
 import itertools
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -25,25 +24,42 @@ def play(mdp, policy, seen, modality=0):
     return episodes.run_episode(KEY, mdp, policy, state, modality)
 
 
-def test_every_state_of_the_paper_is_there_once():
-    classes, seen = episodes.every_state(MDP)
-    assert classes.shape == (384, 3)  # 3! x 2^6
-    assert seen.shape == (384, 3, 2)
+def test_every_state_of_the_map_is_there_once():
+    classes, seen = episodes.every_state(3, 3, 2)
+    assert classes.shape == (1728, 3)  # 3^3 x 2^6
+    assert classes.dtype == np.int32
+    assert seen.shape == (1728, 3, 2)
     rows = np.concatenate([classes, seen.reshape(-1, 6)], axis=1)
+    assert len(np.unique(rows, axis=0)) == 1728
+
+
+def test_the_states_of_the_paper_are_those_whose_classes_differ():
+    classes, seen = episodes.every_state(3, 3, 2)
+    is_of_paper = episodes.are_different(classes)
+    assert np.sum(is_of_paper) == 384  # 3! x 2^6
+    np.testing.assert_array_equal(np.sort(classes[is_of_paper], axis=1), [[0, 1, 2]] * 384)
+    rows = np.concatenate([classes, seen.reshape(-1, 6)], axis=1)[is_of_paper]
     assert len(np.unique(rows, axis=0)) == 384
-    np.testing.assert_array_equal(np.sort(classes, axis=1), np.tile([0, 1, 2], (384, 1)))
 
 
-@pytest.mark.parametrize(("num_pois", "expected"), [(1, 3 * 4), (2, 6 * 16), (4, 4096)])
+def test_classes_are_different_unless_one_comes_twice():
+    classes = np.array([[0, 1, 2], [2, 0, 1], [1, 0, 1], [2, 2, 0], [1, 1, 1]])
+    np.testing.assert_array_equal(
+        episodes.are_different(classes), [True, True, False, False, False]
+    )
+    assert np.all(episodes.are_different(classes[:, :1]))
+
+
+@pytest.mark.parametrize(("num_pois", "expected"), [(1, 3 * 4), (2, 9 * 16), (4, 4096)])
 def test_every_state_of_other_maps(num_pois, expected):
-    classes, seen = episodes.every_state(classes_mdp(num_pois=num_pois))
+    classes, seen = episodes.every_state(num_pois, 3, 2)
     assert seen.shape == (expected, num_pois, 2)
     rows = np.concatenate([classes, seen.reshape(expected, -1)], axis=1)
     assert len(np.unique(rows, axis=0)) == expected
 
 
 def test_of_very_many_states_an_even_sample_is_taken():
-    classes, seen = episodes.every_state(classes_mdp(num_pois=8))  # of 3^8 x 2^16
+    classes, seen = episodes.every_state(8, 3, 2)  # of 3^8 x 2^16
     assert classes.shape == (4096, 8)
     rows = np.concatenate([classes, seen.reshape(4096, -1)], axis=1)
     assert len(np.unique(rows, axis=0)) == 4096
@@ -107,24 +123,19 @@ def test_policies_draw_anew_at_every_step():
 
 def every_state_by_enumeration(num_pois, num_classes, num_modalities):
     """Rows of classes and looks, by `itertools` and in its order."""
-    if num_pois <= num_classes:
-        orders = itertools.permutations(range(num_classes), num_pois)
-    else:
-        orders = itertools.product(range(num_classes), repeat=num_pois)
     # The first look changes fastest.
     looks = [bits[::-1] for bits in itertools.product((0, 1), repeat=num_pois * num_modalities)]
-    return [(*order, *bits) for order in orders for bits in looks]
+    every = itertools.product(range(num_classes), repeat=num_pois)
+    return [(*classes, *bits) for classes in every for bits in looks]
 
 
 @pytest.mark.parametrize(
     "sizes",
-    # PoIs, classes, modalities: an order of all classes, of some, of more PoIs than classes; 4096.
+    # PoIs, classes, modalities: as many PoIs as classes, fewer, more; 4096 states.
     [(3, 3, 2), (2, 3, 2), (2, 5, 3), (4, 2, 1), (3, 1, 2), (6, 2, 1)],
 )
 def test_states_come_in_the_order_of_an_enumeration(sizes):
-    num_pois, num_classes, num_modalities = sizes
-    mdp = replace(classes_mdp(num_pois, num_modalities), num_classes=num_classes)
-    classes, seen = episodes.every_state(mdp)
+    classes, seen = episodes.every_state(*sizes)
     expected = every_state_by_enumeration(*sizes)
     np.testing.assert_array_equal(
         np.concatenate([classes, seen.reshape(len(seen), -1)], axis=1), expected
@@ -136,8 +147,7 @@ def test_states_come_in_the_order_of_an_enumeration(sizes):
 )
 def test_of_more_states_than_an_integer_holds_an_even_sample_is_taken(sizes):
     num_pois, num_classes, num_modalities = sizes
-    mdp = replace(classes_mdp(num_pois, num_modalities), num_classes=num_classes)
-    classes, seen = episodes.every_state(mdp)
+    classes, seen = episodes.every_state(*sizes)
     assert seen.shape == (4096, num_pois, num_modalities)
     looks = seen.reshape(4096, -1).astype(int)
     assert len(np.unique(np.concatenate([classes, looks], axis=1), axis=0)) == 4096
@@ -149,8 +159,6 @@ def test_of_more_states_than_an_integer_holds_an_even_sample_is_taken(sizes):
     np.testing.assert_allclose(looks.mean(axis=0), 0.5, atol=4 * np.sqrt(0.25 / 4096))
     pairs = np.corrcoef(looks.T) - np.eye(looks.shape[1])
     assert np.max(np.abs(pairs)) < 5 / np.sqrt(4096)
-    if num_pois <= num_classes:  # an order holds no class twice
-        assert np.all(np.diff(np.sort(classes, axis=1), axis=1) > 0)
-    again = episodes.every_state(mdp)
+    again = episodes.every_state(*sizes)
     np.testing.assert_array_equal(again[0], classes)
     np.testing.assert_array_equal(again[1], seen)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG
+from teams import CONFIG, NAIVE
 
 import jaxsense
 from jaxsense import mission
@@ -25,7 +25,7 @@ def arena_of(team):
     """A mission in a chosen arena: PoIs, robots' poses, classes, policy and faults."""
     start = jax.jit(lambda *given: mission.start(team, *given))
 
-    def make(positions, poses, classes=(0, 1, 2), policy=mission.NAIVE, faults=None):
+    def make(positions, poses, classes=(0, 1, 2), policy=NAIVE, faults=None):
         classes = jnp.array(classes)
         layout = jaxsense.sim.make_layout(
             CONFIG.arena, jnp.array(positions, jnp.float32), jnp.zeros(len(classes)), classes

@@ -5,10 +5,11 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import PRESETS
+from jaxsense.config import POLICIES, PRESETS
 
 # Untrained detectors are never sure; what they say is of no importance here.
 CONFIG = replace(PRESETS["smoke"], mission=replace(PRESETS["smoke"].mission, least_confidence=0.0))
+NAIVE = POLICIES.index("naive")
 
 
 def alone(function):

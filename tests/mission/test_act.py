@@ -10,7 +10,7 @@ from teams import CONFIG, alone
 
 from jaxsense import mission
 from jaxsense.mission import act
-from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults
+from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults, with_config
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors, world
 
@@ -39,6 +39,48 @@ def facing(arena_of, set_robot):
         return set_robot(state, robot, phase=FACING, target=0, progress_at=-100.0)
 
     return make
+
+
+def scan_as(team, models, robot):
+    """A scan whose detector returns one probability of its first label, whatever it sees."""
+
+    @jax.jit
+    @alone
+    def scan(key, state, confidence):
+        # All weights are zero: of two labels one has the probability 1 / (1 + exp(-logit)).
+        logit = jnp.log(confidence[0] / (1 - confidence[0]))
+        detector = models.detectors[robot]
+        params = jax.tree.map(jnp.zeros_like, detector.params)
+        layer = f"Dense_{len(detector.hidden)}"
+        params["params"][layer]["bias"] = jnp.stack([logit, 0.0])
+        detectors = list(models.detectors)
+        detectors[robot] = replace(detector, params=params)
+        return act.scan(key, team, replace(models, detectors=tuple(detectors)), state, robot)
+
+    return scan
+
+
+@pytest.mark.parametrize(
+    ("robot", "expected"),
+    [
+        # .8 for red and .2 for green, of one green class before two red ones, which were of the
+        # odds 2 to 1 to 1: 2 x .2 / (1/3) to .8 / (2/3) to .8 / (2/3) = 1.2 to 1.2 to 1.2.
+        (CAMERA, [1 / 3, 1 / 3, 1 / 3]),
+        # .8 for a cylinder, of two classes before one cube: 2 x 1.2 to 1.2 to .6.
+        (LIDAR, [4 / 7, 2 / 7, 1 / 7]),
+    ],
+)
+def test_a_detection_updates_the_exact_posterior_and_is_counted(
+    team, models, facing, robot, expected
+):
+    before = facing(robot)
+    counts = before.times_seen.at[0, robot].set(4).at[1].set(2)
+    posterior = before.log_posterior.at[0].set(jnp.log(jnp.array([0.5, 0.25, 0.25])))
+    before = replace(before, times_seen=counts, log_posterior=posterior)
+    after = scan_as(team, models, robot)(jax.random.key(0), before, jnp.float32(0.8))
+    np.testing.assert_allclose(np.exp(after.log_posterior[0]), expected, rtol=1e-5)
+    np.testing.assert_array_equal(after.log_posterior[1:], posterior[1:])
+    np.testing.assert_array_equal(after.times_seen, counts.at[0, robot].set(5))
 
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
@@ -71,6 +113,8 @@ def test_what_is_hidden_or_not_seen_gives_no_detection(scan, facing, robot, sett
     assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, 0)
     assert after.version == 0
     assert not np.any(after.seen)
+    np.testing.assert_array_equal(after.times_seen, before.times_seen)
+    np.testing.assert_array_equal(after.log_posterior, before.log_posterior)
     jax.tree.map(np.testing.assert_array_equal, after.belief, before.belief)
     assert after.robots.attempts[robot] == 1
     assert after.robots.target[robot] == 0
@@ -106,23 +150,24 @@ def test_a_poi_that_is_not_where_it_is_expected_is_not_shown(facing, robot, team
 def test_an_unsure_detector_writes_nothing(models, facing, robot):
     settings = replace(CONFIG.mission, least_confidence=0.6)
     strict = mission.make_mission(replace(CONFIG, mission=settings), contacts=False)
-
-    @jax.jit
-    @alone
-    def scan(key, state, logit):
-        # All weights are zero: of two labels one has the probability 1 / (1 + exp(-logit)).
-        detector = models.detectors[robot]
-        params = jax.tree.map(jnp.zeros_like, detector.params)
-        layer = f"Dense_{len(detector.hidden)}"
-        params["params"][layer]["bias"] = jnp.stack([logit[0], 0.0])
-        detectors = list(models.detectors)
-        detectors[robot] = replace(detector, params=params)
-        return act.scan(key, strict, replace(models, detectors=tuple(detectors)), state, robot)
-
+    scan = scan_as(strict, models, robot)
     for confidence, detections in ((0.59, 0), (0.61, 1)):
-        logit = jnp.float32(np.log(confidence / (1 - confidence)))
-        after = scan(jax.random.key(0), facing(robot), logit)
+        after = scan(jax.random.key(0), facing(robot), jnp.float32(confidence))
         assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, detections)
+
+
+@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
+def test_a_poi_is_seen_however_wrong_its_bearing_is_believed_to_be(team, models, facing, robot):
+    # At .8 m it is 7.18 degrees to either side, .7 of which would reach beyond it if the bearing
+    # were 6 degrees off and nobody knew.
+    unsure = replace(CONFIG, viewpoint=replace(CONFIG.viewpoint, bearing_error=6.0))
+    number, changed = 32, with_config(team, unsure)
+    states = jax.tree.map(lambda x: jnp.stack([x] * number), facing(robot))
+    keys = jax.random.split(jax.random.key(0), number)
+    after = jax.jit(lambda keys, states: act.scan(keys, changed, models, states, robot))(
+        keys, states
+    )
+    np.testing.assert_array_equal(after.robots.detections[:, robot], 1)
 
 
 @pytest.mark.parametrize(

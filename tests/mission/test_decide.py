@@ -6,31 +6,47 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import with_values
+from teams import CONFIG, NAIVE, with_values
 
 from jaxsense import mission
-from jaxsense.mission import decide
-from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE
+from jaxsense.dqn import optimum
+from jaxsense.dqn.optimum import LookValues
+from jaxsense.mission import POLICIES, decide
+from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, with_config
 from jaxsense.types import Belief
+from jaxsense.vae import filtering
 
 # The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
 POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
 POSES = [[0.0, 0.0, 0.0], [1.2, 1.2, 0.0]]
 SURE = Belief(jnp.array([[3.0, 0.0], [-2.0, 0.0], [0.0, 2.0]]), jnp.full((3, 2), 0.25))
+RULES = {"nearest_first": True, "redecides": True, "avoids_targets": True}
 
 
 @pytest.fixture(scope="module")
 def decides(team):
-    return jax.jit(lambda key, models, state: decide.decide(key, team, models, state, 0))
+    def choose(key, models, state, rules):
+        changed = replace(CONFIG, mission=replace(CONFIG.mission, **rules))
+        return decide.decide(key, with_config(team, changed), models, state, 0)
+
+    jitted = jax.jit(choose)
+    return lambda models, state, **rules: jitted(
+        jax.random.key(0), models, state, {**RULES, **rules}
+    )
 
 
 @pytest.fixture(scope="module")
 def chosen(decides, models, arena_of):
-    def choose(values, policy=mission.LATENT, change=lambda state: state):
+    def choose(values, policy=mission.LATENT, change=lambda state: state, **rules):
         state = change(arena_of(POSITIONS, POSES, policy=policy))
-        return decides(jax.random.key(0), with_values(models, values, values), state)
+        return decides(with_values(models, values, values), state, **rules)
 
     return choose
+
+
+def seen_by(own, other=(0, 0, 0)):
+    """How often the robot under test has seen each PoI, and how often the other one has."""
+    return lambda state: replace(state, times_seen=jnp.array([own, other], jnp.int32).T)
 
 
 @pytest.mark.parametrize(
@@ -58,9 +74,29 @@ def test_when_nothing_beats_nop_the_robot_ends(chosen):
     assert state.robots.goals[0] == 0
 
 
-def test_of_equal_values_the_one_that_nobody_heads_for_is_taken(chosen, set_robot):
-    state = chosen([1.0] * 3 + [0.0], change=lambda s: set_robot(s, 1, target=1))
-    assert state.robots.target[0] == 0
+@pytest.mark.parametrize("policy", [mission.LATENT, NAIVE])
+@pytest.mark.parametrize(("is_nearest_first", "target"), [(True, 1), (False, 0)])
+def test_of_equal_values_the_nearest_or_else_the_first_is_taken(
+    chosen, policy, is_nearest_first, target
+):
+    state = chosen([1.0] * 3 + [0.0], policy, nearest_first=is_nearest_first)
+    assert state.robots.target[0] == target
+
+
+@pytest.mark.parametrize("policy", [mission.LATENT, NAIVE])
+@pytest.mark.parametrize(("avoids", "target"), [(True, 0), (False, 1)])
+def test_of_equal_values_the_one_that_nobody_heads_for_is_taken(
+    chosen, set_robot, policy, avoids, target
+):
+    heading = lambda state: set_robot(state, 1, target=1)  # noqa: E731
+    state = chosen([1.0] * 3 + [0.0], policy, heading, avoids_targets=avoids)
+    assert state.robots.target[0] == target
+
+
+def test_the_first_that_nobody_heads_for_is_taken_where_distances_do_not_count(chosen, set_robot):
+    heading = lambda state: set_robot(state, 1, target=0)  # noqa: E731
+    state = chosen([1.0] * 3 + [0.0], change=heading, nearest_first=False)
+    assert state.robots.target[0] == 1
 
 
 def test_a_poi_that_was_given_up_is_left_out(chosen, set_robot):
@@ -75,23 +111,88 @@ def test_a_poi_that_was_given_up_is_left_out(chosen, set_robot):
 
 def test_naive_takes_the_nearest_that_its_own_sensor_has_not_seen(chosen):
     useless = [0.0] * 4
-    assert chosen(useless, mission.NAIVE).robots.target[0] == 1
-
-    def seen_by(own, other):
-        seen = jnp.array([own, other]).T
-        return lambda state: replace(state, seen=seen)
-
-    nobody = [False] * 3
-    after_first = chosen(useless, mission.NAIVE, seen_by([False, True, False], nobody))
+    assert chosen(useless, NAIVE).robots.target[0] == 1
+    after_first = chosen(useless, NAIVE, seen_by([0, 1, 0]))
     assert after_first.robots.target[0] == 0
-    after_others = chosen(useless, mission.NAIVE, seen_by(nobody, [True] * 3))
+    after_others = chosen(useless, NAIVE, seen_by([0, 0, 0], [1, 1, 1]))
     assert after_others.robots.target[0] == 1
-    after_all = chosen(useless, mission.NAIVE, seen_by([True] * 3, nobody))
+    after_all = chosen(useless, NAIVE, seen_by([1, 1, 1]))
     assert after_all.robots.phase[0] == ENDED
 
 
+@pytest.mark.parametrize(
+    ("times", "targets"),
+    [
+        # Of what each has not seen often enough, the nearest; PoI 1 is nearer than 0, that than 2.
+        ([1, 2, 0], (2, 0, 1)),
+        ([1, 1, 1], (3, 1, 1)),
+        ([2, 2, 2], (3, 3, 1)),
+        ([3, 3, 3], (3, 3, 3)),
+    ],
+)
+def test_naive_policies_look_once_twice_and_three_times(chosen, times, targets):
+    for policy, target in zip(("naive", "naive_2", "naive_3"), targets, strict=True):
+        # What the other robot has seen does not count.
+        state = chosen([0.0] * 4, POLICIES.index(policy), seen_by(times, [3, 0, 3]))
+        assert state.robots.target[0] == target
+
+
+def look_values(gains, totals):
+    """Values of looks that are linear in the classes' probabilities, and so exact in a table."""
+    points = jnp.array(optimum.lattice(3), jnp.float32)
+    return LookValues(points @ jnp.array(gains), points @ jnp.array(totals))
+
+
+@pytest.fixture(scope="module")
+def by_tables(decides, models, arena_of):
+    """The robot's choice with a policy that reads tables.
+
+    By the map, PoI n is of class n; by exact Bayes, of the class after that.
+    """
+    shares = jnp.eye(3)
+    belief = jax.vmap(lambda weights: filtering.mixture(SURE, weights))(shares)
+    posterior = jnp.log(jnp.roll(shares, 1, axis=1) + 1e-6)
+
+    def choose(policy, gains, totals):
+        # The other robot's looks would be worth the most at what this one values least.
+        of_each = look_values(gains, totals), look_values([-9 * g for g in gains], [9.0, 0.0, 0.0])
+        trained = replace(
+            models,
+            class_beliefs=SURE,
+            moments_inverse=filtering.moments_inverse(SURE),
+            look_values=of_each,
+        )
+        state = arena_of(POSITIONS, POSES, policy=POLICIES.index(policy))
+        return decides(trained, replace(state, belief=belief, log_posterior=posterior))
+
+    return choose
+
+
+@pytest.mark.parametrize(
+    ("policy", "target"),
+    [
+        ("greedy", 0),  # which the map takes for class 0, of gain 1
+        ("bayes", 2),  # which is of class 0 by exact Bayes
+        ("optimal", 1),  # which is of class 2 by exact Bayes, of total 1
+    ],
+)
+def test_policies_with_tables_take_the_look_of_the_highest_value(by_tables, policy, target):
+    gains, totals = [1.0, -1.0, 0.5], [-1.0, 0.2, 1.0]
+    assert by_tables(policy, gains, totals).robots.target[0] == target
+    # What the other table says is of no importance.
+    is_of_total = policy == "optimal"
+    state = by_tables(policy, *(([0.0] * 3, totals) if is_of_total else (gains, [0.0] * 3)))
+    assert state.robots.target[0] == target
+
+
+@pytest.mark.parametrize("policy", ["greedy", "bayes", "optimal"])
+def test_policies_with_tables_end_where_no_look_has_a_value_above_0(by_tables, policy):
+    assert by_tables(policy, [-0.1, -1.0, 0.0], [-0.1, -1.0, 0.0]).robots.phase[0] == ENDED
+    assert by_tables(policy, [-0.1, -1.0, 0.1], [-0.1, -1.0, 0.1]).robots.phase[0] == DRIVING
+
+
 def test_random_takes_every_poi_and_nop_equally_often(team, models, arena_of):
-    state = arena_of(POSITIONS, POSES, policy=mission.RANDOM)
+    state = arena_of(POSITIONS, POSES, policy=POLICIES.index("random"))
     choose = jax.jit(
         jax.vmap(lambda key: decide.decide(key, team, models, state, 0).robots.target[0])
     )
@@ -102,18 +203,19 @@ def test_random_takes_every_poi_and_nop_equally_often(team, models, arena_of):
 
 
 @pytest.mark.parametrize("phase", [DRIVING, FACING])
+@pytest.mark.parametrize("policy", [mission.LATENT, NAIVE])
 @pytest.mark.parametrize(
-    ("policy", "version", "target"),
-    [(mission.LATENT, 1, 2), (mission.LATENT, 0, 0), (mission.NAIVE, 1, 0)],
+    ("version", "redecides", "target"), [(1, True, 2), (0, True, 0), (1, False, 0)]
 )
-def test_a_changed_map_makes_the_latent_policy_decide_again(
-    chosen, set_robot, phase, policy, version, target
+def test_a_changed_map_makes_a_robot_decide_again(
+    chosen, set_robot, phase, policy, version, redecides, target
 ):
     def under_way(state):
-        state = replace(state, version=jnp.int32(version))
+        # Of the naive policy only PoI 2 is left, which is the best of the latent one.
+        state = seen_by([1, 1, 0])(replace(state, version=jnp.int32(version)))
         return set_robot(state, 0, phase=phase, target=0, goals=1, attempts=1)
 
-    state = chosen([0.0, 0.0, 1.0, 0.5], policy, under_way)
+    state = chosen([0.0, 0.0, 1.0, 0.5], policy, under_way, redecides=redecides)
     assert state.robots.target[0] == target
     if target == 2:
         assert state.robots.phase[0] == DRIVING
@@ -190,7 +292,7 @@ def after_giving_up(decides, models, arena_of, set_robot):
         trained = replace(models, class_beliefs=sure, q_networks=networks)
         state = arena_of(POSITIONS, POSES, policy=mission.LATENT)
         state = set_robot(state, 0, undetected=jnp.array([False, True, False]))
-        return int(decides(jax.random.key(0), trained, state).robots.target[0])
+        return int(decides(trained, state).robots.target[0])
 
     return choose
 

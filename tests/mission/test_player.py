@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG
+from teams import CONFIG, NAIVE
 
 from jaxsense import mission
 from jaxsense.mission.state import Record
@@ -44,7 +44,7 @@ WORKERS = {
 
 @pytest.mark.parametrize("split", WORKERS)
 def test_the_whole_first_mission_is_recorded(split, team, monkeypatch):
-    state = jax.jit(lambda: mission.reset(KEY, team, mission.NAIVE))()
+    state = jax.jit(lambda: mission.reset(KEY, team, NAIVE))()
 
     def fake_reset(key, team, policy, faults):
         poses = jax.random.normal(key, state.scene.poses.shape)

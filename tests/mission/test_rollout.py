@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from teams import CONFIG
+from teams import CONFIG, NAIVE
 
 from jaxsense import mission
 from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
@@ -49,7 +49,7 @@ def played(team, go_on, as_numpy):
 
     @jax.jit
     def begin(keys, faults):
-        return jax.vmap(lambda k, f: mission.reset(k, team, mission.NAIVE, f))(keys, faults)
+        return jax.vmap(lambda k, f: mission.reset(k, team, NAIVE, f))(keys, faults)
 
     number = len(stops_at)
     start = begin(jax.random.split(jax.random.key(0), number), Faults(stops_at, blind_at))
@@ -192,7 +192,7 @@ def test_without_any_robot_the_mission_ends_at_once(played):
 
 def test_same_keys_give_the_same_mission_and_the_policy_does_not_change_the_arena(team):
     reset = jax.jit(lambda key, policy: mission.reset(key, team, policy))
-    first, again = (reset(jax.random.key(3), mission.NAIVE) for _ in range(2))
+    first, again = (reset(jax.random.key(3), NAIVE) for _ in range(2))
     latent, other = reset(jax.random.key(3), mission.LATENT), reset(jax.random.key(4), 0)
     jax.tree.map(np.testing.assert_array_equal, first, again)
     jax.tree.map(np.testing.assert_array_equal, first.scene, latent.scene)

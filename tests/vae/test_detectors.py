@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsense.config import DetectorConfig
-from jaxsense.vae import detectors
+from jaxsense.vae import detectors, metrics
 
 CONFIG = DetectorConfig(hidden=(16,), steps=200, batch=64, learning_rate=1e-2)
 
@@ -59,6 +59,77 @@ def test_detect_gives_probabilities_of_the_labels_in_order(trained):
     assert features.shape == (50, 2)
     np.testing.assert_allclose(features.sum(axis=-1), 1.0, rtol=1e-6)
     np.testing.assert_array_equal(features[:, 1] > 0.5, labels == 1)
+
+
+def with_logits(*logits):
+    """A detector of these logits for every window, half by its last bias and half by its kernel."""
+    detector = detectors.init(jax.random.key(0), jnp.zeros((2, 3)), len(logits), CONFIG)
+    layers = jax.tree.map(jnp.zeros_like, detector.params["params"])
+    half = jnp.array(logits) / 2
+    layers["Dense_0"]["bias"] = layers["Dense_0"]["bias"].at[0].set(1.0)
+    layers["Dense_1"] = {"kernel": layers["Dense_1"]["kernel"].at[0].set(half), "bias": half}
+    return replace(detector, params={"params": layers})
+
+
+@pytest.mark.parametrize(
+    ("temperature", "left", "error"),
+    [
+        (0.25, 1.0, 1e-5),
+        (0.5, 1.0, 1e-5),
+        (1.0, 1.0, 1e-5),
+        (2.0, 1.0, 1e-5),
+        (4.0, 1.0, 1e-5),
+        # 257 temperatures from 1/4 to 4 are steps of 16^(1/256) = 1.0109: half of one away at most.
+        (3.0, 1.0, 0.0055),
+        (0.7, 1.0, 0.0055),
+        # Beyond 4 and 1/4 some of it is left.
+        (8.0, 2.0, 1e-5),
+        (0.1, 0.4, 1e-5),
+    ],
+)
+def test_calibration_finds_the_temperature_of_the_logits(temperature, left, error):
+    # Of ten looks that are all the same eight are of label 0: logits should be ln(8 / 2) apart.
+    right, labels = np.log(4.0), jnp.array([0] * 8 + [1] * 2)
+    detector = with_logits(0.5 + temperature * right, 0.5)
+    calibrated = detectors.calibrate(detector, jnp.zeros((10, 3)), labels)
+    logits = detectors.logits(calibrated, jnp.zeros(3))
+    assert logits[0] - logits[1] == pytest.approx(left * right, rel=error)
+
+
+def test_calibration_reads_windows_as_the_detector_does(trained):
+    # Labels are drawn by its own logits, and by flatter and sharper ones.
+    _, detector, _ = trained
+    windows, _ = synthetic_windows(jax.random.key(5), 4000)
+    logits = jax.vmap(detectors.logits, in_axes=(None, 0))(detector, windows)
+    is_unsure = jnp.abs(logits[:, 0] - logits[:, 1]) < 4
+    unsure, logits = windows[is_unsure], logits[is_unsure]
+    for sharpness in (0.5, 1.0, 2.0):
+        labels = jax.random.categorical(jax.random.key(6), sharpness * logits)
+        calibrated = detectors.calibrate(detector, unsure, labels)
+        found = jax.vmap(detectors.logits, in_axes=(None, 0))(calibrated, unsure)
+        ratio = np.sum(found * logits) / np.sum(logits**2)
+        np.testing.assert_allclose(found, ratio * logits, atol=1e-4)
+        # Four standard errors of the most likely sharpness, and a step of the search.
+        apart = np.asarray(logits[:, 0] - logits[:, 1])
+        spread = 1 / (2 + 2 * np.cosh(sharpness * apart))  # p (1 - p) of each label
+        error = 4 / np.sqrt(np.sum(spread * apart**2)) + 0.011 * sharpness
+        np.testing.assert_allclose(ratio, sharpness, atol=error)
+
+
+def test_calibration_changes_no_label_and_never_makes_the_looks_less_likely(trained):
+    _, detector, _ = trained
+    of_one, labels = synthetic_windows(jax.random.key(7), 300)
+    # Half way between the labels, where the detector is unsure.
+    windows = (of_one + of_one[::-1]) / 2
+    for given in (labels, 1 - labels, jnp.zeros(300, int)):
+        calibrated = detectors.calibrate(detector, windows, given)
+        before, after = (
+            jax.vmap(detectors.detect, in_axes=(None, 0))(d, windows)
+            for d in (detector, calibrated)
+        )
+        np.testing.assert_array_equal(before.argmax(axis=1), after.argmax(axis=1))
+        nll_before, nll_after = (metrics.negative_log_likelihood(p, given) for p in (before, after))
+        assert nll_after <= nll_before + 1e-6
 
 
 def test_a_training_starts_from_the_loss_of_the_detector_it_is_given():

@@ -183,6 +183,22 @@ def test_fusion_takes_the_filter_if_there_is_one():
     assert not np.allclose(found.mean, in_place.mean)
 
 
+def test_entropy_by_hand():
+    # (ln 2) / 2 + 2 (ln 4) / 4; a class without weight counts nothing.
+    weights = jnp.array([[0.5, 0.25, 0.25], [0.0, 0.5, 0.5], [0.0, 1.0, 0.0]])
+    expected = [1.5 * np.log(2), np.log(2), 0.0]
+    np.testing.assert_allclose(filtering.entropy(weights), expected, atol=1e-6)
+
+
+def test_likelihoods_of_classes_by_hand():
+    # Of three classes one is green and two are red: .2 / (1/3) = .6 and .8 / (2/3) = 1.2.
+    found = peers.log_likelihoods(jnp.array([0.8, 0.2]), LABELS[0])
+    np.testing.assert_allclose(np.exp(found), [0.6, 1.2, 1.2], rtol=1e-6)
+    # One cube and two cylinders; what the detector rules out keeps a chance of 1e-12.
+    found = peers.log_likelihoods(jnp.array([1.0, 0.0]), LABELS[1])
+    np.testing.assert_allclose(np.exp(found), [1.5, 1.5, 3e-12], rtol=1e-5)
+
+
 def test_bayes_by_hand():
     # Two of three classes are red: .8 for red counts .8 / (2/3), and .2 for green .2 / (1/3).
     log_weights = peers.bayes_update(jnp.log(jnp.full(3, 1 / 3)), jnp.array([0.8, 0.2]), LABELS[0])

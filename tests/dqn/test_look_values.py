@@ -1,0 +1,262 @@
+"""The values of looks by dynamic programming, against enumeration and against play."""
+
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense.config import MdpConfig
+from jaxsense.dqn import belief_mdp, episodes, optimum, policies
+from jaxsense.dqn.belief_mdp import MapMdp
+from jaxsense.types import Belief
+from jaxsense.vae import filtering
+
+KEY = jax.random.key(0)
+HORIZON = 3
+NUM_CLASSES = (1, 2, 3, 4, 6, 15)
+interpolate = jax.jit(jax.vmap(optimum.interpolate, in_axes=(None, 0)))
+
+
+@pytest.mark.parametrize("number", NUM_CLASSES)
+def test_the_lattice_holds_every_point_of_whole_steps_once(number):
+    steps, points = optimum.steps_of_lattice(number), optimum.lattice(number)
+    # Steps divided among the classes: bars between them in any of steps + C - 1 places.
+    assert points.shape == (math.comb(steps + number - 1, number - 1), number)
+    whole = np.round(points * steps)
+    np.testing.assert_allclose(points * steps, whole, atol=1e-9)
+    assert np.all(whole >= 0)
+    np.testing.assert_array_equal(whole.sum(axis=1), steps)
+    assert len(np.unique(whole, axis=0)) == len(points)
+
+
+def test_the_more_classes_the_fewer_steps_and_never_more_than_8192_points():
+    # 512 at most; 127 x 128 / 2 = 8128, 128 x 129 / 2 = 8256; of 15 classes C(18, 4) = 3060 points,
+    # not C(19, 5) = 11,628.
+    assert [optimum.steps_of_lattice(n) for n in (1, 2, 3, 15)] == [512, 512, 126, 4]
+
+
+@pytest.mark.parametrize("number", NUM_CLASSES)
+def test_a_point_of_the_lattice_reads_its_own_row(number):
+    points = optimum.lattice(number)
+    rows = jnp.arange(len(points), dtype=jnp.float32)
+    # To within the rounding of a probability, 6e-8, times the steps and the difference of two rows.
+    np.testing.assert_allclose(interpolate(rows, jnp.array(points, jnp.float32)), rows, atol=0.5)
+    steps = optimum.steps_of_lattice(number)
+    sums = np.round(steps * np.cumsum(points[:, ::-1], axis=1)[:, ::-1][:, 1:]).astype(int)
+    np.testing.assert_array_equal(optimum._rows(sums, steps), np.arange(len(points)))
+
+
+@pytest.mark.parametrize("number", NUM_CLASSES)
+def test_a_linear_function_is_read_exactly_between_the_points(number):
+    random = np.random.default_rng(number)
+    slopes = random.normal(size=number)
+    table = jnp.array(optimum.lattice(number) @ slopes, jnp.float32)
+    inside = random.dirichlet(np.ones(number), 200)
+    # And on the faces, where some classes are impossible.
+    edges = random.dirichlet(np.full(number, 0.05), 200)
+    for weights in (inside, edges, np.eye(number)):
+        found = interpolate(table, jnp.array(weights, jnp.float32))
+        np.testing.assert_allclose(found, weights @ slopes, atol=1e-5)
+
+
+def entropy(weights):
+    return -sum(w * math.log(w) for w in weights if w > 0)
+
+
+# Information of class probabilities, for enumeration and for the table, and the settings.
+REWARDS = {
+    "nats": (
+        lambda weights: -entropy(weights),
+        lambda weights: -filtering.entropy(weights),
+        MdpConfig(reward="nats", look_cost=0.02),
+    ),
+    "paper": (
+        lambda weights: 2 * sum(w * w for w in weights),
+        lambda weights: 2 * jnp.sum(weights**2),
+        MdpConfig(reward="paper", min_increase=0.12),
+    ),
+}
+# For each class two looks that are equally likely, and how likely every class makes each.
+ROUND, EDGY = (0.8, 0.2), (0.2, 0.8)
+RED, GREEN = (0.8, 0.5, 0.1), (0.2, 0.5, 0.9)
+LOOKS = {2: ((ROUND, ROUND), (EDGY, ROUND)), 3: ((RED, RED), (RED, GREEN), (GREEN, GREEN))}
+# Points of the lattices, of 512 and of 126 steps.
+STARTS = {
+    2: ((1 / 2, 1 / 2), (3 / 4, 1 / 4), (7 / 8, 1 / 8), (1 / 16, 15 / 16), (1, 0)),
+    3: ((1 / 3, 1 / 3, 1 / 3), (1 / 2, 1 / 3, 1 / 6), (1 / 6, 1 / 6, 2 / 3), (1 / 3, 2 / 3, 0)),
+}
+
+
+def enumerated(name, weights, horizon):
+    """Expected reward of a look and of all that pay after it, over all that looks may show."""
+    (information, _, config), looks = REWARDS[name], LOOKS[len(weights)]
+    expected = 0.0
+    for chance, of_class in zip(weights, looks, strict=True):
+        for likelihoods in of_class:
+            after = [w * x for w, x in zip(weights, likelihoods, strict=True)]
+            after = [w / sum(after) for w in after]
+            gain = information(after) - information(weights)
+            if name == "nats":
+                reward = gain - config.look_cost
+            else:
+                # No gain that comes up is so near to the threshold that a point beside it is
+                # rewarded otherwise.
+                assert abs(gain - config.min_increase) > 0.015
+                reward = gain if gain > config.min_increase else -1.0
+            later = max(enumerated(name, after, horizon - 1), 0.0) if horizon > 1 else 0.0
+            expected += chance / len(of_class) * (reward + later)
+    return expected
+
+
+@pytest.mark.parametrize("number", [2, 3])
+@pytest.mark.parametrize("name", REWARDS)
+def test_values_are_those_of_all_histories(name, number):
+    _, information, config = REWARDS[name]
+    likelihoods = jnp.log(jnp.array(LOOKS[number]))
+    starts = jnp.array(STARTS[number], jnp.float32)
+    by_horizon = []
+    for horizon in (1, 2, HORIZON):
+        found = optimum.solve(likelihoods, information, config, horizon)
+        gain = [enumerated(name, weights, 1) for weights in STARTS[number]]
+        total = [enumerated(name, weights, horizon) for weights in STARTS[number]]
+        np.testing.assert_allclose(interpolate(found.gain, starts), gain, atol=1e-5)
+        # A step of the lattice apart, a slope that changes by 1 where looks begin to pay is read
+        # wrongly by a quarter of the step.
+        error = 0.25 / optimum.steps_of_lattice(number) if horizon > 1 else 1e-5
+        np.testing.assert_allclose(interpolate(found.total, starts), total, atol=error)
+        by_horizon.append(total[0])
+    # Later looks pay.
+    assert by_horizon[0] + 0.005 < by_horizon[2]
+
+
+def test_a_look_that_is_certain_pays_once():
+    # It shows the class: ln 2 from one half each, and then no more than it costs.
+    likelihoods = jnp.array([[[0.0, -200.0]], [[-200.0, 0.0]]])
+    config = MdpConfig(reward="nats", look_cost=0.1)
+    found = optimum.solve(likelihoods, lambda w: -filtering.entropy(w), config, 5)
+    weights = jnp.array([[0.5, 0.5], [1.0, 0.0], [0.0, 1.0]])
+    for table in (found.gain, found.total):
+        # In none of the last two can the look of the other class happen.
+        np.testing.assert_allclose(
+            interpolate(table, weights), [math.log(2) - 0.1, -0.1, -0.1], atol=1e-6
+        )
+
+
+# A look is red with the chance .75, .5 or .25: three, two or one of four looks.
+OF_RED, OF_GREEN = (0.75, 0.5, 0.25), (0.25, 0.5, 0.75)
+CALIBRATED = jnp.log(
+    jnp.array(
+        [
+            [OF_RED, OF_RED, OF_RED, OF_GREEN],
+            [OF_RED, OF_RED, OF_GREEN, OF_GREEN],
+            [OF_RED, OF_GREEN, OF_GREEN, OF_GREEN],
+        ]
+    )
+)
+
+
+def weights_of(belief):
+    """Class probabilities of an entry whose mean holds their logarithms."""
+    return jax.nn.softmax(belief.mean)
+
+
+def exact_mdp(information, config):
+    """Two PoIs, whose entries are their classes' logarithmic probabilities by exact Bayes."""
+
+    def observe(key, classes, poi, modality):
+        return CALIBRATED[classes[poi], jax.random.randint(key, (), 0, 4)], classes
+
+    return MapMdp(
+        config=config,
+        num_pois=2,
+        num_classes=3,
+        num_modalities=1,
+        unseen=Belief(jnp.zeros(3), jnp.ones(3)),
+        new_scene=lambda key, classes: classes,
+        observe=observe,
+        write=lambda belief, seen, features, modality: replace(belief, mean=belief.mean + features),
+        information=lambda belief: information(weights_of(belief)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("information", "cost", "looks_ahead"),
+    [
+        (lambda weights: -filtering.entropy(weights), 0.03, False),
+        # One look alone does not pay, several do.
+        (lambda weights: jnp.max(weights) ** 8, 0.02, True),
+    ],
+    ids=["entropy", "convex"],
+)
+def test_the_policy_by_the_table_returns_the_tables_value(information, cost, looks_ahead):
+    config = MdpConfig(reward="nats", look_cost=cost, max_steps=200, partly_seen_starts=False)
+    mdp = exact_mdp(information, config)
+
+    @jax.jit
+    def play(keys):
+        found = optimum.solve(CALIBRATED, information, config, 100)
+
+        def returns(key):
+            start_key, play_key = jax.random.split(key)
+            start = belief_mdp.reset(start_key, mdp, seen=jnp.zeros((2, 1), bool))
+            return [
+                episodes.run_episode(
+                    play_key, mdp, policies.by_posterior(table, weights_of), start, 0
+                )[0]
+                for table in (found.total, found.gain)
+            ]
+
+        unseen = jnp.full(3, 1 / 3)
+        expected = [optimum.interpolate(table, unseen) for table in (found.total, found.gain)]
+        return expected, jax.vmap(returns)(keys)
+
+    number = 4000
+    (total, gain), (optimal, short_sighted) = play(jax.random.split(KEY, number))
+    # Four standard errors of the mean; each of the two PoIs is worth the table's value.
+    error = 4 * optimal.std() / np.sqrt(number)
+    np.testing.assert_allclose(optimal.mean(), 2 * total, atol=error)
+    difference = optimal - short_sighted
+    assert difference.mean() > -4 * difference.std() / np.sqrt(number)
+    if looks_ahead:
+        assert gain < 0 < total
+        np.testing.assert_array_equal(short_sighted, 0.0)
+        assert difference.mean() > 4 * difference.std() / np.sqrt(number)
+
+
+def test_the_policy_takes_the_look_of_the_highest_value_or_else_nop():
+    mdp = exact_mdp(jnp.max, MdpConfig(partly_seen_starts=False))
+    act = policies.by_posterior(jnp.array(optimum.lattice(3)[:, 0]) - 0.5, weights_of)
+    state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1]), jnp.zeros((2, 1), bool))
+    for first_classes, action in (((0.6, 0.7), 1), ((0.8, 0.7), 0), ((0.4, 0.49), 2)):
+        means = jnp.log(jnp.array([[p, (1 - p) / 2, (1 - p) / 2] for p in first_classes]))
+        belief = replace(state.belief, mean=means)
+        assert act(KEY, replace(state, belief=belief)) == action
+
+
+LIKELIHOODS = jnp.zeros((3, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("likelihoods", "horizon", "error", "expected"),
+    [
+        (jnp.zeros((3, 2, 2)), 2, AssertionError, "likelihoods"),
+        (LIKELIHOODS.at[1, 0, 2].set(jnp.nan), 2, ValueError, "likelihoods = nan: must be finite"),
+        (jnp.full((3, 2, 3), -jnp.inf), 2, ValueError, "likelihoods = -inf: must be finite"),
+        (LIKELIHOODS, 0, ValueError, "horizon = 0: must be a whole number greater than 0"),
+        (LIKELIHOODS, 1.5, ValueError, "horizon = 1.5: must be a whole number"),
+    ],
+)
+def test_what_has_no_values_is_named(likelihoods, horizon, error, expected):
+    with pytest.raises(error, match=expected):
+        optimum.solve(likelihoods, jnp.max, MdpConfig(), horizon)
+
+
+def test_sizes_that_no_lattice_has_are_named():
+    for number in (0, -1, 1.5):
+        with pytest.raises(ValueError, match=r"num_classes = .*: must be a whole number"):
+            optimum.steps_of_lattice(number)
+    with pytest.raises(AssertionError, match="weights"):
+        optimum.interpolate(jnp.zeros(513), jnp.full((1, 2), 0.5))
