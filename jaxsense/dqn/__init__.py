@@ -7,6 +7,10 @@ from jaxsense.dqn.belief_mdp import information as information
 from jaxsense.dqn.belief_mdp import observation as observation
 from jaxsense.dqn.belief_mdp import reset as reset
 from jaxsense.dqn.belief_mdp import step as step
+from jaxsense.dqn.optimum import LookValues as LookValues
+from jaxsense.dqn.optimum import interpolate as interpolate
+from jaxsense.dqn.optimum import solve as solve
+from jaxsense.dqn.policies import by_posterior as by_posterior
 from jaxsense.dqn.policies import greedy as greedy
 from jaxsense.dqn.policies import naive as naive
 from jaxsense.dqn.policies import optimal as optimal

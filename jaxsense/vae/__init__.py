@@ -2,6 +2,7 @@
 
 from jaxsense.vae.detectors import Detector as Detector
 from jaxsense.vae.detectors import detect as detect
+from jaxsense.vae.filtering import update as update
 from jaxsense.vae.fusion import fuse as fuse
 from jaxsense.vae.fusion import unseen as unseen
 from jaxsense.vae.fusion import write as write
@@ -17,3 +18,5 @@ from jaxsense.vae.jmvae import train as train
 from jaxsense.vae.metrics import nearest_class as nearest_class
 from jaxsense.vae.metrics import plausible_classes as plausible_classes
 from jaxsense.vae.metrics import sigma_norm as sigma_norm
+from jaxsense.vae.peers import bayes_update as bayes_update
+from jaxsense.vae.peers import product_of_experts as product_of_experts

@@ -63,12 +63,6 @@ def _check_belief(belief: Belief, class_means: jax.Array) -> None:
     values.require_positive("belief.std", belief.std)
 
 
-def unambiguous(belief: Belief, class_means: jax.Array, true_class: jax.Array) -> jax.Array:
-    """Whether a belief leaves only its true class open, `[]` bool (the paper's Table I)."""
-    plausible = plausible_classes(belief, class_means)
-    return plausible[true_class] & (jnp.sum(plausible) == 1)
-
-
 def negative_log_likelihood(probabilities: jax.Array, labels: jax.Array) -> jax.Array:
     """Mean of `-log p(label)`, `[]` in nats.
 

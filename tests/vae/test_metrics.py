@@ -46,19 +46,6 @@ def test_plausible_classes_lie_within_two_standard_deviations(mean, std, expecte
     assert tuple(metrics.plausible_classes(belief(mean, std), CLASS_MEANS)) == expected
 
 
-@pytest.mark.parametrize(
-    ("mean", "std", "true_class", "expected"),
-    [
-        ((0.1, 0.0), (1.0, 1.0), 0, True),
-        ((0.1, 0.0), (1.0, 1.0), 1, False),  # sure of a wrong class
-        ((1.5, 0.0), (1.0, 1.0), 0, False),  # two classes left open
-    ],
-)
-def test_unambiguous_needs_the_true_class_and_no_other(mean, std, true_class, expected):
-    answer = metrics.unambiguous(belief(mean, std), CLASS_MEANS, jnp.int32(true_class))
-    assert bool(answer) == expected
-
-
 def test_nearest_class_goes_by_the_mean_alone():
     # To (2, 1.9): sqrt(4 + 3.61) = 2.76, sqrt(1 + 3.61) = 2.15, sqrt(4 + 4.41) = 2.9.
     assert metrics.nearest_class(belief((2.0, 1.9), (9.0, 0.1)), CLASS_MEANS) == 1
