@@ -241,14 +241,14 @@ class EvaluationConfig:
     """Episodes per start state, to average over the noise of detections; an eighth as many for the
     naive and the random policy."""
 
-    num_histories: int = 65520
+    num_histories: int = 8190
     """Random histories of looks at a PoI, after which the map is compared with exact Bayes."""
     num_states: int = 4096
     """Most states of the map in which policies are compared, one by one; of more, as many at even
     distances."""
-    value_points: int = 8192
+    value_points: int = 2048
     """Most points of the lattice on which the values of looks stand, see `dqn.optimum`."""
-    value_looks: int = 128
+    value_looks: int = 32
     """Looks at each class that stand for all looks in these values."""
 
     def check(self) -> None:
