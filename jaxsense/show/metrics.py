@@ -145,7 +145,7 @@ SIGMA_NORM = (
     Metric(
         "unambiguous",
         "sigma norm, unambiguous",
-        "Uncertainty of beliefs in a single class (Fig. 4); settings of `paper` are fitted to it.",
+        "Uncertainty of beliefs in a single class (Fig. 4); the preset paper is fitted to it.",
         "from 1.05",
     ),
     Metric(
