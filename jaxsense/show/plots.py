@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogLocator, NullFormatter, PercentFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from jaxsense.config import POLICIES, Config
 from jaxsense.mission.compare import interval
@@ -292,7 +292,7 @@ def missions(block: dict[str, Any]) -> Figure:
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("share of wrong points")
     axes[0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes[0].yaxis.set_major_formatter(PercentFormatter(1.0))
+    axes[0].yaxis.set_major_formatter(lambda share, _: f"{100 * share:g}%")
     axes[0].yaxis.set_minor_formatter(NullFormatter())
     axes[1].legend(loc="upper left")
     return figure

@@ -35,7 +35,8 @@ PLOTS = {
     "policies": (
         "Share of wrong points in finished maps against looks and against time, for each policy",
         "What a look is worth: policies that choose looks by what they reveal, and naive "
-        "exploration with one, two and three looks at each point, joined by a line.",
+        "exploration with one, two and three looks at each point, joined by a line. A policy "
+        "without any wrong point stands at 0.01%.",
     ),
     "calibration": (
         "Share of right labels against the detectors' confidence, and the likelihood of the true "
