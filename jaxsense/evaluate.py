@@ -40,9 +40,16 @@ class Arguments:
     """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
     policy: str = "all"
     """`latent`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3` or `random`; `policies`
-    for all of these; `MODALITY_alone`, `MODALITY_stops` or `MODALITY_blind`, for example
+    for all of these; `ROBOT_alone`, `ROBOT_stops` or `ROBOT_blind`, for example
     `camera_alone`, for the latent policy where that robot is alone, stops or goes blind after 6 s;
     or `all`."""
+    num_pois: Annotated[int | None, tyro.conf.arg(name="arena.num-pois")] = None
+    """Number of points of interest, if another than the run's."""
+    side: Annotated[float | None, tyro.conf.arg(name="arena.side")] = None
+    """Inner length and width of the arena, in metres, if others than the run's."""
+    robots: tuple[str, ...] | None = None
+    """The robots, each the modality of its sensor, if others than the run's; for example
+    `camera camera lidar`."""
     devices: int | None = None
     """Accelerators, or threads on a CPU, that share the missions. By default all accelerators, or
     as many threads as cores, at most 8."""
@@ -67,6 +74,7 @@ def main(argv: list[str] | None = None) -> None:
     try:
         workers = devices.start(arguments.devices)
         config, models = rundir.load(arguments.run, arguments.trust)
+        config = _elsewhere(arguments, config)
         played = _cases(arguments, config)
         path = arguments.run / "summary.json"
         # If these files cannot be written, fail now rather than after minutes of work.
@@ -144,6 +152,15 @@ def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) 
     cases = metrics.cases(found).items()
     new = {name: {**block, "seed": arguments.seed} for name, block in cases}
     return {**before, **found, **new}
+
+
+def _elsewhere(arguments: Arguments, config: Config) -> Config:
+    """The run's settings with the arena and the team of these missions."""
+    sizes = {"num_pois": arguments.num_pois, "side": arguments.side}
+    changed = {name: value for name, value in sizes.items() if value is not None}
+    arena = dataclasses.replace(config.arena, **changed)
+    robots = config.robots if arguments.robots is None else arguments.robots
+    return dataclasses.replace(config, arena=arena, robots=robots)
 
 
 def _cases(arguments: Arguments, config: Config) -> dict[str, mission.Case]:

@@ -37,6 +37,7 @@ from jaxsense.config.section import section
 _MOST_NUMBERS = 2**32
 """Numbers of 32 bits in an array or a network, 16 GiB."""
 _MOST_MODALITIES = 8  # the JMVAE has an encoder for each subset
+_MOST_ROBOTS = 64
 
 
 @section
@@ -44,7 +45,10 @@ class Config:
     """All settings of a run but its seed."""
 
     modalities: tuple[str, ...] = ("camera", "lidar")
-    """The sensors, one robot each."""
+    """The sensors that are trained."""
+    robots: tuple[str, ...] | None = None
+    """The robots of missions: for each the modality of its sensor, which several may share. By
+    default one robot for each of `modalities`."""
     sensors: dict[str, SensorConfig] = dataclasses.field(default_factory=dict, hash=False)
     """Custom sensors, by the name of their modality."""
     arena: ArenaConfig = ArenaConfig()
@@ -65,6 +69,7 @@ class Config:
         require_types(self)
         self._check_modalities()
         self._check_classes()
+        self._check_robots()
         weights = self.jmvae.reconstruction_weights
         if len(weights) != len(self.modalities):
             raise ConfigError(
@@ -160,6 +165,22 @@ class Config:
                     f"must not have both {twin!r} and {name!r}, which no sensor can tell apart",
                 )
 
+    def _check_robots(self) -> None:
+        """The robots must carry trained sensors, which together tell some classes apart."""
+        known = ", ".join(self.modalities)
+        if not 1 <= len(self.team) <= _MOST_ROBOTS:
+            reason = f"must name 1 to {_MOST_ROBOTS} robots, each one of {known}"
+            raise ConfigError("robots", self.team, reason)
+        for modality in self.team:
+            if modality not in self.modalities:
+                raise ConfigError("robots", self.team, f"must each be one of modalities: {known}")
+        told = set(zip(*map(self.label_of_class, self.team), strict=True))
+        if len(told) == 1 < len(self.arena.classes):
+            reason = (
+                f"cannot tell any of {', '.join(self.arena.classes)} apart; must be robots that do"
+            )
+            raise ConfigError("robots", self.team, reason)
+
     def _check_fields_of_view(self) -> None:
         """Sensors must have the PoIs that they look at in view."""
         viewpoint = self.viewpoint
@@ -223,6 +244,28 @@ class Config:
                     f"takes {4 * number / 2**30:,.0f} GiB with the other settings; must take at "
                     f"most {4 * _MOST_NUMBERS / 2**30:.0f} GiB",
                 )
+
+    @property
+    def team(self) -> tuple[str, ...]:
+        """Modality of each robot of a mission, R of them."""
+        return self.modalities if self.robots is None else self.robots
+
+    @property
+    def robot_names(self) -> tuple[str, ...]:
+        """Names of the robots: the modality, numbered if several robots share it."""
+        return tuple(
+            modality if self.team.count(modality) == 1 else f"{modality}_{number}"
+            for modality, number in zip(self.team, self._numbers(), strict=True)
+        )
+
+    def _numbers(self) -> list[int]:
+        """For each robot, its number among those that share its modality, from 1."""
+        return [self.team[: r + 1].count(modality) for r, modality in enumerate(self.team)]
+
+    @property
+    def modality_of_robot(self) -> tuple[int, ...]:
+        """For each robot, the index of its modality."""
+        return tuple(map(self.modalities.index, self.team))
 
     def attribute(self, modality: str) -> str:
         """Attribute that a modality tells apart: `colour`, `shape` or one of `arena.attributes`."""

@@ -1,6 +1,7 @@
 """Driving to a viewpoint, turning to the PoI, scanning it, and writing the map."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -194,11 +195,16 @@ def scan(
     """
     aims = jax.vmap(lambda key, state: _aim(key, mission, state, robot))(keys, states)
 
-    def look(robot: int) -> tuple[jax.Array, Belief, jax.Array]:
-        return jax.vmap(lambda state, aim: _look(mission, models, state, aim, robot))(states, aims)
+    of_robot = mission.config.modality_of_robot
+    carried = sorted(set(of_robot))
+
+    def look(i: int) -> tuple[jax.Array, Belief, jax.Array]:
+        with_sensor = functools.partial(_look, mission, models, robot, carried[i])
+        return jax.vmap(with_sensor)(states, aims)
 
     # The choice of the sensor outside the batch: inside, it would be traced over and over.
-    is_seen, entries, posteriors = call(look, robot, len(mission.world.sensors))
+    which = jnp.array([carried.index(modality) for modality in of_robot])[robot]
+    is_seen, entries, posteriors = call(look, which, len(carried))
 
     def write(state: MissionState, aim: _Aim, seen: jax.Array, entry: Belief, posterior: jax.Array):
         return _write(mission, state, aim, seen, entry, posterior, robot)
@@ -233,23 +239,32 @@ def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
 
 
 def _look(
-    mission: Mission, models: Models, state: MissionState, aim: _Aim, robot: int
+    mission: Mission,
+    models: Models,
+    robot: Index,
+    modality: int,
+    state: MissionState,
+    aim: _Aim,
 ) -> tuple[jax.Array, Belief, jax.Array]:
     """Whether the PoI is seen, `[]` bool, and its new entry and `[C]` posterior if it is."""
-    world, scene, sensor = mission.world, state.scene, mission.world.sensors[robot]
-    data = arenas.place(world.arena, scene.layout, scene.poses)
-    readings = worlds.scan_around(aim.noise_key, world, scene, data, robot, aim.bearing)
+    world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
+    # Robots with the same sensor look alike: the first of them takes the place of the one that
+    # scans, so that the program has one scan for each sensor and not for each robot.
+    first = mission.config.modality_of_robot.index(modality)
+    exchanged = scene.poses.at[robot].set(scene.poses[first]).at[first].set(scene.poses[robot])
+    data = arenas.place(world.arena, scene.layout, exchanged)
+    readings = worlds.scan_around(aim.noise_key, world, scene, data, first, aim.bearing, modality)
     is_blind = now(mission, state) >= state.faults.blind_at[robot]
     readings = jnp.where(is_blind, sensor.blind, readings)
     error = jnp.radians(mission.config.viewpoint.bearing_error)
     arena = mission.config.arena
     shows = sensors.shows_poi(sensor, readings, aim.bearing, aim.distance, arena, error)
-    features = detectors.detect(models.detectors[robot], sensors.as_window(sensor, readings))
+    features = detectors.detect(models.detectors[modality], sensors.as_window(sensor, readings))
     is_sure = jnp.max(features) >= mission.config.mission.least_confidence
     old = jax.tree.map(lambda x: x[aim.poi], state.belief)
     shape, seen = make_jmvae(mission.config), state.seen[aim.poi]
-    entry = fusion.write(models.jmvae, shape, old, seen, features, robot)
-    labels = jnp.array(mission.config.label_of_class(mission.config.modalities[robot]))
+    entry = fusion.write(models.jmvae, shape, old, seen, features, modality)
+    labels = jnp.array(mission.config.label_of_class(mission.config.modalities[modality]))
     posterior = peers.bayes_update(state.log_posterior[aim.poi], features, labels)
     return shows & is_sure, entry, posterior
 
@@ -265,6 +280,7 @@ def _write(
 ) -> MissionState:
     """Records a scan, and writes its entry and posterior if the PoI was seen."""
     poi, detects = aim.poi, aim.scans & is_seen
+    modality = jnp.array(mission.config.modality_of_robot)[robot]
     own = robot_of(state, robot)
     failed, gives_up = _fail(own, aim.scans & ~detects, mission.config.mission.attempts)
     after = dataclasses.replace(
@@ -286,7 +302,7 @@ def _write(
         state,
         belief=belief,
         log_posterior=log_posterior,
-        times_seen=state.times_seen.at[poi, robot].add(detects),
+        times_seen=state.times_seen.at[poi, modality].add(detects),
         version=state.version + detects,
     )
 

@@ -26,17 +26,18 @@ class Case:
 def cases(config: Config) -> dict[str, Case]:
     """Lists the policies, each robot alone, and each robot failing in mid-mission.
 
-    Each of `POLICIES` is a case; in `MODALITY_alone` all other robots stand
-    still from the start; in `MODALITY_stops` and `MODALITY_blind` the robot stops or its sensor
-    goes blind after 6 s. Cases with faults use the latent policy.
+    Each of `POLICIES` is a case; in `ROBOT_alone` all other robots stand still from the start; in
+    `ROBOT_stops` and `ROBOT_blind` the robot stops or its sensor goes blind after 6 s. A robot has
+    the name of its modality, with a number if several share it, see `Config.robot_names`. Cases
+    with faults use the latent policy.
     """
     healthy = no_faults(config)
     found = {name: Case(policy, healthy) for policy, name in enumerate(POLICIES)}
-    for m, modality in enumerate(config.modalities if len(config.modalities) > 1 else ()):
-        own = jnp.arange(len(config.modalities)) == m
+    for r, name in enumerate(config.robot_names if len(config.team) > 1 else ()):
+        own = jnp.arange(len(config.team)) == r
         alone = Faults(jnp.where(own, jnp.inf, 0.0), healthy.blind_at)
         failing = jnp.where(own, FAULT_TIME, jnp.inf)
-        found[f"{modality}_alone"] = Case(LATENT, alone)
-        found[f"{modality}_stops"] = Case(LATENT, Faults(failing, healthy.blind_at))
-        found[f"{modality}_blind"] = Case(LATENT, Faults(healthy.stops_at, failing))
+        found[f"{name}_alone"] = Case(LATENT, alone)
+        found[f"{name}_stops"] = Case(LATENT, Faults(failing, healthy.blind_at))
+        found[f"{name}_blind"] = Case(LATENT, Faults(healthy.stops_at, failing))
     return found

@@ -105,8 +105,9 @@ def _values(
     num_pois = mission.config.arena.num_pois
     on_map = jax.vmap(functools.partial(filtering.weights, models.readout))(state.belief)
     exact = jnp.exp(state.log_posterior)
-    looks = jax.tree.map(lambda *x: jnp.stack(x)[robot], *models.look_values)
-    times = state.times_seen[:, robot]
+    modality = jnp.array(mission.config.modality_of_robot)[robot]
+    looks = jax.tree.map(lambda *x: jnp.stack(x)[modality], *models.look_values)
+    times = state.times_seen[:, modality]
 
     def expected(table: jax.Array, weights: jax.Array) -> jax.Array:
         return jax.vmap(lambda weights: optimum.interpolate(table, weights))(weights)
@@ -132,7 +133,8 @@ def _q_values(
 ) -> jax.Array:
     """`[N + 1]` values of the Q-network."""
     network = policies.q_network(mission.config.arena.num_pois, mission.config.dqn.hidden)
-    q_network = jax.tree.map(lambda *x: jnp.stack(x)[robot], *models.q_networks)
+    modality = jnp.array(mission.config.modality_of_robot)[robot]
+    q_network = jax.tree.map(lambda *x: jnp.stack(x)[modality], *models.q_networks)
 
     def values_if(sure: Belief) -> jax.Array:
         """The network's values as if all PoIs given up were known to be of one class."""

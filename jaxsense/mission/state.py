@@ -117,7 +117,7 @@ class MissionState:
       belief: `[N, D]` the shared map.
       log_posterior: `[N, C]` logarithms of the classes' probabilities by exact Bayes, for the
         policies `bayes` and `optimal`.
-      times_seen: `[N, R]` int32, how often each robot has written each PoI.
+      times_seen: `[N, M]` int32, how often robots of each modality have written each PoI.
       version: `[]` int32, writes into the map so far.
       robots: their state.
       steps: `[]` int32 control periods so far.
@@ -145,7 +145,7 @@ class MissionState:
 
     @property
     def seen(self) -> jax.Array:
-        """`[..., N, R]` bool, which robots have written which PoI."""
+        """`[..., N, M]` bool, which modalities have written which PoI."""
         return self.times_seen > 0
 
 
@@ -163,7 +163,7 @@ class Record:
       scanned: `[R]` bool, the robot took a scan.
       detected: `[R]` bool, the scan was written into the map.
       belief: `[N, D]` the map.
-      seen: `[N, R]` bool.
+      seen: `[N, M]` bool.
       clearance: `[]` smallest free distance around any robot in it, in metres.
     """
 
@@ -182,9 +182,10 @@ class Record:
 
 def make_mission(config: Config, *, contacts: bool = True) -> Mission:
     """Compiles the arena of a mission, by default with contacts."""
-    carries_lidar = tuple(modality == "lidar" for modality in config.modalities)
+    world = worlds.make_world(config, config.team, contacts=contacts)
+    carries_lidar = tuple(name == "lidar" for name in config.team)
     free = arenas.build(config.arena, carries_lidar, obstacles=False)
-    return Mission(worlds.make_world(config, contacts=contacts), free)
+    return Mission(world, free)
 
 
 def with_config(mission: Mission, config: Config) -> Mission:
@@ -194,7 +195,7 @@ def with_config(mission: Mission, config: Config) -> Mission:
 
 def no_faults(config: Config) -> Faults:
     """Robots that never fail."""
-    never = jnp.full(len(config.modalities), jnp.inf)
+    never = jnp.full(len(config.team), jnp.inf)
     return Faults(never, never)
 
 
@@ -240,7 +241,7 @@ def start(
 ) -> MissionState:
     """Starts a mission in a given arena with an empty map; see `reset` for the arguments."""
     config = mission.config
-    num_robots, num_pois = len(config.modalities), config.arena.num_pois
+    num_robots, num_pois = len(config.team), config.arena.num_pois
     num_classes = len(config.arena.classes)
     chex.assert_shape(classes, (num_pois,), custom_message="classes")
     checks.require_index("classes", classes, num_classes)
@@ -259,7 +260,7 @@ def start(
         warmstart=jnp.zeros(3 * num_robots),
         belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), entry),
         log_posterior=jnp.full((num_pois, num_classes), -jnp.log(num_classes)),
-        times_seen=jnp.zeros((num_pois, num_robots), jnp.int32),
+        times_seen=jnp.zeros((num_pois, len(config.modalities)), jnp.int32),
         version=jnp.int32(0),
         robots=_idle_robots(num_robots, *ways.is_free.shape),
         steps=jnp.int32(0),
@@ -305,7 +306,7 @@ def _idle_robots(num_robots: int, num_pois: int, num_views: int) -> Robots:
 
 def _random_poses(key: Key, config: Config, layout: arenas.Layout, ways: Roadmap) -> jax.Array:
     """Random `[R, 3]` poses with room around the robots and, where possible, ways to all PoIs."""
-    num_robots = len(config.modalities)
+    num_robots = len(config.team)
     draws = jax.random.uniform(key, (num_robots, 3, _FREE_DRAWS), minval=-1.0)
     reach = config.arena.side / 2 - config.navigation.robot_radius
 

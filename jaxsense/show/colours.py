@@ -8,9 +8,14 @@ from jaxsense.config import ArenaConfig
 
 RGB = tuple[float, float, float]
 
-ROBOT_COLOURS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
+_ROBOT_COLOURS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
 _APART = 0.25  # in RGB, which the eye distinguishes at a glance
 _DARKEST, _LIGHTEST = -0.75, 0.6
+
+
+def modality_colour(modality: int) -> str:
+    """The colour of the robots that carry a sensor, by its index."""
+    return _ROBOT_COLOURS[modality % len(_ROBOT_COLOURS)]
 
 
 def class_colour(arena: ArenaConfig, label: str) -> RGB:

@@ -20,8 +20,8 @@ class World:
 
     Attributes:
       config: all settings.
-      arena: the compiled arena, with one robot for each modality.
-      sensors: the sensor of each robot.
+      arena: the compiled arena.
+      sensors: the sensor of each modality; in a training robot m carries the m-th.
     """
 
     config: Config
@@ -44,9 +44,18 @@ class Scene:
     poses: jax.Array
 
 
-def make_world(config: Config, *, contacts: bool = False) -> World:
-    """Compiles the arena that `config` describes, with one robot for each modality."""
-    carries_lidar = tuple(modality == "lidar" for modality in config.modalities)
+def make_world(
+    config: Config, robots: tuple[str, ...] | None = None, *, contacts: bool = False
+) -> World:
+    """Compiles the arena that `config` describes.
+
+    Args:
+      config: all settings.
+      robots: the modality of each robot; by default one robot for each of `config.modalities`, as a
+        training needs.
+      contacts: see `arena.build`.
+    """
+    carries_lidar = tuple(name == "lidar" for name in robots or config.modalities)
     arena = arenas.build(config.arena, carries_lidar, contacts=contacts)
     return World(config, arena, sensors.make(config))
 
@@ -108,7 +117,13 @@ def look(
 
 
 def scan_around(
-    key: Key, world: World, scene: Scene, data: mjx.Data, robot: int, bearing: jax.Array
+    key: Key,
+    world: World,
+    scene: Scene,
+    data: mjx.Data,
+    robot: int,
+    bearing: jax.Array,
+    modality: int | None = None,
 ) -> jax.Array:
     """Readings of a robot's sensor around a bearing from its current place.
 
@@ -119,11 +134,12 @@ def scan_around(
       data: the MJX state of the scene, from `place`.
       robot: index of the robot; static.
       bearing: `[]` in the robot's frame, in radians.
+      modality: index of the robot's sensor; static, by default that of the robot.
 
     Returns:
       `[window, ...]` readings of the rays that the detector reads.
     """
-    sensor = world.sensors[robot]
+    sensor = world.sensors[robot if modality is None else modality]
     rays = sensors.window_of(sensor, sensor.directions, bearing)
     return sensors.scan(key, sensor, world.arena, data, scene.layout, scene.light, robot, rays)
 

@@ -13,7 +13,7 @@ from jaxsense.run import files
 from jaxsense.run.missions import Recording
 from jaxsense.show.animation.svg import Timeline, add
 from jaxsense.show.animation.views import SIZE, ArenaView, MapView
-from jaxsense.show.colours import ROBOT_COLOURS
+from jaxsense.show.colours import modality_colour
 from jaxsense.types import Belief
 
 WIDTH = 2 * SIZE + 40
@@ -59,7 +59,7 @@ def write(
     duration = float(shown[-1]) + _PAUSE
     moments = shown / duration
     views = ArenaView(config, recording.end), MapView(config, recording.end, class_beliefs)
-    height = _TOP + SIZE + _LINE * len(config.modalities) + 16
+    height = _TOP + SIZE + _LINE * max(2, len(config.team)) + 16
     root = Element(
         "svg",
         {
@@ -125,11 +125,12 @@ def _draw(
             clock = [f"{min(t, seconds):.0f} s" for t in np.floor(record.time)]
             clock[-1] = f"{seconds:.1f} s"
             _strip(half, timeline, clock, SIZE, 25, "film-title film-end")
-            for r, modality in enumerate(config.modalities):
+            for r, robot in enumerate(config.robot_names):
                 y = _TOP + SIZE + 24 + _LINE * r
-                add(half, "circle", cx=8, cy=y - 6, r=7, fill=ROBOT_COLOURS[r % len(ROBOT_COLOURS)])
+                colour = modality_colour(config.modality_of_robot[r])
+                add(half, "circle", cx=8, cy=y - 6, r=7, fill=colour)
                 doing = [
-                    f"{modality} {_doing(int(phase), int(target), config.arena.num_pois)}"
+                    f"{robot} {_doing(int(phase), int(target), config.arena.num_pois)}"
                     for phase, target in zip(record.phase[:, r], record.target[:, r], strict=True)
                 ]
                 _strip(half, timeline, doing, 24, y, "film-line")

@@ -10,7 +10,7 @@ from jaxsense.config import ROBOT_RADIUS, Config
 from jaxsense.mission import MissionState, Record
 from jaxsense.mission.state import ENDED, FACING
 from jaxsense.show.animation.svg import Timeline, add
-from jaxsense.show.colours import ROBOT_COLOURS, as_hex, class_colour
+from jaxsense.show.colours import as_hex, class_colour, modality_colour
 from jaxsense.types import Belief
 
 SIZE = 340  # px, of a view
@@ -27,14 +27,17 @@ class ArenaView:
 
     def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
         """Adds it to a group whose origin is the view's upper left corner."""
-        for r in range(len(self._config.modalities)):
+        for r in range(len(self._config.team)):
             self._draw_trail(parent, timeline, record, r)
         fields = add(parent, "g")
         for n in range(self._config.arena.num_pois):
             self._draw_poi(parent, timeline, record, n)
-        for r in range(len(self._config.modalities)):
+        for r in range(len(self._config.team)):
             self._draw_looks(parent, timeline, record, r)
             self._draw_robot(parent, fields, timeline, record, r)
+
+    def _colour(self, r: int) -> str:
+        return modality_colour(self._config.modality_of_robot[r])
 
     def _place(self, position: ArrayLike) -> np.ndarray:
         """`[..., 2]` metres, y upwards from the middle, in pixels, y downwards from the corner."""
@@ -50,7 +53,7 @@ class ArenaView:
             "polyline",
             points=" ".join(f"{x:.1f},{y:.1f}" for x, y in places[is_new]),
             fill="none",
-            stroke=_robot_colour(r),
+            stroke=self._colour(r),
             stroke_width=2,
             stroke_opacity=0.6,
         )
@@ -73,18 +76,18 @@ class ArenaView:
             box = add(group, "rect", x=-u, y=-v, width=2 * u, height=2 * v, rx=1, fill=colour)
             box.set("transform", turn)
         add(group, "text", str(n + 1), y=5, class_="film-number", fill="#fff")
-        num_robots = len(self._config.modalities)
-        for r in range(num_robots):  # who has written it into the map
+        num_modalities = len(self._config.modalities)
+        for m in range(num_modalities):  # which sensors have written it into the map
             mark = add(
                 group,
                 "circle",
-                cx=13 * (r - (num_robots - 1) / 2),
+                cx=13 * (m - (num_modalities - 1) / 2),
                 cy=-1.42 * radius - 7,
                 r=4.5,
-                fill=_robot_colour(r),
+                fill=modality_colour(m),
                 stroke="#fff",
             )
-            timeline.set(mark, "opacity", record.seen[:, n, r])
+            timeline.set(mark, "opacity", record.seen[:, n, m])
 
     def _draw_looks(self, parent: Element, timeline: Timeline, record: Record, r: int) -> None:
         """A line from the robot to what it scans."""
@@ -95,7 +98,7 @@ class ArenaView:
             (x1, y1), (x2, y2) = map(
                 self._place, (record.poses[i, r], self._end.scene.layout.position[target])
             )
-            line = add(parent, "line", x1=x1, y1=y1, x2=x2, y2=y2, stroke=_robot_colour(r))
+            line = add(parent, "line", x1=x1, y1=y1, x2=x2, y2=y2, stroke=self._colour(r))
             line.set("stroke-width", "3")
             since = np.arange(len(record.time)) - i
             timeline.vary(
@@ -107,14 +110,14 @@ class ArenaView:
     ) -> None:
         places = self._place(record.poses[:, r])
         angles = -np.degrees(np.unwrap(record.poses[:, r, 2]))
-        colour, radius = _robot_colour(r), self._scale * ROBOT_RADIUS
+        colour, radius = self._colour(r), self._scale * ROBOT_RADIUS
         field, robot = (add(each, "g") for each in (fields, parent))
         for group in (field, robot):
             timeline.move(group, places)
         field, body = (add(each, "g") for each in (field, robot))
         for group in (field, body):
             timeline.turn(group, angles)
-        settings = getattr(self._config, self._config.modalities[r], None)
+        settings = getattr(self._config, self._config.team[r], None)
         shape = _sector(
             self._scale * self._config.navigation.view_range,
             getattr(settings, "field_of_view", 360.0),
@@ -185,10 +188,6 @@ class MapView:
     def _place(self, mean: ArrayLike) -> np.ndarray:
         """`[..., 2]` latent, upwards from the middle, in pixels, downwards from the corner."""
         return SIZE / 2 + self._scale * np.asarray(mean) * (1, -1)
-
-
-def _robot_colour(r: int) -> str:
-    return ROBOT_COLOURS[r % len(ROBOT_COLOURS)]
 
 
 def _sector(radius: float, angle: float) -> str:
