@@ -243,7 +243,7 @@ def greedy_return(
     See `compare_policies` for the arguments.
     """
     mdp = observe.bank_mdp(config, bank, params, make_jmvae(config))
-    act = policies.greedy(mdp, q_network, config.dqn.hidden)
+    act = _greedy(mdp, q_network, modality, config)
 
     def episode(key: Key) -> jax.Array:
         reset_key, episode_key = jax.random.split(key)
@@ -251,6 +251,13 @@ def greedy_return(
         return episodes.run_episode(episode_key, mdp, act, start, modality)[0]
 
     return jnp.mean(jax.vmap(episode)(jax.random.split(key, config.evaluation.num_starts)))
+
+
+def _greedy(mdp: MapMdp, q_network: Params, modality: jax.Array, config: Config) -> policies.Policy:
+    """The greedy policy of a Q-network, of a team's for a robot that is alone."""
+    if config.dqn.task == "team":
+        return policies.greedy_alone(mdp, q_network, modality, config.dqn, config.team.travel)
+    return policies.greedy(mdp, q_network, config.dqn.hidden)
 
 
 def compare_policies(
@@ -293,7 +300,7 @@ def compare_policies(
         expected = policies.expected_rewards(table_key, mdp, modality, _EXPECTATION_DRAWS)
         optimal = policies.optimal(mdp, expected, labels)
     compared = (
-        policies.greedy(mdp, q_network, config.dqn.hidden),
+        _greedy(mdp, q_network, modality, config),
         optimal,
         policies.naive(mdp, modality),
         policies.random(mdp),

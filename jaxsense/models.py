@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from flax import linen as nn
 
 from jaxsense import networks
 from jaxsense.config import Config
@@ -27,7 +28,7 @@ class Models:
       moments_inverse: `[C, 2D + 1]` from `filtering.moments_inverse`, to read the classes'
         probabilities from the map with.
       look_values: for each modality, what a look is worth by dynamic programming.
-      q_networks: parameters of one Q-network for each modality.
+      q_networks: parameters of the Q-network of each modality; those of a team are the same.
     """
 
     detectors: tuple[Detector, ...]
@@ -49,6 +50,15 @@ def make_jmvae(config: Config) -> Jmvae:
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
 
+def make_q_network(config: Config) -> tuple[nn.Module, int]:
+    """The Q-network, and the size of its input."""
+    num_pois, size, number = config.arena.num_pois, config.jmvae.latent_size, len(config.modalities)
+    if config.dqn.task == "team":
+        network = policies.team_network(size, number, config.dqn)
+        return network, network.features * num_pois
+    return policies.q_network(num_pois, config.dqn.hidden), 2 * size * num_pois
+
+
 def init(key: Key, config: Config) -> Models:
     """Models with random parameters, to try the functions before training."""
     detector_key, jmvae_key, dqn_key = jax.random.split(key, 3)
@@ -59,8 +69,7 @@ def init(key: Key, config: Config) -> Models:
         detectors.init(k, jnp.zeros((2, s.window * s.channels)), size, config.detector)
         for k, s, size in zip(keys, sensors.make(config), num_labels, strict=True)
     )
-    size = 2 * config.jmvae.latent_size * config.arena.num_pois
-    q_network = policies.q_network(config.arena.num_pois, config.dqn.hidden)
+    q_network, size = make_q_network(config)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
     shape = (len(config.arena.classes), config.jmvae.latent_size)
     params, classes = (

@@ -11,7 +11,7 @@ Params = Any
 """A pytree of network parameters."""
 
 
-class _Dense(nn.Module):
+class Dense(nn.Module):
     """A layer for `[F]` features, or for `[F, B]`, with an example in each column.
 
     With the batch last, layers of this size and their gradients take half as long on a CPU.
@@ -22,6 +22,7 @@ class _Dense(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
+        """`[F]` to `[size]`, or `[F, B]` to `[size, B]`."""
         kernel = self.param("kernel", self.kernel_init, (x.shape[0], self.size))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.size,))
         # In full precision, so that an accelerator agrees with a CPU.
@@ -44,17 +45,17 @@ class MLP(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[F]` to `[outputs]`, or `[F, B]` to `[outputs, B]`."""
         for i, size in enumerate(self.hidden):
-            x = nn.relu(_Dense(size, nn.initializers.he_normal(), name=f"Dense_{i}")(x))
+            x = nn.relu(Dense(size, nn.initializers.he_normal(), name=f"Dense_{i}")(x))
         last = nn.initializers.lecun_normal()
-        return _Dense(self.outputs, last, name=f"Dense_{len(self.hidden)}")(x)
+        return Dense(self.outputs, last, name=f"Dense_{len(self.hidden)}")(x)
 
 
 @functools.partial(jax.jit, static_argnames=("network", "inputs"))
-def init(key: jax.Array, network: MLP, inputs: int) -> Params:
+def init(key: jax.Array, network: nn.Module, inputs: int) -> Params:
     """Random parameters of a network for `[inputs]`, compiled once per shape."""
     return network.init(key, jnp.zeros(inputs))
 
 
-def apply(network: MLP, params: Params, x: jax.Array) -> jax.Array:
+def apply(network: nn.Module, params: Params, x: jax.Array) -> jax.Array:
     """The forward pass of a network, see `MLP.__call__`."""
     return jnp.asarray(network.apply(params, x))

@@ -5,12 +5,15 @@ from stored detections of those scans. Features of single looks have the same di
 looks of one scene share its light.
 """
 
+import math
+
 import chex
 import jax
 import jax.numpy as jnp
 
 from jaxsense.config import Config, values
 from jaxsense.dqn.belief_mdp import MapMdp
+from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.networks import Params
 from jaxsense.sim import world as worlds
 from jaxsense.types import Belief, Key
@@ -42,8 +45,18 @@ def live_mdp(
     return _mdp(config, params, model, new_scene, observe)
 
 
-def bank_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> MapMdp:
-    """The map MDP over stored detections; a scene is the `[N]` array of the PoIs' classes."""
+def bank_mdp(
+    config: Config, bank: Bank, params: Params, model: Jmvae, num_pois: int | None = None
+) -> MapMdp:
+    """The map MDP over stored detections; a scene is the `[N]` array of the PoIs' classes.
+
+    Args:
+      config: all settings.
+      bank: the detections.
+      params: of the JMVAE, with those of the filter if there is one.
+      model: the shape of the JMVAE.
+      num_pois: N, by default that of the arena.
+    """
     values.require_one_each("bank", bank, model.modalities)
     for features, size in zip(bank, model.feature_sizes, strict=True):
         shape = (len(config.arena.classes), None, size)
@@ -57,17 +70,50 @@ def bank_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> MapMdp
         row = jax.random.key_data(key)[-1] % samples.shape[1]
         return samples[classes[poi], row], classes
 
-    return _mdp(config, params, model, lambda key, classes: classes, observe)
+    return _mdp(config, params, model, lambda key, classes: classes, observe, num_pois)
 
 
-def _mdp(config: Config, params: Params, model: Jmvae, new_scene, observe) -> MapMdp:
+def team_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> TeamMdp:
+    """The MDP of a team over stored detections, see `bank_mdp` for the arguments."""
+    settings, arena = config.team, config.arena
+    num_pois = settings.num_pois[1]
+    num_robots = len(config.modalities) * settings.robots_each
+
+    def new_places(key: Key, number: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Each PoI at a random place in a cell of its own, robots anywhere."""
+        del number
+        per_side = math.ceil(math.sqrt(2 * num_pois))
+        draws = jax.random.uniform(key, (1 + per_side**2 + 2 * num_pois + 3 * num_robots,))
+        side = settings.sides[0] + (settings.sides[1] - settings.sides[0]) * draws[0]
+        order, draws = draws[1 : 1 + per_side**2], draws[1 + per_side**2 :]
+        cell = jnp.argsort(order)[:num_pois]
+        corner = jnp.stack([cell // per_side, cell % per_side], axis=-1)
+        play = jnp.maximum(side / per_side - arena.poi_pitch, 0.0)
+        jitter = play * (draws[: 2 * num_pois].reshape(num_pois, 2) - 0.5)
+        positions = (corner + 0.5) * side / per_side - side / 2 + jitter
+        places = 2 * draws[2 * num_pois :].reshape(num_robots, 3) - 1
+        reach = side / 2 - config.navigation.robot_radius
+        poses = jnp.concatenate([reach * places[:, :2], jnp.pi * places[:, 2:]], axis=-1)
+        return positions, poses
+
+    return TeamMdp(settings, bank_mdp(config, bank, params, model, num_pois), new_places)
+
+
+def _mdp(
+    config: Config,
+    params: Params,
+    model: Jmvae,
+    new_scene,
+    observe,
+    num_pois: int | None = None,
+) -> MapMdp:
     def nats(belief: Belief) -> jax.Array:
         return -filtering.entropy(filtering.weights(params[fusion.FILTER], belief))
 
     rewarded = {"information": nats} if config.mdp.reward == "nats" else {}
     return MapMdp(
         config=config.mdp,
-        num_pois=config.arena.num_pois,
+        num_pois=num_pois or config.arena.num_pois,
         num_classes=len(config.arena.classes),
         num_modalities=len(config.modalities),
         unseen=fusion.unseen(model, config.mdp.unseen_variance),

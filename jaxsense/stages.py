@@ -22,6 +22,7 @@ from jaxsense.dqn import belief_mdp, optimum
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.optimum import LookValues
+from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.dqn.training import DqnState
 from jaxsense.models import Models, make_jmvae
 from jaxsense.networks import Params
@@ -191,8 +192,8 @@ def stages(config: Config, world: World | None = None) -> list[Stage]:
         Stage("look_values", _look_values, ("class_beliefs", "detections"), is_saved=True),
         Stage("beliefs", _measure_beliefs, (params, "class_beliefs", "detections")),
         Stage("starts", functools.partial(_starts, world), learned),
-        *(_agent_stage(m, world, config, learned) for m in range(len(config.modalities))),
-        *(_policies_stage(m, name, params) for m, name in enumerate(config.modalities)),
+        *_agent_stages(world, config, learned),
+        *(_policies_stage(m, config, params) for m in range(len(config.modalities))),
     ]
 
 
@@ -260,8 +261,13 @@ def models(outputs: Mapping[str, Any], config: Config) -> Models:
         class_beliefs=outputs["class_beliefs"],
         moments_inverse=filtering.moments_inverse(outputs["class_beliefs"]),
         look_values=outputs["look_values"],
-        q_networks=tuple(outputs[f"dqn_{name}"] for name in config.modalities),
+        q_networks=tuple(outputs[agent(config, name)] for name in config.modalities),
     )
+
+
+def agent(config: Config, modality: str) -> str:
+    """Name of the stage that trains the Q-network of a modality's robots."""
+    return "dqn_team" if config.dqn.task == "team" else f"dqn_{modality}"
 
 
 def mission_key(key: Key) -> Key:
@@ -289,11 +295,13 @@ def num_scenes(config: Config) -> tuple[int, int, int]:
     return num_train, max(num_bank, _num_scene_starts(config)), num_held_out
 
 
-def make_map_mdp(
+def make_mdp(
     world: World, config: Config, bank: Bank, params: Params, trained: tuple[Detector, ...]
-) -> MapMdp:
-    """The map MDP in which the Q-networks learn, with looks as `config.dqn.observe` sets."""
+) -> MapMdp | TeamMdp:
+    """The MDP in which the Q-networks learn, see `config.dqn.task` and `config.dqn.observe`."""
     model = make_jmvae(config)
+    if config.dqn.task == "team":
+        return observe.team_mdp(config, bank, params, model)
     if config.dqn.observe == "live":
         return observe.live_mdp(config, worlds.with_config(world, config), trained, params, model)
     return observe.bank_mdp(config, bank, params, model)
@@ -575,9 +583,9 @@ def _starts(
     *trained: Detector,
 ) -> MapState:
     """`[num_starts]` first states of episodes."""
-    mdp = make_map_mdp(world, config, detections.bank, params, trained)
+    mdp = make_mdp(world, config, detections.bank, params, trained)
     number = config.dqn.num_starts
-    if config.dqn.observe == "bank":
+    if config.dqn.observe == "bank" or isinstance(mdp, TeamMdp):
         return dqn.starts(key, mdp, number)
 
     def begin(key: Key, classes: jax.Array, scene: Scene, looks: tuple[jax.Array, ...]):
@@ -588,10 +596,17 @@ def _starts(
     return jax.vmap(begin)(jax.random.split(key, number), *detections.starts)
 
 
-def _agent_stage(modality: int, world: World, config: Config, learned: tuple[str, ...]) -> Steps:
-    """The training of one modality's Q-network."""
+def _agent_stages(world: World, config: Config, learned: tuple[str, ...]) -> list[Steps]:
+    """The training of each modality's Q-network, or of the one of a team."""
+    indices = {agent(config, name): m for m, name in enumerate(config.modalities)}
+    return [_agent_stage(name, m, world, config, learned) for name, m in indices.items()]
+
+
+def _agent_stage(
+    name: str, modality: int, world: World, config: Config, learned: tuple[str, ...]
+) -> Steps:
     return Steps(
-        f"dqn_{config.modalities[modality]}",
+        name,
         functools.partial(_begin_dqn, world),
         ("starts", *learned),
         modality,
@@ -615,7 +630,7 @@ def _begin_dqn(
     *trained: Detector,
 ) -> DqnState:
     del modality
-    mdp = make_map_mdp(world, config, detections.bank, params, trained)
+    mdp = make_mdp(world, config, detections.bank, params, trained)
     return dqn.init(key, mdp, config.dqn, starts)
 
 
@@ -630,7 +645,7 @@ def _advance_dqn(
     params: Params,
     *trained: Detector,
 ) -> tuple[DqnState, Progress]:
-    mdp = make_map_mdp(world, config, detections.bank, params, trained)
+    mdp = make_mdp(world, config, detections.bank, params, trained)
 
     def evaluate(key: Key, q_network: Params) -> jax.Array:
         return examine.greedy_return(key, modality, q_network, params, detections.held_out, config)
@@ -646,9 +661,10 @@ def _finish_dqn(config: Config, state: DqnState, *inputs: Any) -> Params:
     return state.params
 
 
-def _policies_stage(modality: int, name: str, params: str) -> Stage:
+def _policies_stage(modality: int, config: Config, params: str) -> Stage:
     """The comparison of one modality's policies; `params` names the stage that the map needs."""
-    inputs = f"dqn_{name}", params, "look_values", "detections"
+    name = config.modalities[modality]
+    inputs = agent(config, name), params, "look_values", "detections"
     return Stage(f"policies_{name}", _play_policies, inputs, modality, program="policies")
 
 

@@ -61,11 +61,11 @@ class Transition:
     """One step of the map MDP for a Q-network to learn from, or a batch as columns.
 
     Attributes:
-      s_tm1: `[N * 2D, ...]` float32 map before the action, see `belief_mdp.observation`.
+      s_tm1: `[S, ...]` float32 observation before the action, see `belief_mdp.observation`.
       a_tm1: `[...]` int32 action, `N` being no operation.
       r_t: `[...]` float32 reward.
-      discount_t: `[...]` float32, 0 where the episode ended and 1 elsewhere.
-      s_t: `[N * 2D, ...]` float32 map after the action.
+      discount_t: `[...]` float32 discount factor, 0 where the episode ended.
+      s_t: `[S, ...]` float32 observation after the action.
     """
 
     s_tm1: jax.Array

@@ -150,9 +150,67 @@ class MdpConfig:
 
 
 @section
+class TravelConfig:
+    """The model of travel: a robot turns to a PoI, drives straight until it is near, and looks."""
+
+    speed: Traced[float] = 0.19
+    """Speed of driving, in metres per second."""
+    turn_rate: Traced[float] = 1.0
+    """Rate of turning, in radians per second."""
+    view_distance: Traced[float] = 0.9
+    """Distance from which a robot looks at a PoI, in metres."""
+    look_seconds: Traced[float] = 1.0
+    """Time of a look itself, in seconds."""
+
+    def check(self) -> None:
+        """Raises `ConfigError` for an invalid field."""
+        require_types(self)
+        require_positive(self, "speed", "turn_rate", "look_seconds")
+        require_not_negative(self, "view_distance")
+
+
+@section
+class TeamConfig:
+    """The map MDP in which a team learns with `dqn.task` = team: with places, robots and time."""
+
+    travel: TravelConfig = TravelConfig()
+    num_pois: tuple[int, int] = (3, 8)
+    """Fewest and most points of interest in an episode."""
+    robots_each: int = 2
+    """Most robots of each modality in an episode; the fewest is one."""
+    sides: Traced[tuple[float, float]] = (3.0, 5.0)
+    """Shortest and longest side of the arena of an episode, in metres."""
+    alone: Traced[float] = 0.25
+    """Share of episodes of the paper's MDP: one robot is alone, and nothing is far away."""
+    partly_seen: Traced[float] = 0.5
+    """Share of the other episodes that start with some looks taken."""
+    second_cost: Traced[float] = 0.02
+    """Price of a second, in units of the reward."""
+    max_steps: Traced[int] = 300
+    """Longest episode, in choices."""
+
+    def check(self) -> None:
+        """Raises `ConfigError` for an invalid field."""
+        require_types(self)
+        fewest, most = self.num_pois
+        expected = "must be a number greater than 0 and one that is not below it"
+        require(1 <= fewest <= most, self, "num_pois", expected)
+        require_positive(self, "robots_each", "max_steps")
+        require_at_most(self, robots_each=8, max_steps=100_000)
+        require(0 < self.sides[0] <= self.sides[1] <= 100, self, "sides", "must be two lengths")
+        for name in ("alone", "partly_seen"):
+            require(0 <= getattr(self, name) <= 1, self, name, "must be within 0 and 1")
+        require_not_negative(self, "second_cost")
+
+
+@section
 class DqnConfig:
     """The deep Q-network of each modality."""
 
+    task: Literal["map", "team"] = "map"
+    """`map`: an agent looks alone at `arena.num_pois` PoIs and looks take no time, as in the paper;
+    a dense network for each modality. `team`: robots share the map, see the section team; one
+    network for any number of PoIs and robots."""
     observe: Literal["live", "bank"] = "live"
     """`live` casts a scan in the environment's own arena at every step; `bank` draws from stored
     detections."""

@@ -13,12 +13,20 @@ from jaxsense.config.section import Traced, section
 MOST_EPISODES = 100_000
 """Most missions of one policy whose states fit a computer's memory."""
 
-POLICIES = ("latent", "greedy", "bayes", "optimal", "naive", "naive_2", "naive_3", "random")
+POLICIES = (
+    *("latent", "greedy", "bayes", "optimal", "naive", "naive_2", "naive_3", "random"),
+    *("nearest", "auction", "rollout"),
+)
 """Policies of robots in missions; the index is the policy's code. `latent` asks the Q-networks.
 `greedy` takes the look of the highest expected gain on the map, `bayes` on the exact posterior over
 the classes, and `optimal` the look of the highest total gain by dynamic programming. With `naive`
 every robot looks at every PoI once, with `naive_2` twice, with `naive_3` three times. `random`
-takes any PoI, or ends."""
+takes any PoI, or ends. The last three know ways as well as gains on the map, see `dqn.rules`:
+`nearest` takes the nearest PoI of which it expects to learn, `auction` shares these out among the
+robots by their times, and `rollout` takes the one with the highest gain for each second."""
+
+KNOW_WAYS = ("nearest", "auction", "rollout")
+"""Policies whose values count ways, so that no rule of traffic breaks ties."""
 
 MISSIONS_AT_ONCE = 384
 """Most missions that are played side by side."""

@@ -15,6 +15,7 @@ from jaxsense.config.learning import (
     FilterConfig,
     JmvaeConfig,
     MdpConfig,
+    TeamConfig,
 )
 from jaxsense.config.mission import (
     MISSIONS_AT_ONCE,
@@ -59,6 +60,7 @@ class Config:
     jmvae: JmvaeConfig = JmvaeConfig()
     filter: FilterConfig = FilterConfig()
     mdp: MdpConfig = MdpConfig()
+    team: TeamConfig = TeamConfig()
     dqn: DqnConfig = DqnConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     navigation: NavigationConfig = NavigationConfig()
@@ -168,18 +170,20 @@ class Config:
     def _check_robots(self) -> None:
         """The robots must carry trained sensors, which together tell some classes apart."""
         known = ", ".join(self.modalities)
-        if not 1 <= len(self.team) <= _MOST_ROBOTS:
+        if not 1 <= len(self.carried) <= _MOST_ROBOTS:
             reason = f"must name 1 to {_MOST_ROBOTS} robots, each one of {known}"
-            raise ConfigError("robots", self.team, reason)
-        for modality in self.team:
+            raise ConfigError("robots", self.carried, reason)
+        for modality in self.carried:
             if modality not in self.modalities:
-                raise ConfigError("robots", self.team, f"must each be one of modalities: {known}")
-        told = set(zip(*map(self.label_of_class, self.team), strict=True))
+                raise ConfigError(
+                    "robots", self.carried, f"must each be one of modalities: {known}"
+                )
+        told = set(zip(*map(self.label_of_class, self.carried), strict=True))
         if len(told) == 1 < len(self.arena.classes):
             reason = (
                 f"cannot tell any of {', '.join(self.arena.classes)} apart; must be robots that do"
             )
-            raise ConfigError("robots", self.team, reason)
+            raise ConfigError("robots", self.carried, reason)
 
     def _check_fields_of_view(self) -> None:
         """Sensors must have the PoIs that they look at in view."""
@@ -246,7 +250,7 @@ class Config:
                 )
 
     @property
-    def team(self) -> tuple[str, ...]:
+    def carried(self) -> tuple[str, ...]:
         """Modality of each robot of a mission, R of them."""
         return self.modalities if self.robots is None else self.robots
 
@@ -254,18 +258,18 @@ class Config:
     def robot_names(self) -> tuple[str, ...]:
         """Names of the robots: the modality, numbered if several robots share it."""
         return tuple(
-            modality if self.team.count(modality) == 1 else f"{modality}_{number}"
-            for modality, number in zip(self.team, self._numbers(), strict=True)
+            modality if self.carried.count(modality) == 1 else f"{modality}_{number}"
+            for modality, number in zip(self.carried, self._numbers(), strict=True)
         )
 
     def _numbers(self) -> list[int]:
         """For each robot, its number among those that share its modality, from 1."""
-        return [self.team[: r + 1].count(modality) for r, modality in enumerate(self.team)]
+        return [self.carried[: r + 1].count(modality) for r, modality in enumerate(self.carried)]
 
     @property
     def modality_of_robot(self) -> tuple[int, ...]:
         """For each robot, the index of its modality."""
-        return tuple(map(self.modalities.index, self.team))
+        return tuple(map(self.modalities.index, self.carried))
 
     def attribute(self, modality: str) -> str:
         """Attribute that a modality tells apart: `colour`, `shape` or one of `arena.attributes`."""

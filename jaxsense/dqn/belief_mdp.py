@@ -75,11 +75,13 @@ class Outcome:
       reward: `[]` float32.
       terminated: `[]` bool, NOP has ended the episode.
       truncated: `[]` bool, the episode has reached its limit of steps.
+      seconds: `[]` that the action took, or None if actions take no time: each then counts as one.
     """
 
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array
+    seconds: jax.Array | None = None
 
 
 def information(std: jax.Array) -> jax.Array:

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense import networks
-from jaxsense.config import values
-from jaxsense.dqn import belief_mdp, optimum
+from jaxsense.config import DqnConfig, TravelConfig, values
+from jaxsense.dqn import belief_mdp, optimum, team_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
+from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.networks import MLP, Params
 from jaxsense.types import Belief, Index, Key
 
@@ -22,6 +23,11 @@ def q_network(num_pois: int, hidden: tuple[int, ...]) -> MLP:
     return MLP(hidden, num_pois + 1)
 
 
+def team_network(latent_size: int, num_modalities: int, config: DqnConfig) -> PoolingNetwork:
+    """The Q-network of a team, for any number of PoIs."""
+    return PoolingNetwork(config.hidden, team_mdp.num_features(latent_size, num_modalities))
+
+
 def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
     """Takes a Q-network's best action, or -1, whose reward is NaN, if a value is NaN."""
 
@@ -29,6 +35,22 @@ def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
         del key
         seen = belief_mdp.observation(state.belief)
         return _best(networks.apply(q_network(mdp.num_pois, hidden), params, seen))
+
+    return act
+
+
+def greedy_alone(
+    mdp: MapMdp, params: Params, modality: Index, config: DqnConfig, travel: TravelConfig
+) -> Policy:
+    """Takes the best action of a team's Q-network for one robot that is alone, see `greedy`."""
+    network = team_network(mdp.unseen.mean.size, mdp.num_modalities, config)
+
+    def act(key: Key, state: MapState) -> jax.Array:
+        del key
+        team = team_mdp.alone(mdp.num_pois, jnp.asarray(modality))
+        agent = jnp.int32(0)
+        seen = team_mdp.observation(travel, state.belief, team, agent, mdp.num_modalities)
+        return _best(networks.apply(network, params, seen.reshape(-1)))
 
     return act
 

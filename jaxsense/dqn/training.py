@@ -6,20 +6,21 @@ cost.
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 
 import chex
 import jax
 import jax.numpy as jnp
 import optax
+from flax import linen as nn
 
 from jaxsense import networks
 from jaxsense.config import DqnConfig
-from jaxsense.dqn import belief_mdp, losses, replay
-from jaxsense.dqn.belief_mdp import MapMdp, MapState
-from jaxsense.dqn.policies import q_network
-from jaxsense.networks import MLP, Params
+from jaxsense.dqn import belief_mdp, losses, replay, team_mdp
+from jaxsense.dqn.belief_mdp import MapMdp
+from jaxsense.dqn.environments import Environment, State, environment
+from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.networks import Params
 from jaxsense.types import Index, Key, Transition, pytree
 
 _EVALUATED = 10  # epochs
@@ -44,7 +45,7 @@ class DqnState:
     target: Params
     optimiser: optax.OptState
     replay: replay.Replay
-    envs: MapState
+    envs: State
     needs_start: jax.Array
     total_reward: jax.Array
     epoch: jax.Array
@@ -77,7 +78,7 @@ class _Draws:
 
     Attributes:
       coin: `[E]` in [0, 1), below epsilon to explore.
-      action: `[E]` int32 action to explore.
+      action: `[E]` in [0, 1), for the action to explore.
       start: `[E]` int32 start to follow an ended episode.
       step: `[E]` keys of the steps.
       replay: `[updates, blocks, 2]` in [0, 1), see `replay.sample`.
@@ -90,7 +91,7 @@ class _Draws:
     replay: jax.Array
 
 
-def init(key: Key, mdp: MapMdp, config: DqnConfig, prepared: MapState) -> DqnState:
+def init(key: Key, mdp: MapMdp | TeamMdp, config: DqnConfig, prepared: State) -> DqnState:
     """Fresh network, empty replay, and environments before their first start.
 
     Args:
@@ -100,8 +101,9 @@ def init(key: Key, mdp: MapMdp, config: DqnConfig, prepared: MapState) -> DqnSta
       prepared: from `starts`; only its shapes count.
     """
     envs = jax.tree.map(lambda x: jnp.zeros((config.num_envs, *x.shape[1:]), x.dtype), prepared)
-    size = 2 * math.prod(prepared.belief.mean.shape[1:])
-    params = networks.init(key, q_network(mdp.num_pois, config.hidden), size)
+    place = environment(mdp, 0, config)
+    size = jax.eval_shape(jax.vmap(place.observation), prepared).shape[1]
+    params = networks.init(key, place.network, size)
     rounds, blocks = config.replay_capacity // config.num_envs, config.num_envs // config.block
     return DqnState(
         params=params,
@@ -115,23 +117,30 @@ def init(key: Key, mdp: MapMdp, config: DqnConfig, prepared: MapState) -> DqnSta
     )
 
 
-def starts(key: Key, mdp: MapMdp, number: int) -> MapState:
+def starts(key: Key, mdp: MapMdp | TeamMdp, number: int) -> State:
     """Random states, `[number]`, for episodes to start from.
 
     A training prepares them once: a start looks at everything it has seen, which costs far more
     than a step.
     """
-    keys = jax.random.split(key, number)
-    return jax.vmap(lambda key: belief_mdp.reset(key, mdp))(keys)
+
+    def reset(key: Key) -> State:
+        if isinstance(mdp, TeamMdp):
+            return team_mdp.reset(key, mdp)
+        return belief_mdp.reset(key, mdp)
+
+    return jax.vmap(reset)(jax.random.split(key, number))
 
 
-def train(key: Key, mdp: MapMdp, modality: Index, config: DqnConfig) -> tuple[DqnState, EpochInfo]:
+def train(
+    key: Key, mdp: MapMdp | TeamMdp, modality: Index, config: DqnConfig
+) -> tuple[DqnState, EpochInfo]:
     """Trains one agent; `vmap` over `key` for several seeds, over `modality` for several agents.
 
     Args:
       key: random key.
       mdp: the MDP.
-      modality: index of the agent's own sensor, see `belief_mdp.step`.
+      modality: index of the agent's own sensor, see `belief_mdp.step`; a team has all of them.
       config: the settings.
 
     Returns:
@@ -151,11 +160,11 @@ def train(key: Key, mdp: MapMdp, modality: Index, config: DqnConfig) -> tuple[Dq
 
 def train_chunk(
     key: Key,
-    mdp: MapMdp,
+    mdp: MapMdp | TeamMdp,
     modality: Index,
     config: DqnConfig,
     state: DqnState,
-    prepared: MapState,
+    prepared: State,
     evaluate: Callable[[Key, Params], jax.Array] | None = None,
 ) -> tuple[DqnState, EpochInfo]:
     """Trains for `config.chunk` epochs.
@@ -163,7 +172,7 @@ def train_chunk(
     Args:
       key: random key.
       mdp: the MDP.
-      modality: index of the agent's own sensor, see `belief_mdp.step`.
+      modality: index of the agent's own sensor, see `belief_mdp.step`; a team has all of them.
       config: the settings.
       state: the current state.
       prepared: `[num_starts]` from `starts`. Each environment has a share of them, and starts every
@@ -174,10 +183,12 @@ def train_chunk(
     Returns:
       The next state and the `[chunk]` infos.
     """
-    chex.assert_axis_dimension(prepared.steps, 0, config.num_starts, custom_message="prepared")
+    for part in jax.tree.leaves(prepared):
+        chex.assert_axis_dimension(part, 0, config.num_starts, custom_message="prepared")
     shares = jax.tree.map(lambda x: x.reshape(config.num_envs, -1, *x.shape[1:]), prepared)
-    draws = _draw(key, mdp, config)
-    epoch = functools.partial(_epoch, mdp, modality, config, shares)
+    place = environment(mdp, modality, config)
+    draws = _draw(key, config)
+    epoch = functools.partial(_epoch, place, config, shares)
     if evaluate is None:
         return jax.lax.scan(epoch, state, draws)
     every = _EVALUATED if config.chunk % _EVALUATED == 0 else config.chunk
@@ -195,14 +206,14 @@ def train_chunk(
     return state, jax.tree.map(lambda x: x.reshape(-1), infos)
 
 
-def _draw(key: Key, mdp: MapMdp, config: DqnConfig) -> _Draws:
+def _draw(key: Key, config: DqnConfig) -> _Draws:
     """Random numbers of `[chunk]` epochs."""
     env_key, step_key, replay_key = jax.random.split(key, 3)
     shape, blocks = (config.chunk, config.num_envs), config.batch // config.block
     coin, action, start = jax.random.uniform(env_key, (3, *shape))
     return _Draws(
         coin=coin,
-        action=jnp.floor(action * (mdp.num_pois + 1)).astype(jnp.int32),
+        action=action,
         start=jnp.floor(start * (config.num_starts // config.num_envs)).astype(jnp.int32),
         step=jax.random.split(step_key, shape),
         replay=jax.random.uniform(replay_key, (config.chunk, config.updates, blocks, 2)),
@@ -210,10 +221,9 @@ def _draw(key: Key, mdp: MapMdp, config: DqnConfig) -> _Draws:
 
 
 def _epoch(
-    mdp: MapMdp,
-    modality: Index,
+    place: Environment,
     config: DqnConfig,
-    shares: MapState,
+    shares: State,
     state: DqnState,
     draws: _Draws,
 ) -> tuple[DqnState, EpochInfo]:
@@ -222,9 +232,8 @@ def _epoch(
         config.epsilon_min, config.epsilon_start * config.epsilon_decay**state.epoch
     )
     started = _restart(draws.start, state.envs, shares, state.needs_start)
-    network = q_network(mdp.num_pois, config.hidden)
     envs, has_ended, transitions, values = _explore(
-        mdp, modality, network, state.params, started, epsilon, draws
+        place, config, state.params, started, epsilon, draws
     )
     memory = replay.add(state.replay, transitions)
 
@@ -232,7 +241,7 @@ def _epoch(
     episodes = jnp.sum(has_ended)
     ended_reward = jnp.sum(jnp.where(has_ended, total_reward, 0.0))
 
-    params, optimiser, loss = _learn(config, network, state, memory, draws.replay)
+    params, optimiser, loss = _learn(config, place.network, state, memory, draws.replay)
     is_copied = (state.epoch + 1) % config.target_period == 0
     target = jax.tree.map(lambda new, old: jnp.where(is_copied, new, old), params, state.target)
     checked = values, transitions.r_t, loss, params
@@ -259,33 +268,40 @@ def _epoch(
 
 
 def _explore(
-    mdp: MapMdp,
-    modality: Index,
-    network: MLP,
+    place: Environment,
+    config: DqnConfig,
     params: Params,
-    started: MapState,
+    started: State,
     epsilon: jax.Array,
     draws: _Draws,
-) -> tuple[MapState, jax.Array, Transition, jax.Array]:
-    """Next states, which episodes have ended, transitions and `[N + 1, E]` values before them."""
-    observations = jax.vmap(belief_mdp.observation, out_axes=-1)
-    s_tm1 = observations(started.belief)
-    values = networks.apply(network, params, s_tm1)
-    chex.assert_shape(values, (mdp.num_pois + 1, None))
+) -> tuple[State, jax.Array, Transition, jax.Array]:
+    """Next states, which episodes have ended, transitions and `[A, E]` values before them."""
+    observations = jax.vmap(place.observation, out_axes=-1)
+    s_tm1 = observations(started)
+    values = networks.apply(place.network, params, s_tm1)
+    chex.assert_shape(values, (place.num_actions, None))
     greedy = jnp.argmax(values, axis=0).astype(jnp.int32)
-    a_tm1 = jnp.where(draws.coin < epsilon, draws.action, greedy)
-    envs, outcome = jax.vmap(lambda k, env, a: belief_mdp.step(k, mdp, env, a, modality))(
-        draws.step, started, a_tm1
-    )
-    discount_t = jnp.where(outcome.terminated, 0.0, 1.0)
-    s_t = observations(envs.belief)
+    a_tm1 = jnp.where(draws.coin < epsilon, _explored(place, started, draws.action), greedy)
+    envs, outcome = jax.vmap(place.step)(draws.step, started, a_tm1)
+    discount = config.discount
+    if outcome.seconds is not None:
+        discount = discount**outcome.seconds
+    discount_t = jnp.where(outcome.terminated, 0.0, discount)
+    s_t = observations(envs)
     transitions = Transition(s_tm1, a_tm1, outcome.reward, discount_t, s_t)
     return envs, outcome.terminated | outcome.truncated, transitions, values
 
 
+def _explored(place: Environment, states: State, draws: jax.Array) -> jax.Array:
+    """Random `[E]` int32 actions among those that exist in `[E]` states, by `[E]` in [0, 1)."""
+    exists = jax.vmap(place.exists)(states)
+    number = jnp.floor(draws * jnp.sum(exists, axis=1)).astype(jnp.int32)
+    return jnp.argmax(jnp.cumsum(exists, axis=1) > number[:, None], axis=1).astype(jnp.int32)
+
+
 def _learn(
     config: DqnConfig,
-    network: MLP,
+    network: nn.Module,
     state: DqnState,
     memory: replay.Replay,
     draws: jax.Array,
@@ -296,8 +312,7 @@ def _learn(
     def loss(params: Params, batch: Transition) -> jax.Array:
         q_tm1 = networks.apply(network, params, batch.s_tm1)
         q_t = networks.apply(network, state.target, batch.s_t)
-        discount_t = config.discount * batch.discount_t
-        error = losses.td_error(q_tm1, batch.a_tm1, batch.r_t, discount_t, q_t)
+        error = losses.td_error(q_tm1, batch.a_tm1, batch.r_t, batch.discount_t, q_t)
         return jnp.mean(losses.pseudo_huber(error))
 
     def update(carry, draws: jax.Array):
@@ -321,7 +336,7 @@ def _optimiser(config: DqnConfig) -> optax.GradientTransformation:
     return optax.flatten(optax.adam(schedule))
 
 
-def _restart(rows: jax.Array, envs: MapState, shares: MapState, needs_start: jax.Array) -> MapState:
+def _restart(rows: jax.Array, envs: State, shares: State, needs_start: jax.Array) -> State:
     """Restarts each environment that needs it from that row of its share."""
 
     def pick(env: jax.Array, share: jax.Array) -> jax.Array:

@@ -33,8 +33,8 @@ def cases(config: Config) -> dict[str, Case]:
     """
     healthy = no_faults(config)
     found = {name: Case(policy, healthy) for policy, name in enumerate(POLICIES)}
-    for r, name in enumerate(config.robot_names if len(config.team) > 1 else ()):
-        own = jnp.arange(len(config.team)) == r
+    for r, name in enumerate(config.robot_names if len(config.carried) > 1 else ()):
+        own = jnp.arange(len(config.carried)) == r
         alone = Faults(jnp.where(own, jnp.inf, 0.0), healthy.blind_at)
         failing = jnp.where(own, FAULT_TIME, jnp.inf)
         found[f"{name}_alone"] = Case(LATENT, alone)

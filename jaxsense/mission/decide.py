@@ -7,21 +7,24 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense import networks
-from jaxsense.config import POLICIES, ROBOT_RADIUS, Config
-from jaxsense.dqn import belief_mdp, optimum, policies
+from jaxsense.config import KNOW_WAYS, POLICIES, ROBOT_RADIUS, Config
+from jaxsense.dqn import belief_mdp, optimum, rules, team_mdp
+from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
     ENDED,
     FACING,
+    FAILED,
     IDLE,
+    LATENT,
     Mission,
     MissionState,
     now,
     robot_of,
     with_robot,
 )
-from jaxsense.models import Models
+from jaxsense.models import Models, make_q_network
 from jaxsense.sim import roadmap, viewpoints
 from jaxsense.types import Belief, Index, Key, others
 from jaxsense.vae import filtering
@@ -79,7 +82,9 @@ def _choose(
     given_up = robots.unreachable[robot] | robots.undetected[robot]
     values = _values(key, mission, models, state, robot, given_up)
     of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
-    is_best = (of_pois >= jnp.max(of_pois) - settings.equal_values) & (of_pois > values[num_pois])
+    is_best = (of_pois >= jnp.max(of_pois) - _equal_values(mission, state)) & (
+        of_pois > values[num_pois]
+    )
 
     place = state.scene.poses[robot, :2]
     distance = jnp.linalg.norm(state.scene.layout.position - place[None], axis=-1)
@@ -91,6 +96,15 @@ def _choose(
     rank += _KEPT * is_kept + _HEADED_FOR * (is_others & settings.avoids_targets)
     poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
     return jnp.where(jnp.any(is_best), poi, num_pois)
+
+
+def _equal_values(mission: Mission, state: MissionState) -> jax.Array:
+    """`[]` difference of values that counts as none; 0 where ways are part of the values."""
+    knows_ways = [name in KNOW_WAYS for name in POLICIES]
+    if mission.config.dqn.task == "team":
+        knows_ways[LATENT] = True
+    of_policy = jnp.where(jnp.array(knows_ways), 0.0, mission.config.mission.equal_values)
+    return of_policy[state.policy]
 
 
 def _values(
@@ -105,15 +119,23 @@ def _values(
     num_pois = mission.config.arena.num_pois
     on_map = jax.vmap(functools.partial(filtering.weights, models.readout))(state.belief)
     exact = jnp.exp(state.log_posterior)
-    modality = jnp.array(mission.config.modality_of_robot)[robot]
-    looks = jax.tree.map(lambda *x: jnp.stack(x)[modality], *models.look_values)
-    times = state.times_seen[:, modality]
 
     def expected(table: jax.Array, weights: jax.Array) -> jax.Array:
         return jax.vmap(lambda weights: optimum.interpolate(table, weights))(weights)
 
+    modalities = jnp.array(mission.config.modality_of_robot)
+    modality = modalities[robot]
+    of_each = jax.tree.map(lambda *x: jnp.stack(x), *models.look_values)
+    looks = jax.tree.map(lambda x: x[modality], of_each)
+    times = state.times_seen[:, modality]
+    team = team_of(mission, state, given_up)
+    gains = jax.vmap(lambda table: expected(table, on_map))(of_each.gain)[modalities]
+    travel = mission.config.team.travel
+    ways = jax.vmap(lambda pose: team_mdp.travel_seconds(travel, pose, team.positions))(team.poses)
+    by_rule = gains, ways, team, jnp.asarray(robot)
+
     of_pois = {
-        "greedy": expected(looks.gain, on_map),
+        "greedy": gains[robot],
         "bayes": expected(looks.gain, exact),
         "optimal": expected(looks.total, exact),
         "naive": jnp.where(times < 1, 1.0, -1.0),
@@ -123,6 +145,9 @@ def _values(
     values = {
         "latent": _q_values(mission, models, state, robot, given_up),
         **{name: jnp.append(each, 0.0) for name, each in of_pois.items()},
+        "nearest": rules.nearest(*by_rule),
+        "auction": rules.auction(*by_rule),
+        "rollout": rules.rollout(*by_rule),
         "random": jax.nn.one_hot(jax.random.randint(key, (), 0, num_pois + 1), num_pois + 1),
     }
     return jnp.stack([values[name] for name in POLICIES])[state.policy]
@@ -132,9 +157,15 @@ def _q_values(
     mission: Mission, models: Models, state: MissionState, robot: Index, given_up: jax.Array
 ) -> jax.Array:
     """`[N + 1]` values of the Q-network."""
-    network = policies.q_network(mission.config.arena.num_pois, mission.config.dqn.hidden)
+    network, _ = make_q_network(mission.config)
     modality = jnp.array(mission.config.modality_of_robot)[robot]
     q_network = jax.tree.map(lambda *x: jnp.stack(x)[modality], *models.q_networks)
+
+    if mission.config.dqn.task == "team":
+        known = state.belief, team_of(mission, state, given_up), jnp.asarray(robot)
+        travel, number = mission.config.team.travel, len(mission.config.modalities)
+        seen = team_mdp.observation(travel, *known, number)
+        return networks.apply(network, q_network, seen.reshape(-1))
 
     def values_if(sure: Belief) -> jax.Array:
         """The network's values as if all PoIs given up were known to be of one class."""
@@ -146,6 +177,19 @@ def _q_values(
     # The network would count on learning more about a PoI given up. Of a known one nothing is left
     # to learn; since its class is unknown, all classes count alike.
     return jnp.mean(jax.vmap(values_if)(models.class_beliefs), axis=0)
+
+
+def team_of(mission: Mission, state: MissionState, given_up: jax.Array) -> Team:
+    """Everybody's place as the travel model knows it, without PoIs `[N]` that are given up."""
+    phase = state.robots.phase
+    return Team(
+        positions=state.scene.layout.position,
+        present=~given_up,
+        poses=state.scene.poses,
+        modality=jnp.array(mission.config.modality_of_robot),
+        works=(phase != ENDED) & (phase != FAILED),
+        target=state.robots.target,
+    )
 
 
 def _best_view(

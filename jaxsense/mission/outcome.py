@@ -114,7 +114,7 @@ def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any
     }
     robot = name.removesuffix("_alone")
     if robot != name:
-        modality = config.team[config.robot_names.index(robot)]
+        modality = config.carried[config.robot_names.index(robot)]
         labels = np.array(config.label_of_class(modality))
         shares_label = np.array([np.sum(labels == label) > 1 for label in labels])
         cannot_tell = shares_label[found["classes"]]
@@ -144,7 +144,7 @@ def bytes_per_detection(mission: Mission, detections: np.ndarray) -> dict[str, f
     config, size = mission.config, np.dtype(np.float32).itemsize
     sensors = [mission.world.sensors[m] for m in config.modality_of_robot]
     scans = np.array([sensor.scan_bytes for sensor in sensors])
-    features = np.array([size * len(config.labels(name)) for name in config.team])
+    features = np.array([size * len(config.labels(name)) for name in config.carried])
     return {
         "latent": float(2 * size * config.jmvae.latent_size),
         "features": float(np.average(features, weights=detections)),

@@ -182,8 +182,8 @@ class Record:
 
 def make_mission(config: Config, *, contacts: bool = True) -> Mission:
     """Compiles the arena of a mission, by default with contacts."""
-    world = worlds.make_world(config, config.team, contacts=contacts)
-    carries_lidar = tuple(name == "lidar" for name in config.team)
+    world = worlds.make_world(config, config.carried, contacts=contacts)
+    carries_lidar = tuple(name == "lidar" for name in config.carried)
     free = arenas.build(config.arena, carries_lidar, obstacles=False)
     return Mission(world, free)
 
@@ -195,7 +195,7 @@ def with_config(mission: Mission, config: Config) -> Mission:
 
 def no_faults(config: Config) -> Faults:
     """Robots that never fail."""
-    never = jnp.full(len(config.team), jnp.inf)
+    never = jnp.full(len(config.carried), jnp.inf)
     return Faults(never, never)
 
 
@@ -241,7 +241,7 @@ def start(
 ) -> MissionState:
     """Starts a mission in a given arena with an empty map; see `reset` for the arguments."""
     config = mission.config
-    num_robots, num_pois = len(config.team), config.arena.num_pois
+    num_robots, num_pois = len(config.carried), config.arena.num_pois
     num_classes = len(config.arena.classes)
     chex.assert_shape(classes, (num_pois,), custom_message="classes")
     checks.require_index("classes", classes, num_classes)
@@ -306,7 +306,7 @@ def _idle_robots(num_robots: int, num_pois: int, num_views: int) -> Robots:
 
 def _random_poses(key: Key, config: Config, layout: arenas.Layout, ways: Roadmap) -> jax.Array:
     """Random `[R, 3]` poses with room around the robots and, where possible, ways to all PoIs."""
-    num_robots = len(config.team)
+    num_robots = len(config.carried)
     draws = jax.random.uniform(key, (num_robots, 3, _FREE_DRAWS), minval=-1.0)
     reach = config.arena.side / 2 - config.navigation.robot_radius
 

@@ -19,7 +19,7 @@ from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs, compile_programs
 from jaxsense.sim.world import make_world
-from jaxsense.stages import mission_key, models
+from jaxsense.stages import agent, mission_key, models
 from jaxsense.types import Belief, Key
 
 
@@ -103,7 +103,10 @@ def run(
         detections=dict(zip(config.modalities, detections.held_out, strict=True)),
         posteriors=posteriors,
         rewards={
-            n: {name: np.array(trained.curves[f"dqn_{n}"][name]) for name in ("reward", "greedy")}
+            n: {
+                name: np.array(trained.curves[agent(config, n)][name])
+                for name in ("reward", "greedy")
+            }
             for n in config.modalities
         },
         recording=found.recording,
@@ -121,7 +124,7 @@ def _of_agent(config: Config, modality: str, trained: Trained) -> dict[str, Any]
     """One modality's block in the summary's `dqn`."""
     total, first = map(np.asarray, trained.outputs[f"policies_{modality}"])
     env_steps = config.dqn.epochs * config.dqn.num_envs
-    seconds = sum(trained.curves[f"dqn_{modality}"]["seconds"])
+    seconds = sum(trained.curves[agent(config, modality)]["seconds"])
     return {
         **examine.policy_metrics(total, first, config),
         "env_steps": env_steps,

@@ -293,7 +293,7 @@ def _named(models: Models, config: Config) -> dict[str, Any]:
         **filters,
         "class_beliefs": models.class_beliefs,
         "look_values": models.look_values,
-        **{f"dqn_{name}": q_network for name, q_network in q_networks},
+        **{stages.agent(config, name): q_network for name, q_network in q_networks},
     }
 
 

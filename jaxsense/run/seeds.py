@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxsense import stages
 from jaxsense.config import Config, ConfigError
 from jaxsense.mission.compare import described
 from jaxsense.run import rundir
@@ -105,7 +106,7 @@ def rewards(
     }
 
     def load(run: Path, modality: str) -> list[dict[str, np.ndarray]]:
-        directory, name = run / "checkpoints", f"curves_dqn_{modality}"
+        directory, name = run / "checkpoints", f"curves_{stages.agent(config, modality)}"
         try:
             found = Checkpoints(directory).load(name, shapes)
         except ConfigError as error:

@@ -59,7 +59,7 @@ def write(
     duration = float(shown[-1]) + _PAUSE
     moments = shown / duration
     views = ArenaView(config, recording.end), MapView(config, recording.end, class_beliefs)
-    height = _TOP + SIZE + _LINE * max(2, len(config.team)) + 16
+    height = _TOP + SIZE + _LINE * max(2, len(config.carried)) + 16
     root = Element(
         "svg",
         {

@@ -27,12 +27,12 @@ class ArenaView:
 
     def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
         """Adds it to a group whose origin is the view's upper left corner."""
-        for r in range(len(self._config.team)):
+        for r in range(len(self._config.carried)):
             self._draw_trail(parent, timeline, record, r)
         fields = add(parent, "g")
         for n in range(self._config.arena.num_pois):
             self._draw_poi(parent, timeline, record, n)
-        for r in range(len(self._config.team)):
+        for r in range(len(self._config.carried)):
             self._draw_looks(parent, timeline, record, r)
             self._draw_robot(parent, fields, timeline, record, r)
 
@@ -117,7 +117,7 @@ class ArenaView:
         field, body = (add(each, "g") for each in (field, robot))
         for group in (field, body):
             timeline.turn(group, angles)
-        settings = getattr(self._config, self._config.team[r], None)
+        settings = getattr(self._config, self._config.carried[r], None)
         shape = _sector(
             self._scale * self._config.navigation.view_range,
             getattr(settings, "field_of_view", 360.0),

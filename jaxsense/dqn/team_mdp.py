@@ -1,0 +1,276 @@
+"""The shared map with places: a team of robots chooses, drives and looks, and time counts.
+
+A semi-Markov decision process (Sutton, Precup and Singh 1999, Artificial Intelligence 112, Sec. 3).
+One step is one robot's choice: the PoI that it will look at, or NOP, which ends its part. When all
+robots have chosen, time passes until the first of them arrives, turns to its PoI and looks at it;
+the look is written into the map, and every robot still at work chooses again. All robots share one
+reward: that of each look in the map MDP, less a price of each second.
+
+Times come from a model of travel, which `TravelConfig` holds: a robot turns, drives straight until
+it is near enough, and looks.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxsense.config import TeamConfig, TravelConfig, values
+from jaxsense.dqn import belief_mdp
+from jaxsense.dqn.belief_mdp import MapMdp, MapState, Outcome
+from jaxsense.types import Belief, Key, pytree
+
+_TIME_SCALE = 10.0  # s, in which observations count travel
+
+
+@pytree
+class Team:
+    """Robots and PoIs at one moment, as far as each robot knows them.
+
+    Attributes:
+      positions: `[N, 2]` places of the PoIs, in metres.
+      present: `[N]` bool, PoIs that exist, or that the robot that chooses has not given up.
+      poses: `[R, 3]` x [m], y [m] and yaw [rad] of the robots.
+      modality: `[R]` int32 index of each robot's sensor.
+      works: `[R]` bool, robots that have neither ended nor failed.
+      target: `[R]` int32 PoI that each robot heads for, or N.
+    """
+
+    positions: jax.Array
+    present: jax.Array
+    poses: jax.Array
+    modality: jax.Array
+    works: jax.Array
+    target: jax.Array
+
+
+@pytree
+class TeamState:
+    """The state between two choices.
+
+    Attributes:
+      map: the map, and the scene that it describes.
+      team: where everybody is.
+      asks: `[R]` bool, robots that have yet to choose at this moment.
+      agent: `[]` int32, the robot that chooses next.
+      seconds: `[]` since the start.
+    """
+
+    map: MapState
+    team: Team
+    asks: jax.Array
+    agent: jax.Array
+    seconds: jax.Array
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TeamMdp:
+    """The MDP of a team whose members share one map.
+
+    Attributes:
+      config: the teams, and the price of time.
+      map: the map MDP, with the largest number of PoIs.
+      new_places: `(key, number of PoIs) -> (positions [N, 2], poses [R, 3])`.
+    """
+
+    config: TeamConfig
+    map: MapMdp
+    new_places: Callable[[Key, jax.Array], tuple[jax.Array, jax.Array]]
+
+
+def travel_seconds(config: TravelConfig, pose: jax.Array, places: jax.Array) -> jax.Array:
+    """Time until a robot has looked at PoIs, by the model of travel.
+
+    Args:
+      config: the model.
+      pose: `[3]` x [m], y [m] and yaw [rad] of the robot.
+      places: `[N, 2]` of the PoIs, in metres.
+
+    Returns:
+      `[N]` seconds.
+    """
+    chex.assert_shape(pose, (3,), custom_message="pose")
+    chex.assert_shape(places, (None, 2), custom_message="places")
+    turn, way = jax.vmap(lambda place: _way(config, pose, place))(places)
+    return config.look_seconds + jnp.abs(turn) / config.turn_rate + way / config.speed
+
+
+def _way(config: TravelConfig, pose: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`[]` radians to turn and `[]` metres to drive until a robot is near enough to look."""
+    to_place = place - pose[:2]
+    turn = jnp.arctan2(to_place[1], to_place[0]) - pose[2]
+    turn = (turn + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    # All at one place, nobody turns.
+    distance = jnp.linalg.norm(to_place)
+    turn = jnp.where(distance > 0, turn, 0.0)
+    return turn, jnp.maximum(distance - config.view_distance, 0.0)
+
+
+def move(config: TravelConfig, pose: jax.Array, place: jax.Array, seconds: jax.Array) -> jax.Array:
+    """Pose, `[3]`, of a robot some seconds after it set out for a place, by the model of travel."""
+    turn, way = _way(config, pose, place)
+    turning = jnp.minimum(jnp.abs(turn) / config.turn_rate, seconds)
+    yaw = pose[2] + jnp.sign(turn) * turning * config.turn_rate
+    driven = jnp.minimum((seconds - turning) * config.speed, way)
+    to_place = place - pose[:2]
+    along = to_place / jnp.maximum(jnp.linalg.norm(to_place), 1e-6)
+    return jnp.append(pose[:2] + driven * along, yaw)
+
+
+def num_features(latent_size: int, num_modalities: int) -> int:
+    """Numbers that a robot knows of each PoI, see `observation`."""
+    return 2 * latent_size + 3 * num_modalities + 4
+
+
+def observation(
+    config: TravelConfig, belief: Belief, team: Team, agent: jax.Array, num_modalities: int
+) -> jax.Array:
+    """What a robot knows when it chooses.
+
+    Args:
+      config: the model of travel.
+      belief: `[N, D]` the map.
+      team: where everybody is.
+      agent: `[]` int32, the robot that chooses.
+      num_modalities: M.
+
+    Returns:
+      `[F, N]`, for each PoI: mean and standard deviation of its belief; the robot's own time to
+      look at it; for each modality, how soon another robot that heads for it arrives, and how soon
+      the nearest other robot could, as `exp(-time / 10 s)`, 0 for none; the robot's own modality,
+      one number for each; whether the PoI is present; and its place relative to the robot.
+    """
+    chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
+    values.require_positive("belief.std", belief.std)
+    times = jax.vmap(lambda pose: travel_seconds(config, pose, team.positions))(team.poses)
+    soon = jnp.exp(-times / _TIME_SCALE)
+    robots, pois = jnp.arange(team.poses.shape[0]), jnp.arange(team.positions.shape[0])
+    is_other = team.works & (robots != agent)
+    heads = team.target[:, None] == pois[None]
+    carries = team.modality[None] == jnp.arange(num_modalities)[:, None]
+    counts = (carries & is_other[None])[:, :, None]
+    nearest = jnp.max(jnp.where(counts, soon[None], 0.0), axis=1)
+    heading = jnp.max(jnp.where(counts & heads[None], soon[None], 0.0), axis=1)
+    own = jnp.broadcast_to(carries[:, agent][:, None], heading.shape)
+    relative = team.positions - team.poses[agent, :2][None]
+    rows = [
+        belief.mean.T,
+        belief.std.T,
+        (times[agent] / _TIME_SCALE)[None],
+        heading,
+        nearest,
+        own,
+        team.present[None],
+        relative.T,
+    ]
+    return jnp.where(team.present[None], jnp.concatenate(rows, axis=0), 0.0)
+
+
+def alone(num_pois: int, modality: jax.Array) -> Team:
+    """The team of the paper's MDP: one robot, and all is at one place."""
+    return Team(
+        positions=jnp.zeros((num_pois, 2)),
+        present=jnp.ones(num_pois, bool),
+        poses=jnp.zeros((1, 3)),
+        modality=jnp.reshape(jnp.asarray(modality, jnp.int32), (1,)),
+        works=jnp.ones(1, bool),
+        target=jnp.full(1, num_pois),
+    )
+
+
+def reset(key: Key, mdp: TeamMdp) -> TeamState:
+    """Starts an episode with a random number of PoIs, robots and earlier looks.
+
+    In a share of the episodes, `TeamConfig.alone`, one robot is alone, and all is at one place: the
+    map MDP of the paper, where only looks take time.
+    """
+    map_key, place_key, number_key, team_key, alone_key, seen_key = jax.random.split(key, 6)
+    config, num_pois, num_modalities = mdp.config, mdp.map.num_pois, mdp.map.num_modalities
+    fewest, most = config.num_pois
+    number = jax.random.randint(number_key, (), fewest, most + 1)
+    alone = jax.random.bernoulli(alone_key, config.alone)
+    positions, poses = mdp.new_places(place_key, number)
+    chex.assert_shape(positions, (num_pois, 2), custom_message="positions")
+    num_robots = num_modalities * config.robots_each
+    chex.assert_shape(poses, (num_robots, 3), custom_message="poses")
+
+    count_key, single_key = jax.random.split(team_key)
+    # One or more of each modality, robots of one modality side by side.
+    counts = jax.random.randint(count_key, (num_modalities,), 1, config.robots_each + 1)
+    modality = jnp.repeat(jnp.arange(num_modalities), config.robots_each)
+    rank = jnp.arange(num_robots) % config.robots_each
+    single = jax.random.randint(single_key, (), 0, num_modalities) * config.robots_each
+    works = jnp.where(alone, jnp.arange(num_robots) == single, rank < counts[modality])
+
+    some_key, looks_key = jax.random.split(seen_key)
+    seen = belief_mdp.random_start(looks_key, mdp.map)[1]
+    starts_late = alone | jax.random.bernoulli(some_key, config.partly_seen)
+    state = belief_mdp.reset(map_key, mdp.map, seen=seen & starts_late)
+    team = Team(
+        positions=jnp.where(alone, 0.0, positions),
+        present=jnp.arange(num_pois) < number,
+        poses=jnp.where(alone, 0.0, poses),
+        modality=modality,
+        works=works,
+        target=jnp.full(num_robots, num_pois),
+    )
+    first = jnp.argmax(works).astype(jnp.int32)
+    return TeamState(state, team, works, first, jnp.float32(0.0))
+
+
+def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[TeamState, Outcome]:
+    """Lets one robot choose; once all have, time passes until the next look.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      state: the current state.
+      action: `[]` int32 choice of robot `state.agent`: a PoI, or N for NOP.
+
+    Returns:
+      The next state and the outcome. The reward is that of the look, if there was one, less the
+      price of the `seconds` that it took.
+    """
+    chex.assert_rank(action, 0, custom_message="action")
+    values.require_index("action", action, mdp.map.num_pois + 1)
+    num_pois, team, travel = mdp.map.num_pois, state.team, mdp.config.travel
+    robots = jnp.arange(team.poses.shape[0])
+    is_agent = robots == state.agent
+    target = jnp.where(is_agent, action, team.target)
+    works = team.works & ~(is_agent & (action == num_pois))
+    asks = state.asks & ~is_agent & works
+    is_over, others_ask = ~jnp.any(works), jnp.any(asks)
+    passes = ~others_ask & ~is_over
+
+    goals = team.positions[jnp.minimum(target, num_pois - 1)]
+    times = jax.vmap(lambda pose, goal: travel_seconds(travel, pose, goal[None])[0])(
+        team.poses, goals
+    )
+    looker = jnp.argmin(jnp.where(works, times, jnp.inf)).astype(jnp.int32)
+    seconds = jnp.where(passes, times[looker], 0.0)
+    moved = jax.vmap(lambda pose, goal: move(travel, pose, goal, seconds))(team.poses, goals)
+    look = jnp.where(passes, target[looker], num_pois)
+    after, outcome = belief_mdp.step(key, mdp.map, state.map, look, team.modality[looker])
+
+    following = jnp.argmin(jnp.where(asks, (robots - state.agent - 1) % len(robots), len(robots)))
+    team = dataclasses.replace(
+        team,
+        poses=jnp.where(works[:, None], moved, team.poses),
+        works=works,
+        target=jnp.where(passes & (robots == looker), num_pois, target),
+    )
+    state = TeamState(
+        map=after,
+        team=team,
+        asks=jnp.where(passes, works, asks),
+        agent=jnp.where(passes, looker, following.astype(jnp.int32)),
+        seconds=state.seconds + seconds,
+    )
+    return state, Outcome(
+        reward=outcome.reward - mdp.config.second_cost * seconds,
+        terminated=is_over,
+        truncated=~is_over & (after.steps >= mdp.config.max_steps),
+        seconds=seconds,
+    )
