@@ -81,7 +81,7 @@ def _learner(task: Task) -> Learner:
 
     def start(key: jax.Array):
         init_key, start_key, key = jax.random.split(key, 3)
-        prepared = training.starts(start_key, mdp, settings.num_starts)
+        prepared = training.starts(start_key, mdp, settings)
         return key, training.init(init_key, mdp, settings, prepared), prepared
 
     def go_on(carry):

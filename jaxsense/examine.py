@@ -256,7 +256,7 @@ def greedy_return(
 def _greedy(mdp: MapMdp, q_network: Params, modality: jax.Array, config: Config) -> policies.Policy:
     """The greedy policy of a Q-network, of a team's for a robot that is alone."""
     if config.dqn.task == "team":
-        return policies.greedy_alone(mdp, q_network, modality, config.dqn, config.team.travel)
+        return policies.greedy_alone(mdp, q_network, modality, config.team, config.dqn)
     return policies.greedy(mdp, q_network, config.dqn.hidden)
 
 
@@ -359,6 +359,20 @@ def _states(config: Config) -> tuple[np.ndarray, np.ndarray]:
     return episodes.every_state(*sizes, config.evaluation.num_states)
 
 
+def returns(total: np.ndarray, config: Config) -> dict[str, float | None]:
+    """Mean return of each of `POLICIES` from random starts, and the fraction of the optimal one.
+
+    Args:
+      total: `[P, S]` from `compare_policies`.
+      config: all settings.
+    """
+    of_starts = total[:, -config.evaluation.num_starts :].mean(axis=1).tolist()
+    whole = dict(zip(POLICIES, of_starts, strict=True))
+    # Where no look pays, the optimum is 0.
+    fraction = whole["return"] / whole["optimal"] if whole["optimal"] else None
+    return {**whole, "fraction_of_optimal": fraction}
+
+
 def policy_metrics(total: np.ndarray, first: np.ndarray, config: Config) -> dict[str, Any]:
     """One modality's block in the summary's `dqn`, without the speed.
 
@@ -368,15 +382,12 @@ def policy_metrics(total: np.ndarray, first: np.ndarray, config: Config) -> dict
       config: all settings.
     """
     num_states = total.shape[1] - config.evaluation.num_starts
-    whole = dict(zip(POLICIES, total[:, num_states:].mean(axis=1).tolist(), strict=True))
     one_step = dict(zip(POLICIES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
     missed = total[POLICIES.index("optimal"), :num_states] - total[0, :num_states]
     is_optimal = missed <= 0.01
     is_permutation = episodes.are_different(_states(config)[0])
     return {
-        **whole,
-        # Where no look pays, the optimum is 0.
-        "fraction_of_optimal": whole["return"] / whole["optimal"] if whole["optimal"] else None,
+        **returns(total, config),
         "one_step": {
             "policy": one_step["return"],
             "optimal": one_step["optimal"],

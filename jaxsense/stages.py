@@ -178,6 +178,7 @@ def stages(config: Config, world: World | None = None) -> list[Stage]:
     with_filter = _filter_stages(config) if config.jmvae.fusion == "filter" else []
     params = with_filter[-1].name if with_filter else "jmvae"
     learned = "detections", params, *detector_names
+    modalities = range(len(config.modalities))
     return [
         Stage("scenes", _draw_scenes),
         Stage("survey", functools.partial(_survey, world), ("scenes",), has_rows=True),
@@ -193,7 +194,12 @@ def stages(config: Config, world: World | None = None) -> list[Stage]:
         Stage("beliefs", _measure_beliefs, (params, "class_beliefs", "detections")),
         Stage("starts", functools.partial(_starts, world), learned),
         *_agent_stages(world, config, learned),
-        *(_policies_stage(m, config, params) for m in range(len(config.modalities))),
+        *(_policies_stage(m, config, params) for m in modalities),
+        *(
+            _other_numbers_stage(m, config, params)
+            for m in modalities
+            if config.evaluation.num_pois
+        ),
     ]
 
 
@@ -586,7 +592,7 @@ def _starts(
     mdp = make_mdp(world, config, detections.bank, params, trained)
     number = config.dqn.num_starts
     if config.dqn.observe == "bank" or isinstance(mdp, TeamMdp):
-        return dqn.starts(key, mdp, number)
+        return dqn.starts(key, mdp, config.dqn)
 
     def begin(key: Key, classes: jax.Array, scene: Scene, looks: tuple[jax.Array, ...]):
         seen_key, begin_key = jax.random.split(key)
@@ -666,6 +672,29 @@ def _policies_stage(modality: int, config: Config, params: str) -> Stage:
     name = config.modalities[modality]
     inputs = agent(config, name), params, "look_values", "detections"
     return Stage(f"policies_{name}", _play_policies, inputs, modality, program="policies")
+
+
+def _other_numbers_stage(modality: int, config: Config, params: str) -> Stage:
+    """The same with other numbers of PoIs, for the policy of a team."""
+    name = config.modalities[modality]
+    inputs = agent(config, name), params, "look_values", "detections"
+    return Stage(f"numbers_{name}", _play_numbers, inputs, modality, program="numbers")
+
+
+def _play_numbers(
+    key: Key, config: Config, modality: jax.Array, *inputs: Any
+) -> list[tuple[jax.Array, jax.Array]]:
+    """For each of `evaluation.num_pois` the results of `examine.compare_policies`."""
+    settings = config.evaluation
+    fewer = dataclasses.replace(settings, num_states=1, num_repeats=settings.num_repeats // 8)
+
+    def play(number: int) -> tuple[jax.Array, jax.Array]:
+        # The places of a scene play no part here, only their number.
+        arena = dataclasses.replace(config.arena, num_pois=number, side=100.0)
+        there = dataclasses.replace(config, arena=arena, evaluation=fewer)
+        return _play_policies(jax.random.fold_in(key, number), there, modality, *inputs)
+
+    return [play(number) for number in settings.num_pois]
 
 
 def _play_policies(

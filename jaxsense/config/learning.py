@@ -178,13 +178,13 @@ class TeamConfig:
     """Fewest and most points of interest in an episode."""
     robots_each: int = 2
     """Most robots of each modality in an episode; the fewest is one."""
-    sides: Traced[tuple[float, float]] = (3.0, 5.0)
+    sides: Traced[tuple[float, float]] = (3.0, 6.0)
     """Shortest and longest side of the arena of an episode, in metres."""
     alone: Traced[float] = 0.25
     """Share of episodes of the paper's MDP: one robot is alone, and nothing is far away."""
     partly_seen: Traced[float] = 0.5
     """Share of the other episodes that start with some looks taken."""
-    second_cost: Traced[float] = 0.02
+    second_cost: Traced[float] = 0.0
     """Price of a second, in units of the reward."""
     max_steps: Traced[int] = 300
     """Longest episode, in choices."""
@@ -301,6 +301,9 @@ class EvaluationConfig:
 
     num_histories: int = 8190
     """Random histories of looks at a PoI, after which the map is compared with exact Bayes."""
+    num_pois: tuple[int, ...] = ()
+    """Further numbers of PoIs for which a team's policy is compared with the optimum of the map
+    MDP."""
     num_states: int = 4096
     """Most states of the map in which policies are compared, one by one; of more, as many at even
     distances."""
@@ -314,6 +317,8 @@ class EvaluationConfig:
         require_types(self)
         require_positive(self, "num_starts", "num_repeats", "num_states", "num_histories")
         require_positive(self, "value_points", "value_looks")
+        is_right = all(0 < number <= 64 for number in self.num_pois)
+        require(is_right, self, "num_pois", "must be numbers from 1 to 64")
         require_at_most(
             self,
             num_histories=10_000_000,

@@ -85,14 +85,34 @@ _NOISY = Config(
     mission=MissionConfig(policies=POLICIES, episodes=64, least_confidence=0.0, equal_values=0.05),
 )
 
-PresetName = Literal["default", "paper", "noisy", "smoke"]
+_TEAM = Config(
+    arena=ArenaConfig(side=4.0, num_pois=8),
+    dqn=DqnConfig(
+        task="team",
+        observe="bank",
+        hidden=(32, 32),
+        epochs=1500,
+        updates=16,
+        replay_capacity=131072,
+        discount=0.85,
+        target_period=5,
+    ),
+    evaluation=EvaluationConfig(num_pois=(3, 8, 20)),
+    mission=MissionConfig(
+        policies=("latent", "nearest", "auction", "rollout", "naive", "random"), time_limit=300.0
+    ),
+)
+
+PresetName = Literal["default", "paper", "noisy", "team", "smoke"]
 
 PRESETS: dict[str, Config] = {
     "default": Config(),
     "paper": _PAPER,
     "noisy": _NOISY,
+    "team": _TEAM,
     "smoke": _SMOKE,
 }
 """`default`: the best settings we know. `paper`: those of the paper where it states them, otherwise
 chosen to reproduce its figures, see `docs/differences.md`. `noisy`: sensors that are often unsure,
-and beliefs that accumulate looks. `smoke`: the whole pipeline in seconds, for tests."""
+and beliefs that accumulate looks. `team`: one policy for any number of PoIs and robots, for which
+time counts. `smoke`: the whole pipeline in seconds, for tests."""

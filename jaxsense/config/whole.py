@@ -82,6 +82,7 @@ class Config:
         if self.mdp.reward == "nats" and self.jmvae.fusion != "filter":
             reason = f"needs jmvae.fusion = 'filter', not {self.jmvae.fusion!r}"
             raise ConfigError("mdp.reward", self.mdp.reward, reason)
+        self._check_task()
         self._check_viewpoints()
         self._check_views()
         looks = self.arena.num_pois * len(self.modalities)
@@ -93,6 +94,16 @@ class Config:
             )
         self._check_fields_of_view()
         self._check_memory()
+
+    def _check_task(self) -> None:
+        """A team learns from stored detections; a dense network is for one number of PoIs."""
+        if self.dqn.task == "team":
+            if self.dqn.observe != "bank":
+                reason = "must be 'bank' with dqn.task = 'team', whose MDP has no scans"
+                raise ConfigError("dqn.observe", self.dqn.observe, reason)
+        elif self.evaluation.num_pois:
+            reason = "needs dqn.task = 'team', whose policy is for any number; must be empty"
+            raise ConfigError("evaluation.num_pois", self.evaluation.num_pois, reason)
 
     def _check_viewpoints(self) -> None:
         """Viewpoints for training must be clear of the PoI and inside the arena."""
@@ -205,7 +216,11 @@ class Config:
         num_labels = sum(len(self.labels(name)) for name in self.modalities)
         windows = {"camera": 3 * self.camera.window, "lidar": self.lidar.window}
         window = max(windows.get(name, 1) for name in self.modalities)
-        state, scene = 2 * num_pois * jmvae.latent_size, num_pois * window
+        of_poi = 2 * jmvae.latent_size
+        state, scene = num_pois * of_poi, num_pois * window
+        if dqn.task == "team":
+            of_poi += 3 * len(self.modalities) + 4
+            state = max(self.team.num_pois[1], num_pois) * of_poi
         views = num_pois * ways.view_sides * len(ways.view_distances)
         trajectories = ways.speed_samples * ways.turn_samples * math.ceil(10 * ways.horizon)
         encoders = 2 ** len(self.modalities)

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense import networks
-from jaxsense.config import DqnConfig, TravelConfig, values
+from jaxsense.config import DqnConfig, TeamConfig, values
 from jaxsense.dqn import belief_mdp, optimum, team_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.pooling import PoolingNetwork
+from jaxsense.dqn.team_mdp import Team
 from jaxsense.networks import MLP, Params
 from jaxsense.types import Belief, Index, Key
 
@@ -40,19 +41,65 @@ def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
 
 
 def greedy_alone(
-    mdp: MapMdp, params: Params, modality: Index, config: DqnConfig, travel: TravelConfig
+    mdp: MapMdp, params: Params, modality: Index, team: TeamConfig, config: DqnConfig
 ) -> Policy:
     """Takes the best action of a team's Q-network for one robot that is alone, see `greedy`."""
-    network = team_network(mdp.unseen.mean.size, mdp.num_modalities, config)
 
     def act(key: Key, state: MapState) -> jax.Array:
         del key
-        team = team_mdp.alone(mdp.num_pois, jnp.asarray(modality))
-        agent = jnp.int32(0)
-        seen = team_mdp.observation(travel, state.belief, team, agent, mdp.num_modalities)
-        return _best(networks.apply(network, params, seen.reshape(-1)))
+        alone = team_mdp.alone(mdp.num_pois, jnp.asarray(modality))
+        known = state.belief, alone, jnp.int32(0), mdp.num_modalities
+        return _best(team_values(params, *known, team, config))
 
     return act
+
+
+def team_values(
+    params: Params,
+    belief: Belief,
+    team: Team,
+    agent: jax.Array,
+    num_modalities: int,
+    config: TeamConfig,
+    dqn: DqnConfig,
+) -> jax.Array:
+    """Values of a robot's actions, `[N + 1]`, by the Q-network of a team.
+
+    Args:
+      params: of the Q-network.
+      belief: `[N, D]` the map.
+      team: where everybody is.
+      agent: `[]` int32, the robot that chooses.
+      num_modalities: M.
+      config: the price of time and the model of travel.
+      dqn: the network, and the discount of time.
+    """
+    latent_size = belief.mean.shape[1]
+    seen = team_mdp.observation(config.travel, belief, team, agent, num_modalities).reshape(-1)
+    after = networks.apply(team_network(latent_size, num_modalities, dqn), params, seen)
+    return of_ways(after, seen, latent_size, config, dqn)
+
+
+def of_ways(
+    after: jax.Array, seen: jax.Array, latent_size: int, config: TeamConfig, dqn: DqnConfig
+) -> jax.Array:
+    """Values of setting out for PoIs now, from the values when a robot has arrived there.
+
+    Until then time passes: `discount^t after - second_cost t`, with `t` the seconds of the way. NOP
+    takes none.
+
+    Args:
+      after: `[N + 1, ...]` rewards of the looks and best values after them; 0 for NOP.
+      seen: `[F * N, ...]` observation.
+      latent_size: D.
+      config: the price of time.
+      dqn: the discount of a second.
+    """
+    num_pois = after.shape[0] - 1
+    observed = seen.reshape(-1, num_pois, *seen.shape[1:])
+    seconds = team_mdp.own_seconds(observed, latent_size)
+    of_pois = dqn.discount**seconds * after[:-1] - config.second_cost * seconds
+    return jnp.concatenate([of_pois, after[-1:]])
 
 
 def random(mdp: MapMdp) -> Policy:

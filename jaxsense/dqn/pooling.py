@@ -1,7 +1,7 @@
 """A Q-network that treats all points of interest alike, for any number of them.
 
 One small network reads each PoI, with what lies around it and a pool over all of them (Zaheer et
-al. 2017, Deep Sets); NOP's value comes from the pool. PoIs that are not present count nowhere.
+al. 2017, Deep Sets). PoIs that are not present count nowhere.
 """
 
 import chex
@@ -11,7 +11,8 @@ from flax import linen as nn
 
 from jaxsense.networks import Dense
 
-_REACHES = (0.5, 1.5)  # m, over which PoIs count as neighbours
+_REACHES = (2.0, 6.0)  # s, within which PoIs count as near
+_SPEED, _TURN_RATE, _VIEW = 0.2, 1.0, 0.9  # m/s, rad/s and m
 _MESSAGES = 8
 _NOTHING = -1e6  # value of a PoI that is not present
 
@@ -50,15 +51,35 @@ class PoolingNetwork(nn.Module):
         of_poi = nn.relu(of_poi.reshape(size, *known.shape[1:]) + context[:, None])
         value = Dense(1, last, name="Value")(of_poi.reshape(size, -1))
         value = value.reshape(*known.shape[1:])
-        nop = Dense(1, last, name="NOP")(nn.relu(context))
+        # A robot's part ends with NOP.
+        nop = jnp.zeros((1, *batch))
         return jnp.concatenate([jnp.where(present[0] > 0, value, _NOTHING), nop])
 
     def _messages(self, flat: jax.Array, present: jax.Array, place: jax.Array) -> jax.Array:
-        """What lies around each PoI: messages of all PoIs, the near ones weighing most."""
+        """What lies near each PoI: messages of all PoIs, loudest from where a robot is soonest."""
         sent = Dense(_MESSAGES, nn.initializers.lecun_normal(), name="Message")(flat)
         sent = nn.relu(sent).reshape(_MESSAGES, *present.shape[1:]) * present
-        apart = jnp.sqrt(jnp.sum((place[:, :, None] - place[:, None]) ** 2, axis=0) + 1e-6)
+        seconds = _seconds_between(place)
         gathered = [
-            jnp.sum(jnp.exp(-apart / reach)[None] * sent[:, None], axis=2) for reach in _REACHES
+            jnp.sum(jnp.exp(-seconds / reach)[None] * sent[:, None], axis=2) for reach in _REACHES
         ]
         return jnp.concatenate(gathered)
+
+
+def _seconds_between(place: jax.Array) -> jax.Array:
+    """About how long a robot takes from one PoI to the next, `[N, N, ...]` seconds.
+
+    It is only a measure of nearness, and so a rough model of travel is enough.
+
+    Args:
+      place: `[2, N, ...]` of the PoIs in metres from where the robot sets out.
+    """
+    apart = jnp.sqrt(jnp.sum(place**2, axis=0) + 1e-6)
+    course = place / apart[None]
+    stop = course * jnp.maximum(apart - _VIEW, 0.0)[None]
+    way = place[:, None] - stop[:, :, None]
+    length = jnp.sqrt(jnp.sum(way**2, axis=0) + 1e-6)
+    ahead = jnp.sum(way * course[:, :, None], axis=0) / length
+    # From 0 for straight on to a half turn, without the cost of an arc cosine.
+    turn = jnp.pi / 2 * (1.0 - ahead)
+    return turn / _TURN_RATE + jnp.maximum(length - _VIEW, 0.0) / _SPEED

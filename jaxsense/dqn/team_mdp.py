@@ -1,10 +1,10 @@
 """The shared map with places: a team of robots chooses, drives and looks, and time counts.
 
-A semi-Markov decision process (Sutton, Precup and Singh 1999, Artificial Intelligence 112, Sec. 3).
-One step is one robot's choice: the PoI that it will look at, or NOP, which ends its part. When all
-robots have chosen, time passes until the first of them arrives, turns to its PoI and looks at it;
-the look is written into the map, and every robot still at work chooses again. All robots share one
-reward: that of each look in the map MDP, less a price of each second.
+One step is one robot's choice: the PoI that it will look at, or NOP, which ends its part. Then time
+passes until a robot arrives and looks; the look is written into the map, and that robot chooses
+next. For each robot this is a semi-Markov decision process (Sutton, Precup and Singh 1999,
+Artificial Intelligence 112, Sec. 3), whose actions take as long as its way: it earns the rewards of
+its own looks in the map MDP, less a price of each second, discounted by the time that passes.
 
 Times come from a model of travel, which `TravelConfig` holds: a robot turns, drives straight until
 it is near enough, and looks.
@@ -22,7 +22,8 @@ from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState, Outcome
 from jaxsense.types import Belief, Key, pytree
 
-_TIME_SCALE = 10.0  # s, in which observations count travel
+TIME_SCALE = 10.0
+"""Seconds in which observations count travel."""
 
 
 @pytree
@@ -48,13 +49,13 @@ class Team:
 
 @pytree
 class TeamState:
-    """The state between two choices.
+    """The state before a choice.
 
     Attributes:
       map: the map, and the scene that it describes.
       team: where everybody is.
-      asks: `[R]` bool, robots that have yet to choose at this moment.
-      agent: `[]` int32, the robot that chooses next.
+      asks: `[R]` bool, robots that have yet to choose at this moment, as all do at first.
+      agent: `[]` int32, the robot that chooses.
       seconds: `[]` since the start.
     """
 
@@ -119,6 +120,11 @@ def move(config: TravelConfig, pose: jax.Array, place: jax.Array, seconds: jax.A
     return jnp.append(pose[:2] + driven * along, yaw)
 
 
+def own_seconds(observed: jax.Array, latent_size: int) -> jax.Array:
+    """`[N, ...]` the robot's own time to look at each PoI, from `[F, N, ...]` of `observation`."""
+    return TIME_SCALE * observed[2 * latent_size]
+
+
 def num_features(latent_size: int, num_modalities: int) -> int:
     """Numbers that a robot knows of each PoI, see `observation`."""
     return 2 * latent_size + 3 * num_modalities + 4
@@ -145,7 +151,7 @@ def observation(
     chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
     values.require_positive("belief.std", belief.std)
     times = jax.vmap(lambda pose: travel_seconds(config, pose, team.positions))(team.poses)
-    soon = jnp.exp(-times / _TIME_SCALE)
+    soon = jnp.exp(-times / TIME_SCALE)
     robots, pois = jnp.arange(team.poses.shape[0]), jnp.arange(team.positions.shape[0])
     is_other = team.works & (robots != agent)
     heads = team.target[:, None] == pois[None]
@@ -158,7 +164,7 @@ def observation(
     rows = [
         belief.mean.T,
         belief.std.T,
-        (times[agent] / _TIME_SCALE)[None],
+        (times[agent] / TIME_SCALE)[None],
         heading,
         nearest,
         own,
@@ -221,7 +227,7 @@ def reset(key: Key, mdp: TeamMdp) -> TeamState:
 
 
 def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[TeamState, Outcome]:
-    """Lets one robot choose; once all have, time passes until the next look.
+    """Lets one robot choose; if no other has to, time passes until the next look.
 
     Args:
       key: random key.
@@ -230,8 +236,8 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
       action: `[]` int32 choice of robot `state.agent`: a PoI, or N for NOP.
 
     Returns:
-      The next state and the outcome. The reward is that of the look, if there was one, less the
-      price of the `seconds` that it took.
+      The next state and the outcome. The reward is that of the look, if there was one, of the robot
+      that chooses next; `seconds` have passed.
     """
     chex.assert_rank(action, 0, custom_message="action")
     values.require_index("action", action, mdp.map.num_pois + 1)
@@ -264,12 +270,12 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
     state = TeamState(
         map=after,
         team=team,
-        asks=jnp.where(passes, works, asks),
+        asks=jnp.where(passes, robots == looker, asks),
         agent=jnp.where(passes, looker, following.astype(jnp.int32)),
         seconds=state.seconds + seconds,
     )
     return state, Outcome(
-        reward=outcome.reward - mdp.config.second_cost * seconds,
+        reward=outcome.reward,
         terminated=is_over,
         truncated=~is_over & (after.steps >= mdp.config.max_steps),
         seconds=seconds,

@@ -12,11 +12,9 @@ import chex
 import jax
 import jax.numpy as jnp
 import optax
-from flax import linen as nn
 
-from jaxsense import networks
 from jaxsense.config import DqnConfig
-from jaxsense.dqn import belief_mdp, losses, replay, team_mdp
+from jaxsense.dqn import losses, replay
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.dqn.environments import Environment, State, environment
 from jaxsense.dqn.team_mdp import TeamMdp
@@ -103,7 +101,7 @@ def init(key: Key, mdp: MapMdp | TeamMdp, config: DqnConfig, prepared: State) ->
     envs = jax.tree.map(lambda x: jnp.zeros((config.num_envs, *x.shape[1:]), x.dtype), prepared)
     place = environment(mdp, 0, config)
     size = jax.eval_shape(jax.vmap(place.observation), prepared).shape[1]
-    params = networks.init(key, place.network, size)
+    params = place.init(key)
     rounds, blocks = config.replay_capacity // config.num_envs, config.num_envs // config.block
     return DqnState(
         params=params,
@@ -117,19 +115,14 @@ def init(key: Key, mdp: MapMdp | TeamMdp, config: DqnConfig, prepared: State) ->
     )
 
 
-def starts(key: Key, mdp: MapMdp | TeamMdp, number: int) -> State:
-    """Random states, `[number]`, for episodes to start from.
+def starts(key: Key, mdp: MapMdp | TeamMdp, config: DqnConfig) -> State:
+    """Random states, `[num_starts]`, for episodes to start from.
 
     A training prepares them once: a start looks at everything it has seen, which costs far more
     than a step.
     """
-
-    def reset(key: Key) -> State:
-        if isinstance(mdp, TeamMdp):
-            return team_mdp.reset(key, mdp)
-        return belief_mdp.reset(key, mdp)
-
-    return jax.vmap(reset)(jax.random.split(key, number))
+    reset = environment(mdp, 0, config).reset
+    return jax.vmap(reset)(jax.random.split(key, config.num_starts))
 
 
 def train(
@@ -147,7 +140,7 @@ def train(
       The last state and the `[epochs]` infos.
     """
     init_key, start_key, chunk_key = jax.random.split(key, 3)
-    prepared = starts(start_key, mdp, config.num_starts)
+    prepared = starts(start_key, mdp, config)
     state = init(init_key, mdp, config, prepared)
     keys = jax.random.split(chunk_key, config.epochs // config.chunk)
     state, infos = jax.lax.scan(
@@ -241,7 +234,7 @@ def _epoch(
     episodes = jnp.sum(has_ended)
     ended_reward = jnp.sum(jnp.where(has_ended, total_reward, 0.0))
 
-    params, optimiser, loss = _learn(config, place.network, state, memory, draws.replay)
+    params, optimiser, loss = _learn(config, place, state, memory, draws.replay)
     is_copied = (state.epoch + 1) % config.target_period == 0
     target = jax.tree.map(lambda new, old: jnp.where(is_copied, new, old), params, state.target)
     checked = values, transitions.r_t, loss, params
@@ -278,17 +271,19 @@ def _explore(
     """Next states, which episodes have ended, transitions and `[A, E]` values before them."""
     observations = jax.vmap(place.observation, out_axes=-1)
     s_tm1 = observations(started)
-    values = networks.apply(place.network, params, s_tm1)
+    values = place.values(params, s_tm1)
     chex.assert_shape(values, (place.num_actions, None))
     greedy = jnp.argmax(values, axis=0).astype(jnp.int32)
     a_tm1 = jnp.where(draws.coin < epsilon, _explored(place, started, draws.action), greedy)
-    envs, outcome = jax.vmap(place.step)(draws.step, started, a_tm1)
-    discount = config.discount
-    if outcome.seconds is not None:
-        discount = discount**outcome.seconds
-    discount_t = jnp.where(outcome.terminated, 0.0, discount)
-    s_t = observations(envs)
-    transitions = Transition(s_tm1, a_tm1, outcome.reward, discount_t, s_t)
+
+    def step(key: Key, state: State, s_tm1: jax.Array, action: jax.Array):
+        after, learned, outcome = place.step(key, state, s_tm1, action)
+        numbers = learned.a_tm1, learned.r_t, learned.discount_t
+        return after, (learned.s_tm1, learned.s_t), numbers, outcome
+
+    steps = jax.vmap(step, in_axes=(0, 0, -1, 0), out_axes=(0, -1, 0, 0))
+    envs, (s_tm1, s_t), numbers, outcome = steps(draws.step, started, s_tm1, a_tm1)
+    transitions = Transition(s_tm1, *numbers, s_t)
     return envs, outcome.terminated | outcome.truncated, transitions, values
 
 
@@ -301,7 +296,7 @@ def _explored(place: Environment, states: State, draws: jax.Array) -> jax.Array:
 
 def _learn(
     config: DqnConfig,
-    network: nn.Module,
+    place: Environment,
     state: DqnState,
     memory: replay.Replay,
     draws: jax.Array,
@@ -310,8 +305,8 @@ def _learn(
     optimiser = _optimiser(config)
 
     def loss(params: Params, batch: Transition) -> jax.Array:
-        q_tm1 = networks.apply(network, params, batch.s_tm1)
-        q_t = networks.apply(network, state.target, batch.s_t)
+        q_tm1 = place.learned(params, batch.s_tm1)
+        q_t = place.values(state.target, batch.s_t)
         error = losses.td_error(q_tm1, batch.a_tm1, batch.r_t, batch.discount_t, q_t)
         return jnp.mean(losses.pseudo_huber(error))
 

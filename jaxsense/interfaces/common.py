@@ -3,7 +3,7 @@
 import jax
 
 from jaxsense.config import values
-from jaxsense.dqn import belief_mdp, training
+from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.types import Key
 
@@ -30,7 +30,11 @@ def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
     prepared ones costs nothing.
     """
     values.require_number("number", number)
-    return jax.jit(lambda key: training.starts(key, mdp, number))(key)
+
+    def reset(key: Key) -> MapState:
+        return belief_mdp.reset(key, mdp)
+
+    return jax.jit(lambda key: jax.vmap(reset)(jax.random.split(key, number)))(key)
 
 
 def start(key: Key, mdp: MapMdp, starts: MapState | None) -> MapState:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jaxsense import networks
 from jaxsense.config import KNOW_WAYS, POLICIES, ROBOT_RADIUS, Config
-from jaxsense.dqn import belief_mdp, optimum, rules, team_mdp
+from jaxsense.dqn import belief_mdp, optimum, policies, rules, team_mdp
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission.state import (
     BACKING,
@@ -157,15 +157,14 @@ def _q_values(
     mission: Mission, models: Models, state: MissionState, robot: Index, given_up: jax.Array
 ) -> jax.Array:
     """`[N + 1]` values of the Q-network."""
-    network, _ = make_q_network(mission.config)
     modality = jnp.array(mission.config.modality_of_robot)[robot]
     q_network = jax.tree.map(lambda *x: jnp.stack(x)[modality], *models.q_networks)
 
     if mission.config.dqn.task == "team":
         known = state.belief, team_of(mission, state, given_up), jnp.asarray(robot)
-        travel, number = mission.config.team.travel, len(mission.config.modalities)
-        seen = team_mdp.observation(travel, *known, number)
-        return networks.apply(network, q_network, seen.reshape(-1))
+        config, number = mission.config, len(mission.config.modalities)
+        return policies.team_values(q_network, *known, number, config.team, config.dqn)
+    network, _ = make_q_network(mission.config)
 
     def values_if(sure: Belief) -> jax.Array:
         """The network's values as if all PoIs given up were known to be of one class."""

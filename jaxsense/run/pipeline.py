@@ -125,8 +125,15 @@ def _of_agent(config: Config, modality: str, trained: Trained) -> dict[str, Any]
     total, first = map(np.asarray, trained.outputs[f"policies_{modality}"])
     env_steps = config.dqn.epochs * config.dqn.num_envs
     seconds = sum(trained.curves[agent(config, modality)]["seconds"])
+    others = {
+        str(number): examine.returns(np.asarray(total), config)
+        for number, (total, _) in zip(
+            config.evaluation.num_pois, trained.outputs.get(f"numbers_{modality}", ()), strict=True
+        )
+    }
     return {
         **examine.policy_metrics(total, first, config),
+        **({"other_numbers": others} if others else {}),
         "env_steps": env_steps,
         "env_steps_per_s": env_steps / seconds,
     }

@@ -108,7 +108,7 @@ def chunks():
     """States of a small training after every epoch, and the infos, stepped from the host."""
     config = SMALL
     init_key, start_key, chunk_key = jax.random.split(jax.random.key(0), 3)
-    prepared = training.starts(start_key, MDP, config.num_starts)
+    prepared = training.starts(start_key, MDP, config)
 
     @chex.assert_max_traces(n=1)  # a second chunk must not be traced again
     def chunk(key, state):
@@ -182,7 +182,7 @@ def test_an_episode_goes_on_until_nop_or_the_cut():
         epsilon_min=0.0,
         num_starts=8,
     )
-    prepared = training.starts(jax.random.key(2), mdp, config.num_starts)
+    prepared = training.starts(jax.random.key(2), mdp, config)
     state = training.init(jax.random.key(0), mdp, config, prepared)
     layers = state.params["params"]
     layers = {**layers, "Dense_1": {**layers["Dense_1"], "bias": jnp.array([1e3, -1e3])}}
@@ -242,7 +242,7 @@ def test_values_after_an_action_are_those_of_the_target_network():
 
 def test_the_replay_holds_as_many_transitions_as_the_settings_say():
     key = jax.random.key(0)
-    prepared = jax.eval_shape(lambda key: training.starts(key, MDP, SMALL.num_starts), key)
+    prepared = jax.eval_shape(lambda key: training.starts(key, MDP, SMALL), key)
     state = jax.eval_shape(lambda key: training.init(key, MDP, SMALL, prepared), key)
     rounds, blocks, _, width = state.replay.columns.shape
     assert rounds * blocks * width == SMALL.replay_capacity
@@ -282,7 +282,7 @@ def length_of(key, params):
 def trained_for(chunk, evaluate, **settings):
     """The state and the infos after one chunk of a small training, which begins at epoch 5."""
     config = replace(SMALL, epochs=chunk, chunk=chunk, **settings)
-    prepared = training.starts(jax.random.key(2), MDP, config.num_starts)
+    prepared = training.starts(jax.random.key(2), MDP, config)
     state = training.init(jax.random.key(0), MDP, config, prepared)
     train = jax.jit(
         lambda key, state: training.train_chunk(key, MDP, 0, config, state, prepared, evaluate),

@@ -83,7 +83,7 @@ SCENE_MDP = replace(
 @pytest.fixture(scope="module")
 def chunk():
     """Two epochs of exploration, and where they start."""
-    prepared = training.starts(KEY, SCENE_MDP, CONFIG.num_starts)
+    prepared = training.starts(KEY, SCENE_MDP, CONFIG)
     state = training.init(KEY, SCENE_MDP, CONFIG, prepared)
 
     def run(state, prepared):
