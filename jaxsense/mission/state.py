@@ -306,30 +306,29 @@ def _idle_robots(num_robots: int, num_pois: int, num_views: int) -> Robots:
 
 def _random_poses(key: Key, config: Config, layout: arenas.Layout, ways: Roadmap) -> jax.Array:
     """Random `[R, 3]` poses with room around the robots and, where possible, ways to all PoIs."""
-    num_robots = len(config.carried)
+    num_robots, settings = len(config.carried), config.navigation
     draws = jax.random.uniform(key, (num_robots, 3, _FREE_DRAWS), minval=-1.0)
-    reach = config.arena.side / 2 - config.navigation.robot_radius
+    reach = config.arena.side / 2 - settings.robot_radius
+    places = reach * jnp.swapaxes(draws[:, :2], 1, 2)
 
-    def to_each_poi(place: jax.Array) -> jax.Array:
-        of_poi = jax.vmap(lambda poi: roadmap.lengths(config, layout, ways, place, poi).min())
-        return of_poi(jnp.arange(config.arena.num_pois))
-
-    poses = jnp.zeros((0, 3))
-    for draw in draws:
-        places = reach * draw[:2].T
-        to_pois = jnp.linalg.norm(places[:, None] - layout.position[None], axis=-1)
-        room = jnp.min(to_pois, axis=-1) - config.arena.poi_extent - config.navigation.robot_radius
-        to_pois = jax.vmap(to_each_poi)(places)
+    def room_at(place: jax.Array) -> jax.Array:
+        to_pois = jnp.linalg.norm(layout.position - place[None], axis=-1)
+        room = jnp.min(to_pois) - config.arena.poi_extent - settings.robot_radius
         # From a corner behind a PoI there may be no way out.
-        is_cut_off = jnp.any(jnp.isinf(to_pois), axis=-1)
-        room = jnp.where(is_cut_off, room - config.arena.side, room)
-        for other in poses:
-            apart = jnp.linalg.norm(places - other[None, :2], axis=-1)
-            room = jnp.minimum(room, apart - 3 * config.navigation.robot_radius)
-        chosen = jnp.where(jnp.any(room > 0), jnp.argmax(room > 0), jnp.argmax(room))
-        pose = jnp.append(places[chosen], jnp.pi * draw[2, chosen])
-        poses = jnp.concatenate([poses, pose[None]])
-    return poses
+        has_ways = jnp.all(roadmap.reaches(config, layout, ways, place))
+        return jnp.where(has_ways, room, room - config.arena.side)
+
+    def place_robot(taken: jax.Array, robot: jax.Array) -> tuple[jax.Array, jax.Array]:
+        apart = jnp.linalg.norm(places[robot][:, None] - taken[None], axis=-1)
+        beside = jnp.min(apart, axis=-1) - 3 * settings.robot_radius
+        free = jnp.minimum(room[robot], beside)
+        chosen = jnp.where(jnp.any(free > 0), jnp.argmax(free > 0), jnp.argmax(free))
+        place = places[robot, chosen]
+        return taken.at[robot].set(place), jnp.append(place, jnp.pi * draws[robot, 2, chosen])
+
+    room = jax.vmap(jax.vmap(room_at))(places)
+    nowhere = jnp.full((num_robots, 2), jnp.inf)
+    return jax.lax.scan(place_robot, nowhere, jnp.arange(num_robots))[1]
 
 
 def robot_of(state: MissionState, robot: Index) -> Robots:

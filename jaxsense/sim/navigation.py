@@ -5,7 +5,6 @@ reach of its present speed that keep clear of walls, PoIs and other robots, a ro
 that brings it to its goal soonest. A command is a forward speed [m/s] and a turn rate [rad/s].
 """
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import chex
@@ -72,24 +71,25 @@ def clearance(arena: ArenaConfig, layout: Layout, poses: jax.Array) -> jax.Array
       `[R]` metres from a robot's outline to the nearest wall, PoI or robot; negative inside one.
     """
     chex.assert_shape(poses, (None, 3), custom_message="poses")
-    x, y = poses[:, 0], poses[:, 1]
-    nearest = arena.side / 2 - jnp.maximum(jnp.abs(x), jnp.abs(y))
-    for n in range(arena.num_pois):
-        from_x, from_y = x - layout.position[n, 0], y - layout.position[n, 1]
-        cos, sin = jnp.cos(layout.yaw[n]), jnp.sin(layout.yaw[n])
-        for i, shape in enumerate(arena.shapes.values()):
-            half_u, half_v = (share * arena.poi_radius for share in shape.half_sides)
-            along = jnp.abs(cos * from_x + sin * from_y) - half_u
-            across = jnp.abs(cos * from_y - sin * from_x) - half_v
-            outside = jnp.hypot(jnp.maximum(along, 0.0), jnp.maximum(across, 0.0))
-            to_box = outside + jnp.minimum(jnp.maximum(along, across), 0.0)
-            to_cylinder = jnp.hypot(from_x, from_y) - half_u
-            distance = to_box if shape.primitive == "box" else to_cylinder
-            nearest = jnp.where(layout.shape[n] == i, jnp.minimum(nearest, distance), nearest)
-    for r in range(len(poses)):
-        apart = jnp.hypot(x - x[r], y - y[r]) - amiro.BODY_RADIUS
-        nearest = jnp.where(jnp.arange(len(poses)) == r, nearest, jnp.minimum(nearest, apart))
-    return nearest - amiro.BODY_RADIUS
+    x, y = poses[:, :1], poses[:, 1:2]
+    to_wall = arena.side / 2 - jnp.max(jnp.abs(poses[:, :2]), axis=-1)
+
+    shapes = arena.shapes.values()
+    half_sides = arena.poi_radius * jnp.array([shape.half_sides for shape in shapes])
+    is_box = jnp.array([shape.primitive == "box" for shape in shapes])[layout.shape]
+    half_u, half_v = half_sides[layout.shape].T
+    from_x, from_y = x - layout.position[None, :, 0], y - layout.position[None, :, 1]
+    cos, sin = jnp.cos(layout.yaw)[None], jnp.sin(layout.yaw)[None]
+    along = jnp.abs(cos * from_x + sin * from_y) - half_u[None]
+    across = jnp.abs(cos * from_y - sin * from_x) - half_v[None]
+    outside = jnp.hypot(jnp.maximum(along, 0.0), jnp.maximum(across, 0.0))
+    to_box = outside + jnp.minimum(jnp.maximum(along, across), 0.0)
+    to_cylinder = jnp.hypot(from_x, from_y) - half_u[None]
+    to_poi = jnp.min(jnp.where(is_box[None], to_box, to_cylinder), axis=-1)
+
+    apart = jnp.hypot(x - x.T, y - y.T) - amiro.BODY_RADIUS
+    to_robot = jnp.min(jnp.where(jnp.eye(len(poses), dtype=bool), jnp.inf, apart), axis=-1)
+    return jnp.minimum(jnp.minimum(to_wall, to_poi), to_robot) - amiro.BODY_RADIUS
 
 
 class _Arcs(NamedTuple):
@@ -109,9 +109,9 @@ class _Frame(NamedTuple):
     cos: jax.Array
     sin: jax.Array
 
-    def of(self, place: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Coordinates of a place, from those in the world."""
-        to_x, to_y = place[0] - self.pose[0], place[1] - self.pose[1]
+    def of(self, places: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Coordinates of places, from `[..., 2]` in the world."""
+        to_x, to_y = places[..., 0] - self.pose[0], places[..., 1] - self.pose[1]
         return self.cos * to_x + self.sin * to_y, self.cos * to_y - self.sin * to_x
 
     def in_world(self, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -160,8 +160,8 @@ def drive_to(
     pose, present = poses[robot], commands[robot]
     frame = _Frame(pose, jnp.cos(pose[2]), jnp.sin(pose[2]))
     room_of_map = _room_of_map(settings, arena, layout, frame, arcs)
-    moving = zip(others(poses, robot), others(commands, robot), strict=True)
-    room, room_now = _room_beside(settings, frame, arcs, moving, *room_of_map)
+    moving = others(poses, robot), others(commands, robot)
+    room, room_now = _room_beside(settings, frame, arcs, *moving, *room_of_map)
     least = jax.lax.cummin(room, axis=1)
     beside = sidestep(settings, arena, layout, pose[:2], waypoint, others(poses[:, :2], robot))
     arrival = _arrival(settings, arcs, *frame.of(beside), room_of_map[0])
@@ -179,35 +179,44 @@ def _room_of_map(
     world_x, world_y = frame.in_world(x, y)
     room = arena.side / 2 - jnp.maximum(jnp.abs(world_x), jnp.abs(world_y)) - reach
     room_now = arena.side / 2 - jnp.max(jnp.abs(frame.pose[:2])) - reach
-    for n in range(arena.num_pois):
-        at_x, at_y = frame.of(layout.position[n])
-        keep = arena.poi_extent + reach
-        room = jnp.minimum(room, jnp.hypot(x - at_x, y - at_y) - keep)
-        room_now = jnp.minimum(room_now, jnp.hypot(at_x, at_y) - keep)
-    return room, room_now
+    at_x, at_y = frame.of(layout.position)
+    keep = arena.poi_extent + reach
+    room = jnp.minimum(room, _to_nearest(arcs, at_x[:, None], at_y[:, None]) - keep)
+    return room, jnp.minimum(room_now, jnp.min(jnp.hypot(at_x, at_y)) - keep)
 
 
 def _room_beside(
     settings: NavigationConfig,
     frame: _Frame,
     arcs: _Arcs,
-    moving: Iterable[tuple[jax.Array, jax.Array]],
+    poses: jax.Array,
+    commands: jax.Array,
     room: jax.Array,
     room_now: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Reduces both results of `_room_of_map` by robots, each a `[3]` pose and `[2]` command."""
-    x, y, keep = arcs.x, arcs.y, 2 * settings.robot_radius
-    for other, command in moving:
-        at_x, at_y = frame.of(other)
-        course, speed = other[2] - frame.pose[2], command[0]
-        then_x = at_x + arcs.times * speed * jnp.cos(course)
-        then_y = at_y + arcs.times * speed * jnp.sin(course)
-        to_other = jnp.minimum(
-            jnp.hypot(x - then_x[None], y - then_y[None]), jnp.hypot(x - at_x, y - at_y)
-        )
-        room = jnp.minimum(room, to_other - keep)
-        room_now = jnp.minimum(room_now, jnp.hypot(at_x, at_y) - keep)
-    return room, room_now
+    """Reduces both results of `_room_of_map` by robots of `[K, 3]` poses and `[K, 2]` commands."""
+    # Each counts twice: it may go straight on or stand.
+    speed = jnp.append(commands[:, 0], jnp.zeros(len(commands)))
+    poses = jnp.tile(poses, (2, 1))
+    at_x, at_y = frame.of(poses[:, :2])
+    course, way = poses[:, 2] - frame.pose[2], arcs.times[None] * speed[:, None]
+    x = at_x[:, None] + way * jnp.cos(course)[:, None]
+    y = at_y[:, None] + way * jnp.sin(course)[:, None]
+    keep = 2 * settings.robot_radius
+    room_now = jnp.minimum(room_now, jnp.min(jnp.hypot(at_x, at_y), initial=jnp.inf) - keep)
+    return jnp.minimum(room, _to_nearest(arcs, x, y) - keep), room_now
+
+
+def _to_nearest(arcs: _Arcs, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Metres, `[S, T]`, from the arcs to the nearest of K places, each `[T]` or `[1]`."""
+
+    def nearer(squared: jax.Array, place: tuple[jax.Array, jax.Array]):
+        to_x, to_y = arcs.x - place[0][None], arcs.y - place[1][None]
+        return jnp.minimum(squared, to_x**2 + to_y**2), None
+
+    # All places at once would not fit the cache, and to compile them one by one takes long.
+    far = jnp.full_like(arcs.x, jnp.inf)
+    return jnp.sqrt(jax.lax.scan(nearer, far, (x, y))[0])
 
 
 def _arrival(
@@ -260,16 +269,17 @@ def sidestep(
     """
     keep = 2 * settings.robot_radius + _SIDESTEP
     reach = arena.side / 2 - settings.robot_radius
-    result = waypoint
-    for other in blocking:
-        along = waypoint - place
-        length = jnp.maximum(jnp.linalg.norm(along), 1e-6)
-        along /= length
-        right = jnp.stack([along[1], -along[0]])
-        ahead, beside = jnp.dot(other - place, along), jnp.dot(other - place, right)
-        blocks = (jnp.abs(beside) < keep - _SIDESTEP / 2) & (ahead > 0) & (ahead < length)
-        # On the tangents to a circle around the other robot; inside it, outwards.
+    along = waypoint - place
+    length = jnp.maximum(jnp.linalg.norm(along), 1e-6)
+    along /= length
+    right = jnp.stack([along[1], -along[0]])
+
+    def beside(other: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Place beside another robot, and whether to go there."""
         to_other = other - place
+        ahead, aside = jnp.dot(to_other, along), jnp.dot(to_other, right)
+        blocks = (jnp.abs(aside) < keep - _SIDESTEP / 2) & (ahead > 0) & (ahead < length)
+        # On the tangents to a circle around the other robot; inside it, outwards.
         apart = jnp.maximum(jnp.linalg.norm(to_other), 1e-6)
         turn = jnp.arcsin(jnp.minimum(keep / apart, 1.0)) + jnp.maximum(1.0 - apart / keep, 0.0)
         step = jnp.sqrt(jnp.maximum(apart**2 - keep**2, 0.15**2)) / apart
@@ -283,8 +293,13 @@ def sidestep(
         has_room &= jnp.max(jnp.abs(sides), axis=-1) <= reach
         detour = jnp.linalg.norm(sides - waypoint[None], axis=-1) + jnp.array([0.0, 0.05])
         best = jnp.argmin(jnp.where(has_room, detour, jnp.inf))
-        result = jnp.where(blocks & jnp.any(has_room), sides[best], result)
-    return result
+        return sides[best], blocks & jnp.any(has_room)
+
+    # The last of several robots counts.
+    steps, applies = jax.vmap(beside)(blocking)
+    places = jnp.concatenate([waypoint[None], steps])
+    last = jnp.max(jnp.where(applies, 1 + jnp.arange(len(blocking)), 0), initial=0)
+    return places[last]
 
 
 def _arcs(settings: NavigationConfig) -> _Arcs:

@@ -6,6 +6,7 @@ a way from anywhere to any viewpoint is then a minimum over two of them. This is
 paper's move_base that knows the map of the arena.
 """
 
+import functools
 import math
 
 import chex
@@ -52,13 +53,11 @@ def build(config: Config, layout: Layout) -> Roadmap:
     reach = arena.side / 2 - settings.robot_radius
     to_pois = jnp.linalg.norm(nodes[:, None] - layout.position[None], axis=-1)
     is_usable = jnp.all(to_pois >= radius, axis=-1) & (jnp.max(jnp.abs(nodes), axis=-1) <= reach)
-    edges = _straight(nodes, nodes, layout.position, radius)
-    between = _shortest(jnp.where(is_usable[:, None] & is_usable[None], edges, jnp.inf))
-
     places, is_free = _viewpoints(config, layout)
-    last = _straight(places.reshape(-1, 2), nodes, layout.position, radius)
-    to_places = _min_plus(jnp.where(is_usable[None], last, jnp.inf), between)
-    to_viewpoint = to_places.reshape(*is_free.shape, -1)
+    starts = jnp.concatenate([nodes, places.reshape(-1, 2)])
+    edges = _straight(starts, nodes, layout.position, radius)
+    ways = _shortest(jnp.where(is_usable[None], edges, jnp.inf))
+    to_viewpoint = ways[len(nodes) :].reshape(*is_free.shape, -1)
     return Roadmap(nodes, places, jnp.where(is_free[..., None], to_viewpoint, jnp.inf), is_free)
 
 
@@ -83,6 +82,19 @@ def lengths(
     direct, to_node = first[: len(goals)], first[len(goals) :]
     around = jnp.min(to_node[None] + roadmap.to_viewpoint[poi], axis=-1)
     return jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
+
+
+def reaches(config: Config, layout: Layout, roadmap: Roadmap, place: jax.Array) -> jax.Array:
+    """Whether there is a way from a place to a viewpoint of each PoI, `[N]` bool; see `lengths`."""
+    chex.assert_shape(place, (2,), custom_message="place")
+    goals = roadmap.viewpoints.reshape(-1, 2)
+    ends = jnp.concatenate([goals, roadmap.nodes])
+    first = _straight(place[None], ends, layout.position, _radius(config) - _MARGIN)[0]
+    is_seen = jnp.isfinite(first)
+    direct = is_seen[: len(goals)].reshape(roadmap.is_free.shape) & roadmap.is_free
+    leads_on = jnp.any(jnp.isfinite(roadmap.to_viewpoint), axis=1)
+    around = is_seen[None, len(goals) :] & leads_on
+    return jnp.any(direct, axis=-1) | jnp.any(around, axis=-1)
 
 
 def next_place(
@@ -152,34 +164,54 @@ def _straight(start: jax.Array, end: jax.Array, centres: jax.Array, radius: floa
     A free way keeps `radius` from all `[N, 2]` centres or, where it begins or ends closer, comes no
     closer on the way.
     """
-    along = end[None] - start[:, None]
-    is_free = jnp.ones(along.shape[:2], bool)
-    for centre in centres:
-        from_start = jnp.linalg.norm(start - centre[None], axis=-1)[:, None]
-        from_end = jnp.linalg.norm(end - centre[None], axis=-1)[None]
-        kept = jnp.minimum(jnp.minimum(from_start, from_end), radius)
-        is_free &= _from_segments(start, end, centre) >= kept - _SLACK
-    return jnp.where(is_free, jnp.linalg.norm(along, axis=-1), jnp.inf)
 
+    def around(places: jax.Array) -> tuple[jax.Array, ...]:
+        """Places as seen from each centre, and the squared distance to keep from it, `[N, ...]`."""
+        x = places[None, :, 0] - centres[:, :1]
+        y = places[None, :, 1] - centres[:, 1:]
+        kept = jnp.minimum(jnp.sqrt(x**2 + y**2), radius) - _SLACK
+        return x, y, jnp.maximum(kept, 0.0) ** 2
 
-def _from_segments(start: jax.Array, end: jax.Array, point: jax.Array) -> jax.Array:
-    """Distances `[A, B]` of a point from the straight ways between `[A, 2]` and `[B, 2]`."""
-    start_x, start_y = start[:, None, 0], start[:, None, 1]
-    along_x, along_y = end[None, :, 0] - start_x, end[None, :, 1] - start_y
-    to_x, to_y = point[0] - start_x, point[1] - start_y
-    squared = jnp.maximum(along_x**2 + along_y**2, 1e-12)
-    share = jnp.clip((to_x * along_x + to_y * along_y) / squared, 0.0, 1.0)
-    return jnp.hypot(to_x - share * along_x, to_y - share * along_y)
+    def keep_off(is_free: jax.Array, ends: tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]):
+        """Crosses off the ways that come too close to one centre."""
+        from_x, from_y, from_kept = (x[:, None] for x in ends[0])
+        to_x, to_y, to_kept = (x[None] for x in ends[1])
+        along_x, along_y = to_x - from_x, to_y - from_y
+        squared = along_x**2 + along_y**2
+        ahead = -(from_x * along_x + from_y * along_y)
+        beside = from_x * along_y - from_y * along_x
+        # Elsewhere it is closest at one of its ends.
+        passes_by = (ahead > 0) & (ahead < squared)
+        # Times the squared length of the way, which saves a division and a root.
+        is_near = beside**2 < jnp.minimum(from_kept, to_kept) * squared
+        return is_free & ~(passes_by & is_near), None
+
+    # All centres at once would not fit the cache, and to compile them one by one takes long.
+    is_free = jnp.ones((len(start), len(end)), bool)
+    is_free, _ = jax.lax.scan(keep_off, is_free, (around(start), around(end)))
+    along_x, along_y = end[None, :, 0] - start[:, :1], end[None, :, 1] - start[:, 1:]
+    return jnp.where(is_free, jnp.sqrt(along_x**2 + along_y**2), jnp.inf)
 
 
 def _shortest(edges: jax.Array) -> jax.Array:
-    """Lengths `[K, K]` of shortest ways over any number of nodes, from `[K, K]` single edges."""
-    ways = jnp.where(jnp.eye(len(edges), dtype=bool), 0.0, edges)
-    for _ in range(max(1, math.ceil(math.log2(len(edges))))):
-        ways = _min_plus(ways, ways)
-    return ways
+    """Lengths `[A, K]` of shortest ways over any number of nodes, from `[A, K]` single edges.
 
+    The first K of the A starts are the nodes. The method of Floyd (1962) and Warshall, with the
+    nodes of one PoI at a time, which passes over the memory a tenth as often.
+    """
+    num_starts, num_nodes = edges.shape
 
-def _min_plus(first: jax.Array, second: jax.Array) -> jax.Array:
-    """Least sum over B of `[A, B]` and `[B, C]`, `[A, C]`."""
-    return jax.lax.map(lambda row: jnp.min(row[:, None] + second, axis=0), first)
+    def through(ways: jax.Array, first: jax.Array) -> tuple[jax.Array, None]:
+        """Adds the ways through the nodes of one PoI."""
+        enter = jax.lax.dynamic_slice(ways, (0, first), (num_starts, NODES_PER_POI))
+        leave = jax.lax.dynamic_slice(ways, (first, 0), (NODES_PER_POI, num_nodes))
+
+        def go_on(node: jax.Array, leave: jax.Array) -> jax.Array:
+            to_node = jax.lax.dynamic_slice(leave, (0, first + node), (NODES_PER_POI, 1))
+            return jnp.minimum(leave, to_node + leave[node][None])
+
+        leave = jax.lax.fori_loop(0, NODES_PER_POI, go_on, leave)
+        sums = (enter[:, i, None] + leave[None, i] for i in range(NODES_PER_POI))
+        return functools.reduce(jnp.minimum, sums, ways), None
+
+    return jax.lax.scan(through, edges, jnp.arange(0, num_nodes, NODES_PER_POI))[0]

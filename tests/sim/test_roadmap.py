@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.sparse import csgraph
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig, Config, NavigationConfig
@@ -27,6 +28,7 @@ RING = np.concatenate([np.zeros((1, 2)), 0.6 * np.stack([np.cos(ANGLES), np.sin(
 
 build = jax.jit(roadmap.build, static_argnums=0)
 lengths = jax.jit(roadmap.lengths, static_argnums=0)
+reaches = jax.jit(roadmap.reaches, static_argnums=0)
 next_place = jax.jit(roadmap.next_place, static_argnums=0)
 
 
@@ -280,6 +282,75 @@ def test_within_a_ring_of_pois_there_are_ways():
     assert np.isfinite(length).all()
 
 
+def straight(starts, ends, centres, radius):
+    """Lengths of straight ways, infinite where one comes closer to a centre than it may."""
+    starts, ends, centres = (np.array(x, np.float64) for x in (starts, ends, centres))
+    starts, ends = starts[:, None, None], ends[None, :, None]
+    along, to_centre = ends - starts, centres - starts
+    squared = np.maximum(np.sum(along**2, axis=-1), 1e-12)
+    share = np.clip(np.sum(to_centre * along, axis=-1) / squared, 0, 1)
+    apart = np.linalg.norm(to_centre - share[..., None] * along, axis=-1)
+    at_ends = (np.linalg.norm(centres - place, axis=-1) for place in (starts, ends))
+    is_free = np.all(apart >= np.minimum(np.minimum(*at_ends), radius) - 1e-3, axis=-1)
+    return np.where(is_free, np.linalg.norm(along[:, :, 0], axis=-1), np.inf)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "arena",
+    [ArenaConfig(), ArenaConfig(num_pois=9, poi_gap=0.1), ArenaConfig(num_pois=16, side=6.0)],
+    ids=["few", "walls of PoIs", "many"],
+)
+def test_ways_are_the_shortest_that_dijkstra_finds(arena, seed):
+    config = Config(arena=arena)
+    classes = jnp.zeros(arena.num_pois, jnp.int32)
+    centres = sim.random_layout(jax.random.key(seed), arena, classes).position
+    _, _, ways = planned(config, centres)
+    nodes, places = ways.nodes, ways.viewpoints[ways.is_free]
+    starts = np.concatenate([nodes, places])
+    edges = straight(starts, nodes, centres, KEEP + MARGIN)
+    has_room = np.linalg.norm(nodes[:, None] - centres[None], axis=-1).min(axis=-1) >= KEEP + MARGIN
+    edges[:, ~has_room | (np.abs(nodes).max(axis=-1) > arena.side / 2 - 0.1)] = np.inf
+    # Nobody goes to a viewpoint on the way to a node.
+    graph = np.pad(edges, ((0, 0), (0, len(places))), constant_values=np.inf)
+    graph = csgraph.csgraph_from_dense(graph, null_value=np.inf)
+    shortest = csgraph.dijkstra(graph, indices=np.arange(len(nodes), len(starts)))
+    assert np.isfinite(edges[: len(nodes)]).mean() < 0.7
+    expected = shortest[:, : len(nodes)]
+    np.testing.assert_allclose(ways.to_viewpoint[ways.is_free], expected, atol=1e-5)
+    np.testing.assert_array_equal(ways.to_viewpoint[~ways.is_free], np.inf)
+
+
+def test_a_place_reaches_the_pois_with_a_way_of_finite_length():
+    places = jax.random.uniform(jax.random.key(0), (100, 2), minval=-1.4, maxval=1.4)
+    opened = [[-1.2, -1.2] if n == 4 else p for n, p in enumerate(RING)]
+    shares = []
+    for pois in (RING, opened):
+        plan = planned(WALLED_IN, pois)
+        each = jax.vmap(lambda place, poi, plan=plan: lengths(*plan, place, poi), in_axes=(None, 0))
+        length = jax.vmap(each, in_axes=(0, None))(places, jnp.arange(9))
+        expected = np.isfinite(length).any(axis=-1)
+        found = jax.vmap(lambda place, plan=plan: reaches(*plan, place))(places)
+        np.testing.assert_array_equal(found, expected)
+        shares.append(expected[:, 0].mean())
+    # Within the ring, and from nearly everywhere.
+    assert 0.02 < shares[0] < 0.25
+    assert shares[1] > 0.9
+
+
+def test_a_place_with_no_node_in_sight_reaches_the_pois_around_it():
+    # The ring is so narrow that all nodes in it are too close to a PoI: at 0.3117 m from the middle
+    # and at most 18 degrees beside a PoI, sqrt(0.53^2 + 0.3117^2 - 0.3302 cos 18) = 0.2526 from it.
+    # The viewpoint at 0.35 m and 22.5 degrees is 0.246 from two of them, which is enough.
+    plan = planned(WALLED_IN, RING * 0.53 / 0.6)
+    place = 0.3 * jnp.array([np.cos(np.pi / 8), np.sin(np.pi / 8)])
+    reached = reaches(*plan, place)
+    by_poi = jax.vmap(lambda poi: lengths(*plan, place, poi))(jnp.arange(9))
+    np.testing.assert_array_equal(reached, np.isfinite(by_poi).any(axis=-1))
+    # Those of the ring on its side have viewpoints beside it, those beyond the middle none.
+    np.testing.assert_array_equal(np.flatnonzero(reached), [0, 1, 2, 3, 8])
+
+
 @pytest.fixture(scope="module")
 def beside_wall_and_poi():
     """PoI 0 at (1, 0), half a metre from the wall, and PoI 1 at (0.4, 0) west of it."""
@@ -342,9 +413,10 @@ def test_a_robot_that_is_alone_has_a_next_place():
     "call",
     [
         lambda plan, place: roadmap.lengths(*plan, place, 0),
+        lambda plan, place: roadmap.reaches(*plan, place),
         lambda plan, place: roadmap.next_place(*plan, place, FAR_AWAY, 0, 0),
     ],
-    ids=["lengths", "next_place"],
+    ids=["lengths", "reaches", "next_place"],
 )
 def test_a_wrong_shape_of_the_place_is_named_while_tracing(call):
     plan = planned(ALONE, [[0.0, 0.0]])

@@ -1,0 +1,62 @@
+"""Where robots stand at the start of a mission."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import sim
+from jaxsense.config import ArenaConfig, Config
+from jaxsense.mission import state
+from jaxsense.sim import roadmap
+
+# So narrow that from some places there is no way out.
+CONFIG = Config(arena=ArenaConfig(num_pois=16, poi_gap=0.1))
+KEEP = 0.241421  # m, a cube's corner from its middle and a robot in planning
+REACH = 1.4  # m, half the arena's side less the robot
+
+
+@pytest.fixture(scope="module")
+def started():
+    """Of 64 arenas: candidates `[2, 32, 3]`, the room at them, whether ways lead on, and poses."""
+
+    def start(key):
+        layout_key, pose_key = jax.random.split(key)
+        layout = sim.random_layout(layout_key, CONFIG.arena, jnp.arange(16) % 3)
+        ways = roadmap.build(CONFIG, layout)
+        draws = jax.random.uniform(pose_key, (2, 3, 32), minval=-1.0)
+        candidates = jnp.swapaxes(draws, 1, 2) * jnp.array([[[REACH, REACH, jnp.pi]]])
+
+        def look(pose):
+            def reached(poi):
+                return jnp.isfinite(roadmap.lengths(CONFIG, layout, ways, pose[:2], poi).min())
+
+            to_pois = jnp.linalg.norm(layout.position - pose[None, :2], axis=-1)
+            return jnp.min(to_pois) - KEEP, jnp.all(jax.vmap(reached)(jnp.arange(16)))
+
+        room, has_ways = jax.vmap(jax.vmap(look))(candidates)
+        return candidates, room, has_ways, state._random_poses(pose_key, CONFIG, layout, ways)
+
+    return jax.tree.map(np.array, jax.jit(jax.vmap(start))(jax.random.split(jax.random.key(0), 64)))
+
+
+def test_robots_start_at_the_first_places_with_room_and_ways_to_all_pois(started):
+    number = only_cut_off = only_too_close = 0
+    for candidates, room, has_ways, poses in zip(*started, strict=True):
+        taken = np.full((1, 2), 9.0)
+        for robot in range(2):
+            apart = np.linalg.norm(candidates[robot, :, None, :2] - taken[None], axis=-1)
+            is_apart, has_room = apart.min(axis=-1) > 0.3, room[robot] > 0
+            is_right = has_room & has_ways[robot] & is_apart
+            if not is_right.any():
+                break  # in an arena where no PoI has ways to all others
+            first = np.argmax(is_right)
+            np.testing.assert_allclose(poses[robot], candidates[robot, first], atol=1e-6)
+            taken = np.append(taken, poses[robot][None, :2], axis=0)
+            number += 1
+            only_cut_off += np.any((has_room & is_apart & ~has_ways[robot])[:first])
+            only_too_close += np.any((has_room & has_ways[robot] & ~is_apart)[:first])
+    assert number > 120
+    # All conditions matter.
+    assert only_cut_off > 0
+    assert only_too_close > 0
