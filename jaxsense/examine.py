@@ -290,10 +290,9 @@ def compare_policies(
     start_key, table_key, play_key = jax.random.split(key, 3)
     starts = _every_start(start_key, mdp, config)
     if config.jmvae.fusion == "filter":
-        total = jnp.stack([values.total for values in look_values])[modality]
-        optimal = policies.by_posterior(
-            total, functools.partial(filtering.weights, params[fusion.FILTER])
-        )
+        own = jax.tree.map(lambda *x: jnp.stack(x)[modality], *look_values)
+        weights = functools.partial(filtering.weights, params[fusion.FILTER])
+        optimal = policies.by_posterior(own.total, own.first_total, weights)
     else:
         # A second look by the same sensor replaces the first, so that it never pays.
         labels = jnp.array([config.label_of_class(m) for m in config.modalities])

@@ -76,9 +76,8 @@ def init(key: Key, config: Config) -> Models:
         jmvae.init(jmvae_key, make_jmvae(config)),
         Belief(jnp.zeros(shape), jnp.ones(shape)),
     )
-    no_values = jnp.zeros(
-        len(optimum.lattice(len(config.arena.classes), config.evaluation.value_points))
-    )
+    lattice = optimum.lattice(len(config.arena.classes), config.evaluation.value_points)
+    no_values, nothing = jnp.zeros(len(lattice)), jnp.zeros(())
     if config.jmvae.fusion == "filter":
         params[FILTER] = filtering.init(filter_key, make_jmvae(config), classes, config.filter)
     return Models(
@@ -86,6 +85,6 @@ def init(key: Key, config: Config) -> Models:
         jmvae=params,
         class_beliefs=classes,
         moments_inverse=filtering.moments_inverse(classes),
-        look_values=(LookValues(no_values, no_values),) * len(config.modalities),
+        look_values=(LookValues(no_values, no_values, nothing, nothing),) * len(config.modalities),
         q_networks=tuple(networks.init(k, q_network, size) for k in dqn_keys),
     )

@@ -30,7 +30,7 @@ from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene, World
 from jaxsense.types import Belief, Key, pytree
-from jaxsense.vae import detectors, filtering, jmvae, peers
+from jaxsense.vae import detectors, filtering, fusion, jmvae, peers
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.fusion import FILTER
 from jaxsense.vae.minibatch import FitState
@@ -558,6 +558,10 @@ def _look_values(
     """What a look with each modality is worth, from the detections for training."""
     del key
     settings = config.evaluation
+    unseen = None  # in nats it is worth as much as any entry with equal probabilities
+    if config.mdp.reward == "paper":
+        entry = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
+        unseen = belief_mdp.information(entry.std)
 
     def information(weights: jax.Array) -> jax.Array:
         if config.mdp.reward == "nats":
@@ -568,7 +572,7 @@ def _look_values(
         of_look = functools.partial(peers.log_likelihoods, label_of_class=jnp.array(labels))
         likelihoods = jax.vmap(jax.vmap(of_look))(features[:, : settings.value_looks])
         sizes = _MOST_LOOKS, settings.value_points
-        return optimum.solve(likelihoods, information, config.mdp, *sizes)
+        return optimum.solve(likelihoods, information, config.mdp, *sizes, unseen)
 
     labels = [config.label_of_class(name) for name in config.modalities]
     return tuple(map(of_modality, detections.bank, labels))

@@ -203,7 +203,8 @@ def with_bias(bias):
 def constant(gain, total):
     """The same values of looks at every posterior."""
     points = len(optimum.lattice(3))
-    return LookValues(jnp.full(points, gain), jnp.full(points, total))
+    tables = jnp.full(points, gain), jnp.full(points, total)
+    return LookValues(*tables, jnp.float32(gain), jnp.float32(total))
 
 
 @pytest.fixture(scope="module")
