@@ -8,7 +8,6 @@ same keys.
 
 import dataclasses
 import functools
-import math
 import zlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -363,7 +362,7 @@ def _detector_stage(modality: int, name: str, config: Config) -> Steps:
     def split(examples: tuple[Examples, ...]) -> tuple[Examples, Examples]:
         """The looks to train on, and those to calibrate with."""
         windows, labels = examples[modality]
-        number = len(labels) - math.ceil(config.detector.calibration * len(labels))
+        number = config.detector.num_training(len(labels))
         return (windows[:number], labels[:number]), (windows[number:], labels[number:])
 
     def begin(

@@ -82,6 +82,7 @@ class Config:
         if self.mdp.reward == "nats" and self.jmvae.fusion != "filter":
             reason = f"needs jmvae.fusion = 'filter', not {self.jmvae.fusion!r}"
             raise ConfigError("mdp.reward", self.mdp.reward, reason)
+        self._check_learning()
         self._check_viewpoints()
         self._check_views()
         looks = self.arena.num_pois * len(self.modalities)
@@ -93,6 +94,18 @@ class Config:
             )
         self._check_fields_of_view()
         self._check_memory()
+
+    def _check_learning(self) -> None:
+        """A filter must hold all classes, and a detector have scans to train on."""
+        number, size = len(self.arena.classes), self.jmvae.latent_size
+        if self.jmvae.fusion == "filter" and number > 2 * size + 1:
+            reason = f"must be at least {number // 2}, so that a filter can hold {number} classes"
+            raise ConfigError("jmvae.latent_size", size, reason)
+        # Whole scenes are surveyed.
+        scans = -(-self.detector.num_scans // self.arena.num_pois) * self.arena.num_pois
+        if self.detector.num_training(scans) < 1:
+            reason = f"leaves no scan to train on, of {scans}; must be less"
+            raise ConfigError("detector.calibration", self.detector.calibration, reason)
 
     def _check_viewpoints(self) -> None:
         """Viewpoints for training must be clear of the PoI and inside the arena."""
