@@ -182,9 +182,9 @@ def beliefs(
       detections; and Pearson's correlation of `||sigma||` with the entropy of the exact posterior.
     """
     model, number = make_jmvae(config), len(classes.mean)
-    readout = {"classes": classes, "inverse": filtering.moments_inverse(classes)}
     labels = [jnp.array(config.label_of_class(m)) for m in config.modalities]
     unseen = fusion.unseen(model, config.mdp.unseen_variance)
+    readout = {"inverse": filtering.moments_inverse(classes), "unseen": unseen}
 
     def look(carry, drawn):
         belief, exact, seen = carry

@@ -259,6 +259,7 @@ def models(outputs: Mapping[str, Any], config: Config) -> Models:
         jmvae={**outputs["jmvae"], **trained},
         class_beliefs=outputs["class_beliefs"],
         moments_inverse=filtering.moments_inverse(outputs["class_beliefs"]),
+        unseen=_unseen(config),
         look_values=outputs["look_values"],
         q_networks=tuple(outputs[agent(config, name)] for name in config.modalities),
     )
@@ -500,6 +501,11 @@ def _class_beliefs(key: Key, config: Config, params: Params, detections: Detecti
     return examine.class_beliefs(params, detections.bank, config)
 
 
+def _unseen(config: Config) -> Belief:
+    """`[D]` entry of an unseen PoI."""
+    return fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
+
+
 def _filter_stages(config: Config) -> list[Stage]:
     """The training of the filter, and its parameters among those of the JMVAE."""
     settings, model = config.filter, make_jmvae(config)
@@ -508,7 +514,7 @@ def _filter_stages(config: Config) -> list[Stage]:
     def begin(
         key: Key, config: Config, classes: Belief, detections: Detections
     ) -> tuple[Params, FitState]:
-        params = filtering.init(key, model, classes, config.filter)
+        params = filtering.init(key, model, classes, _unseen(config), config.filter)
         return params, filtering.start(params, config.filter)
 
     def advance(
@@ -559,8 +565,7 @@ def _look_values(
     settings = config.evaluation
     unseen = None  # in nats it is worth as much as any entry with equal probabilities
     if config.mdp.reward == "paper":
-        entry = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
-        unseen = belief_mdp.information(entry.std)
+        unseen = belief_mdp.information(_unseen(config).std)
 
     def information(weights: jax.Array) -> jax.Array:
         if config.mdp.reward == "nats":

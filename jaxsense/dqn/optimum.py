@@ -94,9 +94,18 @@ def interpolate(table: jax.Array, weights: jax.Array) -> jax.Array:
 
     Returns:
       `[]` the value.
+
+    Raises:
+      ValueError: if no lattice of these classes has P points.
     """
     chex.assert_rank(weights, 1, custom_message="weights")
-    rows, shares = _corners(weights, steps_of_lattice(len(weights), len(table)))
+    chex.assert_rank(table, 1, custom_message="table")
+    steps = steps_of_lattice(len(weights), len(table))
+    number = _num_points(steps, len(weights))
+    if len(table) != number:
+        reason = f"must be {number} or another number of points of a lattice"
+        raise ValueError(f"length of table = {len(table)}: {reason}")
+    rows, shares = _corners(weights, steps)
     return jnp.sum(shares * table[rows])
 
 
