@@ -29,8 +29,8 @@ from jaxsense.sim.world import make_world
 
 PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 MISSION_KEYS = {
-    "accuracy", "observations_per_poi", "time_s", "collisions", "goals_reached_fraction",
-    "information", "episodes", "ended",
+    "accuracy", "observations_per_poi", "time_s", "mean_time_s", "collisions",
+    "goals_reached_fraction", "information", "episodes", "ended",
 }  # fmt: skip
 
 
@@ -259,6 +259,8 @@ def test_an_evaluation_keeps_what_another_one_has_written_meanwhile(
     blocks = json.loads((path / "summary.json").read_text(encoding="utf-8"))["mission"]
     expected = {**dict.fromkeys(mission.POLICIES, 0), "latent": 4, "naive": 3}
     assert {name: blocks[name]["seed"] for name in mission.POLICIES} == expected
+    # Nothing compares policies of different arenas.
+    assert not any({"intervals", "of_naive"} & set(block) for block in blocks.values())
 
 
 def test_an_evaluation_waits_for_another_one_that_writes(evaluated, tmp_path):
