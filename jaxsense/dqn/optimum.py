@@ -135,7 +135,7 @@ def solve(
       likelihoods: `[C, K, C]` logarithms of the likelihoods of all classes, up to a constant, in
         each of K equally likely looks at a PoI of each class.
       information: `[C]` class probabilities to the `[]` information of the map's entry.
-      config: the rewards.
+      config: the rewards, and `max_steps`, which also limits the looks at one PoI.
       horizon: most looks at one PoI; static.
       most_points: of the lattice; static.
       unseen: `[]` information of the entry of an unseen PoI, whose classes are equally likely; by
@@ -174,9 +174,10 @@ def solve(
     chances = points[:, :, None] / num_looks
     gain = jnp.sum(chances * rewards, axis=(1, 2))
 
-    def earlier(total: jax.Array, _) -> tuple[jax.Array, None]:
+    def earlier(total: jax.Array, left: jax.Array) -> tuple[jax.Array, None]:
         following = jnp.sum(shares * jnp.maximum(total, 0.0)[rows], axis=-1)
-        return gain + jnp.sum(chances * following, axis=(1, 2)), None
+        longer = gain + jnp.sum(chances * following, axis=(1, 2))
+        return jnp.where(left <= config.max_steps, longer, total), None
 
-    total, _ = jax.lax.scan(earlier, gain, None, length=horizon - 1)
+    total, _ = jax.lax.scan(earlier, gain, jnp.arange(2, horizon + 1))
     return LookValues(gain[:-1], total[:-1], gain[-1], total[-1])

@@ -135,6 +135,17 @@ def test_values_are_those_of_all_histories(name, number):
     assert by_horizon[0] + 0.005 < by_horizon[2]
 
 
+def test_an_episode_of_few_steps_has_as_few_looks():
+    _, information, config = REWARDS["nats"]
+    likelihoods = jnp.log(jnp.array(LOOKS[3]))
+    shorter = replace(config, max_steps=2)
+    found = optimum.solve(likelihoods, information, shorter, HORIZON)
+    for horizon, is_same in ((2, True), (HORIZON, False)):
+        other = optimum.solve(likelihoods, information, config, horizon)
+        assert np.allclose(found.total, other.total, atol=1e-6) == is_same
+        assert np.allclose(found.first_total, other.first_total, atol=1e-6) == is_same
+
+
 def test_a_look_that_is_certain_pays_once():
     # It shows the class: ln 2 from one half each, and then no more than it costs.
     likelihoods = jnp.array([[[0.0, -200.0]], [[-200.0, 0.0]]])
