@@ -17,6 +17,7 @@ from jaxsense import cli, mission
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import require, require_types
 from jaxsense.config.mission import MOST_EPISODES
+from jaxsense.mission import compare
 from jaxsense.run import devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError
@@ -151,7 +152,8 @@ def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) 
     """The earlier blocks, with those of the cases played now and their seed."""
     cases = metrics.cases(found).items()
     new = {name: {**block, "seed": arguments.seed} for name, block in cases}
-    return {**before, **found, **new}
+    blocks = compare.compared({**metrics.cases(before), **new})
+    return {**before, **found, **blocks}
 
 
 def _elsewhere(arguments: Arguments, config: Config) -> Config:

@@ -182,9 +182,9 @@ def beliefs(
       detections; and Pearson's correlation of `||sigma||` with the entropy of the exact posterior.
     """
     model, number = make_jmvae(config), len(classes.mean)
-    readout = {"classes": classes, "inverse": filtering.moments_inverse(classes)}
     labels = [jnp.array(config.label_of_class(m)) for m in config.modalities]
     unseen = fusion.unseen(model, config.mdp.unseen_variance)
+    readout = {"inverse": filtering.moments_inverse(classes), "unseen": unseen}
 
     def look(carry, drawn):
         belief, exact, seen = carry
@@ -290,10 +290,9 @@ def compare_policies(
     start_key, table_key, play_key = jax.random.split(key, 3)
     starts = _every_start(start_key, mdp, config)
     if config.jmvae.fusion == "filter":
-        total = jnp.stack([values.total for values in look_values])[modality]
-        optimal = policies.by_posterior(
-            total, functools.partial(filtering.weights, params[fusion.FILTER])
-        )
+        own = jax.tree.map(lambda *x: jnp.stack(x)[modality], *look_values)
+        weights = functools.partial(filtering.weights, params[fusion.FILTER])
+        optimal = policies.by_posterior(own.total, own.first_total, weights)
     else:
         # A second look by the same sensor replaces the first, so that it never pays.
         labels = jnp.array([config.label_of_class(m) for m in config.modalities])

@@ -11,7 +11,7 @@ from jaxsense.dqn.optimum import LookValues
 from jaxsense.networks import Params
 from jaxsense.sim import sensors
 from jaxsense.types import Belief, Key, pytree
-from jaxsense.vae import detectors, filtering, jmvae
+from jaxsense.vae import detectors, filtering, fusion, jmvae
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.fusion import FILTER
 from jaxsense.vae.jmvae import Jmvae
@@ -27,6 +27,7 @@ class Models:
       class_beliefs: `[C, D]` mean joint posterior of each class, to read the map with.
       moments_inverse: `[C, 2D + 1]` from `filtering.moments_inverse`, to read the classes'
         probabilities from the map with.
+      unseen: `[D]` entry of an unseen PoI.
       look_values: for each modality, what a look is worth by dynamic programming.
       q_networks: parameters of the Q-network of each modality; those of a team are the same.
     """
@@ -35,13 +36,14 @@ class Models:
     jmvae: Params
     class_beliefs: Belief
     moments_inverse: jax.Array
+    unseen: Belief
     look_values: tuple[LookValues, ...]
     q_networks: tuple[Params, ...]
 
     @property
     def readout(self) -> Params:
         """What `filtering.weights` reads the map with."""
-        return {"classes": self.class_beliefs, "inverse": self.moments_inverse}
+        return {"inverse": self.moments_inverse, "unseen": self.unseen}
 
 
 def make_jmvae(config: Config) -> Jmvae:
@@ -76,16 +78,18 @@ def init(key: Key, config: Config) -> Models:
         jmvae.init(jmvae_key, make_jmvae(config)),
         Belief(jnp.zeros(shape), jnp.ones(shape)),
     )
-    no_values = jnp.zeros(
-        len(optimum.lattice(len(config.arena.classes), config.evaluation.value_points))
-    )
+    lattice = optimum.lattice(len(config.arena.classes), config.evaluation.value_points)
+    no_values, nothing = jnp.zeros(len(lattice)), jnp.zeros(())
+    unseen = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
     if config.jmvae.fusion == "filter":
-        params[FILTER] = filtering.init(filter_key, make_jmvae(config), classes, config.filter)
+        inputs = make_jmvae(config), classes, unseen, config.filter
+        params[FILTER] = filtering.init(filter_key, *inputs)
     return Models(
         detectors=trained,
         jmvae=params,
         class_beliefs=classes,
         moments_inverse=filtering.moments_inverse(classes),
-        look_values=(LookValues(no_values, no_values),) * len(config.modalities),
+        unseen=unseen,
+        look_values=(LookValues(no_values, no_values, nothing, nothing),) * len(config.modalities),
         q_networks=tuple(networks.init(k, q_network, size) for k in dqn_keys),
     )

@@ -8,7 +8,6 @@ same keys.
 
 import dataclasses
 import functools
-import math
 import zlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -30,7 +29,7 @@ from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene, World
 from jaxsense.types import Belief, Key, pytree
-from jaxsense.vae import detectors, filtering, jmvae, peers
+from jaxsense.vae import detectors, filtering, fusion, jmvae, peers
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.fusion import FILTER
 from jaxsense.vae.minibatch import FitState
@@ -266,6 +265,7 @@ def models(outputs: Mapping[str, Any], config: Config) -> Models:
         jmvae={**outputs["jmvae"], **trained},
         class_beliefs=outputs["class_beliefs"],
         moments_inverse=filtering.moments_inverse(outputs["class_beliefs"]),
+        unseen=_unseen(config),
         look_values=outputs["look_values"],
         q_networks=tuple(outputs[agent(config, name)] for name in config.modalities),
     )
@@ -369,7 +369,7 @@ def _detector_stage(modality: int, name: str, config: Config) -> Steps:
     def split(examples: tuple[Examples, ...]) -> tuple[Examples, Examples]:
         """The looks to train on, and those to calibrate with."""
         windows, labels = examples[modality]
-        number = len(labels) - math.ceil(config.detector.calibration * len(labels))
+        number = config.detector.num_training(len(labels))
         return (windows[:number], labels[:number]), (windows[number:], labels[number:])
 
     def begin(
@@ -507,6 +507,11 @@ def _class_beliefs(key: Key, config: Config, params: Params, detections: Detecti
     return examine.class_beliefs(params, detections.bank, config)
 
 
+def _unseen(config: Config) -> Belief:
+    """`[D]` entry of an unseen PoI."""
+    return fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
+
+
 def _filter_stages(config: Config) -> list[Stage]:
     """The training of the filter, and its parameters among those of the JMVAE."""
     settings, model = config.filter, make_jmvae(config)
@@ -515,7 +520,7 @@ def _filter_stages(config: Config) -> list[Stage]:
     def begin(
         key: Key, config: Config, classes: Belief, detections: Detections
     ) -> tuple[Params, FitState]:
-        params = filtering.init(key, model, classes, config.filter)
+        params = filtering.init(key, model, classes, _unseen(config), config.filter)
         return params, filtering.start(params, config.filter)
 
     def advance(
@@ -564,6 +569,9 @@ def _look_values(
     """What a look with each modality is worth, from the detections for training."""
     del key
     settings = config.evaluation
+    unseen = None  # in nats it is worth as much as any entry with equal probabilities
+    if config.mdp.reward == "paper":
+        unseen = belief_mdp.information(_unseen(config).std)
 
     def information(weights: jax.Array) -> jax.Array:
         if config.mdp.reward == "nats":
@@ -574,7 +582,7 @@ def _look_values(
         of_look = functools.partial(peers.log_likelihoods, label_of_class=jnp.array(labels))
         likelihoods = jax.vmap(jax.vmap(of_look))(features[:, : settings.value_looks])
         sizes = _MOST_LOOKS, settings.value_points
-        return optimum.solve(likelihoods, information, config.mdp, *sizes)
+        return optimum.solve(likelihoods, information, config.mdp, *sizes, unseen)
 
     labels = [config.label_of_class(name) for name in config.modalities]
     return tuple(map(of_modality, detections.bank, labels))

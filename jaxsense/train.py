@@ -331,7 +331,8 @@ def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any], monitor
     monitor.check_stop()
     plots.write_plots(run.path, config, result)
     film, beliefs = run.path / "mission.svg", result.models.class_beliefs
-    animation.write(film, config, result.recording, beliefs, "latent policy")
+    title = f"{config.mission.policies[0]} policy".replace("_", " ")
+    animation.write(film, config, result.recording, beliefs, title)
     summary = {**_header(run, timing), **result.summary}
     page.write(run.path, config, summary)
     monitor.check_stop()

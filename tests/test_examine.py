@@ -21,7 +21,7 @@ from jaxsense.dqn import optimum
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.models import make_jmvae
 from jaxsense.types import Belief
-from jaxsense.vae import filtering
+from jaxsense.vae import filtering, fusion
 
 # Classes: green cylinder, red cylinder, red cube. Three latent dimensions, of which one is unused.
 CONFIG = Config(
@@ -203,7 +203,8 @@ def with_bias(bias):
 def constant(gain, total):
     """The same values of looks at every posterior."""
     points = len(optimum.lattice(3))
-    return LookValues(jnp.full(points, gain), jnp.full(points, total))
+    tables = jnp.full(points, gain), jnp.full(points, total)
+    return LookValues(*tables, jnp.float32(gain), jnp.float32(total))
 
 
 @pytest.fixture(scope="module")
@@ -248,9 +249,9 @@ def test_values_that_are_not_numbers_give_totals_that_are_none(played):
 def test_with_a_filter_the_optimum_is_by_the_total_of_the_own_sensors_looks():
     filtered = replace(CONFIG, jmvae=replace(CONFIG.jmvae, fusion="filter"))
     classes = Belief(CLASS_MEANS, jnp.ones((3, 3)))
-    of_filter = filtering.init(
-        jax.random.key(0), make_jmvae(filtered), classes, FilterConfig(hidden=(1,))
-    )
+    model = make_jmvae(filtered)
+    inputs = classes, fusion.unseen(model, 20.0), FilterConfig(hidden=(1,))
+    of_filter = filtering.init(jax.random.key(0), model, *inputs)
     # No look of the camera pays by its total, and every look of the LiDAR does.
     values = constant(1.0, -1.0), constant(-1.0, 1.0)
 

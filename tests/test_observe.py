@@ -12,7 +12,7 @@ from jaxsense.config import MODALITIES, PRESETS, FilterConfig
 from jaxsense.dqn import belief_mdp
 from jaxsense.sim import world as worlds
 from jaxsense.types import Belief
-from jaxsense.vae import detectors, filtering, jmvae
+from jaxsense.vae import detectors, filtering, fusion, jmvae
 from jaxsense.vae.jmvae import Jmvae
 
 CONFIG = PRESETS["smoke"]
@@ -58,7 +58,8 @@ def test_bank_mdp_writes_by_the_jmvae():
 def test_the_reward_in_nats_is_the_fall_of_entropy_of_the_map_less_the_cost():
     # Green is class 0, red the others. The filter adds the logarithm of the label's probability.
     classes = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
-    params = filtering.init(jax.random.key(0), MODEL, classes, FilterConfig(hidden=(1,)))
+    inputs = classes, fusion.unseen(MODEL, 20.0), FilterConfig(hidden=(1,))
+    params = filtering.init(jax.random.key(0), MODEL, *inputs)
     layer = {"kernel": jnp.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0]]), "bias": jnp.zeros(3)}
     params["networks"] = {m: {"params": {"Dense_0": layer}} for m in MODEL.modalities}
     config = replace(

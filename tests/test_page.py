@@ -135,6 +135,22 @@ def test_figures_stand_beside_those_of_the_paper(read):
     assert rows["jmvae"][:2] == ["1.50", "4.50"]
 
 
+@pytest.mark.parametrize(
+    ("change", "caption"),
+    [
+        ({}, "All robots together, in the same arenas for each policy"),
+        ({"seed": 1}, "All robots together; policies of equal seed and missions had the same"),
+        ({"episodes": 64}, "All robots together; policies of equal seed and missions had the same"),
+    ],
+)
+def test_the_table_of_missions_tells_which_arenas_are_the_same(tmp_path, change, caption):
+    missions = {**SUMMARY["mission"], "naive": {**MISSION, **change}}
+    text = page.write(write_run(tmp_path), CONFIG, {**SUMMARY, "mission": missions}).read_text()
+    assert caption in text
+    rows = {row[0]: row[1:] for row in Reader(text).rows if row}
+    assert rows.get("seed") == (["-", "-", "1"] if "seed" in change else None)
+
+
 def test_what_was_run_is_told_and_escaped(run, read):
     text = " ".join(" ".join(read.words).split())
     for words in ("smoke preset, seed 3", "0 in theory", "0123abc", "jax <0.10>", "nothing: all"):

@@ -74,7 +74,8 @@ def check_common(summary: dict) -> None:
     assert all(block["accuracy"] >= 0.99 for block in summary["detectors"].values())
     assert summary["jmvae"]["unambiguous"] == TABLE_1
     assert summary["jmvae"]["moment_matching_error"] <= 0.10
-    assert all(block["num_states"] == 384 for block in summary["dqn"].values())
+    for block in summary["dqn"].values():
+        assert (block["num_states"], block["num_permutations"]) == (1728, 384)
 
 
 def test_default_preset(default):
@@ -87,7 +88,8 @@ def test_default_preset(default):
     assert latent["fusion"]["mean_error"] <= 0.5
     for block in default["dqn"].values():
         assert 0.99 <= block["fraction_of_optimal"] <= 1.01
-        assert block["optimal_states"] >= 380
+        assert block["optimal_permutations"] >= 380
+        assert block["optimal_states"] / 1728 >= 380 / 384
         assert block["one_step"]["policy"] / block["one_step"]["optimal"] >= 0.98
     assert default["timing"]["total_s"] <= 180
 
@@ -132,3 +134,18 @@ def test_missions_with_the_default_preset(default, default_run, run_program):
     assert mission["lidar_alone"]["ambiguous_reported"] >= 0.98
     size = mission["bytes_per_detection"]
     assert size["raw"] / size["latent"] >= 100
+
+
+def test_noisy_preset(tmp_path, summary_of):
+    noisy = summary_of("noisy", 0, tmp_path / "noisy")
+    belief = noisy["belief"]
+    assert belief["looks"] == [1, 2, 3, 4, 5, 6]
+    for found, exact in zip(belief["nll"], belief["bayes_nll"], strict=True):
+        assert found <= 1.15 * exact + 0.003
+    for found, exact in zip(belief["accuracy"], belief["bayes_accuracy"], strict=True):
+        assert found >= exact - 0.005
+    assert belief["doubt_correlation"] >= 0.95
+    for block in noisy["dqn"].values():
+        assert 0.98 <= block["fraction_of_optimal"] <= 1.01
+    assert noisy["mission"]["latent"]["accuracy"] >= 0.97
+    assert all(block["ece"] <= 0.02 for block in noisy["detectors"].values())

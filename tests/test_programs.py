@@ -11,6 +11,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import jax
@@ -25,12 +26,13 @@ from jaxsense.config import PRESETS, Config
 from jaxsense.run import devices, files, missions, programs
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.monitor import Monitor
+from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.sim.world import make_world
 
 PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 MISSION_KEYS = {
-    "accuracy", "observations_per_poi", "time_s", "collisions", "goals_reached_fraction",
-    "information", "episodes", "ended",
+    "accuracy", "observations_per_poi", "time_s", "mean_time_s", "collisions",
+    "goals_reached_fraction", "information", "episodes", "ended",
 }  # fmt: skip
 
 
@@ -98,6 +100,18 @@ def test_summary_keeps_its_contract(smoke_run):
     assert 1920 <= summary["mission"]["bytes_per_detection"]["raw"] <= 2732
 
 
+def test_the_film_is_named_after_the_policy_that_it_shows(tmp_path, monkeypatch):
+    first = dataclasses.replace(PRESETS["smoke"].mission, policies=("naive_2", "latent"))
+    config, titles = dataclasses.replace(PRESETS["smoke"], mission=first), []
+    monkeypatch.setattr(train.animation, "write", lambda *inputs: titles.append(inputs[-1]))
+    monkeypatch.setattr(train.plots, "write_plots", lambda *inputs: None)
+    monkeypatch.setattr(train.page, "write", lambda *inputs: None)
+    result = SimpleNamespace(models=SimpleNamespace(class_beliefs=None), recording=None, summary={})
+    with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as run:
+        train._write(run, result, {}, Monitor())  # pyright: ignore
+    assert titles == ["naive 2 policy"]
+
+
 def test_a_finished_run_is_loaded_with_its_settings(smoke_run):
     config, models = jaxsense.load(smoke_run)
     assert config == PRESETS["smoke"]
@@ -108,6 +122,22 @@ def test_a_finished_run_is_loaded_with_its_settings(smoke_run):
     assert not np.array_equal(
         kernel, untrained.jmvae["encoders"]["camera"]["params"]["Dense_0"]["kernel"]
     )
+
+
+@pytest.mark.slow  # compiles a whole run of its own; before a release
+def test_a_run_with_a_filter_trains_plays_and_is_loaded(tmp_path, cache):
+    path = tmp_path / "run"
+    options = "--jmvae.fusion", "filter", "--mdp.reward", "nats"
+    train.main([*SMOKE, *cache, *options, "--out", str(path)])
+    summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    # The filter is hardly trained, but adds up what the looks show.
+    assert summary["belief"]["accuracy"][-1] > summary["belief"]["accuracy"][0] + 0.1
+    assert summary["mission"]["latent"]["accuracy"] > summary["mission"]["random"]["accuracy"]
+    config, models = jaxsense.load(path)
+    assert (config.jmvae.fusion, config.mdp.reward) == ("filter", "nats")
+    unseen = models.jmvae["filter"]["unseen"]
+    np.testing.assert_allclose(unseen.std, [20**0.5] * 2, rtol=1e-6)
+    np.testing.assert_allclose(models.unseen.std, unseen.std, rtol=1e-6)
 
 
 def test_another_run_is_never_overwritten(smoke_run, capsys):
@@ -259,6 +289,8 @@ def test_an_evaluation_keeps_what_another_one_has_written_meanwhile(
     blocks = json.loads((path / "summary.json").read_text(encoding="utf-8"))["mission"]
     expected = {**dict.fromkeys(mission.POLICIES, 0), "latent": 4, "naive": 3}
     assert {name: blocks[name]["seed"] for name in mission.POLICIES} == expected
+    # Nothing compares policies of different arenas.
+    assert not any({"intervals", "of_naive"} & set(block) for block in blocks.values())
 
 
 def test_an_evaluation_waits_for_another_one_that_writes(evaluated, tmp_path):

@@ -260,7 +260,7 @@ def test_a_class_is_read_by_its_detections_for_training(monkeypatch):
 @pytest.mark.parametrize("reward", ["nats", "paper"])
 def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(reward):
     mdp = MdpConfig(reward=reward, look_cost=0.125, min_increase=0.01)
-    fusion = dataclasses.replace(TINY.jmvae, fusion="filter")
+    fusion = dataclasses.replace(TINY.jmvae, fusion="filter", latent_size=1)
     config = dataclasses.replace(TINY, jmvae=fusion, mdp=mdp)
     # The camera is sure, red or green; the LiDAR knows nothing: two cylinders to one cube.
     camera, lidar = jnp.array([[0, 1], [1, 0], [1, 0]]), jnp.full((3, 2), 1 / 3).at[:, 0].set(2 / 3)
@@ -273,16 +273,21 @@ def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(r
     even = jnp.full(3, 1 / 3)
     if reward == "nats":
         # ln 3 before; nothing after a green one, and ln 2 after each of two red ones.
-        expected = [np.log(3) - np.log(2) * 2 / 3 - 0.125, -0.125]
+        expected = first = [np.log(3) - np.log(2) * 2 / 3 - 0.125, -0.125]
     else:
         # Before, a variance of 1 + that of the three means. After a green one 1, and after a red
         # one 1 + 12 / 4 = 4.
         before = 1 / np.sqrt(1 + np.var(mean))
         expected = [((1 - before) + 2 * (1 / 2 - before)) / 3, -1.0]
+        # An unseen PoI has a variance of 20, so that even the LiDAR's first look pays.
+        unseen = 1 / np.sqrt(20)
+        first = [((1 - unseen) + 2 * (1 / 2 - unseen)) / 3, before - unseen]
     found = [optimum.interpolate(values.gain, even) for values in (camera, lidar)]
     np.testing.assert_allclose(found, expected, atol=1e-4)
+    np.testing.assert_allclose([camera.first_gain, lidar.first_gain], first, atol=1e-4)
     # A second look of the camera adds nothing, and so costs more than it pays.
     np.testing.assert_allclose(optimum.interpolate(camera.total, even), expected[0], atol=1e-4)
+    np.testing.assert_allclose(camera.first_total, first[0], atol=1e-4)
 
 
 def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):

@@ -14,7 +14,7 @@ from jaxsense.dqn import belief_mdp
 from jaxsense.dqn import training as dqn
 from jaxsense.models import make_jmvae
 from jaxsense.types import Belief
-from jaxsense.vae import detectors, filtering, jmvae
+from jaxsense.vae import detectors, filtering, fusion, jmvae
 
 CONFIG = Config(
     detector=DetectorConfig(hidden=(2,), steps=3, batch=4),
@@ -123,7 +123,8 @@ def test_the_cost_of_a_look_may_be_traced():
     with_filter = dataclasses.replace(CONFIG.jmvae, fusion="filter")
     model, keys = make_jmvae(CONFIG), jax.random.split(jax.random.key(0), 4)
     classes = Belief(jax.random.normal(keys[0], (3, 2)), jnp.full((3, 2), 0.2))
-    params = {"filter": filtering.init(keys[1], model, classes, CONFIG.filter)}
+    unseen = fusion.unseen(model, 20.0)
+    params = {"filter": filtering.init(keys[1], model, classes, unseen, CONFIG.filter)}
     bank = (jnp.full((3, 1, 2), 0.5),) * 2
 
     def rewarded(cost):

@@ -46,6 +46,10 @@ class DetectorConfig:
         reason = "must be at least 0, at most 0.5"
         require(0 <= self.calibration <= 0.5, self, "calibration", reason)
 
+    def num_training(self, number: int) -> int:
+        """How many of a number of scans are left to train on."""
+        return number - math.ceil(self.calibration * number)
+
 
 @section
 class JmvaeConfig:

@@ -119,6 +119,8 @@ class MissionConfig:
         known = f"must name some of {', '.join(POLICIES)}"
         is_known = len(self.policies) > 0 and set(self.policies) <= set(POLICIES)
         require(is_known, self, "policies", known)
+        is_once = len(set(self.policies)) == len(self.policies)
+        require(is_once, self, "policies", "must name no policy twice")
         require_at_most(self, episodes=MOST_EPISODES, time_limit=3600)
         steps = self.control_period / TIMESTEP
         require(

@@ -83,6 +83,7 @@ class Config:
             reason = f"needs jmvae.fusion = 'filter', not {self.jmvae.fusion!r}"
             raise ConfigError("mdp.reward", self.mdp.reward, reason)
         self._check_task()
+        self._check_learning()
         self._check_viewpoints()
         self._check_views()
         looks = self.arena.num_pois * len(self.modalities)
@@ -104,6 +105,18 @@ class Config:
         elif self.evaluation.num_pois:
             reason = "needs dqn.task = 'team', whose policy is for any number; must be empty"
             raise ConfigError("evaluation.num_pois", self.evaluation.num_pois, reason)
+
+    def _check_learning(self) -> None:
+        """A filter must hold all classes, and a detector have scans to train on."""
+        number, size = len(self.arena.classes), self.jmvae.latent_size
+        if self.jmvae.fusion == "filter" and number > 2 * size + 1:
+            reason = f"must be at least {number // 2}, so that a filter can hold {number} classes"
+            raise ConfigError("jmvae.latent_size", size, reason)
+        # Whole scenes are surveyed.
+        scans = -(-self.detector.num_scans // self.arena.num_pois) * self.arena.num_pois
+        if self.detector.num_training(scans) < 1:
+            reason = f"leaves no scan to train on, of {scans}; must be less"
+            raise ConfigError("detector.calibration", self.detector.calibration, reason)
 
     def _check_viewpoints(self) -> None:
         """Viewpoints for training must be clear of the PoI and inside the arena."""

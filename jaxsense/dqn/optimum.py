@@ -30,12 +30,16 @@ class LookValues:
     """Expected rewards of one modality's looks at a PoI.
 
     Attributes:
-      gain: `[P]` of the next look alone.
+      gain: `[P]` of the next look alone, at the points of the lattice.
       total: `[P]` of the next look and of all that pay after it.
+      first_gain: `[]` the gain of a PoI that nobody has looked at.
+      first_total: `[]` its total.
     """
 
     gain: jax.Array
     total: jax.Array
+    first_gain: jax.Array
+    first_total: jax.Array
 
 
 def steps_of_lattice(num_classes: int, most_points: int = MOST_POINTS) -> int:
@@ -90,9 +94,18 @@ def interpolate(table: jax.Array, weights: jax.Array) -> jax.Array:
 
     Returns:
       `[]` the value.
+
+    Raises:
+      ValueError: if no lattice of these classes has P points.
     """
     chex.assert_rank(weights, 1, custom_message="weights")
-    rows, shares = _corners(weights, steps_of_lattice(len(weights), len(table)))
+    chex.assert_rank(table, 1, custom_message="table")
+    steps = steps_of_lattice(len(weights), len(table))
+    number = _num_points(steps, len(weights))
+    if len(table) != number:
+        reason = f"must be {number} or another number of points of a lattice"
+        raise ValueError(f"length of table = {len(table)}: {reason}")
+    rows, shares = _corners(weights, steps)
     return jnp.sum(shares * table[rows])
 
 
@@ -114,6 +127,7 @@ def solve(
     config: MdpConfig,
     horizon: int,
     most_points: int = MOST_POINTS,
+    unseen: jax.Array | None = None,
 ) -> LookValues:
     """The values of one modality's looks.
 
@@ -121,9 +135,11 @@ def solve(
       likelihoods: `[C, K, C]` logarithms of the likelihoods of all classes, up to a constant, in
         each of K equally likely looks at a PoI of each class.
       information: `[C]` class probabilities to the `[]` information of the map's entry.
-      config: the rewards.
+      config: the rewards, and `max_steps`, which also limits the looks at one PoI.
       horizon: most looks at one PoI; static.
       most_points: of the lattice; static.
+      unseen: `[]` information of the entry of an unseen PoI, whose classes are equally likely; by
+        default that of an entry written with equal probabilities.
 
     Returns:
       The values at the points of the lattice. The optimal policy takes every look whose `total` is
@@ -136,10 +152,14 @@ def solve(
     values.require_number("horizon", horizon)
     points = jnp.asarray(lattice(number, most_points), jnp.float32)
     steps = steps_of_lattice(number, len(points))
+    # The unseen PoI is the last row, to which no look leads.
+    points = jnp.concatenate([points, jnp.full((1, number), 1 / number)])
+    before = jax.vmap(information)(points)
+    before = before if unseen is None else before.at[-1].set(unseen)
 
-    def looks(weights: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def looks(row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         """`[C, K]` rewards of the looks, and the corners around the posteriors after them."""
-        before = information(weights)
+        weights, before = row
 
         def look(likelihood: jax.Array):
             after = weights * jnp.exp(likelihood - jnp.max(likelihood))
@@ -150,13 +170,14 @@ def solve(
 
         return jax.vmap(jax.vmap(look))(likelihoods)
 
-    rewards, rows, shares = jax.lax.map(looks, points, batch_size=_POINTS_AT_ONCE)
+    rewards, rows, shares = jax.lax.map(looks, (points, before), batch_size=_POINTS_AT_ONCE)
     chances = points[:, :, None] / num_looks
     gain = jnp.sum(chances * rewards, axis=(1, 2))
 
-    def earlier(total: jax.Array, _) -> tuple[jax.Array, None]:
+    def earlier(total: jax.Array, left: jax.Array) -> tuple[jax.Array, None]:
         following = jnp.sum(shares * jnp.maximum(total, 0.0)[rows], axis=-1)
-        return gain + jnp.sum(chances * following, axis=(1, 2)), None
+        longer = gain + jnp.sum(chances * following, axis=(1, 2))
+        return jnp.where(left <= config.max_steps, longer, total), None
 
-    total, _ = jax.lax.scan(earlier, gain, None, length=horizon - 1)
-    return LookValues(gain, total)
+    total, _ = jax.lax.scan(earlier, gain, jnp.arange(2, horizon + 1))
+    return LookValues(gain[:-1], total[:-1], gain[-1], total[-1])

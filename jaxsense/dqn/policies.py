@@ -182,21 +182,24 @@ def optimal(mdp: MapMdp, rewards: jax.Array, label_of_class: jax.Array) -> Polic
     return act
 
 
-def by_posterior(table: jax.Array, weights: Callable[[Belief], jax.Array]) -> Policy:
+def by_posterior(
+    table: jax.Array, first: jax.Array, weights: Callable[[Belief], jax.Array]
+) -> Policy:
     """Takes the look of the highest value, by what the map shows; NOP if none is above 0.
 
     Args:
       table: `[P]` values of a look, one of `optimum.LookValues`: with `total` the optimal policy,
         with `gain` one that does not look ahead.
+      first: `[]` value of a look at an unseen PoI, `first_total` or `first_gain`.
       weights: `belief [D] -> [C]`, the classes' probabilities that an entry of the map holds.
     """
 
-    def of_poi(belief: Belief) -> jax.Array:
-        return optimum.interpolate(table, weights(belief))
+    def of_poi(belief: Belief, seen: jax.Array) -> jax.Array:
+        return jnp.where(jnp.any(seen), optimum.interpolate(table, weights(belief)), first)
 
     def act(key: Key, state: MapState) -> jax.Array:
         del key
-        return _best(jnp.append(jax.vmap(of_poi)(state.belief), 0.0))
+        return _best(jnp.append(jax.vmap(of_poi)(state.belief, state.seen), 0.0))
 
     return act
 

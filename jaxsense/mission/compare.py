@@ -5,26 +5,31 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
+REFERENCE = "latent"
+"""The policy that the others are compared with."""
+
 _CONFIDENCE = 0.95
 _NAIVE = ("naive", "naive_2", "naive_3")
 
 
 def interval(values: np.ndarray) -> tuple[Any, Any]:
-    """The 95% interval of the mean of `[K, ...]` values, by Student's t."""
-    average = values.mean(axis=0)
+    """The 95% interval of the mean of `[K, ...]` values, by Student's t; None of a single one."""
     if len(values) == 1:
-        return average, average
+        return None, None
+    average = values.mean(axis=0)
     error = scipy.stats.sem(values) * scipy.stats.t.ppf((1 + _CONFIDENCE) / 2, len(values) - 1)
     return average - error, average + error
 
 
-def described(values: np.ndarray) -> dict[str, float]:
-    """The mean of `[K]` values and its 95% interval."""
-    low, high = interval(values)
-    return {"mean": float(values.mean()), "low": float(low), "high": float(high)}
+def described(values: np.ndarray) -> dict[str, float | None]:
+    """The mean of `[K]` values and its 95% interval, see `interval`."""
+    low, high = (None if end is None else float(end) for end in interval(values))
+    return {"mean": float(values.mean()), "low": low, "high": high}
 
 
-def differences(found: dict[str, Any], reference: dict[str, Any]) -> dict[str, dict[str, float]]:
+def differences(
+    found: dict[str, Any], reference: dict[str, Any]
+) -> dict[str, dict[str, float | None]]:
     """Mean differences of one case from another, arena by arena, with their 95% intervals.
 
     Args:
@@ -55,7 +60,8 @@ def of_naive(blocks: dict[str, dict[str, Any]], name: str) -> dict[str, float] |
       name: of the policy.
 
     Returns:
-      The ratios; None if naive exploration was not played, or is more accurate with fewer looks.
+      The ratios of looks, of median times and of mean times; None if naive exploration was not
+      played, or is more accurate with fewer looks.
     """
     if not {name, *_NAIVE} <= set(blocks):
         return None
@@ -71,5 +77,26 @@ def of_naive(blocks: dict[str, dict[str, Any]], name: str) -> dict[str, float] |
             blocks[name][key]
             / np.interp(blocks[name]["accuracy"], accuracies, [block[key] for block in naive])
         )
-        for key in ("observations_per_poi", "time_s")
+        for key in ("observations_per_poi", "time_s", "mean_time_s")
     }
+
+
+def compared(blocks: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Blocks of the summary with the comparisons that hold: between cases in the same arenas.
+
+    `of_naive` is computed anew. `intervals`, which need every mission, stay or are left out.
+    """
+
+    def compare(name: str, block: dict[str, Any]) -> dict[str, Any]:
+        beside = {n: other for n, other in blocks.items() if arenas(other) == arenas(block)}
+        stale = {"of_naive"} if REFERENCE in beside else {"of_naive", "intervals"}
+        kept = {key: value for key, value in block.items() if key not in stale}
+        ratios = of_naive(beside, name)
+        return kept if ratios is None else {**kept, "of_naive": ratios}
+
+    return {name: compare(name, block) for name, block in blocks.items()}
+
+
+def arenas(block: dict[str, Any]) -> tuple[Any, Any]:
+    """The seed, None in a run's own blocks, and the number of the arenas of a case."""
+    return block.get("seed"), block["episodes"]

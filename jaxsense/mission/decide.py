@@ -120,8 +120,11 @@ def _values(
     on_map = jax.vmap(functools.partial(filtering.weights, models.readout))(state.belief)
     exact = jnp.exp(state.log_posterior)
 
-    def expected(table: jax.Array, weights: jax.Array) -> jax.Array:
-        return jax.vmap(lambda weights: optimum.interpolate(table, weights))(weights)
+    is_seen = jnp.any(state.seen, axis=-1)
+
+    def expected(table: jax.Array, first: jax.Array, weights: jax.Array) -> jax.Array:
+        known = jax.vmap(lambda weights: optimum.interpolate(table, weights))(weights)
+        return jnp.where(is_seen, known, first)
 
     modalities = jnp.array(mission.config.modality_of_robot)
     modality = modalities[robot]
@@ -129,15 +132,16 @@ def _values(
     looks = jax.tree.map(lambda x: x[modality], of_each)
     times = state.times_seen[:, modality]
     team = team_of(mission, state, given_up)
-    gains = jax.vmap(lambda table: expected(table, on_map))(of_each.gain)[modalities]
+    by_map = jax.vmap(expected, in_axes=(0, 0, None))
+    gains = by_map(of_each.gain, of_each.first_gain, on_map)[modalities]
     travel = mission.config.team.travel
     ways = jax.vmap(lambda pose: team_mdp.travel_seconds(travel, pose, team.positions))(team.poses)
     by_rule = gains, ways, team, jnp.asarray(robot)
 
     of_pois = {
         "greedy": gains[robot],
-        "bayes": expected(looks.gain, exact),
-        "optimal": expected(looks.total, exact),
+        "bayes": expected(looks.gain, looks.first_gain, exact),
+        "optimal": expected(looks.total, looks.first_total, exact),
         "naive": jnp.where(times < 1, 1.0, -1.0),
         "naive_2": jnp.where(times < 2, 1.0, -1.0),
         "naive_3": jnp.where(times < 3, 1.0, -1.0),

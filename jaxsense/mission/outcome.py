@@ -102,6 +102,7 @@ def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any
         "accuracy": float(found["is_right"].mean()),
         "observations_per_poi": float(found["observations_per_poi"].mean()),
         "time_s": float(np.median(found["time_s"])),
+        "mean_time_s": float(found["time_s"].mean()),
         "collisions": int(found["collisions"].sum()),
         "goals_reached_fraction": _share(found["goals_reached"].sum(), found["goals"].sum()),
         "information": float(found["information"].mean()),

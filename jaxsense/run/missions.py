@@ -28,9 +28,6 @@ from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.types import Key
 
-REFERENCE = "latent"
-"""The policy that the others are compared with."""
-
 _CHUNK_TIME = 2.5  # s
 
 
@@ -230,12 +227,10 @@ def summary(mission: Mission, played: Played) -> dict[str, Any]:
     """The summary's block `mission`."""
     config = mission.config
     blocks = {name: summarise(config, name, found) for name, found in played.metrics.items()}
-    reference = played.metrics.get(REFERENCE)
+    reference = played.metrics.get(compare.REFERENCE)
     for name, found in played.metrics.items():
-        if reference is not None and name != REFERENCE:
+        if reference is not None and name != compare.REFERENCE:
             blocks[name]["intervals"] = compare.differences(found, reference)
-        if (ratios := compare.of_naive(blocks, name)) is not None:
-            blocks[name]["of_naive"] = ratios
     detections = sum(found["detections"].sum(axis=0) for found in played.metrics.values())
     size = bytes_per_detection(mission, np.asarray(detections))
-    return {**blocks, "bytes_per_detection": size}
+    return {**compare.compared(blocks), "bytes_per_detection": size}

@@ -34,7 +34,7 @@ class RunResult:
       posteriors: `[C, S', D]` beliefs of these, `joint` and for each modality.
       rewards: for each modality the `[epochs]` mean total reward of the episodes that ended, as
         `reward`, and of the greedy policy, as `greedy`; NaN in other epochs.
-      recording: the first mission of the latent policy.
+      recording: the first mission of the first of `config.mission.policies`.
       summary: the blocks `detectors`, `jmvae`, `dqn` and `mission` of `summary.json`.
     """
 

@@ -83,8 +83,8 @@ def statistics(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     Returns:
       The same structure, with `{"mean", "low", "high"}` in place of every number: the mean and its
-      95% interval by Student's t. Omits what some run lacks and what is no number; in a list, None
-      takes its place.
+      95% interval by Student's t, None of a single run. Omits what some run lacks and what is no
+      number; in a list, None takes its place.
     """
     return _statistics(list(summaries)) or {}
 

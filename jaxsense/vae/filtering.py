@@ -25,25 +25,29 @@ LEAST_WEIGHT = 1e-5
 _LEAST_FEATURE = 1e-6
 
 
-def init(key: Key, model: Jmvae, classes: Belief, config: FilterConfig) -> Params:
+def init(key: Key, model: Jmvae, classes: Belief, unseen: Belief, config: FilterConfig) -> Params:
     """Parameters of an untrained filter.
 
     Args:
       key: random key.
       model: shape of the JMVAE.
       classes: `[C, D]` joint posterior of each class.
+      unseen: `[D]` entry of an unseen PoI.
       config: sizes of the networks.
 
     Returns:
-      A dictionary of the `classes`, the `inverse` of `moments_inverse`, and one of the `networks`
-      for each modality.
+      A dictionary of the `classes`, the `inverse` of `moments_inverse`, `unseen`, and one of the
+      `networks` for each modality.
     """
     chex.assert_shape(classes.mean, (None, model.latent_size), custom_message="classes.mean")
     chex.assert_shape(classes.std, classes.mean.shape, custom_message="classes.std")
+    chex.assert_shape(unseen.mean, (model.latent_size,), custom_message="unseen.mean")
+    chex.assert_shape(unseen.std, (model.latent_size,), custom_message="unseen.std")
     number = len(classes.mean)
     return {
         "classes": classes,
         "inverse": moments_inverse(classes),
+        "unseen": unseen,
         "networks": {
             name: networks.init(k, MLP(config.hidden, number), size)
             for k, name, size in zip(
@@ -72,15 +76,12 @@ def update(
       ValueError: if there is no such modality, features are no probabilities, or a belief is not
         finite or not positive.
     """
-    if not 0 <= modality < len(model.modalities):
-        raise ValueError(f"modality = {modality}: must be an index of {model.modalities}")
+    values.require_index("modality", modality, len(model.modalities))
     size = (model.feature_sizes[modality],)
     chex.assert_shape(features, size, custom_message=f"features of {model.modalities[modality]}")
     values.require_probabilities("features", features)
     chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
     chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
-    values.require_finite("belief.mean", belief.mean)
-    values.require_positive("belief.std", belief.std)
     found = evidence(params, model, features, modality)
     prior = jnp.log(weights(params, belief))
     return mixture(params["classes"], jax.nn.softmax(prior + found))
@@ -91,6 +92,7 @@ def evidence(params: Params, model: Jmvae, features: jax.Array, modality: int) -
 
     Or `[C, B]` of `[D_m, B]`.
     """
+    values.require_index("modality", modality, len(model.modalities))
     hidden = tuple(
         layer["bias"].shape[0]
         for name, layer in sorted(_layers(params, model, modality).items())[:-1]
@@ -111,6 +113,8 @@ def mixture(classes: Belief, weights: jax.Array) -> Belief:
       classes: `[C, D]` joint posterior of each class.
       weights: `[C]` of sum 1.
     """
+    chex.assert_shape(weights, classes.mean.shape[:1], custom_message="weights")
+    values.require_probabilities("weights", weights)
     mean = weights @ classes.mean
     spread = classes.std**2 + (classes.mean - mean[None]) ** 2
     return Belief(mean, jnp.sqrt(weights @ spread))
@@ -136,17 +140,19 @@ def weights(params: Params, belief: Belief) -> jax.Array:
     """The classes' probabilities that a belief holds.
 
     Args:
-      params: of the filter; only `classes` and `inverse` are used.
-      belief: `[D]`. One that is wider than every mixture of the classes in each dimension, as that
-        of an unseen PoI is, leaves all classes equally likely.
+      params: of the filter; only `inverse` and `unseen` are used.
+      belief: `[D]`. That of an unseen PoI leaves all classes equally likely.
 
     Returns:
       `[C]` probabilities of `LEAST_WEIGHT` at least.
     """
+    values.require_finite("belief.mean", belief.mean)
+    values.require_positive("belief.std", belief.std)
     found = jnp.maximum(params["inverse"] @ _moments(belief), LEAST_WEIGHT)
-    classes = params["classes"]
-    widest = jnp.max(classes.std**2 + classes.mean**2, axis=0)
-    is_unseen = jnp.all(belief.std**2 + belief.mean**2 > 1.01 * widest)
+    unseen = params["unseen"]
+    apart = jnp.maximum(jnp.abs(belief.mean - unseen.mean), jnp.abs(belief.std - unseen.std))
+    # Another program may have rounded the same entry otherwise.
+    is_unseen = jnp.all(apart <= 1e-5 * unseen.std)
     return jnp.where(is_unseen, 1 / len(found), found / jnp.sum(found))
 
 

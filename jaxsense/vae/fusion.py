@@ -43,13 +43,18 @@ def fuse(
       The new entry. The old one enters it only through the decoder.
 
     Raises:
-      ValueError: if `features` lacks an entry for a modality, or all are None.
+      ValueError: if `features` lacks an entry for a modality, all are None, or one holds no
+        probabilities; if the belief is not finite or not positive.
     """
     chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
     chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
     chex.assert_shape(seen, (len(model.modalities),), custom_message="seen")
+    values.require_finite("belief.mean", belief.mean)
     values.require_positive("belief.std", belief.std)
     jmvae.check_features(model, features)
+    for name, new in zip(model.modalities, features, strict=True):
+        if new is not None:
+            values.require_probabilities(f"features of {name}", new)
     generated = jmvae.decode(params, model, belief.mean)
     others = [m for m, new in enumerate(features) if new is None]
     entry = belief
@@ -77,12 +82,11 @@ def write(
     In place, or by the filter if `params` has one: it needs no `seen`.
 
     Raises:
-      ValueError: if there is no such modality.
+      ValueError: if there is no such modality; see also `fuse`.
     """
     if FILTER in params:
         return filtering.update(params[FILTER], model, belief, features, modality)
-    if not 0 <= modality < len(model.modalities):
-        raise ValueError(f"modality = {modality}: must be an index of {model.modalities}")
+    values.require_index("modality", modality, len(model.modalities))
     of_all = tuple(features if m == modality else None for m in range(len(model.modalities)))
     return fuse(params, model, belief, seen, of_all)
 

@@ -97,16 +97,10 @@ def encode(params: Params, model: Jmvae, features: Features) -> tuple[jax.Array,
       `[D]` mean and `[D]` log-variance.
 
     Raises:
-      ValueError: if `features` lacks an entry for a modality, or all are None.
+      ValueError: if `features` lacks an entry for a modality, all are None, or one is not finite.
     """
     check_features(model, features)
     subset = tuple(m for m, feature in enumerate(features) if feature is not None)
-    for m in subset:
-        chex.assert_shape(
-            features[m],
-            (model.feature_sizes[m],),
-            custom_message=f"features of {model.modalities[m]}",
-        )
     return _encode(params, model, subset, features)
 
 
@@ -122,7 +116,7 @@ def _encode(
 
 
 def check_features(model: Jmvae, features: Features) -> None:
-    """Raises a `ValueError` unless each modality has an entry, and one or more are not None."""
+    """Raises an error unless each modality has finite features or None, and one or more have."""
     if len(features) != len(model.modalities):
         raise ValueError(
             f"features has {len(features)} entries: must be {len(model.modalities)}, one for each "
@@ -130,6 +124,10 @@ def check_features(model: Jmvae, features: Features) -> None:
         )
     if all(feature is None for feature in features):
         raise ValueError(f"features = {features}: must hold one modality or more")
+    for name, size, feature in zip(model.modalities, model.feature_sizes, features, strict=True):
+        if feature is not None:
+            chex.assert_shape(feature, (size,), custom_message=f"features of {name}")
+            values.require_finite(f"features of {name}", feature)
 
 
 def decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]:

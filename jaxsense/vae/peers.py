@@ -49,6 +49,8 @@ def bayes_update(
     """
     chex.assert_rank(log_weights, 1, custom_message="log_weights")
     chex.assert_shape(label_of_class, log_weights.shape, custom_message="label_of_class")
+    # Infinite if no class has any weight, NaN if one is.
+    values.require_finite("largest of log_weights", jnp.max(log_weights))
     return jax.nn.log_softmax(log_weights + log_likelihoods(features, label_of_class))
 
 
@@ -65,6 +67,7 @@ def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Beli
     """
     for name, each in (("belief", belief), ("posterior", posterior), ("prior", prior)):
         chex.assert_shape(each.std, each.mean.shape, custom_message=name)
+        values.require_finite(f"{name}.mean", each.mean)
         values.require_positive(f"{name}.std", each.std)
     of_belief, of_posterior, of_prior = (x.std**-2 for x in (belief, posterior, prior))
     precision = jnp.maximum(of_belief + of_posterior - of_prior, _LEAST_PRECISION)

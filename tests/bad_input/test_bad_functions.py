@@ -11,7 +11,9 @@ from refusals import INF, NAN, SMOKE
 
 import jaxsense
 from jaxsense import Belief, dqn, interfaces, mission, sim, vae
+from jaxsense.config import FilterConfig
 from jaxsense.run import missions
+from jaxsense.vae import filtering, fusion
 
 
 class World:
@@ -27,6 +29,9 @@ class World:
         layout = sim.random_layout(self.key, SMOKE.arena, self.classes)
         light = sim.random_light(self.key)
         self.scene = sim.Scene(layout, light, jnp.zeros((2, 3)))
+        classes = Belief(jnp.eye(3)[:, :2], jnp.ones((3, 2)))
+        inputs = self.model, classes, vae.unseen(self.model, 20.0), FilterConfig(hidden=(1,))
+        self.filter = filtering.init(self.key, *inputs)
         self.bank = tuple(jnp.full((3, 4, 2), 0.5) for _ in range(2))
         self.mdp = jaxsense.bank_mdp(SMOKE, self.bank, self.params, self.model)
         beliefs = Belief(jnp.zeros((3, 2)), jnp.ones((3, 2)))
@@ -34,6 +39,7 @@ class World:
         self.state = dqn.MapState(beliefs, seen, self.classes, self.classes, jnp.int32(0))
         self.belief, self.means = Belief(jnp.zeros(2), jnp.ones(2)), jnp.zeros((3, 2))
         self.seen, self.x = jnp.zeros(2, bool), jnp.zeros(2)
+        self.look = jnp.array([0.75, 0.25])
 
     def belief_of(self, **parts):
         return dataclasses.replace(self.belief, **parts)
@@ -161,13 +167,93 @@ FUNCTIONS = {
         lambda w: vae.fuse(w.params, w.model, w.belief_of(std=-w.belief.std), w.seen, (w.x, None)),
         "belief.std = -1.0: must be greater than 0",
     ),
+    "fuse mean": (
+        lambda w: vae.fuse(w.params, w.model, w.belief_of(mean=w.x * NAN), w.seen, (w.look, None)),
+        "belief.mean = nan: must be finite",
+    ),
+    "fuse features": (
+        lambda w: vae.fuse(w.params, w.model, w.belief, w.seen, (jnp.array([2.0, -1.0]), None)),
+        "features of camera = 2.0: must be probabilities, within 0 and 1",
+    ),
+    "fuse sum": (
+        lambda w: vae.fuse(w.params, w.model, w.belief, w.seen, (w.look, w.x)),
+        "sum of features of lidar = 0.0: must be 1",
+    ),
+    "posterior nan": (
+        lambda w: vae.posterior(w.params, w.model, (None, w.x * NAN)),
+        "features of lidar = nan: must be finite",
+    ),
+    "write mean": (
+        lambda w: vae.write(
+            w.params, w.model, w.belief_of(mean=jnp.array([0.0, INF])), w.seen, w.look, 0
+        ),
+        "belief.mean = inf: must be finite",
+    ),
+    "write real": (
+        lambda w: vae.write(w.params, w.model, w.belief, w.seen, w.look, 0.0),
+        "modality of dtype float32: must be a whole number from 0 to 1",
+    ),
+    "update real": (
+        lambda w: vae.update(w.filter, w.model, w.belief, w.look, 0.0),
+        "modality of dtype float32: must be a whole number from 0 to 1",
+    ),
+    "update bool": (
+        lambda w: vae.update(w.filter, w.model, w.belief, w.look, True),
+        "modality of dtype bool: must be a whole number from 0 to 1",
+    ),
+    "update negative": (
+        lambda w: vae.update(w.filter, w.model, w.belief, w.look, -1),
+        "modality = -1: must be a whole number from 0 to 1",
+    ),
+    "evidence": (
+        lambda w: filtering.evidence(w.filter, w.model, w.look, -1),
+        "modality = -1: must be a whole number from 0 to 1",
+    ),
+    "mixture": (
+        lambda w: filtering.mixture(w.filter["classes"], jnp.array([2.0, -1.0, 0.0])),
+        "weights = 2.0: must be probabilities, within 0 and 1",
+    ),
+    "mixture sum": (
+        lambda w: filtering.mixture(w.filter["classes"], jnp.full(3, 0.5)),
+        "sum of weights = 1.5: must be 1",
+    ),
+    "weights mean": (
+        lambda w: filtering.weights(w.filter, w.belief_of(mean=w.x * NAN)),
+        "belief.mean = nan: must be finite",
+    ),
+    "weights std": (
+        lambda w: filtering.weights(w.filter, w.belief_of(std=-w.belief.std)),
+        "belief.std = -1.0: must be greater than 0",
+    ),
+    "most_likely_class": (
+        lambda w: fusion.most_likely_class(
+            {"filter": w.filter}, w.means, w.belief_of(mean=w.x * NAN)
+        ),
+        "belief.mean = nan: must be finite",
+    ),
+    "product_of_experts": (
+        lambda w: vae.product_of_experts(w.belief, w.belief_of(mean=w.x * NAN), w.belief),
+        "posterior.mean = nan: must be finite",
+    ),
+    "bayes_update nan": (
+        lambda w: vae.bayes_update(jnp.array([0.0, NAN]), w.look, jnp.array([0, 1])),
+        "largest of log_weights = nan: must be finite",
+    ),
+    "bayes_update none": (
+        lambda w: vae.bayes_update(jnp.full(2, -INF), w.look, jnp.array([0, 1])),
+        "largest of log_weights = -inf: must be finite",
+    ),
+    "interpolate": (
+        lambda w: dqn.interpolate(jnp.zeros(7), jnp.full(3, 1 / 3)),
+        "length of table = 7: must be 6 or another number of points of a lattice",
+    ),
     "fuse seen": (
         lambda w: vae.fuse(w.params, w.model, w.belief, jnp.zeros(3, bool), (w.x, None)),
         "seen",
     ),
     "write": (
         lambda w: vae.write(w.params, w.model, w.belief, w.seen, w.x, 2),
-        "modality = 2: must be an index",
+        "modality = 2: must be a whole number from 0 to 1",
     ),
     "unseen": (lambda w: vae.unseen(w.model, -1.0), "variance = -1.0: must be greater than 0"),
     "unseen nan": (lambda w: vae.unseen(w.model, NAN), "variance = nan"),

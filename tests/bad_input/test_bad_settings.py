@@ -104,6 +104,7 @@ def test_plain_settings_are_refused_or_used(stored):
 
 TWINS = {**COLOURS, "crimson": COLOURS["red"]}
 TURNED = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "board": Shape("box", (0.5, 1.0))}
+SIX = tuple(f"{colour} {shape}" for colour in ("red", "green", "blue") for shape in SHAPES)
 CHANGES = [
     ({"modalities": ["lidar"]}, "modalities = ['lidar']: must be a tuple of texts"),
     ({"modalities": ("lidar", "lidar")}, "must name no modality twice"),
@@ -160,6 +161,18 @@ CHANGES = [
         {"detector.calibration": 0.51},
         "detector.calibration = 0.51: must be at least 0, at most",
     ),
+    (
+        {"detector.calibration": 0.5, "detector.num_scans": 1, "arena.num_pois": 1},
+        "detector.calibration = 0.5: leaves no scan to train on, of 1; must be less",
+    ),
+    (
+        {"jmvae.fusion": "filter", "jmvae.latent_size": 1, "arena.classes": SIX[:5]},
+        "jmvae.latent_size = 1: must be at least 2, so that a filter can hold 5 classes",
+    ),
+    (
+        {"jmvae.fusion": "filter", "jmvae.latent_size": 2, "arena.classes": SIX},
+        "jmvae.latent_size = 2: must be at least 3, so that a filter can hold 6 classes",
+    ),
     ({"jmvae.latent_size": 10**9}, "jmvae.latent_size = 1000000000: must be at most 256"),
     ({"jmvae.restarts": 10**6}, "jmvae.restarts = 1000000: must be at most 1,000"),
     ({"jmvae.samples_per_class": 10**9}, "jmvae.samples_per_class = 1000000000: takes"),
@@ -197,6 +210,7 @@ CHANGES = [
     ({"mission.episodes": 10**9}, "mission.episodes = 1000000000: must be at most 100,000"),
     ({"mission.time_limit": 1e9}, "mission.time_limit = 1000000000.0: must be at most 3,600"),
     ({"mission.policies": ()}, "mission.policies = (): must name some of latent, greedy, bayes,"),
+    ({"mission.policies": ("naive", "latent", "naive")}, "must name no policy twice"),
     ({"mission.policies": ("naive", "best")}, "('naive', 'best'): must name some of latent, gr"),
     ({"mission.policies": ["naive"]}, "mission.policies = ['naive']: must be a tuple of texts"),
     ({"mission.control_period": 0.033}, "must be a multiple of 0.01 s"),

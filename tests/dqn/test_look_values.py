@@ -127,9 +127,23 @@ def test_values_are_those_of_all_histories(name, number):
         # wrongly by a quarter of the step.
         error = 0.25 / optimum.steps_of_lattice(number) if horizon > 1 else 1e-5
         np.testing.assert_allclose(interpolate(found.total, starts), total, atol=error)
+        # The first start is that of equal probabilities.
+        first = [found.first_gain, found.first_total]
+        np.testing.assert_allclose(first, [gain[0], total[0]], atol=error)
         by_horizon.append(total[0])
     # Later looks pay.
     assert by_horizon[0] + 0.005 < by_horizon[2]
+
+
+def test_an_episode_of_few_steps_has_as_few_looks():
+    _, information, config = REWARDS["nats"]
+    likelihoods = jnp.log(jnp.array(LOOKS[3]))
+    shorter = replace(config, max_steps=2)
+    found = optimum.solve(likelihoods, information, shorter, HORIZON)
+    for horizon, is_same in ((2, True), (HORIZON, False)):
+        other = optimum.solve(likelihoods, information, config, horizon)
+        assert np.allclose(found.total, other.total, atol=1e-6) == is_same
+        assert np.allclose(found.first_total, other.first_total, atol=1e-6) == is_same
 
 
 def test_a_look_that_is_certain_pays_once():
@@ -163,8 +177,16 @@ def weights_of(belief):
     return jax.nn.softmax(belief.mean)
 
 
-def exact_mdp(information, config):
-    """Two PoIs, whose entries are their classes' logarithmic probabilities by exact Bayes."""
+def exact_mdp(information, config, unseen=None):
+    """Two PoIs, whose entries are their classes' logarithmic probabilities by exact Bayes.
+
+    An entry that was written has a standard deviation of 1. One that was not has 2, and the
+    information `unseen`, if this is given.
+    """
+
+    def information_of(belief):
+        written = information(weights_of(belief))
+        return written if unseen is None else jnp.where(belief.std[0] == 2, unseen, written)
 
     def observe(key, classes, poi, modality):
         return CALIBRATED[classes[poi], jax.random.randint(key, (), 0, 4)], classes
@@ -174,44 +196,44 @@ def exact_mdp(information, config):
         num_pois=2,
         num_classes=3,
         num_modalities=1,
-        unseen=Belief(jnp.zeros(3), jnp.ones(3)),
+        unseen=Belief(jnp.zeros(3), jnp.full(3, 2.0)),
         new_scene=lambda key, classes: classes,
         observe=observe,
-        write=lambda belief, seen, features, modality: replace(belief, mean=belief.mean + features),
-        information=lambda belief: information(weights_of(belief)),
+        write=lambda belief, seen, features, modality: Belief(belief.mean + features, jnp.ones(3)),
+        information=information_of,
     )
 
 
 @pytest.mark.parametrize(
-    ("information", "cost", "looks_ahead"),
+    ("information", "cost", "looks_ahead", "unseen"),
     [
-        (lambda weights: -filtering.entropy(weights), 0.03, False),
+        (lambda weights: -filtering.entropy(weights), 0.03, False, None),
         # One look alone does not pay, several do.
-        (lambda weights: jnp.max(weights) ** 8, 0.02, True),
+        (lambda weights: jnp.max(weights) ** 8, 0.02, True, None),
+        # An unseen PoI is less well known than one whose looks left all classes open: it pays .5
+        # more to look there first.
+        (lambda weights: -filtering.entropy(weights), 0.03, False, -math.log(3) - 0.5),
     ],
-    ids=["entropy", "convex"],
+    ids=["entropy", "convex", "unseen"],
 )
-def test_the_policy_by_the_table_returns_the_tables_value(information, cost, looks_ahead):
+def test_the_policy_by_the_table_returns_the_tables_value(information, cost, looks_ahead, unseen):
     config = MdpConfig(reward="nats", look_cost=cost, max_steps=200, partly_seen_starts=False)
-    mdp = exact_mdp(information, config)
+    mdp = exact_mdp(information, config, unseen)
 
     @jax.jit
     def play(keys):
-        found = optimum.solve(CALIBRATED, information, config, 100)
+        found = optimum.solve(CALIBRATED, information, config, 100, unseen=unseen)
 
         def returns(key):
             start_key, play_key = jax.random.split(key)
             start = belief_mdp.reset(start_key, mdp, seen=jnp.zeros((2, 1), bool))
-            return [
-                episodes.run_episode(
-                    play_key, mdp, policies.by_posterior(table, weights_of), start, 0
-                )[0]
-                for table in (found.total, found.gain)
-            ]
+            compared = (
+                policies.by_posterior(found.total, found.first_total, weights_of),
+                policies.by_posterior(found.gain, found.first_gain, weights_of),
+            )
+            return [episodes.run_episode(play_key, mdp, each, start, 0)[0] for each in compared]
 
-        unseen = jnp.full(3, 1 / 3)
-        expected = [optimum.interpolate(table, unseen) for table in (found.total, found.gain)]
-        return expected, jax.vmap(returns)(keys)
+        return (found.first_total, found.first_gain), jax.vmap(returns)(keys)
 
     number = 4000
     (total, gain), (optimal, short_sighted) = play(jax.random.split(KEY, number))
@@ -228,12 +250,18 @@ def test_the_policy_by_the_table_returns_the_tables_value(information, cost, loo
 
 def test_the_policy_takes_the_look_of_the_highest_value_or_else_nop():
     mdp = exact_mdp(jnp.max, MdpConfig(partly_seen_starts=False))
-    act = policies.by_posterior(jnp.array(optimum.lattice(3)[:, 0]) - 0.5, weights_of)
-    state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1]), jnp.zeros((2, 1), bool))
+    table = jnp.array(optimum.lattice(3)[:, 0]) - 0.5
+    act = policies.by_posterior(table, jnp.float32(0.15), weights_of)
+    state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1]), jnp.ones((2, 1), bool))
     for first_classes, action in (((0.6, 0.7), 1), ((0.8, 0.7), 0), ((0.4, 0.49), 2)):
         means = jnp.log(jnp.array([[p, (1 - p) / 2, (1 - p) / 2] for p in first_classes]))
         belief = replace(state.belief, mean=means)
         assert act(KEY, replace(state, belief=belief)) == action
+    # The first look at PoI 1 has a value of .15, and one at PoI 0 of .1 or .2.
+    seen = jnp.array([[True], [False]])
+    for known, action in (((0.6, 0.2, 0.2), 1), ((0.7, 0.15, 0.15), 0)):
+        belief = replace(state.belief, mean=jnp.log(jnp.array([known, (1.0, 0.0, 0.0)])))
+        assert act(KEY, replace(state, belief=belief, seen=seen)) == action
 
 
 LIKELIHOODS = jnp.zeros((3, 2, 3))

@@ -13,6 +13,10 @@ def test_the_interval_is_that_of_student():
     np.testing.assert_allclose(high, [2 + 12.706, 2], atol=1e-3)
 
 
+def test_a_single_value_has_no_interval():
+    assert compare.described(np.array([3.0])) == {"mean": 3.0, "low": None, "high": None}
+
+
 def test_differences_are_taken_arena_by_arena():
     # Of two PoIs: half, both and both right, against none, half and half.
     found = {
@@ -35,8 +39,10 @@ def test_differences_are_taken_arena_by_arena():
     assert differences["time_s"]["mean"] == -2
 
 
-def block(accuracy, looks, seconds):
-    return {"accuracy": accuracy, "observations_per_poi": looks, "time_s": seconds}
+def block(accuracy, looks, seconds, **more):
+    # Long missions lift the mean above the median.
+    times = {"time_s": seconds, "mean_time_s": seconds + 10}
+    return {"accuracy": accuracy, "observations_per_poi": looks, **times, "episodes": 8, **more}
 
 
 NAIVE = {
@@ -57,7 +63,8 @@ NAIVE = {
 )
 def test_naive_exploration_of_the_same_accuracy_is_interpolated(accuracy, looks, seconds):
     found = compare.of_naive({**NAIVE, "latent": block(accuracy, 1.5, 30.0)}, "latent")
-    expected = {"observations_per_poi": 1.5 / looks, "time_s": 30 / seconds}
+    times = {"time_s": 30 / seconds, "mean_time_s": 40 / (seconds + 10)}
+    expected = {"observations_per_poi": 1.5 / looks, **times}
     assert found == pytest.approx(expected)
 
 
@@ -75,3 +82,22 @@ def test_there_is_nothing_to_compare_with_below_one_look_or_without_all_three():
     two = {name: NAIVE[name] for name in ("naive", "naive_2")}
     assert compare.of_naive({**two, "latent": block(0.97, 1.0, 9.0)}, "latent") is None
     assert compare.of_naive(NAIVE, "latent") is None
+
+
+def test_only_cases_in_the_same_arenas_are_compared():
+    latent = block(0.97, 1.5, 30.0)
+    of_latent = {"accuracy": {"mean": -0.01, "low": -0.02, "high": 0.0}}
+    naive = {name: {**each, "intervals": of_latent} for name, each in NAIVE.items()}
+    found = compare.compared({**naive, "latent": latent})
+    assert found["latent"]["of_naive"] == compare.of_naive({**NAIVE, "latent": latent}, "latent")
+    assert all(found[name]["intervals"] == of_latent for name in NAIVE)
+    # Once the latent policy has played in other arenas, or in fewer of them, nothing is left.
+    for change in ({"seed": 3}, {"episodes": 7}):
+        after = compare.compared({**found, "latent": {**found["latent"], **change}})
+        assert after == {**NAIVE_ALONE, "latent": {**latent, **change}}
+    # Other arenas of all of them are the same for all.
+    elsewhere = {name: {**each, "seed": 3} for name, each in found.items()}
+    assert compare.compared(elsewhere) == elsewhere
+
+
+NAIVE_ALONE = compare.compared(NAIVE)

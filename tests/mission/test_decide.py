@@ -140,7 +140,9 @@ def test_naive_policies_look_once_twice_and_three_times(chosen, times, targets):
 def look_values(gains, totals):
     """Values of looks that are linear in the classes' probabilities, and so exact in a table."""
     points = jnp.array(optimum.lattice(3), jnp.float32)
-    return LookValues(points @ jnp.array(gains), points @ jnp.array(totals))
+    # No look at an unseen PoI pays.
+    nothing = jnp.float32(-5.0)
+    return LookValues(points @ jnp.array(gains), points @ jnp.array(totals), nothing, nothing)
 
 
 @pytest.fixture(scope="module")
@@ -153,16 +155,17 @@ def by_tables(decides, models, arena_of):
     belief = jax.vmap(lambda weights: filtering.mixture(SURE, weights))(shares)
     posterior = jnp.log(jnp.roll(shares, 1, axis=1) + 1e-6)
 
-    def choose(policy, gains, totals):
+    def choose(policy, gains, totals, seen=(1, 1, 1), **first):
         # The other robot's looks would be worth the most at what this one values least.
-        of_each = look_values(gains, totals), look_values([-9 * g for g in gains], [9.0, 0.0, 0.0])
+        own = replace(look_values(gains, totals), **first)
+        of_each = own, look_values([-9 * g for g in gains], [9.0, 0.0, 0.0])
         trained = replace(
             models,
             class_beliefs=SURE,
             moments_inverse=filtering.moments_inverse(SURE),
             look_values=of_each,
         )
-        state = arena_of(POSITIONS, POSES, policy=POLICIES.index(policy))
+        state = seen_by(seen)(arena_of(POSITIONS, POSES, policy=POLICIES.index(policy)))
         return decides(trained, replace(state, belief=belief, log_posterior=posterior))
 
     return choose
@@ -189,6 +192,16 @@ def test_policies_with_tables_take_the_look_of_the_highest_value(by_tables, poli
 def test_policies_with_tables_end_where_no_look_has_a_value_above_0(by_tables, policy):
     assert by_tables(policy, [-0.1, -1.0, 0.0], [-0.1, -1.0, 0.0]).robots.phase[0] == ENDED
     assert by_tables(policy, [-0.1, -1.0, 0.1], [-0.1, -1.0, 0.1]).robots.phase[0] == DRIVING
+
+
+@pytest.mark.parametrize("policy", ["greedy", "bayes", "optimal"])
+def test_a_poi_that_nobody_has_seen_has_the_value_of_a_first_look(by_tables, policy):
+    first = {"first_total" if policy == "optimal" else "first_gain": jnp.float32(2.0)}
+    values = [1.0, -1.0, 0.5], [-1.0, 0.2, 1.0]
+    assert by_tables(policy, *values, seen=(1, 1, 0), **first).robots.target[0] == 2
+    assert by_tables(policy, *values, seen=(0, 1, 1), **first).robots.target[0] == 0
+    first = {name: jnp.float32(-2.0) for name in first}
+    assert by_tables(policy, *values, seen=(0, 0, 0), **first).robots.phase[0] == ENDED
 
 
 def test_random_takes_every_poi_and_nop_equally_often(team, models, arena_of):

@@ -112,6 +112,7 @@ def test_summary_of_a_case_as_worked_by_hand():
         "accuracy": pytest.approx(5 / 6),
         "observations_per_poi": 1.5,
         "time_s": 15.0,
+        "mean_time_s": 15.0,
         "collisions": 2,
         "goals_reached_fraction": 0.9,
         "information": 5.5,

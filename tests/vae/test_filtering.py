@@ -23,7 +23,7 @@ UNSEEN = fusion.unseen(MODEL, 20.0)
 
 def exact():
     """A filter without hidden layers whose evidence is the logarithm of the label's feature."""
-    params = filtering.init(jax.random.key(0), MODEL, CLASSES, FilterConfig(hidden=(1,)))
+    params = filtering.init(jax.random.key(0), MODEL, CLASSES, UNSEEN, FilterConfig(hidden=(1,)))
     of_class = {
         name: {"params": {"Dense_0": {"kernel": jnp.eye(2)[:, labels], "bias": jnp.zeros(3)}}}
         for name, labels in zip(MODEL.modalities, LABELS, strict=True)
@@ -57,8 +57,16 @@ def test_a_mixture_has_the_moments_by_hand():
     np.testing.assert_allclose(found.std, [np.sqrt(0.16 + 1.0), 0.4], atol=1e-6)
 
 
-def test_an_unseen_poi_may_be_of_any_class():
-    np.testing.assert_allclose(filtering.weights(exact(), UNSEEN), 1 / 3, atol=1e-6)
+@pytest.mark.parametrize("variance", [20.0, 1.0, 0.01])
+def test_an_unseen_poi_may_be_of_any_class_however_wide_its_entry_is(variance):
+    # Of the classes in the first dimension, 1.2^2 + .4^2 = 1.6 is the largest mean square.
+    unseen = fusion.unseen(MODEL, variance)
+    params = {**exact(), "unseen": unseen}
+    np.testing.assert_allclose(filtering.weights(params, unseen), 1 / 3, atol=1e-6)
+    rounded = Belief(unseen.mean, jnp.nextafter(unseen.std, 0.0))
+    np.testing.assert_allclose(filtering.weights(params, rounded), 1 / 3, atol=1e-6)
+    found = filtering.update(params, MODEL, unseen, jnp.array([0.8, 0.2]), 0)
+    np.testing.assert_allclose(filtering.weights(params, found), [1 / 9, 4 / 9, 4 / 9], atol=1e-5)
 
 
 def test_looks_by_hand():
@@ -94,7 +102,7 @@ def test_looks_come_to_the_same_in_any_order():
 
 def test_a_single_dimension_holds_three_classes():
     line = Belief(jnp.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]), jnp.full((3, 2), 0.3))
-    params = {"classes": line, "inverse": filtering.moments_inverse(line)}
+    params = {"inverse": filtering.moments_inverse(line), "unseen": UNSEEN}
     shares = jnp.array([0.2, 0.3, 0.5])
     found = filtering.weights(params, filtering.mixture(line, shares))
     np.testing.assert_allclose(found, shares, atol=1e-4)
@@ -103,7 +111,7 @@ def test_a_single_dimension_holds_three_classes():
 @pytest.fixture(scope="module")
 def trained():
     config = FilterConfig(hidden=(16,), steps=600, batch=128)
-    params = filtering.init(jax.random.key(1), MODEL, CLASSES, config)
+    params = filtering.init(jax.random.key(1), MODEL, CLASSES, UNSEEN, config)
     looks = bank(jax.random.key(2), 4000)
 
     @jax.jit
@@ -158,7 +166,7 @@ def test_training_goes_on_where_it_stopped(trained):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"modality": 2}, "modality = 2: must be an index of"),
+        ({"modality": 2}, "modality = 2: must be a whole number from 0 to 1"),
         ({"features": jnp.array([0.5, 1.5])}, "features = 1.5: must be probabilities, within"),
         ({"features": jnp.array([0.5, jnp.nan])}, "features = nan: must be probabilities"),
         ({"features": jnp.array([0.5, 0.6])}, "sum of features = 1.1"),

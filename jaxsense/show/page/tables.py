@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
+from jaxsense.mission.compare import arenas
 from jaxsense.show import metrics
 from jaxsense.show.metrics import Metric, cases, mean, text
 
@@ -115,9 +116,13 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
     return [*alone, "together"], rows
 
 
-def missions(summary: Summary) -> tuple[list[str], list[Row]]:
-    """Missions: policies and failures as columns, and their metrics as rows."""
+def missions(summary: Summary) -> tuple[str, list[str], list[Row]]:
+    """Missions: a caption, policies and failures as columns, and their metrics as rows."""
     blocks = cases(summary["mission"])
+    played = [arenas(block) for block in blocks.values()]
+    caption = "All robots together, in the same arenas for each policy"
+    if any(each != played[0] for each in played):
+        caption = "All robots together; policies of equal seed and missions had the same arenas"
     # Some metrics exist only where a robot is alone, or beside other policies.
     every = blocks.values()
     measured = [m for m in metrics.MISSIONS if any(m.block in block for block in every)]
@@ -126,7 +131,7 @@ def missions(summary: Summary) -> tuple[list[str], list[Row]]:
     for reason in sorted(reasons):
         numbers = [text(block["ended"].get(reason, 0), 1) for block in blocks.values()]
         rows.append(Row(reason, numbers, "", "Missions that ended early for this reason."))
-    return [name.replace("_", " ") for name in blocks], rows
+    return caption, [name.replace("_", " ") for name in blocks], rows
 
 
 @dataclasses.dataclass(frozen=True)

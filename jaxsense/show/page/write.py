@@ -98,7 +98,7 @@ def _render(run: Path, config: Config, summary: dict[str, Any], template: str) -
         undefined=jinja2.StrictUndefined,
     )
     columns, table = tables.unambiguous(summary, list(config.arena.classes))
-    mission_columns, missions = tables.missions(summary)
+    mission_caption, mission_columns, missions = tables.missions(summary)
     return environment.get_template(template).render(
         run=run,
         argument=lambda path: shlex.quote(str(path)),
@@ -115,6 +115,7 @@ def _render(run: Path, config: Config, summary: dict[str, Any], template: str) -
         latent_space=tables.latent_space(summary),
         table_columns=columns,
         table=table,
+        mission_caption=mission_caption,
         mission_columns=mission_columns,
         missions=missions,
         stages=tables.timing(summary),
