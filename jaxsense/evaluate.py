@@ -74,14 +74,14 @@ def main(argv: list[str] | None = None) -> None:
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
         workers = devices.start(arguments.devices)
-        config, models = rundir.load(arguments.run, arguments.trust)
-        config = _elsewhere(arguments, config)
+        trained, models = rundir.load(arguments.run, arguments.trust)
+        config = _elsewhere(arguments, trained)
         played = _cases(arguments, config)
         path = arguments.run / "summary.json"
         # If these files cannot be written, fail now rather than after minutes of work.
         with files.locked(arguments.run, waits=True):
             summary = rundir.read_summary(arguments.run)
-            page.write(arguments.run, config, summary)
+            page.write(arguments.run, trained, summary)
             rundir.write_json(path, summary)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> None:
         compiling = compiler.monitor.seconds["mission"]["compile_s"]
     block = missions.summary(team, found)
     try:
-        written = _write(arguments, config, models.class_beliefs, block, found.recording)
+        written = _write(arguments, (trained, config), models.class_beliefs, block, found.recording)
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({cli.reason(error)})")
     rate = found.control_steps / seconds
@@ -121,30 +121,43 @@ def main(argv: list[str] | None = None) -> None:
 
 def _write(
     arguments: Arguments,
-    config: Config,
+    configs: tuple[Config, Config],
     class_beliefs: Belief,
     found: dict[str, Any],
     recording: missions.Recording,
 ) -> list[str]:
     """Writes the metrics into the run's summary and page, and the animation if requested.
 
+    Args:
+      arguments: of the program.
+      configs: the settings of the run, and of these missions.
+      class_beliefs: `[C, D]` beliefs of the classes.
+      found: the block of the missions.
+      recording: the first mission.
+
     Returns:
       Lines about where they are.
     """
     path, written = arguments.run / "summary.json", []
+    trained, config = configs
     if arguments.animate:
         name = next(iter(metrics.cases(found)))
-        film = arguments.run / f"mission-{name}-{arguments.seed}.svg"
+        place = "" if config == trained else f"-{_name(config)}"
+        film = arguments.run / f"mission-{name}-{arguments.seed}{place}.svg"
         title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
         animation.write(film, config, recording, class_beliefs, title)
         written.append(f"The first mission of {name} is in {film}.")
     # Another evaluation may have written metrics since this one began.
     with files.locked(arguments.run, waits=True):
         summary = rundir.read_summary(arguments.run)
-        summary["mission"] = _merge(summary["mission"], found, arguments)
+        if config == trained:
+            summary["mission"] = _merge(summary["mission"], found, arguments)
+        else:
+            _add_elsewhere(summary, config, found, arguments)
         rundir.write_json(path, summary)
         plots.write_missions(arguments.run, summary)
-        report = page.write(arguments.run, config, summary)
+        plots.write_teams(arguments.run, trained, summary)
+        report = page.write(arguments.run, trained, summary)
     return [*written, f"The metrics are in {path}, and with all others in {report}."]
 
 
@@ -154,6 +167,29 @@ def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) 
     new = {name: {**block, "seed": arguments.seed} for name, block in cases}
     blocks = compare.compared({**metrics.cases(before), **new})
     return {**before, **found, **blocks}
+
+
+def _add_elsewhere(
+    summary: dict[str, Any], config: Config, found: dict[str, Any], arguments: Arguments
+) -> None:
+    """Adds missions in another arena, or with other robots, to those that are there."""
+    places = summary.setdefault("elsewhere", {})
+    place = places.setdefault(
+        _name(config),
+        {
+            "num_pois": config.arena.num_pois,
+            "side": config.arena.side,
+            "robots": list(config.carried),
+            "mission": {},
+        },
+    )
+    place["mission"] = _merge(place["mission"], found, arguments)
+
+
+def _name(config: Config) -> str:
+    """Name of an arena and a team, also for files."""
+    robots = "-".join(config.carried)
+    return f"{config.arena.num_pois}-points-{config.arena.side:g}-m-{robots}"
 
 
 def _elsewhere(arguments: Arguments, config: Config) -> Config:

@@ -1,6 +1,7 @@
 """The plots of a run: the paper's Fig. 4 and Fig. 5, and the sensors' scanlines."""
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from jaxsense.config import POLICIES, Config
 from jaxsense.mission.compare import interval
@@ -56,6 +57,12 @@ def write_seeds(
 def write_missions(path: Path, summary: dict[str, Any]) -> None:
     """Writes `policies.png` of one run or several seeds into a directory."""
     _write(path / "policies.png", missions(summary["mission"]))
+
+
+def write_teams(path: Path, config: Config, summary: dict[str, Any]) -> None:
+    """Writes `teams.png` of a run that has played in other arenas or with other robots."""
+    if "elsewhere" in summary:
+        _write(path / "teams.png", teams(config, summary))
 
 
 def _write(path: Path, figure: Figure) -> None:
@@ -296,6 +303,49 @@ def missions(block: dict[str, Any]) -> Figure:
     axes[0].yaxis.set_minor_formatter(NullFormatter())
     axes[1].legend(loc="upper left")
     return figure
+
+
+def teams(config: Config, summary: dict[str, Any]) -> Figure:
+    """Median time of missions, of every policy, against numbers of PoIs and of robots.
+
+    Args:
+      config: all settings.
+      summary: of the run, with the block `elsewhere`.
+    """
+    own = {
+        "num_pois": config.arena.num_pois,
+        "robots": list(config.carried),
+        "mission": summary["mission"],
+    }
+    places = [own, *summary["elsewhere"].values()]
+    with_team = [place for place in places if place["robots"] == own["robots"]]
+    # Of the numbers of PoIs, the one that most teams have played with.
+    numbers = [place["num_pois"] for place in places]
+    number = max(numbers, key=numbers.count)
+    with_number = [place for place in places if place["num_pois"] == number]
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _times(left, with_team, lambda place: place["num_pois"])
+    left.set(xlabel="points of interest", title=f"robots: {', '.join(own['robots'])}")
+    _times(right, with_number, lambda place: len(place["robots"]))
+    right.set(xlabel="robots", title=f"{number} points of interest")
+    left.legend()
+    return figure
+
+
+def _times(ax: Any, places: list[dict[str, Any]], number: Callable[[dict[str, Any]], int]) -> None:
+    """A line for each policy: the time of missions against a number of each place."""
+    for i, name in enumerate(POLICIES):
+        of_policy = [
+            (number(place), metrics.mean(place["mission"][name]["time_s"]))
+            for place in sorted(places, key=number)
+            if name in place["mission"]
+        ]
+        if of_policy:
+            ax.plot(*zip(*of_policy, strict=True), "oDs^"[i % 4] + "-", color=f"C{i}", label=name)
+    ax.set(ylabel="median time [s]", ylim=(0, None))
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.grid(alpha=0.3)
 
 
 def _wrong(case: dict[str, Any]) -> float:

@@ -38,6 +38,10 @@ PLOTS = {
         "exploration with one, two and three looks at each point, joined by a line. A policy "
         "without any wrong point stands at 0.01%.",
     ),
+    "teams": (
+        "Median time of missions against numbers of points and of robots, for each policy",
+        "Missions of the run's policies in other arenas and with other robots.",
+    ),
     "calibration": (
         "Share of right labels against the detectors' confidence, and the likelihood of the true "
         "class in the map against the number of looks, beside exact Bayes",
