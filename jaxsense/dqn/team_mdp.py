@@ -226,6 +226,22 @@ def reset(key: Key, mdp: TeamMdp) -> TeamState:
     return TeamState(state, team, works, first, jnp.float32(0.0))
 
 
+def _look(
+    key: Key, mdp: MapMdp, state: MapState, action: jax.Array, modality: jax.Array
+) -> tuple[MapState, jax.Array]:
+    """The map after a look or NOP, and the `[]` reward."""
+
+    def look(m: int) -> tuple[MapState, jax.Array]:
+        after, outcome = belief_mdp.step(key, mdp, state, action, m)
+        return after, outcome.reward
+
+    # Every sensor looks, and one look counts: under `vmap` a switch takes many times as long.
+    found = look(0)
+    for m in range(1, mdp.num_modalities):
+        found = jax.tree.map(lambda x, y: jnp.where(modality == m, x, y), look(m), found)  # noqa: B023
+    return found
+
+
 def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[TeamState, Outcome]:
     """Lets one robot choose; if no other has to, time passes until the next look.
 
@@ -258,7 +274,7 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
     seconds = jnp.where(passes, times[looker], 0.0)
     moved = jax.vmap(lambda pose, goal: move(travel, pose, goal, seconds))(team.poses, goals)
     look = jnp.where(passes, target[looker], num_pois)
-    after, outcome = belief_mdp.step(key, mdp.map, state.map, look, team.modality[looker])
+    after, reward = _look(key, mdp.map, state.map, look, team.modality[looker])
 
     following = jnp.argmin(jnp.where(asks, (robots - state.agent - 1) % len(robots), len(robots)))
     team = dataclasses.replace(
@@ -275,7 +291,7 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
         seconds=state.seconds + seconds,
     )
     return state, Outcome(
-        reward=outcome.reward,
+        reward=reward,
         terminated=is_over,
         truncated=~is_over & (after.steps >= mdp.config.max_steps),
         seconds=seconds,
