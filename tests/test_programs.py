@@ -172,7 +172,10 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        (["--preset", "best"], "preset = 'best': must be one of default, paper, noisy, smoke"),
+        (
+            ["--preset", "best"],
+            "preset = 'best': must be one of default, paper, noisy, team, smoke",
+        ),
         (["--taste", "sweet"], "train: option = '--taste': must be one of the program"),
         (["--jmvae.hiden", "3"], "of the program; perhaps --jmvae.hidden (--help"),
         (["--arena.side", "x"], "arena.side = 'x': must be a finite number"),
@@ -237,7 +240,7 @@ def test_every_setting_has_a_sentence_of_help():
 
 
 def test_presets_are_configurations():
-    assert set(PRESETS) == {"default", "paper", "noisy", "smoke"}
+    assert set(PRESETS) == {"default", "paper", "noisy", "team", "smoke"}
     assert all(isinstance(preset, Config) for preset in PRESETS.values())
     assert PRESETS["default"].dqn.observe == "live"
     assert PRESETS["paper"].dqn.observe == "bank"
@@ -346,7 +349,7 @@ def test_evaluate_prints_the_comparison(evaluated):
         "accuracy",
         "goals",
         "control steps/s",
-        "24 missions",
+        "33 missions",  # three of each of eleven policies
     ):
         assert words in printed
 
