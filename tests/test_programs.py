@@ -230,8 +230,12 @@ def test_every_setting_has_a_sentence_of_help():
     import dataclasses
     import inspect
 
-    sections = [f.type for f in dataclasses.fields(Config) if dataclasses.is_dataclass(f.type)]
-    assert sections
+    def within(section):
+        parts = [f.type for f in dataclasses.fields(section) if dataclasses.is_dataclass(f.type)]
+        return [*parts, *(inner for part in parts for inner in within(part))]
+
+    sections = within(Config)
+    assert {"DqnConfig", "TravelConfig"} <= {section.__name__ for section in sections}
     for section in sections:
         (node,) = ast.parse(inspect.getsource(section)).body
         for field, following in zip(node.body, node.body[1:], strict=False):
@@ -305,7 +309,7 @@ def test_an_evaluation_waits_for_another_one_that_writes(evaluated, tmp_path):
     arguments = evaluate.Arguments(path, seed=7)
 
     def write():
-        evaluate._write(arguments, config, models.class_beliefs, found, None)
+        evaluate._write(arguments, (config, config), models.class_beliefs, found, None)
 
     with ThreadPoolExecutor(1) as executor:
         with files.locked(path, waits=False):

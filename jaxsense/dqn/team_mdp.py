@@ -248,7 +248,7 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
     is_agent = robots == state.agent
     target = jnp.where(is_agent, action, team.target)
     works = team.works & ~(is_agent & (action == num_pois))
-    asks = state.asks & ~is_agent & works
+    asks = state.asks & ~is_agent
     is_over, others_ask = ~jnp.any(works), jnp.any(asks)
     passes = ~others_ask & ~is_over
 
