@@ -40,8 +40,8 @@ class Arguments:
     seed: int = 0
     """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
     policy: str = "all"
-    """`latent`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3` or `random`; `policies`
-    for all of these; `ROBOT_alone`, `ROBOT_stops` or `ROBOT_blind`, for example
+    """`latent`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3`, `random`, `nearest`,
+    `auction` or `rollout`; `policies` for all; `ROBOT_alone`, `ROBOT_stops` or `ROBOT_blind`, as in
     `camera_alone`, for the latent policy where that robot is alone, stops or goes blind after 6 s;
     or `all`."""
     num_pois: Annotated[int | None, tyro.conf.arg(name="arena.num-pois")] = None
@@ -187,8 +187,9 @@ def _add_elsewhere(
 
 
 def _name(config: Config) -> str:
-    """Name of an arena and a team, also for files."""
-    robots = "-".join(config.carried)
+    """Name of an arena and a team, also for files, whose names are short."""
+    numbers = {modality: config.carried.count(modality) for modality in config.carried}
+    robots = "-".join(f"{number}-{modality}" for modality, number in numbers.items())
     return f"{config.arena.num_pois}-points-{config.arena.side:g}-m-{robots}"
 
 
@@ -197,8 +198,19 @@ def _elsewhere(arguments: Arguments, config: Config) -> Config:
     sizes = {"num_pois": arguments.num_pois, "side": arguments.side}
     changed = {name: value for name, value in sizes.items() if value is not None}
     arena = dataclasses.replace(config.arena, **changed)
-    robots = config.robots if arguments.robots is None else arguments.robots
-    return dataclasses.replace(config, arena=arena, robots=robots)
+    # The Q-network of one agent has an input for each PoI.
+    if config.dqn.task == "map" and arena.num_pois != config.arena.num_pois:
+        number = config.arena.num_pois
+        reason = (
+            f"the policies of this run are for {number} points; must be {number}, or a run with"
+        )
+        raise ConfigError("arena.num_pois", arena.num_pois, f"{reason} dqn.task = team")
+    is_own = arguments.robots in (None, config.carried)
+    robots = config.robots if is_own else arguments.robots
+    # No mission starts with a map that is partly seen, which limits the number of PoIs.
+    mdp = dataclasses.replace(config.mdp, partly_seen_starts=False)
+    mdp = config.mdp if arena == config.arena else mdp
+    return dataclasses.replace(config, arena=arena, robots=robots, mdp=mdp)
 
 
 def _cases(arguments: Arguments, config: Config) -> dict[str, mission.Case]:

@@ -92,6 +92,8 @@ def results(models, file, tmp_path_factory):
         for key, aval in function.inputs.items():
             drawn = rng.uniform(0.1, 1.0, (BATCH, *aval.shape)) * (0.3 if key == "bearing" else 1)
             drawn = drawn > 0.55 if aval.dtype == bool else drawn
+            # Features are probabilities.
+            drawn = drawn / drawn.sum(axis=-1, keepdims=True) if key == "features" else drawn
             inputs[f"{name}/{key}"] = drawn.astype(aval.dtype)
     folder = tmp_path_factory.mktemp("results")
     np.savez(folder / "in.npz", **inputs)

@@ -18,6 +18,9 @@ from jaxsense.config import (
     ConfigError,
     SensorConfig,
     Shape,
+    TeamConfig,
+    TravelConfig,
+    as_plain,
     from_plain,
 )
 
@@ -54,6 +57,30 @@ def test_settings_survive_json():
         stored = json.loads(json.dumps(dataclasses.asdict(config)))
         assert from_plain(stored) == config
     assert from_plain({"arena": {"side": 4.0}}).arena == ArenaConfig(side=4.0)
+
+
+def test_a_team_of_robots_survives_json():
+    team = TeamConfig(travel=TravelConfig(speed=0.5), num_pois=(2, 5))
+    for robots in (None, ("camera", "lidar", "camera")):
+        config = Config(robots=robots, team=team)
+        assert from_plain(json.loads(json.dumps(as_plain(config)))) == config
+    # What is not stored comes from the settings to start from, also within a section.
+    base = Config(team=team)
+    found = from_plain({"team": {"travel": {"turn_rate": 2.0}}}, base)
+    travel = dataclasses.replace(team.travel, turn_rate=2.0)
+    assert found == Config(team=dataclasses.replace(team, travel=travel))
+
+
+def test_robots_carry_the_sensors_of_the_settings():
+    config = Config(robots=("camera", "lidar", "camera"))
+    assert config.carried == ("camera", "lidar", "camera")
+    assert config.robot_names == ("camera_1", "lidar", "camera_2")
+    assert config.modality_of_robot == (0, 1, 0)
+    alone = Config(robots=("lidar",))
+    assert (alone.robot_names, alone.modality_of_robot) == (("lidar",), (1,))
+    # By default one for each modality.
+    assert Config().carried == Config().robot_names == ("camera", "lidar")
+    assert Config().modality_of_robot == (0, 1)
 
 
 def test_changing_the_dictionaries_of_one_leaves_the_others():

@@ -172,7 +172,10 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        (["--preset", "best"], "preset = 'best': must be one of default, paper, noisy, smoke"),
+        (
+            ["--preset", "best"],
+            "preset = 'best': must be one of default, paper, noisy, team, smoke",
+        ),
         (["--taste", "sweet"], "train: option = '--taste': must be one of the program"),
         (["--jmvae.hiden", "3"], "of the program; perhaps --jmvae.hidden (--help"),
         (["--arena.side", "x"], "arena.side = 'x': must be a finite number"),
@@ -227,8 +230,12 @@ def test_every_setting_has_a_sentence_of_help():
     import dataclasses
     import inspect
 
-    sections = [f.type for f in dataclasses.fields(Config) if dataclasses.is_dataclass(f.type)]
-    assert sections
+    def within(section):
+        parts = [f.type for f in dataclasses.fields(section) if dataclasses.is_dataclass(f.type)]
+        return [*parts, *(inner for part in parts for inner in within(part))]
+
+    sections = within(Config)
+    assert {"DqnConfig", "TravelConfig"} <= {section.__name__ for section in sections}
     for section in sections:
         (node,) = ast.parse(inspect.getsource(section)).body
         for field, following in zip(node.body, node.body[1:], strict=False):
@@ -237,7 +244,7 @@ def test_every_setting_has_a_sentence_of_help():
 
 
 def test_presets_are_configurations():
-    assert set(PRESETS) == {"default", "paper", "noisy", "smoke"}
+    assert set(PRESETS) == {"default", "paper", "noisy", "team", "smoke"}
     assert all(isinstance(preset, Config) for preset in PRESETS.values())
     assert PRESETS["default"].dqn.observe == "live"
     assert PRESETS["paper"].dqn.observe == "bank"
@@ -302,7 +309,7 @@ def test_an_evaluation_waits_for_another_one_that_writes(evaluated, tmp_path):
     arguments = evaluate.Arguments(path, seed=7)
 
     def write():
-        evaluate._write(arguments, config, models.class_beliefs, found, None)
+        evaluate._write(arguments, (config, config), models.class_beliefs, found, None)
 
     with ThreadPoolExecutor(1) as executor:
         with files.locked(path, waits=False):
@@ -346,7 +353,7 @@ def test_evaluate_prints_the_comparison(evaluated):
         "accuracy",
         "goals",
         "control steps/s",
-        "24 missions",
+        "33 missions",  # three of each of eleven policies
     ):
         assert words in printed
 

@@ -169,7 +169,10 @@ def test_a_config_reproduces_its_run(smoke_run, cache, tmp_path, capsys):
         ("[1]", "must hold an object"),
         ('{"colour": 1}', "colour = 1: is no field of a run's config.json"),
         ('{"seed": 1.5}', "seed = 1.5: must be a whole number"),
-        ('{"preset": "best"}', "preset = 'best': must be one of default, paper, noisy, smoke"),
+        (
+            '{"preset": "best"}',
+            "preset = 'best': must be one of default, paper, noisy, team, smoke",
+        ),
         ('{"config": {"dqn": {"epoch": 3}}}', "epoch = 3: is no setting; perhaps dqn.epochs"),
         ('{"config": {"dqn": {"epochs": "many"}}}', "dqn.epochs = 'many': must be a whole number"),
         ('{"config": {"jmvae": {"beta": -1}}}', "jmvae.beta = -1.0: must be a number greater"),

@@ -6,6 +6,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 _MOST_SHOWN = 200  # characters of a value
 _LEAST, _MOST = 1e-30, 1e30  # a product of two still fits float32
+_WITHIN = {"travel": "team."}  # sections that are part of another
 
 
 class ConfigError(ValueError):
@@ -21,7 +22,8 @@ def require(condition: bool, section: object, field: str, expected: str) -> None
     if not condition:
         # All settings together, and the options of a program, have no name before their fields.
         name = type(section).__name__.removesuffix("Config").removesuffix("Arguments").lower()
-        raise ConfigError(f"{name}.{field}".lstrip("."), getattr(section, field), expected)
+        place = f"{_WITHIN.get(name, '')}{name}.{field}".lstrip(".")
+        raise ConfigError(place, getattr(section, field), expected)
 
 
 def require_types(section: Any, bits: int = 31) -> None:

@@ -178,6 +178,7 @@ class TeamConfig:
     """The map MDP in which a team learns with `dqn.task` = team: with places, robots and time."""
 
     travel: TravelConfig = TravelConfig()
+    """How long a robot takes to look at a point."""
     num_pois: tuple[int, int] = (3, 8)
     """Fewest and most points of interest in an episode."""
     robots_each: int = 2
@@ -199,6 +200,7 @@ class TeamConfig:
         fewest, most = self.num_pois
         expected = "must be a number greater than 0 and one that is not below it"
         require(1 <= fewest <= most, self, "num_pois", expected)
+        require(most <= 64, self, "num_pois", "must be numbers from 1 to 64")
         require_positive(self, "robots_each", "max_steps")
         require_at_most(self, robots_each=8, max_steps=100_000)
         require(0 < self.sides[0] <= self.sides[1] <= 100, self, "sides", "must be two lengths")

@@ -84,13 +84,13 @@ def _find(stored: dict[str, Any], name: str) -> Any:
     return next((value for value in found if value is not None), None)
 
 
-def _over(base: Config, stored: dict[str, Any]) -> dict[str, Any]:
-    """Plain settings of `base`, with the stored fields in place of its own."""
-    plain = as_plain(base)
-    for name, section in stored.items():
-        is_section = dataclasses.is_dataclass(getattr(base, name, None))
-        merges = is_section and isinstance(section, dict)
-        plain[name] = {**plain[name], **section} if merges else section
+def _over(base: Any, stored: dict[str, Any]) -> dict[str, Any]:
+    """Plain settings of `base`, with the stored fields in place of its own, in every section."""
+    plain = dataclasses.asdict(base)
+    for name, value in stored.items():
+        own = getattr(base, name, None)
+        merges = dataclasses.is_dataclass(own) and isinstance(value, dict)
+        plain[name] = _over(own, value) if merges else value
     return plain
 
 

@@ -86,7 +86,9 @@ class Config:
         self._check_learning()
         self._check_viewpoints()
         self._check_views()
-        looks = self.arena.num_pois * len(self.modalities)
+        is_team = self.dqn.task == "team"
+        num_pois = self.team.num_pois[1] if is_team else self.arena.num_pois
+        looks = num_pois * len(self.modalities)
         if self.mdp.partly_seen_starts and not 2 <= looks <= 30:
             raise ConfigError(
                 "mdp.partly_seen_starts",

@@ -121,9 +121,10 @@ def _of_team(mdp: TeamMdp, config: DqnConfig) -> Environment:
         chosen = state.action.at[state.now.agent].set(action)
         now, outcome = team_mdp.step(key, mdp, state.now, action)
         after = Remembered(now, seen, chosen)
-        # The way of the robot that has just looked is over. Without a look nothing is to be
-        # learned: an action that does not exist has value and target 0.
-        looked = now.seconds > state.now.seconds
+        # The way of the robot that has just looked is over. Without a look, the robot that chooses
+        # next has not chosen yet or has ended, and nothing is to be learned: an action that does
+        # not exist has value and target 0.
+        looked = chosen[now.agent] < mdp.map.num_pois
         transition = Transition(
             s_tm1=seen[now.agent],
             a_tm1=jnp.where(looked, chosen[now.agent], -1),

@@ -56,6 +56,7 @@ class TeamState:
       team: where everybody is.
       asks: `[R]` bool, robots that have yet to choose at this moment, as all do at first.
       agent: `[]` int32, the robot that chooses.
+      looked: `[R]` seconds that each robot's look has lasted already.
       seconds: `[]` since the start.
     """
 
@@ -63,6 +64,7 @@ class TeamState:
     team: Team
     asks: jax.Array
     agent: jax.Array
+    looked: jax.Array
     seconds: jax.Array
 
 
@@ -225,7 +227,7 @@ def reset(key: Key, mdp: TeamMdp, modality: jax.Array | None = None) -> TeamStat
         target=jnp.full(num_robots, num_pois),
     )
     first = jnp.argmax(works).astype(jnp.int32)
-    return TeamState(state, team, works, first, jnp.float32(0.0))
+    return TeamState(state, team, works, first, jnp.zeros(num_robots), jnp.float32(0.0))
 
 
 def _look(
@@ -277,7 +279,7 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
     is_agent = robots == state.agent
     target = jnp.where(is_agent, action, team.target)
     works = team.works & ~(is_agent & (action == num_pois))
-    asks = state.asks & ~is_agent & works
+    asks = state.asks & ~is_agent
     is_over, others_ask = ~jnp.any(works), jnp.any(asks)
     passes = ~others_ask & ~is_over
 
@@ -285,8 +287,12 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
     times = jax.vmap(lambda pose, goal: travel_seconds(travel, pose, goal[None])[0])(
         team.poses, goals
     )
-    looker = jnp.argmin(jnp.where(works, times, jnp.inf)).astype(jnp.int32)
-    seconds = jnp.where(passes, times[looker], 0.0)
+    left = times - state.looked
+    looker = jnp.argmin(jnp.where(works, left, jnp.inf)).astype(jnp.int32)
+    seconds = jnp.where(passes, left[looker], 0.0)
+    # A look that has begun goes on while another robot looks.
+    looked = jnp.maximum(state.looked + seconds - (times - travel.look_seconds), 0.0)
+    looked = jnp.minimum(looked, travel.look_seconds)
     moved = jax.vmap(lambda pose, goal: move(travel, pose, goal, seconds))(team.poses, goals)
     look = jnp.where(passes, target[looker], num_pois)
     after, reward = _look(key, mdp.map, state.map, look, team.modality[looker])
@@ -303,6 +309,7 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
         team=team,
         asks=jnp.where(passes, robots == looker, asks),
         agent=jnp.where(passes, looker, following.astype(jnp.int32)),
+        looked=jnp.where(passes, jnp.where(robots == looker, 0.0, looked), state.looked),
         seconds=state.seconds + seconds,
     )
     return state, Outcome(

@@ -18,13 +18,20 @@ SECTIONS = {
     if dataclasses.is_dataclass(getattr(SMOKE, field.name))
 }
 FIELDS = [(name, f) for name, section in SECTIONS.items() for f in dataclasses.fields(section)]
+# With those of a section within a section.
+PARTS = {**SECTIONS, "team.travel": SMOKE.team.travel}
 NUMBERS = [
     (name, field)
-    for name, section in SECTIONS.items()
+    for name, section in PARTS.items()
     for field, kind in get_type_hints(type(section)).items()
     if kind in (int, float)
 ]
-TRACED = {(name, f.name) for name, f in FIELDS if f.type not in (int, float)}
+TRACED = {
+    (name, f.name)
+    for name, section in PARTS.items()
+    for f in dataclasses.fields(section)
+    if f.type not in (int, float)
+}
 """Fields that may be arrays, whose numbers nobody checks."""
 
 

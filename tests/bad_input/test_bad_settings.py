@@ -15,6 +15,7 @@ from refusals import (
     INF,
     NAN,
     NUMBERS,
+    PARTS,
     SECTIONS,
     SMOKE,
     TRACED,
@@ -31,10 +32,10 @@ from jaxsense.config import COLOURS, SHAPES, ArenaConfig, as_plain, from_plain
 def test_no_number_may_be_such(value):
     """2**63 metres or steps and the like; where only real numbers are meant, 2**63 is one."""
     for section, name in NUMBERS:
-        if value == 2**63 and isinstance(getattr(SECTIONS[section], name), float):
+        if value == 2**63 and isinstance(getattr(PARTS[section], name), float):
             continue
         with pytest.raises(ConfigError) as error:
-            dataclasses.replace(SECTIONS[section], **{name: value})
+            dataclasses.replace(PARTS[section], **{name: value})
         check_message(str(error.value))
         assert str(error.value).startswith(f"{section}.{name} = "), error.value
 
@@ -47,7 +48,7 @@ def test_no_number_may_be_something_else(value):
         if isinstance(value, np.ndarray) and (section, name) in TRACED:
             continue
         with pytest.raises(ConfigError) as error:
-            dataclasses.replace(SECTIONS[section], **{name: value})
+            dataclasses.replace(PARTS[section], **{name: value})
         check_message(str(error.value))
         assert str(error.value).startswith(f"{section}.{name} = ")
 
@@ -58,17 +59,18 @@ ZERO = {
     "dqn.final_learning_rate", "dqn.epsilon_min", "navigation.inflation", "mission.equal_values",
     "mission.least_confidence", "lidar.range_noise_growth", "lidar.mixed_pixels", "lidar.dropout",
     "camera.exposure_error", "camera.colour_cast", "camera.low_light", "camera.shadow",
-    "detector.calibration", "mdp.look_cost",
+    "detector.calibration", "mdp.look_cost", "team.alone", "team.partly_seen", "team.second_cost",
+    "team.travel.view_distance",
 }  # fmt: skip
 
 
 def test_only_these_numbers_may_be_zero():
     for section, name in NUMBERS:
         if f"{section}.{name}" in ZERO:
-            dataclasses.replace(SECTIONS[section], **{name: 0})
+            dataclasses.replace(PARTS[section], **{name: 0})
         else:
             with pytest.raises(ConfigError, match=f"^{section}."):
-                dataclasses.replace(SECTIONS[section], **{name: 0})
+                dataclasses.replace(PARTS[section], **{name: 0})
 
 
 @settings(max_examples=150, deadline=None, derandomize=True, database=None)
@@ -189,6 +191,38 @@ CHANGES = [
     ({"mdp.reward": "nats"}, "mdp.reward = 'nats': needs jmvae.fusion = 'filter', not 'in_place'"),
     ({"mdp.look_cost": -0.1}, "mdp.look_cost = -0.1: must be a number that is not negative"),
     ({"mdp.look_cost": 1e7}, "mdp.look_cost = 10000000.0: must be at most 1,000,000"),
+    (
+        {
+            "dqn.task": "team",
+            "team.num_pois": (3, 16),
+            "mdp.partly_seen_starts": True,
+        },
+        "mdp.partly_seen_starts = True: needs 2 to 30 pairs of PoI and modality, not 32; must be",
+    ),
+    ({"dqn.task": "robots"}, "dqn.task = 'robots': must be one of map, team"),
+    ({"dqn.task": "team", "dqn.observe": "live"}, "dqn.observe = 'live': must be 'bank' with dqn"),
+    ({"evaluation.num_pois": (3,)}, "evaluation.num_pois = (3,): needs dqn.task = 'team'"),
+    ({"evaluation.num_pois": (0,)}, "evaluation.num_pois = (0,): must be numbers from 1 to 64"),
+    ({"evaluation.num_pois": (65,)}, "evaluation.num_pois = (65,): must be numbers from 1 to 64"),
+    ({"team.num_pois": (0, 3)}, "team.num_pois = (0, 3): must be a number greater than 0 and"),
+    ({"team.num_pois": (4, 3)}, "team.num_pois = (4, 3): must be a number greater than 0 and"),
+    ({"team.num_pois": (3, 65)}, "team.num_pois = (3, 65): must be numbers from 1 to 64"),
+    ({"team.num_pois": (3,)}, "team.num_pois = (3,): must be a tuple of 2 whole numbers"),
+    ({"team.robots_each": 9}, "team.robots_each = 9: must be at most 8"),
+    ({"team.sides": (0.0, 3.0)}, "team.sides = (0.0, 3.0): must be two lengths"),
+    ({"team.sides": (4.0, 3.0)}, "team.sides = (4.0, 3.0): must be two lengths"),
+    ({"team.sides": (4.0, 101.0)}, "team.sides = (4.0, 101.0): must be two lengths"),
+    ({"team.alone": 1.1}, "team.alone = 1.1: must be within 0 and 1"),
+    ({"team.partly_seen": 1.1}, "team.partly_seen = 1.1: must be within 0 and 1"),
+    ({"team.travel": None}, "team.travel = None: must be of type TravelConfig"),
+    ({"robots": ()}, "robots = (): must name 1 to 64 robots, each one of camera, lidar"),
+    ({"robots": ("camera",) * 65}, "must name 1 to 64 robots"),
+    ({"robots": ["camera"]}, "robots = ['camera']: must be a tuple of texts or None"),
+    ({"robots": ("camera", "sonar")}, "must each be one of modalities: camera, lidar"),
+    (
+        {"robots": ("camera", "camera"), "arena.classes": ("red cylinder", "red cube")},
+        "cannot tell any of red cylinder, red cube apart; must be robots that do",
+    ),
     ({"mdp.partly_seen_starts": 1}, "mdp.partly_seen_starts = 1: must be True or False"),
     ({"dqn.observe": "Live"}, "dqn.observe = 'Live': must be one of live, bank"),
     ({"dqn.observe": ("live",)}, "must be one of live, bank"),

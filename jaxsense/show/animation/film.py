@@ -70,7 +70,7 @@ def write(
             "aria-labelledby": f"{path.stem}-title",
         },
     )
-    robots = " and ".join(config.modalities)
+    robots = " and ".join(dict.fromkeys(config.carried))
     add(
         root,
         "title",

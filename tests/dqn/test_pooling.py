@@ -1,0 +1,94 @@
+"""The Q-network of a team: any number of PoIs, in any order."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import networks
+from jaxsense.dqn import pooling, team_mdp
+from jaxsense.dqn.pooling import PoolingNetwork
+
+FEATURES = team_mdp.num_features(2, 2)
+NETWORK = PoolingNetwork((6, 8), FEATURES)
+PARAMS = networks.init(jax.random.key(0), NETWORK, 3 * FEATURES)
+apply = jax.jit(lambda x: networks.apply(NETWORK, PARAMS, x.reshape(-1, *x.shape[2:])))
+
+
+def seen(number, seed=1):
+    """`[F, N]` of as many PoIs, all of which are present."""
+    return jax.random.normal(jax.random.key(seed), (FEATURES, number)).at[-3].set(1.0)
+
+
+def test_permuting_pois_permutes_their_values():
+    x = seen(4)
+    values = apply(x)
+    assert len(np.unique(values)) == 5
+    for order in itertools.permutations(range(4)):
+        permuted = apply(x[:, jnp.array(order)])
+        np.testing.assert_allclose(permuted[:4], values[jnp.array(order)], atol=1e-5)
+
+
+@pytest.mark.parametrize("filled", [0.0, 3.0])
+def test_absent_pois_change_no_value(filled):
+    x, values = seen(3), apply(seen(3))
+    absent = jnp.full((FEATURES, 2), filled).at[-3].set(0.0)
+    padded = jnp.concatenate([absent[:, :1], x, absent[:, 1:]], axis=1)
+    found = apply(padded)
+    np.testing.assert_allclose(found[jnp.array([1, 2, 3, 5])], values, atol=1e-5)
+    # Nobody takes one: NOP is worth more.
+    np.testing.assert_array_equal(found[jnp.array([0, 4])], pooling._NOTHING)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 8])
+def test_nop_is_worth_nothing_and_one_network_serves_every_number_of_pois(number):
+    values = apply(seen(number))
+    assert values.shape == (number + 1,)
+    assert values[-1] == 0
+    assert np.all(values[:-1] != 0)
+
+
+def test_a_poi_counts_for_the_values_of_the_others():
+    x = seen(3)
+    for row in (0, 4, FEATURES - 1):  # mean, time and place of PoI 2
+        changed = apply(x.at[row, 2].add(0.5))
+        assert np.all(changed[:3] != apply(x)[:3])
+
+
+def test_a_batch_equals_single_ones():
+    batch = jnp.stack([seen(3, seed) for seed in range(4)], axis=-1)
+    batch = batch.at[-3, 1, 2].set(0.0)
+    together = apply(batch)
+    for i in range(4):
+        np.testing.assert_allclose(together[:, i], apply(batch[:, :, i]), atol=1e-5)
+
+
+@pytest.mark.parametrize("is_absent", [False, True])
+def test_gradients_are_finite_where_all_pois_are_at_one_place(is_absent):
+    # The lengths of ways are 0 there, whose square root has no gradient.
+    x = seen(3).at[-2:].set(0.0)
+    x = jnp.where(jnp.arange(3) == 1, 0.0, x) if is_absent else x
+
+    def total(params, x):
+        return jnp.sum(networks.apply(NETWORK, params, x.reshape(-1))[:-1:2])
+
+    gradients = jax.jit(jax.grad(total, argnums=(0, 1)))(PARAMS, x)
+    assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradients))
+    assert any(np.any(g != 0) for g in jax.tree.leaves(gradients[0]))
+
+
+def test_nearness_as_worked_by_hand():
+    # From the origin over PoI 0 to each; robots look from .9 m, and drive .2 m in a second.
+    place = jnp.array([[1.9, 1.0, 5.0, -2.9], [0.0, 2.9, 0.0, 0.0]])
+    seconds = pooling._seconds_between(place)[0]
+    # It stops 1 m ahead. PoI 0 is near enough; PoI 1 a quarter turn and 2 m to drive; PoI 2 4 m
+    # straight on, 3.1 to drive; PoI 3 a half turn and 3.9 m behind it, 3 to drive.
+    expected = [0, np.pi / 2 + 2 / 0.2, 3.1 / 0.2, np.pi + 3.0 / 0.2]
+    np.testing.assert_allclose(seconds, expected, atol=1e-3)
+
+
+def test_a_number_that_no_poi_has_is_refused():
+    with pytest.raises(AssertionError):
+        networks.apply(NETWORK, PARAMS, jnp.zeros(FEATURES + 1))

@@ -1,0 +1,198 @@
+"""What a team's Q-network learns from, and what it then says, where that is known."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import classes_mdp, paying_once_mdp
+
+from jaxsense import networks
+from jaxsense.config import DqnConfig, TeamConfig, TravelConfig
+from jaxsense.dqn import belief_mdp, environments, losses, policies, team_mdp, training
+from jaxsense.dqn.team_mdp import TeamMdp
+
+TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
+FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
+SMALL = DqnConfig(
+    task="team", observe="bank", hidden=(8,), num_envs=8, epochs=12, chunk=12, updates=1, batch=8,
+    replay_capacity=64, num_starts=16, discount=0.5,
+)  # fmt: skip
+
+
+def team_of(mapped, poses, places, **config):
+    given = {"travel": TRAVEL, "robots_each": 1, "alone": 0.0, "partly_seen": 0.0, **config}
+    return TeamMdp(TeamConfig(**given), mapped, lambda key, number: (places, poses))
+
+
+# From the origin 6, 11 and 16 s to look, less the turns, see `test_team_mdp.py`.
+TWO = team_of(
+    classes_mdp(partly_seen_starts=False),
+    jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, jnp.pi / 2]]),
+    jnp.array([[1.9, 0.0], [0.0, 2.9], [-3.9, 0.0]]),
+    num_pois=(3, 3),
+)
+
+
+def test_values_of_setting_out_as_worked_by_hand():
+    # D = 1 and M = 1: nine numbers of each PoI, the third of which is its time in tens of seconds.
+    seen = jnp.zeros((9, 3)).at[2].set(jnp.array([0.2, 0.0, 0.4])).reshape(-1)
+    after = jnp.array([8.0, 3.0, 16.0, 0.0])
+    config, dqn = TeamConfig(second_cost=0.1), replace(SMALL, discount=0.5)
+    # 2 s: 8/4 - .2; at once; 4 s: 16/16 - .4; NOP.
+    values = policies.of_ways(after, seen, 1, config, dqn)
+    np.testing.assert_allclose(values, [1.8, 3.0, 0.6, 0.0], rtol=1e-6)
+    # The same for a batch in the last axis.
+    both = policies.of_ways(
+        jnp.stack([after, -after], 1), jnp.stack([seen, seen], 1), 1, config, dqn
+    )
+    np.testing.assert_allclose(both.T, [[1.8, 3.0, 0.6, 0], [-2.2, -3.0, -1.4, 0]], rtol=1e-6)
+
+
+def team_params(mdp, config=SMALL):
+    network = policies.team_network(2, mdp.map.num_modalities, config)
+    params = networks.init(jax.random.key(1), network, network.features * mdp.map.num_pois)
+    # So that some look is worth more than NOP.
+    params["params"]["Value"]["bias"] += 9.0
+    return params
+
+
+@pytest.mark.parametrize("modality", [0, 1])
+def test_at_one_place_a_robot_values_what_one_that_is_alone_does(modality):
+    params = team_params(TWO)
+    greedy = jax.jit(policies.greedy_alone(TWO.map, params, modality, TWO.config, SMALL))
+    taken = set()
+    for seed in range(8):
+        state = belief_mdp.reset(jax.random.key(seed), TWO.map)
+        # All at (1, 2), with a heading that is of no importance.
+        alone = team_mdp.alone(3, modality)
+        there = replace(
+            alone, positions=jnp.tile(jnp.array([1.0, 2.0]), (3, 1)), poses=jnp.array([[1, 2, 0.7]])
+        )
+        values = [
+            policies.team_values(params, state.belief, team, jnp.int32(0), 2, TWO.config, SMALL)
+            for team in (alone, there)
+        ]
+        np.testing.assert_allclose(values[0], values[1], rtol=1e-5)
+        taken.add(action := int(jnp.argmax(values[0])))
+        assert greedy(jax.random.key(0), state) == action
+        # They look at once: half of what comes after, without a price of time.
+        seen = team_mdp.observation(TRAVEL, state.belief, alone, jnp.int32(0), 2).reshape(-1)
+        after = networks.apply(policies.team_network(2, 2, SMALL), params, seen)
+        np.testing.assert_allclose(values[0], 0.5 * after, rtol=1e-5)
+    assert len(taken) > 1
+
+
+def test_the_greedy_policy_tells_if_a_value_is_not_finite():
+    params = jax.tree.map(lambda x: x * jnp.nan, team_params(TWO))
+    act = policies.greedy_alone(TWO.map, params, 0, TWO.config, SMALL)
+    assert act(jax.random.key(0), belief_mdp.reset(jax.random.key(0), TWO.map)) == -1
+
+
+@pytest.fixture(scope="module")
+def steps():
+    """What is learned from each choice of two robots, with the observations before them."""
+    place = environments.environment(TWO, 0, SMALL)
+    observe, step = jax.jit(place.observation), jax.jit(place.step)
+    state, found = jax.jit(place.reset)(jax.random.key(0)), []
+    # Robot 0 to PoI 0, 6 s away; robot 1 to PoI 1, 11 s; robot 0 ends; robot 1 looks, and ends.
+    for action in (0, 1, 3, 3):
+        seen = observe(state)
+        agent = int(state.now.agent)
+        state, transition, outcome = step(jax.random.key(1), state, seen, jnp.int32(action))
+        found.append((agent, seen, transition, outcome, observe(state)))
+    return found
+
+
+def test_a_look_is_learned_from_when_its_robot_set_out(steps):
+    agents, seen, transitions, outcomes, after = zip(*steps, strict=True)
+    assert agents == (0, 1, 0, 1)
+    # No look, that of robot 0 at PoI 0, that of robot 1 at PoI 1, and none.
+    assert [int(t.a_tm1) for t in transitions] == [-1, 0, 1, -1]
+    assert [float(t.discount_t) for t in transitions] == [0, 1, 1, 0]
+    gain = 0.2 - 1 / np.sqrt(40)
+    np.testing.assert_allclose([t.r_t for t in transitions], [0, gain, gain, 0], atol=1e-6)
+    assert [bool(o.terminated) for o in outcomes] == [False, False, False, True]
+    np.testing.assert_array_equal(transitions[1].s_tm1, seen[0])
+    np.testing.assert_array_equal(transitions[2].s_tm1, seen[1])
+    assert not np.array_equal(seen[0], seen[1])
+    for transition, observed in zip(transitions[1:3], after[1:3], strict=True):
+        np.testing.assert_array_equal(transition.s_t, observed)
+
+
+def test_without_a_look_nothing_is_lost(steps):
+    for _, _, t, _, _ in (steps[0], steps[3]):
+        q_tm1, q_t = jnp.arange(4.0), jnp.full(4, 9.0)
+        assert losses.td_error(q_tm1, t.a_tm1, t.r_t, t.discount_t, q_t) == 0
+    slope = jax.grad(lambda q: losses.td_error(q, t.a_tm1, t.r_t, t.discount_t, q_t))(q_tm1)
+    np.testing.assert_array_equal(slope, 0.0)
+
+
+def test_a_second_look_at_the_same_moment_is_learned_too():
+    # Both are as near: the second look takes no more time.
+    poses = jnp.zeros((2, 3))
+    mdp = replace(TWO, new_places=lambda key, number: (TWO.new_places(key, number)[0], poses))
+    place = environments.environment(mdp, 0, SMALL)
+    state, found = place.reset(jax.random.key(0)), []
+    for action in (0, 0, 1):
+        state, transition, outcome = place.step(
+            jax.random.key(1), state, place.observation(state), jnp.int32(action)
+        )
+        found.append((int(transition.a_tm1), float(outcome.seconds)))
+    np.testing.assert_allclose(found, [(-1, 0), (0, 6), (0, 0)], atol=1e-5)
+
+
+def test_exploring_takes_every_poi_that_is_present_and_no_other():
+    place = environments.environment(TWO, 0, SMALL)
+    state = place.reset(jax.random.key(0))
+    present = jnp.array([[True, False, True], [False, False, True], [True, True, True]])
+    states = jax.tree.map(lambda x: jnp.stack([x] * 3), state)
+    team = replace(states.now.team, present=present)
+    states = replace(states, now=replace(states.now, team=team))
+    draws = jax.random.uniform(jax.random.key(1), (600,)).at[:2].set(jnp.array([0.0, 0.9999999]))
+    of_draw = jax.jit(jax.vmap(lambda x: training._explored(place, states, jnp.full(3, x))))
+    found = np.asarray(of_draw(draws))
+    for column, expected in zip(found.T, ([0, 2, 3], [2, 3], [0, 1, 2, 3]), strict=True):
+        assert sorted(set(column)) == expected
+        shares = np.bincount(column, minlength=4)[np.array(expected)] / 600
+        # Four standard errors.
+        np.testing.assert_allclose(shares, 1 / len(expected), atol=4 * 0.5 / np.sqrt(600))
+
+
+# As the probe in `test_dqn_training.py`, for a team of one: the first look at a PoI pays .8, others
+# cost 1. After the look comes the way to the next one, a second of looking: gamma = .5.
+ALONE = team_of(
+    paying_once_mdp(num_pois=2), jnp.ones((1, 3)), jnp.ones((2, 2)), num_pois=(2, 2), alone=1.0,
+    max_steps=3,
+)  # fmt: skip
+PROBE = replace(
+    SMALL, hidden=(16,), num_envs=32, epochs=600, chunk=600, updates=2, batch=64,
+    replay_capacity=4096, learning_rate=1e-2, final_learning_rate=1e-4, epsilon_min=0.5,
+    target_period=20, num_starts=256,
+)  # fmt: skip
+SEEN = jnp.array([[[0], [0]], [[1], [0]], [[0], [1]], [[1], [1]]], bool)
+Q = np.array(
+    [
+        [1.2, 1.2, 0.0],  # .8 + .5 x .8
+        [-0.6, 0.8, 0.0],  # -1 + .5 x .8; .8 + .5 x 0
+        [0.8, -0.6, 0.0],
+        [-1.0, -1.0, 0.0],  # -1 + .5 x 0
+    ]
+)
+
+
+def test_a_robot_alone_learns_the_values_worked_by_hand():
+    train = jax.jit(
+        lambda key: training.train(key, ALONE, 0, PROBE), compiler_options=FAST_TO_COMPILE
+    )
+    state, info = train(jax.random.key(0))
+    assert np.all(info.is_finite)
+
+    def learned(seen):
+        known = belief_mdp.reset(jax.random.key(0), ALONE.map, jnp.zeros(2, int), seen).belief
+        team = team_mdp.alone(2, 0)
+        x = team_mdp.observation(TRAVEL, known, team, jnp.int32(0), 1).reshape(-1)
+        return networks.apply(policies.team_network(2, 1, PROBE), state.params, x)
+
+    np.testing.assert_allclose(jax.vmap(learned)(SEEN), Q, atol=0.1)

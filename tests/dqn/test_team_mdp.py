@@ -1,0 +1,416 @@
+"""The team's MDP with times worked by hand, on maps whose rewards are known."""
+
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from toys import classes_mdp, noisy_mdp
+
+from jaxsense.config import TeamConfig, TravelConfig
+from jaxsense.dqn import belief_mdp, team_mdp
+from jaxsense.dqn.team_mdp import Team, TeamMdp, TeamState
+from jaxsense.types import Belief
+
+TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
+NOP, CAMERA, LIDAR = 3, 0, 1
+# From the origin 1.0, 2.0 and 3.0 m to drive: 5, 10 and 15 s.
+PLACES = jnp.array([[1.9, 0.0], [0.0, 2.9], [-3.9, 0.0]])
+FIRST, SECOND = 0.2 - 1 / np.sqrt(40), 0.8  # gains of looks, see `toys.classes_mdp`
+
+
+def make_mdp(mapped=None, places=PLACES, robots_each=1, **config):
+    mapped = classes_mdp(partly_seen_starts=False) if mapped is None else mapped
+    poses = jnp.arange(3.0 * robots_each * mapped.num_modalities).reshape(-1, 3)
+    given = {"travel": TRAVEL, "num_pois": (1, 3), "robots_each": robots_each, **config}
+    return TeamMdp(TeamConfig(**given), mapped, lambda key, number: (places, poses))
+
+
+MDP = make_mdp()
+
+
+def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
+    """Nobody has chosen yet."""
+    number = len(poses)
+    works = jnp.ones(number, bool) if works is None else jnp.array(works)
+    seen = jnp.zeros((3, 2), bool) if seen is None else jnp.array(seen, bool)
+    known = belief_mdp.reset(jax.random.key(0), mdp.map, jnp.array([0, 1, 2]), seen)
+    team = Team(
+        positions=places,
+        present=jnp.ones(3, bool),
+        poses=jnp.array(poses, jnp.float32),
+        modality=jnp.array(modality),
+        works=works,
+        target=jnp.full(number, NOP),
+    )
+    first = jnp.argmax(works).astype(jnp.int32)
+    return TeamState(known, team, works, first, jnp.zeros(number), jnp.float32(0))
+
+
+jitted = jax.jit(lambda key, state, action: team_mdp.step(key, MDP, state, action))
+
+
+def play(state, *actions):
+    """The states after each action, and the outcomes."""
+    states, outcomes = [], []
+    for action in actions:
+        state, outcome = jitted(jax.random.key(1), state, jnp.int32(action))
+        states.append(state)
+        outcomes.append(outcome)
+    return states, outcomes
+
+
+@pytest.mark.parametrize(
+    ("pose", "place", "seconds"),
+    [
+        # A quarter turn at 1 rad/s, 2 - .9 m at .2 m/s, and the look.
+        ((0, 0, 0), (0, 2), math.pi / 2 + 5.5 + 1),
+        ((0, 0, 0), (0, -2), math.pi / 2 + 5.5 + 1),
+        # From (1, 1) to (1, 3), from which the robot looks away by .5 rad.
+        ((1, 1, math.pi / 2 - 0.5), (1, 3), 0.5 + 5.5 + 1),
+        # The short way around: from 3 to -3 rad, 2 pi - 6.
+        ((0, 0, 3.0), (-2 * math.cos(0.14159265), -2 * math.sin(0.14159265)), 0.28319 + 5.5 + 1),
+        # A heading of two turns too many.
+        ((0, 0, 4 * math.pi), (2, 0), 5.5 + 1),
+        # Near enough: only turning and looking.
+        ((0, 0, 0), (0, 0.8), math.pi / 2 + 1),
+        # All at one place: only looking, whatever the heading.
+        ((1, 2, 0.7), (1, 2), 1.0),
+    ],
+)
+def test_time_until_a_look_as_worked_by_hand(pose, place, seconds):
+    pose, places = jnp.array(pose, jnp.float32), jnp.array([place], jnp.float32)
+    np.testing.assert_allclose(team_mdp.travel_seconds(TRAVEL, pose, places), [seconds], rtol=1e-4)
+
+
+def test_every_number_of_the_model_counts():
+    pose, places = jnp.zeros(3), jnp.array([[0.0, 2.0]])
+    model = TravelConfig(speed=0.4, turn_rate=2.0, view_distance=0.4, look_seconds=3.0)
+    expected = math.pi / 2 / 2 + (2 - 0.4) / 0.4 + 3
+    np.testing.assert_allclose(team_mdp.travel_seconds(model, pose, places)[0], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "expected"),
+    [
+        (0.0, (0, 0, 0)),
+        (0.5, (0, 0, 0.5)),  # still turning, to the left
+        (math.pi / 2 + 2, (0, 0.4, math.pi / 2)),  # and 2 s of driving at .2 m/s
+        (math.pi / 2 + 5.5, (0, 1.1, math.pi / 2)),
+        (99.0, (0, 1.1, math.pi / 2)),  # it waits there
+    ],
+)
+def test_the_pose_on_the_way_as_worked_by_hand(seconds, expected):
+    moved = team_mdp.move(TRAVEL, jnp.zeros(3), jnp.array([0.0, 2.0]), jnp.float32(seconds))
+    np.testing.assert_allclose(moved, expected, atol=1e-6)
+    mirrored = team_mdp.move(TRAVEL, jnp.zeros(3), jnp.array([0.0, -2.0]), jnp.float32(seconds))
+    np.testing.assert_allclose(mirrored, np.array(expected) * (1, -1, -1), atol=1e-6)
+
+
+@jax.jit
+def in_two_parts(pose, place, share):
+    """The time of a way in one part; in two; and the pose at its end, in one and in two."""
+    whole = team_mdp.travel_seconds(TRAVEL, pose, place[None])[0]
+    before = share * (whole - TRAVEL.look_seconds)
+    between = team_mdp.move(TRAVEL, pose, place, before)
+    rest = team_mdp.travel_seconds(TRAVEL, between, place[None])[0]
+    end = team_mdp.move(TRAVEL, pose, place, whole)
+    return whole, before + rest, end, team_mdp.move(TRAVEL, between, place, rest)
+
+
+PLACE = st.floats(-3, 3, width=32)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True, database=None)
+@given(st.tuples(PLACE, PLACE, PLACE), st.tuples(PLACE, PLACE), st.floats(0, 1, width=32))
+def test_a_way_in_two_parts_takes_as_long_as_in_one(pose, place, share):
+    numbers = (jnp.array(x, jnp.float32) for x in (pose, place, share))
+    one, two, end, end_of_two = in_two_parts(*numbers)
+    np.testing.assert_allclose(one, two, atol=1e-3)
+    np.testing.assert_allclose(end[:2], end_of_two[:2], atol=1e-3)
+    # A heading counts only up to full turns.
+    np.testing.assert_allclose(np.exp(1j * end[2]), np.exp(1j * end_of_two[2]), atol=2e-3)
+
+
+def resets(number=600, **config):
+    mdp = make_mdp(robots_each=2, **config)
+    keys = jax.random.split(jax.random.key(3), number)
+    return jax.jit(jax.vmap(lambda key: team_mdp.reset(key, mdp)))(keys)
+
+
+def test_teams_start_with_every_number_of_pois_and_of_robots():
+    found = resets(alone=0.0, num_pois=(2, 3))
+    present, works = np.asarray(found.team.present), np.asarray(found.team.works)
+    # The first ones exist: two or three equally often, 300 +- 4 sqrt(600 / 4) = +- 49.
+    np.testing.assert_array_equal(present, np.arange(3) < present.sum(axis=1)[:, None])
+    np.testing.assert_allclose(
+        np.bincount(present.sum(axis=1), minlength=4), [0, 0, 300, 300], atol=49
+    )
+    # Of two robots of each modality, the first works, and the second in half of the teams.
+    np.testing.assert_array_equal(found.team.modality, np.tile([0, 0, 1, 1], (600, 1)))
+    np.testing.assert_allclose(works.mean(axis=0), [1, 0.5, 1, 0.5], atol=0.082)
+    assert abs(np.corrcoef(works[:, 1], works[:, 3])[0, 1]) < 4 / np.sqrt(600)
+    np.testing.assert_array_equal(found.asks, works)
+    np.testing.assert_array_equal(found.agent, 0)
+    np.testing.assert_array_equal(found.seconds, 0)
+    np.testing.assert_array_equal(found.team.target, 3)
+    np.testing.assert_array_equal(found.team.positions, np.tile(PLACES, (600, 1, 1)))
+    np.testing.assert_array_equal(found.team.poses[0], np.arange(12.0).reshape(4, 3))
+
+
+def test_alone_one_robot_of_either_modality_is_where_everything_is():
+    found = resets(alone=1.0)
+    works = np.asarray(found.team.works)
+    np.testing.assert_array_equal(works.sum(axis=1), 1)
+    np.testing.assert_allclose(works.mean(axis=0), [0.5, 0, 0.5, 0], atol=0.082)
+    np.testing.assert_array_equal(found.agent, works.argmax(axis=1))
+    np.testing.assert_array_equal(found.team.positions, 0.0)
+    np.testing.assert_array_equal(found.team.poses, 0.0)
+    # As in the paper's MDP, half of the looks are taken: 3600 coins.
+    np.testing.assert_allclose(np.mean(found.map.seen), 0.5, atol=4 * 0.5 / 60)
+
+
+def test_shares_of_episodes_alone_and_partly_seen():
+    found = resets(alone=0.25, partly_seen=0.5)
+    alone = np.asarray(found.team.works).sum(axis=1) == 1
+    np.testing.assert_allclose(alone.mean(), 0.25, atol=4 * np.sqrt(0.25 * 0.75 / 600))
+    # Of the others half start late, in which 1 of 64 has seen nothing all the same.
+    has_seen = np.asarray(found.map.seen).any(axis=(1, 2))[~alone]
+    np.testing.assert_allclose(has_seen.mean(), 0.5 * 63 / 64, atol=4 * 0.5 / np.sqrt(450))
+    assert not np.any(resets(100, alone=0.0, partly_seen=0.0).map.seen)
+    late = np.asarray(resets(100, alone=0.0, partly_seen=1.0).map.seen)
+    assert late.any(axis=(1, 2)).mean() > 0.9
+
+
+def test_two_robots_as_worked_by_hand():
+    begun = start([[0, 0, 0], [0, 0, math.pi / 2]], [CAMERA, LIDAR])
+    # Robot 0 takes PoI 0, 6 s away; robot 1 PoI 1, 11 s away; then robot 0 has enough.
+    states, outcomes = play(begun, 0, 1, NOP, NOP)
+    np.testing.assert_allclose([o.seconds for o in outcomes], [0, 6, 5, 0], atol=1e-5)
+    np.testing.assert_allclose([s.seconds for s in states], [0, 6, 11, 11], atol=1e-5)
+    np.testing.assert_allclose([o.reward for o in outcomes], [0, FIRST, FIRST, 0], atol=1e-6)
+    assert [int(s.agent) for s in states[:3]] == [1, 0, 1]
+    assert [bool(o.terminated) for o in outcomes] == [False, False, False, True]
+    assert not any(o.truncated for o in outcomes)
+    # At first nobody has moved; after 6 s robot 1 has driven 1.2 m; then robot 0 stays.
+    expected = [
+        [[0, 0, 0], [0, 0, np.pi / 2]],
+        [[1, 0, 0], [0, 1.2, np.pi / 2]],
+        [[1, 0, 0], [0, 2, np.pi / 2]],
+    ]
+    for state, poses in zip(states[:3], expected, strict=True):
+        np.testing.assert_allclose(state.team.poses, poses, atol=1e-5)
+    np.testing.assert_array_equal(states[0].team.target, [0, NOP])
+    np.testing.assert_array_equal(states[1].team.target, [NOP, 1])
+    np.testing.assert_array_equal(states[2].team.works, [False, True])
+    np.testing.assert_array_equal(states[1].map.seen, [[1, 0], [0, 0], [0, 0]])
+    np.testing.assert_array_equal(states[2].map.seen, [[1, 0], [0, 1], [0, 0]])
+
+
+def test_who_looks_again_gains_nothing_and_another_sensor_much():
+    facing = [[0, 0, 0], [0, 0, 0]]
+    # The camera looks at PoI 0 after 6 s, again after 7; the LiDAR, 6 s away too, in between.
+    states, outcomes = play(start(facing, [CAMERA, LIDAR]), 0, 0, 0, NOP, NOP)
+    np.testing.assert_allclose([o.reward for o in outcomes], [0, FIRST, SECOND, -1, 0], atol=1e-6)
+    np.testing.assert_allclose([s.seconds for s in states], [0, 6, 6, 7, 7], atol=1e-5)
+    assert [int(s.agent) for s in states[:4]] == [1, 0, 1, 0]
+
+
+def test_robots_look_side_by_side():
+    # All three are near enough: each look takes 1 s, and there is one of each robot in every one.
+    here = jnp.zeros((3, 2))
+    begun = start([[0, 0, 0]] * 3, [CAMERA, LIDAR, CAMERA], places=here)
+    states, _ = play(begun, 0, 1, 2, 0, 1, 2)
+    # The third choice lets time pass, and from then on every choice one look.
+    np.testing.assert_allclose([s.seconds for s in states], [0, 0, 1, 1, 1, 2], atol=1e-5)
+    assert [int(s.agent) for s in states] == [1, 2, 0, 1, 2, 0]
+
+
+def test_a_look_that_has_begun_goes_on_while_others_look():
+    # Robot 1 is in place after 5.4 s and robot 0 looks at 6 s: .4 s are left.
+    poses = [[0, 0, 0], [0, 0.08, math.pi / 2]]
+    places = jnp.array([[1.9, 0.0], [0.0, 2.06], [-3.9, 0.0]])
+    states, outcomes = play(start(poses, [CAMERA, LIDAR], places=places), 0, 1, 0)
+    # (2.06 - .08 - .9) / .2 = 5.4 s and 1 s of looking.
+    np.testing.assert_allclose([o.seconds for o in outcomes], [0, 6, 0.4], atol=1e-4)
+    assert [int(s.agent) for s in states] == [1, 0, 1]
+
+
+def test_first_choices_go_round_the_robots_that_work():
+    begun = start([[0, 0, 0]] * 4, [0, 0, 1, 1], works=[True, False, True, True])
+    states, outcomes = play(begun, 2, 2, 0)
+    assert [int(s.agent) for s in states] == [2, 3, 3]
+    # The third choice is of PoI 0, 6 s away: robot 3 looks first.
+    np.testing.assert_allclose([o.seconds for o in outcomes], [0, 0, 6], atol=1e-5)
+    np.testing.assert_array_equal(states[2].team.poses[1], 0.0)  # that one takes no part
+    assert states[2].map.seen[0, LIDAR]
+
+
+def test_all_may_end_without_a_look():
+    states, outcomes = play(start([[0, 0, 0]] * 2, [0, 1]), NOP, NOP)
+    assert [bool(o.terminated) for o in outcomes] == [False, True]
+    assert [float(o.reward) for o in outcomes] == [0, 0]
+    assert float(states[1].seconds) == 0
+    assert not np.any(states[1].map.seen)
+
+
+def test_an_episode_is_cut_after_its_own_number_of_choices():
+    mdp = make_mdp(classes_mdp(partly_seen_starts=False, max_steps=1), max_steps=3)
+    state, cut = start([[0, 0, 0]], [CAMERA], mdp), []
+    for _ in range(3):
+        state, outcome = team_mdp.step(jax.random.key(0), mdp, state, jnp.int32(0))
+        cut.append(bool(outcome.truncated))
+    assert cut == [False, False, True]
+    _, ended = team_mdp.step(jax.random.key(0), mdp, state, jnp.int32(NOP))
+    assert ended.terminated
+    assert not ended.truncated
+
+
+@pytest.mark.parametrize("modality", [CAMERA, LIDAR])
+@pytest.mark.parametrize("mapped", [classes_mdp(partly_seen_starts=False), noisy_mdp()])
+def test_a_robot_alone_earns_what_the_map_mdp_gives(mapped, modality):
+    mdp = make_mdp(mapped)
+    alone = team_mdp.alone(3, modality)
+    known = belief_mdp.reset(jax.random.key(4), mapped)
+    one = jnp.ones(1, bool)
+    team = TeamState(known, alone, one, jnp.int32(0), jnp.zeros(1), jnp.float32(0))
+    both = jax.jit(
+        lambda key, team, known, action: (
+            team_mdp.step(key, mdp, team, action),
+            belief_mdp.step(key, mapped, known, action, modality),
+        )
+    )
+    for i, action in enumerate([0, 2, 2, 1, NOP]):
+        key = jax.random.key(10 + i)
+        (team, here), (known, there) = both(key, team, known, jnp.int32(action))
+        np.testing.assert_allclose(here.reward, there.reward, rtol=1e-6)
+        assert here.terminated == there.terminated
+        assert float(here.seconds) == (0 if action == NOP else 1)
+        jax.tree.map(np.testing.assert_array_equal, team.map, known)
+
+
+@pytest.mark.parametrize(
+    ("action", "expected"),
+    [
+        (jnp.int32(4), "action = 4: must be a whole number from 0 to 3"),
+        (jnp.int32(-1), "action = -1"),
+        (jnp.float32(1), "action of dtype float32"),
+    ],
+)
+def test_an_action_that_does_not_exist_is_refused(action, expected):
+    with pytest.raises(ValueError, match=expected):
+        team_mdp.step(jax.random.key(0), MDP, start([[0, 0, 0]], [0]), action)
+
+
+def test_places_of_another_size_are_named():
+    with pytest.raises(AssertionError, match="positions"):
+        team_mdp.reset(jax.random.key(0), make_mdp(places=PLACES[:2]))
+    with pytest.raises(AssertionError, match="poses"):
+        team_mdp.reset(jax.random.key(0), replace(MDP, config=TeamConfig(robots_each=2)))
+
+
+BELIEF = Belief(jnp.array([[3.0], [-1.0], [0.5]]), jnp.array([[0.3], [2.0], [1.0]]))
+
+
+def team_of_three(**changed):
+    """A camera and a LiDAR at the origin, which heads for PoI 1, and a camera that has ended."""
+    team = Team(
+        positions=PLACES,
+        present=jnp.ones(3, bool),
+        poses=jnp.array([[0, 0, 0], [0, 0, math.pi / 2], [1.9, 0, 0]]),
+        modality=jnp.array([CAMERA, LIDAR, CAMERA]),
+        works=jnp.array([True, True, False]),
+        target=jnp.array([NOP, 1, 0]),
+    )
+    return replace(team, **changed)
+
+
+observe = jax.jit(
+    lambda team, agent, belief=BELIEF: team_mdp.observation(TRAVEL, belief, team, agent, 2)
+)
+
+
+def test_what_a_robot_knows_as_worked_by_hand():
+    turn, half = math.pi / 2, math.pi
+    # Seconds to PoIs 0, 1 and 2: 5, 10 and 15 of driving, 1 of looking, and the turns.
+    camera = np.array([6, 11 + turn, 16 + half]) / 10
+    lidar = np.exp(-np.array([6 + turn, 11, 16 + turn]) / 10)
+    # The camera that has ended stands at PoI 0 and counts nowhere.
+    expected = [
+        [3, -1, 0.5],
+        [0.3, 2, 1],
+        camera,
+        [0, 0, 0],  # no other camera heads for anything
+        [0, lidar[1], 0],
+        [0, 0, 0],  # nor could be anywhere
+        lidar,
+        [1, 1, 1],  # its own sensor is a camera
+        [0, 0, 0],
+        [1, 1, 1],
+        *np.asarray(PLACES).T,
+    ]
+    found = observe(team_of_three(), jnp.int32(0))
+    assert found.shape == (team_mdp.num_features(1, 2), 3)
+    np.testing.assert_allclose(found, np.array(expected), atol=1e-5)
+    np.testing.assert_allclose(team_mdp.own_seconds(found, 1), 10 * camera, rtol=1e-5)
+    # For the LiDAR the camera is the other one; it heads for PoI 2 now.
+    heading = team_of_three(target=jnp.array([2, 1, 0]))
+    found = observe(heading, jnp.int32(1))
+    np.testing.assert_allclose(found[3], [0, 0, np.exp(-camera[2])], atol=1e-5)
+    np.testing.assert_array_equal(found[4], 0)
+    np.testing.assert_allclose(found[5], np.exp(-camera), atol=1e-5)
+    np.testing.assert_array_equal(found[6], 0)
+    np.testing.assert_array_equal(found[7:9], [[0] * 3, [1] * 3])
+
+
+def test_of_robots_with_the_same_sensor_the_nearest_counts():
+    found = observe(team_of_three(works=jnp.ones(3, bool)), jnp.int32(1))
+    times = np.stack(
+        [
+            [6, 11 + math.pi / 2, 16 + math.pi],
+            # The second camera stands at PoI 0 and looks away from PoIs 1 and 2.
+            team_mdp.travel_seconds(TRAVEL, jnp.array([1.9, 0, 0]), PLACES),
+        ]
+    )
+    assert times[1, 0] == 1 < times[0, 0]
+    np.testing.assert_allclose(found[5], np.exp(-times.min(axis=0) / 10), atol=1e-5)
+    # It heads for PoI 0, where it is.
+    np.testing.assert_allclose(found[3], [np.exp(-0.1), 0, 0], atol=1e-5)
+
+
+def test_the_place_is_seen_from_the_robot():
+    moved = team_of_three(poses=jnp.array([[1.0, -2.0, 0.5], [0, 0, 0], [0, 0, 0]]))
+    found = observe(moved, jnp.int32(0))
+    np.testing.assert_allclose(found[-2:].T, np.asarray(PLACES) - (1.0, -2.0), atol=1e-6)
+
+
+@pytest.mark.parametrize("agent", [0, 1])
+def test_permuting_pois_permutes_what_is_known_of_them(agent):
+    order = jnp.array([2, 0, 1])
+    heading = team_of_three(present=jnp.array([True, True, False]))
+    there = replace(
+        heading,
+        positions=PLACES[order],
+        present=heading.present[order],
+        target=jnp.array([NOP, 2, 1]),  # PoI 1 is now the third, PoI 0 the second
+    )
+    belief = jax.tree.map(lambda x: x[order], BELIEF)
+    here = observe(heading, jnp.int32(agent))
+    np.testing.assert_array_equal(observe(there, jnp.int32(agent), belief), here[:, order])
+
+
+def test_of_an_absent_poi_nothing_is_known():
+    found = observe(team_of_three(present=jnp.array([True, False, True])), jnp.int32(0))
+    np.testing.assert_array_equal(found[:, 1], 0.0)
+    whole = observe(team_of_three(), jnp.int32(0))
+    np.testing.assert_array_equal(found[:, [0, 2]], whole[:, [0, 2]])
+
+
+def test_a_standard_deviation_of_zero_is_refused():
+    belief = replace(BELIEF, std=BELIEF.std.at[1].set(0.0))
+    with pytest.raises(ValueError, match=r"belief\.std = 0\.0"):
+        team_mdp.observation(TRAVEL, belief, team_of_three(), jnp.int32(0), 2)
