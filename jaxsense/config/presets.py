@@ -95,6 +95,7 @@ _TEAM = Config(
         updates=16,
         replay_capacity=131072,
         discount=0.85,
+        epsilon_min=0.05,
         target_period=5,
     ),
     evaluation=EvaluationConfig(num_pois=(3, 8, 20)),

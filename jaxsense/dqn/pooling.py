@@ -60,10 +60,12 @@ class PoolingNetwork(nn.Module):
         sent = Dense(_MESSAGES, nn.initializers.lecun_normal(), name="Message")(flat)
         sent = nn.relu(sent).reshape(_MESSAGES, *present.shape[1:]) * present
         seconds = _seconds_between(place)
-        gathered = [
-            jnp.sum(jnp.exp(-seconds / reach)[None] * sent[:, None], axis=2) for reach in _REACHES
-        ]
-        return jnp.concatenate(gathered)
+        near, far = (jnp.exp(-seconds / reach) for reach in _REACHES)
+        of_near = jnp.sum(near[None] * sent[:, None], axis=2)
+        # A mean, so that many PoIs that are far away do not count like a near one.
+        of_far = jnp.sum(far[None] * sent[:, None], axis=2)
+        of_far /= 1.0 + jnp.sum(far * present, axis=1)[None]
+        return jnp.concatenate([of_near, of_far])
 
 
 def _seconds_between(place: jax.Array) -> jax.Array:

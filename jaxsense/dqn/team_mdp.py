@@ -214,10 +214,12 @@ def reset(key: Key, mdp: TeamMdp, modality: jax.Array | None = None) -> TeamStat
     chex.assert_shape(positions, (num_pois, 2), custom_message="positions")
     chex.assert_shape(poses, (num_robots, 3), custom_message="poses")
 
-    some_key, looks_key = jax.random.split(seen_key)
-    seen = belief_mdp.random_start(looks_key, mdp.map)[1]
+    some_key, share_key, looks_key = jax.random.split(seen_key, 3)
     starts_late = alone | jax.random.bernoulli(some_key, config.partly_seen)
-    state = belief_mdp.reset(map_key, mdp.map, seen=seen & starts_late)
+    # Of any share, so that the end of a mission is seen as often as its middle.
+    share = jnp.where(starts_late, jax.random.uniform(share_key), 0.0)
+    seen = jax.random.bernoulli(looks_key, share, (num_pois, mdp.map.num_modalities))
+    state = belief_mdp.reset(map_key, mdp.map, seen=seen)
     team = Team(
         positions=jnp.where(alone, 0.0, positions),
         present=jnp.arange(num_pois) < number,
