@@ -7,6 +7,7 @@ from benchmarks.jmvae import jmvae
 from benchmarks.measure import Options, Row
 from benchmarks.physics import physics, physics_contacts, physics_solver
 from benchmarks.rays import rays
+from benchmarks.team import team_mdp
 from benchmarks.time_to_optimal import time_to_optimal_rejax, time_to_optimal_sb3
 from benchmarks.train import train, train_warm
 
@@ -20,6 +21,7 @@ ROWS: dict[str, Callable[[Options], Row]] = {
     "dqn_sb3": dqn_sb3,
     "dqn_live": dqn_live,
     "dqn_seeds": dqn_seeds,
+    "team_mdp": team_mdp,
     "time_to_optimal_rejax": time_to_optimal_rejax,
     "time_to_optimal_sb3": time_to_optimal_sb3,
     "train": train,

@@ -50,7 +50,16 @@ autodoc_typehints_format = "short"
 # What only some extras need, and what is too large for building the site.
 autodoc_mock_imports = [
     name
-    for name in ("gymnasium", "gymnax", "rejax", "stable_baselines3", "tensorboardX", "torch")
+    for name in (
+        "gymnasium",
+        "gymnax",
+        "jaxmarl",
+        "pettingzoo",
+        "rejax",
+        "stable_baselines3",
+        "tensorboardX",
+        "torch",
+    )
     if importlib.util.find_spec(name) is None
 ]
 python_use_unqualified_type_names = True

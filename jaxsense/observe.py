@@ -77,9 +77,8 @@ def team_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> TeamMd
     """The MDP of a team over stored detections, see `bank_mdp` for the arguments."""
     settings, arena = config.team, config.arena
     num_pois = settings.num_pois[1]
-    num_robots = len(config.modalities) * settings.robots_each
 
-    def new_places(key: Key, number: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def new_places(key: Key, number: jax.Array, num_robots: int) -> tuple[jax.Array, jax.Array]:
         """Each PoI at a random place in a cell of its own, robots anywhere."""
         del number
         per_side = math.ceil(math.sqrt(2 * num_pois))

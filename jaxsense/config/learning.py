@@ -157,13 +157,13 @@ class MdpConfig:
 class TravelConfig:
     """The model of travel: a robot turns to a PoI, drives straight until it is near, and looks."""
 
-    speed: Traced[float] = 0.19
+    speed: Traced[float] = 0.2
     """Speed of driving, in metres per second."""
-    turn_rate: Traced[float] = 1.0
+    turn_rate: Traced[float] = 1.2
     """Rate of turning, in radians per second."""
-    view_distance: Traced[float] = 0.9
+    view_distance: Traced[float] = 0.96
     """Distance from which a robot looks at a PoI, in metres."""
-    look_seconds: Traced[float] = 1.0
+    look_seconds: Traced[float] = 0.7
     """Time of a look itself, in seconds."""
 
     def check(self) -> None:

@@ -75,12 +75,12 @@ class TeamMdp:
     Attributes:
       config: the teams, and the price of time.
       map: the map MDP, with the largest number of PoIs.
-      new_places: `(key, number of PoIs) -> (positions [N, 2], poses [R, 3])`.
+      new_places: `(key, number of PoIs, R) -> (positions [N, 2], poses [R, 3])`.
     """
 
     config: TeamConfig
     map: MapMdp
-    new_places: Callable[[Key, jax.Array], tuple[jax.Array, jax.Array]]
+    new_places: Callable[[Key, jax.Array, int], tuple[jax.Array, jax.Array]]
 
 
 def travel_seconds(config: TravelConfig, pose: jax.Array, places: jax.Array) -> jax.Array:
@@ -188,29 +188,31 @@ def alone(num_pois: int, modality: jax.Array) -> Team:
     )
 
 
-def reset(key: Key, mdp: TeamMdp) -> TeamState:
-    """Starts an episode with a random number of PoIs, robots and earlier looks.
+def reset(key: Key, mdp: TeamMdp, modality: jax.Array | None = None) -> TeamState:
+    """Starts an episode with a random number of PoIs and earlier looks.
 
-    In a share of the episodes, `TeamConfig.alone`, one robot is alone, and all is at one place: the
-    map MDP of the paper, where only looks take time.
+    Args:
+      key: random key.
+      mdp: the MDP.
+      modality: `[R]` int32 sensors of the robots, who all work; by default the team is random. In a
+        share of its episodes, `TeamConfig.alone`, one robot is alone, and all is at one place: the
+        map MDP of the paper, where only looks take time.
     """
     map_key, place_key, number_key, team_key, alone_key, seen_key = jax.random.split(key, 6)
-    config, num_pois, num_modalities = mdp.config, mdp.map.num_pois, mdp.map.num_modalities
+    config, num_pois = mdp.config, mdp.map.num_pois
     fewest, most = config.num_pois
     number = jax.random.randint(number_key, (), fewest, most + 1)
-    alone = jax.random.bernoulli(alone_key, config.alone)
-    positions, poses = mdp.new_places(place_key, number)
+    if modality is None:
+        alone = jax.random.bernoulli(alone_key, config.alone)
+        modality, works = _random_team(team_key, mdp, alone)
+    else:
+        chex.assert_rank(modality, 1, custom_message="modality")
+        values.require_index("modality", modality, mdp.map.num_modalities)
+        alone, works = jnp.bool_(False), jnp.ones(modality.shape, bool)
+    num_robots = len(modality)
+    positions, poses = mdp.new_places(place_key, number, num_robots)
     chex.assert_shape(positions, (num_pois, 2), custom_message="positions")
-    num_robots = num_modalities * config.robots_each
     chex.assert_shape(poses, (num_robots, 3), custom_message="poses")
-
-    count_key, single_key = jax.random.split(team_key)
-    # One or more of each modality, robots of one modality side by side.
-    counts = jax.random.randint(count_key, (num_modalities,), 1, config.robots_each + 1)
-    modality = jnp.repeat(jnp.arange(num_modalities), config.robots_each)
-    rank = jnp.arange(num_robots) % config.robots_each
-    single = jax.random.randint(single_key, (), 0, num_modalities) * config.robots_each
-    works = jnp.where(alone, jnp.arange(num_robots) == single, rank < counts[modality])
 
     some_key, looks_key = jax.random.split(seen_key)
     seen = belief_mdp.random_start(looks_key, mdp.map)[1]
@@ -226,6 +228,35 @@ def reset(key: Key, mdp: TeamMdp) -> TeamState:
     )
     first = jnp.argmax(works).astype(jnp.int32)
     return TeamState(state, team, works, first, jnp.zeros(num_robots), jnp.float32(0.0))
+
+
+def _look(
+    key: Key, mdp: MapMdp, state: MapState, action: jax.Array, modality: jax.Array
+) -> tuple[MapState, jax.Array]:
+    """The map after a look or NOP, and the `[]` reward."""
+
+    def look(m: int) -> tuple[MapState, jax.Array]:
+        after, outcome = belief_mdp.step(key, mdp, state, action, m)
+        return after, outcome.reward
+
+    # Every sensor looks, and one look counts: under `vmap` a switch takes many times as long.
+    found = look(0)
+    for m in range(1, mdp.num_modalities):
+        found = jax.tree.map(lambda x, y: jnp.where(modality == m, x, y), look(m), found)  # noqa: B023
+    return found
+
+
+def _random_team(key: Key, mdp: TeamMdp, alone: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`[R]` int32 modalities and `[R]` bool `works`: one or more of each modality, or one alone."""
+    num_modalities, most = mdp.map.num_modalities, mdp.config.robots_each
+    count_key, single_key = jax.random.split(key)
+    counts = jax.random.randint(count_key, (num_modalities,), 1, most + 1)
+    # Robots of one modality side by side.
+    modality = jnp.repeat(jnp.arange(num_modalities), most)
+    robots = jnp.arange(len(modality))
+    single = jax.random.randint(single_key, (), 0, num_modalities) * most
+    works = jnp.where(alone, robots == single, robots % most < counts[modality])
+    return modality, works
 
 
 def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[TeamState, Outcome]:
@@ -264,7 +295,7 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
     looked = jnp.minimum(looked, travel.look_seconds)
     moved = jax.vmap(lambda pose, goal: move(travel, pose, goal, seconds))(team.poses, goals)
     look = jnp.where(passes, target[looker], num_pois)
-    after, outcome = belief_mdp.step(key, mdp.map, state.map, look, team.modality[looker])
+    after, reward = _look(key, mdp.map, state.map, look, team.modality[looker])
 
     following = jnp.argmin(jnp.where(asks, (robots - state.agent - 1) % len(robots), len(robots)))
     team = dataclasses.replace(
@@ -282,7 +313,7 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
         seconds=state.seconds + seconds,
     )
     return state, Outcome(
-        reward=outcome.reward,
+        reward=reward,
         terminated=is_over,
         truncated=~is_over & (after.steps >= mdp.config.max_steps),
         seconds=seconds,

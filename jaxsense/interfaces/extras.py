@@ -1,6 +1,7 @@
 """Packages that are not installed with jaxsense itself."""
 
 import contextlib
+import sys
 from collections.abc import Iterator
 
 
@@ -13,3 +14,18 @@ def extra(name: str) -> Iterator[None]:
         package = (error.name or name).partition(".")[0]
         message = f"{package} is not installed: pip install 'jaxsense[{name}]'"
         raise ModuleNotFoundError(message, name=package) from None
+
+
+@contextlib.contextmanager
+def quietly() -> Iterator[None]:
+    """Sends what an import prints to the standard error, and keeps the streams that it replaces.
+
+    jaxmarl sets `sys.stdout` to `sys.__stdout__`, which is not where a notebook prints.
+    """
+    kept = {name: getattr(sys, name) for name in ("stdout", "stderr", "__stdout__")}
+    sys.stdout = sys.__stdout__ = sys.stderr  # pyright: ignore
+    try:
+        yield
+    finally:
+        for name, stream in kept.items():
+            setattr(sys, name, stream)

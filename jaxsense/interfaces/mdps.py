@@ -1,4 +1,4 @@
-"""The map MDP built from a run's models."""
+"""The map MDP, and that of a team, built from a run's models."""
 
 import jax
 import jax.numpy as jnp
@@ -7,6 +7,7 @@ import numpy as np
 from jaxsense import observe
 from jaxsense.config import Config, values
 from jaxsense.dqn.belief_mdp import MapMdp
+from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.models import Models, make_jmvae
 from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
@@ -30,8 +31,19 @@ def map_mdp(config: Config, models: Models, bank: Bank | None = None) -> MapMdp:
     return observe.live_mdp(config, world, models.detectors, models.jmvae, shape)
 
 
+def team_mdp(config: Config, models: Models, bank: Bank) -> TeamMdp:
+    """Builds the MDP of a team from the JMVAE of a run.
+
+    Args:
+      config: the settings, of which `TeamConfig` holds those of the team.
+      models: from `jaxsense.load`, or `jaxsense.init`.
+      bank: stored detections to draw from, for example from `detections`.
+    """
+    return observe.team_mdp(config, bank, models.jmvae, make_jmvae(config))
+
+
 def detections(key: Key, config: Config, models: Models, samples: int) -> Bank:
-    """Detections in simulated looks at every class: a bank for `map_mdp`.
+    """Detections in simulated looks at every class: a bank for `map_mdp` or `team_mdp`.
 
     Args:
       key: random key.

@@ -10,6 +10,7 @@ import numpy as np
 from jaxsense import networks
 from jaxsense.config import Config
 from jaxsense.dqn import belief_mdp, policies
+from jaxsense.dqn.team_mdp import Team
 from jaxsense.models import Models, make_jmvae
 from jaxsense.sim import sensors
 from jaxsense.types import Belief
@@ -100,6 +101,8 @@ def _encode(models: Models, model: jmvae.Jmvae, subset: tuple[int, ...]) -> Func
 
 
 def _decide(config: Config, models: Models, m: int) -> Function:
+    if config.dqn.task == "team":
+        return _decide_in_team(config, models, m)
     num_pois = config.arena.num_pois
     q_network = policies.q_network(num_pois, config.dqn.hidden)
 
@@ -111,6 +114,39 @@ def _decide(config: Config, models: Models, m: int) -> Function:
     shape = num_pois, config.jmvae.latent_size
     inputs = {"mean": _floats(*shape), "std": _floats(*shape)}
     return Function("the PoI to look at next, N for NOP, and the value of each", inputs, apply)
+
+
+def _decide_in_team(config: Config, models: Models, m: int) -> Function:
+    num_pois, num_robots = config.arena.num_pois, len(config.carried)
+
+    def apply(
+        mean: jax.Array,
+        std: jax.Array,
+        positions: jax.Array,
+        poses: jax.Array,
+        works: jax.Array,
+        target: jax.Array,
+        robot: jax.Array,
+    ) -> dict[str, jax.Array]:
+        modality = jnp.array(config.modality_of_robot)
+        present = jnp.ones(num_pois, bool)
+        team = Team(positions, present, poses, modality, works, target)
+        known = Belief(mean, std), team, robot, len(config.modalities)
+        values = policies.team_values(models.q_networks[m], *known, config.team, config.dqn)
+        return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
+
+    shape = num_pois, config.jmvae.latent_size
+    inputs = {
+        "mean": _floats(*shape),
+        "std": _floats(*shape),
+        "positions": _floats(num_pois, 2),
+        "poses": _floats(num_robots, 3),
+        "works": jax.ShapeDtypeStruct((num_robots,), bool),
+        "target": jax.ShapeDtypeStruct((num_robots,), jnp.int32),
+        "robot": jax.ShapeDtypeStruct((), jnp.int32),
+    }
+    about = "the PoI to look at next, N for NOP, and the value of each; targets likewise"
+    return Function(about, inputs, apply)
 
 
 def _classify(models: Models) -> Function:

@@ -1,4 +1,4 @@
-"""A map MDP that trains in seconds: a short JMVAE on noisy detections, drawn from a bank."""
+"""MDPs for the interfaces: detections are drawn from a bank, and a JMVAE trains in seconds."""
 
 import dataclasses
 import functools
@@ -6,15 +6,28 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import MODALITIES, PRESETS, Config, JmvaeConfig
+from jaxsense.config import MODALITIES, PRESETS, Config, JmvaeConfig, TeamConfig
 from jaxsense.dqn import belief_mdp, episodes, policies
-from jaxsense.interfaces import map_mdp
+from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.interfaces import map_mdp, team_mdp
 from jaxsense.models import Models, init, make_jmvae
 from jaxsense.observe import Bank
 from jaxsense.vae import jmvae
 
 CONFIG = dataclasses.replace(
     PRESETS["smoke"], jmvae=JmvaeConfig(hidden=(32, 32), restarts=1, steps=3000, batch=64)
+)
+# A price of time that is a sum of powers of 2, and the lonely episodes that no interface may have.
+TEAM = dataclasses.replace(
+    CONFIG,
+    robots=("camera", "camera", "lidar"),
+    team=TeamConfig(num_pois=(1, 4), robots_each=1, alone=1.0, second_cost=0.125, max_steps=12),
+)
+ONLY_CAMERAS = dataclasses.replace(
+    TEAM,
+    modalities=("camera",),
+    robots=("camera",),
+    jmvae=dataclasses.replace(CONFIG.jmvae, reconstruction_weights=(10.0,)),
 )
 
 
@@ -47,6 +60,13 @@ def small_mdp() -> belief_mdp.MapMdp:
     """The MDP."""
     models, bank = trained()
     return map_mdp(CONFIG, models, bank)
+
+
+@functools.cache
+def team() -> TeamMdp:
+    """The MDP of a team, with an untrained JMVAE."""
+    models = init(jax.random.key(0), TEAM)
+    return team_mdp(TEAM, models, noisy_bank(jax.random.key(1), TEAM))
 
 
 @functools.cache

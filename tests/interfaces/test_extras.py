@@ -13,6 +13,8 @@ import pytest
         ("rejax", "gymnax", "rejax"),
         ("gymnasium", "gymnasium", "gymnasium"),
         ("stable_baselines3", "gymnasium", "sb3"),
+        ("jaxmarl", "jaxmarl", "jaxmarl"),
+        ("pettingzoo", "pettingzoo", "pettingzoo"),
     ],
 )
 def test_a_missing_package_is_named_with_its_extra(monkeypatch, module, package, extra):
@@ -24,7 +26,14 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch, module, package,
     monkeypatch.setitem(sys.modules, package, None)
     # An import leaves the module on its package as well.
     interfaces = importlib.import_module("jaxsense.interfaces")
-    for name in ("gymnax", "rejax", "gymnasium", "stable_baselines3"):
+    for name in (
+        "gymnax",
+        "rejax",
+        "gymnasium",
+        "stable_baselines3",
+        "jaxmarl",
+        "pettingzoo",
+    ):
         monkeypatch.delattr(interfaces, name, raising=False)
     with pytest.raises(ModuleNotFoundError) as error:
         importlib.import_module(f"jaxsense.interfaces.{module}")

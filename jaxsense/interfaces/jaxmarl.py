@@ -1,0 +1,119 @@
+"""The MDP of a team as an environment of jaxmarl 0.2: `pip install 'jaxsense[jaxmarl]'`."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxsense.config import Config
+from jaxsense.dqn.team_mdp import TeamMdp, TeamState
+from jaxsense.interfaces import team
+from jaxsense.interfaces.extras import extra, quietly
+from jaxsense.types import Key
+
+with extra("jaxmarl"), quietly():
+    from jaxmarl.environments import multi_agent_env, spaces  # pyright: ignore[reportMissingImports]
+
+
+@struct.dataclass
+class TeamEnvState(multi_agent_env.State):
+    """The state of an environment.
+
+    Attributes:
+      done: `[]` bool, the episode has ended.
+      step: `[]` int32 choices so far.
+      team: the state of the MDP.
+    """
+
+    team: TeamState
+
+
+class TeamEnv(multi_agent_env.MultiAgentEnv):
+    """The MDP of a team: each robot of `Config.robots` is an agent of its name.
+
+    Robots take turns. In a step, the robot whose turn it is chooses; actions of others are ignored.
+    Action n < N heads for PoI n, and action N is NOP, which ends the robot's part. If nobody else
+    has to choose, time passes until the next look. The robot that has looked earns the look's
+    reward, and it is its turn. All methods are those of jaxmarl.
+    """
+
+    def __init__(self, mdp: TeamMdp, config: Config):
+        """Makes the environment.
+
+        Args:
+          mdp: the MDP, see `interfaces.team_mdp`.
+          config: the settings, which name the robots.
+
+        Raises:
+          ValueError: if the MDP has other sensors than the settings.
+        """
+        team.check_team(mdp, config)
+        super().__init__(len(config.robot_names))
+        self.mdp = mdp
+        self.config = config
+        self.agents = list(config.robot_names)
+        size = (team.observation_size(mdp),)
+        self.observation_spaces = {
+            agent: spaces.Box(-jnp.inf, jnp.inf, size, jnp.float32) for agent in self.agents
+        }
+        self.action_spaces = {agent: spaces.Discrete(mdp.map.num_pois + 1) for agent in self.agents}
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def reset(self, key: Key) -> tuple[dict[str, jax.Array], TeamEnvState]:
+        """Starts an episode."""
+        start = team.start(key, self.mdp, self.config)
+        state = TeamEnvState(done=jnp.bool_(False), step=start.map.steps, team=start)  # pyright: ignore
+        return self.get_obs(state), state
+
+    def step_env(  # pyright: ignore
+        self, key: Key, state: TeamEnvState, actions: dict[str, jax.Array]
+    ) -> tuple[
+        dict[str, jax.Array],
+        TeamEnvState,
+        dict[str, jax.Array],
+        dict[str, jax.Array],
+        dict[str, Any],
+    ]:
+        """Takes one step, without a reset.
+
+        Returns:
+          Observations, state, rewards, dones and infos. A robot is done when its part is over, and
+          all are when the episode is, which `__all__` tells. `seconds`, `[R]` and the same for all,
+          are those that passed.
+        """
+        chosen = jnp.stack([jnp.asarray(actions[agent], jnp.int32) for agent in self.agents])
+        after, outcome = team.step(key, self.mdp, state.team, chosen)
+        dones = outcome.terminated | outcome.truncated
+        ended = jnp.all(dones)
+        state = TeamEnvState(done=ended, step=after.map.steps, team=after)  # pyright: ignore
+        infos = {"seconds": jnp.full(self.num_agents, outcome.seconds)}
+        of_each = {**self._named(dones), "__all__": ended}
+        return self.get_obs(state), state, self._named(outcome.rewards), of_each, infos
+
+    def get_obs(self, state: TeamEnvState) -> dict[str, jax.Array]:  # pyright: ignore
+        """What each robot knows, `[F * N]`, see `team_mdp.observation`."""
+        return self._named(team.observations(self.mdp, state.team))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def get_avail_actions(self, state: TeamEnvState) -> dict[str, jax.Array]:
+        """Actions that each robot has, `[N + 1]` bool: only NOP if it is not its turn."""
+        return self._named(team.available(state.team))
+
+    @property
+    def name(self) -> str:
+        """Name of the environment."""
+        return "jaxsense-Team"
+
+    @property
+    def agent_classes(self) -> dict[str, list[str]]:
+        """Robots of each modality."""
+        classes: dict[str, list[str]] = {}
+        for agent, modality in zip(self.agents, self.config.carried, strict=True):
+            classes.setdefault(modality, []).append(agent)
+        return classes
+
+    def _named(self, of_robots: jax.Array) -> dict[str, jax.Array]:
+        """`[R, ...]` by the names of the robots."""
+        return dict(zip(self.agents, of_robots, strict=True))

@@ -1,0 +1,140 @@
+"""The PettingZoo form: its own tests, and the same steps as the MDP of a team."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import small
+
+pytest.importorskip("pettingzoo", reason="needs the extra jaxsense[pettingzoo]")
+
+from gymnasium.error import ResetNeeded
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from jaxsense.dqn import team_mdp
+from jaxsense.interfaces.pettingzoo import TeamParallelEnv
+
+AGENTS = ["camera_1", "camera_2", "lidar"]
+NOP = 4
+
+
+@pytest.fixture(scope="module")
+def env():
+    return TeamParallelEnv(small.team(), small.TEAM)
+
+
+def test_pettingzoos_own_tests_pass(env):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        parallel_api_test(env, num_cycles=40)
+        parallel_seed_test(lambda: TeamParallelEnv(small.team(), small.TEAM), num_cycles=40)
+
+
+def test_every_step_equals_the_mdps(env):
+    """The keys are those that the environment splits from its seed."""
+    mdp = small.team()
+    observations, infos = env.reset(seed=3)
+    (word,) = np.random.SeedSequence(3).generate_state(1)
+    key, start_key = jax.random.split(jax.random.key(int(word)))
+    modality = jnp.array([0, 0, 1])
+    state = jax.jit(lambda key: team_mdp.reset(key, mdp, modality))(start_key)
+    step = jax.jit(lambda key, state, action: team_mdp.step(key, mdp, state, action))
+    observe = jax.jit(
+        lambda s, r: team_mdp.observation(mdp.config.travel, s.map.belief, s.team, r, 2)
+    )
+    for i in range(12):
+        agent, live = (
+            int(state.agent),
+            [a for a, w in zip(AGENTS, state.team.works, strict=True) if w],
+        )
+        assert env.agents == live
+        for r, name in enumerate(AGENTS):
+            if name in live:
+                expected = observe(state, r).reshape(-1)
+                np.testing.assert_allclose(observations[name], expected, atol=1e-5)
+                pois = np.asarray(state.team.present) & (r == agent)
+                np.testing.assert_array_equal(infos[name]["action_mask"], [*pois, True])
+                assert env.observation_space(name).contains(observations[name])
+        # The lidar ends its part with its first choice.
+        action = NOP if agent == 2 else int(np.argmax(state.team.present))
+        actions = dict.fromkeys(live, NOP) | {AGENTS[agent]: action}
+        observations, rewards, terminations, truncations, infos = env.step(actions)
+        key, step_key = jax.random.split(key)
+        state, outcome = step(step_key, state, jnp.int32(action))
+        works, seconds = np.asarray(state.team.works), float(outcome.seconds)
+        own = np.where(np.arange(3) == int(state.agent), float(outcome.reward), 0.0)
+        own = dict(zip(AGENTS, own - 0.125 * seconds * works, strict=True))
+        for found in (observations, rewards, terminations, truncations, infos):
+            assert list(found) == live
+        for name in live:
+            assert rewards[name] == pytest.approx(own[name], abs=1e-5)
+            assert infos[name]["seconds"] == pytest.approx(seconds)
+            assert terminations[name] == (not works[AGENTS.index(name)])
+            assert truncations[name] == (i == 11)
+    assert live == ["camera_1", "camera_2"]
+    assert env.agents == []
+
+
+def test_values_are_of_python(env):
+    observations, infos = env.reset(seed=0)
+    assert infos["lidar"]["action_mask"].dtype == np.int8
+    for agent in AGENTS:
+        assert (observations[agent].dtype, observations[agent].shape) == (np.float32, (56,))
+        assert env.action_space(agent).n == NOP + 1
+    # What it gives is the caller's to change.
+    observations["lidar"] += 1.0
+    _, rewards, terminations, truncations, infos = env.step(dict.fromkeys(AGENTS, NOP))
+    assert type(rewards["lidar"]) is float
+    assert type(terminations["lidar"]) is type(truncations["lidar"]) is bool
+    assert type(infos["lidar"]["seconds"]) is float
+
+
+def test_agents_leave_when_their_part_is_over(env):
+    env.reset(seed=1)
+    for number in (1, 2, 3):
+        # Not all have to act; those that have left may.
+        turn = AGENTS[number - 1]
+        terminations = env.step({turn: NOP, "camera_1": NOP})[2]
+        assert [agent for agent, over in terminations.items() if over] == [turn]
+        assert env.agents == AGENTS[number:]
+    assert env.possible_agents == AGENTS
+
+
+def test_seeds_repeat_and_differ(env):
+    def play(**reset):
+        seen = [env.reset(**reset)[0]["lidar"]]
+        for _ in range(4):
+            seen.append(env.step(dict.fromkeys(env.agents, 0))[0]["lidar"])
+        return np.stack(seen)
+
+    first, again, other, later = play(seed=1), play(seed=1), play(seed=2), play()
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+    assert (other[0] != later[0]).any()
+    # Without any seed, two environments differ.
+    fresh = [TeamParallelEnv(small.team(), small.TEAM).reset()[0]["lidar"] for _ in range(2)]
+    assert (fresh[0] != fresh[1]).any()
+
+
+def test_what_cannot_be_is_told(env):
+    with pytest.raises(
+        ValueError, match=r"config.modalities = \('camera',\): must be 2, as in mdp"
+    ):
+        TeamParallelEnv(small.team(), small.ONLY_CAMERAS)
+    fresh = TeamParallelEnv(small.team(), small.TEAM)
+    with pytest.raises(ResetNeeded):
+        fresh.step(dict.fromkeys(AGENTS, 0))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"actions of \['lidar'\]: must have one of 'camera_1'"):
+        env.step({"lidar": 0})
+    for action in (5, -1, 0.5):
+        with pytest.raises(
+            ValueError, match=rf"actions\['lidar'\] = {action}: must be in Discrete"
+        ):
+            env.step({"camera_1": 0, "lidar": action})
+    for turn in AGENTS:
+        env.step({turn: NOP})
+    with pytest.raises(ResetNeeded, match="after the end"):
+        env.step(dict.fromkeys(AGENTS, 0))
