@@ -1,5 +1,7 @@
 """The animated SVG, read as a viewer reads it."""
 
+import dataclasses
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from recordings import CLASS_BELIEFS, CONFIG, recording
 
 from jaxsense.show import animation
+from jaxsense.show.colours import modality_colour
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -108,3 +111,44 @@ def test_without_motion_the_end_is_shown(picture):
 def test_the_longest_mission_is_still_small(tmp_path):
     parse(tmp_path / "mission.svg", steps=1200)
     assert (tmp_path / "mission.svg").stat().st_size < 300_000
+
+
+def test_six_robots_are_drawn_and_named(tmp_path):
+    robots = ("camera", "lidar", "camera", "camera", "lidar", "camera")
+    config = dataclasses.replace(CONFIG, robots=robots)
+    two = recording()
+    # Three times the two robots of the recording, in places of their own.
+    of_robots = ("poses", "command", "wanted", "phase", "target", "scanned", "detected")
+    tripled = {n: np.concatenate([getattr(two.records, n)] * 3, axis=1) for n in of_robots}
+    record = dataclasses.replace(two.records, **tripled)
+    record.poses[:, :, 1] += np.linspace(-0.5, 0.5, 6)
+    faults = SimpleNamespace(blind_at=np.full(6, np.inf))
+    end = SimpleNamespace(**{**vars(two.end), "faults": faults})
+    path = tmp_path / "mission.svg"
+    animation.write(path, config, type(two)(end, record), CLASS_BELIEFS, "latent policy")
+    picture = ElementTree.fromstring(path.read_text())
+    assert "robots with camera and lidar look at 3 points" in picture.find(f"{SVG}title").text
+    names = ("camera_1", "lidar_1", "camera_2", "camera_3", "lidar_2", "camera_4")
+    for name in ("film-moving", "film-still"):
+        half = part(picture, name)
+        # One trail for each robot.
+        trails = list(half.iter(f"{SVG}polyline"))
+        assert len(trails) == 6
+        assert len({trail.get("points") for trail in trails}) == 6
+        colours = [modality_colour(robot == "lidar") for robot in robots]
+        assert [trail.get("stroke") for trail in trails] == colours
+        # A line of text with a mark for each, below one another and within the picture.
+        lines = [t for t in half.iter(f"{SVG}text") if t.text and t.text.endswith("has ended")]
+        assert [line.text for line in lines] == [f"{name} has ended" for name in names]
+        heights = [float(line.get("y")) for line in lines]
+        assert np.all(np.diff(heights) > 20)
+        assert heights[-1] < float(picture.get("viewBox").split()[3])
+    fields = [p for p in part(picture, "film-still").iter(f"{SVG}path") if "A" in p.get("d")]
+    assert len(fields) == 6
+
+
+def test_a_film_of_one_kind_of_robots_names_no_other(tmp_path):
+    config = dataclasses.replace(CONFIG, robots=("camera", "camera"))
+    animation.write(tmp_path / "film.svg", config, recording(), CLASS_BELIEFS, "latent policy")
+    picture = ElementTree.fromstring((tmp_path / "film.svg").read_text())
+    assert "robots with camera look at" in picture.find(f"{SVG}title").text

@@ -22,7 +22,7 @@ from smoke import SMOKE, error_line
 
 import jaxsense
 from jaxsense import cli, evaluate, mission, stages, train
-from jaxsense.config import PRESETS, Config
+from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.run import devices, files, missions, programs
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.monitor import Monitor
@@ -356,6 +356,59 @@ def test_evaluate_prints_the_comparison(evaluated):
         "33 missions",  # three of each of eleven policies
     ):
         assert words in printed
+
+
+def test_missions_elsewhere_have_the_settings_that_are_asked_for():
+    config, path = PRESETS["smoke"], Path("run")
+    arguments = evaluate.Arguments(path, side=4.0, robots=("camera", "camera", "lidar"))
+    there = evaluate._elsewhere(arguments, config)
+    assert (there.arena.side, there.arena.num_pois) == (4.0, 3)
+    assert there.carried == ("camera", "camera", "lidar")
+    assert evaluate._name(there) == "3-points-4-m-2-camera-1-lidar"
+    # Also 64 robots have a name that a file may bear.
+    crowd = dataclasses.replace(there, robots=("camera", "lidar") * 32)
+    assert evaluate._name(crowd) == "3-points-4-m-32-camera-32-lidar"
+    # What is asked for is no other place if the run has it already.
+    same = evaluate.Arguments(path, num_pois=3, side=3.0, robots=("camera", "lidar"))
+    assert evaluate._elsewhere(same, config) == config
+    # A policy for any number of points has no limit to the looks of a start.
+    team = PRESETS["team"]
+    partly = dataclasses.replace(
+        team,
+        mdp=dataclasses.replace(team.mdp, partly_seen_starts=True),
+        team=dataclasses.replace(team.team, num_pois=(3, 8)),
+    )
+    there = evaluate._elsewhere(evaluate.Arguments(path, num_pois=30, side=8.0), partly)
+    assert there.arena.num_pois == 30
+    with pytest.raises(
+        ConfigError, match=r"arena\.num_pois = 4: the policies of this run are for 3"
+    ):
+        evaluate._elsewhere(evaluate.Arguments(path, num_pois=4), config)
+
+
+@pytest.mark.slow  # compiles missions of three robots
+def test_other_robots_play_apart_from_a_runs_own(smoke_run, tmp_path, cache):
+    path = tmp_path / "run"
+    shutil.copytree(smoke_run, path)
+    before = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    options = "--robots", "camera", "camera", "lidar", "--episodes", "3", "--animate"
+    for policy in ("nearest", "camera_2_alone"):
+        evaluate.main([str(path), *options, "--policy", policy, *cache])
+    after = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    (name, place), *others = after.pop("elsewhere").items()
+    assert not others
+    assert after == before
+    assert name == "3-points-3-m-2-camera-1-lidar"
+    assert (place["num_pois"], place["side"]) == (3, 3.0)
+    assert place["robots"] == ["camera", "camera", "lidar"]
+    # Of both evaluations.
+    assert set(place["mission"]) == {"nearest", "camera_2_alone", "bytes_per_detection"}
+    assert {"told", "ambiguous_reported"} <= set(place["mission"]["camera_2_alone"])
+    film = ElementTree.parse(path / f"mission-nearest-0-{name}.svg")
+    lines = {text.text for text in film.iter("{http://www.w3.org/2000/svg}text")}
+    assert {"camera_1 asks", "camera_2 asks", "lidar asks"} <= lines
+    assert (path / "teams.png").read_bytes()[:4] == b"\x89PNG"
+    assert "with other robots" in (path / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(smoke_run, evaluated):
