@@ -174,6 +174,8 @@ def test_all_are_done_when_the_last_ends_or_the_limit_is_reached(env, step_env):
         _, state, _, dones, _ = step_env(jax.random.key(i), state, named([NOP] * 3))
         assert [bool(dones[agent]) for agent in AGENTS] == [True] * number + [False] * (3 - number)
         assert bool(dones["__all__"]) == bool(state.done) == (number == 3)
+    for mask in env.get_avail_actions(state).values():
+        assert mask.tolist() == [False] * 4 + [True]
     _, state = env.reset(jax.random.key(6))
     for i in range(12):
         assert not state.done

@@ -94,9 +94,9 @@ def test_values_are_of_python(env):
 def test_agents_leave_when_their_part_is_over(env):
     env.reset(seed=1)
     for number in (1, 2, 3):
-        # Not all have to act; those that have left may.
+        # Not all have to act, and actions of those that have left are ignored.
         turn = AGENTS[number - 1]
-        terminations = env.step({turn: NOP, "camera_1": NOP})[2]
+        terminations = env.step({"camera_1": 99, turn: NOP})[2]
         assert [agent for agent, over in terminations.items() if over] == [turn]
         assert env.agents == AGENTS[number:]
     assert env.possible_agents == AGENTS
