@@ -86,9 +86,9 @@ class Config:
         self._check_learning()
         self._check_viewpoints()
         self._check_views()
-        is_team = self.dqn.task == "team"
-        num_pois = self.team.num_pois[1] if is_team else self.arena.num_pois
-        looks = num_pois * len(self.modalities)
+        of_team = self.team.num_pois if self.dqn.task == "team" else ()
+        most = max(self.arena.num_pois, *of_team, *self.evaluation.num_pois, 0)
+        looks = most * len(self.modalities)
         if self.mdp.partly_seen_starts and not 2 <= looks <= 30:
             raise ConfigError(
                 "mdp.partly_seen_starts",

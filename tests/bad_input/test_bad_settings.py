@@ -199,6 +199,14 @@ CHANGES = [
         },
         "mdp.partly_seen_starts = True: needs 2 to 30 pairs of PoI and modality, not 32; must be",
     ),
+    (
+        {
+            "dqn.task": "team",
+            "evaluation.num_pois": (3, 20),
+            "mdp.partly_seen_starts": True,
+        },
+        "mdp.partly_seen_starts = True: needs 2 to 30 pairs of PoI and modality, not 40; must be",
+    ),
     ({"dqn.task": "robots"}, "dqn.task = 'robots': must be one of map, team"),
     ({"dqn.task": "team", "dqn.observe": "live"}, "dqn.observe = 'live': must be 'bank' with dqn"),
     ({"evaluation.num_pois": (3,)}, "evaluation.num_pois = (3,): needs dqn.task = 'team'"),

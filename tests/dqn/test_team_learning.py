@@ -23,7 +23,7 @@ SMALL = DqnConfig(
 
 def team_of(mapped, poses, places, **config):
     given = {"travel": TRAVEL, "robots_each": 1, "alone": 0.0, "partly_seen": 0.0, **config}
-    return TeamMdp(TeamConfig(**given), mapped, lambda key, number: (places, poses))
+    return TeamMdp(TeamConfig(**given), mapped, lambda *given: (places, poses))
 
 
 # From the origin 6, 11 and 16 s to look, less the turns, see `test_team_mdp.py`.
@@ -132,7 +132,7 @@ def test_without_a_look_nothing_is_lost(steps):
 def test_a_second_look_at_the_same_moment_is_learned_too():
     # Both are as near: the second look takes no more time.
     poses = jnp.zeros((2, 3))
-    mdp = replace(TWO, new_places=lambda key, number: (TWO.new_places(key, number)[0], poses))
+    mdp = replace(TWO, new_places=lambda *given: (TWO.new_places(*given)[0], poses))
     place = environments.environment(mdp, 0, SMALL)
     state, found = place.reset(jax.random.key(0)), []
     for action in (0, 0, 1):
