@@ -377,6 +377,7 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
         team,
         mdp=dataclasses.replace(team.mdp, partly_seen_starts=True),
         team=dataclasses.replace(team.team, num_pois=(3, 8)),
+        evaluation=dataclasses.replace(team.evaluation, num_pois=(3, 8)),
     )
     there = evaluate._elsewhere(evaluate.Arguments(path, num_pois=30, side=8.0), partly)
     assert there.arena.num_pois == 30
