@@ -128,7 +128,7 @@ def test_six_robots_are_drawn_and_named(tmp_path):
     animation.write(path, config, type(two)(end, record), CLASS_BELIEFS, "latent policy")
     picture = ElementTree.fromstring(path.read_text())
     assert "robots with camera and lidar look at 3 points" in picture.find(f"{SVG}title").text
-    names = ("camera_1", "lidar_1", "camera_2", "camera_3", "lidar_2", "camera_4")
+    names = ("camera 1", "lidar 1", "camera 2", "camera 3", "lidar 2", "camera 4")
     for name in ("film-moving", "film-still"):
         half = part(picture, name)
         # One trail for each robot.

@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from jaxsense.config import POLICIES, Config
 from jaxsense.mission.compare import interval
@@ -29,6 +29,7 @@ from jaxsense.vae.metrics import reliability
 _MOST_ELLIPSES = 40
 _SMOOTHING = 20  # epochs
 _LEAST_SHARE = 1e-4
+_NUM_COLOURS = 10  # of matplotlib's cycle
 _FAR = 0.2  # sigma from the median of its class, beyond which a detection is an outlier
 
 
@@ -342,9 +343,10 @@ def _times(ax: Any, places: list[dict[str, Any]], number: Callable[[dict[str, An
             if name in place["mission"]
         ]
         if of_policy:
-            ax.plot(*zip(*of_policy, strict=True), "oDs^"[i % 4] + "-", color=f"C{i}", label=name)
-    ax.set(ylabel="median time [s]", ylim=(0, None))
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+            # The last ones in the same colours have dashes.
+            style = "oDs^"[i % 4] + ("-" if i < _NUM_COLOURS else "--")
+            ax.plot(*zip(*of_policy, strict=True), style, color=f"C{i}", label=name)
+    ax.set(ylabel="median time [s]", ylim=(0, None), xticks=sorted(set(map(number, places))))
     ax.grid(alpha=0.3)
 
 

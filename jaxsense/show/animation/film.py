@@ -125,7 +125,8 @@ def _draw(
             clock = [f"{min(t, seconds):.0f} s" for t in np.floor(record.time)]
             clock[-1] = f"{seconds:.1f} s"
             _strip(half, timeline, clock, SIZE, 25, "film-title film-end")
-            for r, robot in enumerate(config.robot_names):
+            for r, named in enumerate(config.robot_names):
+                robot = named.replace("_", " ")
                 y = _TOP + SIZE + 24 + _LINE * r
                 colour = modality_colour(config.modality_of_robot[r])
                 add(half, "circle", cx=8, cy=y - 6, r=7, fill=colour)

@@ -15,6 +15,8 @@ from jaxsense.types import Belief
 
 SIZE = 340  # px, of a view
 _FLASH = 6  # frames that a look is shown for
+_READABLE = 9.0  # px, radius of a PoI that its number fits into
+_MOST_ABREAST = 4  # numbers
 _SMOOTHING = 8  # frames in which an ellipse comes to its new shape
 
 
@@ -75,7 +77,11 @@ class ArenaView:
             turn = f"rotate({-np.degrees(float(layout.yaw[n])):.1f})"
             box = add(group, "rect", x=-u, y=-v, width=2 * u, height=2 * v, rx=1, fill=colour)
             box.set("transform", turn)
-        add(group, "text", str(n + 1), y=5, class_="film-number", fill="#fff")
+        if radius < _READABLE:
+            beside = {"x": radius + 12, "fill": colour, "class_": "film-number film-on-light"}
+        else:
+            beside = {"x": 0, "fill": "#fff", "class_": "film-number"}
+        add(group, "text", str(n + 1), y=5, **beside)
         num_modalities = len(self._config.modalities)
         for m in range(num_modalities):  # which sensors have written it into the map
             mark = add(
@@ -164,7 +170,7 @@ class MapView:
             timeline.set(ellipse, "fill-opacity", 0.1 * is_seen)
             # Numbers of PoIs at the same place in the map stand side by side.
             number = add(numbers, "g")
-            timeline.move(number, mean + np.array([14 * (n - (num_pois - 1) / 2), -6]))
+            timeline.move(number, mean + _beside(n, num_pois))
             add(number, "text", str(n + 1), class_="film-number film-on-light", fill=colour)
         self._draw_labels(parent, colours)
 
@@ -188,6 +194,15 @@ class MapView:
     def _place(self, mean: ArrayLike) -> np.ndarray:
         """`[..., 2]` latent, upwards from the middle, in pixels, downwards from the corner."""
         return SIZE / 2 + self._scale * np.asarray(mean) * (1, -1)
+
+
+def _beside(n: int, num_pois: int) -> np.ndarray:
+    """Where the number of a PoI stands from its place in the map: in rows of four at most."""
+    columns = min(num_pois, _MOST_ABREAST)
+    row, column = divmod(n, columns)
+    rows = -(-num_pois // columns)
+    width = 14 if num_pois < 10 else 20  # px, of one or two digits
+    return np.array([width * (column - (columns - 1) / 2), 15 * (row - (rows - 1) / 2) - 6])
 
 
 def _sector(radius: float, angle: float) -> str:
