@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG
+from teams import CONFIG, NAIVE
 
 from jaxsense import mission
 from jaxsense.mission import motion
@@ -22,7 +22,7 @@ def test_missions_with_contacts_always_and_never_computed_take_the_same_decision
     keys = jax.random.split(jax.random.key(2), 6)
     records = []
     for each in (never, always):
-        reset = jax.jit(jax.vmap(lambda k, m=each: mission.reset(k, m, mission.NAIVE)))
+        reset = jax.jit(jax.vmap(lambda k, m=each: mission.reset(k, m, NAIVE)))
         roll = jax.jit(jax.vmap(lambda k, s, m=each: mission.rollout(k, m, models, s, 150)[1]))
         records.append(roll(keys, reset(keys)))
     for name in ("phase", "target", "scanned", "detected", "seen"):
