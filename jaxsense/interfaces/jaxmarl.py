@@ -33,10 +33,7 @@ class TeamEnvState(multi_agent_env.State):
 class TeamEnv(multi_agent_env.MultiAgentEnv):
     """The MDP of a team: each robot of `Config.robots` is an agent of its name.
 
-    Robots take turns. In a step, the robot whose turn it is chooses; actions of others are ignored.
-    Action n < N heads for PoI n, and action N is NOP, which ends the robot's part. If nobody else
-    has to choose, time passes until the next look. The robot that has looked earns the look's
-    reward, and it is its turn. All methods are those of jaxmarl.
+    Robots take turns, see `jaxsense.interfaces.team`. All methods are those of jaxmarl.
     """
 
     def __init__(self, mdp: TeamMdp, config: Config):

@@ -1,4 +1,10 @@
-"""The part that the interfaces for several agents share: a team in which each robot is an agent."""
+"""The part that the interfaces for several agents share: a team in which each robot is an agent.
+
+Robots take turns. In a step, the robot whose turn it is chooses; actions of others are ignored.
+Action n < N heads for PoI n, and action N is NOP, which ends the robot's part. If nobody else has
+to choose, time passes until the next look. The robot that has looked earns the look's reward, and
+it is its turn.
+"""
 
 import chex
 import jax

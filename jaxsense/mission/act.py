@@ -5,6 +5,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from mujoco import mjx
 
 from jaxsense.mission.decide import planning_margin, sees, standing_robots
 from jaxsense.mission.state import (
@@ -197,10 +198,20 @@ def scan(
 
     of_robot = mission.config.modality_of_robot
     carried = sorted(set(of_robot))
+    # Robots with the same sensor look alike: the first of them takes the place of the one that
+    # scans, so that the program has one scan for each sensor and not for each robot.
+    first = jnp.array([of_robot.index(modality) for modality in of_robot])[robot]
+
+    def place(state: MissionState) -> mjx.Data:
+        layout, poses = state.scene.layout, state.scene.poses
+        exchanged = poses.at[robot].set(poses[first]).at[first].set(poses[robot])
+        return arenas.place(mission.world.arena, layout, exchanged)
+
+    placed = jax.vmap(place)(states)
 
     def look(i: int) -> tuple[jax.Array, Belief, jax.Array]:
         with_sensor = functools.partial(_look, mission, models, robot, carried[i])
-        return jax.vmap(with_sensor)(states, aims)
+        return jax.vmap(with_sensor)(states, placed, aims)
 
     # The choice of the sensor outside the batch: inside, it would be traced over and over.
     which = jnp.array([carried.index(modality) for modality in of_robot])[robot]
@@ -244,15 +255,12 @@ def _look(
     robot: Index,
     modality: int,
     state: MissionState,
+    data: mjx.Data,
     aim: _Aim,
 ) -> tuple[jax.Array, Belief, jax.Array]:
     """Whether the PoI is seen, `[]` bool, and its new entry and `[C]` posterior if it is."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
-    # Robots with the same sensor look alike: the first of them takes the place of the one that
-    # scans, so that the program has one scan for each sensor and not for each robot.
     first = mission.config.modality_of_robot.index(modality)
-    exchanged = scene.poses.at[robot].set(scene.poses[first]).at[first].set(scene.poses[robot])
-    data = arenas.place(world.arena, scene.layout, exchanged)
     readings = worlds.scan_around(aim.noise_key, world, scene, data, first, aim.bearing, modality)
     is_blind = now(mission, state) >= state.faults.blind_at[robot]
     readings = jnp.where(is_blind, sensor.blind, readings)
