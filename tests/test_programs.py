@@ -280,6 +280,7 @@ def test_evaluate_writes_the_mission_block_of_the_summary_and_no_other(evaluated
         assert (blocks[policy]["episodes"], blocks[policy]["seed"]) == (1, 0)
 
 
+@pytest.mark.slow  # plays twice; the next test has what is kept of a summary, without playing
 def test_an_evaluation_keeps_what_another_one_has_written_meanwhile(
     evaluated, tmp_path, cache, monkeypatch
 ):
