@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import examine
 from jaxsense.config import PRESETS
 from jaxsense.run import loop, pipeline, programs
 from jaxsense.run.checkpoints import Checkpoints
@@ -14,21 +13,6 @@ from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.stages import Progress, Stage, Steps
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
-
-
-def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(monkeypatch):
-    def broken(*args, **settings):
-        raise ArithmeticError("no such policy")
-
-    monkeypatch.setattr(examine, "latent_space", broken)
-    # What compiles longest is traced after the error then.
-    monkeypatch.setattr(programs, "_on_cpu", lambda: False)
-    monitor = Monitor()
-    with (
-        pytest.raises(ArithmeticError, match="no such policy"),
-        pipeline.compiled(SMOKE, monitor) as compiled,
-    ):
-        loop.train(KEY, SMOKE, compiled, monitor)
 
 
 @pytest.fixture
@@ -76,6 +60,14 @@ def test_a_stage_reports_its_steps_and_none_beyond_the_last(toy):
     curves = found.curves["count"]
     np.testing.assert_array_equal(curves["double"], [2, np.nan, 6, 8, 10])
     assert len(curves["seconds"]) == 3
+
+
+def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(toy):
+    def broken(key, config, *inputs):
+        raise ArithmeticError("no such policy")
+
+    with pytest.raises(ArithmeticError, match="no such policy"):
+        toy(counting("count"), Stage("broken", broken, ("count",)))
 
 
 def test_stages_are_given_what_those_before_return(toy):

@@ -17,7 +17,7 @@ from jaxsense.vae.jmvae import Jmvae
 
 CONFIG = PRESETS["smoke"]
 MODEL = Jmvae(CONFIG.modalities, (2, 2), 2, (8,))
-NUM_LOOKS = 2048
+NUM_LOOKS = 1024
 
 
 def numbered_bank():
@@ -179,7 +179,7 @@ def test_a_short_training_tells_most_looks_apart(features):
     of_bank = np.mean(bank.argmax(axis=-1) == labels[:, None])
     of_live = np.mean(live.argmax(axis=-1) == labels[classes])
     assert of_bank > 0.9
-    # Four standard errors of a share at worst .9, of 3 x 2048 and of 2048 looks.
+    # Four standard errors of a share at worst .9, of 3 x 1024 and of 1024 looks.
     error = np.sqrt(0.9 * 0.1 * (1 / bank[..., 0].size + 1 / len(live)))
     np.testing.assert_allclose(of_live, of_bank, atol=4 * error)
 

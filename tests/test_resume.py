@@ -1,5 +1,7 @@
 """Runs that are stopped and go on end with what an uninterrupted run ends with."""
 
+import contextlib
+import io
 import json
 import resource
 import shutil
@@ -15,14 +17,16 @@ import jaxsense
 from jaxsense import train
 from jaxsense.run.rundir import RunDirectory
 
-INTERRUPTIONS = [("detector_", 30), ("jmvae", 150), ("dqn_", 20), ("dqn_", 40)]
+INTERRUPTIONS = [("detector_", 30), ("jmvae", 150), ("dqn_", 40)]
 
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory, cache, smoke_run):
-    """A run that was stopped in each of its trainings, the last time in the last one."""
+    """A run of a config, stopped in each of its trainings, the last time in the last one."""
     path = tmp_path_factory.mktemp("runs") / "stopped"
-    start = [*SMOKE, "--out", str(path)]
+    few = path.with_name("few.json")  # all else is as in the preset
+    few.write_text(json.dumps({"preset": "smoke", "seed": 5, "config": {"dqn": {"epochs": 60}}}))
+    start = ["--config", str(few), "--quiet", "--out", str(path)]
     for stage, step in INTERRUPTIONS:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(RunDirectory, "append_metrics", interrupting(at(stage, step)))
@@ -44,18 +48,26 @@ def steps(path, stage):
     return [line["step"] for line in lines if line["stage"] == stage]
 
 
-def test_a_stopped_run_goes_on_and_ends_the_same(stopped, smoke_run, cache, tmp_path, capsys):
-    path = tmp_path / "run"
+@pytest.fixture(scope="module")
+def resumed(stopped, cache):
+    """A copy of the run that went on to its end, and what was printed."""
+    path, printed = stopped.with_name("resumed"), io.StringIO()
     shutil.copytree(stopped, path)
     assert list((path / "checkpoints" / "unfinished").glob("dqn_*"))
-    train.main(["--resume", str(path), "--quiet", *cache])
+    with contextlib.redirect_stdout(printed):
+        train.main(["--resume", str(path), "--quiet", "--tensorboard", *cache])
+    return path, printed.getvalue()
+
+
+def test_a_stopped_run_goes_on_and_ends_the_same(resumed, smoke_run):
+    path, printed = resumed
     assert without_times(path) == without_times(smoke_run)
     assert (path / "reward.png").read_bytes() == (smoke_run / "reward.png").read_bytes()
     assert not (path / "checkpoints" / "unfinished").exists()
     # Nothing was trained twice.
     for stage in ("detector_camera", "detector_lidar", "jmvae_1", "dqn_camera", "dqn_lidar"):
         assert steps(path, stage) == steps(smoke_run, stage), stage
-    assert capsys.readouterr().out.splitlines() == [
+    assert printed.splitlines() == [
         f"Everything is in {path}; open {path / 'report.html'} first.",
         f"Next: python -m jaxsense.evaluate {path} --animate",
     ]
@@ -145,16 +157,12 @@ def test_a_full_disk_is_named_and_nothing_is_lost(smoke_run, cache, tmp_path):
     assert without_times(path) == without_times(smoke_run)
 
 
-def test_a_config_reproduces_its_run(smoke_run, cache, tmp_path, capsys):
-    path, file = tmp_path / "again", smoke_run / "config.json"
+def test_a_config_reproduces_its_run(resumed, smoke_run, capsys):
+    path, file = resumed[0], smoke_run / "config.json"
     content = json.loads(file.read_text(encoding="utf-8"))
-    few = tmp_path / "few.json"  # all else is as in the preset
-    few.write_text(json.dumps({"preset": "smoke", "seed": 5, "config": {"dqn": {"epochs": 60}}}))
-    options = ["--quiet", "--tensorboard"]
-    train.main(["--config", str(few), "--out", str(path), *options, *cache])
     assert without_times(path) == without_times(smoke_run)
     (events,) = (path / "tensorboard").iterdir()
-    assert b"dqn_camera/reward" in events.read_bytes()
+    assert b"dqn_lidar/reward" in events.read_bytes()
     assert json.loads((path / "config.json").read_text(encoding="utf-8")) == content
     assert content["seed"] == 5
     assert content["versions"]["jaxsense"] == jaxsense.__version__

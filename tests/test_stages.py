@@ -41,7 +41,11 @@ def with_observe(way):
     return dataclasses.replace(TINY, dqn=dataclasses.replace(TINY.dqn, observe=way))
 
 
-@pytest.fixture(scope="module", params=["bank", pytest.param("live", marks=pytest.mark.slow)])
+# Both compile everything twice, for a minute; `test_traced_settings.py` runs `learn`, and
+# `test_programs.py` a run.
+@pytest.fixture(
+    scope="module", params=[pytest.param(way, marks=pytest.mark.slow) for way in ("bank", "live")]
+)
 def trained(request):
     """The programs of a run, and what they have trained."""
     monitor = Monitor()

@@ -195,7 +195,7 @@ def test_train_refuses(argv, expected, place, capsys):
     assert expected in refusal(train.main, [*base, *out, *argv], place, capsys)
 
 
-@pytest.mark.parametrize(("section", "name"), NUMBERS[::5])
+@pytest.mark.parametrize(("section", "name"), NUMBERS[::10])
 @pytest.mark.parametrize("text", ["nan", "-1", "x"])
 def test_train_refuses_numbers(section, name, text, place, capsys):
     option = f"--{section}.{name.replace('_', '-')}"
@@ -297,8 +297,9 @@ def test_evaluate_refuses_a_broken_summary(summary, expected, run, capsys):
     ("module", "argv"),
     [
         ("jaxsense.train", ["--dqn.epochs", "x"]),
-        ("jaxsense.evaluate", ["--seed", "x"]),
-        ("benchmarks", ["--json"]),
+        # Processes that take seconds to start, for lines that `test_other_commands_refuse` reads.
+        pytest.param("jaxsense.evaluate", ["--seed", "x"], marks=pytest.mark.slow),
+        pytest.param("benchmarks", ["--json"], marks=pytest.mark.slow),
     ],
 )
 def test_a_process_ends_with_one_line(module, argv, tmp_path):

@@ -1,5 +1,6 @@
 """Deep Q-learning on a probe whose values are known, and the bookkeeping around it."""
 
+import functools
 from dataclasses import replace
 
 import chex
@@ -57,7 +58,8 @@ SMALL = DqnConfig(
 
 def states():
     classes = jnp.zeros(2, int)
-    return jax.vmap(lambda seen: belief_mdp.reset(jax.random.key(0), MDP, classes, seen))(SEEN)
+    reset = lambda seen: belief_mdp.reset(jax.random.key(0), MDP, classes, seen)  # noqa: E731
+    return jax.jit(jax.vmap(reset))(SEEN)
 
 
 @pytest.fixture(scope="module")
@@ -108,14 +110,20 @@ def chunks():
     """States of a small training after every epoch, and the infos, stepped from the host."""
     config = SMALL
     init_key, start_key, chunk_key = jax.random.split(jax.random.key(0), 3)
-    prepared = training.starts(start_key, MDP, config)
+
+    @jax.jit
+    def begin():
+        prepared = training.starts(start_key, MDP, config)
+        return prepared, training.init(init_key, MDP, config, prepared)
+
+    prepared, first = begin()
 
     @chex.assert_max_traces(n=1)  # a second chunk must not be traced again
     def chunk(key, state):
         return training.train_chunk(key, MDP, 0, config, state, prepared)
 
     chunk = jax.jit(chunk, compiler_options=FAST_TO_COMPILE)
-    all_states, infos = [training.init(init_key, MDP, config, prepared)], []
+    all_states, infos = [first], []
     for key in jax.random.split(chunk_key, config.epochs):
         state, info = chunk(key, all_states[-1])
         all_states.append(state)
@@ -182,8 +190,13 @@ def test_an_episode_goes_on_until_nop_or_the_cut():
         epsilon_min=0.0,
         num_starts=8,
     )
-    prepared = training.starts(jax.random.key(2), mdp, config)
-    state = training.init(jax.random.key(0), mdp, config, prepared)
+
+    @jax.jit
+    def begin():
+        prepared = training.starts(jax.random.key(2), mdp, config)
+        return prepared, training.init(jax.random.key(0), mdp, config, prepared)
+
+    prepared, state = begin()
     layers = state.params["params"]
     layers = {**layers, "Dense_1": {**layers["Dense_1"], "bias": jnp.array([1e3, -1e3])}}
     state = replace(state, params={"params": layers})
@@ -220,9 +233,14 @@ def test_values_after_an_action_are_those_of_the_target_network():
         learning_rate=1e-9, final_learning_rate=1e-9,
     )  # fmt: skip
     seen = jnp.ones((1, 1), bool)
-    one = belief_mdp.reset(jax.random.key(0), mdp, jnp.zeros(1, int), seen)
-    prepared = jax.tree.map(lambda x: jnp.stack([x] * config.num_starts), one)
-    state = training.init(jax.random.key(0), mdp, config, prepared)
+
+    @jax.jit
+    def begin():
+        one = belief_mdp.reset(jax.random.key(0), mdp, jnp.zeros(1, int), seen)
+        prepared = jax.tree.map(lambda x: jnp.stack([x] * config.num_starts), one)
+        return prepared, training.init(jax.random.key(0), mdp, config, prepared)
+
+    prepared, state = begin()
     state = replace(
         state,
         params=with_bias(state.params, [1.0, 0.0]),
@@ -254,9 +272,14 @@ def test_every_start_of_a_share_and_every_action_is_drawn():
     draws = training._draw(jax.random.key(0), config)
     assert set(np.unique(draws.start)) == {0, 1, 2, 3}
     place = environments.environment(MDP, 0, config)
-    prepared = training.starts(jax.random.key(1), MDP, config)
-    envs = jax.tree.map(lambda x: x[: config.num_envs], prepared)
-    action = jax.vmap(lambda draws: training._explored(place, envs, draws))(draws.action)
+
+    @jax.jit
+    def explore(draws):
+        prepared = training.starts(jax.random.key(1), MDP, config)
+        envs = jax.tree.map(lambda x: x[: config.num_envs], prepared)
+        return jax.vmap(lambda draws: training._explored(place, envs, draws))(draws)
+
+    action = explore(draws.action)
     shares = np.bincount(action.reshape(-1), minlength=MDP.num_pois + 1) / action.size
     # Four standard errors of a share of 1/3 of 1600.
     np.testing.assert_allclose(shares, 1 / 3, atol=4 * np.sqrt(2 / 9 / action.size))
@@ -285,16 +308,17 @@ def length_of(key, params):
     return sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(params))
 
 
-def trained_for(chunk, evaluate, **settings):
-    """The state and the infos after one chunk of a small training, which begins at epoch 5."""
-    config = replace(SMALL, epochs=chunk, chunk=chunk, **settings)
+@functools.partial(jax.jit, static_argnames="evaluate", compiler_options=FAST_TO_COMPILE)
+def train_from_epoch_5(config, evaluate):
     prepared = training.starts(jax.random.key(2), MDP, config)
     state = training.init(jax.random.key(0), MDP, config, prepared)
-    train = jax.jit(
-        lambda key, state: training.train_chunk(key, MDP, 0, config, state, prepared, evaluate),
-        compiler_options=FAST_TO_COMPILE,
-    )
-    return train(jax.random.key(1), replace(state, epoch=jnp.int32(5)))
+    state = replace(state, epoch=jnp.int32(5))
+    return training.train_chunk(jax.random.key(1), MDP, 0, config, state, prepared, evaluate)
+
+
+def trained_for(chunk, evaluate, **settings):
+    """The state and the infos after one chunk of a small training, which begins at epoch 5."""
+    return train_from_epoch_5(replace(SMALL, epochs=chunk, chunk=chunk, **settings), evaluate)
 
 
 def test_an_evaluation_changes_nothing_that_is_learnt():

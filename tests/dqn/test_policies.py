@@ -13,8 +13,17 @@ MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
 LABELS = jnp.array([[1, 0, 0], [0, 0, 1]])
 
 
+reset = jax.jit(lambda classes, seen: belief_mdp.reset(KEY, MDP, classes, seen))
+
+
 def start(seen):
-    return belief_mdp.reset(KEY, MDP, jnp.array([0, 1, 2]), jnp.array(seen, bool))
+    return reset(jnp.array([0, 1, 2]), jnp.array(seen, bool))
+
+
+@pytest.fixture(scope="module")
+def rewards():
+    """Of the LiDAR's looks."""
+    return jax.jit(lambda: policies.expected_rewards(KEY, MDP, 1, num_draws=2))()
 
 
 @pytest.mark.parametrize(
@@ -36,13 +45,11 @@ def test_naive_looks_at_the_first_poi_the_own_sensor_has_not_seen(seen_by_camera
         (((0, 0), (0, 1), (0, 1)), 0),
     ],
 )
-def test_optimal_takes_the_look_that_pays_most_or_else_nop(seen, expected):
-    rewards = policies.expected_rewards(KEY, MDP, 1, num_draws=2)
+def test_optimal_takes_the_look_that_pays_most_or_else_nop(rewards, seen, expected):
     assert policies.optimal(MDP, rewards, LABELS)(KEY, start(seen)) == expected
 
 
-def test_expected_rewards_of_each_look():
-    rewards = policies.expected_rewards(KEY, MDP, 1, num_draws=2)
+def test_expected_rewards_of_each_look(rewards):
     # Nobody, camera, LiDAR, both: .2 - 1 / sqrt(40) = .041886; 1 - .2 = .8; twice in vain.
     table = np.repeat([[0.041886], [0.8], [-1.0], [-1.0]], 3, axis=1)
     np.testing.assert_allclose(rewards, table, rtol=1e-4)
@@ -50,7 +57,7 @@ def test_expected_rewards_of_each_look():
 
 def test_expected_rewards_average_over_the_draws():
     mdp = noisy_mdp()  # every look gains a uniform number of its own
-    rewards = policies.expected_rewards(KEY, mdp, 0, num_draws=400)
+    rewards = jax.jit(lambda: policies.expected_rewards(KEY, mdp, 0, num_draws=400))()
     # 1/2 +- 4 sqrt(1/12 / 400) = +- .058, by different draws for each entry.
     np.testing.assert_allclose(rewards, 0.5, atol=0.058)
     assert len(np.unique(rewards)) == 12
@@ -70,7 +77,7 @@ def test_expected_rewards_average_over_the_draws():
 def test_optimal_averages_over_the_classes_that_the_looks_leave_open(rewards_of_classes, expected):
     rewards = jnp.broadcast_to(jnp.array(rewards_of_classes), (4, 3))
     seen = jnp.array([(0, 0), (0, 1), (0, 1)], bool)
-    state = belief_mdp.reset(KEY, MDP, jnp.array([1, 1, 2]), seen)
+    state = reset(jnp.array([1, 1, 2]), seen)
     assert policies.optimal(MDP, rewards, LABELS)(KEY, state) == expected
 
 
@@ -99,6 +106,7 @@ def test_rewards_of_one_poi_and_three_modalities():
     of_codes = [0.041886, 0.8, -1.0, -1.0, 0.8, 1.0, -1.0, -1.0]
     np.testing.assert_allclose(rewards, np.repeat(of_codes, 3).reshape(8, 3), rtol=1e-4)
     act = policies.optimal(mdp, rewards, jnp.zeros((3, 3), int))
+    start = jax.jit(lambda seen: belief_mdp.reset(KEY, mdp, jnp.array([2]), seen))
     for seen, expected in (((0, 0, 1), 0), ((0, 1, 1), 1)):
-        state = belief_mdp.reset(KEY, mdp, jnp.array([2]), jnp.array([seen], bool))
+        state = start(jnp.array([seen], bool))
         assert act(KEY, state) == expected

@@ -18,27 +18,33 @@ NUM_ENVS = BLOCKS * WIDTH
 
 def transitions(numbers):
     """Transitions that can be told apart: each part is a multiple of i."""
-    i = jnp.asarray(np.asarray(numbers), jnp.float32)
+    i = np.array(numbers, np.float32)
     return Transition(
-        s_tm1=jnp.stack([i, -i]),
-        a_tm1=i.astype(jnp.int32),
+        s_tm1=np.stack([i, -i]),
+        a_tm1=i.astype(np.int32),
         r_t=2 * i,
         discount_t=3 * i,
-        s_t=jnp.stack([4 * i, -4 * i]),
+        s_t=np.stack([4 * i, -4 * i]),
     )
+
+
+add, sample = jax.jit(replay.add), jax.jit(replay.sample)
+
+
+@jax.jit
+def of_rounds(ring, rounds):
+    draws = jnp.stack([(jnp.arange(ROUNDS) + 0.5) / rounds, jnp.zeros(ROUNDS)], axis=-1)
+    # A draw for each block takes that block.
+    return jax.vmap(lambda draw: replay.sample(jnp.tile(draw, (BLOCKS, 1)), ring))(draws)
 
 
 def everything(ring, rounds):
     """All that is in the first rounds of a ring, by drawing each of its blocks."""
-    draws = jnp.stack([(jnp.arange(rounds) + 0.5) / rounds, jnp.zeros(rounds)], axis=-1)
-    # A draw for each block takes that block.
-    each = jax.vmap(lambda draw: replay.sample(jnp.tile(draw, (BLOCKS, 1)), ring))(draws)
-    return each
+    return jax.tree.map(lambda x: np.asarray(x)[:rounds], of_rounds(ring, rounds))
 
 
 def test_the_ring_holds_what_a_deque_would():
     ring, deque = replay.init(2, ROUNDS, BLOCKS, WIDTH), collections.deque(maxlen=ROUNDS)
-    add = jax.jit(replay.add)
     numbers = np.random.default_rng(0).permutation(60).reshape(-1, NUM_ENVS)
     for i, batch in enumerate(numbers):
         ring = add(ring, transitions(batch))
@@ -58,8 +64,8 @@ def test_the_ring_holds_what_a_deque_would():
 def test_every_transition_that_is_there_is_drawn_with_the_same_chance(rounds):
     ring = replay.init(2, ROUNDS, BLOCKS, WIDTH)
     for i in range(rounds):
-        ring = replay.add(ring, transitions(NUM_ENVS * i + np.arange(NUM_ENVS)))
-    drawn = replay.sample(jax.random.uniform(jax.random.key(0), (6000, 2)), ring)
+        ring = add(ring, transitions(NUM_ENVS * i + np.arange(NUM_ENVS)))
+    drawn = sample(jax.random.uniform(jax.random.key(0), (6000, 2)), ring)
     chex.assert_trees_all_equal(drawn, transitions(drawn.a_tm1))  # what belongs together stays so
     counts = np.bincount(drawn.a_tm1, minlength=NUM_ENVS * rounds)
     there = counts[NUM_ENVS * max(0, rounds - ROUNDS) :]
@@ -69,24 +75,24 @@ def test_every_transition_that_is_there_is_drawn_with_the_same_chance(rounds):
 
 
 def test_draws_are_tied_to_blocks_in_order():
-    ring = replay.add(replay.init(2, ROUNDS, 8, 1), transitions(np.arange(8)))
+    ring = add(replay.init(2, ROUNDS, 8, 1), transitions(np.arange(8)))
     # 4 draws of 8 blocks: the first takes 0 or 1, by the half of [0, 1) that it is in.
     draws = jnp.array([[0.9, 0.4], [0.0, 0.6], [0.5, 0.0], [0.2, 0.99]])
-    np.testing.assert_array_equal(replay.sample(draws, ring).a_tm1, [0, 3, 4, 7])
+    np.testing.assert_array_equal(sample(draws, ring).a_tm1, [0, 3, 4, 7])
     # 8 draws of 4 blocks of 2: two of each, wherever in [0, 1) they are.
-    ring = replay.add(replay.init(2, ROUNDS, 4, 2), transitions(np.arange(8)))
+    ring = add(replay.init(2, ROUNDS, 4, 2), transitions(np.arange(8)))
     draws = jax.random.uniform(jax.random.key(0), (8, 2))
     blocks = [0, 1, 0, 1, 2, 3, 2, 3, 4, 5, 4, 5, 6, 7, 6, 7]
-    np.testing.assert_array_equal(replay.sample(draws, ring).a_tm1, blocks)
+    np.testing.assert_array_equal(sample(draws, ring).a_tm1, blocks)
 
 
 def test_the_largest_number_below_one_draws_what_is_there():
-    ring = replay.add(replay.init(2, ROUNDS, 512, 1), transitions(np.arange(512)))
+    ring = add(replay.init(2, ROUNDS, 512, 1), transitions(np.arange(512)))
     below = np.nextafter(np.float32(1), np.float32(0))
-    last = replay.sample(jnp.full((512, 2), below), ring)
+    last = sample(jnp.full((512, 2), below), ring)
     assert last.a_tm1[-1] == 511
     # Of any number of rounds that are there, the last one: products round to below it.
-    assert replay.sample(jnp.array([[below, 0.0]]), ring).a_tm1[0] == 0
+    assert sample(jnp.array([[below, 0.0]]), ring).a_tm1[0] == 0
     counts = np.arange(1, 2**20, dtype=np.float32)
     assert np.all((below * counts).astype(np.int32) == counts - 1)
 
@@ -112,7 +118,7 @@ def test_add_takes_a_donated_state_and_is_traced_once():
 
 
 def test_parts_of_a_transition_have_the_dtypes_they_were_added_with():
-    ring = replay.add(replay.init(2, ROUNDS, BLOCKS, WIDTH), transitions(range(NUM_ENVS)))
-    drawn = replay.sample(jnp.zeros((BLOCKS, 2)), ring)
+    ring = add(replay.init(2, ROUNDS, BLOCKS, WIDTH), transitions(range(NUM_ENVS)))
+    drawn = sample(jnp.zeros((BLOCKS, 2)), ring)
     kinds = [x.dtype for x in astuple(drawn)]
     assert kinds == [x.dtype for x in astuple(transitions(range(NUM_ENVS)))]

@@ -62,32 +62,37 @@ def team_params(mdp, config=SMALL):
 def test_at_one_place_a_robot_values_what_one_that_is_alone_does(modality):
     params = team_params(TWO)
     greedy = jax.jit(policies.greedy_alone(TWO.map, params, modality, TWO.config, SMALL))
+    reset = jax.jit(lambda key: belief_mdp.reset(key, TWO.map))
+
+    @jax.jit
+    def valued(belief, team):
+        """Its values, and what comes after its looks."""
+        values = policies.team_values(params, belief, team, jnp.int32(0), 2, TWO.config, SMALL)
+        seen = team_mdp.observation(TRAVEL, belief, team, jnp.int32(0), 2).reshape(-1)
+        return values, networks.apply(policies.team_network(2, 2, SMALL), params, seen)
+
     taken = set()
     for seed in range(8):
-        state = belief_mdp.reset(jax.random.key(seed), TWO.map)
+        state = reset(jax.random.key(seed))
         # All at (1, 2), with a heading that is of no importance.
         alone = team_mdp.alone(3, modality)
         there = replace(
             alone, positions=jnp.tile(jnp.array([1.0, 2.0]), (3, 1)), poses=jnp.array([[1, 2, 0.7]])
         )
-        values = [
-            policies.team_values(params, state.belief, team, jnp.int32(0), 2, TWO.config, SMALL)
-            for team in (alone, there)
-        ]
-        np.testing.assert_allclose(values[0], values[1], rtol=1e-5)
-        taken.add(action := int(jnp.argmax(values[0])))
+        values, after = valued(state.belief, alone)
+        np.testing.assert_allclose(values, valued(state.belief, there)[0], rtol=1e-5)
+        taken.add(action := int(np.argmax(values)))
         assert greedy(jax.random.key(0), state) == action
         # They look at once: half of what comes after, without a price of time.
-        seen = team_mdp.observation(TRAVEL, state.belief, alone, jnp.int32(0), 2).reshape(-1)
-        after = networks.apply(policies.team_network(2, 2, SMALL), params, seen)
-        np.testing.assert_allclose(values[0], 0.5 * after, rtol=1e-5)
+        np.testing.assert_allclose(values, 0.5 * after, rtol=1e-5)
     assert len(taken) > 1
 
 
 def test_the_greedy_policy_tells_if_a_value_is_not_finite():
     params = jax.tree.map(lambda x: x * jnp.nan, team_params(TWO))
     act = policies.greedy_alone(TWO.map, params, 0, TWO.config, SMALL)
-    assert act(jax.random.key(0), belief_mdp.reset(jax.random.key(0), TWO.map)) == -1
+    key = jax.random.key(0)
+    assert jax.jit(lambda: act(key, belief_mdp.reset(key, TWO.map)))() == -1
 
 
 @pytest.fixture(scope="module")
@@ -134,10 +139,11 @@ def test_a_second_look_at_the_same_moment_is_learned_too():
     poses = jnp.zeros((2, 3))
     mdp = replace(TWO, new_places=lambda *given: (TWO.new_places(*given)[0], poses))
     place = environments.environment(mdp, 0, SMALL)
-    state, found = place.reset(jax.random.key(0)), []
+    observe, step = jax.jit(place.observation), jax.jit(place.step)
+    state, found = jax.jit(place.reset)(jax.random.key(0)), []
     for action in (0, 0, 1):
-        state, transition, outcome = place.step(
-            jax.random.key(1), state, place.observation(state), jnp.int32(action)
+        state, transition, outcome = step(
+            jax.random.key(1), state, observe(state), jnp.int32(action)
         )
         found.append((int(transition.a_tm1), float(outcome.seconds)))
     np.testing.assert_allclose(found, [(-1, 0), (0, 6), (0, 0)], atol=1e-5)
@@ -145,7 +151,7 @@ def test_a_second_look_at_the_same_moment_is_learned_too():
 
 def test_exploring_takes_every_poi_that_is_present_and_no_other():
     place = environments.environment(TWO, 0, SMALL)
-    state = place.reset(jax.random.key(0))
+    state = jax.jit(place.reset)(jax.random.key(0))
     present = jnp.array([[True, False, True], [False, False, True], [True, True, True]])
     states = jax.tree.map(lambda x: jnp.stack([x] * 3), state)
     team = replace(states.now.team, present=present)
@@ -189,10 +195,12 @@ def test_a_robot_alone_learns_the_values_worked_by_hand():
     state, info = train(jax.random.key(0))
     assert np.all(info.is_finite)
 
+    @jax.jit
+    @jax.vmap
     def learned(seen):
         known = belief_mdp.reset(jax.random.key(0), ALONE.map, jnp.zeros(2, int), seen).belief
         team = team_mdp.alone(2, 0)
         x = team_mdp.observation(TRAVEL, known, team, jnp.int32(0), 1).reshape(-1)
         return networks.apply(policies.team_network(2, 1, PROBE), state.params, x)
 
-    np.testing.assert_allclose(jax.vmap(learned)(SEEN), Q, atol=0.1)
+    np.testing.assert_allclose(learned(SEEN), Q, atol=0.1)

@@ -136,10 +136,15 @@ def test_a_way_in_two_parts_takes_as_long_as_in_one(pose, place, share):
     np.testing.assert_allclose(np.exp(1j * end[2]), np.exp(1j * end_of_two[2]), atol=2e-3)
 
 
-def resets(number=600, **config):
-    mdp = make_mdp(robots_each=2, **config)
-    keys = jax.random.split(jax.random.key(3), number)
-    return jax.jit(jax.vmap(lambda key: team_mdp.reset(key, mdp)))(keys)
+@jax.jit
+def reset_all(keys, config):
+    mdp = replace(make_mdp(robots_each=2), config=config)
+    return jax.vmap(lambda key: team_mdp.reset(key, mdp))(keys)
+
+
+def resets(**config):
+    config = TeamConfig(travel=TRAVEL, robots_each=2, **{"num_pois": (1, 3), **config})
+    return reset_all(jax.random.split(jax.random.key(3), 600), config)
 
 
 def test_teams_start_with_every_number_of_pois_and_of_robots():
@@ -185,8 +190,8 @@ def test_shares_of_episodes_alone_and_partly_seen():
     # Of the others half start late, in which 1 of 7 has seen nothing all the same.
     has_seen = np.asarray(found.map.seen).any(axis=(1, 2))[~alone]
     np.testing.assert_allclose(has_seen.mean(), 0.5 * 6 / 7, atol=4 * 0.5 / np.sqrt(450))
-    assert not np.any(resets(100, alone=0.0, partly_seen=0.0).map.seen)
-    late = np.asarray(resets(100, alone=0.0, partly_seen=1.0).map.seen)
+    assert not np.any(resets(alone=0.0, partly_seen=0.0).map.seen)
+    late = np.asarray(resets(alone=0.0, partly_seen=1.0).map.seen)
     assert late.any(axis=(1, 2)).mean() > 0.7
 
 
@@ -265,11 +270,12 @@ def test_all_may_end_without_a_look():
 def test_an_episode_is_cut_after_its_own_number_of_choices():
     mdp = make_mdp(classes_mdp(partly_seen_starts=False, max_steps=1), max_steps=3)
     state, cut = start([[0, 0, 0]], [CAMERA], mdp), []
+    step = jax.jit(lambda key, state, action: team_mdp.step(key, mdp, state, action))
     for _ in range(3):
-        state, outcome = team_mdp.step(jax.random.key(0), mdp, state, jnp.int32(0))
+        state, outcome = step(jax.random.key(0), state, jnp.int32(0))
         cut.append(bool(outcome.truncated))
     assert cut == [False, False, True]
-    _, ended = team_mdp.step(jax.random.key(0), mdp, state, jnp.int32(NOP))
+    _, ended = step(jax.random.key(0), state, jnp.int32(NOP))
     assert ended.terminated
     assert not ended.truncated
 

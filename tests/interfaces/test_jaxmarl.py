@@ -85,7 +85,16 @@ def test_spaces_tell_what_is_given(env):
 
 def test_the_whole_team_starts_and_is_never_alone(env):
     keys = jax.random.split(jax.random.key(1), 64)
-    observations, states = jax.vmap(env.reset)(keys)
+
+    @jax.jit
+    @jax.vmap
+    def start(key):
+        observations, state = env.reset(key)
+        known = env.mdp.config.travel, state.team.map.belief, state.team.team
+        expected = [team_mdp.observation(*known, r, 2).reshape(-1) for r in range(3)]
+        return observations, state, dict(zip(AGENTS, expected, strict=True))
+
+    observations, states, expected = start(keys)
     team = states.team.team
     assert team.works.all()
     assert states.team.asks.all()
@@ -95,12 +104,7 @@ def test_the_whole_team_starts_and_is_never_alone(env):
     assert len(np.unique(team.positions[:, :, 0])) > 64
     assert set(np.asarray(team.present.sum(axis=1))) == {1, 2, 3, 4}
     assert not states.done.any()
-    for r, agent in enumerate(AGENTS):
-        known = states.team.map.belief, team
-        expected = jax.vmap(
-            lambda belief, team: team_mdp.observation(env.mdp.config.travel, belief, team, r, 2)  # noqa: B023
-        )(*known)
-        np.testing.assert_allclose(observations[agent], expected.reshape(64, -1), atol=1e-5)
+    assert_trees_close(observations, expected)
 
 
 def test_only_the_robot_whose_turn_it_is_has_pois(env, step_env):
@@ -124,6 +128,11 @@ def test_every_step_equals_the_mdps(env, mdp_step, step_env):
     _, state = env.reset(jax.random.key(3))
     expected = state.team
     looks = 0
+    observe = jax.jit(
+        lambda state, r: team_mdp.observation(
+            env.mdp.config.travel, state.map.belief, state.team, r, 2
+        ).reshape(-1)
+    )
     for i in range(11):
         key = jax.random.key(10 + i)
         agent = int(expected.agent)
@@ -146,18 +155,14 @@ def test_every_step_equals_the_mdps(env, mdp_step, step_env):
         }
         np.testing.assert_allclose(infos["seconds"], [seconds] * 3)
         for r, name in enumerate(AGENTS):
-            known = env.mdp.config.travel, expected.map.belief, expected.team, r, 2
-            np.testing.assert_allclose(
-                observations[name], team_mdp.observation(*known).reshape(-1), atol=1e-5
-            )
+            np.testing.assert_allclose(observations[name], observe(expected, r), atol=1e-5)
     assert looks > 5
 
 
 def test_actions_of_the_others_and_absent_pois_do_nothing(env, step_env):
     keys = jax.random.split(jax.random.key(4), 16)
-    states = jax.vmap(env.reset)(keys)[1]
-    row = int(np.argmin(states.team.team.present.sum(axis=1)))
-    state = jax.tree.map(lambda x: x[row], states)
+    states = [env.reset(key)[1] for key in keys]
+    state = min(states, key=lambda state: int(state.team.team.present.sum()))
     assert list(state.team.team.present) == [True, False, False, False]
     key = jax.random.key(5)
     quiet = step_env(key, state, named([0, NOP, NOP]))
@@ -197,21 +202,26 @@ def test_an_ended_episode_starts_again_in_the_same_step(env):
 
 
 def test_it_scans_in_a_batch_and_equals_one_alone(env):
-    def play(key):
-        def step(carry, key):
-            _, state = carry
-            choose_key, step_key = jax.random.split(key)
-            actions = random_actions(choose_key, env.get_avail_actions(state))
-            after, state, rewards, dones, infos = env.step(step_key, state, actions)
-            return (after, state), (after, rewards, dones, infos)
+    choose = jax.jit(lambda key, state: random_actions(key, env.get_avail_actions(state)))
 
+    def step(carry, key):
+        _, state = carry
+        choose_key, step_key = jax.random.split(key)
+        after, state, rewards, dones, infos = env.step(step_key, state, choose(choose_key, state))
+        return (after, state), (after, rewards, dones, infos)
+
+    def play(key):
         start_key, key = jax.random.split(key)
         return jax.lax.scan(step, env.reset(start_key), jax.random.split(key, 24))
 
     keys = jax.random.split(jax.random.key(8), 4)
     together = jax.jit(jax.vmap(play))(keys)
-    alone = jax.jit(play)(keys[2])
-    assert_trees_close(jax.tree.map(lambda x: x[2], together), alone)
+    # One alone: the programs that the other tests have, step by step.
+    start_key, key = jax.random.split(keys[2])
+    alone, found = env.reset(start_key), jax.tree.map(lambda x: x[2], together[1])
+    for i, step_key in enumerate(jax.random.split(key, 24)):
+        alone, outcome = step(alone, step_key)
+        assert_trees_close(jax.tree.map(lambda x: x[i], found), outcome)  # noqa: B023
     observations, rewards, dones, infos = together[1]
     assert observations["lidar"].shape == (4, 24, 56)
     assert rewards["lidar"].shape == dones["__all__"].shape == (4, 24)

@@ -23,17 +23,19 @@ def models():
 @pytest.fixture(scope="session")
 def arena_of(team):
     """A mission in a chosen arena: PoIs, robots' poses, classes, policy and faults."""
-    start = jax.jit(lambda *given: mission.start(team, *given))
+
+    @jax.jit
+    def start(positions, poses, classes, policy, faults):
+        layout = jaxsense.sim.make_layout(CONFIG.arena, positions, jnp.zeros(len(classes)), classes)
+        light = jaxsense.sim.Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
+        return mission.start(
+            team, jaxsense.sim.Scene(layout, light, poses), classes, policy, faults
+        )
 
     def make(positions, poses, classes=(0, 1, 2), policy=NAIVE, faults=None):
-        classes = jnp.array(classes)
-        layout = jaxsense.sim.make_layout(
-            CONFIG.arena, jnp.array(positions, jnp.float32), jnp.zeros(len(classes)), classes
-        )
-        light = jaxsense.sim.Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
-        scene = jaxsense.sim.Scene(layout, light, jnp.array(poses, jnp.float32))
+        positions, poses = (np.array(x, np.float32) for x in (positions, poses))
         faults = mission.no_faults(CONFIG) if faults is None else faults
-        return start(scene, classes, jnp.int32(policy), faults)
+        return start(positions, poses, np.array(classes), np.int32(policy), faults)
 
     return make
 
@@ -43,9 +45,9 @@ def set_robot():
     """The state with some entries of one robot's record replaced."""
 
     def change(state, robot, **values):
-        robots = {
-            name: getattr(state.robots, name).at[robot].set(value) for name, value in values.items()
-        }
+        robots = {name: np.array(getattr(state.robots, name)) for name in values}
+        for name, value in values.items():
+            robots[name][robot] = value
         return replace(state, robots=replace(state.robots, **robots))
 
     return change

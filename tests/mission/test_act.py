@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from teams import CONFIG, alone
 
-from jaxsense import mission
 from jaxsense.mission import act
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults, with_config
 from jaxsense.sim import arena as arenas
@@ -19,15 +18,21 @@ POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
 CAMERA, LIDAR = 0, 1
 AWAY = [0.0, 1.2, 0.0]
 IN_THE_VIEW = [0.4, 0.0, 0.0]
-BLIND = Faults(jnp.full(2, jnp.inf), jnp.zeros(2))
+BLIND = Faults(jnp.full(2, jnp.inf), jnp.full(2, 0.0))
 
 
 @pytest.fixture(scope="module")
 def scan(team, models):
-    return [
-        jax.jit(alone(lambda key, state, r=robot: act.scan(key, team, models, state, r)))
-        for robot in (CAMERA, LIDAR)
-    ]
+    """A scan in one mission, by one program for all robots, networks and numbers."""
+
+    @jax.jit
+    def of_one(key, state, robot, models, config):
+        changed = with_config(team, config)
+        return alone(lambda key, state: act.scan(key, changed, models, state, robot))(key, state)
+
+    return lambda key, state, robot, models=models, config=CONFIG: of_one(
+        key, state, robot, models, config
+    )
 
 
 @pytest.fixture(scope="module")
@@ -41,23 +46,17 @@ def facing(arena_of, set_robot):
     return make
 
 
-def scan_as(team, models, robot):
-    """A scan whose detector returns one probability of its first label, whatever it sees."""
-
-    @jax.jit
-    @alone
-    def scan(key, state, confidence):
-        # All weights are zero: of two labels one has the probability 1 / (1 + exp(-logit)).
-        logit = jnp.log(confidence[0] / (1 - confidence[0]))
-        detector = models.detectors[robot]
-        params = jax.tree.map(jnp.zeros_like, detector.params)
-        layer = f"Dense_{len(detector.hidden)}"
-        params["params"][layer]["bias"] = jnp.stack([logit, 0.0])
-        detectors = list(models.detectors)
-        detectors[robot] = replace(detector, params=params)
-        return act.scan(key, team, replace(models, detectors=tuple(detectors)), state, robot)
-
-    return scan
+def sure(models, robot, confidence):
+    """Models whose detector returns one probability of its first label, whatever it sees."""
+    # All weights are zero: of two labels one has the probability 1 / (1 + exp(-logit)).
+    logit = np.log(confidence / (1 - confidence))
+    detector = models.detectors[robot]
+    params = jax.tree.map(np.zeros_like, detector.params)
+    layer = f"Dense_{len(detector.hidden)}"
+    params["params"][layer]["bias"] = np.array([logit, 0.0], np.float32)
+    detectors = list(models.detectors)
+    detectors[robot] = replace(detector, params=params)
+    return replace(models, detectors=tuple(detectors))
 
 
 @pytest.mark.parametrize(
@@ -71,13 +70,13 @@ def scan_as(team, models, robot):
     ],
 )
 def test_a_detection_updates_the_exact_posterior_and_is_counted(
-    team, models, facing, robot, expected
+    scan, models, facing, robot, expected
 ):
     before = facing(robot)
     counts = before.times_seen.at[0, robot].set(4).at[1].set(2)
     posterior = before.log_posterior.at[0].set(jnp.log(jnp.array([0.5, 0.25, 0.25])))
     before = replace(before, times_seen=counts, log_posterior=posterior)
-    after = scan_as(team, models, robot)(jax.random.key(0), before, jnp.float32(0.8))
+    after = scan(jax.random.key(0), before, robot, sure(models, robot, 0.8))
     np.testing.assert_allclose(np.exp(after.log_posterior[0]), expected, rtol=1e-5)
     np.testing.assert_array_equal(after.log_posterior[1:], posterior[1:])
     np.testing.assert_array_equal(after.times_seen, counts.at[0, robot].set(5))
@@ -86,7 +85,7 @@ def test_a_detection_updates_the_exact_posterior_and_is_counted(
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
 def test_what_is_seen_is_written_into_the_map(scan, facing, robot):
     before = facing(robot)
-    after = scan[robot](jax.random.key(0), before)
+    after = scan(jax.random.key(0), before, robot)
     assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, 1)
     assert after.robots.phase[robot] == IDLE
     assert after.robots.target[robot] == CONFIG.arena.num_pois
@@ -109,7 +108,7 @@ def test_what_is_seen_is_written_into_the_map(scan, facing, robot):
 )
 def test_what_is_hidden_or_not_seen_gives_no_detection(scan, facing, robot, setting):
     before = facing(robot, **setting)
-    after = scan[robot](jax.random.key(0), before)
+    after = scan(jax.random.key(0), before, robot)
     assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, 0)
     assert after.version == 0
     assert not np.any(after.seen)
@@ -122,7 +121,7 @@ def test_what_is_hidden_or_not_seen_gives_no_detection(scan, facing, robot, sett
 
 def test_the_lidar_looks_over_a_robot_without_one(scan, facing):
     # Its beams are at 0.152 m; the camera robot is 0.094 m high.
-    after = scan[LIDAR](jax.random.key(0), facing(LIDAR, other=IN_THE_VIEW))
+    after = scan(jax.random.key(0), facing(LIDAR, other=IN_THE_VIEW), LIDAR)
     assert after.robots.detections[LIDAR] == 1
 
 
@@ -147,27 +146,23 @@ def test_a_poi_that_is_not_where_it_is_expected_is_not_shown(facing, robot, team
 
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
-def test_an_unsure_detector_writes_nothing(models, facing, robot):
-    settings = replace(CONFIG.mission, least_confidence=0.6)
-    strict = mission.make_mission(replace(CONFIG, mission=settings), contacts=False)
-    scan = scan_as(strict, models, robot)
+def test_an_unsure_detector_writes_nothing(scan, models, facing, robot):
+    strict = replace(CONFIG, mission=replace(CONFIG.mission, least_confidence=0.6))
     for confidence, detections in ((0.59, 0), (0.61, 1)):
-        after = scan(jax.random.key(0), facing(robot), jnp.float32(confidence))
+        after = scan(
+            jax.random.key(0), facing(robot), robot, sure(models, robot, confidence), strict
+        )
         assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, detections)
 
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
-def test_a_poi_is_seen_however_wrong_its_bearing_is_believed_to_be(team, models, facing, robot):
+def test_a_poi_is_seen_however_wrong_its_bearing_is_believed_to_be(scan, facing, robot):
     # At .8 m it is 7.18 degrees to either side, .7 of which would reach beyond it if the bearing
     # were 6 degrees off and nobody knew.
     unsure = replace(CONFIG, viewpoint=replace(CONFIG.viewpoint, bearing_error=6.0))
-    number, changed = 32, with_config(team, unsure)
-    states = jax.tree.map(lambda x: jnp.stack([x] * number), facing(robot))
-    keys = jax.random.split(jax.random.key(0), number)
-    after = jax.jit(lambda keys, states: act.scan(keys, changed, models, states, robot))(
-        keys, states
-    )
-    np.testing.assert_array_equal(after.robots.detections[:, robot], 1)
+    state = facing(robot)
+    for key in jax.random.split(jax.random.key(0), 32):
+        assert scan(key, state, robot, config=unsure).robots.detections[robot] == 1
 
 
 @pytest.mark.parametrize(
@@ -183,15 +178,15 @@ def test_only_a_robot_that_faces_the_poi_and_is_calm_scans(
     scan, facing, set_robot, pose, turning, scans
 ):
     state = set_robot(facing(CAMERA, pose), CAMERA, command=jnp.array([0.0, turning]))
-    after = scan[CAMERA](jax.random.key(0), state)
+    after = scan(jax.random.key(0), state, CAMERA)
     assert after.robots.looks[CAMERA] == scans
 
 
 def test_a_robot_that_passes_through_the_view_is_waited_for(scan, facing, set_robot):
     passing = set_robot(facing(CAMERA, other=IN_THE_VIEW), LIDAR, phase=DRIVING)
     waits = set_robot(passing, CAMERA, progress_at=0.0)
-    assert scan[CAMERA](jax.random.key(0), waits).robots.looks[CAMERA] == 0
-    assert scan[CAMERA](jax.random.key(0), passing).robots.looks[CAMERA] == 1
+    assert scan(jax.random.key(0), waits, CAMERA).robots.looks[CAMERA] == 0
+    assert scan(jax.random.key(0), passing, CAMERA).robots.looks[CAMERA] == 1
 
 
 def test_after_some_failures_the_poi_is_given_up(scan, facing, set_robot):
@@ -199,7 +194,7 @@ def test_after_some_failures_the_poi_is_given_up(scan, facing, set_robot):
     for attempt in range(1, CONFIG.mission.attempts + 1):
         assert not state.robots.undetected[CAMERA, 0]
         state = set_robot(state, CAMERA, phase=FACING, view=attempt)
-        state = scan[CAMERA](jax.random.key(attempt), state)
+        state = scan(jax.random.key(attempt), state, CAMERA)
         assert state.robots.attempts[CAMERA] == attempt
         assert state.robots.excluded[CAMERA].sum() == attempt
     np.testing.assert_array_equal(state.robots.undetected[CAMERA], [True, False, False])
@@ -207,7 +202,7 @@ def test_after_some_failures_the_poi_is_given_up(scan, facing, set_robot):
 
 @pytest.fixture(scope="module")
 def approach(team):
-    return jax.jit(lambda state: act.approach(team, state, CAMERA))
+    return jax.jit(lambda state, robot: act.approach(team, state, robot))
 
 
 def driving(state, set_robot, view, seconds, progress_at, way_left=0.1):
@@ -223,21 +218,21 @@ def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
     # It wants to a viewpoint on the far side of the PoI.
     patience = CONFIG.navigation.stuck_time
     start = facing(CAMERA)
-    still = approach(driving(start, set_robot, 0, patience - 0.1, 0.0))
+    still = approach(driving(start, set_robot, 0, patience - 0.1, 0.0), CAMERA)
     assert still.robots.phase[CAMERA] == DRIVING
-    stuck = approach(driving(start, set_robot, 0, patience + 0.2, 0.0))
+    stuck = approach(driving(start, set_robot, 0, patience + 0.2, 0.0), CAMERA)
     assert stuck.robots.phase[CAMERA] == BACKING
     assert stuck.robots.attempts[CAMERA] == 1
     np.testing.assert_array_equal(np.flatnonzero(stuck.robots.excluded[CAMERA]), [0])
     assert (stuck.robots.goals[CAMERA], stuck.robots.reached[CAMERA]) == (1, 0)
     # A way that has become shorter is progress.
-    goes_on = approach(driving(start, set_robot, 0, patience + 0.2, 0.0, way_left=9.0))
+    goes_on = approach(driving(start, set_robot, 0, patience + 0.2, 0.0, way_left=9.0), CAMERA)
     assert goes_on.robots.phase[CAMERA] == DRIVING
     assert goes_on.robots.way_left[CAMERA] < 9.0
     # And after the time of recovery it asks again.
     later = patience + 0.2 + CONFIG.navigation.recovery_time + 0.1
     steps = jnp.int32(round(later / CONFIG.mission.control_period))
-    assert approach(replace(stuck, steps=steps)).robots.phase[CAMERA] == IDLE
+    assert approach(replace(stuck, steps=steps), CAMERA).robots.phase[CAMERA] == IDLE
 
 
 def test_a_viewpoint_on_which_a_robot_has_come_to_stand_is_left_without_blame(
@@ -247,25 +242,24 @@ def test_a_viewpoint_on_which_a_robot_has_come_to_stand_is_left_without_blame(
     start = facing(CAMERA, pose=(-1.0, 0.0, 0.0))
     place = start.roadmap.viewpoints[0, view]
     taken = replace(start, scene=replace(start.scene, poses=start.scene.poses.at[1, :2].set(place)))
-    state = approach(driving(taken, set_robot, view, 1.0, 0.9))
+    state = approach(driving(taken, set_robot, view, 1.0, 0.9), CAMERA)
     assert state.robots.phase[CAMERA] == IDLE
     assert state.robots.goals[CAMERA] == 0
     assert state.robots.attempts[CAMERA] == 0
     assert state.robots.excluded[CAMERA, view]
     # One that only drives past will be gone.
     passing = set_robot(driving(taken, set_robot, view, 1.0, 0.9), LIDAR, phase=DRIVING)
-    assert approach(passing).robots.phase[CAMERA] == DRIVING
+    assert approach(passing, CAMERA).robots.phase[CAMERA] == DRIVING
 
 
-def test_a_robot_that_has_ended_makes_room_for_one_that_is_stuck(team, facing, set_robot):
+def test_a_robot_that_has_ended_makes_room_for_one_that_is_stuck(approach, facing, set_robot):
     state = facing(CAMERA, pose=(0.0, 0.0, 0.0), other=[0.3, 0.0, 0.0])
     state = set_robot(state, LIDAR, phase=ENDED, target=3)
     state = driving(state, set_robot, 0, 3.0, 0.0)
-    approach = jax.jit(lambda state: act.approach(team, state, LIDAR))
-    assert np.any(approach(state).robots.wanted[LIDAR] != 0)
+    assert np.any(approach(state, LIDAR).robots.wanted[LIDAR] != 0)
     # But not for one that gets on, nor for one that is far away.
     gets_on = set_robot(state, CAMERA, progress_at=2.5)
-    np.testing.assert_array_equal(approach(gets_on).robots.wanted[LIDAR], 0.0)
+    np.testing.assert_array_equal(approach(gets_on, LIDAR).robots.wanted[LIDAR], 0.0)
     far = state.scene.poses.at[LIDAR, :2].set(jnp.array([-1.3, 0.0]))
     far = replace(state, scene=replace(state.scene, poses=far))
-    np.testing.assert_array_equal(approach(far).robots.wanted[LIDAR], 0.0)
+    np.testing.assert_array_equal(approach(far, LIDAR).robots.wanted[LIDAR], 0.0)

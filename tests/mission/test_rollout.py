@@ -12,19 +12,19 @@ from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
 from jaxsense.sim import amiro, navigation
 from jaxsense.sim import arena as arenas
 
-STEPS, CHUNK = 320, 40
+STEPS, CHUNK = 240, 40
 NUM_POIS = CONFIG.arena.num_pois
 PERIOD = CONFIG.mission.control_period
 FAULT_TIME = 4.0  # s
 NEVER = (np.inf, np.inf)
 # For each case: when robots stop and go blind, and the number of its arenas.
 CASES = {
-    "healthy": (NEVER, NEVER, 8),
-    "0 stops": ((FAULT_TIME, np.inf), NEVER, 3),
-    "1 stops": ((np.inf, FAULT_TIME), NEVER, 3),
-    "0 blind": (NEVER, (FAULT_TIME, np.inf), 3),
-    "1 blind": (NEVER, (np.inf, FAULT_TIME), 3),
-    "nobody": ((0.0, 0.0), NEVER, 2),
+    "healthy": (NEVER, NEVER, 4),
+    "0 stops": ((FAULT_TIME, np.inf), NEVER, 2),
+    "1 stops": ((np.inf, FAULT_TIME), NEVER, 2),
+    "0 blind": (NEVER, (FAULT_TIME, np.inf), 2),
+    "1 blind": (NEVER, (np.inf, FAULT_TIME), 2),
+    "nobody": ((0.0, 0.0), NEVER, 1),
 }
 NUM_ARENAS = CASES["healthy"][2]
 
@@ -52,7 +52,7 @@ def played(team, go_on, as_numpy):
         return jax.vmap(lambda k, f: mission.reset(k, team, NAIVE, f))(keys, faults)
 
     number = len(stops_at)
-    start = begin(jax.random.split(jax.random.key(0), number), Faults(stops_at, blind_at))
+    start = begin(jax.random.split(jax.random.key(4), number), Faults(stops_at, blind_at))
     states, records = [start], []
     for i in range(STEPS // CHUNK):
         keys = jax.random.split(jax.random.key(1 + i), number)
@@ -185,7 +185,7 @@ def test_a_robot_that_goes_blind_detects_nothing_more_and_the_mission_says_so(pl
 
 def test_without_any_robot_the_mission_ends_at_once(played):
     _, end, _ = played[0]["nobody"]
-    assert reasons(end) == ["no robot left"] * 2
+    assert reasons(end) == ["no robot left"]
     assert np.all(end.steps == 1)
     assert np.all(end.robots.looks == 0)
 

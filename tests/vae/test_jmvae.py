@@ -17,6 +17,12 @@ TWO = Jmvae(("camera", "lidar"), (2, 2), latent_size=2, hidden=(8,))
 THREE = Jmvae(("camera", "lidar", "sonar"), (2, 3, 1), latent_size=4, hidden=(8,))
 
 
+init = jax.jit(jmvae.init, static_argnums=1)
+encode = jax.jit(jmvae.encode, static_argnums=1)
+decode = jax.jit(jmvae.decode, static_argnums=1)
+loss = jax.jit(jmvae.loss, static_argnums=2)
+
+
 def some_features(model, seed=0):
     keys = jax.random.split(jax.random.key(seed), len(model.modalities))
     return tuple(
@@ -29,13 +35,16 @@ def keep(features, subset):
 
 
 def zero_parameters(model):
-    return jax.tree.map(jnp.zeros_like, jmvae.init(jax.random.key(0), model))
+    return jax.tree.map(np.zeros_like, init(jax.random.key(0), model))
 
 
 def with_output(params, part, name, output):
     """Parameters with the bias of one network's last layer replaced."""
     network = {"params": dict(params[part][name]["params"])}
-    network["params"]["Dense_1"] = {**network["params"]["Dense_1"], "bias": jnp.array(output)}
+    network["params"]["Dense_1"] = {
+        **network["params"]["Dense_1"],
+        "bias": np.array(output, np.float32),
+    }
     return {**params, part: {**params[part], name: network}}
 
 
@@ -48,8 +57,8 @@ def test_subsets_are_all_non_empty_ones_with_the_joint_one_last():
 
 @pytest.mark.parametrize("model", [TWO, THREE])
 def test_every_subset_has_an_encoder_of_its_own(model):
-    params, features = jmvae.init(jax.random.key(0), model), some_features(model)
-    before = {s: jmvae.encode(params, model, keep(features, s)) for s in model.subsets}
+    params, features = init(jax.random.key(0), model), some_features(model)
+    before = {s: encode(params, model, keep(features, s)) for s in model.subsets}
     for mean, log_var in before.values():
         assert mean.shape == log_var.shape == (model.latent_size,)
     means = [tuple(mean.tolist()) for mean, _ in before.values()]
@@ -58,14 +67,14 @@ def test_every_subset_has_an_encoder_of_its_own(model):
         name = "+".join(model.modalities[m] for m in changed)
         other = with_output(params, "encoders", name, jnp.full(2 * model.latent_size, 9.0))
         for subset in model.subsets:
-            mean, _ = jmvae.encode(other, model, keep(features, subset))
+            mean, _ = encode(other, model, keep(features, subset))
             assert np.array_equal(mean, before[subset][0]) == (subset != changed)
 
 
 def test_first_half_of_an_encoders_output_is_the_mean_and_the_second_the_log_variance():
     params = with_output(zero_parameters(TWO), "encoders", "lidar", [1.0, 2.0, jnp.log(4.0), 0.0])
     features = keep(some_features(TWO), (1,))
-    mean, log_var = jmvae.encode(params, TWO, features)
+    mean, log_var = encode(params, TWO, features)
     np.testing.assert_allclose(mean, [1.0, 2.0])
     np.testing.assert_allclose(log_var, [1.386294, 0.0], rtol=1e-5)
     belief = jmvae.posterior(params, TWO, features)
@@ -74,21 +83,21 @@ def test_first_half_of_an_encoders_output_is_the_mean_and_the_second_the_log_var
 
 
 def test_decode_gives_the_features_of_every_modality():
-    params = jmvae.init(jax.random.key(0), THREE)
+    params = init(jax.random.key(0), THREE)
     z = jnp.array([0.3, -0.2, 1.0, 0.5])
-    before = jmvae.decode(params, THREE, z)
+    before = decode(params, THREE, z)
     assert [x.shape for x in before] == [(2,), (3,), (1,)]
-    after = jmvae.decode(with_output(params, "decoders", "lidar", [9.0, 9.0, 9.0]), THREE, z)
+    after = decode(with_output(params, "decoders", "lidar", [9.0, 9.0, 9.0]), THREE, z)
     changed = [not np.array_equal(x, y) for x, y in zip(before, after, strict=True)]
     assert changed == [False, True, False]
 
 
 def test_encode_takes_batches_by_vmap_as_a_loop_of_singles():
-    params = jmvae.init(jax.random.key(0), TWO)
+    params = init(jax.random.key(0), TWO)
     camera, lidar = jax.random.uniform(jax.random.key(1), (2, 5, 2))
-    batch, _ = jax.vmap(lambda x, w: jmvae.encode(params, TWO, (x, w)))(camera, lidar)
+    batch, _ = jax.vmap(lambda x, w: encode(params, TWO, (x, w)))(camera, lidar)
     for mean, x, w in zip(batch, camera, lidar, strict=True):
-        np.testing.assert_allclose(mean, jmvae.encode(params, TWO, (x, w))[0], rtol=1e-5)
+        np.testing.assert_allclose(mean, encode(params, TWO, (x, w))[0], rtol=1e-5)
 
 
 def test_bad_input_raises_an_error_that_names_it():
@@ -120,7 +129,7 @@ def test_loss_as_worked_by_hand():
     params = with_output(params, "encoders", "camera+lidar", [1.0, 0.0, 0.0, 0.0])
     params = with_output(params, "encoders", "lidar", [1.0, 2.0, 0.0, 0.0])
     params = with_output(params, "decoders", "camera", [1.0, 0.0])
-    total, parts = jmvae.loss(
+    total, parts = loss(
         jax.random.key(0),
         params,
         TWO,
@@ -137,28 +146,28 @@ def test_loss_as_worked_by_hand():
 
 
 def test_loss_of_three_modalities_follows_from_encode_and_decode():
-    params, features = jmvae.init(jax.random.key(0), THREE), some_features(THREE, seed=1)
+    params, features = init(jax.random.key(0), THREE), some_features(THREE, seed=1)
     weights, alpha, beta = (2.0, 0.5, 3.0), 0.7, 0.3
     keys = jax.random.split(jax.random.key(2), 4000)
     options = {"alpha": alpha, "beta": beta, "reconstruction_weights": weights}
-    losses, _ = jax.vmap(lambda k: jmvae.loss(k, params, THREE, features, **options))(keys)
+    losses, _ = jax.vmap(lambda k: loss(k, params, THREE, features, **options))(keys)
 
     def kl(p, q):
         (m, v), (n, w) = (p[0], np.exp(p[1])), (q[0], np.exp(q[1]))
         return 0.5 * np.sum(v / w + (n - m) ** 2 / w - 1 + np.log(w / v))
 
-    def encode(subset):
-        belief = jmvae.encode(params, THREE, keep(features, subset))
+    def encoded(subset):
+        belief = encode(params, THREE, keep(features, subset))
         return [np.asarray(x, np.float64) for x in belief]
 
-    joint = encode((0, 1, 2))
+    joint = encoded((0, 1, 2))
     others = [s for size in (1, 2) for s in itertools.combinations(range(3), size)]
-    divergence = alpha * sum(kl(joint, encode(s)) for s in others)
+    divergence = alpha * sum(kl(joint, encoded(s)) for s in others)
     divergence += beta * kl(joint, [np.zeros(4), np.zeros(4)])
     # The expected reconstruction by draws of our own: only the means over many draws agree.
     noise = np.random.default_rng(0).standard_normal((4000, 4))
     z = jnp.array(joint[0] + np.exp(0.5 * joint[1]) * noise, jnp.float32)
-    decoded = jax.vmap(lambda z: jmvae.decode(params, THREE, z))(z)
+    decoded = jax.vmap(lambda z: decode(params, THREE, z))(z)
     reconstruction = np.sum(
         [
             weight * 0.5 * np.sum((np.asarray(d) - np.asarray(x)) ** 2, axis=1)
@@ -175,37 +184,40 @@ def test_loss_of_three_modalities_follows_from_encode_and_decode():
 
 
 def test_losses_of_a_batch_are_those_of_its_examples():
-    params = jmvae.init(jax.random.key(0), THREE)
+    params = init(jax.random.key(0), THREE)
     keys = jax.random.split(jax.random.key(1), 5)
     examples = jax.vmap(lambda k: some_features(THREE, k))(jnp.arange(5))
     options = {"alpha": 0.7, "beta": 0.3, "reconstruction_weights": (2.0, 0.5, 3.0)}
     noise = jax.vmap(lambda k: jax.random.normal(k, (THREE.latent_size,)), out_axes=-1)(keys)
     columns = tuple(x.T for x in examples)
-    together, parts = jmvae.losses(noise, params, THREE, columns, **options)
+    together, parts = jax.jit(jmvae.losses, static_argnums=2)(
+        noise, params, THREE, columns, **options
+    )
     assert together.shape == (5,)
     for i, key in enumerate(keys):
-        alone, of_one = jmvae.loss(key, params, THREE, tuple(x[i] for x in examples), **options)
+        alone, of_one = loss(key, params, THREE, tuple(x[i] for x in examples), **options)
         np.testing.assert_allclose(together[i], alone, rtol=1e-5)
         for name, part in of_one.items():
             np.testing.assert_allclose(parts[name][i], part, rtol=1e-5)
 
 
 def test_loss_is_that_of_encode_and_decode_with_the_keys_draw():
-    params, features = jmvae.init(jax.random.key(0), TWO), some_features(TWO)
+    params, features = init(jax.random.key(0), TWO), some_features(TWO)
     options = {"alpha": 0.0, "beta": 0.0, "reconstruction_weights": (2.0, 0.5)}
-    total, _ = jmvae.loss(jax.random.key(4), params, TWO, features, **options)
-    mean, log_var = jmvae.encode(params, TWO, features)
+    total, _ = loss(jax.random.key(4), params, TWO, features, **options)
+    mean, log_var = encode(params, TWO, features)
     noise = jax.random.normal(jax.random.key(4), mean.shape)
-    camera, lidar = jmvae.decode(params, TWO, gaussian.sample(noise, mean, log_var))
+    camera, lidar = decode(params, TWO, gaussian.sample(noise, mean, log_var))
     expected = jnp.sum((camera - features[0]) ** 2) + 0.25 * jnp.sum((lidar - features[1]) ** 2)
     np.testing.assert_allclose(total, expected, rtol=1e-5)
 
 
 def test_every_step_of_a_training_draws_anew():
     config = JmvaeConfig(hidden=(8,), steps=20, batch=4, learning_rate=1e-12)
-    state = jmvae.start(jmvae.init(jax.random.key(0), TWO), config)
+    state = jmvae.start(init(jax.random.key(0), TWO), config)
     bank = tuple(jax.random.uniform(k, (3, 50, 2)) for k in jax.random.split(jax.random.key(1)))
-    _, losses = jmvae.train(jax.random.key(2), state, TWO, bank, config, 20)
+    train = jax.jit(jmvae.train, static_argnums=(2, 5))
+    _, losses = train(jax.random.key(2), state, TWO, bank, config, 20)
     assert len(np.unique(losses)) == 20
 
 
@@ -218,17 +230,17 @@ def test_gradient_of_the_loss_agrees_with_finite_differences():
         features = tuple(x.astype(jnp.float64) for x in some_features(model))
 
         @jax.jit
-        def loss(flat):
+        def of_flat(flat):
             options = {"alpha": 0.5, "beta": 0.2, "reconstruction_weights": (3.0, 1.0)}
             params = jax.tree.map(lambda x: x.astype(jnp.float64), unravel(flat))
             return jmvae.loss(jax.random.key(1), params, model, features, **options)[0]
 
-        gradient, h = jax.jit(jax.grad(loss))(flat), 1e-6
+        gradient, h = jax.jit(jax.grad(of_flat))(flat), 1e-6
         rows = np.flatnonzero(np.abs(np.asarray(gradient)) > 1e-3)[::7]
         assert len(rows) >= 5
         for i in rows:
             step = jnp.zeros_like(flat).at[i].set(h)
-            slope = (loss(flat + step) - loss(flat - step)) / (2 * h)
+            slope = (of_flat(flat + step) - of_flat(flat - step)) / (2 * h)
             np.testing.assert_allclose(gradient[i], slope, rtol=1e-5)
 
 
