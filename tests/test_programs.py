@@ -491,6 +491,7 @@ NUMBERS = {
 }
 
 
+@pytest.mark.slow  # a run of its own; `test_traced_settings` is the fast companion
 def test_other_numbers_need_no_other_program(smoke_run, cache, tmp_path):
     traced = Path(cache[1]) / "traced"
     before = {path.name for path in traced.iterdir()}

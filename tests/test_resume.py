@@ -100,6 +100,7 @@ def test_a_run_that_cannot_go_on_is_named(stopped, cache, tmp_path, capsys, chan
     assert expected in error_line(["--resume", str(path), *cache], capsys)
 
 
+@pytest.mark.slow  # faults of files are tried one by one before a release too
 def test_a_run_goes_on_from_what_is_sound(stopped, smoke_run, cache, tmp_path, capsys):
     path = tmp_path / "run"
     shutil.copytree(stopped, path)

@@ -37,14 +37,14 @@ def test_slopes_are_those_of_finite_differences(by):
         angles = rng.uniform(-np.pi, np.pi, 100)
         numbers, unravel = ravel_pytree((origins[0], angles[0], section))
 
-        values = jax.vmap(lambda start: hit(*unravel(start)))
+        values = jax.jit(jax.vmap(lambda start: hit(*unravel(start))))
         starts = np.column_stack([origins, angles, np.tile(numbers[3:], (100, 1))])
         steps = STEP * np.eye(len(numbers))
         around = [starts[:, None] + sign * steps for sign in (1, -1)]
         after, before = (values(x.reshape(-1, len(numbers))).reshape(100, -1, 3) for x in around)
         expected = np.swapaxes((after - before) / (2 * STEP), 1, 2)
         met = np.isfinite(values(np.tile(starts, (len(numbers), 1)))[:100, 0])
-        jacobian = jax.vmap(jax.jacrev(hit, INPUTS), in_axes=(0, 0, None))
+        jacobian = jax.jit(jax.vmap(jax.jacrev(hit, INPUTS), in_axes=(0, 0, None)))
         parts = [
             np.reshape(x, (100, 3, -1)) for x in jax.tree.leaves(jacobian(origins, angles, section))
         ]
