@@ -145,6 +145,8 @@ def _write(
         place = "" if config == trained else f"-{_name(config)}"
         film = arguments.run / f"mission-{name}-{arguments.seed}{place}.svg"
         title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
+        if place:
+            title += f", {config.arena.num_pois} points, {len(config.carried)} robots"
         animation.write(film, config, recording, class_beliefs, title)
         written.append(f"The first mission of {name} is in {film}.")
     # Another evaluation may have written metrics since this one began.
@@ -205,8 +207,10 @@ def _elsewhere(arguments: Arguments, config: Config) -> Config:
             f"the policies of this run are for {number} points; must be {number}, or a run with"
         )
         raise ConfigError("arena.num_pois", arena.num_pois, f"{reason} dqn.task = team")
-    is_own = arguments.robots in (None, config.carried)
-    robots = config.robots if is_own else arguments.robots
+    robots, given = config.robots, arguments.robots
+    if given is not None and sorted(given) != sorted(config.carried):
+        # In one order, so that a team plays in the same arenas however it is named.
+        robots = tuple(sorted(given, key=[*config.modalities, *given].index))
     # No mission starts with a map that is partly seen, which limits the number of PoIs.
     mdp = dataclasses.replace(config.mdp, partly_seen_starts=False)
     mdp = config.mdp if arena == config.arena else mdp

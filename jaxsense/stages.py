@@ -694,7 +694,7 @@ def _play_numbers(
 ) -> list[tuple[jax.Array, jax.Array]]:
     """For each of `evaluation.num_pois` the results of `examine.compare_policies`."""
     settings = config.evaluation
-    fewer = dataclasses.replace(settings, num_states=1, num_repeats=settings.num_repeats // 8)
+    fewer = dataclasses.replace(settings, num_states=1, num_repeats=-(-settings.num_repeats // 8))
 
     def play(number: int) -> tuple[jax.Array, jax.Array]:
         # The places of a scene play no part here, only their number.

@@ -71,6 +71,13 @@ def test_a_team_of_robots_survives_json():
     assert found == Config(team=dataclasses.replace(team, travel=travel))
 
 
+@pytest.mark.parametrize("name", ["robots", "modalities"])
+@pytest.mark.parametrize("given", ["camera", {"camera": 1}])
+def test_names_of_sensors_are_a_list(name, given):
+    with pytest.raises(ConfigError, match=rf"{name} = .*camera.*: must be a list of names"):
+        from_plain({name: given})
+
+
 def test_robots_carry_the_sensors_of_the_settings():
     config = Config(robots=("camera", "lidar", "camera"))
     assert config.carried == ("camera", "lidar", "camera")

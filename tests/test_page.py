@@ -304,3 +304,14 @@ def test_a_browser_shows_all_of_it(run, tmp_path, width, is_phone):
     assert found["asked"] == []
     assert found["below"] == is_phone
     assert found["moved"] > 40
+
+
+def test_missions_elsewhere_have_tables_of_their_own(tmp_path):
+    place = {"num_pois": 16, "side": 6.0, "robots": ["camera", "camera", "lidar"]}
+    elsewhere = {"there": {**place, "mission": {"latent": {**MISSION, "accuracy": 0.75}}}}
+    path = write_run(tmp_path / "run")
+    page.write(path, CONFIG, {**SUMMARY, "elsewhere": elsewhere})
+    read = Reader((path / "report.html").read_text(encoding="utf-8"))
+    words = " ".join(read.words)
+    assert "16 points in 6 m; robots: camera, camera, lidar, in the same arenas" in words
+    assert ["accuracy", "0.750"] in read.rows

@@ -370,8 +370,11 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
     # Also 64 robots have a name that a file may bear.
     crowd = dataclasses.replace(there, robots=("camera", "lidar") * 32)
     assert evaluate._name(crowd) == "3-points-4-m-32-camera-32-lidar"
+    # However it is named, a team plays in the same arenas.
+    mixed = evaluate.Arguments(path, side=4.0, robots=("camera", "lidar", "camera"))
+    assert evaluate._elsewhere(mixed, config) == there
     # What is asked for is no other place if the run has it already.
-    same = evaluate.Arguments(path, num_pois=3, side=3.0, robots=("camera", "lidar"))
+    same = evaluate.Arguments(path, num_pois=3, side=3.0, robots=("lidar", "camera"))
     assert evaluate._elsewhere(same, config) == config
     # A policy for any number of points has no limit to the looks of a start.
     team = PRESETS["team"]

@@ -294,6 +294,18 @@ def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(r
     np.testing.assert_allclose(camera.first_total, first[0], atol=1e-4)
 
 
+def test_other_numbers_of_pois_are_played_an_eighth_as_often_but_always_once(monkeypatch):
+    played = []
+    monkeypatch.setattr(stages, "_play_policies", lambda key, config, *_: played.append(config))
+    team = PRESETS["team"]
+    for repeats in (1, 96):
+        settings = dataclasses.replace(team.evaluation, num_repeats=repeats, num_pois=(5, 20))
+        config = dataclasses.replace(team, evaluation=settings)
+        stages._play_numbers(KEY, config, jnp.int32(0))
+    assert [config.arena.num_pois for config in played] == [5, 20, 5, 20]
+    assert [config.evaluation.num_repeats for config in played] == [1, 1, 12, 12]
+
+
 def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):
     # 41 steps are 14 chunks of 3, the last of which has 2.
     def train(key, state, model, bank, config, steps):

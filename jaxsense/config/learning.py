@@ -233,7 +233,7 @@ class DqnConfig:
     replay_capacity: int = 512000
     """Capacity of the replay, in transitions; a multiple of num_envs."""
     discount: Traced[float] = 0.5
-    """Discount factor, gamma."""
+    """Discount factor, gamma: of a step, or with `task` = team of a second."""
     learning_rate: Traced[float] = 1e-3
     """Learning rate of Adam."""
     final_learning_rate: Traced[float] = 1e-5

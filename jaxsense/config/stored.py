@@ -28,6 +28,9 @@ def from_plain(stored: Any, base: Config | None = None) -> Config:
     """
     if not isinstance(stored, dict):
         raise ConfigError("config", stored, "must be an object with a section for each part")
+    for name in ("modalities", "robots"):
+        if isinstance(stored.get(name), str | dict):  # which would be taken apart
+            raise ConfigError(name, stored[name], "must be a list of names")
     # Each section checks the types of its fields itself.
     rules = dacite.Config(strict=True, check_types=False, type_hooks={float: _number})
     try:

@@ -146,9 +146,10 @@ def reset(
       modalities, from a random one on.
     """
     start_key, scene_key, begin_key, look_key = jax.random.split(key, 4)
-    random_classes, random_seen = random_start(start_key, mdp)
-    classes = random_classes if classes is None else classes
-    seen = random_seen if seen is None else seen
+    if classes is None or seen is None:
+        random_classes, random_seen = random_start(start_key, mdp)
+        classes = random_classes if classes is None else classes
+        seen = random_seen if seen is None else seen
     chex.assert_shape(classes, (mdp.num_pois,), custom_message="classes")
     values.require_index("classes", classes, mdp.num_classes)
     scene = mdp.new_scene(scene_key, classes)

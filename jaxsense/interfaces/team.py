@@ -35,7 +35,9 @@ class TeamOutcome:
 
 
 def check_team(mdp: TeamMdp, config: Config) -> None:
-    """Raises `ValueError` unless the MDP has the sensors of the settings."""
+    """Raises `ValueError` unless it is the MDP of a team with the sensors of the settings."""
+    if not isinstance(mdp, TeamMdp):
+        raise ValueError(f"mdp = {type(mdp).__name__}: must be a TeamMdp, from interfaces.team_mdp")
     number = mdp.map.num_modalities
     if len(config.modalities) != number:
         raise ValueError(f"config.modalities = {config.modalities}: must be {number}, as in mdp")

@@ -1,7 +1,6 @@
 """The plots of a run: the paper's Fig. 4 and Fig. 5, and the sensors' scanlines."""
 
 import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -319,23 +318,53 @@ def teams(config: Config, summary: dict[str, Any]) -> Figure:
         "mission": summary["mission"],
     }
     places = [own, *summary["elsewhere"].values()]
-    with_team = [place for place in places if place["robots"] == own["robots"]]
-    # Of the numbers of PoIs, the one that most teams have played with.
-    numbers = [place["num_pois"] for place in places]
-    number = max(numbers, key=numbers.count)
-    with_number = [place for place in places if place["num_pois"] == number]
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    _times(left, with_team, lambda place: place["num_pois"])
-    left.set(xlabel="points of interest", title=f"robots: {', '.join(own['robots'])}")
-    _times(right, with_number, lambda place: len(place["robots"]))
-    right.set(xlabel="robots", title=f"{number} points of interest")
-    left.legend()
+    by_team, by_number = _groups(places, "robots"), _groups(places, "num_pois")
+    panels = [(f"robots: {_counted(team)}", "num_pois", group) for team, group in by_team]
+    panels += [
+        (f"{number} points of interest", "robots", group)
+        for number, group in by_number
+        if len({len(place["robots"]) for place in group}) > 1
+    ]
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(5 * columns, 4 * rows), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for ax, (title, key, group) in zip(axes, panels, strict=False):
+        _times(ax, group, key)
+        ax.set(title=title)
+    for ax in axes[len(panels) :]:
+        ax.set_axis_off()
+    handles = {
+        label: handle
+        for ax in figure.axes
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(handles.values(), handles.keys(), loc="outside right upper")
     return figure
 
 
-def _times(ax: Any, places: list[dict[str, Any]], number: Callable[[dict[str, Any]], int]) -> None:
-    """A line for each policy: the time of missions against a number of each place."""
+def _groups(places: list[dict[str, Any]], key: str) -> list[tuple[Any, list[dict[str, Any]]]]:
+    """Places by what they have in common, in the order in which it came first."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for place in places:
+        found.setdefault(str(place[key]), []).append(place)
+    return [(group[0][key], group) for group in found.values()]
+
+
+def _counted(team: list[str]) -> str:
+    """A team in words: `2 camera, 1 lidar`."""
+    return ", ".join(f"{team.count(modality)} {modality}" for modality in dict.fromkeys(team))
+
+
+def _times(ax: Any, places: list[dict[str, Any]], key: str) -> None:
+    """A line for each policy: the time of missions against the number of PoIs or of robots."""
+
+    def number(place: dict[str, Any]) -> int:
+        return place[key] if key == "num_pois" else len(place[key])
+
+    numbers = sorted(map(number, places))
+    # Places of one number differ in something else, and no line leads from one to the other.
+    line = "-" if len(set(numbers)) == len(numbers) else ""
     for i, name in enumerate(POLICIES):
         of_policy = [
             (number(place), metrics.mean(place["mission"][name]["time_s"]))
@@ -344,9 +373,10 @@ def _times(ax: Any, places: list[dict[str, Any]], number: Callable[[dict[str, An
         ]
         if of_policy:
             # The last ones in the same colours have dashes.
-            style = "oDs^"[i % 4] + ("-" if i < _NUM_COLOURS else "--")
+            style = "oDs^"[i % 4] + (line if i < _NUM_COLOURS else 2 * line)
             ax.plot(*zip(*of_policy, strict=True), style, color=f"C{i}", label=name)
-    ax.set(ylabel="median time [s]", ylim=(0, None), xticks=sorted(set(map(number, places))))
+    label = "points of interest" if key == "num_pois" else "robots"
+    ax.set(xlabel=label, ylabel="median time [s]", ylim=(0, None), xticks=sorted(set(numbers)))
     ax.grid(alpha=0.3)
 
 

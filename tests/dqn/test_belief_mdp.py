@@ -67,6 +67,12 @@ def test_reset_writes_what_has_been_seen_and_nothing_else():
     assert state.steps == 0
 
 
+def test_reset_draws_no_start_that_is_given(monkeypatch):
+    monkeypatch.setattr(belief_mdp, "random_start", None)
+    state = belief_mdp.reset(jax.random.key(0), MDP, CLASSES, SEEN)
+    np.testing.assert_array_equal(state.seen, SEEN)
+
+
 def test_reset_writes_the_modalities_in_random_order():
     seen = jnp.ones((3, 2), bool)
     states = jax.vmap(reset, in_axes=(0, None, None))(

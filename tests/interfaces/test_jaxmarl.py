@@ -255,6 +255,8 @@ def test_other_sensors_than_those_of_the_settings_are_named():
         ValueError, match=r"config.modalities = \('camera',\): must be 2, as in mdp"
     ):
         TeamEnv(small.team(), small.ONLY_CAMERAS)
+    with pytest.raises(ValueError, match="mdp = MapMdp: must be a TeamMdp"):
+        TeamEnv(small.team().map, small.ONLY_CAMERAS)
 
 
 def test_the_import_prints_nothing_and_keeps_streams(monkeypatch, capfd):

@@ -154,10 +154,11 @@ class MapView:
             add(parent, "circle", cx=x, cy=y, r=3, fill=colour)
         numbers = add(parent, "g")
         num_pois = self._config.arena.num_pois
+        # Before the first look each is wider than the view, a little less so than the one before.
+        step = min(4.0, SIZE / 4 / num_pois)
         for n in range(num_pois):
             mean = self._place(_smooth(_in_plane(record.belief.mean[:, n])))
-            # Before the first look it is wider than the view.
-            widest = SIZE / 2 - 5 - 4 * n
+            widest = SIZE / 2 - 5 - step * n
             std = self._scale * _in_plane(record.belief.std[:, n])
             radii = _smooth(np.minimum(std, widest))
             colour = colours[int(self._end.classes[n])]

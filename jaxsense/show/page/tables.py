@@ -116,13 +116,22 @@ def unambiguous(summary: Summary, classes: list[str]) -> tuple[list[str], list[R
     return [*alone, "together"], rows
 
 
-def missions(summary: Summary) -> tuple[str, list[str], list[Row]]:
-    """Missions: a caption, policies and failures as columns, and their metrics as rows."""
-    blocks = cases(summary["mission"])
+def missions(summary: Summary) -> list[tuple[str, list[str], list[Row]]]:
+    """Missions of the run, and then elsewhere: captions, policies as columns, metrics as rows."""
+    tables = [_missions(summary["mission"], "All robots together")]
+    for place in summary.get("elsewhere", {}).values():
+        arena = f"{place['num_pois']} points in {place['side']:g} m"
+        tables.append(_missions(place["mission"], f"{arena}; robots: {', '.join(place['robots'])}"))
+    return tables
+
+
+def _missions(mission: dict[str, Any], name: str) -> tuple[str, list[str], list[Row]]:
+    """The table of one place."""
+    blocks = cases(mission)
     played = [arenas(block) for block in blocks.values()]
-    caption = "All robots together, in the same arenas for each policy"
+    caption = f"{name}, in the same arenas for each policy"
     if any(each != played[0] for each in played):
-        caption = "All robots together; policies of equal seed and missions had the same arenas"
+        caption = f"{name}; policies of equal seed and missions had the same arenas"
     # Some metrics exist only where a robot is alone, or beside other policies.
     every = blocks.values()
     measured = [m for m in metrics.MISSIONS if any(m.block in block for block in every)]

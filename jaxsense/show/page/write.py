@@ -102,7 +102,6 @@ def _render(run: Path, config: Config, summary: dict[str, Any], template: str) -
         undefined=jinja2.StrictUndefined,
     )
     columns, table = tables.unambiguous(summary, list(config.arena.classes))
-    mission_caption, mission_columns, missions = tables.missions(summary)
     return environment.get_template(template).render(
         run=run,
         argument=lambda path: shlex.quote(str(path)),
@@ -119,9 +118,7 @@ def _render(run: Path, config: Config, summary: dict[str, Any], template: str) -
         latent_space=tables.latent_space(summary),
         table_columns=columns,
         table=table,
-        mission_caption=mission_caption,
-        mission_columns=mission_columns,
-        missions=missions,
+        missions=tables.missions(summary),
         stages=tables.timing(summary),
         plots=_plots(run),
         films=_films(run),
