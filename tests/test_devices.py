@@ -179,3 +179,21 @@ def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):
     assert devices.start(1) == Workers()
     workers = devices.start(None)
     assert workers.mesh.size == workers.number == 2
+
+
+DECOMPOSED = """
+import jax, jax.numpy as jnp
+from jaxsense.run import devices
+workers = devices.start(2)
+matrices = jnp.stack([jnp.eye(18)] * 288)
+again = lambda _, x: jnp.linalg.cholesky(x @ x)
+program = jax.jit(lambda x: jax.lax.fori_loop(0, 400, again, x)).lower(matrices).compile()
+for _ in range(4):
+    devices.side_by_side(lambda i: jax.block_until_ready(program(matrices)), workers.threads)
+"""
+
+
+def test_programs_side_by_side_do_not_wait_for_each_other_for_ever():
+    # Cholesky decompositions as in the physics of six robots.
+    environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
+    subprocess.run([sys.executable, "-c", DECOMPOSED], env=environment, check=True, timeout=120)

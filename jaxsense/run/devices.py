@@ -95,6 +95,7 @@ def start(number: int | None) -> Workers:
     jax.config.update("jax_default_matmul_precision", "highest")
     if number is not None and not 1 <= number <= _MOST_DEVICES:
         raise ConfigError("devices", number, f"must be within 1 and {_MOST_DEVICES}")
+    _make_room(number or NUM_THREADS)
     if jax.default_backend() == "cpu" and jax.process_count() == 1:
         return Workers(threads=number or NUM_THREADS)
     there = jax.device_count()
@@ -102,6 +103,17 @@ def start(number: int | None) -> Workers:
     if number > there:
         raise ConfigError("devices", number, f"must be within 1 and {there}")
     return Workers(mesh=make_mesh(number) if number > 1 else None)
+
+
+def _make_room(threads: int) -> None:
+    """Makes XLA's pool of threads larger than the number of programs side by side.
+
+    A large batch of Cholesky decompositions, as in the physics of six robots, is shared out to the
+    pool by a member of the pool, which waits for the others. If every member does, all wait for
+    ever. The pool is made with the backend, and otherwise has as many threads as there are cores.
+    """
+    if 2 * threads > (os.cpu_count() or 1):
+        os.environ.setdefault("NPROC", str(2 * threads))
 
 
 def make_mesh(number: int | None = None) -> Mesh:
