@@ -318,13 +318,18 @@ def teams(config: Config, summary: dict[str, Any]) -> Figure:
         "mission": summary["mission"],
     }
     places = [own, *summary["elsewhere"].values()]
-    by_team, by_number = _groups(places, "robots"), _groups(places, "num_pois")
-    panels = [(f"robots: {_counted(team)}", "num_pois", group) for team, group in by_team]
-    panels += [
+    of_numbers = [
         (f"{number} points of interest", "robots", group)
-        for number, group in by_number
+        for number, group in _groups(places, "num_pois")
         if len({len(place["robots"]) for place in group}) > 1
     ]
+    drawn = [place for _, _, group in of_numbers for place in group]
+    panels = [
+        (f"robots: {_counted(team)}", "num_pois", group)
+        for team, group in _groups(places, "robots")
+        if len(group) > 1 or group[0] not in drawn
+    ]
+    panels += of_numbers
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(5 * columns, 4 * rows), layout="constrained")
