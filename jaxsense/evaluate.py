@@ -144,9 +144,10 @@ def _write(
         name = next(iter(metrics.cases(found)))
         place = "" if config == trained else f"-{_name(config)}"
         film = arguments.run / f"mission-{name}-{arguments.seed}{place}.svg"
-        title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
+        what = f" policy, seed {arguments.seed}"
         if place:
-            title += f", {config.arena.num_pois} points, {len(config.carried)} robots"
+            what = f", {config.arena.num_pois} points, {len(config.carried)} robots"
+        title = f"{name}{what}".replace("_", " ")
         animation.write(film, config, recording, class_beliefs, title)
         written.append(f"The first mission of {name} is in {film}.")
     # Another evaluation may have written metrics since this one began.
