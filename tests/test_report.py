@@ -161,25 +161,29 @@ def test_every_policy_stands_at_its_looks_and_its_share_of_wrong_points():
 
 
 def test_every_place_of_missions_stands_in_a_picture_of_times():
-    def place(number, robots, seconds):
+    def place(number, robots, seconds, side=CONFIG.arena.side):
         mission = {"latent": {"time_s": seconds}, "naive": {"time_s": seconds + 1}}
-        return {"num_pois": number, "robots": robots.split(), "mission": mission}
+        team = robots.split()
+        return {"num_pois": number, "side": side, "robots": team, "mission": mission}
 
     elsewhere = [
         place(16, "camera camera lidar lidar", 45.0),
         place(8, "camera lidar", 36.0),
         place(8, "camera camera lidar lidar", 20.0),
+        place(8, "lidar lidar lidar", 50.0, side=9.0),
     ]
     own = place(3, "camera lidar", 12.0)["mission"]
     summary = {"mission": own, "elsewhere": dict(enumerate(elsewhere))}
     found = {
         ax.get_title(): np.transpose(ax.lines[0].get_data()).tolist()
         for ax in plots.teams(CONFIG, summary).axes
+        if ax.axison
     }
     assert found == {
         "robots: 1 camera, 1 lidar": [[3, 12.0], [8, 36.0]],
         "robots: 2 camera, 2 lidar": [[8, 20.0], [16, 45.0]],
-        "8 points of interest": [[2, 36.0], [4, 20.0]],
+        "robots: 3 lidar": [[8, 50.0]],
+        "8 points of interest in 3 m": [[2, 36.0], [4, 20.0]],
     }
 
 

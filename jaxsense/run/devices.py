@@ -110,10 +110,10 @@ def _make_room(threads: int) -> None:
 
     A large batch of Cholesky decompositions, as in the physics of six robots, is shared out to the
     pool by a member of the pool, which waits for the others. If every member does, all wait for
-    ever. The pool is made with the backend, and otherwise has as many threads as there are cores.
+    ever. XLA reads the size when it makes the backend; by itself it takes the number of cores.
     """
-    if 2 * threads > (os.cpu_count() or 1):
-        os.environ.setdefault("NPROC", str(2 * threads))
+    cores = len(os.sched_getaffinity(0))  # a process may be held to some of them
+    os.environ.setdefault("NPROC", str(max(2 * threads, cores)))
 
 
 def make_mesh(number: int | None = None) -> Mesh:

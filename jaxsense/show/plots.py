@@ -314,22 +314,23 @@ def teams(config: Config, summary: dict[str, Any]) -> Figure:
     """
     own = {
         "num_pois": config.arena.num_pois,
+        "side": config.arena.side,
         "robots": list(config.carried),
         "mission": summary["mission"],
     }
     places = [own, *summary["elsewhere"].values()]
-    of_numbers = [
-        (f"{number} points of interest", "robots", group)
-        for number, group in _groups(places, "num_pois")
+    of_arenas = [
+        (f"{number} points of interest in {side:g} m", "robots", group)
+        for (number, side), group in _groups(places, "num_pois", "side")
         if len({len(place["robots"]) for place in group}) > 1
     ]
-    drawn = [place for _, _, group in of_numbers for place in group]
+    drawn = [place for _, _, group in of_arenas for place in group]
     panels = [
         (f"robots: {_counted(team)}", "num_pois", group)
-        for team, group in _groups(places, "robots")
+        for (team,), group in _groups(places, "robots")
         if len(group) > 1 or group[0] not in drawn
     ]
-    panels += of_numbers
+    panels += of_arenas
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(5 * columns, 4 * rows), layout="constrained")
@@ -348,12 +349,12 @@ def teams(config: Config, summary: dict[str, Any]) -> Figure:
     return figure
 
 
-def _groups(places: list[dict[str, Any]], key: str) -> list[tuple[Any, list[dict[str, Any]]]]:
-    """Places by what they have in common, in the order in which it came first."""
+def _groups(places: list[dict[str, Any]], *keys: str) -> list[tuple[list[Any], list[Any]]]:
+    """Places by the values of the keys, in the order in which these came first."""
     found: dict[str, list[dict[str, Any]]] = {}
     for place in places:
-        found.setdefault(str(place[key]), []).append(place)
-    return [(group[0][key], group) for group in found.values()]
+        found.setdefault(str([place[key] for key in keys]), []).append(place)
+    return [([group[0][key] for key in keys], group) for group in found.values()]
 
 
 def _counted(team: list[str]) -> str:
