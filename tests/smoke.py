@@ -12,6 +12,10 @@ from jaxsense import train
 from jaxsense.run.rundir import RunDirectory
 
 SMOKE = ("--preset", "smoke", "--seed", "5", "--quiet")
+MISSION_KEYS = {
+    "accuracy", "observations_per_poi", "time_s", "mean_time_s", "collisions",
+    "goals_reached_fraction", "information", "episodes", "ended",
+}  # fmt: skip
 
 
 def without_times(path):

@@ -41,8 +41,8 @@ def with_observe(way):
     return dataclasses.replace(TINY, dqn=dataclasses.replace(TINY.dqn, observe=way))
 
 
-# Both compile everything twice, for a minute; `test_traced_settings.py` runs `learn`, and
-# `test_programs.py` a run.
+# Both compile everything twice, for a minute; `test_examples.py` runs `learn` up to the policies,
+# and `test_train.py` a run.
 @pytest.fixture(
     scope="module", params=[pytest.param(way, marks=pytest.mark.slow) for way in ("bank", "live")]
 )

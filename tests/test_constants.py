@@ -1,0 +1,107 @@
+"""What changes a program and what does not: numbers of the settings are none of its constants."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import jax
+import pytest
+from smoke import SMOKE
+
+from jaxsense import stages, train
+from jaxsense.config import PRESETS
+from jaxsense.run import programs
+from jaxsense.run.compilation import Compiler, Program
+from jaxsense.run.monitor import Monitor
+from jaxsense.sim.world import make_world
+
+NUMBERS = {
+    "detector.learning-rate": "0.001",
+    "jmvae.alpha": "0.3",
+    "jmvae.annealing": "0.4",
+    "jmvae.reconstruction-weights": "8 9",
+    "mdp.min-increase": "0.1",
+    "mdp.max-steps": "15",
+    "dqn.discount": "0.7",
+    "dqn.target-period": "7",
+    "lidar.range-noise": "0.02",
+    "camera.pixel-noise": "0.01",
+    "viewpoint.max-bearing": "15",
+    "navigation.goal-angle": "5",
+    "mission.equal-values": "0.2",
+    "mission.attempts": "2",
+    "mission.time-limit": "2",
+}
+
+
+@pytest.mark.slow  # a run of its own; `test_traced_settings` is the fast companion
+def test_other_numbers_need_no_other_program(smoke_run, cache, tmp_path):
+    traced = Path(cache[1]) / "traced"
+    before = {path.name for path in traced.iterdir()}
+    options = [word for name, text in NUMBERS.items() for word in (f"--{name}", *text.split())]
+    train.main([*SMOKE, *cache, *options, "--out", str(tmp_path / "run")])
+    assert {path.name for path in traced.iterdir()} == before
+    first, second = (
+        json.loads((path / "summary.json").read_text()) for path in (smoke_run, tmp_path / "run")
+    )
+    for block in ("detectors", "jmvae", "dqn", "mission"):
+        assert first[block] != second[block]
+
+
+@pytest.mark.slow  # traces everything twice
+def test_no_number_is_a_constant_of_a_program():
+    config = PRESETS["smoke"]
+
+    def changed(x):
+        if isinstance(x, bool):
+            return not x
+        return x + 1 if isinstance(x, int) else 0.99 * (x or 0.01)
+
+    other = jax.tree.map(changed, config)
+    pairs = zip(jax.tree.leaves(config), jax.tree.leaves(other), strict=True)
+    assert all(here != there for here, there in pairs)
+    constants = [
+        {name: set(re.findall(r"dense<.*?>", text)) for name, text in lowered(each).items()}
+        for each in (config, other)
+    ]
+    assert len(constants[0]) > 15
+    assert constants[0] == constants[1]
+
+
+def test_a_size_changes_only_what_depends_on_it():
+    config = PRESETS["smoke"]
+    other = dataclasses.replace(config, jmvae=dataclasses.replace(config.jmvae, hidden=(32,)))
+    names = "scenes", "examples", "detector_camera", "detector_lidar", "jmvae_1"
+    first, second = (lowered(c, names) for c in (config, other))
+    changed = {name for name, text in first.items() if second[name] != text}
+    assert {name.partition("-")[0] for name in changed} == {"jmvae"}
+
+
+def lowered(config, names=None):
+    """The programs of a run as text, by their names; of these stages alone, and of no missions."""
+    found = {}
+
+    def compile_one(self, function, *args, **options):
+        program = jax.jit(function).trace(*args)
+        if names is None or self._stage.removeprefix("jmvae") in map(as_stage, names):
+            found[f"{self._stage}-{self._name}"] = program.lower().as_text()
+        return program.out_info
+
+    def as_stage(name):
+        return name.removesuffix("_1").removeprefix("jmvae")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Program, "compile", compile_one)
+        if names is not None:
+            patch.setattr(programs, "_trace_missions", lambda *_: None)
+            listed = stages.stages(config)
+            some = [stage for stage in listed if stage.name in {*names, "survey", "detections"}]
+            patch.setattr(programs, "stages", lambda *_: some)
+        with Compiler(Monitor()) as compiler:
+            made = programs.compile_programs(config, make_world(config), compiler)
+            for each in made.of_stages.values():
+                each.shapes.result()
+            if names is None:
+                made.player.result()
+    return found

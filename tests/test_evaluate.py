@@ -1,0 +1,248 @@
+"""The command `evaluate`, run as a user runs it: in-process, on the run that tests share."""
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+from xml.etree import ElementTree
+
+import jax
+import numpy as np
+import pytest
+from smoke import MISSION_KEYS, error_line
+
+import jaxsense
+from jaxsense import cli, evaluate, mission
+from jaxsense.config import PRESETS, ConfigError
+from jaxsense.run import devices, files, missions
+from jaxsense.run.compilation import Compiler
+from jaxsense.run.monitor import Monitor
+
+
+@pytest.fixture(scope="module")
+def evaluated(smoke_run, tmp_path_factory, cache):
+    """A copy of the run, evaluated, its summary before, and what was printed."""
+    path = tmp_path_factory.mktemp("runs") / "copy"
+    shutil.copytree(smoke_run, path)
+    before = json.loads((path / "summary.json").read_text())
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        # As many missions as need the batch of the run, whose programs are there.
+        evaluate.main([str(path), "--episodes", "1", "--policy", "policies", "--animate", *cache])
+    return path, before, printed.getvalue()
+
+
+def test_evaluate_writes_the_mission_block_of_the_summary_and_no_other(evaluated):
+    path, before, _ = evaluated
+    after = json.loads((path / "summary.json").read_text())
+    blocks = after.pop("mission")
+    before.pop("mission")
+    assert after == before
+    assert set(blocks) == {*mission.POLICIES, "bytes_per_detection"}
+    for policy in mission.POLICIES:
+        # The policies of an untrained team may be less accurate than naive exploration.
+        compared = {"of_naive"} | ({"intervals"} if policy != "latent" else set())
+        assert set(blocks[policy]) | compared == MISSION_KEYS | {"seed"} | compared
+        assert ("intervals" in blocks[policy]) == (policy != "latent")
+        assert (blocks[policy]["episodes"], blocks[policy]["seed"]) == (1, 0)
+
+
+@pytest.mark.slow  # plays twice; the next test has what is kept of a summary, without playing
+def test_an_evaluation_keeps_what_another_one_has_written_meanwhile(
+    evaluated, tmp_path, cache, monkeypatch
+):
+    path, play, is_first = tmp_path / "run", missions.Player.play, [True]
+    shutil.copytree(evaluated[0], path)
+    begin = ["--episodes", "7", *cache]  # a batch whose programs are there
+
+    def meanwhile(*args):
+        if is_first.pop() if is_first else False:
+            evaluate.main([str(path), "--policy", "naive", "--seed", "3", *begin])
+        return play(*args)
+
+    monkeypatch.setattr(missions.Player, "play", meanwhile)
+    evaluate.main([str(path), "--policy", "latent", "--seed", "4", *begin])
+    blocks = json.loads((path / "summary.json").read_text(encoding="utf-8"))["mission"]
+    expected = {**dict.fromkeys(mission.POLICIES, 0), "latent": 4, "naive": 3}
+    assert {name: blocks[name]["seed"] for name in mission.POLICIES} == expected
+    # Nothing compares policies of different arenas.
+    assert not any({"intervals", "of_naive"} & set(block) for block in blocks.values())
+
+
+def test_an_evaluation_waits_for_another_one_that_writes(evaluated, tmp_path):
+    path = tmp_path / "run"
+    shutil.copytree(evaluated[0], path)
+    config, models = jaxsense.load(path)
+    summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    found = {"latent": summary["mission"]["latent"]}
+    arguments = evaluate.Arguments(path, seed=7)
+
+    def write():
+        evaluate._write(arguments, (config, config), models.class_beliefs, found, None)
+
+    with ThreadPoolExecutor(1) as executor:
+        with files.locked(path, waits=False):
+            writing = executor.submit(write)
+            assert not wait((writing,), timeout=0.5).done
+            summary["mission"]["naive"]["seed"] = 8
+            (path / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+        writing.result()
+    blocks = json.loads((path / "summary.json").read_text(encoding="utf-8"))["mission"]
+    assert (blocks["latent"]["seed"], blocks["naive"]["seed"]) == (7, 8)
+
+
+def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):
+    path = tmp_path / "röm"
+    shutil.copytree(smoke_run, path)
+    (path / "summary.json").unlink()
+    program = """
+import sys
+from jaxsense import cli, train
+train._train = lambda begin, arguments, run, *more: (run.path / "summary.json").write_text(
+    open(sys.argv[1], encoding="utf-8").read(), encoding="utf-8")
+cli.run(lambda: train.main(["--resume", sys.argv[2]]))
+"""
+    command = [sys.executable, "-c", program, str(smoke_run / "summary.json"), str(path)]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert "r\\xf6m" in ended.stdout
+    (path / "summary.json").unlink()
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")
+
+
+def test_evaluate_prints_the_comparison(evaluated):
+    _, _, printed = evaluated
+    for words in (
+        "latent",
+        "naive",
+        "random",
+        "accuracy",
+        "goals",
+        "control steps/s",
+        "11 missions",  # one of each policy
+    ):
+        assert words in printed
+
+
+def test_missions_elsewhere_have_the_settings_that_are_asked_for():
+    config, path = PRESETS["smoke"], Path("run")
+    arguments = evaluate.Arguments(path, side=4.0, robots=("camera", "camera", "lidar"))
+    there = evaluate._elsewhere(arguments, config)
+    assert (there.arena.side, there.arena.num_pois) == (4.0, 3)
+    assert there.carried == ("camera", "camera", "lidar")
+    assert evaluate._name(there) == "3-points-4-m-2-camera-1-lidar"
+    # Also 64 robots have a name that a file may bear.
+    crowd = dataclasses.replace(there, robots=("camera", "lidar") * 32)
+    assert evaluate._name(crowd) == "3-points-4-m-32-camera-32-lidar"
+    # However it is named, a team plays in the same arenas.
+    mixed = evaluate.Arguments(path, side=4.0, robots=("camera", "lidar", "camera"))
+    assert evaluate._elsewhere(mixed, config) == there
+    # What is asked for is no other place if the run has it already.
+    same = evaluate.Arguments(path, num_pois=3, side=3.0, robots=("lidar", "camera"))
+    assert evaluate._elsewhere(same, config) == config
+    # A policy for any number of points has no limit to the looks of a start.
+    team = PRESETS["team"]
+    partly = dataclasses.replace(
+        team,
+        mdp=dataclasses.replace(team.mdp, partly_seen_starts=True),
+        team=dataclasses.replace(team.team, num_pois=(3, 8)),
+        evaluation=dataclasses.replace(team.evaluation, num_pois=(3, 8)),
+    )
+    there = evaluate._elsewhere(evaluate.Arguments(path, num_pois=30, side=8.0), partly)
+    assert there.arena.num_pois == 30
+    with pytest.raises(
+        ConfigError, match=r"arena\.num_pois = 4: the policies of this run are for 3"
+    ):
+        evaluate._elsewhere(evaluate.Arguments(path, num_pois=4), config)
+
+
+@pytest.mark.slow  # compiles missions of three robots
+def test_other_robots_play_apart_from_a_runs_own(smoke_run, tmp_path, cache):
+    path = tmp_path / "run"
+    shutil.copytree(smoke_run, path)
+    before = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    options = "--robots", "camera", "camera", "lidar", "--episodes", "3", "--animate"
+    for policy in ("nearest", "camera_2_alone"):
+        evaluate.main([str(path), *options, "--policy", policy, *cache])
+    after = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    (name, place), *others = after.pop("elsewhere").items()
+    assert not others
+    assert after == before
+    assert name == "3-points-3-m-2-camera-1-lidar"
+    assert (place["num_pois"], place["side"]) == (3, 3.0)
+    assert place["robots"] == ["camera", "camera", "lidar"]
+    # Of both evaluations.
+    assert set(place["mission"]) == {"nearest", "camera_2_alone", "bytes_per_detection"}
+    assert {"told", "ambiguous_reported"} <= set(place["mission"]["camera_2_alone"])
+    film = ElementTree.parse(path / f"mission-nearest-0-{name}.svg")
+    lines = {text.text for text in film.iter("{http://www.w3.org/2000/svg}text")}
+    assert {"camera 1 asks", "camera 2 asks", "lidar asks"} <= lines
+    assert (path / "teams.png").read_bytes()[:4] == b"\x89PNG"
+    assert "with other robots" in (path / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(smoke_run, evaluated):
+    path, _, _ = evaluated
+    for report, episodes, films in ((smoke_run, 4, 1), (path, 1, 2)):
+        text = (report / "report.html").read_text()
+        assert text.count("<img") == 5
+        assert text.count("<use") == films
+        assert f"<td>{episodes}</td>" in text
+
+
+def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cache):
+    path, _, _ = evaluated
+    config, models = jaxsense.load(path)
+    case = mission.cases(config)["latent"]
+    # The programs with which it was evaluated.
+    kept, workers = (
+        cli.keep_programs("jaxsense.evaluate", Path(cache[1]), config),
+        devices.start(None),
+    )
+    with Compiler(Monitor(), kept) as compiler:
+        team, batch = mission.make_mission(config), missions.batch_of(11)
+        player = missions.Player(team, compiler, batch, workers)
+        played = player.play(jax.random.key(0), models, {"latent": case}, 1)
+    found, recording = played.metrics["latent"], played.recording
+    np.testing.assert_array_equal(found["detections"][0], recording.records.detected.sum(axis=0))
+    seconds = recording.end.steps * config.mission.control_period
+    assert found["time_s"][0] == pytest.approx(seconds)
+    film = ElementTree.fromstring((path / "mission-latent-0.svg").read_text())
+    texts = {text.text for text in film.iter("{http://www.w3.org/2000/svg}text")}
+    assert {f"{seconds:.1f} s", "latent policy, seed 0"} <= texts
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--policy", "best"], "policy = 'best': must be one of all, policies, latent, greedy"),
+        (["--episodes", "0"], "episodes = 0: must be within 1 and 100,000"),
+        (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
+        (["--episode", "3"], "'--episode': must be one of the program; perhaps --episodes"),
+    ],
+)
+def test_bad_options_of_evaluate_are_named_in_one_line(smoke_run, options, expected, capsys):
+    before = (smoke_run / "summary.json").read_text()
+    assert expected in error_line([str(smoke_run), *options], capsys, evaluate)
+    assert (smoke_run / "summary.json").read_text() == before
+
+
+def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
+    line = error_line([str(tmp_path / "none")], capsys, evaluate)
+    assert f"run = {str(tmp_path / 'none')!r}: must hold a run's settings" in line
+    versions = {"jaxsense": jaxsense.__version__}
+    stored = {"versions": versions, "config": {"colour": 1}}
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    assert "colour = 1: is no setting" in error_line([str(tmp_path)], capsys, evaluate)
+    (tmp_path / "config.json").write_text(json.dumps({"versions": versions}))
+    line = error_line([str(tmp_path)], capsys, evaluate)
+    assert "must be a finished run (there is no checkpoint 'detector_camera')" in line

@@ -1,0 +1,238 @@
+"""The command `train`, run as a user runs it: in-process, with the smoke preset."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from smoke import MISSION_KEYS, SMOKE, error_line
+
+import jaxsense
+from jaxsense import train
+from jaxsense.config import PRESETS, Config
+from jaxsense.run.compilation import Program
+from jaxsense.run.monitor import Monitor
+from jaxsense.run.rundir import RunDirectory, Settings
+
+PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+
+
+def test_run_directory_holds_everything(smoke_run):
+    names = {path.name for path in smoke_run.iterdir()} | {".lock"}  # which may be gone
+    plots = {"latent_space.png", "reward.png", "scanlines.png", "calibration.png", "policies.png"}
+    others = {"config.json", "metrics.jsonl", "summary.json", "checkpoints"}
+    assert names == {*others, *plots, "mission.svg", "report.html", ".lock"}
+    for plot in plots:
+        assert (smoke_run / plot).read_bytes()[:4] == b"\x89PNG"
+    stages = {json.loads(line)["stage"] for line in (smoke_run / "metrics.jsonl").open()}
+    assert {"detector_camera", "detector_lidar", "jmvae_1", "dqn_camera", "dqn_lidar"} <= stages
+
+
+def test_summary_keeps_its_contract(smoke_run):
+    summary = json.loads((smoke_run / "summary.json").read_text())
+    assert set(summary) == {
+        "preset", "seed", "versions", "devices", "timing", "detectors", "jmvae", "belief", "dqn",
+        "mission",
+    }  # fmt: skip
+    assert summary["preset"] == "smoke"
+    assert summary["seed"] == 5
+    assert set(summary["timing"]) == {"total_s", "stages"}
+    for stage in summary["timing"]["stages"].values():
+        assert set(stage) == {"compile_s", "run_s"}
+    assert set(summary["detectors"]) == {"camera", "lidar"}
+    assert set(summary["detectors"]["camera"]) == {"accuracy", "ece", "nll"}
+    belief = summary["belief"]
+    assert belief["looks"] == [1, 2, 3, 4, 5, 6]
+    for curve in ("nll", "accuracy", "bayes_nll", "bayes_accuracy"):
+        assert len(belief[curve]) == 6
+    assert set(belief) == {"looks", *["nll", "accuracy", "bayes_nll", "bayes_accuracy"],
+                           "doubt_correlation"}  # fmt: skip
+    assert -1 <= belief["doubt_correlation"] <= 1
+    latent = summary["jmvae"]
+    assert set(latent) == {
+        "active_units", "sigma_norm", "unambiguous", "consistent", "moment_matching_error", "fusion"
+    }  # fmt: skip
+    for block, kind in (("sigma_norm", float), ("unambiguous", bool), ("consistent", float)):
+        assert set(latent[block]) == {"joint", "camera", "lidar"}
+        for values in latent[block].values():
+            assert [type(value) for value in values] == [kind] * 3
+    assert set(latent["fusion"]) == {"accuracy", "mean_error", "std_error"}
+    for block in summary["dqn"].values():
+        assert set(block) == {
+            "return", "optimal", "naive", "random", "fraction_of_optimal", "one_step",
+            "optimal_states", "num_states", "optimal_permutations", "num_permutations", "env_steps",
+            "env_steps_per_s",
+        }  # fmt: skip
+        assert set(block["one_step"]) == {"policy", "optimal", "random"}
+        assert block["num_states"] == 384
+        assert block["env_steps"] == 60 * 32  # epochs x environments of the smoke preset
+        assert block["fraction_of_optimal"] == pytest.approx(block["return"] / block["optimal"])
+    assert set(summary["mission"]) == {"latent", "naive", "random", "bytes_per_detection"}
+    for policy in ("latent", "naive", "random"):
+        block = summary["mission"][policy]
+        assert set(block) == MISSION_KEYS | ({"intervals"} if policy != "latent" else set())
+        assert block["episodes"] == 4
+        assert sum(block["ended"].values()) == 4
+        assert block["collisions"] == 0
+    # Two float32 for each of two dimensions, and one for each of two labels, against more than 1920
+    # bytes of pixels or beams.
+    assert summary["mission"]["bytes_per_detection"]["latent"] == 16
+    assert summary["mission"]["bytes_per_detection"]["features"] == 8
+    assert 1920 <= summary["mission"]["bytes_per_detection"]["raw"] <= 2732
+
+
+def test_the_film_is_named_after_the_policy_that_it_shows(tmp_path, monkeypatch):
+    first = dataclasses.replace(PRESETS["smoke"].mission, policies=("naive_2", "latent"))
+    config, titles = dataclasses.replace(PRESETS["smoke"], mission=first), []
+    monkeypatch.setattr(train.animation, "write", lambda *inputs: titles.append(inputs[-1]))
+    monkeypatch.setattr(train.plots, "write_plots", lambda *inputs: None)
+    monkeypatch.setattr(train.page, "write", lambda *inputs: None)
+    result = SimpleNamespace(models=SimpleNamespace(class_beliefs=None), recording=None, summary={})
+    with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as run:
+        train._write(run, result, {}, Monitor())  # pyright: ignore
+    assert titles == ["naive 2 policy"]
+
+
+def test_a_finished_run_is_loaded_with_its_settings(smoke_run):
+    config, models = jaxsense.load(smoke_run)
+    assert config == PRESETS["smoke"]
+    untrained = jaxsense.init(jax.random.key(0), config)
+    assert jax.tree.structure(models) == jax.tree.structure(untrained)
+    kernel = models.jmvae["encoders"]["camera"]["params"]["Dense_0"]["kernel"]
+    assert np.isfinite(kernel).all()
+    assert not np.array_equal(
+        kernel, untrained.jmvae["encoders"]["camera"]["params"]["Dense_0"]["kernel"]
+    )
+
+
+@pytest.mark.slow  # compiles a whole run of its own; before a release
+def test_a_run_with_a_filter_trains_plays_and_is_loaded(tmp_path, cache):
+    path = tmp_path / "run"
+    options = "--jmvae.fusion", "filter", "--mdp.reward", "nats"
+    train.main([*SMOKE, *cache, *options, "--out", str(path)])
+    summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    # The filter is hardly trained, but adds up what the looks show.
+    assert summary["belief"]["accuracy"][-1] > summary["belief"]["accuracy"][0] + 0.1
+    assert summary["mission"]["latent"]["accuracy"] > summary["mission"]["random"]["accuracy"]
+    config, models = jaxsense.load(path)
+    assert (config.jmvae.fusion, config.mdp.reward) == ("filter", "nats")
+    unseen = models.jmvae["filter"]["unseen"]
+    np.testing.assert_allclose(unseen.std, [20**0.5] * 2, rtol=1e-6)
+    np.testing.assert_allclose(models.unseen.std, unseen.std, rtol=1e-6)
+
+
+def test_another_run_is_never_overwritten(smoke_run, capsys):
+    before = {path: path.stat().st_mtime_ns for path in smoke_run.rglob("*")}
+    line = error_line([*SMOKE, "--out", str(smoke_run)], capsys)
+    assert f"out = {str(smoke_run)!r}: is not empty; must be a new directory" in line
+    assert {path: path.stat().st_mtime_ns for path in smoke_run.rglob("*")} == before
+
+
+def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
+    cache, tmp_path, capsys, monkeypatch
+):
+    run = Program.__call__
+
+    def poisoned(self, *args):
+        output = run(self, *args)
+        if (self._stage, self._name) != ("jmvae", "advance"):
+            return output
+        state, progress = output
+        return state, dataclasses.replace(progress, loss=progress.loss.at[4].set(jnp.nan))
+
+    monkeypatch.setattr(Program, "__call__", poisoned)
+    out = tmp_path / "broken"
+    line = error_line([*SMOKE, *cache, "--out", str(out)], capsys)
+    assert "jmvae_1: loss = nan at step 5 of 300" in line
+    assert str(out) in line
+    assert (out / "checkpoints" / "detector_camera.msgpack").exists()
+    assert (out / "config.json").exists()
+    assert not (out / "summary.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (
+            ["--preset", "best"],
+            "preset = 'best': must be one of default, paper, noisy, team, smoke",
+        ),
+        (["--taste", "sweet"], "train: option = '--taste': must be one of the program"),
+        (["--jmvae.hiden", "3"], "of the program; perhaps --jmvae.hidden (--help"),
+        (["--arena.side", "x"], "arena.side = 'x': must be a finite number"),
+        (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
+        (["--seed", "one"], "seed = 'one': must be a whole number"),
+        (["--dqn.num-envs", "-4"], "dqn.num_envs = -4: must be a number greater than 0"),
+        (["--dqn.observe", "ideal"], "'ideal'"),
+        (["--jmvae.hidden", "64", "0"], "jmvae.hidden = (64, 0): must be one or more layer sizes"),
+        (["--jmvae.beta", "nan"], "jmvae.beta = nan: must be a finite number"),
+        (["--modalities"], "modalities = (): must name 1 to 8 of camera, lidar"),
+        (["--modalities", "sonar"], "modalities = ('sonar',): must be some of camera, lidar"),
+        (["--arena.num-pois", "50"], "arena.num_pois = 50: at most"),
+        (["--arena.classes", "pink cube"], "'pink cube' must be"),
+        (["--dqn.replay-capacity", "1000"], "dqn.replay_capacity = 1000: must be a multiple of"),
+        (["--lidar.window", "700"], "lidar.window = 700: at most 683 of 683 rays fit"),
+    ],
+)
+def test_bad_options_are_named_in_one_line(argv, expected, capsys, tmp_path):
+    out = tmp_path / "out"
+    assert expected in error_line([*argv, "--out", str(out)], capsys)
+    assert not out.exists()
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.write_text("kept")
+    line = error_line(["--preset", "smoke", "--out", str(file / "run")], capsys)
+    assert f"out = {str(file / 'run')!r}: cannot be written" in line
+    assert file.read_text() == "kept"
+
+
+def test_help_explains_every_field(capsys):
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--help"])
+    assert stop.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for option in ("--preset", "--seed", "--out", "--arena.side", "--dqn.epsilon-decay"):
+        assert option in text
+    assert "in metres" in text
+
+
+def test_whoever_reads_the_help_may_stop_reading():
+    code = "from jaxsense import cli, train; cli.run(lambda: train.main(['--help']))"
+    with subprocess.Popen([sys.executable, "-c", code], **PIPES) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode in (0, 141)
+
+
+def test_every_setting_has_a_sentence_of_help():
+    import ast
+    import dataclasses
+    import inspect
+
+    def within(section):
+        parts = [f.type for f in dataclasses.fields(section) if dataclasses.is_dataclass(f.type)]
+        return [*parts, *(inner for part in parts for inner in within(part))]
+
+    sections = within(Config)
+    assert {"DqnConfig", "TravelConfig"} <= {section.__name__ for section in sections}
+    for section in sections:
+        (node,) = ast.parse(inspect.getsource(section)).body
+        for field, following in zip(node.body, node.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign):
+                assert isinstance(following, ast.Expr), f"{node.name}.{ast.unparse(field)}"
+
+
+def test_presets_are_configurations():
+    assert set(PRESETS) == {"default", "paper", "noisy", "team", "smoke"}
+    assert all(isinstance(preset, Config) for preset in PRESETS.values())
+    assert PRESETS["default"].dqn.observe == "live"
+    assert PRESETS["paper"].dqn.observe == "bank"
+    assert (PRESETS["paper"].jmvae.alpha, PRESETS["paper"].jmvae.beta) == (1.0, 0.1)
+    assert (PRESETS["paper"].dqn.epochs, PRESETS["paper"].dqn.num_envs) == (2000, 512)
