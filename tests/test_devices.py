@@ -187,8 +187,8 @@ from jaxsense.run import devices
 workers = devices.start(2)
 matrices = jnp.stack([jnp.eye(18)] * 288)
 again = lambda _, x: jnp.linalg.cholesky(x @ x)
-program = jax.jit(lambda x: jax.lax.fori_loop(0, 400, again, x)).lower(matrices).compile()
-for _ in range(4):
+program = jax.jit(lambda x: jax.lax.fori_loop(0, 100, again, x)).lower(matrices).compile()
+for _ in range(3):
     devices.side_by_side(lambda i: jax.block_until_ready(program(matrices)), workers.threads)
 """
 

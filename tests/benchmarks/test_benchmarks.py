@@ -14,7 +14,7 @@ from benchmarks import ROWS, __main__, peers
 from benchmarks.measure import Options, Side, compare, make_row
 from jaxsense.run import devices
 
-QUICK = ("rays", "jmvae", "dqn_rejax")
+QUICK = ("rays", "jmvae")
 KEYS = {
     "row", "unit", "ours", "peer", "theirs", "ratio", "compile_s", "device", "batch", "versions",
 }  # fmt: skip
