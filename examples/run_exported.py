@@ -2,9 +2,9 @@
 
     python examples/run_exported.py runs/.../exported.zip
 
-plays the looks of two robots at the points of interest of one map: each asks its own policy where
-to look, and writes what its sensor tells of there. In place of real scans, a detector's answer is
-made up; `detect` is what gives it on a robot.
+plays the looks of a run's robots at the points of interest of one map: each asks its own policy
+where to look, and writes into the map what its sensor detects there. Real robots detect in their
+scans with `detect`; here the detections are made up.
 """
 
 import argparse
@@ -29,8 +29,8 @@ def load(path: Path | str) -> tuple[dict[str, Any], Programs]:
       path: the file.
 
     Returns:
-      Its `contents.json`, and its programs by name. They take and give arrays with a leading batch
-      axis of any size; `contents["programs"][name]` tells names, shapes and dtypes of both.
+      Its `contents.json`, and its programs by name. They take and return arrays with a leading
+      batch axis of any size; `contents["programs"][name]` lists names, shapes and dtypes of both.
     """
     with zipfile.ZipFile(path) as files:
         contents = json.loads(files.read("contents.json"))
@@ -42,7 +42,7 @@ def load(path: Path | str) -> tuple[dict[str, Any], Programs]:
 
 
 def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) -> list[str]:
-    """Two or more robots look at PoIs of the given classes until their policies say NOP.
+    """The robots look at PoIs of the given classes until their policies say NOP.
 
     Args:
       contents: from `load`.
@@ -52,17 +52,32 @@ def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) ->
     Returns:
       A line for each look, and one for each PoI at the end.
     """
-    num_pois, modalities = contents["num_pois"], contents["modalities"]
+    num_pois, modalities, robots = len(classes), contents["modalities"], contents["robots"]
     mean = np.tile(np.float32(contents["unseen"]["mean"]), (num_pois, 1))
     std = np.tile(np.float32(contents["unseen"]["std"]), (num_pois, 1))
     seen = np.zeros((num_pois, len(modalities)), bool)
+    angles = 2 * np.pi * np.arange(num_pois, dtype=np.float32) / num_pois
+    known = {
+        "mean": mean,
+        "std": std,
+        # What policies of a team also read: places in metres, on a circle around the robots.
+        "positions": 2 * np.stack([np.cos(angles), np.sin(angles)], axis=1),
+        "present": np.ones(num_pois, bool),
+        "poses": np.zeros((len(robots), 3), np.float32),
+        "modality": np.int32([modalities.index(name) for name in robots]),
+        "works": np.ones(len(robots), bool),
+        "target": np.full(len(robots), num_pois, np.int32),
+    }
     lines = []
-    working = list(modalities)
-    while working and len(lines) < 20 * num_pois:
-        for name in list(working):
-            action = int(programs[f"decide_{name}"](mean[None], std[None])["action"][0])
+    while known["works"].any() and len(lines) < 20 * num_pois:
+        for robot in np.flatnonzero(known["works"]):
+            name = robots[robot]
+            given = {**known, "robot": np.int32(robot)}
+            inputs = contents["programs"][f"decide_{name}"]["inputs"]
+            decided = programs[f"decide_{name}"](*(given[key][None] for key in inputs))
+            action = int(decided["action"][0])
             if action == num_pois:
-                working.remove(name)
+                known["works"][robot] = False
                 continue
             label = contents["label_of_class"][name][classes[action]]
             labels = contents["labels"][name]
@@ -71,6 +86,8 @@ def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) ->
             entry = programs[f"write_{name}"](mean[poi], std[poi], seen[poi], features[None])
             mean[poi], std[poi] = entry["mean"], entry["std"]
             seen[action, modalities.index(name)] = True
+            # It drives there in no time; 0.9 m on this side of the PoI it looks at it.
+            known["poses"][robot, :2] = 0.55 * known["positions"][action]
             told = ", ".join(np.array(contents["classes"])[plausible(programs, mean, std)[action]])
             lines.append(f"{name} looks at PoI {action}: {labels[label]}; it may be: {told}")
     for poi, told in enumerate(plausible(programs, mean, std)):

@@ -35,8 +35,9 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 
 def exported(function: Function) -> export.Exported:
     """A function for a batch of any size, lowered for all of `PLATFORMS`."""
-    (batch,) = export.symbolic_shape("batch")
-    inputs = (jax.ShapeDtypeStruct((batch, *x.shape), x.dtype) for x in function.inputs.values())
+    one = [jax.ShapeDtypeStruct((1, *x.shape), x.dtype) for x in function.inputs.values()]
+    sizes = [f"batch, {function.any_size.get(name, '...')}" for name in function.inputs]
+    inputs = export.symbolic_args_specs(one, sizes)
     return export.export(jax.jit(jax.vmap(function.apply)), platforms=PLATFORMS)(*inputs)
 
 
@@ -68,6 +69,7 @@ def _description(config: Config, models: Models) -> dict[str, Any]:
     unseen = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
     return {
         "modalities": config.modalities,
+        "robots": config.carried,
         "classes": arena.classes,
         "labels": {name: config.labels(name) for name in config.modalities},
         "label_of_class": {name: config.label_of_class(name) for name in config.modalities},
@@ -80,7 +82,7 @@ def _description(config: Config, models: Models) -> dict[str, Any]:
 
 
 def _described(aval: Any) -> dict[str, Any]:
-    """Dtype and shape, with "batch" for the batch."""
+    """Dtype and shape, with the names of axes of any size, such as "batch"."""
     shape = [n if isinstance(n, int) else str(n) for n in aval.shape]
     return {"shape": shape, "dtype": aval.dtype.name}
 

@@ -1,5 +1,7 @@
 """All trained networks of a run, as one pytree."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
@@ -30,6 +32,7 @@ class Models:
       unseen: `[D]` entry of an unseen PoI.
       look_values: for each modality, what a look is worth by dynamic programming.
       q_networks: parameters of the Q-network of each modality; those of a team are the same.
+      tours: parameters of the network that orders a team's looks, see `dqn.tours`; else None.
     """
 
     detectors: tuple[Detector, ...]
@@ -39,6 +42,7 @@ class Models:
     unseen: Belief
     look_values: tuple[LookValues, ...]
     q_networks: tuple[Params, ...]
+    tours: Params | None
 
     @property
     def readout(self) -> Params:
@@ -59,6 +63,38 @@ def make_q_network(config: Config) -> tuple[nn.Module, int]:
         network = policies.team_network(size, number, config.dqn)
         return network, network.features * num_pois
     return policies.q_network(num_pois, config.dqn.hidden), 2 * size * num_pois
+
+
+def expected(
+    table: jax.Array, first: jax.Array, weights: jax.Array, is_seen: jax.Array
+) -> jax.Array:
+    """`[N]` values of a look at each PoI, from one table of `LookValues`.
+
+    Args:
+      table: `[P]` values by the classes' probabilities.
+      first: `[]` value of a look at an unseen PoI.
+      weights: `[N, C]` the classes' probabilities.
+      is_seen: `[N]` bool.
+    """
+    known = jax.vmap(functools.partial(optimum.interpolate, table))(weights)
+    return jnp.where(is_seen, known, first)
+
+
+def expected_gains(
+    readout: Params, look_values: tuple[LookValues, ...], belief: Belief, is_seen: jax.Array
+) -> jax.Array:
+    """`[M, N]` reward that each modality's look at each PoI promises, by what the map shows.
+
+    Args:
+      readout: see `Models.readout`.
+      look_values: of each modality.
+      belief: `[N, D]` the map.
+      is_seen: `[N]` bool.
+    """
+    on_map = jax.vmap(functools.partial(filtering.weights, readout))(belief)
+    of_each = jax.tree.map(lambda *x: jnp.stack(x), *look_values)
+    by_map = jax.vmap(expected, in_axes=(0, 0, None, None))
+    return by_map(of_each.gain, of_each.first_gain, on_map, is_seen)
 
 
 def init(key: Key, config: Config) -> Models:
@@ -92,4 +128,5 @@ def init(key: Key, config: Config) -> Models:
         unseen=unseen,
         look_values=(LookValues(no_values, no_values, nothing, nothing),) * len(config.modalities),
         q_networks=tuple(networks.init(k, q_network, size) for k in dqn_keys),
+        tours=networks.init(dqn_key, q_network, size) if config.dqn.task == "team" else None,
     )

@@ -15,21 +15,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsense import examine, observe
+from jaxsense import examine, networks, observe
 from jaxsense.config import Config
-from jaxsense.dqn import belief_mdp, optimum
+from jaxsense.dqn import belief_mdp, optimum, policies, rules, team_mdp, tours
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.dqn.team_mdp import TeamMdp, TeamState
+from jaxsense.dqn.tours import Trials
 from jaxsense.dqn.training import DqnState
-from jaxsense.models import Models, make_jmvae
+from jaxsense.models import Models, expected_gains, make_jmvae
 from jaxsense.networks import Params
 from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene, World
 from jaxsense.types import Belief, Key, pytree
-from jaxsense.vae import detectors, filtering, fusion, jmvae, peers
+from jaxsense.vae import detectors, filtering, fusion, jmvae, minibatch, peers
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.fusion import FILTER
 from jaxsense.vae.minibatch import FitState
@@ -193,6 +194,7 @@ def stages(config: Config, world: World | None = None) -> list[Stage]:
         Stage("beliefs", _measure_beliefs, (params, "class_beliefs", "detections")),
         Stage("starts", functools.partial(_starts, world), learned),
         *_agent_stages(world, config, learned),
+        *([_tour_stage(config, params)] if config.dqn.task == "team" else []),
         *(_policies_stage(m, config, params) for m in modalities),
         *(
             _other_numbers_stage(m, config, params)
@@ -268,6 +270,7 @@ def models(outputs: Mapping[str, Any], config: Config) -> Models:
         unseen=_unseen(config),
         look_values=outputs["look_values"],
         q_networks=tuple(outputs[agent(config, name)] for name in config.modalities),
+        tours=outputs.get("tours"),
     )
 
 
@@ -673,6 +676,71 @@ def _advance_dqn(
 
 def _finish_dqn(config: Config, state: DqnState, *inputs: Any) -> Params:
     return state.params
+
+
+def _tour_stage(config: Config, params: str) -> Steps:
+    """The training of the network that orders a team's looks, see `tours`.
+
+    It learns from trials of which every chunk makes some, and all keep those before.
+    """
+    settings, latent_size = config.team.tours, config.jmvae.latent_size
+    size = _chunk_size(settings.steps)
+    chunks = _num_chunks(settings.steps)
+    number = -(-settings.states // chunks)
+    network = policies.team_network(latent_size, len(config.modalities), config.dqn)
+
+    def begin(key: Key, config: Config, *_: Any) -> tuple[FitState, Trials]:
+        num_pois = config.team.num_pois[1]
+        optimiser = minibatch.adam(config.team.tours.learning_rate, settings.steps)
+        fit = minibatch.start(networks.init(key, network, network.features * num_pois), optimiser)
+        return fit, tours.no_trials(network.features, num_pois, chunks * number)
+
+    def advance(
+        key: Key,
+        config: Config,
+        state: tuple[FitState, Trials],
+        look_values: tuple[LookValues, ...],
+        classes: Belief,
+        params: Params,
+        detections: Detections,
+    ) -> tuple[tuple[FitState, Trials], Progress]:
+        fit, trials = state
+        try_key, draw_key = jax.random.split(key)
+        mdp = observe.team_mdp(config, detections.bank, params, make_jmvae(config))
+        readout = {"inverse": filtering.moments_inverse(classes), "unseen": mdp.map.unseen}
+        settings = config.team.tours
+
+        def policy(state: TeamState) -> jax.Array:
+            known = state.map.belief, jnp.any(state.map.seen, axis=-1)
+            gains = expected_gains(readout, look_values, *known)[state.team.modality]
+            ways = team_mdp.ways(config.team.travel, state.team)
+            return rules.auction(gains, ways, state.team, state.agent)
+
+        found = tours.try_choices(try_key, mdp, policy, settings, number)
+        trials = tours.write(trials, found, fit.step // size * number)
+        rows = tours.sample(draw_key, trials, (size, settings.batch))
+
+        def loss(params: Params, rows: jax.Array, step: jax.Array) -> jax.Array:
+            del step
+            batch = jax.tree.map(lambda x: x[:, rows], trials)
+            return tours.loss(network, params, batch, latent_size)
+
+        optimiser = minibatch.adam(settings.learning_rate, settings.steps)
+        fit, losses = minibatch.fit(fit, loss, rows, optimiser, settings.steps)
+        return (fit, trials), Progress(losses, {})
+
+    def finish(config: Config, state: tuple[FitState, Trials], *_: Any) -> Params:
+        return state[0].params
+
+    return Steps(
+        "tours",
+        begin,
+        ("look_values", "class_beliefs", params, "detections"),
+        advance=advance,
+        finish=finish,
+        steps=settings.steps,
+        chunks=chunks,
+    )
 
 
 def _policies_stage(modality: int, config: Config, params: str) -> Stage:

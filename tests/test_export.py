@@ -5,6 +5,7 @@ import importlib.metadata
 import io
 import json
 import re
+import runpy
 import subprocess
 import sys
 import zipfile
@@ -17,7 +18,8 @@ import pytest
 
 from jaxsense import export
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
-from jaxsense.dqn import observation
+from jaxsense.dqn import observation, policies
+from jaxsense.dqn.team_mdp import Team
 from jaxsense.interfaces.onboard import functions
 from jaxsense.models import init, make_jmvae
 from jaxsense.networks import MLP
@@ -162,6 +164,42 @@ def test_the_map_is_read_as_jaxsense_reads_it(models, results):
         return metrics.nearest_class(belief, means), metrics.plausible_classes(belief, means)
 
     check(results, "classify", classify, "nearest", "plausible")
+
+
+def test_the_policy_of_a_team_serves_any_number_of_points_and_robots():
+    dqn = dataclasses.replace(PRESETS["team"].dqn, hidden=(8,))
+    config = dataclasses.replace(CONFIG, dqn=dqn, robots=("camera", "lidar", "lidar"))
+    trained = init(jax.random.key(0), config)
+    means = jax.random.normal(jax.random.key(1), trained.class_beliefs.mean.shape)
+    trained = dataclasses.replace(trained, class_beliefs=Belief(means, jnp.ones_like(means)))
+    of_run = functions(config, trained)
+    decide = export.exported(of_run["decide_lidar"])
+    assert [str(n) for n in decide.out_avals[1].shape] == ["batch", "points + 1"]
+    for num_pois, num_robots in ((5, 3), (2, 1)):
+        rng = np.random.default_rng(num_pois)
+        belief = Belief(*rng.uniform(0.1, 1, (2, num_pois, 2)).astype(np.float32))
+        team = Team(
+            positions=rng.normal(size=(num_pois, 2)).astype(np.float32),
+            present=np.arange(num_pois) < 4,
+            poses=rng.normal(size=(num_robots, 3)).astype(np.float32),
+            modality=np.ones(num_robots, np.int32),
+            works=np.ones(num_robots, bool),
+            target=np.full(num_robots, num_pois, np.int32),
+        )
+        given = {**vars(belief), **vars(team), "robot": np.int32(num_robots - 1)}
+        inputs = (np.asarray(given[name])[None] for name in of_run["decide_lidar"].inputs)
+        found = decide.call(*inputs)
+        known = belief, team, given["robot"], 2, config.team, config.dqn
+        expected = policies.tour_values(trained.q_networks[1], trained.tours, *known)
+        np.testing.assert_allclose(found["values"][0], expected, rtol=1e-4)
+        assert found["action"][0] == np.argmax(expected)
+
+    # The example plays a team with the same functions.
+    programs = {name: jax.jit(jax.vmap(f.apply)) for name, f in of_run.items()}
+    contents = export._description(config, trained)
+    contents["programs"] = {name: {"inputs": list(f.inputs)} for name, f in of_run.items()}
+    lines = runpy.run_path(str(EXAMPLE))["explore"](contents, programs, [0, 1, 2, 0])
+    assert [line.split(" is a ")[0] for line in lines[-4:]] == [f"PoI {n}" for n in range(4)]
 
 
 def test_contents_describe_what_is_there(results, file):

@@ -12,6 +12,7 @@ from jaxsense.config.learning import FilterConfig as FilterConfig
 from jaxsense.config.learning import JmvaeConfig as JmvaeConfig
 from jaxsense.config.learning import MdpConfig as MdpConfig
 from jaxsense.config.learning import TeamConfig as TeamConfig
+from jaxsense.config.learning import ToursConfig as ToursConfig
 from jaxsense.config.learning import TravelConfig as TravelConfig
 from jaxsense.config.mission import KNOW_WAYS as KNOW_WAYS
 from jaxsense.config.mission import MISSIONS_AT_ONCE as MISSIONS_AT_ONCE

@@ -6,7 +6,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 _MOST_SHOWN = 200  # characters of a value
 _LEAST, _MOST = 1e-30, 1e30  # a product of two still fits float32
-_WITHIN = {"travel": "team."}  # sections that are part of another
+_WITHIN = {"travel": "team.", "tours": "team."}  # sections that are part of another
 
 
 class ConfigError(ValueError):

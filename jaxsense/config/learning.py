@@ -174,11 +174,37 @@ class TravelConfig:
 
 
 @section
+class ToursConfig:
+    """How a team learns in which order to visit its points, see `jaxsense.dqn.tours`."""
+
+    states: int = 65536
+    """States in which choices are tried."""
+    tries: int = 4
+    """Choices tried in each state."""
+    walk: Traced[int] = 8
+    """Most choices before such a state."""
+    steps: int = 3200
+    """Gradient steps."""
+    batch: int = 1024
+    """States in one gradient step."""
+    learning_rate: Traced[float] = 2e-3
+    """Learning rate of Adam at the start; it falls to zero along a cosine."""
+
+    def check(self) -> None:
+        """Raises `ConfigError` for an invalid field."""
+        require_types(self)
+        require_positive(self, "states", "tries", "steps", "batch", "learning_rate")
+        require_not_negative(self, "walk")
+
+
+@section
 class TeamConfig:
     """The map MDP in which a team learns with `dqn.task` = team: with places, robots and time."""
 
     travel: TravelConfig = TravelConfig()
     """How long a robot takes to look at a point."""
+    tours: ToursConfig = ToursConfig()
+    """How it learns which point comes first."""
     num_pois: tuple[int, int] = (3, 8)
     """Fewest and most points of interest in an episode."""
     robots_each: int = 2

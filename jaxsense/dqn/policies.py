@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jaxsense import networks
 from jaxsense.config import DqnConfig, TeamConfig, values
-from jaxsense.dqn import belief_mdp, optimum, team_mdp
+from jaxsense.dqn import belief_mdp, optimum, team_mdp, tours
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import Team
@@ -17,6 +17,8 @@ from jaxsense.networks import MLP, Params
 from jaxsense.types import Belief, Index, Key
 
 Policy = Callable[[Key, MapState], jax.Array]
+
+_NOT_WORTH = -1e6  # s, below minus any tour
 
 
 def q_network(num_pois: int, hidden: tuple[int, ...]) -> MLP:
@@ -78,6 +80,41 @@ def team_values(
     seen = team_mdp.observation(config.travel, belief, team, agent, num_modalities).reshape(-1)
     after = networks.apply(team_network(latent_size, num_modalities, dqn), params, seen)
     return of_ways(after, seen, latent_size, config, dqn)
+
+
+def tour_values(
+    params: Params,
+    tour_params: Params,
+    belief: Belief,
+    team: Team,
+    agent: jax.Array,
+    num_modalities: int,
+    config: TeamConfig,
+    dqn: DqnConfig,
+) -> jax.Array:
+    """Values of a robot's actions, `[N + 1]`, in the order that ends the team's work soonest.
+
+    Of the looks that are worth their time by `team_values`, the value is minus the seconds until
+    the team is done, up to a constant; that of NOP lies below them, and those of others lowest.
+
+    Args:
+      params: of the Q-network.
+      tour_params: of the network of `tours`.
+      belief: `[N, D]` the map.
+      team: where everybody is.
+      agent: `[]` int32, the robot that chooses.
+      num_modalities: M.
+      config: the price of time and the model of travel.
+      dqn: the network, and the discount of time.
+    """
+    known = belief, team, agent, num_modalities
+    worth = team_values(params, *known, config, dqn)
+    latent_size = belief.mean.shape[1]
+    seen = team_mdp.observation(config.travel, *known).reshape(-1)
+    network = team_network(latent_size, num_modalities, dqn)
+    seconds = tours.seconds(network, tour_params, seen, latent_size)
+    of_pois = jnp.where(worth[:-1] > worth[-1], -seconds, 2 * _NOT_WORTH)
+    return jnp.append(of_pois, _NOT_WORTH)
 
 
 def of_ways(

@@ -100,6 +100,11 @@ def travel_seconds(config: TravelConfig, pose: jax.Array, places: jax.Array) -> 
     return config.look_seconds + jnp.abs(turn) / config.turn_rate + way / config.speed
 
 
+def ways(config: TravelConfig, team: Team) -> jax.Array:
+    """`[R, N]` seconds until each robot has looked at each PoI, see `travel_seconds`."""
+    return jax.vmap(lambda pose: travel_seconds(config, pose, team.positions))(team.poses)
+
+
 def _way(config: TravelConfig, pose: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array]:
     """`[]` radians to turn and `[]` metres to drive until a robot is near enough to look."""
     to_place = place - pose[:2]
@@ -152,7 +157,7 @@ def observation(
     """
     chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
     values.require_positive("belief.std", belief.std)
-    times = jax.vmap(lambda pose: travel_seconds(config, pose, team.positions))(team.poses)
+    times = ways(config, team)
     soon = jnp.exp(-times / TIME_SCALE)
     robots, pois = jnp.arange(team.poses.shape[0]), jnp.arange(team.positions.shape[0])
     is_other = team.works & (robots != agent)

@@ -25,11 +25,13 @@ class Function:
       about: its result, in one line.
       inputs: shape and dtype of each input, by its name.
       apply: `(*inputs) -> {name: output}`.
+      any_size: names of the axes that may have any size, by input, as in `"points, ..."`.
     """
 
     about: str
     inputs: dict[str, jax.ShapeDtypeStruct]
     apply: Callable[..., dict[str, jax.Array]]
+    any_size: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
 def functions(config: Config, models: Models) -> dict[str, Function]:
@@ -123,16 +125,17 @@ def _decide_in_team(config: Config, models: Models, m: int) -> Function:
         mean: jax.Array,
         std: jax.Array,
         positions: jax.Array,
+        present: jax.Array,
         poses: jax.Array,
+        modality: jax.Array,
         works: jax.Array,
         target: jax.Array,
         robot: jax.Array,
     ) -> dict[str, jax.Array]:
-        modality = jnp.array(config.modality_of_robot)
-        present = jnp.ones(num_pois, bool)
         team = Team(positions, present, poses, modality, works, target)
         known = Belief(mean, std), team, robot, len(config.modalities)
-        values = policies.team_values(models.q_networks[m], *known, config.team, config.dqn)
+        trained = models.q_networks[m], models.tours
+        values = policies.tour_values(*trained, *known, config.team, config.dqn)
         return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
 
     shape = num_pois, config.jmvae.latent_size
@@ -140,13 +143,17 @@ def _decide_in_team(config: Config, models: Models, m: int) -> Function:
         "mean": _floats(*shape),
         "std": _floats(*shape),
         "positions": _floats(num_pois, 2),
+        "present": jax.ShapeDtypeStruct((num_pois,), bool),
         "poses": _floats(num_robots, 3),
+        "modality": jax.ShapeDtypeStruct((num_robots,), jnp.int32),
         "works": jax.ShapeDtypeStruct((num_robots,), bool),
         "target": jax.ShapeDtypeStruct((num_robots,), jnp.int32),
         "robot": jax.ShapeDtypeStruct((), jnp.int32),
     }
     about = "the PoI to look at next, N for NOP, and the value of each; targets likewise"
-    return Function(about, inputs, apply)
+    of_pois = dict.fromkeys(("mean", "std", "positions", "present"), "points, ...")
+    of_robots = dict.fromkeys(("poses", "modality", "works", "target"), "robots, ...")
+    return Function(about, inputs, apply, {**of_pois, **of_robots})
 
 
 def _classify(models: Models) -> Function:

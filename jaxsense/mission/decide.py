@@ -1,14 +1,13 @@
 """Choosing the PoI that a robot looks at next, and the viewpoint."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 
 from jaxsense import networks
 from jaxsense.config import KNOW_WAYS, POLICIES, ROBOT_RADIUS, Config
-from jaxsense.dqn import belief_mdp, optimum, policies, rules, team_mdp
+from jaxsense.dqn import belief_mdp, policies, rules, team_mdp
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission.state import (
     BACKING,
@@ -24,10 +23,9 @@ from jaxsense.mission.state import (
     robot_of,
     with_robot,
 )
-from jaxsense.models import Models, make_q_network
+from jaxsense.models import Models, expected, expected_gains, make_q_network
 from jaxsense.sim import roadmap, viewpoints
 from jaxsense.types import Belief, Index, Key, others
-from jaxsense.vae import filtering
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
@@ -117,31 +115,22 @@ def _values(
 ) -> jax.Array:
     """`[N + 1]` values of the policy's actions, NOP's last."""
     num_pois = mission.config.arena.num_pois
-    on_map = jax.vmap(functools.partial(filtering.weights, models.readout))(state.belief)
-    exact = jnp.exp(state.log_posterior)
-
-    is_seen = jnp.any(state.seen, axis=-1)
-
-    def expected(table: jax.Array, first: jax.Array, weights: jax.Array) -> jax.Array:
-        known = jax.vmap(lambda weights: optimum.interpolate(table, weights))(weights)
-        return jnp.where(is_seen, known, first)
-
+    exact, is_seen = jnp.exp(state.log_posterior), jnp.any(state.seen, axis=-1)
     modalities = jnp.array(mission.config.modality_of_robot)
     modality = modalities[robot]
     of_each = jax.tree.map(lambda *x: jnp.stack(x), *models.look_values)
     looks = jax.tree.map(lambda x: x[modality], of_each)
+    known = models.readout, models.look_values, state.belief, is_seen
+    gains = expected_gains(*known)[modalities]
     times = state.times_seen[:, modality]
     team = team_of(mission, state, given_up)
-    by_map = jax.vmap(expected, in_axes=(0, 0, None))
-    gains = by_map(of_each.gain, of_each.first_gain, on_map)[modalities]
-    travel = mission.config.team.travel
-    ways = jax.vmap(lambda pose: team_mdp.travel_seconds(travel, pose, team.positions))(team.poses)
+    ways = team_mdp.ways(mission.config.team.travel, team)
     by_rule = gains, ways, team, jnp.asarray(robot)
 
     of_pois = {
         "greedy": gains[robot],
-        "bayes": expected(looks.gain, looks.first_gain, exact),
-        "optimal": expected(looks.total, looks.first_total, exact),
+        "bayes": expected(looks.gain, looks.first_gain, exact, is_seen),
+        "optimal": expected(looks.total, looks.first_total, exact, is_seen),
         "naive": jnp.where(times < 1, 1.0, -1.0),
         "naive_2": jnp.where(times < 2, 1.0, -1.0),
         "naive_3": jnp.where(times < 3, 1.0, -1.0),
@@ -167,7 +156,8 @@ def _q_values(
     if mission.config.dqn.task == "team":
         known = state.belief, team_of(mission, state, given_up), jnp.asarray(robot)
         config, number = mission.config, len(mission.config.modalities)
-        return policies.team_values(q_network, *known, number, config.team, config.dqn)
+        trained = q_network, models.tours
+        return policies.tour_values(*trained, *known, number, config.team, config.dqn)
     network, _ = make_q_network(mission.config)
 
     def values_if(sure: Belief) -> jax.Array:

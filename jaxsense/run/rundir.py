@@ -294,6 +294,7 @@ def _named(models: Models, config: Config) -> dict[str, Any]:
         "class_beliefs": models.class_beliefs,
         "look_values": models.look_values,
         **{stages.agent(config, name): q_network for name, q_network in q_networks},
+        **({} if models.tours is None else {"tours": models.tours}),
     }
 
 

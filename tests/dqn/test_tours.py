@@ -1,0 +1,148 @@
+"""Trials of choices, with times worked by hand, and what is learned from them."""
+
+import functools
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import classes_mdp
+
+from jaxsense import networks
+from jaxsense.config import DqnConfig, TeamConfig, ToursConfig, TravelConfig
+from jaxsense.dqn import policies, team_mdp, tours
+from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.dqn.tours import Trials
+from jaxsense.vae import minibatch
+
+TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
+# In a row, 1.9 and 3.9 m from two robots at the origin; the third is not present.
+PLACES = jnp.array([[1.9, 0.0], [3.9, 0.0], [9.0, 9.0]])
+# 1 m to the first and 2 m on to the second, with a look at each.
+IN_ORDER = (5 + 1) + (10 + 1)
+# 3 m to the second, a half turn and .2 m back to the first.
+BACKWARDS = (15 + 1) + (math.pi + 1 + 1)
+NETWORK = policies.team_network(2, 2, DqnConfig(task="team", observe="bank", hidden=(8,)))
+
+
+def make_mdp(present=2, max_steps=300):
+    mapped = classes_mdp(partly_seen_starts=False)
+    given = {"travel": TRAVEL, "num_pois": (present, present), "robots_each": 1, "alone": 1.0}
+    settings = TeamConfig(**given, partly_seen=0.0, max_steps=max_steps)
+    return TeamMdp(settings, mapped, lambda *given: (PLACES, jnp.zeros((2, 3))))
+
+
+@functools.partial(jax.jit, static_argnames=("present", "tries"))
+def trials_of(present=2, max_steps=300, walk=0, bonus=0.0, tries=3):
+    """Trials in 64 states; all look once at each PoI in the order of their numbers."""
+
+    def in_order(state):
+        own = state.map.seen[:, state.team.modality[state.agent]]
+        of_pois = jnp.where(own | ~state.team.present, -1.0, 3.0 - jnp.arange(3))
+        return jnp.append(of_pois + bonus, 0.0)
+
+    config, mdp = ToursConfig(tries=tries, walk=walk), make_mdp(present, max_steps)
+    return tours.try_choices(jax.random.key(0), mdp, in_order, config, 64)
+
+
+def own_seconds(trials):
+    return team_mdp.own_seconds(trials.observation.reshape(NETWORK.features, 3, 64), 2)
+
+
+def test_seconds_until_all_are_done_as_worked_by_hand():
+    found = trials_of()
+    np.testing.assert_array_equal(found.is_tried, np.repeat([[True], [True], [False]], 64, 1))
+    # The other robot goes in order in either case.
+    expected = [IN_ORDER, (BACKWARDS + IN_ORDER) / 2]
+    np.testing.assert_allclose(found.seconds[:2], np.repeat(expected, 64).reshape(2, 64), rtol=1e-5)
+    np.testing.assert_allclose(own_seconds(found)[:2, 0], [6.0, 16.0], rtol=1e-5)
+
+
+def test_of_one_open_point_no_choice_is_recorded():
+    assert not trials_of(present=1).is_tried.any()
+
+
+def test_as_many_choices_are_tried_as_asked_and_only_open_ones():
+    found = trials_of(tries=1)
+    np.testing.assert_array_equal(found.is_tried.sum(axis=0), 1)
+    assert not found.is_tried[2].any()
+    # The first takes 10 s less, and so comes e^2 times as often: 56 of 64, give or take 2.6.
+    assert 48 <= found.is_tried[0].sum() <= 63
+
+
+def test_trials_start_some_choices_on():
+    found = trials_of(walk=6)
+    # After the first look at a PoI a robot has no choice any more.
+    assert 5 < found.is_tried.any(axis=0).sum() < 60
+    assert len(np.unique(np.round(own_seconds(found)[0], 3))) > 1
+
+
+def test_a_team_that_never_ends_stops_at_the_limit():
+    found = trials_of(max_steps=7, bonus=10.0)
+    assert np.isfinite(found.seconds).all()
+    assert (found.seconds[:2] > 0).all()
+
+
+def test_the_loss_is_of_differences_within_a_state():
+    size = NETWORK.features * 3
+    params = jax.tree.map(jnp.zeros_like, networks.init(jax.random.key(0), NETWORK, size))
+    # All predictions are the ways themselves.
+    known = (
+        jnp.zeros((NETWORK.features, 3, 2)).at[4].set(jnp.array([[0.6, 0.1], [1.6, 0.2], [0, 0]]))
+    )
+    known = known.at[-3, :2].set(1.0)
+    tried = jnp.array([[True, True], [True, True], [False, False]])
+    trials = Trials(
+        known.reshape(-1, 2), tried, jnp.array([[26.0, 31.0], [36.0, 32.0], [5.0, 9.0]])
+    )
+    # 6 and 16 s, and 1 and 2 s: each 20 and 30 s too little, and that is no error.
+    assert tours.loss(NETWORK, params, trials, 2) < 1e-6
+    # 6 s off between the two: 3 s each from their mean, of 3 s.
+    later = replace(trials, seconds=trials.seconds.at[1, 0].add(6.0))
+    expected = (2 * (math.sqrt(2) - 1) + 0) / 4
+    np.testing.assert_allclose(tours.loss(NETWORK, params, later, 2), expected, rtol=1e-5)
+
+
+def test_columns_are_written_and_only_those_with_a_trial_drawn():
+    room = tours.no_trials(2, 3, 5)
+    one = Trials(jnp.ones((6, 2)), jnp.ones((3, 2), bool), jnp.ones((3, 2)))
+    found = tours.write(room, one, jnp.int32(3))
+    np.testing.assert_array_equal(found.seconds.sum(axis=0), [0, 0, 0, 3, 3])
+    np.testing.assert_array_equal(found.observation.sum(axis=0), [0, 0, 0, 6, 6])
+    drawn = tours.sample(jax.random.key(0), found, (40,))
+    assert set(np.asarray(drawn).tolist()) == {3, 4}
+
+
+def test_training_finds_the_shorter_tour():
+    trials, optimiser = trials_of(), minibatch.adam(1e-2, 100)
+    params = networks.init(jax.random.key(1), NETWORK, NETWORK.features * 3)
+    state = minibatch.start(params, optimiser)
+
+    def loss(params, drawn, step):
+        return tours.loss(NETWORK, params, trials, 2)
+
+    state, losses = jax.jit(lambda s: minibatch.fit(s, loss, jnp.zeros(100), optimiser))(state)
+    assert losses[-1] < 1e-3 < losses[0]
+    learned = tours.seconds(NETWORK, state.params, trials.observation, 2)
+    expected = (BACKWARDS - IN_ORDER) / 2
+    np.testing.assert_allclose(learned[1] - learned[0], expected, atol=0.2)
+
+
+@pytest.mark.parametrize(
+    ("worth", "order"),
+    [
+        ([1.0, 1.0, 1.0], [2, 0, 1, 3]),  # the soonest first, NOP last
+        ([1.0, -1.0, 1.0], [2, 0, 3, 1]),  # what is not worth its time below NOP
+        ([-1.0, -1.0, -1.0], [3]),
+    ],
+)
+def test_looks_that_pay_come_in_the_order_of_their_tours(monkeypatch, worth, order):
+    monkeypatch.setattr(policies, "team_values", lambda *known: jnp.array([*worth, 0.0]))
+    monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
+    state = team_mdp.reset(jax.random.key(0), make_mdp(present=3), jnp.array([0, 1]))
+    dqn = DqnConfig(task="team", observe="bank", hidden=(8,))
+    known = state.map.belief, state.team, state.agent, 2, TeamConfig(travel=TRAVEL), dqn
+    values = policies.tour_values(None, None, *known)
+    assert np.argsort(-values)[: len(order)].tolist() == order
