@@ -258,6 +258,8 @@ class Config:
             "dqn.num_starts": dqn.num_starts * max(state, scene),
             "dqn.num_envs dqn.chunk": dqn.num_envs * max(5 * dqn.chunk, state, scene),
             "dqn.batch dqn.updates dqn.chunk": 2 * dqn.batch * max(dqn.chunk * dqn.updates, state),
+            "team.tours.states": self.team.tours.states * 2 * state,
+            "team.tours.batch team.tours.steps": self.team.tours.batch * self.team.tours.steps,
             "evaluation.num_starts evaluation.num_repeats": evaluation.num_starts
             * evaluation.num_repeats
             * state,

@@ -94,8 +94,9 @@ def tour_values(
 ) -> jax.Array:
     """Values of a robot's actions, `[N + 1]`, in the order that ends the team's work soonest.
 
-    Of the looks that are worth their time by `team_values`, the value is minus the seconds until
-    the team is done, up to a constant; that of NOP lies below them, and those of others lowest.
+    A look is worth it if its reward and what follows, as the Q-network predicts them, exceed the
+    price of the way. The value is then minus the seconds until the team is done, up to a constant;
+    that of NOP lies below these, and those of other looks lowest.
 
     Args:
       params: of the Q-network.
@@ -107,14 +108,14 @@ def tour_values(
       config: the price of time and the model of travel.
       dqn: the network, and the discount of time.
     """
-    known = belief, team, agent, num_modalities
-    worth = team_values(params, *known, config, dqn)
     latent_size = belief.mean.shape[1]
-    seen = team_mdp.observation(config.travel, *known).reshape(-1)
     network = team_network(latent_size, num_modalities, dqn)
+    observed = team_mdp.observation(config.travel, belief, team, agent, num_modalities)
+    seen = observed.reshape(-1)
+    after = networks.apply(network, params, seen)[:-1]
+    is_worth_it = after > config.second_cost * team_mdp.own_seconds(observed, latent_size)
     seconds = tours.seconds(network, tour_params, seen, latent_size)
-    of_pois = jnp.where(worth[:-1] > worth[-1], -seconds, 2 * _NOT_WORTH)
-    return jnp.append(of_pois, _NOT_WORTH)
+    return jnp.append(jnp.where(is_worth_it, -seconds, 2 * _NOT_WORTH), _NOT_WORTH)
 
 
 def of_ways(

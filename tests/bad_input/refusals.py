@@ -19,7 +19,7 @@ SECTIONS = {
 }
 FIELDS = [(name, f) for name, section in SECTIONS.items() for f in dataclasses.fields(section)]
 # With those of a section within a section.
-PARTS = {**SECTIONS, "team.travel": SMOKE.team.travel}
+PARTS = {**SECTIONS, "team.travel": SMOKE.team.travel, "team.tours": SMOKE.team.tours}
 NUMBERS = [
     (name, field)
     for name, section in PARTS.items()

@@ -60,6 +60,7 @@ ZERO = {
     "mission.least_confidence", "lidar.range_noise_growth", "lidar.mixed_pixels", "lidar.dropout",
     "camera.exposure_error", "camera.colour_cast", "camera.low_light", "camera.shadow",
     "detector.calibration", "mdp.look_cost", "team.alone", "team.partly_seen", "team.second_cost",
+    "team.tours.walk",
     "team.travel.view_distance",
 }  # fmt: skip
 
@@ -275,6 +276,22 @@ def changed(changes: dict, base: Config = SMOKE) -> Config:
         for name, part in parts.items()
     }
     return dataclasses.replace(base, **made)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"states": 2 * 10**9}, "team.tours.states = 2000000000: takes"),
+        ({"steps": 10**7}, "team.tours.steps = 10000000: takes"),
+        ({"tries": 0}, "team.tours.tries = 0: must be a number greater than 0"),
+        ({"walk": -1}, "team.tours.walk = -1: must be a number that is not negative"),
+    ],
+)
+def test_tours_that_cannot_be_learned_are_named(changes, expected):
+    with pytest.raises(ConfigError) as error:
+        tours = dataclasses.replace(SMOKE.team.tours, **changes)
+        changed({"team": {"tours": tours}})
+    assert expected in str(error.value)
 
 
 @pytest.mark.parametrize(("changes", "expected"), CHANGES, ids=count())

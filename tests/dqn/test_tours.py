@@ -131,18 +131,20 @@ def test_training_finds_the_shorter_tour():
 
 
 @pytest.mark.parametrize(
-    ("worth", "order"),
+    ("after", "cost", "order"),
     [
-        ([1.0, 1.0, 1.0], [2, 0, 1, 3]),  # the soonest first, NOP last
-        ([1.0, -1.0, 1.0], [2, 0, 3, 1]),  # what is not worth its time below NOP
-        ([-1.0, -1.0, -1.0], [3]),
+        ([1.0, 1.0, 1.0], 0.0, [2, 0, 1, 3]),  # the soonest first, NOP last
+        ([1.0, -1.0, 1.0], 0.0, [2, 0, 3, 1]),  # what is not worth its way below NOP
+        ([-1.0, -1.0, -1.0], 0.0, [3]),
+        ([1.0, 1.0, 7.0], 0.1, [2, 0, 3, 1]),  # ways of 6, 16 and 61 s at .1 a second
     ],
 )
-def test_looks_that_pay_come_in_the_order_of_their_tours(monkeypatch, worth, order):
-    monkeypatch.setattr(policies, "team_values", lambda *known: jnp.array([*worth, 0.0]))
+def test_looks_that_pay_come_in_the_order_of_their_tours(monkeypatch, after, cost, order):
+    monkeypatch.setattr(networks, "apply", lambda network, params, seen: jnp.array([*after, 0.0]))
     monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
     state = team_mdp.reset(jax.random.key(0), make_mdp(present=3), jnp.array([0, 1]))
     dqn = DqnConfig(task="team", observe="bank", hidden=(8,))
-    known = state.map.belief, state.team, state.agent, 2, TeamConfig(travel=TRAVEL), dqn
+    team = TeamConfig(travel=TRAVEL, second_cost=cost)
+    known = state.map.belief, state.team, state.agent, 2, team, dqn
     values = policies.tour_values(None, None, *known)
     assert np.argsort(-values)[: len(order)].tolist() == order
