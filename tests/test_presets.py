@@ -149,3 +149,39 @@ def test_noisy_preset(tmp_path, summary_of):
         assert 0.98 <= block["fraction_of_optimal"] <= 1.01
     assert noisy["mission"]["latent"]["accuracy"] >= 0.97
     assert all(block["ece"] <= 0.02 for block in noisy["detectors"].values())
+
+
+def test_team_preset(tmp_path, summary_of, run_program):
+    path = tmp_path / "team"
+    policies = "latent", "nearest", "auction", "rollout", "naive"
+    options = "--mission.policies", *policies, "--mission.episodes", "256"
+    team = summary_of("team", 0, path, *options)
+    for block in team["dqn"].values():
+        assert [*block["other_numbers"]] == ["3", "8", "20"]
+        for numbers in (block, *block["other_numbers"].values()):
+            assert 0.98 <= numbers["fraction_of_optimal"] <= 1.01
+    check_team_missions(team["mission"], rules=policies[1:4], of_naive=0.90, of_rules=1.0)
+    assert team["mission"]["latent"]["observations_per_poi"] <= 1.75
+
+    # Twice as many points as it ever learned with, and more robots.
+    large = "--arena.num-pois", "16", "--arena.side", "6", "--episodes", "128"
+    for policy in ("latent", "auction", "naive"):
+        run_program("evaluate", path, str(path), *large, "--policy", policy)
+    four = "--robots", "camera", "camera", "lidar", "lidar", "--policy", "latent"
+    elsewhere = run_program("evaluate", path, str(path), *large, *four)["elsewhere"]
+    of_two, of_four = (place["mission"] for place in elsewhere.values())
+    check_team_missions(of_two, rules=("auction",), of_naive=0.92, of_rules=1.0)
+    assert of_four["latent"]["time_s"] <= 0.65 * of_two["latent"]["time_s"]
+
+
+def check_team_missions(
+    mission: dict, rules: tuple[str, ...], of_naive: float, of_rules: float
+) -> None:
+    """Compares the latent policy with naive exploration and with the best of some rules."""
+    latent, naive = mission["latent"], mission["naive"]
+    assert latent["accuracy"] >= naive["accuracy"] - 0.003
+    assert latent["time_s"] <= of_naive * naive["time_s"]
+    # Means, because medians of so few missions vary by more than the difference.
+    best = min(mission[rule]["mean_time_s"] for rule in rules)
+    assert latent["mean_time_s"] <= of_rules * best
+    assert all(mission[policy]["collisions"] == 0 for policy in ("latent", "naive", *rules))

@@ -288,9 +288,11 @@ def changed(changes: dict, base: Config = SMOKE) -> Config:
     ],
 )
 def test_tours_that_cannot_be_learned_are_named(changes, expected):
+    def make():
+        return changed({"team": {"tours": dataclasses.replace(SMOKE.team.tours, **changes)}})
+
     with pytest.raises(ConfigError) as error:
-        tours = dataclasses.replace(SMOKE.team.tours, **changes)
-        changed({"team": {"tours": tours}})
+        make()
     assert expected in str(error.value)
 
 
