@@ -14,7 +14,7 @@ from jaxsense.config import Config
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn.belief_mdp import MapMdp, MapState, random_start, reset
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.models import make_jmvae
+from jaxsense.models import make_jmvae, readout
 from jaxsense.networks import Params
 from jaxsense.observe import Bank
 from jaxsense.types import Belief, Key, call
@@ -184,7 +184,7 @@ def beliefs(
     model, number = make_jmvae(config), len(classes.mean)
     labels = [jnp.array(config.label_of_class(m)) for m in config.modalities]
     unseen = fusion.unseen(model, config.mdp.unseen_variance)
-    readout = {"inverse": filtering.moments_inverse(classes), "unseen": unseen}
+    read = readout(filtering.moments_inverse(classes), unseen)
 
     def look(carry, drawn):
         belief, exact, seen = carry
@@ -196,7 +196,7 @@ def beliefs(
 
         belief, exact = call(write, modality, len(bank))
         seen = seen.at[modality].set(True)
-        shares = jnp.log(filtering.weights(readout, belief))
+        shares = jnp.log(filtering.weights(read, belief))
         return (belief, exact, seen), (shares, exact, jnp.linalg.norm(belief.std))
 
     def history(key: Key, true_class: jax.Array):

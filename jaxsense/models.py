@@ -47,7 +47,12 @@ class Models:
     @property
     def readout(self) -> Params:
         """What `filtering.weights` reads the map with."""
-        return {"inverse": self.moments_inverse, "unseen": self.unseen}
+        return readout(self.moments_inverse, self.unseen)
+
+
+def readout(moments_inverse: jax.Array, unseen: Belief) -> Params:
+    """What `filtering.weights` reads the map with, see `Models`."""
+    return {"inverse": moments_inverse, "unseen": unseen}
 
 
 def make_jmvae(config: Config) -> Jmvae:
@@ -109,6 +114,7 @@ def init(key: Key, config: Config) -> Models:
     )
     q_network, size = make_q_network(config)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
+    tour_key = jax.random.fold_in(dqn_key, 1)
     shape = (len(config.arena.classes), config.jmvae.latent_size)
     params, classes = (
         jmvae.init(jmvae_key, make_jmvae(config)),
@@ -128,5 +134,5 @@ def init(key: Key, config: Config) -> Models:
         unseen=unseen,
         look_values=(LookValues(no_values, no_values, nothing, nothing),) * len(config.modalities),
         q_networks=tuple(networks.init(k, q_network, size) for k in dqn_keys),
-        tours=networks.init(dqn_key, q_network, size) if config.dqn.task == "team" else None,
+        tours=networks.init(tour_key, q_network, size) if config.dqn.task == "team" else None,
     )

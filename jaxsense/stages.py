@@ -24,7 +24,7 @@ from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.dqn.tours import Trials
 from jaxsense.dqn.training import DqnState
-from jaxsense.models import Models, expected_gains, make_jmvae
+from jaxsense.models import Models, expected_gains, make_jmvae, readout
 from jaxsense.networks import Params
 from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
@@ -681,7 +681,7 @@ def _finish_dqn(config: Config, state: DqnState, *inputs: Any) -> Params:
 def _tour_stage(config: Config, params: str) -> Steps:
     """The training of the network that orders a team's looks, see `tours`.
 
-    It learns from trials of which every chunk makes some, and all keep those before.
+    Each chunk adds trials and learns from all so far.
     """
     settings, latent_size = config.team.tours, config.jmvae.latent_size
     size = _chunk_size(settings.steps)
@@ -707,16 +707,16 @@ def _tour_stage(config: Config, params: str) -> Steps:
         fit, trials = state
         try_key, draw_key = jax.random.split(key)
         mdp = observe.team_mdp(config, detections.bank, params, make_jmvae(config))
-        readout = {"inverse": filtering.moments_inverse(classes), "unseen": mdp.map.unseen}
-        settings = config.team.tours
+        read = readout(filtering.moments_inverse(classes), mdp.map.unseen)
 
         def policy(state: TeamState) -> jax.Array:
             known = state.map.belief, jnp.any(state.map.seen, axis=-1)
-            gains = expected_gains(readout, look_values, *known)[state.team.modality]
+            gains = expected_gains(read, look_values, *known)[state.team.modality]
             ways = team_mdp.ways(config.team.travel, state.team)
-            return rules.auction(gains, ways, state.team, state.agent)
+            worth = gains - config.team.second_cost * ways
+            return rules.auction(worth, ways, state.team, state.agent)
 
-        found = tours.try_choices(try_key, mdp, policy, settings, number)
+        found = tours.try_choices(try_key, mdp, policy, config.team.tours, number)
         trials = tours.write(trials, found, fit.step // size * number)
         rows = tours.sample(draw_key, trials, (size, settings.batch))
 
@@ -725,7 +725,7 @@ def _tour_stage(config: Config, params: str) -> Steps:
             batch = jax.tree.map(lambda x: x[:, rows], trials)
             return tours.loss(network, params, batch, latent_size)
 
-        optimiser = minibatch.adam(settings.learning_rate, settings.steps)
+        optimiser = minibatch.adam(config.team.tours.learning_rate, settings.steps)
         fit, losses = minibatch.fit(fit, loss, rows, optimiser, settings.steps)
         return (fit, trials), Progress(losses, {})
 

@@ -200,6 +200,7 @@ def test_the_policy_of_a_team_serves_any_number_of_points_and_robots():
     contents["programs"] = {name: {"inputs": list(f.inputs)} for name, f in of_run.items()}
     lines = runpy.run_path(str(EXAMPLE))["explore"](contents, programs, [0, 1, 2, 0])
     assert [line.split(" is a ")[0] for line in lines[-4:]] == [f"PoI {n}" for n in range(4)]
+    assert any("looks at PoI" in line for line in lines)
 
 
 def test_contents_describe_what_is_there(results, file):

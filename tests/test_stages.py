@@ -12,8 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import examine, observe, stages
-from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig, MdpConfig, MissionConfig
+from jaxsense import examine, models, observe, stages
+from jaxsense.config import (
+    PRESETS,
+    DetectorConfig,
+    JmvaeConfig,
+    MdpConfig,
+    MissionConfig,
+    TeamConfig,
+    ToursConfig,
+)
 from jaxsense.dqn import optimum
 from jaxsense.run import loop, missions, pipeline
 from jaxsense.run.monitor import Monitor
@@ -323,6 +331,41 @@ def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):
         assert len(progress.loss) == 3
     assert seen[0] == 2.0  # of 1, 2, 3
     assert seen[-1] == 40.5  # of 40 and 41
+
+
+def test_a_team_learns_its_tours_from_all_trials_so_far():
+    config = dataclasses.replace(
+        TINY,
+        dqn=dataclasses.replace(TINY.dqn, task="team", observe="bank"),
+        team=TeamConfig(
+            num_pois=(2, 3), tours=ToursConfig(states=20, tries=2, walk=1, steps=41, batch=8)
+        ),
+    )
+    untrained = models.init(KEY, config)
+    bank = tuple(jnp.ones((3, 4, n)) / n for n in models.make_jmvae(config).feature_sizes)
+    # The first look at a PoI pays, and no other.
+    values = tuple(dataclasses.replace(v, first_gain=jnp.ones(())) for v in untrained.look_values)
+    given: Any = stages.Detections(bank, (), (), jnp.zeros(2), ())  # pyright: ignore
+    inputs = values, untrained.class_beliefs, untrained.jmvae, given
+    stage: Any = next(s for s in stages.stages(config) if s.name == "tours")
+    state = stage.begin(KEY, config, *inputs)
+    first = state[0].params
+    advance = jax.jit(lambda key, state: stage.advance(key, config, state, *inputs))
+    # 41 steps are 14 chunks of 3, the last of which has 2; 20 states are 2 in each chunk.
+    written = []
+    for key in stage.chunk_keys(KEY):
+        state, progress = advance(key, state)
+        assert np.isfinite(progress.loss).all()
+        written.append(np.asarray(state[1].observation))
+    assert len(written) == 14
+    for i, observed in enumerate(written):
+        assert np.any(observed[:, : 2 * i + 2], axis=0).all()
+        assert not np.any(observed[:, 2 * i + 2 :])
+        np.testing.assert_array_equal(observed[:, : 2 * i + 2], written[-1][:, : 2 * i + 2])
+    assert int(state[0].step) == 41
+    assert state[1].is_tried.sum(axis=0).max() == 2
+    learned = stage.finish(config, state, *inputs)
+    assert any(np.any(x != y) for x, y in zip(*map(jax.tree.leaves, (first, learned)), strict=True))
 
 
 def test_the_restart_with_the_lowest_loss_is_kept():

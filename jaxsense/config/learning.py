@@ -178,7 +178,7 @@ class ToursConfig:
     """How a team learns in which order to visit its points, see `jaxsense.dqn.tours`."""
 
     states: int = 65536
-    """States in which choices are tried."""
+    """States in which choices are tried, and a few more that fill the last chunk."""
     tries: int = 4
     """Choices tried in each state."""
     walk: Traced[int] = 8
@@ -193,8 +193,10 @@ class ToursConfig:
     def check(self) -> None:
         """Raises `ConfigError` for an invalid field."""
         require_types(self)
-        require_positive(self, "states", "tries", "steps", "batch", "learning_rate")
+        require_positive(self, "states", "steps", "batch", "learning_rate")
         require_not_negative(self, "walk")
+        require(self.tries >= 2, self, "tries", "must be at least 2, to compare choices")
+        require_at_most(self, walk=10_000, learning_rate=1)
 
 
 @section

@@ -8,6 +8,8 @@ from jaxsense.config.learning import (
     EvaluationConfig,
     JmvaeConfig,
     MdpConfig,
+    TeamConfig,
+    ToursConfig,
 )
 from jaxsense.config.mission import POLICIES, MissionConfig, NavigationConfig
 from jaxsense.config.scene import ArenaConfig, CameraConfig, LidarConfig, ViewpointConfig
@@ -45,6 +47,7 @@ _SMOKE = Config(
         replay_capacity=2048,
         num_starts=64,
     ),
+    team=TeamConfig(tours=ToursConfig(states=512, steps=60, batch=64)),
     evaluation=EvaluationConfig(
         num_starts=32,
         num_repeats=1,

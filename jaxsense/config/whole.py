@@ -239,7 +239,7 @@ class Config:
         views = num_pois * ways.view_sides * len(ways.view_distances)
         trajectories = ways.speed_samples * ways.turn_samples * math.ceil(10 * ways.horizon)
         encoders = 2 ** len(self.modalities)
-        detector, evaluation = self.detector, self.evaluation
+        detector, evaluation, tours = self.detector, self.evaluation, self.team.tours
         numbers = {
             "detector.hidden": _weights(window, *detector.hidden, num_labels),
             "detector.num_scans": detector.num_scans * window,
@@ -258,8 +258,8 @@ class Config:
             "dqn.num_starts": dqn.num_starts * max(state, scene),
             "dqn.num_envs dqn.chunk": dqn.num_envs * max(5 * dqn.chunk, state, scene),
             "dqn.batch dqn.updates dqn.chunk": 2 * dqn.batch * max(dqn.chunk * dqn.updates, state),
-            "team.tours.states": self.team.tours.states * 2 * state,
-            "team.tours.batch team.tours.steps": self.team.tours.batch * self.team.tours.steps,
+            "team.tours.states team.tours.tries": tours.states * max(2, tours.tries) * state,
+            "team.tours.batch team.tours.steps": tours.batch * max(tours.steps, 2 * state),
             "evaluation.num_starts evaluation.num_repeats": evaluation.num_starts
             * evaluation.num_repeats
             * state,

@@ -45,7 +45,10 @@ def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
 def greedy_alone(
     mdp: MapMdp, params: Params, modality: Index, team: TeamConfig, config: DqnConfig
 ) -> Policy:
-    """Takes the best action of a team's Q-network for one robot that is alone, see `greedy`."""
+    """Takes the best action of a team's Q-network for one robot that is alone, see `greedy`.
+
+    All is at one place, and so there is no order to choose, see `tours`.
+    """
 
     def act(key: Key, state: MapState) -> jax.Array:
         del key
@@ -95,8 +98,8 @@ def tour_values(
     """Values of a robot's actions, `[N + 1]`, in the order that ends the team's work soonest.
 
     A look is worth it if its reward and what follows, as the Q-network predicts them, exceed the
-    price of the way. The value is then minus the seconds until the team is done, up to a constant;
-    that of NOP lies below these, and those of other looks lowest.
+    price of the way. The value is then minus the predicted seconds of `tours`; that of NOP lies
+    below these, and those of other looks lowest.
 
     Args:
       params: of the Q-network.
@@ -106,7 +109,7 @@ def tour_values(
       agent: `[]` int32, the robot that chooses.
       num_modalities: M.
       config: the price of time and the model of travel.
-      dqn: the network, and the discount of time.
+      dqn: the sizes of both networks.
     """
     latent_size = belief.mean.shape[1]
     network = team_network(latent_size, num_modalities, dqn)
@@ -115,7 +118,9 @@ def tour_values(
     after = networks.apply(network, params, seen)[:-1]
     is_worth_it = after > config.second_cost * team_mdp.own_seconds(observed, latent_size)
     seconds = tours.seconds(network, tour_params, seen, latent_size)
-    return jnp.append(jnp.where(is_worth_it, -seconds, 2 * _NOT_WORTH), _NOT_WORTH)
+    of_pois = jnp.where(is_worth_it, -seconds, 2 * _NOT_WORTH)
+    # NaN is worth nothing in a comparison, but must not pass for a decision.
+    return jnp.append(jnp.where(jnp.isnan(after), after, of_pois), _NOT_WORTH)
 
 
 def of_ways(

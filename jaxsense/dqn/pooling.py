@@ -1,4 +1,4 @@
-"""A Q-network that treats all points of interest alike, for any number of them.
+"""A network that treats all points of interest alike, for any number of them.
 
 One small network reads each PoI, with what lies around it and a pool over all of them (Zaheer et
 al. 2017, Deep Sets). PoIs that are not present count nowhere.
@@ -18,7 +18,7 @@ _NOTHING = -1e6  # value of a PoI that is not present
 
 
 class PoolingNetwork(nn.Module):
-    """The Q-network of a team.
+    """The network of a team, for its Q-values and its tours.
 
     Attributes:
       hidden: sizes of the hidden layers, the same for each PoI.

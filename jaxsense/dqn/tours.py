@@ -1,4 +1,4 @@
-"""How soon a team is done after each choice, learned from trials in the model of travel.
+"""How soon the robots of a team end after each choice, learned from trials in the travel model.
 
 A discounted Q-network, see `team_mdp`, knows what a look is worth, but not the end of a mission:
 it puts off PoIs that lie apart, and the way back to them is long. So some choices of a robot are
@@ -26,7 +26,7 @@ from jaxsense.types import Key, pytree
 Policy = Callable[[TeamState], jax.Array]
 """`[N + 1]` values of actions, the highest of which is taken, NOP's last."""
 
-_NEAR = 5.0  # s, by which a choice is tried e times as rarely
+_NEAR = 5.0  # s; each further one makes a trial e times as rare
 _ERROR = 3.0  # s, above which an error counts linearly
 
 
@@ -38,7 +38,8 @@ class Trials:
       observation: `[F * N, ...]` what the robot knew.
       is_tried: `[N, ...]` bool, PoIs that it set out for; none where it had fewer than two to
         choose from.
-      seconds: `[N, ...]` until a robot had ended, the mean of all at work; counts where tried.
+      seconds: `[N, ...]` mean over the robots at work of the time until each ends; counts where
+        tried.
     """
 
     observation: jax.Array
@@ -53,13 +54,13 @@ def try_choices(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, num
       key: random key.
       mdp: the MDP.
       policy: what everybody follows after the choice, and before it.
-      config: how many choices.
+      config: how many choices, and how far from a start.
       number: B, of states.
 
     Returns:
       `[..., B]` trials.
     """
-    # A robot that is alone has no way.
+    # All that a lone robot looks at is at one place: no order to learn.
     mdp = dataclasses.replace(mdp, config=dataclasses.replace(mdp.config, alone=0.0))
     keys = jax.random.split(key, number)
     return jax.vmap(lambda key: _trial(key, mdp, policy, config), out_axes=-1)(keys)
@@ -159,7 +160,7 @@ def sample(key: Key, trials: Trials, shape: tuple[int, ...]) -> jax.Array:
 def seconds(
     network: PoolingNetwork, params: Params, observation: jax.Array, latent_size: int
 ) -> jax.Array:
-    """Seconds until the team is done if the robot sets out for each PoI, up to a constant.
+    """Seconds until robots end, on average, if this one sets out for each PoI; up to a constant.
 
     Args:
       network: of a team.
@@ -168,7 +169,7 @@ def seconds(
       latent_size: D.
 
     Returns:
-      `[N, ...]`; only differences mean anything.
+      `[N, ...]`; only differences mean anything, and those to absent PoIs nothing.
     """
     learned = networks.apply(network, params, observation)[:-1]
     observed = observation.reshape(network.features, *learned.shape)

@@ -149,7 +149,7 @@ def _values(
 def _q_values(
     mission: Mission, models: Models, state: MissionState, robot: Index, given_up: jax.Array
 ) -> jax.Array:
-    """`[N + 1]` values of the Q-network."""
+    """`[N + 1]` values of the trained policy."""
     modality = jnp.array(mission.config.modality_of_robot)[robot]
     q_network = jax.tree.map(lambda *x: jnp.stack(x)[modality], *models.q_networks)
 

@@ -282,8 +282,10 @@ def changed(changes: dict, base: Config = SMOKE) -> Config:
     ("changes", "expected"),
     [
         ({"states": 2 * 10**9}, "team.tours.states = 2000000000: takes"),
-        ({"steps": 10**7}, "team.tours.steps = 10000000: takes"),
-        ({"tries": 0}, "team.tours.tries = 0: must be a number greater than 0"),
+        ({"steps": 10**8}, "team.tours.steps = 100000000: takes"),
+        ({"tries": 1}, "team.tours.tries = 1: must be at least 2, to compare choices"),
+        ({"walk": 2**31 - 1}, "team.tours.walk = 2147483647: must be at most 10,000"),
+        ({"batch": 10**9}, "team.tours.batch = 1000000000: takes"),
         ({"walk": -1}, "team.tours.walk = -1: must be a number that is not negative"),
     ],
 )
