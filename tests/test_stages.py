@@ -333,6 +333,7 @@ def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):
     assert seen[-1] == 40.5  # of 40 and 41
 
 
+@pytest.mark.slow  # compiles trials of the auction, with the map's readout
 def test_a_team_learns_its_tours_from_all_trials_so_far():
     config = dataclasses.replace(
         TINY,
