@@ -92,6 +92,7 @@ def test_trials_start_some_choices_on():
     found = trials_of(walk=6)
     # After the first look at a PoI a robot has no choice any more, and none is recorded.
     assert 5 < found.is_tried.any(axis=0).sum() < 60
+    assert set(found.is_tried.sum(axis=0).tolist()) == {0, 2}
     assert len(np.unique(np.round(own_seconds(found)[0], 3))) > 1
 
 
