@@ -49,40 +49,18 @@ def greedy_alone(
 
     All is at one place, and so there is no order to choose, see `tours`.
     """
+    latent_size = mdp.unseen.mean.shape[0]
+    network = team_network(latent_size, mdp.num_modalities, config)
 
     def act(key: Key, state: MapState) -> jax.Array:
         del key
         alone = team_mdp.alone(mdp.num_pois, jnp.asarray(modality))
         known = state.belief, alone, jnp.int32(0), mdp.num_modalities
-        return _best(team_values(params, *known, team, config))
+        seen = team_mdp.observation(team.travel, *known).reshape(-1)
+        after = networks.apply(network, params, seen)
+        return _best(of_ways(after, seen, latent_size, team, config))
 
     return act
-
-
-def team_values(
-    params: Params,
-    belief: Belief,
-    team: Team,
-    agent: jax.Array,
-    num_modalities: int,
-    config: TeamConfig,
-    dqn: DqnConfig,
-) -> jax.Array:
-    """Values of a robot's actions, `[N + 1]`, by the Q-network of a team.
-
-    Args:
-      params: of the Q-network.
-      belief: `[N, D]` the map.
-      team: where everybody is.
-      agent: `[]` int32, the robot that chooses.
-      num_modalities: M.
-      config: the price of time and the model of travel.
-      dqn: the network, and the discount of time.
-    """
-    latent_size = belief.mean.shape[1]
-    seen = team_mdp.observation(config.travel, belief, team, agent, num_modalities).reshape(-1)
-    after = networks.apply(team_network(latent_size, num_modalities, dqn), params, seen)
-    return of_ways(after, seen, latent_size, config, dqn)
 
 
 def tour_values(

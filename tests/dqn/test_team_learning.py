@@ -67,9 +67,9 @@ def test_at_one_place_a_robot_values_what_one_that_is_alone_does(modality):
     @jax.jit
     def valued(belief, team):
         """Its values, and what comes after its looks."""
-        values = policies.team_values(params, belief, team, jnp.int32(0), 2, TWO.config, SMALL)
         seen = team_mdp.observation(TRAVEL, belief, team, jnp.int32(0), 2).reshape(-1)
-        return values, networks.apply(policies.team_network(2, 2, SMALL), params, seen)
+        after = networks.apply(policies.team_network(2, 2, SMALL), params, seen)
+        return policies.of_ways(after, seen, 2, TWO.config, SMALL), after
 
     taken = set()
     for seed in range(8):
