@@ -21,8 +21,8 @@ from jaxsense.types import Belief, Key, call
 from jaxsense.vae import filtering, fusion, jmvae, metrics, peers
 from jaxsense.vae.jmvae import Jmvae
 
-POLICIES = ("return", "optimal", "naive", "random")
-"""The greedy policy of a Q-network, and its baselines."""
+MDP_POLICIES = ("return", "optimal", "naive", "random")
+"""The greedy policy of a Q-network, and its baselines, in the map MDP."""
 _EXPECTATION_DRAWS = 1024
 _LOOKS = 6  # of a random history at one PoI
 
@@ -269,7 +269,7 @@ def compare_policies(
     bank: Bank,
     config: Config,
 ) -> tuple[jax.Array, jax.Array]:
-    """Plays episodes with each of `POLICIES`, on the same detections from the same starts.
+    """Plays episodes with each of `MDP_POLICIES`, on the same detections from the same starts.
 
     Args:
       key: random key.
@@ -359,14 +359,14 @@ def _states(config: Config) -> tuple[np.ndarray, np.ndarray]:
 
 
 def returns(total: np.ndarray, config: Config) -> dict[str, float | None]:
-    """Mean return of each of `POLICIES` from random starts, and the fraction of the optimal one.
+    """Mean return of each of `MDP_POLICIES` from random starts, and the share of the optimal one.
 
     Args:
       total: `[P, S]` from `compare_policies`.
       config: all settings.
     """
     of_starts = total[:, -config.evaluation.num_starts :].mean(axis=1).tolist()
-    whole = dict(zip(POLICIES, of_starts, strict=True))
+    whole = dict(zip(MDP_POLICIES, of_starts, strict=True))
     # Where no look pays, the optimum is 0.
     fraction = whole["return"] / whole["optimal"] if whole["optimal"] else None
     return {**whole, "fraction_of_optimal": fraction}
@@ -381,8 +381,8 @@ def policy_metrics(total: np.ndarray, first: np.ndarray, config: Config) -> dict
       config: all settings.
     """
     num_states = total.shape[1] - config.evaluation.num_starts
-    one_step = dict(zip(POLICIES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
-    missed = total[POLICIES.index("optimal"), :num_states] - total[0, :num_states]
+    one_step = dict(zip(MDP_POLICIES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
+    missed = total[MDP_POLICIES.index("optimal"), :num_states] - total[0, :num_states]
     is_optimal = missed <= 0.01
     is_permutation = episodes.are_different(_states(config)[0])
     return {

@@ -222,7 +222,7 @@ def played():
 def test_policies_are_played_from_every_state_and_from_random_starts(played):
     total, first = map(np.asarray, played(jnp.array([0.0, 0.0, 0.0, 1.0]), EXACT))
     assert total.shape == first.shape == (4, NUM_STATES + 16)
-    of = dict(zip(examine.POLICIES, total, strict=True))
+    of = dict(zip(examine.MDP_POLICIES, total, strict=True))
     np.testing.assert_array_equal(of["return"], 0.0)  # always NOP
     # The means over all states; a policy is at best as good.
     optimal, naive, uniform = (
@@ -231,7 +231,7 @@ def test_policies_are_played_from_every_state_and_from_random_starts(played):
     assert optimal > naive > uniform
     # It goes on where the camera has not seen all: bits 0, 2 and 4 of the number of a state.
     goes_on = np.arange(NUM_STATES) % 64 & 0b010101 != 0b010101
-    of_naive = first[examine.POLICIES.index("naive"), :NUM_STATES]
+    of_naive = first[examine.MDP_POLICIES.index("naive"), :NUM_STATES]
     np.testing.assert_array_equal(of_naive != 0, goes_on)
     # The camera's own looks alone: no state pays more than three of the best, from a variance of
     # 20 in three dimensions to sqrt(3).
@@ -261,7 +261,7 @@ def test_with_a_filter_the_optimum_is_by_the_total_of_the_own_sensors_looks():
         inputs = modality, with_bias(jnp.zeros(4)), params, values, EXACT, filtered
         return examine.compare_policies(jax.random.key(0), *inputs)
 
-    optimal = examine.POLICIES.index("optimal")
+    optimal = examine.MDP_POLICIES.index("optimal")
     total, first = play(jnp.int32(0))
     np.testing.assert_array_equal(total[optimal], 0.0)
     total, first = play(jnp.int32(1))

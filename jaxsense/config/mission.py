@@ -85,6 +85,11 @@ class NavigationConfig:
             "must be 1 to 20 distances, each greater than 0",
         )
 
+    @property
+    def margin(self) -> float:
+        """Free space around a robot's body in planning, in metres."""
+        return self.robot_radius - ROBOT_RADIUS
+
 
 @section
 class MissionConfig:

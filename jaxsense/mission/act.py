@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from jaxsense.mission.decide import planning_margin, sees, standing_robots
+from jaxsense.mission.decide import sees, standing_robots
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
@@ -102,7 +102,7 @@ def _way(mission: Mission, state: MissionState, robot: Index, own: Robots) -> _W
     place = state.roadmap.viewpoints[poi, goal]
     is_near = jnp.linalg.norm(place - position) <= config.navigation.goal_distance
     room = viewpoints.free_room(
-        place[:1], place[1:], planning_margin(config), config.arena, scene.layout, standing, poi
+        place[:1], place[1:], config.navigation.margin, config.arena, scene.layout, standing, poi
     )
     is_here = own.view == num_views
     is_there = is_here | (is_near & sees(mission, state, robot, poi))

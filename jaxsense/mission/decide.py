@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense import networks
-from jaxsense.config import KNOW_WAYS, POLICIES, ROBOT_RADIUS, Config
+from jaxsense.config import KNOW_WAYS, POLICIES
 from jaxsense.dqn import belief_mdp, policies, rules, team_mdp
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission.state import (
@@ -198,7 +198,7 @@ def _best_view(
     poi = jnp.minimum(target, config.arena.num_pois - 1)
     standing = standing_robots(state, robot)
     length = roadmap.lengths(config, scene.layout, state.roadmap, scene.poses[robot, :2], poi)
-    places, margin = state.roadmap.viewpoints[poi], planning_margin(config)
+    places, margin = state.roadmap.viewpoints[poi], config.navigation.margin
     room = viewpoints.free_room(
         places[:, 0], places[:, 1], margin, config.arena, scene.layout, standing, poi
     )
@@ -227,8 +227,3 @@ def standing_robots(state: MissionState, robot: Index) -> jax.Array:
     phase = others(state.robots.phase, robot)
     drives = (phase == DRIVING) | (phase == BACKING)
     return jnp.where(drives[:, None], 1e3, others(state.scene.poses[:, :2], robot))
-
-
-def planning_margin(config: Config) -> float:
-    """Free space around a robot's body in planning, in metres."""
-    return config.navigation.robot_radius - ROBOT_RADIUS

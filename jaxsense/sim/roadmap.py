@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense.config import NODES_PER_POI, Config
-from jaxsense.sim import amiro, viewpoints
+from jaxsense.sim import viewpoints
 from jaxsense.sim.arena import Layout
 from jaxsense.types import pytree
 
@@ -148,12 +148,10 @@ def _viewpoints(config: Config, layout: Layout) -> tuple[jax.Array, jax.Array]:
     offsets = (distances[:, None, None] * ring[None]).reshape(-1, 2)
     places = layout.position[:, None] + offsets[None]
     none = jnp.zeros((0, 2))
-    # Room for the planning radius, not only for the body.
-    clearance = settings.robot_radius - amiro.BODY_RADIUS
 
     def room(places: jax.Array, poi: jax.Array) -> jax.Array:
         x, y = places[:, 0], places[:, 1]
-        return viewpoints.free_room(x, y, clearance, config.arena, layout, none, poi)
+        return viewpoints.free_room(x, y, settings.margin, config.arena, layout, none, poi)
 
     return places, jax.vmap(room)(places, jnp.arange(num_pois)) > 0
 
