@@ -149,17 +149,21 @@ def test_states_are_tried_in_parts_of_one_size(monkeypatch):
     np.testing.assert_array_equal(in_parts.seconds, at_once.seconds)
 
 
+@jax.jit
+def after_choice(state, action):
+    return tours._step(jax.random.key(0), make_mdp(), state, action)[0]
+
+
 @pytest.mark.parametrize(("apart", "is_asked"), [(3.9, True), (2.0, False)])
 def test_after_a_look_robots_choose_anew_unless_they_look_already(apart, is_asked):
     # The first robot has looked after 6 s; the second is on its way, or has begun after 5.5 s.
-    places = PLACES.at[1, 0].set(apart)
-    mdp = replace(make_mdp(), new_places=lambda *given: (places, jnp.zeros((2, 3))))
-    key = jax.random.key(0)
-    state = team_mdp.reset(key, mdp, jnp.arange(2))
-    step = jax.jit(lambda state, action: tours._step(key, mdp, state, action)[0])
-    state = step(state, jnp.int32(0))
+    state = team_mdp.reset(jax.random.key(0), make_mdp(), jnp.arange(2))
+    state = replace(
+        state, team=replace(state.team, positions=state.team.positions.at[1, 0].set(apart))
+    )
+    state = after_choice(state, jnp.int32(0))
     assert (int(state.agent), state.asks.tolist()) == (1, [False, True])
-    state = step(state, jnp.int32(1))
+    state = after_choice(state, jnp.int32(1))
     assert (int(state.agent), float(state.seconds)) == (0, pytest.approx(6.0))
     assert state.asks.tolist() == [True, is_asked]
 
@@ -173,12 +177,8 @@ def test_who_tries_a_choice_keeps_it_and_the_others_may_change_their_mind():
 
     mdp = make_mdp()
     state = team_mdp.reset(jax.random.key(0), mdp, jnp.arange(2))
-    config = ToursConfig(last_end=1.0)
-    end = jax.jit(
-        lambda state, poi: tours._seconds_to_end(
-            jax.random.key(0), mdp, to_first, config, state, poi
-        )
-    )
+    given = jax.random.key(0), mdp, to_first, ToursConfig(last_end=1.0)
+    end = jax.jit(lambda state, poi: tours._seconds_to_end(*given, state, poi))
     # The other looks at PoI 0 after 6 s; the chooser goes on to PoI 1 and then back.
     np.testing.assert_allclose(end(state, jnp.int32(1)), BACKWARDS, rtol=1e-5)
     # The other is on its way to PoI 1. When the chooser looks at PoI 0 it is near enough to do so
