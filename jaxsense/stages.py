@@ -194,7 +194,7 @@ def stages(config: Config, world: World | None = None) -> list[Stage]:
         Stage("beliefs", _measure_beliefs, (params, "class_beliefs", "detections")),
         Stage("starts", functools.partial(_starts, world), learned),
         *_agent_stages(world, config, learned),
-        *(_tour_stages(config, params) if config.dqn.task == "team" else []),
+        *([_tour_stage(config, params)] if config.dqn.task == "team" else []),
         *(_policies_stage(m, config, params) for m in modalities),
         *(
             _other_numbers_stage(m, config, params)
@@ -678,20 +678,34 @@ def _finish_dqn(config: Config, state: DqnState, *inputs: Any) -> Params:
     return state.params
 
 
-def _tour_stages(config: Config, params: str) -> list[Stage]:
-    """The training of the network that orders a team's looks, see `tours`."""
+def _tour_stage(config: Config, params: str) -> Steps:
+    """The training of the network that orders a team's looks, see `tours`.
+
+    Each chunk adds trials and learns from all so far.
+    """
     settings, latent_size = config.team.tours, config.jmvae.latent_size
     size = _chunk_size(settings.steps)
+    chunks = _num_chunks(settings.steps)
+    number = -(-settings.states // chunks)
     network = policies.team_network(latent_size, len(config.modalities), config.dqn)
 
-    def try_choices(
+    def begin(key: Key, config: Config, *_: Any) -> tuple[FitState, Trials]:
+        num_pois = config.team.num_pois[1]
+        optimiser = minibatch.adam(config.team.tours.learning_rate, settings.steps)
+        fit = minibatch.start(networks.init(key, network, network.features * num_pois), optimiser)
+        return fit, tours.no_trials(network.features, num_pois, chunks * number)
+
+    def advance(
         key: Key,
         config: Config,
+        state: tuple[FitState, Trials],
         look_values: tuple[LookValues, ...],
         classes: Belief,
         params: Params,
         detections: Detections,
-    ) -> Trials:
+    ) -> tuple[tuple[FitState, Trials], Progress]:
+        fit, trials = state
+        try_key, draw_key = jax.random.split(key)
         mdp = observe.team_mdp(config, detections.bank, params, make_jmvae(config))
         read = readout(filtering.moments_inverse(classes), mdp.map.unseen)
 
@@ -702,16 +716,9 @@ def _tour_stages(config: Config, params: str) -> list[Stage]:
             worth = gains - config.team.second_cost * ways
             return rules.auction(worth, ways, state.team, state.agent)
 
-        return tours.try_choices(key, mdp, policy, config.team.tours, settings.states)
-
-    def begin(key: Key, config: Config, trials: Trials) -> FitState:
-        optimiser = minibatch.adam(config.team.tours.learning_rate, settings.steps)
-        return minibatch.start(networks.init(key, network, len(trials.observation)), optimiser)
-
-    def advance(
-        key: Key, config: Config, state: FitState, trials: Trials
-    ) -> tuple[FitState, Progress]:
-        rows = tours.sample(key, trials, (size, settings.batch))
+        found = tours.try_choices(try_key, mdp, policy, config.team.tours, number)
+        trials = tours.write(trials, found, fit.step // size * number)
+        rows = tours.sample(draw_key, trials, (size, settings.batch))
 
         def loss(params: Params, rows: jax.Array, step: jax.Array) -> jax.Array:
             del step
@@ -719,24 +726,21 @@ def _tour_stages(config: Config, params: str) -> list[Stage]:
             return tours.loss(network, params, batch, latent_size)
 
         optimiser = minibatch.adam(config.team.tours.learning_rate, settings.steps)
-        state, losses = minibatch.fit(state, loss, rows, optimiser, settings.steps)
-        return state, Progress(losses, {})
+        fit, losses = minibatch.fit(fit, loss, rows, optimiser, settings.steps)
+        return (fit, trials), Progress(losses, {})
 
-    def finish(config: Config, state: FitState, *_: Any) -> Params:
-        return state.params
+    def finish(config: Config, state: tuple[FitState, Trials], *_: Any) -> Params:
+        return state[0].params
 
-    return [
-        Stage("trials", try_choices, ("look_values", "class_beliefs", params, "detections")),
-        Steps(
-            "tours",
-            begin,
-            ("trials",),
-            advance=advance,
-            finish=finish,
-            steps=settings.steps,
-            chunks=_num_chunks(settings.steps),
-        ),
-    ]
+    return Steps(
+        "tours",
+        begin,
+        ("look_values", "class_beliefs", params, "detections"),
+        advance=advance,
+        finish=finish,
+        steps=settings.steps,
+        chunks=chunks,
+    )
 
 
 def _policies_stage(modality: int, config: Config, params: str) -> Stage:

@@ -334,7 +334,7 @@ def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):
 
 
 @pytest.mark.slow  # compiles trials of the auction, with the map's readout
-def test_a_team_learns_its_tours_from_trials():
+def test_a_team_learns_its_tours_from_all_trials_so_far():
     config = dataclasses.replace(
         TINY,
         dqn=dataclasses.replace(TINY.dqn, task="team", observe="bank"),
@@ -347,21 +347,25 @@ def test_a_team_learns_its_tours_from_trials():
     # The first look at a PoI pays, and no other.
     values = tuple(dataclasses.replace(v, first_gain=jnp.ones(())) for v in untrained.look_values)
     given: Any = stages.Detections(bank, (), (), jnp.zeros(2), ())  # pyright: ignore
-    found: dict[str, Any] = {stage.name: stage for stage in stages.stages(config)}
     inputs = values, untrained.class_beliefs, untrained.jmvae, given
-    trials = jax.jit(lambda key: found["trials"].begin(key, config, *inputs))(KEY)
-    assert trials.seconds.shape == (3, 20)
-    assert trials.is_tried.sum(axis=0).max() == 2
-    stage = found["tours"]
-    state = stage.begin(KEY, config, trials)
-    first = state.params
-    advance = jax.jit(lambda key, state: stage.advance(key, config, state, trials))
-    # 41 steps are 14 chunks of 3, the last of which has 2.
+    stage: Any = next(s for s in stages.stages(config) if s.name == "tours")
+    state = stage.begin(KEY, config, *inputs)
+    first = state[0].params
+    advance = jax.jit(lambda key, state: stage.advance(key, config, state, *inputs))
+    # 41 steps are 14 chunks of 3, the last of which has 2; 20 states are 2 in each chunk.
+    written = []
     for key in stage.chunk_keys(KEY):
         state, progress = advance(key, state)
         assert np.isfinite(progress.loss).all()
-    assert (stage.chunks, int(state.step)) == (14, 41)
-    learned = stage.finish(config, state, trials)
+        written.append(np.asarray(state[1].observation))
+    assert len(written) == 14
+    for i, observed in enumerate(written):
+        assert np.any(observed[:, : 2 * i + 2], axis=0).all()
+        assert not np.any(observed[:, 2 * i + 2 :])
+        np.testing.assert_array_equal(observed[:, : 2 * i + 2], written[-1][:, : 2 * i + 2])
+    assert int(state[0].step) == 41
+    assert state[1].is_tried.sum(axis=0).max() == 2
+    learned = stage.finish(config, state, *inputs)
     assert any(np.any(x != y) for x, y in zip(*map(jax.tree.leaves, (first, learned)), strict=True))
 
 

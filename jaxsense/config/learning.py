@@ -177,15 +177,13 @@ class TravelConfig:
 class ToursConfig:
     """How a team learns in which order to visit its points, see `jaxsense.dqn.tours`."""
 
-    states: int = 98304
-    """States in which choices are tried."""
+    states: int = 65536
+    """States in which choices are tried, and a few more that fill the last chunk."""
     tries: int = 4
     """Choices tried in each state."""
-    walk: Traced[int] = 16
+    walk: Traced[int] = 8
     """Most choices before such a state."""
-    last_end: Traced[float] = 0.7
-    """Share of the last robot's end in the time that counts; the rest is the mean of all ends."""
-    steps: int = 4800
+    steps: int = 3200
     """Gradient steps."""
     batch: int = 1024
     """States in one gradient step."""
@@ -198,7 +196,6 @@ class ToursConfig:
         require_positive(self, "states", "steps", "batch", "learning_rate")
         require_not_negative(self, "walk")
         require(self.tries >= 2, self, "tries", "must be at least 2, to compare choices")
-        require(0 <= self.last_end <= 1, self, "last_end", "must be within 0 and 1")
         require_at_most(self, walk=10_000, learning_rate=1)
 
 

@@ -1,9 +1,7 @@
 """A network that treats all points of interest alike, for any number of them.
 
-One small network reads every pair of PoIs, with the way between them, and another every PoI, with
-what its pairs and a pool over all PoIs tell of the rest (Zaheer et al. 2017, Deep Sets; Santoro et
-al. 2017, A simple neural network module for relational reasoning). PoIs that are not present count
-nowhere.
+One small network reads each PoI, with what lies around it and a pool over all of them (Zaheer et
+al. 2017, Deep Sets). PoIs that are not present count nowhere.
 """
 
 import chex
@@ -13,8 +11,9 @@ from flax import linen as nn
 
 from jaxsense.networks import Dense
 
+_REACHES = (2.0, 6.0)  # s, within which PoIs count as near
 _SPEED, _TURN_RATE, _VIEW = 0.2, 1.0, 0.9  # m/s, rad/s and m
-_FAR, _NEAR = 10.0, 3.0  # s, in which the network reads ways between PoIs
+_MESSAGES = 8
 _NOTHING = -1e6  # value of a PoI that is not present
 
 
@@ -22,7 +21,7 @@ class PoolingNetwork(nn.Module):
     """The network of a team, for its Q-values and its tours.
 
     Attributes:
-      hidden: sizes of the hidden layers: the first of each pair of PoIs, the others of each PoI.
+      hidden: sizes of the hidden layers, the same for each PoI.
       features: numbers known of each PoI; the last three are its presence and its place.
     """
 
@@ -35,42 +34,38 @@ class PoolingNetwork(nn.Module):
         batch = x.shape[1:]
         chex.assert_is_divisible(x.shape[0], self.features)
         x = x.reshape(self.features, x.shape[0] // self.features, *batch)
-        known, present, place = x[:-2], x[-3], x[-2:]
-        from_pairs = self._pairs(known, present, place)
-        each = jnp.concatenate([known, from_pairs])
-        for i, size in enumerate(self.hidden[1:]):
-            each = nn.relu(_layer(size, f"PoI_{i}", each))
-        own = jnp.concatenate([known, from_pairs, each])
-        pool = _pool(each, present)
-        context = _layer(self.hidden[-1], "Context", pool)
-        of_poi = nn.relu(_layer(self.hidden[-1], "Own", own) + context[:, None])
-        value = _layer(1, "Value", of_poi)[0]
+        present, place = x[-3][None], x[-2:]
+        known = x[:-2]
+        flat = known.reshape(known.shape[0], -1)
+        for i, size in enumerate(self.hidden):
+            flat = nn.relu(Dense(size, nn.initializers.he_normal(), name=f"PoI_{i}")(flat))
+        each = flat.reshape(-1, *known.shape[1:]) * present
+        number = jnp.maximum(jnp.sum(present, axis=1), 1.0)
+        pool = jnp.concatenate([jnp.sum(each, axis=1) / number, jnp.max(each, axis=1)])
+        around = self._messages(flat, present, place)
+        own = jnp.concatenate([known, each, around])
+        size = self.hidden[-1]
+        last = nn.initializers.lecun_normal()
+        context = Dense(size, nn.initializers.he_normal(), name="Context")(pool)
+        of_poi = Dense(size, nn.initializers.he_normal(), name="Own")(own.reshape(own.shape[0], -1))
+        of_poi = nn.relu(of_poi.reshape(size, *known.shape[1:]) + context[:, None])
+        value = Dense(1, last, name="Value")(of_poi.reshape(size, -1))
+        value = value.reshape(*known.shape[1:])
         # A robot's part ends with NOP.
         nop = jnp.zeros((1, *batch))
-        return jnp.concatenate([jnp.where(present > 0, value, _NOTHING), nop])
+        return jnp.concatenate([jnp.where(present[0] > 0, value, _NOTHING), nop])
 
-    def _pairs(self, known: jax.Array, present: jax.Array, place: jax.Array) -> jax.Array:
-        """`[2H, N, ...]` what each PoI hears from its pairs with the others."""
-        size, number = self.hidden[0], present.shape[0]
-        seconds = jnp.swapaxes(_seconds_between(place), 0, 1)
-        between = jnp.stack([seconds / _FAR, jnp.exp(-seconds / _NEAR)])
-        of_one, of_other = (_layer(size, name, known) for name in ("One", "Other"))
-        pair = of_other[:, :, None] + of_one[:, None] + _layer(size, "Between", between)
-        is_other = 1.0 - jnp.eye(number).reshape(number, number, *[1] * (present.ndim - 1))
-        return _pool(nn.relu(pair), present[:, None] * is_other)
-
-
-def _layer(size: int, name: str, x: jax.Array) -> jax.Array:
-    """`[F, ...]` to `[size, ...]`, the same layer for each column."""
-    layer = Dense(size, nn.initializers.he_normal(), name=name)
-    return layer(x.reshape(x.shape[0], -1)).reshape(size, *x.shape[1:])
-
-
-def _pool(x: jax.Array, counts: jax.Array) -> jax.Array:
-    """`[2F, ...]` mean and largest of `[F, N, ...]` numbers over those that count, `[N, ...]`."""
-    counted = x * counts[None]
-    number = jnp.maximum(jnp.sum(counts, axis=0), 1.0)
-    return jnp.concatenate([jnp.sum(counted, axis=1) / number[None], jnp.max(counted, axis=1)])
+    def _messages(self, flat: jax.Array, present: jax.Array, place: jax.Array) -> jax.Array:
+        """What lies near each PoI: messages of all PoIs, loudest from where a robot is soonest."""
+        sent = Dense(_MESSAGES, nn.initializers.lecun_normal(), name="Message")(flat)
+        sent = nn.relu(sent).reshape(_MESSAGES, *present.shape[1:]) * present
+        seconds = _seconds_between(place)
+        near, far = (jnp.exp(-seconds / reach) for reach in _REACHES)
+        of_near = jnp.sum(near[None] * sent[:, None], axis=2)
+        # A mean, so that many PoIs that are far away do not count like a near one.
+        of_far = jnp.sum(far[None] * sent[:, None], axis=2)
+        of_far /= 1.0 + jnp.sum(far * present, axis=1)[None]
+        return jnp.concatenate([of_near, of_far])
 
 
 def _seconds_between(place: jax.Array) -> jax.Array:

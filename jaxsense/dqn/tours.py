@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from jaxsense import networks
 from jaxsense.config import ToursConfig
 from jaxsense.dqn import team_mdp
-from jaxsense.dqn.belief_mdp import Outcome
 from jaxsense.dqn.losses import pseudo_huber
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import TIME_SCALE, TeamMdp, TeamState
@@ -27,7 +26,6 @@ from jaxsense.types import Key, pytree
 Policy = Callable[[TeamState], jax.Array]
 """`[N + 1]` values of actions, the highest of which is taken, NOP's last."""
 
-_AT_ONCE = 4096  # states, of which trials are made side by side
 _NEAR = 5.0  # s; each further one makes a trial e times as rare
 _ERROR = 3.0  # s, above which an error counts linearly
 
@@ -40,7 +38,8 @@ class Trials:
       observation: `[F * N, ...]` what the robot knew.
       is_tried: `[N, ...]` bool, PoIs that it set out for; none where it had fewer than two to
         choose from.
-      seconds: `[N, ...]` until robots have ended, see `ToursConfig.last_end`; counts where tried.
+      seconds: `[N, ...]` mean over the robots at work of the time until each ends; counts where
+        tried.
     """
 
     observation: jax.Array
@@ -64,12 +63,7 @@ def try_choices(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, num
     # All that a lone robot looks at is at one place: no order to learn.
     mdp = dataclasses.replace(mdp, config=dataclasses.replace(mdp.config, alone=0.0))
     keys = jax.random.split(key, number)
-    # In parts of the same size: a remainder would compile again.
-    parts = -(-number // _AT_ONCE)
-    rows = jnp.arange(parts * -(-number // parts)).reshape(parts, -1) % number
-    try_one = jax.vmap(lambda key: _trial(key, mdp, policy, config))
-    found = jax.lax.map(lambda rows: try_one(keys[rows]), rows)
-    return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(-1, *x.shape[2:])[:number], 0, -1), found)
+    return jax.vmap(lambda key: _trial(key, mdp, policy, config), out_axes=-1)(keys)
 
 
 def _trial(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig) -> Trials:
@@ -83,8 +77,7 @@ def _trial(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig) -> Trial
     times = team_mdp.travel_seconds(travel, pose, state.team.positions)
     rank = jnp.where(is_open, jax.random.gumbel(tried_key, (num_pois,)) - times / _NEAR, -jnp.inf)
     tried = jax.lax.top_k(rank, min(config.tries, num_pois))[1]
-    given = mdp, policy, config, state
-    seconds = jax.vmap(lambda poi: _seconds_to_end(play_key, *given, poi))(tried)
+    seconds = jax.vmap(lambda poi: _seconds_to_end(play_key, mdp, policy, state, poi))(tried)
     is_choice = jnp.sum(is_open) > 1
     known = state.map.belief, state.team, state.agent, mdp.map.num_modalities
     return Trials(
@@ -102,62 +95,58 @@ def _some_way_on(
     number = jax.random.randint(number_key, (), 0, config.walk + 1)
 
     def advance(i: jax.Array, state: TeamState) -> TeamState:
-        after, outcome = _step(jax.random.fold_in(step_key, i), mdp, state, _best(policy, state))
+        after, outcome = _step(jax.random.fold_in(step_key, i), mdp, policy, state)
         return _where(outcome.terminated, state, after)
 
     return jax.lax.fori_loop(0, number, advance, state)
 
 
 def _seconds_to_end(
-    key: Key,
-    mdp: TeamMdp,
-    policy: Policy,
-    config: ToursConfig,
-    state: TeamState,
-    poi: jax.Array,
+    key: Key, mdp: TeamMdp, policy: Policy, state: TeamState, poi: jax.Array
 ) -> jax.Array:
-    """`[]` seconds until robots have ended if one sets out for a PoI, see `ToursConfig.last_end`.
-
-    That robot does not change its mind before it has looked; the others may.
-    """
+    """`[]` seconds until a robot has ended if one sets out for a PoI, the mean of all at work."""
     begin_key, step_key = jax.random.split(key)
-    is_chooser = jnp.arange(state.team.works.shape[0]) == state.agent
-
-    def step(key: Key, now: TeamState, action: jax.Array) -> TeamState:
-        after, _ = _step(key, mdp, now, action)
-        keeps = is_chooser & (after.team.target == poi)
-        return dataclasses.replace(after, asks=after.asks & ~keeps)
+    after, _ = team_mdp.step(begin_key, mdp, state, poi)
+    ends = jnp.full(state.team.works.shape, state.seconds)
 
     def goes_on(carry: tuple[TeamState, jax.Array, jax.Array]) -> jax.Array:
         return jnp.any(carry[0].team.works) & (carry[2] < mdp.config.max_steps)
 
     def advance(carry: tuple[TeamState, jax.Array, jax.Array]):
         now, ends, i = carry
-        now = step(jax.random.fold_in(step_key, i), now, _best(policy, now))
+        now, _ = _step(jax.random.fold_in(step_key, i), mdp, policy, now)
         return now, jnp.where(now.team.works, now.seconds, ends), i + 1
 
-    after = step(begin_key, state, poi)
-    first = after, jnp.full(is_chooser.shape, after.seconds), jnp.int32(0)
+    first = after, jnp.where(after.team.works, after.seconds, ends), jnp.int32(0)
     _, ends, _ = jax.lax.while_loop(goes_on, advance, first)
     took = jnp.where(state.team.works, ends - state.seconds, 0.0)
-    mean = jnp.sum(took) / jnp.maximum(jnp.sum(state.team.works), 1)
-    return config.last_end * jnp.max(took) + (1.0 - config.last_end) * mean
+    return jnp.sum(took) / jnp.maximum(jnp.sum(state.team.works), 1)
 
 
-def _step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[TeamState, Outcome]:
-    """`team_mdp.step`; a look is news, after which robots under way choose anew, as in missions."""
-    after, outcome = team_mdp.step(key, mdp, state, action)
-    is_news = after.seconds > state.seconds
-    is_under_way = after.team.works & (after.looked <= 0)
-    return dataclasses.replace(after, asks=after.asks | (is_news & is_under_way)), outcome
-
-
-def _best(policy: Policy, state: TeamState) -> jax.Array:
-    return jnp.argmax(policy(state)).astype(jnp.int32)
+def _step(key: Key, mdp: TeamMdp, policy: Policy, state: TeamState):
+    return team_mdp.step(key, mdp, state, jnp.argmax(policy(state)).astype(jnp.int32))
 
 
 def _where(condition: jax.Array, ours: TeamState, theirs: TeamState) -> TeamState:
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), ours, theirs)
+
+
+def no_trials(num_features: int, num_pois: int, number: int) -> Trials:
+    """Room for the trials of a number of states."""
+    return Trials(
+        observation=jnp.zeros((num_features * num_pois, number)),
+        is_tried=jnp.zeros((num_pois, number), bool),
+        seconds=jnp.zeros((num_pois, number)),
+    )
+
+
+def write(trials: Trials, found: Trials, column: jax.Array) -> Trials:
+    """Writes the trials of some states over those from a column on."""
+    return jax.tree.map(
+        lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, column, axis=1),
+        trials,
+        found,
+    )
 
 
 def sample(key: Key, trials: Trials, shape: tuple[int, ...]) -> jax.Array:

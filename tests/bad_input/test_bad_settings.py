@@ -60,7 +60,7 @@ ZERO = {
     "mission.least_confidence", "lidar.range_noise_growth", "lidar.mixed_pixels", "lidar.dropout",
     "camera.exposure_error", "camera.colour_cast", "camera.low_light", "camera.shadow",
     "detector.calibration", "mdp.look_cost", "team.alone", "team.partly_seen", "team.second_cost",
-    "team.tours.walk", "team.tours.last_end",
+    "team.tours.walk",
     "team.travel.view_distance",
 }  # fmt: skip
 
@@ -286,7 +286,6 @@ def changed(changes: dict, base: Config = SMOKE) -> Config:
         ({"tries": 1}, "team.tours.tries = 1: must be at least 2, to compare choices"),
         ({"walk": 2**31 - 1}, "team.tours.walk = 2147483647: must be at most 10,000"),
         ({"batch": 10**9}, "team.tours.batch = 1000000000: takes"),
-        ({"last_end": 1.5}, "team.tours.last_end = 1.5: must be within 0 and 1"),
         ({"walk": -1}, "team.tours.walk = -1: must be a number that is not negative"),
     ],
 )

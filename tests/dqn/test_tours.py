@@ -3,7 +3,6 @@
 import functools
 import math
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -51,21 +50,21 @@ def make_mdp(present=2, max_steps=300):
     return TeamMdp(settings, mapped, lambda *given: (PLACES, jnp.zeros((2, 3))))
 
 
-def trials_of(present=2, max_steps=300, walk=0, bonus=0.0, last_end=0.7):
+def trials_of(present=2, max_steps=300, walk=0, bonus=0.0):
     """Trials in 64 states; all look once at each PoI in the order of their numbers."""
     # Defaults would be constants of a program.
-    return _trials(present, max_steps, walk, bonus, last_end)
+    return _trials(present, max_steps, walk, bonus)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _trials(present, max_steps, walk, bonus, last_end):
+def _trials(present, max_steps, walk, bonus):
+
     def in_order(state):
         own = state.map.seen[:, state.team.modality[state.agent]]
         of_pois = jnp.where(own | ~state.team.present, -1.0, 3.0 - jnp.arange(3))
         return jnp.append(of_pois + bonus, 0.0)
 
-    config = ToursConfig(tries=2, walk=walk, last_end=last_end)
-    mdp = make_mdp(present, max_steps)
+    config, mdp = ToursConfig(tries=2, walk=walk), make_mdp(present, max_steps)
     return tours.try_choices(jax.random.key(0), mdp, in_order, config, 64)
 
 
@@ -73,12 +72,11 @@ def own_seconds(trials):
     return team_mdp.own_seconds(trials.observation.reshape(NETWORK.features, 3, 64), 2)
 
 
-@pytest.mark.parametrize("last_end", [0.0, 0.7, 1.0])
-def test_seconds_until_all_are_done_as_worked_by_hand(last_end):
-    found = trials_of(last_end=last_end)
+def test_seconds_until_all_are_done_as_worked_by_hand():
+    found = trials_of()
     np.testing.assert_array_equal(found.is_tried, np.repeat([[True], [True], [False]], 64, 1))
     # The other robot goes in order in either case.
-    expected = [IN_ORDER, last_end * BACKWARDS + (1 - last_end) * (BACKWARDS + IN_ORDER) / 2]
+    expected = [IN_ORDER, (BACKWARDS + IN_ORDER) / 2]
     np.testing.assert_allclose(found.seconds[:2], np.repeat(expected, 64).reshape(2, 64), rtol=1e-5)
     np.testing.assert_allclose(own_seconds(found)[:2, 0], [6.0, 16.0], rtol=1e-5)
 
@@ -127,65 +125,14 @@ def test_the_loss_is_of_differences_within_a_state():
     np.testing.assert_allclose(loss(later), expected, rtol=1e-5)
 
 
-def test_only_states_with_a_trial_are_drawn():
-    is_tried = jnp.zeros((3, 5), bool).at[0, 3:].set(True)
-    found = Trials(jnp.ones((6, 5)), is_tried, jnp.ones((3, 5)))
+def test_columns_are_written_and_only_those_with_a_trial_drawn():
+    room = tours.no_trials(2, 3, 5)
+    one = Trials(jnp.ones((6, 2)), jnp.ones((3, 2), bool), jnp.ones((3, 2)))
+    found = tours.write(room, one, jnp.int32(3))
+    np.testing.assert_array_equal(found.seconds.sum(axis=0), [0, 0, 0, 3, 3])
+    np.testing.assert_array_equal(found.observation.sum(axis=0), [0, 0, 0, 6, 6])
     drawn = tours.sample(jax.random.key(0), found, (40,))
     assert set(np.asarray(drawn).tolist()) == {3, 4}
-
-
-def test_states_are_tried_in_parts_of_one_size(monkeypatch):
-    def trial(key, *given):
-        number = jax.random.bits(key)
-        return Trials(jnp.full(6, number), jnp.ones(3, bool), jnp.full(3, number))
-
-    monkeypatch.setattr(tours, "_trial", trial)
-    given: Any = jax.random.key(0), make_mdp(), None, ToursConfig()
-    at_once = tours.try_choices(*given, 7)
-    monkeypatch.setattr(tours, "_AT_ONCE", 3)
-    in_parts = tours.try_choices(*given, 7)
-    assert in_parts.seconds.shape == (3, 7)
-    assert len(np.unique(in_parts.seconds)) == 7
-    np.testing.assert_array_equal(in_parts.seconds, at_once.seconds)
-
-
-@jax.jit
-def after_choice(state, action):
-    return tours._step(jax.random.key(0), make_mdp(), state, action)[0]
-
-
-@pytest.mark.parametrize(("apart", "is_asked"), [(3.9, True), (2.0, False)])
-def test_after_a_look_robots_choose_anew_unless_they_look_already(apart, is_asked):
-    # The first robot has looked after 6 s; the second is on its way, or has begun after 5.5 s.
-    state = team_mdp.reset(jax.random.key(0), make_mdp(), jnp.arange(2))
-    state = replace(
-        state, team=replace(state.team, positions=state.team.positions.at[1, 0].set(apart))
-    )
-    state = after_choice(state, jnp.int32(0))
-    assert (int(state.agent), state.asks.tolist()) == (1, [False, True])
-    state = after_choice(state, jnp.int32(1))
-    assert (int(state.agent), float(state.seconds)) == (0, pytest.approx(6.0))
-    assert state.asks.tolist() == [True, is_asked]
-
-
-def test_who_tries_a_choice_keeps_it_and_the_others_may_change_their_mind():
-    """All turn to PoI 0 as soon as they are asked again."""
-
-    def to_first(state):
-        is_seen = state.map.seen[:, state.team.modality[state.agent]]
-        return jnp.append(jnp.where(is_seen, -1.0, jnp.array([2.0, 1.0, -1.0])), 0.0)
-
-    mdp = make_mdp()
-    state = team_mdp.reset(jax.random.key(0), mdp, jnp.arange(2))
-    given = jax.random.key(0), mdp, to_first, ToursConfig(last_end=1.0)
-    end = jax.jit(lambda state, poi: tours._seconds_to_end(*given, state, poi))
-    # The other looks at PoI 0 after 6 s; the chooser goes on to PoI 1 and then back.
-    np.testing.assert_allclose(end(state, jnp.int32(1)), BACKWARDS, rtol=1e-5)
-    # The other is on its way to PoI 1. When the chooser looks at PoI 0 it is near enough to do so
-    # too, and does, and need not come back.
-    under_way = replace(state.team, target=jnp.array([3, 1]))
-    under_way = replace(state, team=under_way, asks=jnp.array([True, False]))
-    np.testing.assert_allclose(end(under_way, jnp.int32(0)), IN_ORDER, rtol=1e-5)
 
 
 def test_training_finds_the_shorter_tour():
@@ -199,7 +146,7 @@ def test_training_finds_the_shorter_tour():
     state, losses = jax.jit(lambda s: minibatch.fit(s, loss, jnp.zeros(100), optimiser))(state)
     assert losses[-1] < 1e-3 < losses[0]
     learned = jax.jit(lambda x: tours.seconds(NETWORK, state.params, x, 2))(trials.observation)
-    expected = 0.7 * (BACKWARDS - IN_ORDER) + 0.3 * (BACKWARDS - IN_ORDER) / 2
+    expected = (BACKWARDS - IN_ORDER) / 2
     np.testing.assert_allclose(learned[1] - learned[0], expected, atol=0.2)
 
 
