@@ -99,7 +99,6 @@ def test_the_table_has_all_numbers_of_learning_that_may_be_traced():
     assert set(VALUES) == learning - {"jmvae.reconstruction_weights", "mdp.look_cost"}
 
 
-@pytest.mark.slow  # compiles the whole training once more
 def test_all_settings_together_do_what_the_constants_do(together):
     second = {name: values[1] for name, values in VALUES.items()}
     alone = jax.jit(lambda: learn(with_values(second)))()
@@ -120,7 +119,6 @@ def test_each_setting_changes_its_training_and_no_other(together, name):
         assert max(differ.values()) < 1e-6
 
 
-@pytest.mark.slow  # compiles the training of a filter
 def test_the_cost_of_a_look_may_be_traced():
     with_filter = dataclasses.replace(CONFIG.jmvae, fusion="filter")
     model, keys = make_jmvae(CONFIG), jax.random.split(jax.random.key(0), 4)
