@@ -31,15 +31,20 @@ _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
 
 
+def is_due(mission: Mission, state: MissionState, robot: Index) -> jax.Array:
+    """Whether a robot has to decide, `[]` bool: it has nothing to do, or the map has changed."""
+    own = robot_of(state, robot)
+    is_under_way = (own.phase == DRIVING) | (own.phase == FACING)
+    has_news = (state.version != own.decided_on) & mission.config.mission.redecides
+    return (own.phase == IDLE) | (is_under_way & has_news)
+
+
 def decide(
     key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> MissionState:
     """Asks the policy if a decision is due, and sets out for a viewpoint of the PoI."""
     own, config = robot_of(state, robot), mission.config
-    is_idle = own.phase == IDLE
-    is_under_way = (own.phase == DRIVING) | (own.phase == FACING)
-    has_news = (state.version != own.decided_on) & config.mission.redecides
-    decides = is_idle | (is_under_way & has_news)
+    is_idle, decides = own.phase == IDLE, is_due(mission, state, robot)
     action = jnp.where(decides, _choose(key, mission, models, state, robot), own.target)
     is_new = action != own.target
     sets_out = decides & (is_idle | is_new) & (action < config.arena.num_pois)

@@ -1,6 +1,8 @@
 """Missions from beginning to end, as one scan over control periods."""
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +16,17 @@ from jaxsense.mission.state import (
     Mission,
     MissionState,
     Record,
+    Robots,
     now,
     robot_of,
     with_robot,
 )
 from jaxsense.models import Models
 from jaxsense.types import Key
+
+T = TypeVar("T")
+
+_LEAST_GROUP = 32  # missions in which one decides side by side; fewer are no faster
 
 
 def rollout(
@@ -121,7 +128,7 @@ def _act(
 ) -> MissionState:
     """Decides, sets speeds and scans for one robot of each of `[B]` missions."""
 
-    def get_there(key: Key, state: MissionState) -> MissionState:
+    def fail(state: MissionState) -> MissionState:
         stops = now(mission, state) >= state.faults.stops_at[robot]
         own = robot_of(state, robot)
         fails = stops & (own.phase != ENDED)
@@ -130,10 +137,40 @@ def _act(
             phase=jnp.where(fails, FAILED, own.phase),
             target=jnp.where(fails, mission.config.arena.num_pois, own.target),
         )
-        state = with_robot(state, robot, own, failed)
-        state = decide.decide(key, mission, models, state, robot)
-        return act.approach(mission, state, robot)
+        return with_robot(state, robot, own, failed)
+
+    def choose(key: Key, state: MissionState) -> Robots:
+        return decide.decide(key, mission, models, state, robot).robots
 
     choice_keys, scan_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-    states = jax.vmap(get_there)(choice_keys, states)
+    states = jax.vmap(fail)(states)
+    due = jax.vmap(lambda state: decide.is_due(mission, state, robot))(states)
+    robots = _where_due(due, choose, states.robots, choice_keys, states)
+    states = dataclasses.replace(states, robots=robots)
+    states = jax.vmap(lambda state: act.approach(mission, state, robot))(states)
     return act.scan(scan_keys, mission, models, states, robot)
+
+
+def _where_due(due: jax.Array, function: Callable[..., T], before: T, *inputs: Any) -> T:
+    """Applies a function to the rows of a batch that are due, in groups, and so at their cost.
+
+    Args:
+      due: `[B]` bool.
+      function: of a single row of each input; returns a single row.
+      before: `[B, ...]` rows, which the others keep.
+      *inputs: `[B, ...]` each.
+    """
+    total, number = len(due), jnp.sum(due)
+    size = min(total, max(_LEAST_GROUP, total // 8))
+    order = jnp.argsort(~due)
+
+    def advance(carry: tuple[jax.Array, T]) -> tuple[jax.Array, T]:
+        first, after = carry
+        place = first + jnp.arange(size)
+        row = order[jnp.minimum(place, total - 1)]
+        new = jax.vmap(function)(*jax.tree.map(lambda x: x[row], inputs))
+        kept = jnp.where(place < number, row, total)  # beyond the last row, nothing is written
+        put = lambda rows, new: rows.at[kept].set(new, mode="drop")  # noqa: E731
+        return first + size, jax.tree.map(put, after, new)
+
+    return jax.lax.while_loop(lambda carry: carry[0] < number, advance, (jnp.int32(0), before))[1]
