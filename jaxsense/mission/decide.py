@@ -55,20 +55,28 @@ def decide(
     has_way = jnp.isfinite(length)
     sets_out_now, gives_up = sets_out & has_way, sets_out & ~has_way
     poi = jnp.minimum(action, config.arena.num_pois - 1)
-    ends = decides & (action == config.arena.num_pois)
+    nothing_left = decides & (action == config.arena.num_pois)
+    # What was in the way may have gone: before its end a robot tries once more where it was stuck.
+    place = state.scene.poses[robot, :2]
+    stuck_at = own.unreachable & roadmap.reaches(config, state.scene.layout, state.roadmap, place)
+    tries_again = nothing_left & jnp.any(stuck_at) & ~own.tried_again
+    ends, given_up = nothing_left & ~tries_again, own.unreachable & ~(stuck_at & tries_again)
     # A look from the current place is no goal; a PoI without a way to it is a missed one.
     num_views = state.roadmap.viewpoints.shape[1]
     is_goal = (sets_out_now & (view < num_views)) | gives_up
     was_needless = decides & is_new & (own.phase == DRIVING) & (own.view < num_views)
     after = dataclasses.replace(
         own,
-        phase=jnp.select([ends, sets_out_now, gives_up], [ENDED, DRIVING, IDLE], own.phase),
+        phase=jnp.select(
+            [ends, sets_out_now, gives_up | tries_again], [ENDED, DRIVING, IDLE], own.phase
+        ),
         target=action,
         view=jnp.where(sets_out_now, view, own.view),
         decided_on=jnp.where(decides, state.version, own.decided_on),
         excluded=excluded,
         attempts=jnp.where(is_new, 0, own.attempts),
-        unreachable=jnp.where(gives_up, own.unreachable.at[poi].set(True), own.unreachable),
+        unreachable=jnp.where(gives_up, given_up.at[poi].set(True), given_up),
+        tried_again=own.tried_again | tries_again,
         way_left=jnp.where(sets_out_now, length, own.way_left),
         progress_at=jnp.where(sets_out_now, now(mission, state), own.progress_at),
         goals=own.goals + is_goal - was_needless,

@@ -76,6 +76,7 @@ class Robots:
       backs_off_until: seconds.
       unreachable: `[R, N]` bool, PoIs given up without a way, or stuck on the last attempt.
       undetected: `[R, N]` bool, PoIs given up after a last look that showed nothing.
+      tried_again: bool, the robot has returned to PoIs that it had given up although it had a way.
       goals: int32 viewpoints set out for and PoIs given up without a way, less the goals that a new
         decision made needless or another robot occupied.
       reached: int32 goals reached.
@@ -96,6 +97,7 @@ class Robots:
     backs_off_until: jax.Array
     unreachable: jax.Array
     undetected: jax.Array
+    tried_again: jax.Array
     goals: jax.Array
     reached: jax.Array
     looks: jax.Array
@@ -297,6 +299,7 @@ def _idle_robots(num_robots: int, num_pois: int, num_views: int) -> Robots:
         backs_off_until=seconds,
         unreachable=jnp.zeros((num_robots, num_pois), bool),
         undetected=jnp.zeros((num_robots, num_pois), bool),
+        tried_again=jnp.zeros(num_robots, bool),
         goals=number,
         reached=number,
         looks=number,

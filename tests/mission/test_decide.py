@@ -109,6 +109,39 @@ def test_a_poi_that_was_given_up_is_left_out(chosen, set_robot):
     assert state.robots.phase[0] == ENDED
 
 
+def without_ways(state):
+    """No way to PoI 2."""
+    ways = replace(
+        state.roadmap,
+        is_free=state.roadmap.is_free.at[2].set(False),
+        to_viewpoint=state.roadmap.to_viewpoint.at[2].set(jnp.inf),
+    )
+    return replace(state, roadmap=ways)
+
+
+def test_where_a_robot_was_stuck_it_tries_again_once_before_it_ends(chosen, set_robot):
+    given_up = {"unreachable": jnp.array([True, False, True])}
+
+    def at_the_end(tried_again):
+        values = [1.0, 0.0, 1.0, 0.5]  # nothing to learn at PoI 1
+        change = lambda s: without_ways(set_robot(s, 0, tried_again=tried_again, **given_up))  # noqa: E731
+        return jax.tree.map(lambda x: x[0], chosen(values, change=change).robots)
+
+    first, second = at_the_end(jnp.bool_(False)), at_the_end(jnp.bool_(True))
+    assert (first.phase, second.phase) == (IDLE, ENDED)
+    np.testing.assert_array_equal(first.unreachable, [False, False, True])
+    np.testing.assert_array_equal(second.unreachable, given_up["unreachable"])
+    assert first.tried_again
+
+
+def test_a_robot_does_not_try_again_while_there_is_something_else(chosen, set_robot):
+    given_up = jnp.array([True, False, False])
+    state = chosen([1.0, 0.9, 0.0, 0.5], change=lambda s: set_robot(s, 0, unreachable=given_up))
+    assert state.robots.target[0] == 1
+    np.testing.assert_array_equal(state.robots.unreachable[0], given_up)
+    assert not state.robots.tried_again[0]
+
+
 def test_naive_takes_the_nearest_that_its_own_sensor_has_not_seen(chosen):
     useless = [0.0] * 4
     assert chosen(useless, NAIVE).robots.target[0] == 1
@@ -267,14 +300,6 @@ def test_a_robot_that_sees_the_poi_looks_from_where_it_stands(chosen):
 
 
 def test_a_poi_without_any_viewpoint_is_given_up(chosen):
-    def without_ways(state):
-        ways = replace(
-            state.roadmap,
-            is_free=state.roadmap.is_free.at[2].set(False),
-            to_viewpoint=state.roadmap.to_viewpoint.at[2].set(jnp.inf),
-        )
-        return replace(state, roadmap=ways)
-
     state = chosen([0.0, 0.0, 1.0, 0.5], change=without_ways)
     assert state.robots.phase[0] == IDLE
     np.testing.assert_array_equal(state.robots.unreachable[0], [False, False, True])
