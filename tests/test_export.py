@@ -174,6 +174,12 @@ def test_the_policy_of_a_team_serves_any_number_of_points_and_robots():
     trained = dataclasses.replace(trained, class_beliefs=Belief(means, jnp.ones_like(means)))
     of_run = functions(config, trained)
     decide = export.exported(of_run["decide_lidar"])
+
+    @jax.jit
+    def values(*known):
+        sizes = 2, config.team, config.dqn
+        return policies.tour_values(trained.q_networks[1], trained.tours, *known, *sizes)
+
     assert [str(n) for n in decide.out_avals[1].shape] == ["batch", "points + 1"]
     for num_pois, num_robots in ((5, 3), (2, 1)):
         rng = np.random.default_rng(num_pois)
@@ -189,8 +195,7 @@ def test_the_policy_of_a_team_serves_any_number_of_points_and_robots():
         given = {**vars(belief), **vars(team), "robot": np.int32(num_robots - 1)}
         inputs = (np.asarray(given[name])[None] for name in of_run["decide_lidar"].inputs)
         found = decide.call(*inputs)
-        known = belief, team, given["robot"], 2, config.team, config.dqn
-        expected = policies.tour_values(trained.q_networks[1], trained.tours, *known)
+        expected = values(belief, team, given["robot"])
         np.testing.assert_allclose(found["values"][0], expected, rtol=1e-4)
         assert found["action"][0] == np.argmax(expected)
 
