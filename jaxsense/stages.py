@@ -707,16 +707,10 @@ def _tour_stage(config: Config, params: str) -> Steps:
         fit, trials = state
         try_key, draw_key = jax.random.split(key)
         mdp = observe.team_mdp(config, detections.bank, params, make_jmvae(config))
-        read = readout(filtering.moments_inverse(classes), mdp.map.unseen)
-
-        def policy(state: TeamState) -> jax.Array:
-            known = state.map.belief, jnp.any(state.map.seen, axis=-1)
-            gains = expected_gains(read, look_values, *known)[state.team.modality]
-            ways = team_mdp.ways(config.team.travel, state.team)
-            worth = gains - config.team.second_cost * ways
-            return rules.auction(worth, ways, state.team, state.agent)
-
-        found = tours.try_choices(try_key, mdp, policy, config.team.tours, number)
+        followed = _auction(
+            config, readout(filtering.moments_inverse(classes), mdp.map.unseen), look_values
+        )
+        found = tours.try_choices(try_key, mdp, followed, config.team.tours, number)
         trials = tours.write(trials, found, fit.step // size * number)
         rows = tours.sample(draw_key, trials, (size, settings.batch))
 
@@ -741,6 +735,19 @@ def _tour_stage(config: Config, params: str) -> Steps:
         steps=settings.steps,
         chunks=chunks,
     )
+
+
+def _auction(config: Config, read: Params, look_values: tuple[LookValues, ...]) -> tours.Policy:
+    """The policy that robots follow in trials: the auction, less the price of the way."""
+
+    def policy(state: TeamState) -> jax.Array:
+        known = state.map.belief, jnp.any(state.map.seen, axis=-1)
+        gains = expected_gains(read, look_values, *known)[state.team.modality]
+        ways = team_mdp.ways(config.team.travel, state.team)
+        worth = gains - config.team.second_cost * ways
+        return rules.auction(worth, ways, state.team, state.agent)
+
+    return policy
 
 
 def _policies_stage(modality: int, config: Config, params: str) -> Stage:

@@ -226,6 +226,19 @@ class Config:
 
     def _check_memory(self) -> None:
         """No array that can become large may exceed a computer's memory."""
+        for fields, number in self._numbers_of_arrays().items():
+            if number > _MOST_NUMBERS:
+                values = {field: operator.attrgetter(field)(self) for field in fields.split()}
+                field = max(values, key=lambda field: values[field])
+                raise ConfigError(
+                    field,
+                    values[field],
+                    f"takes {4 * number / 2**30:,.0f} GiB with the other settings; must take at "
+                    f"most {4 * _MOST_NUMBERS / 2**30:.0f} GiB",
+                )
+
+    def _numbers_of_arrays(self) -> dict[str, int]:
+        """How many numbers the largest arrays hold, by the fields that make them large."""
         arena, jmvae, dqn, ways = self.arena, self.jmvae, self.dqn, self.navigation
         num_pois, num_classes = arena.num_pois, len(arena.classes)
         num_labels = sum(len(self.labels(name)) for name in self.modalities)
@@ -240,7 +253,7 @@ class Config:
         trajectories = ways.speed_samples * ways.turn_samples * math.ceil(10 * ways.horizon)
         encoders = 2 ** len(self.modalities)
         detector, evaluation, tours = self.detector, self.evaluation, self.team.tours
-        numbers = {
+        return {
             "detector.hidden": _weights(window, *detector.hidden, num_labels),
             "detector.num_scans": detector.num_scans * window,
             "detector.num_held_out": detector.num_held_out * window,
@@ -270,16 +283,6 @@ class Config:
             "navigation.turn_samples": trajectories * num_pois * MISSIONS_AT_ONCE,
             "mission.episodes": self.mission.episodes * views * num_pois * NODES_PER_POI,
         }
-        for fields, number in numbers.items():
-            if number > _MOST_NUMBERS:
-                values = {field: operator.attrgetter(field)(self) for field in fields.split()}
-                field = max(values, key=lambda field: values[field])
-                raise ConfigError(
-                    field,
-                    values[field],
-                    f"takes {4 * number / 2**30:,.0f} GiB with the other settings; must take at "
-                    f"most {4 * _MOST_NUMBERS / 2**30:.0f} GiB",
-                )
 
     @property
     def carried(self) -> tuple[str, ...]:
