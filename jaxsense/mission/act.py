@@ -1,13 +1,13 @@
 """Driving to a viewpoint, turning to the PoI, scanning it, and writing the map."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
 from jaxsense.mission.decide import sees, standing_robots
+from jaxsense.mission.groups import where_due
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
@@ -207,11 +207,14 @@ def scan(
         exchanged = poses.at[robot].set(poses[first]).at[first].set(poses[robot])
         return arenas.place(mission.world.arena, layout, exchanged)
 
-    placed = jax.vmap(place)(states)
+    first_rows = jax.tree.map(lambda x: x[:, 0], (states.belief, states.log_posterior))
+    nothing = jnp.zeros(len(keys), bool), *first_rows  # of these only what is seen is written
 
     def look(i: int) -> tuple[jax.Array, Belief, jax.Array]:
-        with_sensor = functools.partial(_look, mission, models, robot, carried[i])
-        return jax.vmap(with_sensor)(states, placed, aims)
+        def scan_one(state: MissionState, aim: _Aim) -> tuple[jax.Array, Belief, jax.Array]:
+            return _look(mission, models, robot, carried[i], state, place(state), aim)
+
+        return where_due(aims.scans, scan_one, nothing, states, aims)
 
     # The choice of the sensor outside the batch: inside, it would be traced over and over.
     which = jnp.array([carried.index(modality) for modality in of_robot])[robot]

@@ -1,14 +1,13 @@
 """Missions from beginning to end, as one scan over control periods."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 
 from jaxsense.config import values
 from jaxsense.mission import act, decide
+from jaxsense.mission.groups import where_due
 from jaxsense.mission.motion import move
 from jaxsense.mission.state import (
     ENDED,
@@ -23,10 +22,6 @@ from jaxsense.mission.state import (
 )
 from jaxsense.models import Models
 from jaxsense.types import Key
-
-T = TypeVar("T")
-
-_LEAST_GROUP = 32  # missions in which one decides side by side; fewer are no faster
 
 
 def rollout(
@@ -145,32 +140,7 @@ def _act(
     choice_keys, scan_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     states = jax.vmap(fail)(states)
     due = jax.vmap(lambda state: decide.is_due(mission, state, robot))(states)
-    robots = _where_due(due, choose, states.robots, choice_keys, states)
+    robots = where_due(due, choose, states.robots, choice_keys, states)
     states = dataclasses.replace(states, robots=robots)
     states = jax.vmap(lambda state: act.approach(mission, state, robot))(states)
     return act.scan(scan_keys, mission, models, states, robot)
-
-
-def _where_due(due: jax.Array, function: Callable[..., T], before: T, *inputs: Any) -> T:
-    """Applies a function to the rows of a batch that are due, in groups, and so at their cost.
-
-    Args:
-      due: `[B]` bool.
-      function: of a single row of each input; returns a single row.
-      before: `[B, ...]` rows, which the others keep.
-      *inputs: `[B, ...]` each.
-    """
-    total, number = len(due), jnp.sum(due)
-    size = min(total, max(_LEAST_GROUP, total // 8))
-    order = jnp.argsort(~due)
-
-    def advance(carry: tuple[jax.Array, T]) -> tuple[jax.Array, T]:
-        first, after = carry
-        place = first + jnp.arange(size)
-        row = order[jnp.minimum(place, total - 1)]
-        new = jax.vmap(function)(*jax.tree.map(lambda x: x[row], inputs))
-        kept = jnp.where(place < number, row, total)  # beyond the last row, nothing is written
-        put = lambda rows, new: rows.at[kept].set(new, mode="drop")  # noqa: E731
-        return first + size, jax.tree.map(put, after, new)
-
-    return jax.lax.while_loop(lambda carry: carry[0] < number, advance, (jnp.int32(0), before))[1]

@@ -8,7 +8,6 @@ import pytest
 from teams import CONFIG, NAIVE
 
 from jaxsense import mission
-from jaxsense.mission.rollout import _where_due
 from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
 from jaxsense.sim import amiro, navigation
 from jaxsense.sim import arena as arenas
@@ -253,26 +252,3 @@ def test_limits_hold_at_every_physics_step(driven):
     assert np.max(change) <= 1.02 * amiro.MAX_ACCELERATION
     assert np.max(turning) <= 1.02 * amiro.MAX_TURN_ACCELERATION
     assert np.max(change) > 0.5 * amiro.MAX_ACCELERATION
-
-
-@pytest.mark.parametrize("total", [1, 5, 40, 300])
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.6, 1.0])
-def test_those_who_are_due_decide_and_the_others_stay(total, share):
-    rng = np.random.default_rng(total)
-    due = rng.random(total) < share
-    before, x = rng.normal(size=(total, 2)), rng.normal(size=(total, 2))
-    groups = []
-
-    def double(x):
-        jax.debug.callback(lambda _: groups.append(1), x)
-        return {"twice": 2 * x}
-
-    found = jax.jit(lambda due, *rows: _where_due(due, double, {"twice": rows[0]}, rows[1]))(
-        *map(jnp.asarray, (due, before, x))
-    )
-    expected = np.where(due[:, None], 2 * x, before)
-    np.testing.assert_allclose(found["twice"], expected, rtol=1e-6)
-    # In groups of 32, or an eighth of them all, and so never for many who are not due.
-    size = min(total, max(32, total // 8))
-    jax.effects_barrier()
-    assert len(groups) == size * -(-due.sum() // size)
