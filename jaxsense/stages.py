@@ -738,7 +738,7 @@ def _tour_stage(config: Config, params: str) -> Steps:
 
 
 def _auction(config: Config, read: Params, look_values: tuple[LookValues, ...]) -> tours.Policy:
-    """The policy that robots follow in trials: the auction, less the price of the way."""
+    """The policy that robots follow in trials: the auction of gains less the price of the way."""
 
     def policy(state: TeamState) -> jax.Array:
         known = state.map.belief, jnp.any(state.map.seen, axis=-1)

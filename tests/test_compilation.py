@@ -196,8 +196,13 @@ def test_options_of_jax_are_other_settings(tmp_path):
         jax.config.update("jax_compilation_cache_dir", before)
 
 
-def test_a_kept_program_finds_the_functions_that_it_calls(tmp_path):
-    # Only a new process has not bound them yet.
+@pytest.fixture(scope="module")
+def two_processes(tmp_path_factory):
+    """What two processes print that use one directory, and how many compiled programs they keep.
+
+    The second has been told to keep these elsewhere.
+    """
+    path = tmp_path_factory.mktemp("kept")
     code = """if True:
         import sys, jax, jax.numpy as jnp
         from jaxsense.run.compilation import Compiler, Kept, Program
@@ -210,16 +215,27 @@ def test_a_kept_program_finds_the_functions_that_it_calls(tmp_path):
             shape = jax.ShapeDtypeStruct((2, 2), jnp.float32)
             program.compile(jnp.linalg.cholesky, shape)
             print(program(jnp.array([[4.0, 2.0], [2.0, 5.0]])).tolist())
+        jax.jit(lambda x: int(sys.argv[2]) * x)(jnp.arange(3))  # new to each of them
     """
-    outputs = [
-        subprocess.run(
-            [sys.executable, "-c", code, str(tmp_path)],
-            check=True, capture_output=True, text=True, env={**os.environ, "JAX_PLATFORMS": "cpu"},
-        ).stdout
-        for _ in range(2)
-    ]  # fmt: skip
-    # [[2, 0], [1, 2]] times its transpose is the matrix above.
-    assert outputs == ["new\n[[2.0, 0.0], [1.0, 2.0]]\n", "kept\n[[2.0, 0.0], [1.0, 2.0]]\n"]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    said, compiled = [], []
+    for elsewhere in (None, path / "theirs"):
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        if elsewhere is not None:
+            environment["JAX_COMPILATION_CACHE_DIR"] = str(elsewhere)
+        own = path / "own"
+        before = set(own.glob("compiled/*-cache"))
+        command = [sys.executable, "-c", code, str(own), str(2 + len(said))]
+        ended = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+        said.append(ended.stdout)
+        compiled.append(len(set(own.glob("compiled/*-cache")) - before))
+    return said, compiled
+
+
+def test_a_kept_program_finds_the_functions_that_it_calls(two_processes):
+    # Only a new process has not bound them yet. [[2, 0], [1, 2]] times its transpose is the matrix.
+    expected = "[[2.0, 0.0], [1.0, 2.0]]\n"
+    assert two_processes[0] == ["new\n" + expected, "kept\n" + expected]
 
 
 def test_the_oldest_programs_are_forgotten(tmp_path, monkeypatch):
@@ -260,24 +276,7 @@ def test_a_directory_that_others_may_write_is_refused(tmp_path):
         (tmp_path / name).chmod(0o700)
 
 
-def test_jax_keeps_what_it_compiles_beside_it(tmp_path):
-    # Only a new process has not been told where.
-    code = """if True:
-        import sys, jax, jax.numpy as jnp
-        from pathlib import Path
-        from jaxsense.run.compilation import Kept
-        Kept(Path(sys.argv[1]))
-        jax.jit(lambda x: 2 * x)(jnp.arange(3))
-        print(len(list(Path(sys.argv[1], "compiled").glob("*-cache"))) > 0)
-    """
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    for elsewhere, expected in ((None, "True"), (str(tmp_path / "theirs"), "False")):
-        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-        if elsewhere is not None:
-            environment["JAX_COMPILATION_CACHE_DIR"] = elsewhere
-        own = tmp_path / expected
-        told = subprocess.run(
-            [sys.executable, "-c", code, str(own)],
-            check=True, capture_output=True, text=True, env=environment,
-        )  # fmt: skip
-        assert told.stdout == f"{expected}\n"
+def test_jax_keeps_what_it_compiles_beside_it_unless_it_was_told_where(two_processes):
+    _, (first, second) = two_processes
+    assert first > 0
+    assert second == 0

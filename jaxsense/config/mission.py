@@ -115,7 +115,8 @@ class MissionConfig:
     least_confidence: Traced[float] = 0.98
     """Lowest probability of a detected label for a scan to enter the map."""
     attempts: Traced[int] = 3
-    """Failed looks or goals after which a robot gives up a PoI."""
+    """Failed looks or goals after which a robot gives up a PoI. Where it was stuck, it tries as
+    often once more before it ends."""
 
     def check(self) -> None:
         """Raises `ConfigError` for an invalid field."""

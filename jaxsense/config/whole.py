@@ -238,7 +238,7 @@ class Config:
                 )
 
     def _numbers_of_arrays(self) -> dict[str, int]:
-        """How many numbers the largest arrays hold, by the fields that make them large."""
+        """How many numbers each large array holds, by the field or fields that make it large."""
         arena, jmvae, dqn, ways = self.arena, self.jmvae, self.dqn, self.navigation
         num_pois, num_classes = arena.num_pois, len(arena.classes)
         num_labels = sum(len(self.labels(name)) for name in self.modalities)

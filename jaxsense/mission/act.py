@@ -180,7 +180,12 @@ class _Aim:
 
 
 def scan(
-    keys: Key, mission: Mission, models: Models, states: MissionState, robot: Index
+    keys: Key,
+    mission: Mission,
+    models: Models,
+    states: MissionState,
+    robot: Index,
+    parts: int = 1,
 ) -> MissionState:
     """Scans the PoI that a robot faces, and writes the detection into the map.
 
@@ -190,6 +195,7 @@ def scan(
       models: trained networks.
       states: `[B]` missions side by side.
       robot: index of the robot, the same in all of them.
+      parts: see `groups.where_due`.
 
     Returns:
       The `[B]` states after it.
@@ -208,13 +214,13 @@ def scan(
         return arenas.place(mission.world.arena, layout, exchanged)
 
     first_rows = jax.tree.map(lambda x: x[:, 0], (states.belief, states.log_posterior))
-    nothing = jnp.zeros(len(keys), bool), *first_rows  # of these only what is seen is written
+    nothing = jnp.zeros(len(keys), bool), *first_rows  # not seen, and so never written
 
     def look(i: int) -> tuple[jax.Array, Belief, jax.Array]:
         def scan_one(state: MissionState, aim: _Aim) -> tuple[jax.Array, Belief, jax.Array]:
             return _look(mission, models, robot, carried[i], state, place(state), aim)
 
-        return where_due(aims.scans, scan_one, nothing, states, aims)
+        return where_due(aims.scans & ~states.done, scan_one, nothing, states, aims, parts=parts)
 
     # The choice of the sensor outside the batch: inside, it would be traced over and over.
     which = jnp.array([carried.index(modality) for modality in of_robot])[robot]

@@ -56,7 +56,8 @@ def decide(
     sets_out_now, gives_up = sets_out & has_way, sets_out & ~has_way
     poi = jnp.minimum(action, config.arena.num_pois - 1)
     nothing_left = decides & (action == config.arena.num_pois)
-    # What was in the way may have gone: before its end a robot tries once more where it was stuck.
+    # What was in the way may have gone: before it ends, a robot tries once more to reach PoIs where
+    # it was stuck.
     place = state.scene.poses[robot, :2]
     stuck_at = own.unreachable & roadmap.reaches(config, state.scene.layout, state.roadmap, place)
     tries_again = nothing_left & jnp.any(stuck_at) & ~own.tried_again

@@ -1,4 +1,4 @@
-"""Work that is due in a few of the missions side by side, at its cost alone."""
+"""Runs a function only for the missions of a batch that need it."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -8,21 +8,36 @@ import jax.numpy as jnp
 
 T = TypeVar("T")
 
-_FEWEST = 8  # rows of a group; fewer take as long
+_FEWEST = 8  # rows of a group; on a CPU, fewer take as long
 
 
-def where_due(due: jax.Array, function: Callable[..., T], before: T, *inputs: Any) -> T:
-    """Applies a function to the rows of a batch that are due, in groups.
+def where_due(
+    due: jax.Array, function: Callable[..., T], before: T, *inputs: Any, parts: int = 1
+) -> T:
+    """Applies a function to the rows of a batch that are due, one group of rows after another.
+
+    Under a `vmap`, all batches take as many groups as the one with the most rows.
 
     Args:
       due: `[B]` bool.
-      function: of a single row of each input; returns a single row.
-      before: `[B, ...]` rows, which the others keep.
+      function: takes a single row of each input, and returns a single row.
+      before: `[B, ...]` rows to keep where nothing is due.
       *inputs: `[B, ...]` each.
+      parts: how many equal parts of the batch form groups of their own; with one part on each
+        device, no row moves to another.
 
     Returns:
       `[B, ...]` rows.
     """
+    if parts == 1:
+        return _where_due(due, function, before, *inputs)
+    split = jax.tree.map(lambda x: x.reshape(parts, -1, *x.shape[1:]), (due, before, inputs))
+    of_part = jax.vmap(lambda due, before, inputs: _where_due(due, function, before, *inputs))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), of_part(*split))
+
+
+def _where_due(due: jax.Array, function: Callable[..., T], before: T, *inputs: Any) -> T:
+    """See `where_due`, for a batch of one part."""
     total, number = len(due), jnp.sum(due)
     size = min(total, max(_FEWEST, total // 16))
     order = jnp.argsort(~due)
@@ -32,7 +47,7 @@ def where_due(due: jax.Array, function: Callable[..., T], before: T, *inputs: An
         place = first + jnp.arange(size)
         row = order[jnp.minimum(place, total - 1)]
         new = jax.vmap(function)(*jax.tree.map(lambda x: x[row], inputs))
-        kept = jnp.where(place < number, row, total)  # beyond the last row, nothing is written
+        kept = jnp.where(place < number, row, total)  # past the last that is due, none is written
         put = lambda rows, new: rows.at[kept].set(new, mode="drop")  # noqa: E731
         return first + size, jax.tree.map(put, after, new)
 

@@ -21,9 +21,9 @@ REASONS = (
     "robot failed",
     "no robot left",
 )
-"""Ends of a mission. `unreachable`: a robot gave up a PoI without getting there; `undetected`: it
-gave up one after looks that showed nothing; `robot failed`: the others finished. The index is the
-reason's code."""
+"""Ends of a mission. `unreachable`: a robot gave up a PoI without getting there, and did not take
+it back before it ended; `undetected`: it gave up one after looks that showed nothing; `robot
+failed`: the others finished. The index is the reason's code."""
 
 
 def reason(state: MissionState) -> jax.Array:

@@ -74,9 +74,10 @@ class Robots:
       way_left: metres left of the way at the last progress.
       progress_at: seconds, time of the last progress.
       backs_off_until: seconds.
-      unreachable: `[R, N]` bool, PoIs given up without a way, or stuck on the last attempt.
+      unreachable: `[R, N]` bool, PoIs given up without a way, or stuck on the last attempt; where
+        there is a way they are taken back once, before the robot ends.
       undetected: `[R, N]` bool, PoIs given up after a last look that showed nothing.
-      tried_again: bool, the robot has returned to PoIs that it had given up although it had a way.
+      tried_again: bool, the robot has once taken back what it had given up where there is a way.
       goals: int32 viewpoints set out for and PoIs given up without a way, less the goals that a new
         decision made needless or another robot occupied.
       reached: int32 goals reached.

@@ -51,6 +51,7 @@ def names():
     return found
 
 
+@pytest.mark.slow  # the tests of each interface take the same steps
 @pytest.mark.parametrize("package", EXAMPLES)
 def test_examples_run(names, package, tmp_path, monkeypatch, capsys):
     example = EXAMPLES[package]

@@ -134,6 +134,18 @@ def test_where_a_robot_was_stuck_it_tries_again_once_before_it_ends(chosen, set_
     assert first.tried_again
 
 
+def test_a_robot_under_way_stops_to_try_again(chosen, set_robot):
+    given_up = jnp.array([True, False, False])
+
+    def on_its_way(state):
+        state = set_robot(state, 0, phase=DRIVING, target=1, goals=1, unreachable=given_up)
+        return replace(state, version=jnp.int32(1))
+
+    found = jax.tree.map(lambda x: x[0], chosen([1.0, 0.0, 0.0, 0.5], change=on_its_way).robots)
+    assert (found.phase, found.target, found.goals) == (IDLE, 3, 0)
+    assert not np.any(found.unreachable)
+
+
 def test_a_robot_does_not_try_again_while_there_is_something_else(chosen, set_robot):
     given_up = jnp.array([True, False, False])
     state = chosen([1.0, 0.9, 0.0, 0.5], change=lambda s: set_robot(s, 0, unreachable=given_up))

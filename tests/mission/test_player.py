@@ -24,7 +24,7 @@ CHUNK = missions.chunk_of(CONFIG)
 LAST = 2 * CHUNK - 3  # control periods, within the second chunk
 
 
-def fake_step(keys, team, models, states):
+def fake_step(keys, team, models, states, parts):
     """No physics, which would take long to compile: every robot walks where chance takes it."""
     moves = jax.vmap(lambda key: jax.random.normal(key, states.scene.poses.shape[1:]))(keys)
     moves = jnp.where(states.done[:, None, None], 0.0, moves)

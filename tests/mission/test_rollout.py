@@ -33,10 +33,7 @@ NUM_ARENAS = CASES["healthy"][2]
 def go_on(team, models):
     """One control period after another, in arenas side by side."""
 
-    def roll(keys, state):
-        return jax.vmap(lambda k, s: mission.rollout(k, team, models, s, CHUNK))(keys, state)
-
-    return jax.jit(roll)
+    return jax.jit(lambda keys, states: mission.rollout_batch(keys, team, models, states, CHUNK, 1))
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +62,23 @@ def played(team, go_on, as_numpy):
         found[name] = jax.tree.map(lambda x: x[first : first + size], whole)  # noqa: B023
         first += size
     return found, states[1]
+
+
+@pytest.mark.slow  # compiles a mission once more
+def test_a_batch_is_its_members_one_by_one(team, models, played):
+    # Thirteen, more than decide or scan at once.
+    states = played[1]
+    keys = jax.random.split(jax.random.key(9), len(states.steps))
+    together = jax.jit(lambda k, s: mission.rollout_batch(k, team, models, s, CHUNK, 1))
+    alone = jax.jit(lambda k, s: mission.rollout(k, team, models, s, CHUNK))
+    ends, records = together(keys, states)
+    assert np.sum(records.scanned) > 20
+    for b in range(len(keys)):
+        end, record = alone(keys[b], jax.tree.map(lambda x: x[b], states))  # noqa: B023
+        for name in ("phase", "target", "scanned", "detected", "seen"):
+            np.testing.assert_array_equal(getattr(records, name)[b], getattr(record, name))
+        np.testing.assert_allclose(records.poses[b], record.poses, atol=1e-3)
+        np.testing.assert_array_equal(ends.steps[b], end.steps)
 
 
 @pytest.fixture(scope="module")
