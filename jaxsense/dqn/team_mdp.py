@@ -287,8 +287,8 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
     target = jnp.where(is_agent, action, team.target)
     works = team.works & ~(is_agent & (action == num_pois))
     asks = state.asks & ~is_agent
-    is_over, others_ask = ~jnp.any(works), jnp.any(asks)
-    passes = ~others_ask & ~is_over
+    terminated, others_ask = ~jnp.any(works), jnp.any(asks)
+    passes = ~others_ask & ~terminated
 
     goals = team.positions[jnp.minimum(target, num_pois - 1)]
     times = jax.vmap(lambda pose, goal: travel_seconds(travel, pose, goal[None])[0])(
@@ -321,7 +321,7 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
     )
     return state, Outcome(
         reward=reward,
-        terminated=is_over,
-        truncated=~is_over & (after.steps >= mdp.config.max_steps),
+        terminated=terminated,
+        truncated=~terminated & (after.steps >= mdp.config.max_steps),
         seconds=seconds,
     )

@@ -76,9 +76,9 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         """Takes one step, without a reset.
 
         Returns:
-          Observations, state, rewards, dones and infos. A robot is done when its part is over, and
-          all are when the episode is, which `__all__` tells. `seconds`, `[R]` and the same for all,
-          are those that passed.
+          Observations, state, rewards, dones and infos. A robot is done when its part is over;
+          `__all__` is whether the episode is over. `seconds`, `[R]` and the same for all, are those
+          that passed.
         """
         chosen = jnp.stack([jnp.asarray(actions[agent], jnp.int32) for agent in self.agents])
         after, outcome = team.step(key, self.mdp, state.team, chosen)

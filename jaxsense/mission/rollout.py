@@ -52,7 +52,13 @@ def rollout(
 
 
 def rollout_batch(
-    keys: Key, mission: Mission, models: Models, states: MissionState, steps: int, every: int
+    keys: Key,
+    mission: Mission,
+    models: Models,
+    states: MissionState,
+    steps: int,
+    every: int,
+    parts: int = 1,
 ) -> tuple[MissionState, Record]:
     """Runs missions side by side and records some of them.
 
@@ -64,13 +70,14 @@ def rollout_batch(
       steps: how many control periods; static.
       every: records the first of each group of this size; divides B. With one group per device,
         no device waits for another's record.
+      parts: of how many devices each has its part of the batch; see `groups.where_due`.
 
     Returns:
       The `[B]` states after the last one, and `[B / every, steps]` records.
     """
 
     def go_on(states: MissionState, keys: Key):
-        states, records = step(keys, mission, models, states, len(keys) // every)
+        states, records = step(keys, mission, models, states, parts)
         return states, jax.tree.map(lambda x: x.reshape(-1, every, *x.shape[1:])[:, 0], records)
 
     step_keys = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(keys)

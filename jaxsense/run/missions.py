@@ -90,6 +90,7 @@ class Player:
         batch = -(-batch // workers.number) * workers.number
         self.mission, self._monitor, self._batch = mission, compiler.monitor, batch
         config, share = mission.config, batch // workers.number
+        parts = 1 if workers.mesh is None else workers.number  # a thread sees its own rows alone
         chunk = chunk_of(config)
         self._lock = threading.Lock()
 
@@ -114,7 +115,7 @@ class Player:
             team = with_config(mission, config)
             keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(episode)
             keys = jax.vmap(jax.random.fold_in)(keys, number)
-            state, records = rollout_batch(keys, team, models, state, chunk, share)
+            state, records = rollout_batch(keys, team, models, state, chunk, share, parts)
             return state, jax.vmap(lambda s: measure(team, models, s))(state), records
 
         key, numbers = jax.random.key(0), jax.ShapeDtypeStruct((batch,), jnp.int32)

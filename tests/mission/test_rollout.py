@@ -72,7 +72,7 @@ def test_a_batch_is_its_members_one_by_one(team, models, played):
     together = jax.jit(lambda k, s: mission.rollout_batch(k, team, models, s, CHUNK, 1))
     alone = jax.jit(lambda k, s: mission.rollout(k, team, models, s, CHUNK))
     ends, records = together(keys, states)
-    assert np.sum(records.scanned) > 20
+    assert np.sum(records.scanned) > 10
     for b in range(len(keys)):
         end, record = alone(keys[b], jax.tree.map(lambda x: x[b], states))  # noqa: B023
         for name in ("phase", "target", "scanned", "detected", "seen"):
