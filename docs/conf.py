@@ -4,6 +4,8 @@ import importlib
 import importlib.util
 import inspect
 import pkgutil
+import re
+import sys
 from types import ModuleType
 
 from docutils import nodes
@@ -77,11 +79,28 @@ def public_names(package: ModuleType) -> list[tuple[str, str]]:
     """What a package exports: each name, and where it is defined and described."""
     found = []
     for name, value in vars(package).items():
-        home = getattr(value, "__module__", None)
-        is_own = inspect.isclass(value) or inspect.isfunction(value)
-        if is_own and home and home != package.__name__ and home.startswith("jaxsense."):
-            found.append((f"{package.__name__}.{name}", f"{home}.{value.__name__}"))
+        if name.startswith("_"):
+            continue
+        if inspect.isclass(value) or inspect.isfunction(value):
+            home, defined = value.__module__, value.__name__
+        else:
+            home, defined = home_of_constant(name), name
+        if home != package.__name__ and home.startswith("jaxsense."):
+            found.append((f"{package.__name__}.{name}", f"{home}.{defined}"))
     return sorted(found)
+
+
+def home_of_constant(name: str) -> str:
+    """The module of jaxsense that assigns a constant; empty if none does."""
+    assigns = re.compile(rf"^{re.escape(name)}(: .+)? = ", re.MULTILINE)
+    return next(
+        (
+            path
+            for path, module in sorted(sys.modules.items())
+            if path.startswith("jaxsense.") and assigns.search(inspect.getsource(module))
+        ),
+        "",
+    )
 
 
 packages = ["jaxsense"] + [

@@ -7,11 +7,13 @@ Space Representation", 2018.
 
 The parts are `jaxsense.sim` (arena, ray-caster, sensors), `jaxsense.vae` (detectors, JMVAE, fusion)
 and `jaxsense.dqn` (map MDP, Q-learning). `jaxsense.observe` joins them, `jaxsense.stages` trains
-them, and `jaxsense.mission` drives all robots in closed loop. Every function is pure, takes its
-random key first and works on one example: add `vmap` and `jit` yourself.
+them, `jaxsense.mission` drives all robots in closed loop, and `jaxsense.interfaces` offers the MDPs
+to other libraries. Every function is pure, takes its random key first and works on one example: add
+`vmap` and `jit` yourself.
 """
 
 from jaxsense import dqn as dqn
+from jaxsense import interfaces as interfaces
 from jaxsense import mission as mission
 from jaxsense import sim as sim
 from jaxsense import vae as vae

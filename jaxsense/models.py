@@ -61,7 +61,7 @@ def make_jmvae(config: Config) -> Jmvae:
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
 
-def make_q_network(config: Config) -> tuple[nn.Module, int]:
+def _q_network(config: Config) -> tuple[nn.Module, int]:
     """The Q-network, and the size of its input."""
     num_pois, size, number = config.arena.num_pois, config.jmvae.latent_size, len(config.modalities)
     if config.dqn.task == "team":
@@ -112,7 +112,7 @@ def init(key: Key, config: Config) -> Models:
         detectors.init(k, jnp.zeros((2, s.window * s.channels)), size, config.detector)
         for k, s, size in zip(keys, sensors.make(config), num_labels, strict=True)
     )
-    q_network, size = make_q_network(config)
+    q_network, size = _q_network(config)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
     tour_key = jax.random.fold_in(dqn_key, 1)
     shape = (len(config.arena.classes), config.jmvae.latent_size)

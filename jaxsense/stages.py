@@ -21,6 +21,7 @@ from jaxsense.dqn import belief_mdp, optimum, policies, rules, team_mdp, tours
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.optimum import LookValues
+from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.dqn.tours import Trials
 from jaxsense.dqn.training import DqnState
@@ -679,62 +680,66 @@ def _finish_dqn(config: Config, state: DqnState, *inputs: Any) -> Params:
 
 
 def _tour_stage(config: Config, params: str) -> Steps:
-    """The training of the network that orders a team's looks, see `tours`.
-
-    Each chunk adds trials and learns from all so far.
-    """
-    settings, latent_size = config.team.tours, config.jmvae.latent_size
-    size = _chunk_size(settings.steps)
-    chunks = _num_chunks(settings.steps)
-    number = -(-settings.states // chunks)
-    network = policies.team_network(latent_size, len(config.modalities), config.dqn)
-
-    def begin(key: Key, config: Config, *_: Any) -> tuple[FitState, Trials]:
-        num_pois = config.team.num_pois[1]
-        optimiser = minibatch.adam(config.team.tours.learning_rate, settings.steps)
-        fit = minibatch.start(networks.init(key, network, network.features * num_pois), optimiser)
-        return fit, tours.no_trials(network.features, num_pois, chunks * number)
-
-    def advance(
-        key: Key,
-        config: Config,
-        state: tuple[FitState, Trials],
-        look_values: tuple[LookValues, ...],
-        classes: Belief,
-        params: Params,
-        detections: Detections,
-    ) -> tuple[tuple[FitState, Trials], Progress]:
-        fit, trials = state
-        try_key, draw_key = jax.random.split(key)
-        mdp = observe.team_mdp(config, detections.bank, params, make_jmvae(config))
-        followed = _auction(
-            config, readout(filtering.moments_inverse(classes), mdp.map.unseen), look_values
-        )
-        found = tours.try_choices(try_key, mdp, followed, config.team.tours, number)
-        trials = tours.write(trials, found, fit.step // size * number)
-        rows = tours.sample(draw_key, trials, (size, settings.batch))
-
-        def loss(params: Params, rows: jax.Array, step: jax.Array) -> jax.Array:
-            del step
-            batch = jax.tree.map(lambda x: x[:, rows], trials)
-            return tours.loss(network, params, batch, latent_size)
-
-        optimiser = minibatch.adam(config.team.tours.learning_rate, settings.steps)
-        fit, losses = minibatch.fit(fit, loss, rows, optimiser, settings.steps)
-        return (fit, trials), Progress(losses, {})
-
-    def finish(config: Config, state: tuple[FitState, Trials], *_: Any) -> Params:
-        return state[0].params
-
+    """The training of the network that orders a team's looks, see `tours`."""
     return Steps(
         "tours",
-        begin,
+        _begin_tours,
         ("look_values", "class_beliefs", params, "detections"),
-        advance=advance,
-        finish=finish,
-        steps=settings.steps,
-        chunks=chunks,
+        advance=_advance_tours,
+        finish=lambda config, state, *_: state[0].params,
+        steps=config.team.tours.steps,
+        chunks=_num_chunks(config.team.tours.steps),
     )
+
+
+def _begin_tours(key: Key, config: Config, *_: Any) -> tuple[FitState, Trials]:
+    settings, num_pois = config.team.tours, config.team.num_pois[1]
+    network = _tour_network(config)
+    optimiser = minibatch.adam(settings.learning_rate, settings.steps)
+    fit = minibatch.start(networks.init(key, network, network.features * num_pois), optimiser)
+    number = _num_chunks(settings.steps) * _trials_of_chunk(config)
+    return fit, tours.no_trials(network.features, num_pois, number)
+
+
+def _advance_tours(
+    key: Key,
+    config: Config,
+    state: tuple[FitState, Trials],
+    look_values: tuple[LookValues, ...],
+    classes: Belief,
+    params: Params,
+    detections: Detections,
+) -> tuple[tuple[FitState, Trials], Progress]:
+    """Adds trials, and learns from all so far."""
+    fit, trials = state
+    settings, latent_size = config.team.tours, config.jmvae.latent_size
+    size, number = _chunk_size(settings.steps), _trials_of_chunk(config)
+    try_key, draw_key = jax.random.split(key)
+    mdp = observe.team_mdp(config, detections.bank, params, make_jmvae(config))
+    read = readout(filtering.moments_inverse(classes), mdp.map.unseen)
+    followed = _auction(config, read, look_values)
+    found = tours.try_choices(try_key, mdp, followed, settings, number)
+    trials = tours.write(trials, found, fit.step // size * number)
+    rows = tours.sample(draw_key, trials, (size, settings.batch))
+    network = _tour_network(config)
+
+    def loss(params: Params, rows: jax.Array, step: jax.Array) -> jax.Array:
+        del step
+        batch = jax.tree.map(lambda x: x[:, rows], trials)
+        return tours.loss(network, params, batch, latent_size)
+
+    optimiser = minibatch.adam(settings.learning_rate, settings.steps)
+    fit, losses = minibatch.fit(fit, loss, rows, optimiser, settings.steps)
+    return (fit, trials), Progress(losses, {})
+
+
+def _tour_network(config: Config) -> PoolingNetwork:
+    return policies.team_network(config.jmvae.latent_size, len(config.modalities), config.dqn)
+
+
+def _trials_of_chunk(config: Config) -> int:
+    """States in which each chunk tries choices."""
+    return -(-config.team.tours.states // _num_chunks(config.team.tours.steps))
 
 
 def _auction(config: Config, read: Params, look_values: tuple[LookValues, ...]) -> tours.Policy:

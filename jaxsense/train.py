@@ -268,7 +268,7 @@ def _train_together(
       The failed seeds, and why.
     """
     displays = [_display(arguments, run, console, is_shown=run is runs[0]) for run in runs]
-    programs.team.begin(len(runs))
+    programs.trainings.begin(len(runs))
 
     def train(i: int) -> RunResult | StageError:
         key = jax.random.key(runs[i].settings.seed)
@@ -280,7 +280,7 @@ def _train_together(
         except StageError as error:
             return error
         finally:
-            programs.team.leave()
+            programs.trainings.leave()
 
     with displays[0]:
         monitor.begin(displays[0].show)

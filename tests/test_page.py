@@ -46,6 +46,7 @@ SUMMARY = {
         "unambiguous": TABLE,
         "consistent": {name: [0.995, 1.0, 0.5] for name in TABLE},
     },
+    "belief": {"doubt_correlation": 0.9375},
     "dqn": {"camera": POLICY, "lidar": POLICY},
     "mission": {
         "latent": MISSION,
@@ -124,6 +125,7 @@ def test_figures_stand_beside_those_of_the_paper(read):
     assert rows["permutations"] == ["384", "384", "384"]
     assert rows["sigma norm, unambiguous"] == ["0.50 to 1.50", "from 1.05"]
     assert rows["dimensions in use"] == ["2", "1"]
+    assert rows["doubt"] == ["0.938", "-"]
     # Camera, LiDAR and both; the paper's LiDAR cannot tell a red cylinder.
     # In brackets the looks after which just the right classes are plausible.
     red = ["no / no (100.0%)", "yes / no (100.0%)", "yes / yes (100.0%)"]

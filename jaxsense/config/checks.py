@@ -29,7 +29,7 @@ def require(condition: bool, section: object, field: str, expected: str) -> None
 def require_types(section: Any, bits: int = 31) -> None:
     """Raises `ConfigError` unless each field has its declared type.
 
-    Whole numbers in real fields become real, because JAX tells them apart.
+    Whole numbers in real fields become real, because JAX distinguishes them.
 
     Args:
       section: the dataclass.

@@ -108,6 +108,7 @@ _TEAM = Config(
 )
 
 PresetName = Literal["default", "paper", "noisy", "team", "smoke"]
+"""The names of `PRESETS`."""
 
 PRESETS: dict[str, Config] = {
     "default": Config(),

@@ -26,7 +26,7 @@ TIMESTEP = 0.01
 """Step of the physics, in seconds."""
 
 MODALITIES: dict[str, str] = {"camera": "colour", "lidar": "shape"}
-"""Built-in sensors, and the attribute of a PoI that each tells apart."""
+"""Built-in sensors, and the attribute of a PoI that each distinguishes."""
 
 
 @section
@@ -105,7 +105,7 @@ class ArenaConfig:
                 # A PoI may have any yaw.
                 look = (what.primitive, *sorted(what.half_sides)) if name == "shape" else what
                 twin = of_words.setdefault(look, word)
-                reason = f"must not use both {twin!r} and {word!r}, which no sensor can tell apart"
+                reason = f"must not use both {twin!r} and {word!r}, which no sensor can distinguish"
                 require(twin == word, self, "classes", reason)
 
     @property
@@ -272,7 +272,7 @@ class SensorConfig:
     """Function of `Config` that makes the `sim.Sensor`, as `package.module:function`; a name, for
     runs to store."""
     attribute: str
-    """Attribute that it tells apart: `colour`, `shape` or one of `arena.attributes`."""
+    """Attribute that it distinguishes: `colour`, `shape` or one of `arena.attributes`."""
 
     def __post_init__(self):
         require_types(self)

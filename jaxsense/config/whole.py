@@ -182,7 +182,7 @@ class Config:
             raise ConfigError("modalities", self.modalities, "must name no modality twice")
 
     def _check_classes(self) -> None:
-        """Classes must differ in something that a sensor, of this team or not, tells apart."""
+        """Classes must differ in something that a sensor, of this team or not, distinguishes."""
         of_sensors = zip(*map(self.label_of_class, [*MODALITIES, *self.sensors]), strict=True)
         seen: dict[tuple[int, ...], str] = {}
         for name, labels in zip(self.arena.classes, of_sensors, strict=True):
@@ -190,11 +190,11 @@ class Config:
                 raise ConfigError(
                     "arena.classes",
                     self.arena.classes,
-                    f"must not have both {twin!r} and {name!r}, which no sensor can tell apart",
+                    f"must not have both {twin!r} and {name!r}, which no sensor can distinguish",
                 )
 
     def _check_robots(self) -> None:
-        """The robots must carry trained sensors, which together tell some classes apart."""
+        """The robots must carry trained sensors, which together distinguish some classes."""
         known = ", ".join(self.modalities)
         if not 1 <= len(self.carried) <= _MOST_ROBOTS:
             reason = f"must name 1 to {_MOST_ROBOTS} robots, each one of {known}"
@@ -207,7 +207,7 @@ class Config:
         told = set(zip(*map(self.label_of_class, self.carried), strict=True))
         if len(told) == 1 < len(self.arena.classes):
             reason = (
-                f"cannot tell any of {', '.join(self.arena.classes)} apart; must be robots that do"
+                f"cannot distinguish any of {', '.join(self.arena.classes)}; must be robots that do"
             )
             raise ConfigError("robots", self.carried, reason)
 
@@ -307,12 +307,12 @@ class Config:
         return tuple(map(self.modalities.index, self.carried))
 
     def attribute(self, modality: str) -> str:
-        """Attribute that a modality tells apart: `colour`, `shape` or one of `arena.attributes`."""
+        """Attribute that a modality reads: `colour`, `shape` or one of `arena.attributes`."""
         own = self.sensors.get(modality)
         return MODALITIES[modality] if own is None else own.attribute
 
     def labels(self, modality: str) -> tuple[str, ...]:
-        """Words that a modality tells apart, in the order of its features."""
+        """Words that a modality distinguishes, in the order of its features."""
         return self.arena.labels(self.attribute(modality))
 
     def label_of_class(self, modality: str) -> tuple[int, ...]:

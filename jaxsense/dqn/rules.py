@@ -1,4 +1,4 @@
-"""Rules by hand for choosing the next PoI of a team's robot, to compare learned policies with.
+"""Hand-written rules for choosing the next PoI of a team's robot, to compare learned policies with.
 
 All read expected gains of information and times of travel, and return `[N + 1]` values of actions,
 of which the highest counts; NOP's, the last, is 0.

@@ -23,7 +23,7 @@ from jaxsense.mission.state import (
     robot_of,
     with_robot,
 )
-from jaxsense.models import Models, expected, expected_gains, make_q_network
+from jaxsense.models import Models, expected, expected_gains
 from jaxsense.sim import roadmap, viewpoints
 from jaxsense.types import Belief, Index, Key, others
 
@@ -172,7 +172,7 @@ def _q_values(
         config, number = mission.config, len(mission.config.modalities)
         trained = q_network, models.tours
         return policies.tour_values(*trained, *known, number, config.team, config.dqn)
-    network, _ = make_q_network(mission.config)
+    network = policies.q_network(mission.config.arena.num_pois, mission.config.dqn.hidden)
 
     def values_if(sure: Belief) -> jax.Array:
         """The network's values as if all PoIs given up were known to be of one class."""

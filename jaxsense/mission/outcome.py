@@ -96,7 +96,7 @@ def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any
     Returns:
       Means over the missions, except the median of `time_s` and the sum of `collisions`. For a
       robot alone also `told`, the accuracy of its sensor's labels, and `ambiguous_reported`, the
-      share of the PoIs it cannot tell apart that the map shows as ambiguous.
+      share of the PoIs it cannot distinguish that the map shows as ambiguous.
     """
     block: dict[str, Any] = {
         "accuracy": float(found["is_right"].mean()),

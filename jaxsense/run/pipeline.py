@@ -22,6 +22,8 @@ from jaxsense.sim.world import make_world
 from jaxsense.stages import agent, mission_key, models
 from jaxsense.types import Belief, Key
 
+_UNAMBIGUOUS = 0.9  # share of looks in a single class, above which the class counts as one
+
 
 @dataclasses.dataclass(frozen=True)
 class RunResult:
@@ -143,6 +145,7 @@ def _as_lists(metrics: dict[str, Any]) -> dict[str, Any]:
     """The summary's block `jmvae` from the arrays of `examine.latent_space`."""
     lists = jax.tree.map(lambda x: x.tolist(), metrics)
     lists["unambiguous"] = {
-        name: [share > 0.9 for share in shares] for name, shares in lists["unambiguous"].items()
+        name: [share > _UNAMBIGUOUS for share in shares]
+        for name, shares in lists["unambiguous"].items()
     }
     return lists

@@ -16,7 +16,7 @@ from jaxsense.config import Config
 from jaxsense.run import missions
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.run.together import Team, TeamProgram
+from jaxsense.run.together import SharedProgram, Trainings
 from jaxsense.sim.world import World
 from jaxsense.stages import Stage, Steps, stages
 
@@ -45,9 +45,9 @@ class StagePrograms:
       shapes: known once the programs are traced.
     """
 
-    begin: Program | TeamProgram
-    advance: Program | TeamProgram
-    finish: Program | TeamProgram
+    begin: Program | SharedProgram
+    advance: Program | SharedProgram
+    finish: Program | SharedProgram
     shapes: Future[Shapes]
 
 
@@ -61,7 +61,7 @@ class Programs:
       of_stages: their programs, by `Stage.program`.
       player: of the missions.
       workers: what shares rows and missions.
-      team: the trainings side by side.
+      trainings: those side by side.
     """
 
     config: Config
@@ -69,7 +69,7 @@ class Programs:
     of_stages: dict[str, StagePrograms]
     player: Future[missions.Player]
     workers: Workers
-    team: Team
+    trainings: Trainings
 
     def of(self, stage: Stage) -> StagePrograms:
         """The programs of a stage."""
@@ -101,11 +101,12 @@ def compile_programs(
       workers: what shares rows, missions and seeds.
       num_seeds: trainings side by side; each calls the programs from its own threads.
     """
-    found, team = stages(config, world), Team(num_seeds)
+    found, trainings = stages(config, world), Trainings(num_seeds)
 
-    def program(stage: Stage, part: str) -> Program | TeamProgram:
+    def program(stage: Stage, part: str) -> Program | SharedProgram:
         alone = Program(compiler, _name(stage), part)
-        return alone if stage.has_rows or num_seeds == 1 else TeamProgram(alone, team, workers)
+        is_shared = num_seeds > 1 and not stage.has_rows
+        return SharedProgram(alone, trainings, workers) if is_shared else alone
 
     programs = Programs(
         config=config,
@@ -121,7 +122,7 @@ def compile_programs(
         },
         player=Future(),
         workers=workers,
-        team=team,
+        trainings=trainings,
     )
 
     thread = ThreadPoolExecutor(1)

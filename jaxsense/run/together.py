@@ -19,7 +19,7 @@ from jaxsense.run.devices import ALONE, Workers
 _PATIENCE = 0.5  # s without another call, after which those that wait stop waiting for the others
 
 
-class Team:
+class Trainings:
     """Trainings side by side.
 
     Attributes:
@@ -32,7 +32,7 @@ class Team:
         self._lock = threading.Lock()
 
     def begin(self, number: int) -> None:
-        """Begins `number` trainings, at most as many as the team has places."""
+        """Begins `number` trainings, at most `self.number`."""
         self.active = number
 
     def leave(self) -> None:
@@ -41,19 +41,19 @@ class Team:
             self.active -= 1
 
 
-class TeamProgram:
-    """A `Program` that every training of a team calls with its own arguments."""
+class SharedProgram:
+    """A `Program` that every training calls with its own arguments."""
 
-    def __init__(self, program: Program, team: Team, workers: Workers = ALONE):
-        """Shares a program in a team.
+    def __init__(self, program: Program, trainings: Trainings, workers: Workers = ALONE):
+        """Shares a program among trainings.
 
         Args:
           program: compiles and runs the stacked calls.
-          team: calls it.
-          workers: accelerators that share the trainings, if their number divides the team's.
+          trainings: call it.
+          workers: accelerators that share the trainings, if their number divides theirs.
         """
-        self._program, self._team = program, team
-        self._workers = workers if team.number % workers.number == 0 else ALONE
+        self._program, self._trainings = program, trainings
+        self._workers = workers if trainings.number % workers.number == 0 else ALONE
         self._whole: tuple[int, ...] = ()
         self._lock = threading.Lock()
         self._waiting: list[tuple[tuple[Any, ...], Future[Any]]] = []
@@ -67,7 +67,7 @@ class TeamProgram:
         whole: tuple[int, ...] = (),
     ) -> Any:
         """See `Program.compile`; all trainings share the arguments in `whole`."""
-        self._whole, number = whole, self._team.number
+        self._whole, number = whole, self._trainings.number
         axes = tuple(None if i in whole else 0 for i in range(len(args)))
         shapes = shapes_of(args)
         stacked = [
@@ -109,16 +109,16 @@ class TeamProgram:
         """The calls to make now: one per training, or all that have waited too long."""
         with self._lock:
             is_late = time.monotonic() - self._last > _PATIENCE
-            if not (len(self._waiting) >= self._team.active or is_late):
+            if not (len(self._waiting) >= self._trainings.active or is_late):
                 return []
-            number = self._team.number
+            number = self._trainings.number
             calls, self._waiting = self._waiting[:number], self._waiting[number:]
             return calls
 
     def _run(self, calls: list[tuple[tuple[Any, ...], Future[Any]]]) -> None:
         """Makes calls together; an empty place repeats the first call."""
         rows = [args for args, _ in calls]
-        rows += rows[:1] * (self._team.number - len(rows))
+        rows += rows[:1] * (self._trainings.number - len(rows))
         stacked = [
             column[0] if i in self._whole else jax.tree.map(lambda *x: jnp.stack(x), *column)
             for i, column in enumerate(zip(*rows, strict=True))

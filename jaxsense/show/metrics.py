@@ -155,7 +155,7 @@ SIGMA_NORM = (
         "to 1.25",
     ),
 )
-"""The range of `summary["jmvae"]["sigma_norm"]`."""
+"""The range of `summary["jmvae"]["sigma_norm"]`, over the classes of which each is said."""
 
 BELIEFS = (
     Metric(
@@ -218,7 +218,7 @@ MISSIONS = (
     Metric(
         "ambiguous_reported",
         "ambiguous",
-        "One robot alone: of the points that it cannot tell apart, the share shown as ambiguous.",
+        "One robot alone: of the points that it cannot distinguish, the share shown as ambiguous.",
     ),
     Metric("episodes", "missions", digits=0),
     Metric("seed", "seed", "Of the arenas; none if the run itself played the missions.", digits=0),
@@ -228,6 +228,7 @@ MISSIONS = (
 BLOCKS = {
     "detectors.MODALITY": DETECTORS,
     "jmvae": LATENT_SPACE,
+    "jmvae.sigma_norm": SIGMA_NORM,
     "belief": BELIEFS,
     "dqn.MODALITY": AGENTS,
     "mission.POLICY": MISSIONS,

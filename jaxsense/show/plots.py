@@ -27,7 +27,7 @@ from jaxsense.vae.metrics import reliability
 
 _MOST_ELLIPSES = 40
 _SMOOTHING = 20  # epochs
-_LEAST_SHARE = 1e-4
+_LEAST_SHARE = 1e-4  # of wrong points, which stands for all that is less
 _NUM_COLOURS = 10  # of matplotlib's cycle
 _FAR = 0.2  # sigma from the median of its class, beyond which a detection is an outlier
 
@@ -299,7 +299,9 @@ def missions(block: dict[str, Any]) -> Figure:
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("share of wrong points")
     axes[0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes[0].yaxis.set_major_formatter(lambda share, _: f"{100 * share:g}%")
+    axes[0].yaxis.set_major_formatter(lambda share, _: _percent(share))
+    if min(map(_wrong, found.values())) == _LEAST_SHARE:
+        axes[0].set_ylim(bottom=0.8 * _LEAST_SHARE)
     axes[0].yaxis.set_minor_formatter(NullFormatter())
     axes[1].legend(loc="upper left")
     return figure
@@ -389,3 +391,9 @@ def _times(ax: Any, places: list[dict[str, Any]], key: str) -> None:
 def _wrong(case: dict[str, Any]) -> float:
     """The share of wrong points of a case, above 0 for an axis of logarithms."""
     return max(1 - metrics.mean(case["accuracy"]), _LEAST_SHARE)
+
+
+def _percent(share: float) -> str:
+    """A share of wrong points as text."""
+    is_least = share < 1.01 * _LEAST_SHARE
+    return f"{'≤ ' if is_least else ''}{100 * share:g}%"

@@ -130,6 +130,6 @@ def moment_matching_error(belief: Belief, components: Belief) -> jax.Array:
 
 
 def consistent_classes(label_of_class: tuple[int, ...]) -> np.ndarray:
-    """Pairs of classes, `[C, C]` bool, that a modality with these labels cannot tell apart."""
+    """Pairs of classes, `[C, C]` bool, that a modality with these labels cannot distinguish."""
     labels = np.array(label_of_class)
     return labels[:, None] == labels[None, :]

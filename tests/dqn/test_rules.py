@@ -1,4 +1,4 @@
-"""Rules by hand for teams, as worked by hand."""
+"""Hand-written rules for teams, against values worked by hand."""
 
 import jax
 import jax.numpy as jnp

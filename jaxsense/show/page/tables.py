@@ -55,7 +55,7 @@ def policies(summary: Summary) -> list[Row]:
 
 
 def latent_space(summary: Summary) -> list[Row]:
-    """The JMVAE, with a single column."""
+    """The JMVAE and the beliefs of its map, with a single column."""
     block = summary["jmvae"]
     pairs = [
         (mean(norm), mean(is_clear) > 0.5)
@@ -72,7 +72,8 @@ def latent_space(summary: Summary) -> list[Row]:
         )
         for i, metric in enumerate(metrics.SIGMA_NORM)
     ]
-    return [units, *norms, *others]
+    beliefs = [_row(metric, [summary["belief"]]) for metric in metrics.BELIEFS]
+    return [units, *norms, *others, *beliefs]
 
 
 def _range(values: list[float]) -> str:
