@@ -30,6 +30,19 @@ PROGRAM = "jaxsense.evaluate"
 
 
 @dataclasses.dataclass(frozen=True)
+class ArenaArguments:
+    """Another arena than the run's."""
+
+    num_pois: int | None = None
+    """Number of points of interest, if another than the run's."""
+    side: float | None = None
+    """Inner length and width of the arena, in metres, if others than the run's."""
+
+    def __post_init__(self):
+        require_types(self)
+
+
+@dataclasses.dataclass(frozen=True)
 class Arguments:
     """Play missions with the policies of a finished run, and compare them in the same arenas."""
 
@@ -44,10 +57,7 @@ class Arguments:
     `auction` or `rollout`; `policies` for all; `ROBOT_alone`, `ROBOT_stops` or `ROBOT_blind`, as in
     `camera_alone`, for the latent policy where that robot is alone, stops or goes blind after 6 s;
     or `all`."""
-    num_pois: Annotated[int | None, tyro.conf.arg(name="arena.num-pois")] = None
-    """Number of points of interest, if another than the run's."""
-    side: Annotated[float | None, tyro.conf.arg(name="arena.side")] = None
-    """Inner length and width of the arena, in metres, if others than the run's."""
+    arena: ArenaArguments = ArenaArguments()
     robots: tuple[str, ...] | None = None
     """The robots, each the modality of its sensor, if others than the run's; for example
     `camera camera lidar`."""
@@ -81,6 +91,7 @@ def main(argv: list[str] | None = None) -> None:
         # If these files cannot be written, fail now rather than after minutes of work.
         with files.locked(arguments.run, waits=True):
             summary = rundir.read_summary(arguments.run)
+            _pictures(arguments.run, trained, summary)
             page.write(arguments.run, trained, summary)
             rundir.write_json(path, summary)
     except ConfigError as error:
@@ -157,11 +168,23 @@ def _write(
             summary["mission"] = _merge(summary["mission"], found, arguments)
         else:
             _add_elsewhere(summary, config, found, arguments)
+        pictures = _pictures(arguments.run, trained, summary)
         rundir.write_json(path, summary)
-        plots.write_missions(arguments.run, summary)
-        plots.write_teams(arguments.run, trained, summary)
+        for name, content in pictures.items():
+            files.write(arguments.run / name, content)
         report = page.write(arguments.run, trained, summary)
     return [*written, f"The metrics are in {path}, and with all others in {report}."]
+
+
+def _pictures(run: Path, config: Config, summary: dict[str, Any]) -> dict[str, bytes]:
+    """The plots of missions; raises `ConfigError` if the summary is not that of a run."""
+    try:
+        for place in (summary, *summary.get("elsewhere", {}).values()):
+            compare.compared(metrics.cases(place["mission"]))
+        return plots.of_missions(config, summary)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        reason = f"must hold the summary.json of a finished run ({error!r})"
+        raise ConfigError("run", str(run), reason) from None
 
 
 def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) -> dict[str, Any]:
@@ -198,7 +221,7 @@ def _name(config: Config) -> str:
 
 def _elsewhere(arguments: Arguments, config: Config) -> Config:
     """The run's settings with the arena and the team of these missions."""
-    sizes = {"num_pois": arguments.num_pois, "side": arguments.side}
+    sizes = dataclasses.asdict(arguments.arena)
     changed = {name: value for name, value in sizes.items() if value is not None}
     arena = dataclasses.replace(config.arena, **changed)
     # The Q-network of one agent has an input for each PoI.

@@ -108,9 +108,9 @@ def main(argv: list[str] | None = None) -> None:
     path = arguments.out or arguments.run / "exported.zip"
     try:
         config, models = rundir.load(arguments.run, arguments.trust)
-        with files.reserved(path):
+        with files.new(path) as file:
             content = archive(config, models)
-            files.write(path, content)
+            file.write(content)
     except FileExistsError:
         cli.fail(PROGRAM, str(ConfigError("out", str(path), "exists already; must be a new file")))
     except ConfigError as error:

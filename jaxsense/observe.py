@@ -5,8 +5,6 @@ from stored detections of those scans. Features of single looks have the same di
 looks of one scene share its light.
 """
 
-import math
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -81,7 +79,7 @@ def team_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> TeamMd
     def new_places(key: Key, number: jax.Array, num_robots: int) -> tuple[jax.Array, jax.Array]:
         """Each PoI at a random place in a cell of its own, robots anywhere."""
         del number
-        per_side = math.ceil(math.sqrt(2 * num_pois))
+        per_side = settings.cells_per_side
         draws = jax.random.uniform(key, (1 + per_side**2 + 2 * num_pois + 3 * num_robots,))
         side = settings.sides[0] + (settings.sides[1] - settings.sides[0]) * draws[0]
         order, draws = draws[1 : 1 + per_side**2], draws[1 + per_side**2 :]
@@ -95,7 +93,8 @@ def team_mdp(config: Config, bank: Bank, params: Params, model: Jmvae) -> TeamMd
         poses = jnp.concatenate([reach * places[:, :2], jnp.pi * places[:, 2:]], axis=-1)
         return positions, poses
 
-    return TeamMdp(settings, bank_mdp(config, bank, params, model, num_pois), new_places)
+    mapped = bank_mdp(config, bank, params, model, num_pois)
+    return TeamMdp(settings, mapped, new_places, config.modalities)
 
 
 def _mdp(

@@ -133,9 +133,33 @@ def test_evaluate_prints_the_comparison(evaluated):
         assert words in printed
 
 
+@pytest.mark.parametrize(
+    ("place", "change"),
+    [
+        ("home", {"time_s": None}),
+        ("home", {"accuracy": "all"}),
+        ("home", {"observations_per_poi": {}}),
+        ("elsewhere", {"time_s": {}}),
+    ],
+)
+def test_a_summary_that_no_plot_can_show_is_refused(place, change):
+    case = {"episodes": 2, "accuracy": 1.0, "observations_per_poi": 2.0, "time_s": 9.0}
+    arena = {"num_pois": 8, "side": 4.0, "robots": ["camera"]}
+    sound = {"naive": case, "naive_2": case, "latent": case}
+    broken = {**sound, "naive": {**case, **change}}
+    summary = {"mission": sound, "elsewhere": {"there": {**arena, "mission": sound}}}
+    pictures = evaluate._pictures(Path("run"), PRESETS["smoke"], summary)
+    assert [*pictures] == ["policies.png", "teams.png"]
+    (summary if place == "home" else summary["elsewhere"]["there"])["mission"] = broken
+    with pytest.raises(ConfigError, match=r"run = 'run': must hold the summary.json of a finished"):
+        evaluate._pictures(Path("run"), PRESETS["smoke"], summary)
+
+
 def test_missions_elsewhere_have_the_settings_that_are_asked_for():
     config, path = PRESETS["smoke"], Path("run")
-    arguments = evaluate.Arguments(path, side=4.0, robots=("camera", "camera", "lidar"))
+    arguments = evaluate.Arguments(
+        path, arena=evaluate.ArenaArguments(side=4.0), robots=("camera", "camera", "lidar")
+    )
     there = evaluate._elsewhere(arguments, config)
     assert (there.arena.side, there.arena.num_pois) == (4.0, 3)
     assert there.carried == ("camera", "camera", "lidar")
@@ -144,10 +168,14 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
     crowd = dataclasses.replace(there, robots=("camera", "lidar") * 32)
     assert evaluate._name(crowd) == "3-points-4-m-32-camera-32-lidar"
     # However it is named, a team plays in the same arenas.
-    mixed = evaluate.Arguments(path, side=4.0, robots=("camera", "lidar", "camera"))
+    mixed = evaluate.Arguments(
+        path, arena=evaluate.ArenaArguments(side=4.0), robots=("camera", "lidar", "camera")
+    )
     assert evaluate._elsewhere(mixed, config) == there
     # What is asked for is no other place if the run has it already.
-    same = evaluate.Arguments(path, num_pois=3, side=3.0, robots=("lidar", "camera"))
+    same = evaluate.Arguments(
+        path, arena=evaluate.ArenaArguments(3, 3.0), robots=("lidar", "camera")
+    )
     assert evaluate._elsewhere(same, config) == config
     # A policy for any number of points has no limit to the looks of a start.
     team = PRESETS["team"]
@@ -157,12 +185,14 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
         team=dataclasses.replace(team.team, num_pois=(3, 8)),
         evaluation=dataclasses.replace(team.evaluation, num_pois=(3, 8)),
     )
-    there = evaluate._elsewhere(evaluate.Arguments(path, num_pois=30, side=8.0), partly)
+    there = evaluate._elsewhere(
+        evaluate.Arguments(path, arena=evaluate.ArenaArguments(30, 8.0)), partly
+    )
     assert there.arena.num_pois == 30
     with pytest.raises(
         ConfigError, match=r"arena\.num_pois = 4: the policies of this run are for 3"
     ):
-        evaluate._elsewhere(evaluate.Arguments(path, num_pois=4), config)
+        evaluate._elsewhere(evaluate.Arguments(path, arena=evaluate.ArenaArguments(4)), config)
 
 
 @pytest.mark.slow  # compiles missions of three robots

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from smoke import error_line
 
 from jaxsense import export
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
@@ -261,18 +262,28 @@ def test_bad_input_is_one_line_and_overwrites_nothing(run, tmp_path, capsys, pro
     assert list(tmp_path.iterdir()) == [existing]
 
 
-def test_a_file_that_appears_meanwhile_is_not_replaced(run, tmp_path, monkeypatch):
+def test_a_file_that_appears_meanwhile_is_not_replaced(run, tmp_path, monkeypatch, capsys):
     path = tmp_path / "x.zip"
 
     def meanwhile(*_):
-        with pytest.raises(FileExistsError):  # the name is taken
-            path.open("x")
-        raise KeyboardInterrupt
+        path.write_text("of another process", encoding="utf-8")
+        return b"ours"
 
     monkeypatch.setattr(export, "archive", meanwhile)
+    line = error_line([str(run), "--out", str(path)], capsys, export)
+    assert "x.zip': exists already; must be a new file" in line
+    assert [*tmp_path.iterdir()] == [path]
+    assert path.read_text(encoding="utf-8") == "of another process"
+
+
+def test_an_export_that_is_stopped_leaves_nothing(run, tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(export, "archive", stop)
     with pytest.raises(KeyboardInterrupt):
-        export.main([str(run), "--out", str(path)])
-    assert not path.exists()
+        export.main([str(run), "--out", str(tmp_path / "x.zip")])
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_package_that_is_not_installed_can_export(models, monkeypatch):

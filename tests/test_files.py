@@ -244,17 +244,31 @@ def test_only_what_a_write_has_left_is_removed(tmp_path):
     assert all((tmp_path / name).exists() for name in kept)
 
 
-def test_a_reserved_file_is_nobody_elses_and_goes_if_writing_fails(tmp_path):
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_new_file_has_its_name_once_it_is_whole_and_takes_that_of_no_other(
+    tmp_path, monkeypatch, has_links
+):
+    def without_links(*_):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    if not has_links:
+        monkeypatch.setattr(os, "link", without_links)
     path = tmp_path / "file"
-    with files.reserved(path):
-        assert path.read_bytes() == b""
-        with pytest.raises(FileExistsError), files.reserved(path):
-            pass
-        files.write(path, "new")
-    assert path.read_text(encoding="utf-8") == "new"
-    with pytest.raises(ZeroDivisionError), files.reserved(tmp_path / "other"):
+    with files.new(path) as file:
+        file.write(b"new")
+        assert not path.exists()
+        (partial,) = tmp_path.iterdir()
+        assert files.is_unfinished(partial, "file")
+    assert path.read_bytes() == b"new"
+    with pytest.raises(FileExistsError), files.new(path):
+        pass
+    other = tmp_path / "other"
+    with pytest.raises(ZeroDivisionError), files.new(other):
         1 / 0  # noqa: B018
-    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(FileExistsError), files.new(other) as file:
+        other.write_text("of another process", encoding="utf-8")
+    assert other.read_text(encoding="utf-8") == "of another process"
+    assert sorted(tmp_path.iterdir()) == [path, other]
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,18 @@ def test_a_directory_of_somebody_gets_no_lock(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
+@pytest.mark.parametrize("opens", [rundir.resumable, rundir.load])
+def test_a_config_that_has_changed_since_the_run_began_is_refused(tmp_path, opens):
+    path = tmp_path / "run"
+    with RunDirectory.create(path, SETTINGS):
+        pass
+    file = path / "config.json"
+    file.write_text(file.read_text().replace('"seed": 3', '"seed": 7'), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"config.json has changed since the run began"):
+        opens(path)
+    assert rundir.read_settings(file).seed == 7  # for another run
+
+
 def test_a_line_that_a_killed_process_has_left_is_cut(tmp_path):
     path = tmp_path / "run"
     with RunDirectory.create(path, SETTINGS) as run:

@@ -231,10 +231,16 @@ class TeamConfig:
         require(most <= 64, self, "num_pois", "must be numbers from 1 to 64")
         require_positive(self, "robots_each", "max_steps")
         require_at_most(self, robots_each=8, max_steps=100_000)
-        require(0 < self.sides[0] <= self.sides[1] <= 100, self, "sides", "must be two lengths")
+        is_right = 0 < self.sides[0] <= self.sides[1] <= 100
+        require(is_right, self, "sides", "must be two lengths of at most 100 m, the shorter first")
         for name in ("alone", "partly_seen"):
             require(0 <= getattr(self, name) <= 1, self, name, "must be within 0 and 1")
         require_not_negative(self, "second_cost")
+
+    @property
+    def cells_per_side(self) -> int:
+        """Cells along a side of an arena, one of which each PoI has to itself."""
+        return math.ceil(math.sqrt(2 * self.num_pois[1]))
 
 
 @section

@@ -10,6 +10,7 @@ from jaxsense.config.learning import (
     MdpConfig,
     TeamConfig,
     ToursConfig,
+    TravelConfig,
 )
 from jaxsense.config.mission import POLICIES, MissionConfig, NavigationConfig
 from jaxsense.config.scene import ArenaConfig, CameraConfig, LidarConfig, ViewpointConfig
@@ -83,6 +84,7 @@ _NOISY = Config(
     jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000, restarts=1),
     mdp=MdpConfig(reward="nats", look_cost=0.1),
     dqn=DqnConfig(observe="bank", discount=0.2),
+    team=TeamConfig(travel=TravelConfig(view_distance=3.5), sides=(4.0, 9.0)),
     evaluation=EvaluationConfig(num_histories=65520, value_points=8192, value_looks=128),
     navigation=NavigationConfig(view_distances=(0.5, 0.9), view_range=4.0),
     mission=MissionConfig(policies=POLICIES, episodes=64, least_confidence=0.0, equal_values=0.05),

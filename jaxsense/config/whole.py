@@ -104,6 +104,10 @@ class Config:
             if self.dqn.observe != "bank":
                 reason = "must be 'bank' with dqn.task = 'team', whose MDP has no scans"
                 raise ConfigError("dqn.observe", self.dqn.observe, reason)
+            least = self.team.cells_per_side * self.arena.poi_pitch
+            if self.team.sides[0] < least:
+                reason = f"must be at least {least:.2f} m, where {self.team.num_pois[1]} PoIs fit"
+                raise ConfigError("team.sides", self.team.sides, reason)
         elif self.evaluation.num_pois:
             reason = "needs dqn.task = 'team', whose policy is for any number; must be empty"
             raise ConfigError("evaluation.num_pois", self.evaluation.num_pois, reason)

@@ -76,11 +76,13 @@ class TeamMdp:
       config: the teams, and the price of time.
       map: the map MDP, with the largest number of PoIs.
       new_places: `(key, number of PoIs, R) -> (positions [N, 2], poses [R, 3])`.
+      modalities: names of the sensors, in the order of their indices.
     """
 
     config: TeamConfig
     map: MapMdp
     new_places: Callable[[Key, jax.Array, int], tuple[jax.Array, jax.Array]]
+    modalities: tuple[str, ...]
 
 
 def travel_seconds(config: TravelConfig, pose: jax.Array, places: jax.Array) -> jax.Array:

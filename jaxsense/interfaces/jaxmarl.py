@@ -80,7 +80,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
           `__all__` is whether the episode is over. `seconds`, `[R]` and the same for all, are those
           that passed.
         """
-        chosen = jnp.stack([jnp.asarray(actions[agent], jnp.int32) for agent in self.agents])
+        chosen = jnp.stack([jnp.asarray(actions[agent]) for agent in self.agents])
         after, outcome = team.step(key, self.mdp, state.team, chosen)
         dones = outcome.terminated | outcome.truncated
         ended = jnp.all(dones)

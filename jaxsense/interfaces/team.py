@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxsense.config import Config
+from jaxsense.config import Config, values
 from jaxsense.dqn import team_mdp
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.types import Key
@@ -38,9 +38,10 @@ def check_team(mdp: TeamMdp, config: Config) -> None:
     """Raises `ValueError` unless it is the MDP of a team with the sensors of the settings."""
     if not isinstance(mdp, TeamMdp):
         raise ValueError(f"mdp = {type(mdp).__name__}: must be a TeamMdp, from interfaces.team_mdp")
-    number = mdp.map.num_modalities
-    if len(config.modalities) != number:
-        raise ValueError(f"config.modalities = {config.modalities}: must be {number}, as in mdp")
+    if config.modalities != mdp.modalities:
+        raise ValueError(
+            f"config.modalities = {config.modalities}: must be {mdp.modalities}, as in mdp"
+        )
 
 
 def observation_size(mdp: TeamMdp) -> int:
@@ -86,7 +87,8 @@ def step(
       mdp: the MDP.
       state: the current state.
       actions: `[R]` int32, of which only that of robot `state.agent` counts. A PoI that is not
-        present counts as NOP.
+        present counts as NOP. Under `jit` nothing can be checked: an action that does not exist
+        has a reward of NaN.
 
     Returns:
       The next state and the outcome. The robot that has looked, which chooses next, earns the
@@ -94,9 +96,10 @@ def step(
     """
     num_robots, num_pois = len(state.team.works), mdp.map.num_pois
     chex.assert_shape(actions, (num_robots,), custom_message="actions")
+    values.require_index("actions", actions, num_pois + 1)
     action = actions[state.agent]
-    is_there = jnp.append(state.team.present, True)[action]
-    after, outcome = team_mdp.step(key, mdp, state, jnp.where(is_there, action, num_pois))
+    is_absent = jnp.any(~state.team.present & (jnp.arange(num_pois) == action))
+    after, outcome = team_mdp.step(key, mdp, state, jnp.where(is_absent, num_pois, action))
     works, seconds = after.team.works, outcome.seconds
     price = mdp.config.second_cost * seconds  # pyright: ignore
     earned = jnp.where(jnp.arange(num_robots) == after.agent, outcome.reward, 0.0)

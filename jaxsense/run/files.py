@@ -1,12 +1,14 @@
 """Writes files as a whole or not at all, and locks directories."""
 
 import contextlib
+import errno
 import hashlib
 import os
 import re
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import filelock
 
@@ -30,8 +32,7 @@ def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
     Raises:
       WriteError: names the file, which is then unchanged.
     """
-    # A unique name, as another process may write the same file.
-    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(8)}.unfinished")
+    unfinished = _unfinished(path)
     try:
         unfinished.touch(mode, exist_ok=False)
         with unfinished.open("wb") as file:
@@ -63,19 +64,42 @@ def remove_unfinished(directory: Path) -> None:
 
 
 @contextlib.contextmanager
-def reserved(path: Path) -> Iterator[None]:
-    """Reserves a file's name by an empty file, which is removed if the context fails.
+def new(path: Path) -> Iterator[IO[bytes]]:
+    """Opens a new file, which has its name only once it is whole.
 
     Raises:
-      FileExistsError: if the path exists.
+      FileExistsError: if the path exists, now or at the end.
       OSError: if it cannot be written.
     """
-    path.open("xb").close()
+    if path.exists():
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    unfinished = _unfinished(path)
     try:
-        yield
-    except BaseException:
-        path.unlink(missing_ok=True)
+        with unfinished.open("xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        _name(unfinished, path)
+        _sync(path.parent)
+    finally:
+        with contextlib.suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+
+
+def _name(unfinished: Path, path: Path) -> None:
+    """Names a file; raises `FileExistsError` if another has this name."""
+    try:
+        os.link(unfinished, path)
+    except FileExistsError:
         raise
+    except OSError:  # without links
+        path.open("xb").close()
+        unfinished.replace(path)
+
+
+def _unfinished(path: Path) -> Path:
+    """A name for a partial file, unique as another process may write the same file."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(8)}.unfinished")
 
 
 def append(path: Path, line: str) -> None:

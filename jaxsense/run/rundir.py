@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import errno
+import hashlib
 import itertools
 import json
 import subprocess
@@ -86,6 +87,7 @@ class RunDirectory:
             "versions": versions(),
             "commit": commit(),
         }
+        content["digest"] = _digest(content)
         reason = "cannot be written ({}); must be a new directory"
         with contextlib.ExitStack() as kept:
             try:
@@ -180,7 +182,7 @@ def resumable(path: Path, trust: bool = False) -> Settings:
         without trust.
     """
     content = _read_config(path / "config.json", "resume", path)
-    _check_version(content, "resume", path)
+    _check_origin(content, "resume", path)
     if (path / "summary.json").exists():
         raise ConfigError("resume", str(path), "is finished; must be a stopped run")
     return _settings_of(content, trust)
@@ -240,6 +242,7 @@ def read_summary(path: Path) -> dict[str, Any]:
         parts = {"timing", *BLOCKS}
         if not isinstance(summary, dict) or not parts <= set(summary):
             raise ValueError(f"must be an object with {', '.join(sorted(parts))}")
+        json.dumps(summary, allow_nan=False)  # raises what `write_json` would raise
         return summary
     except (OSError, ValueError) as error:
         reason = f"must hold the summary.json of a finished run ({error})"
@@ -262,7 +265,7 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     """
     path = Path(path)
     content = _read_config(path / "config.json", "run", path)
-    _check_version(content, "run", path)
+    _check_origin(content, "run", path)
     config = _settings_of(content, trust).config
     shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
     checkpoints = Checkpoints(path / "checkpoints")
@@ -317,7 +320,8 @@ def _read_config(file: Path, field: str, value: Path) -> dict[str, Any]:
 
 def _settings_of(content: dict[str, Any], trust: bool) -> Settings:
     """The settings in the content of a `config.json`."""
-    unknown = sorted(set(content) - {"preset", "seed", "num_seeds", "config", "versions", "commit"})
+    known = {"preset", "seed", "num_seeds", "config", "versions", "commit", "digest"}
+    unknown = sorted(set(content) - known)
     if unknown:
         raise ConfigError(unknown[0], content[unknown[0]], "is no field of a run's config.json")
     preset = content.get("preset", "default")
@@ -333,10 +337,22 @@ def _settings_of(content: dict[str, Any], trust: bool) -> Settings:
     return Settings(preset, config=config, **numbers)
 
 
-def _check_version(content: dict[str, Any], field: str, path: Path) -> None:
-    """Raises `ConfigError` if a version whose checkpoints may differ wrote the run."""
+def _digest(content: dict[str, Any]) -> str:
+    """SHA-256 of the content of a `config.json`, without its digest."""
+    rest = {name: value for name, value in content.items() if name != "digest"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def _check_origin(content: dict[str, Any], field: str, path: Path) -> None:
+    """Raises `ConfigError` about a `config.json` to which the run's checkpoints may not belong.
+
+    A version whose checkpoints may differ wrote it, or it has changed since the run began.
+    """
     recorded = content.get("versions")
     wrote = recorded.get("jaxsense") if isinstance(recorded, dict) else None
     if not isinstance(wrote, str) or wrote.split(".")[:2] != __version__.split(".")[:2]:
         by = f"jaxsense {wrote}" if wrote else "an older jaxsense"
         raise ConfigError(field, str(path), f"was written by {by}; this is {__version__}")
+    if content.get("digest") not in (None, _digest(content)):
+        reason = "config.json has changed since the run began; start a new run with --config"
+        raise ConfigError(field, str(path), reason)

@@ -40,35 +40,33 @@ def write_plots(path: Path, config: Config, result: RunResult) -> None:
         "reward": rewards(result.rewards, summary["dqn"]),
         "scanlines": scanlines(config, result.windows),
         "calibration": calibration(config, result.detections, summary["belief"]),
+        "policies": missions(summary["mission"]),
     }
     for name, figure in plots.items():
-        _write(path / f"{name}.png", figure)
-    write_missions(path, summary)
+        files.write(path / f"{name}.png", _png(figure))
 
 
 def write_seeds(
     path: Path, curves: dict[str, dict[str, np.ndarray]], summary: dict[str, Any]
 ) -> None:
     """Writes the plots of several seeds into a directory; for `curves` see `rewards`."""
-    _write(path / "reward.png", rewards(curves, summary["dqn"]))
-    write_missions(path, summary)
+    figures = {"reward": rewards(curves, summary["dqn"]), "policies": missions(summary["mission"])}
+    for name, figure in figures.items():
+        files.write(path / f"{name}.png", _png(figure))
 
 
-def write_missions(path: Path, summary: dict[str, Any]) -> None:
-    """Writes `policies.png` of one run or several seeds into a directory."""
-    _write(path / "policies.png", missions(summary["mission"]))
-
-
-def write_teams(path: Path, config: Config, summary: dict[str, Any]) -> None:
-    """Writes `teams.png` of a run that has played in other arenas or with other robots."""
+def of_missions(config: Config, summary: dict[str, Any]) -> dict[str, bytes]:
+    """The files `policies.png` and, with missions elsewhere, `teams.png`, by their names."""
+    figures = {"policies.png": missions(summary["mission"])}
     if "elsewhere" in summary:
-        _write(path / "teams.png", teams(config, summary))
+        figures["teams.png"] = teams(config, summary)
+    return {name: _png(figure) for name, figure in figures.items()}
 
 
-def _write(path: Path, figure: Figure) -> None:
+def _png(figure: Figure) -> bytes:
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=120)
-    files.write(path, content.getvalue())
+    return content.getvalue()
 
 
 def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:

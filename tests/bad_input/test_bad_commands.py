@@ -2,7 +2,9 @@
 
 import ast
 import contextlib
+import io
 import json
+import math
 import subprocess
 import sys
 import time
@@ -23,7 +25,7 @@ from jaxsense.run import pipeline
 from jaxsense.run.files import WriteError
 from jaxsense.run.monitor import StageError
 from jaxsense.run.rundir import RunDirectory, Settings, read_settings
-from jaxsense.run.together import Team
+from jaxsense.run.together import Trainings
 
 SECONDS = 10.0
 
@@ -207,8 +209,17 @@ def test_train_refuses_numbers(section, name, text, place, capsys):
 @given(st.lists(st.one_of(st.sampled_from(["--seed", "--out", "--dqn.epochs", "--config", "--"]),
                           st.text(max_size=4)), min_size=1, max_size=4))  # fmt: skip
 def test_train_reads_or_refuses_any_words(argv):
-    with contextlib.suppress(SystemExit):
-        train.parse(argv)
+    told, status = io.StringIO(), None
+    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            train.parse(argv)
+        except SystemExit as stop:
+            status = stop.code
+    assert status in (None, 0, 2)  # 0 after `-h`
+    lines = told.getvalue().splitlines()
+    assert len(lines) == (status == 2)
+    for line in lines:
+        check_message(line)
 
 
 OTHERS = [
@@ -278,6 +289,7 @@ SUMMARIES = [
     (b"[]", "must be an object with belief, detectors"),
     (b"\xff", "must hold the summary.json of a finished run"),
     (b"[" * 100_000, "nested too deeply"),
+    (json.dumps({**PARTS, "belief": {}, "dqn": math.nan}).encode(), "not JSON compliant"),
     (json.dumps(PARTS).encode(), "must hold the summary.json of a finished run"),
     (json.dumps({**PARTS, "dqn": 3}).encode(), "must hold the summary.json of a finished run"),
     (json.dumps({**PARTS, "jmvae": {"unambiguous": []}}).encode(), "must hold the summary.json"),
@@ -328,7 +340,7 @@ def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsy
     def fails(*_):
         raise error
 
-    compiled = SimpleNamespace(team=Team(1))
+    compiled = SimpleNamespace(trainings=Trainings(1))
     monkeypatch.setattr(pipeline, "compiled", lambda *_: contextlib.nullcontext(compiled))
     monkeypatch.setattr(pipeline, "run", fails)
     argv = ["--preset", "smoke", "--quiet", "--cache", "None", "--out", str(tmp_path / "run")]

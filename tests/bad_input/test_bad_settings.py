@@ -202,6 +202,7 @@ CHANGES = [
         {
             "dqn.task": "team",
             "team.num_pois": (3, 16),
+            "team.sides": (4.0, 6.0),
             "mdp.partly_seen_starts": True,
         },
         "mdp.partly_seen_starts = True: needs 2 to 30 pairs of PoI and modality, not 32; must be",
@@ -226,6 +227,10 @@ CHANGES = [
     ({"team.robots_each": 9}, "team.robots_each = 9: must be at most 8"),
     ({"team.sides": (0.0, 3.0)}, "team.sides = (0.0, 3.0): must be two lengths"),
     ({"team.sides": (4.0, 3.0)}, "team.sides = (4.0, 3.0): must be two lengths"),
+    (
+        {"dqn.task": "team", "dqn.observe": "bank", "team.sides": (2.0, 3.0)},
+        "team.sides = (2.0, 3.0): must be at least 2.33 m, where 8 PoIs fit",
+    ),
     ({"team.sides": (4.0, 101.0)}, "team.sides = (4.0, 101.0): must be two lengths"),
     ({"team.alone": 1.1}, "team.alone = 1.1: must be within 0 and 1"),
     ({"team.partly_seen": 1.1}, "team.partly_seen = 1.1: must be within 0 and 1"),

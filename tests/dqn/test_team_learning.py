@@ -23,7 +23,7 @@ SMALL = DqnConfig(
 
 def team_of(mapped, poses, places, **config):
     given = {"travel": TRAVEL, "robots_each": 1, "alone": 0.0, "partly_seen": 0.0, **config}
-    return TeamMdp(TeamConfig(**given), mapped, lambda *given: (places, poses))
+    return TeamMdp(TeamConfig(**given), mapped, lambda *given: (places, poses), ("camera", "lidar"))
 
 
 # From the origin 6, 11 and 16 s to look, less the turns, see `test_team_mdp.py`.

@@ -27,7 +27,7 @@ def make_mdp(mapped=None, places=PLACES, robots_each=1, **config):
     mapped = classes_mdp(partly_seen_starts=False) if mapped is None else mapped
     poses = jnp.arange(3.0 * robots_each * mapped.num_modalities).reshape(-1, 3)
     given = {"travel": TRAVEL, "num_pois": (1, 3), "robots_each": robots_each, **config}
-    return TeamMdp(TeamConfig(**given), mapped, lambda *given: (places, poses))
+    return TeamMdp(TeamConfig(**given), mapped, lambda *given: (places, poses), ("camera", "lidar"))
 
 
 MDP = make_mdp()

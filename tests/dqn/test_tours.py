@@ -47,7 +47,9 @@ def make_mdp(present=2, max_steps=300):
     mapped = classes_mdp(partly_seen_starts=False)
     given = {"travel": TRAVEL, "num_pois": (present, present), "robots_each": 1, "alone": 1.0}
     settings = TeamConfig(**given, partly_seen=0.0, max_steps=max_steps)
-    return TeamMdp(settings, mapped, lambda *given: (PLACES, jnp.zeros((2, 3))))
+    return TeamMdp(
+        settings, mapped, lambda *given: (PLACES, jnp.zeros((2, 3))), ("camera", "lidar")
+    )
 
 
 def trials_of(present=2, max_steps=300, walk=0, bonus=0.0):

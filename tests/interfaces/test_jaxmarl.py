@@ -250,11 +250,27 @@ def test_the_log_wrapper_sums_rewards(env):
     assert (returned != 0).all()
 
 
+@pytest.mark.parametrize("action", [-3, -1, 5, 100, 0.7])
+def test_actions_that_do_not_exist_are_refused_or_reward_nan(env, step_env, action):
+    _, state = env.reset(jax.random.key(3))
+    actions = {agent: action for agent in AGENTS}
+    with pytest.raises(ValueError, match=r"actions( = |.*: must be a whole number)"):
+        env.step_env(jax.random.key(4), state, actions)
+    if isinstance(action, int):
+        for _ in AGENTS:  # the first look comes after all have chosen
+            _, state, rewards, _, _ = step_env(jax.random.key(4), state, actions)
+        assert np.isnan([*rewards.values()]).any()
+
+
 def test_other_sensors_than_those_of_the_settings_are_named():
     with pytest.raises(
-        ValueError, match=r"config.modalities = \('camera',\): must be 2, as in mdp"
+        ValueError, match=r"config.modalities = \('camera',\): must be \('camera', 'lidar'\), as in"
     ):
         TeamEnv(small.team(), small.ONLY_CAMERAS)
+    # In another order a robot would carry another's sensor.
+    mdp = dataclasses.replace(small.team(), modalities=("lidar", "camera"))
+    with pytest.raises(ValueError, match=r"must be \('lidar', 'camera'\), as in mdp"):
+        TeamEnv(mdp, small.TEAM)
     with pytest.raises(ValueError, match="mdp = MapMdp: must be a TeamMdp"):
         TeamEnv(small.team().map, small.ONLY_CAMERAS)
 

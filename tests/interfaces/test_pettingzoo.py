@@ -120,7 +120,7 @@ def test_seeds_repeat_and_differ(env):
 
 def test_what_cannot_be_is_told(env):
     with pytest.raises(
-        ValueError, match=r"config.modalities = \('camera',\): must be 2, as in mdp"
+        ValueError, match=r"config.modalities = \('camera',\): must be \('camera', 'lidar'\), as in"
     ):
         TeamParallelEnv(small.team(), small.ONLY_CAMERAS)
     fresh = TeamParallelEnv(small.team(), small.TEAM)
