@@ -179,6 +179,7 @@ def check_team_missions(
 ) -> None:
     """Compares the latent policy with naive exploration and with the best of some rules."""
     latent, naive = mission["latent"], mission["naive"]
+    assert not {"time limit", "unreachable"} & set(latent["ended"])
     assert latent["accuracy"] >= naive["accuracy"] - 0.003
     assert latent["time_s"] <= of_naive * naive["time_s"]
     # Means, because medians of so few missions vary by more than the difference.
