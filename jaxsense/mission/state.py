@@ -19,6 +19,7 @@ from jaxsense.types import Belief, Index, Key, pytree
 from jaxsense.vae import fusion
 
 LATENT = POLICIES.index("latent")
+"""Index of the trained policy."""
 
 IDLE, DRIVING, FACING, BACKING, ENDED, FAILED = range(6)
 """Phases of a robot: asking its policy, driving to a viewpoint, turning to a PoI and scanning it,
