@@ -151,6 +151,16 @@ def test_noisy_preset(tmp_path, summary_of):
     assert all(block["ece"] <= 0.02 for block in noisy["detectors"].values())
 
 
+def test_a_team_with_noisy_sensors(tmp_path, summary_of):
+    policies = "--mission.policies", "latent", "naive", "--mission.episodes", "64"
+    found = summary_of("noisy", 0, tmp_path / "team", "--dqn.task", "team", *policies)["mission"]
+    latent, naive = found["latent"], found["naive"]
+    assert latent["accuracy"] >= naive["accuracy"] + 0.02
+    assert latent["mean_time_s"] <= naive["mean_time_s"]
+    # With one robot of each modality and the map policies, one in a hundred missions is late.
+    assert latent["ended"].get("time limit", 0) <= 2
+
+
 def test_team_preset(tmp_path, summary_of, run_program):
     path = tmp_path / "team"
     policies = "latent", "nearest", "auction", "rollout", "naive"

@@ -10,7 +10,9 @@ import functools
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
+from jax.core import Tracer
 from mujoco import mjx
 
 from jaxsense.config import values
@@ -130,6 +132,9 @@ def cast_along(section: CrossSection, origin: jax.Array, direction: Direction) -
     values.require_finite("origin", origin)
     for part in direction:
         values.require_finite("direction", part)
+    if not any(isinstance(part, Tracer) for part in direction):
+        lengths = np.hypot(*map(np.asarray, direction))
+        values.require("length of direction", lengths, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
     # Chosen here and not by `platform_dependent`, which is traced and batched twice as long.
     on_cpu = jax.default_backend() == "cpu"
     nearest = _nearest_by_two_loops if on_cpu else _nearest_by_one_loop

@@ -107,6 +107,7 @@ def look(
         raise ValueError(f"robot = {robot}: must be one of the {len(world.sensors)} robots")
     chex.assert_rank(poi, 0, custom_message="poi")
     values.require_index("poi", poi, world.config.arena.num_pois)
+    values.require_finite("scene.poses", scene.poses)
     viewpoint_key, noise_key = jax.random.split(key)
     others = jnp.delete(scene.poses, robot, axis=0)
     pose, bearing = _viewpoint(viewpoint_key, world, scene.layout, others, poi)

@@ -104,6 +104,12 @@ FUNCTIONS = {
         lambda w: sim.look(w.key, w.world, w.scene, 0, jnp.int32(3)),
         "poi = 3: must be a whole number from 0 to 2",
     ),
+    "look poses": (
+        lambda w: sim.look(
+            w.key, w.world, dataclasses.replace(w.scene, poses=w.scene.poses * NAN), 0, jnp.int32(0)
+        ),
+        "scene.poses = nan: must be finite",
+    ),
     "place": (lambda w: sim.place(w.world.arena, w.scene.layout, jnp.zeros(3)), "poses"),
     "drive": (
         lambda w: sim.drive(w.world.arena, w.world.arena.data, jnp.zeros((3, 2))),
@@ -128,6 +134,12 @@ FUNCTIONS = {
             sim.cross_section(w.world.arena, w.world.arena.data, 0.1, 0), w.x, (w.x, w.x * NAN)
         ),
         "direction = nan: must be finite",
+    ),
+    "cast_along no unit": (
+        lambda w: sim.cast_along(
+            sim.cross_section(w.world.arena, w.world.arena.data, 0.1, 0), w.x, (w.x, w.x * 0)
+        ),
+        "length of direction = ",
     ),
     "fan": (lambda w: sim.fan(0, 90.0), "num_rays = 0: must be a whole number greater than 0"),
     "fan real": (lambda w: sim.fan(1.5, 90.0), "num_rays = 1.5"),
