@@ -94,7 +94,7 @@ def test_a_stopped_run_says_how_to_go_on(stops):
         (lambda path: (path / "summary.json").write_text("{}"), "is finished"),
         (lambda path: edit(path, "versions", {"jaxsense": "0.0.1"}), "was written by jaxsense 0.0"),
         (lambda path: edit(path, "versions", None), "was written by an older jaxsense"),
-        (lambda path: edit(path, "config", {"dqn": {"epoch": 3}}), "epoch = 3: is no setting"),
+        (lambda path: edit(path, "seed", 7), "config.json has changed since the run began"),
     ],
 )
 def test_a_run_that_cannot_go_on_is_named(stopped, cache, tmp_path, capsys, change, expected):
