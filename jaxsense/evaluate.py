@@ -178,13 +178,10 @@ def _write(
 
 def _pictures(run: Path, config: Config, summary: dict[str, Any]) -> dict[str, bytes]:
     """The plots of missions; raises `ConfigError` if the summary is not that of a run."""
-    try:
+    with page.showing(run):
         for place in (summary, *summary.get("elsewhere", {}).values()):
             compare.compared(metrics.cases(place["mission"]))
         return plots.of_missions(config, summary)
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        reason = f"must hold the summary.json of a finished run ({error!r})"
-        raise ConfigError("run", str(run), reason) from None
 
 
 def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import json
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -81,12 +82,19 @@ def write_seeds(run: Path, config: Config, summary: dict[str, Any]) -> Path:
     return _write(run, config, summary, "seeds.html.jinja")
 
 
-def _write(run: Path, config: Config, summary: dict[str, Any], template: str) -> Path:
+@contextlib.contextmanager
+def showing(run: Path) -> Iterator[None]:
+    """Raises `ConfigError` about a run whose summary lacks a value or holds a wrong one."""
     try:
-        text = _render(run, config, summary, template)
+        yield
     except (*_WRONG, jinja2.UndefinedError) as error:
         reason = f"must hold the summary.json of a finished run ({error!r})"
         raise ConfigError("run", str(run), reason) from None
+
+
+def _write(run: Path, config: Config, summary: dict[str, Any], template: str) -> Path:
+    with showing(run):
+        text = _render(run, config, summary, template)
     path = run / "report.html"
     files.write(path, text)
     return path
