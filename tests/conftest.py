@@ -25,14 +25,10 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
 import filelock
-import jax
 import pytest
+import xdist
 from skips import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401
-from smoke import SMOKE
 
-from jaxsense import train
-
-jax.config.update("jax_num_cpu_devices", 2)
 # A script may have started this in the background, where Ctrl-C is not for it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -41,6 +37,19 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.set_threshold(100_000, 50, 50)
 
 SLOW = 1800  # s
+
+
+def pytest_sessionstart(session):
+    """Imports JAX, which takes seconds, where tests run and not in the process that starts them."""
+    if not xdist.is_xdist_controller(session):
+        import jax
+
+        jax.config.update("jax_num_cpu_devices", 2)
+
+
+def pytest_sessionfinish():
+    """At its end, pytest would look five times through gigabytes of compiled programs."""
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items):
@@ -66,6 +75,10 @@ def cache(shared) -> list[str]:
 @pytest.fixture(scope="session")
 def smoke_run(shared, cache) -> Path:
     """A finished run with `SMOKE`, made by whichever worker needs it first; to be read only."""
+    from smoke import SMOKE
+
+    from jaxsense import train
+
     path = shared / "smoke"
     with filelock.FileLock(shared / "smoke.lock"):
         if not (path / "summary.json").exists():

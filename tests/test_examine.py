@@ -49,8 +49,8 @@ def network(inputs, outputs, weights, bias=()):
     biases = np.zeros(outputs, np.float32)
     for output, each in dict(bias).items():
         biases[output] = each
-    hidden = {"kernel": jnp.eye(inputs, 4), "bias": jnp.zeros(4)}
-    last = {"kernel": jnp.array(kernel), "bias": jnp.array(biases)}
+    hidden = {"kernel": np.eye(inputs, 4, dtype=np.float32), "bias": np.zeros(4, np.float32)}
+    last = {"kernel": kernel, "bias": biases}
     return {"params": {"Dense_0": hidden, "Dense_1": last}}
 
 

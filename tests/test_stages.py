@@ -281,7 +281,7 @@ def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(r
     mean = jnp.array([[0.0], [3.0], [3.0 + 12**0.5]])
     classes = Belief(mean, jnp.ones((3, 1)))
     stage = of_stage("look_values", config)
-    camera, lidar = stage.begin(KEY, config, classes, detections_of(bank))
+    camera, lidar = jax.jit(stage.begin)(KEY, config, classes, detections_of(bank))
     even = jnp.full(3, 1 / 3)
     if reward == "nats":
         # ln 3 before; nothing after a green one, and ln 2 after each of two red ones.
@@ -424,7 +424,8 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
         examples = listed["examples"].begin(KEY, MEASURED, surveys)
         state = listed[name].begin(KEY, MEASURED, examples)
         listed[name].advance(KEY, MEASURED, state, examples)
-    looks = listed["detections"].begin(KEY, MEASURED, surveys, None, None)
+    detections = jax.jit(listed["detections"].begin)
+    looks = detections(KEY, MEASURED, surveys, None, None)
 
     seen, bank, held_out = used(trained_on), used(looks.bank), used(looks.held_out)
     starts, shown = used(looks.starts[1]), used(looks.windows)

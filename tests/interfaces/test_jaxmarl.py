@@ -10,14 +10,8 @@ import numpy as np
 import pytest
 import small
 
-pytest.importorskip("jaxsense.interfaces.jaxmarl", reason="needs the extra jaxsense[jaxmarl]")
-
-from jaxmarl.environments import MultiAgentEnv
-from jaxmarl.wrappers.baselines import LogWrapper
-
 import jaxsense.interfaces
 from jaxsense.dqn import team_mdp
-from jaxsense.interfaces.jaxmarl import TeamEnv
 
 AGENTS = ["camera_1", "camera_2", "lidar"]
 NOP = 4
@@ -25,8 +19,15 @@ CAMERA, LIDAR = 0, 1
 
 
 @pytest.fixture(scope="module")
-def env():
-    return TeamEnv(small.team(), small.TEAM)
+def team_env():
+    """The class, whose import takes seconds: not of every worker that collects these tests."""
+    needs = "needs the extra jaxsense[jaxmarl]"
+    return pytest.importorskip("jaxsense.interfaces.jaxmarl", reason=needs).TeamEnv
+
+
+@pytest.fixture(scope="module")
+def env(team_env):
+    return team_env(small.team(), small.TEAM)
 
 
 @pytest.fixture(scope="module")
@@ -60,11 +61,13 @@ def random_actions(key, available):
     return {agent: jax.random.categorical(keys[agent], logits[agent]) for agent in AGENTS}
 
 
-def test_agents_are_the_robots_of_the_settings(env):
+def test_agents_are_the_robots_of_the_settings(team_env, env):
+    from jaxmarl.environments import MultiAgentEnv
+
     assert isinstance(env, MultiAgentEnv)
     assert (env.num_agents, env.agents) == (3, AGENTS)
     assert env.agent_classes == {"camera": ["camera_1", "camera_2"], "lidar": ["lidar"]}
-    one_each = TeamEnv(small.team(), dataclasses.replace(small.TEAM, robots=None))
+    one_each = team_env(small.team(), dataclasses.replace(small.TEAM, robots=None))
     assert one_each.agents == ["camera", "lidar"]
 
 
@@ -232,6 +235,8 @@ def test_it_scans_in_a_batch_and_equals_one_alone(env):
 
 
 def test_the_log_wrapper_sums_rewards(env):
+    from jaxmarl.wrappers.baselines import LogWrapper
+
     logged = LogWrapper(env)
     _, state = logged.reset(jax.random.key(9))
     total, returned = np.zeros(3), np.zeros(3)
@@ -262,19 +267,20 @@ def test_actions_that_do_not_exist_are_refused_or_reward_nan(env, step_env, acti
         assert np.isnan([*rewards.values()]).any()
 
 
-def test_other_sensors_than_those_of_the_settings_are_named():
+def test_other_sensors_than_those_of_the_settings_are_named(team_env):
     with pytest.raises(
         ValueError, match=r"config.modalities = \('camera',\): must be \('camera', 'lidar'\), as in"
     ):
-        TeamEnv(small.team(), small.ONLY_CAMERAS)
+        team_env(small.team(), small.ONLY_CAMERAS)
     # In another order a robot would carry another's sensor.
     mdp = dataclasses.replace(small.team(), modalities=("lidar", "camera"))
     with pytest.raises(ValueError, match=r"must be \('lidar', 'camera'\), as in mdp"):
-        TeamEnv(mdp, small.TEAM)
+        team_env(mdp, small.TEAM)
     with pytest.raises(ValueError, match="mdp = MapMdp: must be a TeamMdp"):
-        TeamEnv(small.team().map, small.ONLY_CAMERAS)
+        team_env(small.team().map, small.ONLY_CAMERAS)
 
 
+@pytest.mark.usefixtures("team_env")  # which is skipped without jaxmarl
 def test_the_import_prints_nothing_and_keeps_streams(monkeypatch, capfd):
     for name in list(sys.modules):
         if name.partition(".")[0] == "jaxmarl" or name == "jaxsense.interfaces.jaxmarl":

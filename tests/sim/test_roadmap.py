@@ -304,8 +304,9 @@ def straight(starts, ends, centres, radius):
 def test_ways_are_the_shortest_that_dijkstra_finds(arena, seed):
     config = Config(arena=arena)
     classes = jnp.zeros(arena.num_pois, jnp.int32)
-    centres = sim.random_layout(jax.random.key(seed), arena, classes).position
-    _, _, ways = planned(config, centres)
+    layout = sim.random_layout(jax.random.key(seed), arena, classes)
+    _, _, ways = planned(config, layout.position)
+    ways, centres = jax.tree.map(np.asarray, (ways, layout.position))
     nodes, places = ways.nodes, ways.viewpoints[ways.is_free]
     starts = np.concatenate([nodes, places])
     edges = straight(starts, nodes, centres, KEEP + MARGIN)

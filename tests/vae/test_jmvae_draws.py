@@ -1,7 +1,6 @@
 """What a JMVAE is trained on: which detections are drawn from a bank."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,8 +10,9 @@ from jaxsense.vae import jmvae, minibatch
 MODEL = jmvae.Jmvae(("camera", "lidar"), (1, 2), 2, (3,))
 SETTINGS = JmvaeConfig(batch=64, steps=40)
 # Class c and row r as 10 c + r; the two modalities have different numbers of rows.
-CAMERA = 10.0 * jnp.arange(4)[:, None, None] + jnp.arange(3)[None, :, None]
-LIDAR = jnp.tile(10.0 * jnp.arange(4)[:, None, None] + jnp.arange(5)[None, :, None], (1, 1, 2))
+CLASSES, ROWS = np.float32(10) * np.arange(4)[:, None, None], np.arange(5)[None, :, None]
+CAMERA = CLASSES + ROWS[:, :3]
+LIDAR = np.tile(CLASSES + ROWS, (1, 1, 2))
 
 
 @pytest.fixture(scope="module")
