@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 REFERENCE = "latent"
 """The policy that the others are compared with."""
@@ -17,7 +17,9 @@ def interval(values: np.ndarray) -> tuple[Any, Any]:
     if len(values) == 1:
         return None, None
     average = values.mean(axis=0)
-    error = scipy.stats.sem(values) * scipy.stats.t.ppf((1 + _CONFIDENCE) / 2, len(values) - 1)
+    error = values.std(axis=0, ddof=1) / np.sqrt(len(values))
+    # `scipy.stats`, which calls the same function, takes a third of a second to import.
+    error = error * scipy.special.stdtrit(len(values) - 1, (1 + _CONFIDENCE) / 2)
     return average - error, average + error
 
 

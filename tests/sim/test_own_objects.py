@@ -21,6 +21,9 @@ CONFIG = ArenaConfig(
 POSITION = jnp.array([[0.0, 0.0], [0.0, 1.0], [1.0, -1.0]])
 LAYOUT = sim.make_layout(CONFIG, POSITION, jnp.zeros(3), jnp.array([0, 1, 0]))
 
+cast = jax.jit(sim.cast)
+cross_section = jax.jit(sim.cross_section, static_argnames=("arena", "robot"))
+
 
 @pytest.fixture(scope="module")
 def view():
@@ -38,7 +41,7 @@ def test_a_layout_holds_what_the_words_of_the_classes_stand_for():
 
 def test_rays_meet_shapes_where_their_sides_are(view):
     arena, data = view
-    section = sim.cross_section(arena, data, 0.152, robot=-1)
+    section = cross_section(arena, data, 0.152, robot=-1)
     # The slab at the origin is 0.2 m by 0.12 m, the post at (0, 1) 0.1 m across.
     for start, angle, distance in (
         ((0.5, 0.0), np.pi, 0.4),
@@ -46,7 +49,7 @@ def test_rays_meet_shapes_where_their_sides_are(view):
         ((0.0, 0.5), np.pi / 2, 0.45),
         ((0.5, 1.0), np.pi, 0.45),
     ):
-        hit = sim.cast(section, jnp.array(start), jnp.float32(angle))
+        hit = cast(section, jnp.array(start), jnp.float32(angle))
         assert hit.distance == pytest.approx(distance, abs=1e-5)
 
 
@@ -75,8 +78,8 @@ def test_a_cylinder_is_as_high_as_all_pois_whatever_its_radius():
     arena = sim.build(config, (True,))
     data = jax.jit(sim.place, static_argnums=0)(arena, layout, jnp.array([[-0.5, 0.0, 0.0]]))
     for height in (0.01, 0.152, 0.19):
-        section = sim.cross_section(arena, data, height, robot=0)
-        hit = sim.cast(section, jnp.array([-0.5, 0.0]), jnp.float32(0.0))
+        section = cross_section(arena, data, height, robot=0)
+        hit = cast(section, jnp.array([-0.5, 0.0]), jnp.float32(0.0))
         assert hit.distance == pytest.approx(0.45, abs=1e-5)
 
 

@@ -13,6 +13,11 @@ from jaxsense.vae import detectors, metrics
 CONFIG = DetectorConfig(hidden=(16,), steps=200, batch=64, learning_rate=1e-2)
 
 
+calibrate = jax.jit(detectors.calibrate)
+detect = jax.jit(jax.vmap(detectors.detect, in_axes=(None, 0)))
+logits_of = jax.jit(jax.vmap(detectors.logits, in_axes=(None, 0)))
+
+
 def synthetic_windows(key, number):
     """Windows of 6 readings around 5: the label says whether the middle two stand out."""
     label_key, noise_key = jax.random.split(key)
@@ -23,7 +28,7 @@ def synthetic_windows(key, number):
 
 
 def accuracy(detector, windows, labels):
-    features = jax.vmap(detectors.detect, in_axes=(None, 0))(detector, windows)
+    features = detect(detector, windows)
     return np.mean(features.argmax(axis=-1) == labels)
 
 
@@ -55,7 +60,7 @@ def test_training_learns_a_separable_set(trained):
 def test_detect_gives_probabilities_of_the_labels_in_order(trained):
     _, detector, _ = trained
     windows, labels = synthetic_windows(jax.random.key(4), 50)
-    features = jax.vmap(detectors.detect, in_axes=(None, 0))(detector, windows)
+    features = detect(detector, windows)
     assert features.shape == (50, 2)
     np.testing.assert_allclose(features.sum(axis=-1), 1.0, rtol=1e-6)
     np.testing.assert_array_equal(features[:, 1] > 0.5, labels == 1)
@@ -91,7 +96,7 @@ def test_calibration_finds_the_temperature_of_the_logits(temperature, left, erro
     # Of ten looks that are all the same eight are of label 0: logits should be ln(8 / 2) apart.
     right, labels = np.log(4.0), jnp.array([0] * 8 + [1] * 2)
     detector = with_logits(0.5 + temperature * right, 0.5)
-    calibrated = detectors.calibrate(detector, jnp.zeros((10, 3)), labels)
+    calibrated = calibrate(detector, jnp.zeros((10, 3)), labels)
     logits = detectors.logits(calibrated, jnp.zeros(3))
     assert logits[0] - logits[1] == pytest.approx(left * right, rel=error)
 
@@ -100,13 +105,13 @@ def test_calibration_reads_windows_as_the_detector_does(trained):
     # Labels are drawn by its own logits, and by flatter and sharper ones.
     _, detector, _ = trained
     windows, _ = synthetic_windows(jax.random.key(5), 4000)
-    logits = jax.vmap(detectors.logits, in_axes=(None, 0))(detector, windows)
+    logits = logits_of(detector, windows)
     is_unsure = jnp.abs(logits[:, 0] - logits[:, 1]) < 4
     unsure, logits = windows[is_unsure], logits[is_unsure]
     for sharpness in (0.5, 1.0, 2.0):
         labels = jax.random.categorical(jax.random.key(6), sharpness * logits)
-        calibrated = detectors.calibrate(detector, unsure, labels)
-        found = jax.vmap(detectors.logits, in_axes=(None, 0))(calibrated, unsure)
+        calibrated = calibrate(detector, unsure, labels)
+        found = logits_of(calibrated, unsure)
         ratio = np.sum(found * logits) / np.sum(logits**2)
         np.testing.assert_allclose(found, ratio * logits, atol=1e-4)
         # Four standard errors of the most likely sharpness, and a step of the search.
@@ -122,11 +127,8 @@ def test_calibration_changes_no_label_and_never_makes_the_looks_less_likely(trai
     # Half way between the labels, where the detector is unsure.
     windows = (of_one + of_one[::-1]) / 2
     for given in (labels, 1 - labels, jnp.zeros(300, int)):
-        calibrated = detectors.calibrate(detector, windows, given)
-        before, after = (
-            jax.vmap(detectors.detect, in_axes=(None, 0))(d, windows)
-            for d in (detector, calibrated)
-        )
+        calibrated = calibrate(detector, windows, given)
+        before, after = (detect(d, windows) for d in (detector, calibrated))
         np.testing.assert_array_equal(before.argmax(axis=1), after.argmax(axis=1))
         nll_before, nll_after = (metrics.negative_log_likelihood(p, given) for p in (before, after))
         assert nll_after <= nll_before + 1e-6
@@ -139,7 +141,7 @@ def test_a_training_starts_from_the_loss_of_the_detector_it_is_given():
     start = detectors.start(detector, config)
     _, losses = detectors.train(jax.random.key(2), start, detector, windows, labels, config, 20)
     assert len(np.unique(losses)) == 20  # every step draws anew
-    each = jax.vmap(detectors.detect, in_axes=(None, 0))(detector, windows)
+    each = detect(detector, windows)
     expected = -np.log(np.asarray(each)[np.arange(1000), labels])
     error = expected.std() / np.sqrt(20 * 256)
     np.testing.assert_allclose(losses.mean(), expected.mean(), atol=4 * error)
