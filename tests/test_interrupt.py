@@ -6,12 +6,14 @@ import sys
 
 import pytest
 
+from jaxsense.run import interrupt
 from jaxsense.run.interrupt import on_interrupt
 
+# The module alone: the package would be imported for seconds.
 PROGRAM = """
-import signal, sys
-from jaxsense.run.interrupt import on_interrupt
-first, second = map(int, sys.argv[1:])
+import runpy, signal, sys
+on_interrupt = runpy.run_path(sys.argv[1])["on_interrupt"]
+first, second = map(int, sys.argv[2:])
 signal.signal(signal.SIGINT, signal.default_int_handler)
 with on_interrupt(lambda: print("stopping", flush=True)):
     signal.raise_signal(first)
@@ -24,7 +26,8 @@ with on_interrupt(lambda: print("stopping", flush=True)):
 @pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
 def test_the_first_signal_stops_in_order_and_the_second_one_at_once(first, second):
-    command = [sys.executable, "-c", PROGRAM, str(int(first)), str(int(second))]
+    signals = str(int(first)), str(int(second))
+    command = [sys.executable, "-c", PROGRAM, interrupt.__file__, *signals]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 128 + second
     assert ended.stdout == "stopping\nstill here\n"
@@ -34,13 +37,13 @@ def test_the_first_signal_stops_in_order_and_the_second_one_at_once(first, secon
 def test_what_was_there_before_comes_back_and_what_is_ignored_stays_so():
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
-        interrupt, stopped = signal.getsignal(signal.SIGINT), []
+        at_first, stopped = signal.getsignal(signal.SIGINT), []
         with on_interrupt(lambda: stopped.append(True)):
             signal.raise_signal(signal.SIGTERM)
             assert not stopped
             signal.raise_signal(signal.SIGINT)
             assert stopped == [True]
-        assert signal.getsignal(signal.SIGINT) is interrupt
+        assert signal.getsignal(signal.SIGINT) is at_first
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGTERM, before)
