@@ -59,7 +59,7 @@ def test_the_reward_in_nats_is_the_fall_of_entropy_of_the_map_less_the_cost():
     # Green is class 0, red the others. The filter adds the logarithm of the label's probability.
     classes = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
     inputs = classes, fusion.unseen(MODEL, 20.0), FilterConfig(hidden=(1,))
-    params = filtering.init(jax.random.key(0), MODEL, *inputs)
+    params = jax.jit(lambda key: filtering.init(key, MODEL, *inputs))(jax.random.key(0))
     layer = {"kernel": jnp.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0]]), "bias": jnp.zeros(3)}
     params["networks"] = {m: {"params": {"Dense_0": layer}} for m in MODEL.modalities}
     config = replace(
@@ -69,8 +69,8 @@ def test_the_reward_in_nats_is_the_fall_of_entropy_of_the_map_less_the_cost():
     )
     looks_red = (jnp.broadcast_to(jnp.array([0.8, 0.2]), (3, 1, 2)),) * 2
     mdp = observe.bank_mdp(config, looks_red, {"filter": params}, MODEL)
-    unseen = jnp.zeros((3, 2), bool)
-    state = belief_mdp.reset(jax.random.key(0), mdp, jnp.array([1, 1, 1]), unseen)
+    reset = jax.jit(lambda key, *start: belief_mdp.reset(key, mdp, *start))
+    state = reset(jax.random.key(0), np.array([1, 1, 1]), np.zeros((3, 2), bool))
 
     @jax.jit
     def look(state, modality):

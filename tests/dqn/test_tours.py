@@ -166,7 +166,7 @@ def test_looks_that_pay_come_in_the_order_of_their_tours(monkeypatch, after, cos
     monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
     team = TeamConfig(travel=TRAVEL, second_cost=cost)
     known = *AT_ORIGIN, team, DQN
-    values = policies.tour_values(None, None, *known)
+    values = jax.jit(lambda: policies.tour_values(None, None, *known))()
     assert np.argsort(-values)[: len(order)].tolist() == order
 
 

@@ -95,8 +95,8 @@ def test_of_several_robots_in_the_way_the_last_is_passed():
 
 def test_clearance_among_many_is_the_least_of_clearances_among_two():
     # Close together, so that robots, PoIs and walls are the nearest of some.
-    poses = jax.random.uniform(jax.random.key(1), (200, 5, 3), minval=-0.5, maxval=0.5)
-    poses *= jnp.array([[[1.2, 5.9, 1.0]]])
+    poses = np.array(jax.random.uniform(jax.random.key(1), (200, 5, 3), minval=-0.5, maxval=0.5))
+    poses *= np.array([1.2, 5.9, 1.0], np.float32)
     layout = random_layout(jax.random.key(2), LARGE)
     clearance = jax.jit(jax.vmap(functools.partial(navigation.clearance, LARGE, layout)))
     together = np.array(clearance(poses))
