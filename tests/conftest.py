@@ -36,7 +36,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # lives: a tenth to a quarter of the time of tests.
 gc.set_threshold(100_000, 50, 50)
 
-SLOW = 1800  # s
+SLOW = 3600  # s
 
 
 def pytest_sessionstart(session):
