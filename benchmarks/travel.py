@@ -1,8 +1,8 @@
 """How well the model of travel predicts missions in MJX: `python -m benchmarks.travel RUN`.
 
 Plays missions of naive exploration with the models of a run, takes each way from a decision to the
-look that it leads to, and prints how long it took, how long the model says, and the numbers of the
-model that fit best.
+look that it leads to, and prints how long it took, how long the model predicts, and the numbers of
+the model that fit best.
 """
 
 import dataclasses

@@ -103,9 +103,12 @@ def main(
     arguments = parse(sys.argv[1:] if argv is None else argv, change)
     console = rich.console.Console(quiet=arguments.quiet)
     try:
-        if arguments.coordinator is not None and not arguments.quiet:
-            say(f"Waiting for the other processes at {arguments.coordinator}.")
-        devices.join(arguments.coordinator, arguments.num_processes, arguments.process_index)
+        devices.join(
+            arguments.coordinator,
+            arguments.num_processes,
+            arguments.process_index,
+            begins=lambda: _say_waits(arguments),
+        )
         workers = devices.start(arguments.devices)
         if jax.process_index() > 0:
             _help(begin, arguments, workers)
@@ -191,6 +194,12 @@ def _option(argv: list[str], name: str) -> str | None:
     """The last value of an option, if any."""
     found = re.findall(rf"(?:^|\0)--{name}(?:=|\0)([^\0]+)", "\0".join(argv))
     return found[-1] if found else None
+
+
+def _say_waits(arguments: Arguments) -> None:
+    """Says what a process waits for that shares a run with others."""
+    if not arguments.quiet:
+        say(f"Waiting for the other processes at {arguments.coordinator}.")
 
 
 def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:

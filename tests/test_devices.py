@@ -163,7 +163,7 @@ def test_two_processes_stop_and_resume_several_seeds(tmp_path):
 )
 def test_processes_that_cannot_be_are_named(given, expected):
     with pytest.raises(ConfigError, match=re.escape(expected)):
-        devices.join(*given)
+        devices.join(*given, begins=lambda: pytest.fail("waits"))
 
 
 def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):

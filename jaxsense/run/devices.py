@@ -137,13 +137,19 @@ def make_mesh(number: int | None = None) -> Mesh:
     return Mesh(np.array(there[:number]), (AXIS,))
 
 
-def join(coordinator: str | None, number: int | None, index: int | None) -> None:
+def join(
+    coordinator: str | None,
+    number: int | None,
+    index: int | None,
+    begins: Callable[[], None] = lambda: None,
+) -> None:
     """Joins the processes that share a run; does nothing without arguments.
 
     Args:
       coordinator: `HOST:PORT` at which the first process listens.
       number: of processes.
       index: of this process, from 0.
+      begins: called once the arguments are found to be right, before it waits for the others.
 
     Raises:
       ConfigError: if only some are given, or a value is wrong.
@@ -170,6 +176,7 @@ def join(coordinator: str | None, number: int | None, index: int | None) -> None
         socket.getaddrinfo(host.strip("[]"), int(port))
     except OSError as error:
         raise ConfigError("coordinator", coordinator, f"cannot be found ({error})") from None
+    begins()
     try:
         jax.distributed.initialize(coordinator, number, index)
     except (RuntimeError, ValueError) as error:

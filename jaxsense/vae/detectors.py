@@ -1,4 +1,4 @@
-"""The scanline detectors f_x and f_w: what a sensor alone can tell of a point of interest."""
+"""The scanline detectors f_x and f_w: what one sensor sees of a point of interest."""
 
 import dataclasses
 

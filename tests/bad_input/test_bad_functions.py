@@ -15,6 +15,10 @@ from jaxsense.config import FilterConfig
 from jaxsense.run import missions
 from jaxsense.vae import filtering, fusion
 
+# Settings whose models have other shapes.
+OTHERS = dataclasses.replace(SMOKE, jmvae=dataclasses.replace(SMOKE.jmvae, fusion="filter"))
+WINDOWS = dataclasses.replace(SMOKE, camera=dataclasses.replace(SMOKE.camera, stride=2, window=40))
+
 
 class World:
     """What the functions are called with, made once."""
@@ -352,6 +356,22 @@ FUNCTIONS = {
     "missions.batch_of": (lambda w: missions.batch_of(0), "total = 0"),
     "mission.rollout": (lambda w: mission.rollout(w.key, None, None, None, 0), "steps = 0"),
     "map_mdp": (lambda w: interfaces.map_mdp(SMOKE, w.models, w.bank[:1]), "bank has 1 entries"),
+    "map_mdp without models": (
+        lambda w: interfaces.map_mdp(SMOKE, None),
+        "models = NoneType: must",
+    ),
+    "map_mdp of others": (
+        lambda w: interfaces.map_mdp(OTHERS, w.models),
+        "models.jmvae: must have the shapes of config",
+    ),
+    "team_mdp of others": (
+        lambda w: interfaces.team_mdp(OTHERS, w.models, w.bank),
+        "models.jmvae: must have the shapes of config",
+    ),
+    "map_mdp of other windows": (
+        lambda w: interfaces.map_mdp(WINDOWS, w.models),
+        "models.detectors of camera: reads windows of 240 numbers; must be of 120, as config's are",
+    ),
     "prepared_starts": (lambda w: interfaces.prepared_starts(w.key, w.mdp, 0), "number = 0"),
     "prepared_starts real": (lambda w: interfaces.prepared_starts(w.key, w.mdp, 1.5), "number ="),
     "detections": (lambda w: interfaces.detections(w.key, SMOKE, w.models, 0), "samples = 0"),

@@ -84,14 +84,14 @@ def driven():
 
 
 def test_a_robot_drives_to_places_in_sight_and_touches_nothing(driven):
-    position, start, goal, distance, seconds, clearance = driven(by_map=False, number=75)
+    position, start, goal, distance, seconds, clearance = driven(by_map=False, number=150)
     # With 0.1 m it is planned 0.0505 m larger than it is, of which a trajectory may cut 0.005.
     assert clearance.min() > 0.03
     along = (goal - start) / distance[:, None]
     share = np.sum((position - start[:, None]) * along[:, None], axis=-1)
     nearest = start[:, None] + np.clip(share, 0, distance[:, None])[..., None] * along[:, None]
     in_sight = np.linalg.norm(position - nearest, axis=-1).min(axis=-1) >= KEEP
-    assert in_sight.sum() > 50
+    assert in_sight.sum() > 100
     # Where it has to turn first it may get behind a PoI, which the roadmap leads it out of.
     assert np.isfinite(seconds[in_sight]).mean() >= 0.93
     # At 0.2 m/s to 0.2 m before the goal, after at most pi s of turning: pi - 1 s longer.
@@ -101,7 +101,7 @@ def test_a_robot_drives_to_places_in_sight_and_touches_nothing(driven):
 
 
 def test_a_robot_that_follows_the_roadmap_always_arrives_and_touches_nothing(driven):
-    _, _, _, length, seconds, clearance = driven(by_map=True, number=30)
+    _, _, _, length, seconds, clearance = driven(by_map=True, number=60)
     assert np.isfinite(length).all()
     assert length.mean() > 1.5
     assert clearance.min() > 0.03
