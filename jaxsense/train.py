@@ -197,7 +197,7 @@ def _option(argv: list[str], name: str) -> str | None:
 
 
 def _say_waits(arguments: Arguments) -> None:
-    """Says what a process waits for that shares a run with others."""
+    """Announces that this process waits for the others of its run."""
     if not arguments.quiet:
         say(f"Waiting for the other processes at {arguments.coordinator}.")
 

@@ -155,7 +155,7 @@ SIGMA_NORM = (
         "to 1.25",
     ),
 )
-"""The range of `summary["jmvae"]["sigma_norm"]`, over the classes of which each is said."""
+"""The range of `summary["jmvae"]["sigma_norm"]`, over the classes that each row is about."""
 
 BELIEFS = (
     Metric(
