@@ -166,6 +166,13 @@ def test_processes_that_cannot_be_are_named(given, expected):
         devices.join(*given, begins=lambda: pytest.fail("waits"))
 
 
+def test_who_joins_is_told_before_it_waits_for_others(monkeypatch):
+    called = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *given: called.append(given))
+    devices.join("localhost:1", 2, 0, begins=lambda: called.append("begins"))
+    assert called == ["begins", ("localhost:1", 2, 0)]
+
+
 def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):
     for number in (0, -1, 10**9):
         with pytest.raises(ConfigError, match=rf"devices = {number}: must be within 1 and 256"):

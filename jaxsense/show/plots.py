@@ -262,7 +262,9 @@ def calibration(
         flat = jnp.asarray(looks.reshape(-1, looks.shape[-1]))
         confidence, accuracy, share = map(np.asarray, reliability(flat, labels))
         left.plot(confidence, accuracy, color=f"C{i}", linewidth=1)
-        left.scatter(confidence, accuracy, s=10 + 300 * share, color=f"C{i}", label=name)
+        # Hollow, for most lie on top of each other where detectors are sure.
+        style = {"marker": "oDs^"[i % 4], "facecolors": "none", "edgecolors": f"C{i}"}
+        left.scatter(confidence, accuracy, s=10 + 300 * share, label=name, **style)
     lowest = 1 / max(looks.shape[-1] for looks in detections.values())
     left.set(xlabel="confidence", ylabel="share of right labels", title="detectors")
     left.set(xlim=(lowest - 0.02, 1.02), ylim=(min(lowest, 0.5) - 0.1, 1.02))
