@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from benchmarks.jmvae import random_bank
 from jaxsense import models, observe
 from jaxsense.config import PRESETS, Config, DqnConfig
+from jaxsense.core.networks import Params
 from jaxsense.dqn import belief_mdp, episodes, policies
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.models import Models
-from jaxsense.networks import Params
 from jaxsense.observe import Bank
 
 MODALITY = 0

@@ -16,11 +16,11 @@ from benchmarks.measure import Options, Row, Side
 from benchmarks.peers import native
 from jaxsense import mission, models
 from jaxsense.config import PRESETS, Config
-from jaxsense.mission import Mission, MissionState
+from jaxsense.mission import Mission, MissionState, navigation
 from jaxsense.mission.motion import move
 from jaxsense.mission.rollout import step as mission_step
 from jaxsense.run import devices
-from jaxsense.sim import amiro, navigation
+from jaxsense.sim import amiro
 from jaxsense.sim import arena as arenas
 from jaxsense.sim.arena import Arena, Layout
 

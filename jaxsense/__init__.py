@@ -23,6 +23,8 @@ from jaxsense.config import Config as Config
 from jaxsense.config import ConfigError as ConfigError
 from jaxsense.config import SensorConfig as SensorConfig
 from jaxsense.config import Shape as Shape
+from jaxsense.core.types import Belief as Belief
+from jaxsense.core.types import Transition as Transition
 from jaxsense.models import Models as Models
 from jaxsense.models import init as init
 from jaxsense.models import make_jmvae as make_jmvae
@@ -31,5 +33,3 @@ from jaxsense.observe import live_mdp as live_mdp
 from jaxsense.run.rundir import load as load
 from jaxsense.run.version import __version__ as __version__
 from jaxsense.stages import learn as learn
-from jaxsense.types import Belief as Belief
-from jaxsense.types import Transition as Transition

@@ -17,6 +17,7 @@ from jaxsense import cli, mission
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import require, require_types
 from jaxsense.config.mission import MOST_EPISODES
+from jaxsense.core.types import Belief
 from jaxsense.mission import compare
 from jaxsense.run import devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
@@ -24,7 +25,6 @@ from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.show import animation, metrics, page, plots
 from jaxsense.show.terminal import Display
 from jaxsense.sim.arena import TIMESTEP
-from jaxsense.types import Belief
 
 PROGRAM = "jaxsense.evaluate"
 

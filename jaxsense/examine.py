@@ -11,13 +11,13 @@ import numpy as np
 
 from jaxsense import observe
 from jaxsense.config import Config
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Belief, Key, call
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn.belief_mdp import MapMdp, MapState, random_start, reset
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.models import make_jmvae, readout
-from jaxsense.networks import Params
 from jaxsense.observe import Bank
-from jaxsense.types import Belief, Key, call
 from jaxsense.vae import filtering, fusion, jmvae, metrics, peers
 from jaxsense.vae.jmvae import Jmvae
 

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxsense import networks
 from jaxsense.config import Config
+from jaxsense.core import networks
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.dqn import optimum, policies
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.networks import Params
 from jaxsense.sim import sensors
-from jaxsense.types import Belief, Key, pytree
 from jaxsense.vae import detectors, filtering, fusion, jmvae
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.fusion import FILTER

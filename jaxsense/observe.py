@@ -9,12 +9,13 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import Config, values
+from jaxsense.config import Config
+from jaxsense.core import checks
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Belief, Key
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.dqn.team_mdp import TeamMdp
-from jaxsense.networks import Params
 from jaxsense.sim import world as worlds
-from jaxsense.types import Belief, Key
 from jaxsense.vae import detectors, filtering, fusion
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.jmvae import Jmvae
@@ -31,7 +32,7 @@ def live_mdp(
     model: Jmvae,
 ) -> MapMdp:
     """The map MDP over live scenes, one MJX arena for each environment."""
-    values.require_one_each("trained", trained, model.modalities)
+    checks.require_one_each("trained", trained, model.modalities)
 
     def new_scene(key: Key, classes: jax.Array):
         return worlds.random_scene(key, world, classes)
@@ -55,12 +56,12 @@ def bank_mdp(
       model: the shape of the JMVAE.
       num_pois: N, by default that of the arena.
     """
-    values.require_one_each("bank", bank, model.modalities)
+    checks.require_one_each("bank", bank, model.modalities)
     for features, size in zip(bank, model.feature_sizes, strict=True):
         shape = (len(config.arena.classes), None, size)
         chex.assert_shape(features, shape, custom_message="bank")
-        values.require_number("looks at each class in the bank", features.shape[1])
-        values.require_finite("bank", features)
+        checks.require_number("looks at each class in the bank", features.shape[1])
+        checks.require_finite("bank", features)
 
     def observe(key: Key, classes: jax.Array, poi: jax.Array, modality: int):
         samples = bank[modality]

@@ -15,8 +15,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsense import examine, networks, observe
+from jaxsense import examine, observe
 from jaxsense.config import Config
+from jaxsense.core import networks, supervised
+from jaxsense.core.networks import Params
+from jaxsense.core.supervised import FitState
+from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.dqn import belief_mdp, optimum, policies, rules, team_mdp, tours
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
@@ -26,15 +30,12 @@ from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.dqn.tours import Trials
 from jaxsense.dqn.training import DqnState
 from jaxsense.models import Models, expected_gains, make_jmvae, readout
-from jaxsense.networks import Params
 from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene, World
-from jaxsense.types import Belief, Key, pytree
-from jaxsense.vae import detectors, filtering, fusion, jmvae, minibatch, peers
+from jaxsense.vae import detectors, filtering, fusion, jmvae, peers
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.fusion import FILTER
-from jaxsense.vae.minibatch import FitState
 
 _MOST_CHUNKS = 20
 _MOST_LOOKS = 20  # at one PoI, in the values of looks
@@ -695,8 +696,8 @@ def _tour_stage(config: Config, params: str) -> Steps:
 def _begin_tours(key: Key, config: Config, *_: Any) -> tuple[FitState, Trials]:
     settings, num_pois = config.team.tours, config.team.num_pois[1]
     network = _tour_network(config)
-    optimiser = minibatch.adam(settings.learning_rate, settings.steps)
-    fit = minibatch.start(networks.init(key, network, network.features * num_pois), optimiser)
+    optimiser = supervised.adam(settings.learning_rate, settings.steps)
+    fit = supervised.start(networks.init(key, network, network.features * num_pois), optimiser)
     number = _num_chunks(settings.steps) * _trials_of_chunk(config)
     return fit, tours.no_trials(network.features, num_pois, number)
 
@@ -728,8 +729,8 @@ def _advance_tours(
         batch = jax.tree.map(lambda x: x[:, rows], trials)
         return tours.loss(network, params, batch, latent_size)
 
-    optimiser = minibatch.adam(settings.learning_rate, settings.steps)
-    fit, losses = minibatch.fit(fit, loss, rows, optimiser, settings.steps)
+    optimiser = supervised.adam(settings.learning_rate, settings.steps)
+    fit, losses = supervised.fit(fit, loss, rows, optimiser, settings.steps)
     return (fit, trials), Progress(losses, {})
 
 

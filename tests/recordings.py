@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 
 from jaxsense.config import PRESETS
+from jaxsense.core.types import Belief
 from jaxsense.mission.state import DRIVING, ENDED, FACING, Record
 from jaxsense.run.missions import Recording
-from jaxsense.types import Belief
 
 CONFIG = PRESETS["smoke"]
 CLASS_BELIEFS = Belief(

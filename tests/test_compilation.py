@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from jaxsense.config import PRESETS
+from jaxsense.core.types import Belief
 from jaxsense.run import compilation, files
 from jaxsense.run.compilation import Compiler, Kept, Program
 from jaxsense.run.monitor import Monitor
-from jaxsense.types import Belief
 from jaxsense.vae.detectors import Detector
 
 

@@ -17,10 +17,10 @@ from jaxsense.config import (
     JmvaeConfig,
     MdpConfig,
 )
+from jaxsense.core.types import Belief
 from jaxsense.dqn import optimum
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.models import make_jmvae
-from jaxsense.types import Belief
 from jaxsense.vae import filtering, fusion
 
 # Classes: green cylinder, red cylinder, red cube. Three latent dimensions, of which one is unused.

@@ -19,15 +19,15 @@ from smoke import error_line
 
 from jaxsense import export
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
+from jaxsense.core.networks import MLP
+from jaxsense.core.types import Belief
 from jaxsense.dqn import observation, policies
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.interfaces.onboard import functions
 from jaxsense.models import init, make_jmvae
-from jaxsense.networks import MLP
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
-from jaxsense.types import Belief
 from jaxsense.vae import detectors, fusion, jmvae, metrics
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "run_exported.py"

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from jaxsense.config import PRESETS, ConfigError
+from jaxsense.core.supervised import FitState
 from jaxsense.run import files
 from jaxsense.run.checkpoints import Checkpoints, Unfinished
 from jaxsense.run.rundir import RunDirectory, Settings
-from jaxsense.vae.minibatch import FitState
 
 TREE = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": (np.int32(4), np.array([True]))}
 SHAPES = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, TREE))

@@ -9,9 +9,9 @@ import pytest
 
 from jaxsense import observe
 from jaxsense.config import MODALITIES, PRESETS, FilterConfig
+from jaxsense.core.types import Belief
 from jaxsense.dqn import belief_mdp
 from jaxsense.sim import world as worlds
-from jaxsense.types import Belief
 from jaxsense.vae import detectors, filtering, fusion, jmvae
 from jaxsense.vae.jmvae import Jmvae
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jaxsense.config import PRESETS, SHAPES, ArenaConfig, Attribute, Shape
+from jaxsense.core.types import Belief
 from jaxsense.show import colours, plots
 from jaxsense.sim import sensors
-from jaxsense.types import Belief
 
 CONFIG = PRESETS["smoke"]
 CENTRES = np.array([[2.0, 0.0], [-2.0, 0.0], [-2.0, 0.05]])  # the last two look alike

@@ -9,7 +9,7 @@ import pytest
 
 import jaxsense
 from jaxsense import dqn, vae
-from jaxsense.types import Belief
+from jaxsense.core.types import Belief
 from jaxsense.vae import jmvae, metrics
 
 CONFIG = jaxsense.PRESETS["smoke"]

@@ -22,12 +22,12 @@ from jaxsense.config import (
     TeamConfig,
     ToursConfig,
 )
+from jaxsense.core.types import Belief
 from jaxsense.dqn import optimum
 from jaxsense.run import loop, missions, pipeline
 from jaxsense.run.monitor import Monitor
 from jaxsense.sim.world import make_world
 from jaxsense.stages import learn
-from jaxsense.types import Belief
 from jaxsense.vae import detectors, jmvae
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(7)

@@ -10,10 +10,10 @@ import pytest
 
 from jaxsense import observe
 from jaxsense.config import Config, DetectorConfig, DqnConfig, JmvaeConfig, MdpConfig
+from jaxsense.core.types import Belief
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn import training as dqn
 from jaxsense.models import make_jmvae
-from jaxsense.types import Belief
 from jaxsense.vae import detectors, filtering, fusion, jmvae
 
 CONFIG = Config(

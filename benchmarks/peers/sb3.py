@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import (  # pyright: ignore[reportMissin
 from benchmarks.maps import MODALITY, Task
 from benchmarks.measure import Options, Side
 from benchmarks.peers.numpy_mdp import NumpyMdp
-from jaxsense.networks import Params
+from jaxsense.core.networks import Params
 
 
 class MapEnv(gymnasium.Env):

@@ -14,8 +14,9 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import MdpConfig, values
-from jaxsense.types import Belief, Index, Key, call, pytree
+from jaxsense.config import MdpConfig
+from jaxsense.core import checks
+from jaxsense.core.types import Belief, Index, Key, call, pytree
 
 Scene = Any
 """Pytree that `observe` looks at; the MDP only carries it."""
@@ -94,7 +95,7 @@ def information(std: jax.Array) -> jax.Array:
       `[...]` information in inverse latent units; grows without bound as `std` -> 0.
     """
     chex.assert_shape(std, (..., None), custom_message="std")
-    values.require_positive("std", std)
+    checks.require_positive("std", std)
     return 1.0 / jnp.linalg.norm(std, axis=-1)
 
 
@@ -118,7 +119,7 @@ def observation(belief: Belief) -> jax.Array:
     """Mean and standard deviation of each PoI's belief, `[N * 2D]`, as a Q-network reads them."""
     chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
     chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
-    values.require_positive("belief.std", belief.std)
+    checks.require_positive("belief.std", belief.std)
     return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)
 
 
@@ -151,7 +152,7 @@ def reset(
         classes = random_classes if classes is None else classes
         seen = random_seen if seen is None else seen
     chex.assert_shape(classes, (mdp.num_pois,), custom_message="classes")
-    values.require_index("classes", classes, mdp.num_classes)
+    checks.require_index("classes", classes, mdp.num_classes)
     scene = mdp.new_scene(scene_key, classes)
     pois = jnp.arange(mdp.num_pois)
     looks = tuple(
@@ -239,9 +240,9 @@ def step(
 
 def _check_step(mdp: MapMdp, state: MapState, action: jax.Array, modality: Index) -> None:
     """Raises an error that names an argument of `step` that does not fit the MDP."""
-    values.require_index("modality", modality, mdp.num_modalities)
+    checks.require_index("modality", modality, mdp.num_modalities)
     chex.assert_rank(action, 0, custom_message="action")
-    values.require_index("action", action, mdp.num_pois + 1)
+    checks.require_index("action", action, mdp.num_pois + 1)
     shape = (mdp.num_pois, *mdp.unseen.mean.shape)
     for part in (state.belief.mean, state.belief.std):
         chex.assert_shape(part, shape, custom_message="state.belief")

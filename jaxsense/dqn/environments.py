@@ -7,13 +7,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsense import networks
 from jaxsense.config import DqnConfig
+from jaxsense.core import networks
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Index, Key, Transition, pytree
 from jaxsense.dqn import belief_mdp, policies, team_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, Outcome
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
-from jaxsense.networks import Params
-from jaxsense.types import Index, Key, Transition, pytree
 
 State = Any
 """A `MapState`, or a `Remembered` state of a team."""

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsense.core.types import Index, Key
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.policies import Policy
-from jaxsense.types import Index, Key
 
 MOST_STATES = 4096
 

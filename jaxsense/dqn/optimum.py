@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense.config import MdpConfig, values
+from jaxsense.config import MdpConfig
+from jaxsense.core import checks
+from jaxsense.core.types import pytree
 from jaxsense.dqn.belief_mdp import reward
-from jaxsense.types import pytree
 
 MOST_POINTS = 2**13
 _MOST_STEPS = 512
@@ -44,8 +45,8 @@ class LookValues:
 
 def steps_of_lattice(num_classes: int, most_points: int = MOST_POINTS) -> int:
     """Steps of the lattice along each edge of the simplex; the more classes, the fewer."""
-    values.require_number("num_classes", num_classes)
-    values.require_number("most_points", most_points)
+    checks.require_number("num_classes", num_classes)
+    checks.require_number("most_points", most_points)
     fits = [n for n in range(1, _MOST_STEPS + 1) if _num_points(n, num_classes) <= most_points]
     return max(fits, default=1)
 
@@ -148,8 +149,8 @@ def solve(
     chex.assert_rank(likelihoods, 3, custom_message="likelihoods")
     number, num_looks, _ = likelihoods.shape
     chex.assert_shape(likelihoods, (number, num_looks, number), custom_message="likelihoods")
-    values.require_finite("likelihoods", likelihoods)
-    values.require_number("horizon", horizon)
+    checks.require_finite("likelihoods", likelihoods)
+    checks.require_number("horizon", horizon)
     points = jnp.asarray(lattice(number, most_points), jnp.float32)
     steps = steps_of_lattice(number, len(points))
     # The unseen PoI is the last row, to which no look leads.

@@ -7,14 +7,14 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense import networks
-from jaxsense.config import DqnConfig, TeamConfig, values
+from jaxsense.config import DqnConfig, TeamConfig
+from jaxsense.core import checks, networks
+from jaxsense.core.networks import MLP, Params
+from jaxsense.core.types import Belief, Index, Key
 from jaxsense.dqn import belief_mdp, optimum, team_mdp, tours
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import Team
-from jaxsense.networks import MLP, Params
-from jaxsense.types import Belief, Index, Key
 
 Policy = Callable[[Key, MapState], jax.Array]
 
@@ -130,7 +130,7 @@ def random(mdp: MapMdp) -> Policy:
 
 def naive(mdp: MapMdp, modality: Index) -> Policy:
     """Explores naively: the first PoI that the own sensor has not seen; NOP after the last."""
-    values.require_index("modality", modality, mdp.num_modalities)
+    checks.require_index("modality", modality, mdp.num_modalities)
 
     def act(key: Key, state: MapState) -> jax.Array:
         del key
@@ -188,7 +188,7 @@ def optimal(mdp: MapMdp, rewards: jax.Array, label_of_class: jax.Array) -> Polic
     shape = (mdp.num_modalities, mdp.num_classes)
     chex.assert_shape(label_of_class, shape, custom_message="label_of_class")
     chex.assert_shape(rewards, (2 ** shape[0], shape[1]), custom_message="rewards")
-    values.require_finite("rewards", rewards)
+    checks.require_finite("rewards", rewards)
 
     def of_poi(seen: jax.Array, poi_class: jax.Array) -> jax.Array:
         is_same = label_of_class == label_of_class[:, poi_class][:, None]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxsense.networks import Dense
+from jaxsense.core.networks import Dense
 
 _REACHES = (2.0, 6.0)  # s, within which PoIs count as near
 _SPEED, _TURN_RATE, _VIEW = 0.2, 1.0, 0.9  # m/s, rad/s and m

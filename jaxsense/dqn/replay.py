@@ -8,7 +8,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.types import Transition, pytree
+from jaxsense.core.types import Transition, pytree
 
 
 @pytree

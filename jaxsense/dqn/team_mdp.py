@@ -17,10 +17,11 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import TeamConfig, TravelConfig, values
+from jaxsense.config import TeamConfig, TravelConfig
+from jaxsense.core import checks
+from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState, Outcome
-from jaxsense.types import Belief, Key, pytree
 
 TIME_SCALE = 10.0
 """Seconds in which observations count travel."""
@@ -158,7 +159,7 @@ def observation(
       one number for each; whether the PoI is present; and its place relative to the robot.
     """
     chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
-    values.require_positive("belief.std", belief.std)
+    checks.require_positive("belief.std", belief.std)
     times = ways(config, team)
     soon = jnp.exp(-times / TIME_SCALE)
     robots, pois = jnp.arange(team.poses.shape[0]), jnp.arange(team.positions.shape[0])
@@ -214,7 +215,7 @@ def reset(key: Key, mdp: TeamMdp, modality: jax.Array | None = None) -> TeamStat
         modality, works = _random_team(team_key, mdp, alone)
     else:
         chex.assert_rank(modality, 1, custom_message="modality")
-        values.require_index("modality", modality, mdp.map.num_modalities)
+        checks.require_index("modality", modality, mdp.map.num_modalities)
         alone, works = jnp.bool_(False), jnp.ones(modality.shape, bool)
     num_robots = len(modality)
     positions, poses = mdp.new_places(place_key, number, num_robots)
@@ -282,7 +283,7 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
       that chooses next; `seconds` have passed.
     """
     chex.assert_rank(action, 0, custom_message="action")
-    values.require_index("action", action, mdp.map.num_pois + 1)
+    checks.require_index("action", action, mdp.map.num_pois + 1)
     num_pois, team, travel = mdp.map.num_pois, state.team, mdp.config.travel
     robots = jnp.arange(team.poses.shape[0])
     is_agent = robots == state.agent

@@ -14,14 +14,14 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxsense import networks
 from jaxsense.config import ToursConfig
+from jaxsense.core import networks
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import team_mdp
 from jaxsense.dqn.losses import pseudo_huber
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import TIME_SCALE, TeamMdp, TeamState
-from jaxsense.networks import Params
-from jaxsense.types import Key, pytree
 
 Policy = Callable[[TeamState], jax.Array]
 """`[N + 1]` values of actions, the highest of which is taken, NOP's last."""

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import optax
 
 from jaxsense.config import DqnConfig
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Index, Key, Transition, pytree
 from jaxsense.dqn import losses, replay
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.dqn.environments import Environment, State, environment
 from jaxsense.dqn.team_mdp import TeamMdp
-from jaxsense.networks import Params
-from jaxsense.types import Index, Key, Transition, pytree
 
 _EVALUATED = 10  # epochs
 

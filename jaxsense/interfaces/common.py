@@ -2,15 +2,15 @@
 
 import jax
 
-from jaxsense.config import values
+from jaxsense.core import checks
+from jaxsense.core.types import Key
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
-from jaxsense.types import Key
 
 
 def check_modality(mdp: MapMdp, modality: int) -> None:
     """Raises `ValueError` unless the MDP has a sensor of that index."""
-    values.require_index("modality", modality, mdp.num_modalities)
+    checks.require_index("modality", modality, mdp.num_modalities)
 
 
 def num_actions(mdp: MapMdp) -> int:
@@ -29,7 +29,7 @@ def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
     A start looks at everything it has seen, which costs several steps; a draw from a few thousand
     prepared ones costs nothing.
     """
-    values.require_number("number", number)
+    checks.require_number("number", number)
 
     def reset(key: Key) -> MapState:
         return belief_mdp.reset(key, mdp)

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense.config import values
+from jaxsense.core import checks
+from jaxsense.core.types import Key
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState, Outcome
 from jaxsense.interfaces import common
 from jaxsense.interfaces.extras import extra
-from jaxsense.types import Key
 
 with extra("gymnasium"):
     from gymnasium import error, spaces  # pyright: ignore[reportMissingImports]
@@ -52,7 +52,7 @@ class MapVectorEnv(VectorEnv):
           ValueError: if there is no such sensor or mode, or no environment.
         """
         common.check_modality(mdp, modality)
-        values.require_number("num_envs", num_envs)
+        checks.require_number("num_envs", num_envs)
         self.num_envs = num_envs
         self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
         size = (common.observation_size(mdp),)

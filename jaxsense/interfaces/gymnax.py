@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxsense.core.types import Key
 from jaxsense.dqn import belief_mdp
 from jaxsense.dqn.belief_mdp import MapMdp, MapState
 from jaxsense.interfaces import common
 from jaxsense.interfaces.extras import extra
-from jaxsense.types import Key
 
 with extra("gymnax"):
     from gymnax.environments import environment, spaces  # pyright: ignore[reportMissingImports]

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxsense.config import Config
+from jaxsense.core.types import Key
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import team
 from jaxsense.interfaces.extras import extra, quietly
-from jaxsense.types import Key
 
 with extra("jaxmarl"), quietly():
     from jaxmarl.environments import multi_agent_env, spaces  # pyright: ignore[reportMissingImports]

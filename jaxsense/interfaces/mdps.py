@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense import observe
-from jaxsense.config import Config, values
+from jaxsense.config import Config
+from jaxsense.core import checks
+from jaxsense.core.types import Key
 from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.models import Models, init, make_jmvae
 from jaxsense.observe import Bank
 from jaxsense.sim import world as worlds
-from jaxsense.types import Key
 from jaxsense.vae import detectors
 
 
@@ -82,7 +83,7 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Bank:
     Returns:
       For each modality `[C, S, D_m]` features.
     """
-    values.require_number("samples", samples)
+    checks.require_number("samples", samples)
     num_classes = len(config.arena.classes)
     world = worlds.make_world(config)
     number = -(-samples * num_classes // config.arena.num_pois)

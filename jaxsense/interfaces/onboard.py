@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense import networks
 from jaxsense.config import Config
+from jaxsense.core import networks
+from jaxsense.core.types import Belief
 from jaxsense.dqn import belief_mdp, policies
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.models import Models, make_jmvae
 from jaxsense.sim import sensors
-from jaxsense.types import Belief
 from jaxsense.vae import detectors, fusion, jmvae, metrics
 
 

@@ -7,11 +7,11 @@ import jax
 import numpy as np
 
 from jaxsense.config import Config
+from jaxsense.core.types import Key
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import team
 from jaxsense.interfaces.extras import extra
 from jaxsense.interfaces.team import TeamOutcome
-from jaxsense.types import Key
 
 with extra("pettingzoo"):
     from gymnasium import error, spaces  # pyright: ignore[reportMissingImports]

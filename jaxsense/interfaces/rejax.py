@@ -4,8 +4,8 @@ from typing import Any
 
 import jax
 
+from jaxsense.core.types import Key
 from jaxsense.interfaces.extras import extra
-from jaxsense.types import Key
 
 with extra("rejax"):
     from jaxsense.interfaces import gymnax

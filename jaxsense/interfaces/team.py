@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxsense.config import Config, values
+from jaxsense.config import Config
+from jaxsense.core import checks
+from jaxsense.core.types import Key
 from jaxsense.dqn import team_mdp
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
-from jaxsense.types import Key
 
 
 @struct.dataclass
@@ -96,7 +97,7 @@ def step(
     """
     num_robots, num_pois = len(state.team.works), mdp.map.num_pois
     chex.assert_shape(actions, (num_robots,), custom_message="actions")
-    values.require_index("actions", actions, num_pois + 1)
+    checks.require_index("actions", actions, num_pois + 1)
     action = actions[state.agent]
     is_absent = jnp.any(~state.team.present & (jnp.arange(num_pois) == action))
     after, outcome = team_mdp.step(key, mdp, state, jnp.where(is_absent, num_pois, action))

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
+from jaxsense.core.types import Belief, Index, Key, call, others, pytree
+from jaxsense.mission import navigation, roadmap
 from jaxsense.mission.decide import sees, standing_robots
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.state import (
@@ -23,10 +25,9 @@ from jaxsense.mission.state import (
 )
 from jaxsense.models import Models, make_jmvae
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import navigation, roadmap, sensors, viewpoints
+from jaxsense.sim import sensors, viewpoints
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene
-from jaxsense.types import Belief, Index, Key, call, others, pytree
 from jaxsense.vae import detectors, fusion, peers
 
 _PROGRESS = 0.02  # m, least shortening of a way that counts as progress

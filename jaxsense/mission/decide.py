@@ -5,10 +5,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from jaxsense import networks
 from jaxsense.config import KNOW_WAYS, POLICIES
+from jaxsense.core import networks
+from jaxsense.core.types import Belief, Index, Key, others
 from jaxsense.dqn import belief_mdp, policies, rules, team_mdp
 from jaxsense.dqn.team_mdp import Team
+from jaxsense.mission import roadmap
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
@@ -24,8 +26,7 @@ from jaxsense.mission.state import (
     with_robot,
 )
 from jaxsense.models import Models, expected, expected_gains
-from jaxsense.sim import roadmap, viewpoints
-from jaxsense.types import Belief, Index, Key, others
+from jaxsense.sim import viewpoints
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another

@@ -9,11 +9,12 @@ import numpy as np
 from mujoco import mjx
 
 from jaxsense.config import ArenaConfig
+from jaxsense.core.types import pytree
+from jaxsense.mission import navigation
 from jaxsense.mission.state import Mission, MissionState
-from jaxsense.sim import amiro, navigation
+from jaxsense.sim import amiro
 from jaxsense.sim import arena as arenas
 from jaxsense.sim.arena import Arena, Layout
-from jaxsense.types import pytree
 
 
 @pytree

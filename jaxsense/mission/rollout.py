@@ -5,7 +5,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import values
+from jaxsense.core import checks
+from jaxsense.core.types import Key
 from jaxsense.mission import act, decide
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.motion import move
@@ -21,7 +22,6 @@ from jaxsense.mission.state import (
     with_robot,
 )
 from jaxsense.models import Models
-from jaxsense.types import Key
 
 
 def rollout(
@@ -40,7 +40,7 @@ def rollout(
       The state after the last one, and the `[steps]` records. For many missions, `rollout_batch`
       is faster than a `vmap` of this.
     """
-    values.require_number("steps", steps)
+    checks.require_number("steps", steps)
 
     def go_on(states: MissionState, key: Key):
         states, records = step(key[None], mission, models, states)

@@ -7,15 +7,16 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense.config import POLICIES, Config
-from jaxsense.config import values as checks
+from jaxsense.core import checks
+from jaxsense.core.types import Belief, Index, Key, pytree
+from jaxsense.mission import roadmap
+from jaxsense.mission.roadmap import Roadmap
 from jaxsense.models import make_jmvae
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import roadmap, sensors
+from jaxsense.sim import sensors
 from jaxsense.sim import world as worlds
 from jaxsense.sim.arena import Arena
-from jaxsense.sim.roadmap import Roadmap
 from jaxsense.sim.world import Scene, World
-from jaxsense.types import Belief, Index, Key, pytree
 from jaxsense.vae import fusion
 
 LATENT = POLICIES.index("latent")

@@ -10,11 +10,11 @@ import jax
 import numpy as np
 
 from jaxsense.config import Config
+from jaxsense.core.types import Key
 from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import Programs, padded
 from jaxsense.stages import Progress, Stage, Steps
-from jaxsense.types import Key
 
 _SAVE_PERIOD = 60.0  # s
 

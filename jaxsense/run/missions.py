@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense.config import MISSIONS_AT_ONCE, Config, values
+from jaxsense.config import MISSIONS_AT_ONCE, Config
+from jaxsense.core import checks
+from jaxsense.core.types import Key
 from jaxsense.mission import compare
 from jaxsense.mission.cases import Case
 from jaxsense.mission.outcome import bytes_per_detection, measure, summarise
@@ -26,7 +28,6 @@ from jaxsense.mission.state import (
 from jaxsense.models import Models, init
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.types import Key
 
 _CHUNK_TIME = 2.5  # s
 
@@ -66,7 +67,7 @@ def chunk_of(config: Config) -> int:
 
 def batch_of(total: int) -> int:
     """How many missions to play side by side: fewer than `total`, as some last long."""
-    values.require_number("total", total)
+    checks.require_number("total", total)
     return min(MISSIONS_AT_ONCE, -(-total // 3))
 
 

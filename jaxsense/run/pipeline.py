@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxsense import examine, mission
 from jaxsense.config import Config
+from jaxsense.core.types import Belief, Key
 from jaxsense.models import Models
 from jaxsense.run import missions
 from jaxsense.run.checkpoints import Checkpoints
@@ -20,7 +21,6 @@ from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs, compile_programs
 from jaxsense.sim.world import make_world
 from jaxsense.stages import agent, mission_key, models
-from jaxsense.types import Belief, Key
 
 _UNAMBIGUOUS = 0.9  # share of looks in a single class, above which the class counts as one
 

@@ -16,13 +16,13 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from jaxsense.config import POLICIES, Config
+from jaxsense.core.types import Belief
 from jaxsense.mission.compare import interval
 from jaxsense.run import files
 from jaxsense.run.pipeline import RunResult
 from jaxsense.show import metrics
 from jaxsense.show.colours import RGB, as_srgb, class_colour
 from jaxsense.sim import sensors
-from jaxsense.types import Belief
 from jaxsense.vae.metrics import reliability
 
 _MOST_ELLIPSES = 40

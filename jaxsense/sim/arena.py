@@ -17,9 +17,9 @@ from flax import struct
 from mujoco import mjx
 
 from jaxsense.config import TIMESTEP, ArenaConfig, Shape
-from jaxsense.config import values as checks
+from jaxsense.core import checks
+from jaxsense.core.types import Key, pytree
 from jaxsense.sim import amiro
-from jaxsense.types import Key, pytree
 
 WALL_HEIGHT = 0.3  # m
 WALL_THICKNESS = 0.05  # m

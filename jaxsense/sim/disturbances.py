@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense.config import CameraConfig, LidarConfig
-from jaxsense.types import Key
+from jaxsense.core.types import Key
 
 
 def measured_ranges(key: Key, distance: jax.Array, config: LidarConfig) -> jax.Array:

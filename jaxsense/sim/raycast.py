@@ -15,9 +15,9 @@ from flax import struct
 from jax.core import Tracer
 from mujoco import mjx
 
-from jaxsense.config import values
+from jaxsense.core import checks
+from jaxsense.core.types import pytree
 from jaxsense.sim.arena import Arena
-from jaxsense.types import pytree
 
 _VISIBLE_GROUP = 0
 
@@ -79,7 +79,7 @@ def cross_section(arena: Arena, data: mjx.Data, height: float, robot: int) -> Cr
     """
     if not -1 <= robot < arena.num_robots:
         raise ValueError(f"robot = {robot}: must be -1 or one of the {arena.num_robots} robots")
-    values.require_finite("height", height)
+    checks.require_finite("height", height)
     kinds = arena.mj_model.geom_type
     seen = [
         g
@@ -129,12 +129,12 @@ def cast_along(section: CrossSection, origin: jax.Array, direction: Direction) -
     """Casts rays along unit vectors: twice as fast as `cast` if these are shared by many calls."""
     chex.assert_shape(origin, (2,), custom_message="origin")
     chex.assert_equal_shape(direction, custom_message="direction")
-    values.require_finite("origin", origin)
+    checks.require_finite("origin", origin)
     for part in direction:
-        values.require_finite("direction", part)
+        checks.require_finite("direction", part)
     if not any(isinstance(part, Tracer) for part in direction):
         lengths = np.hypot(*map(np.asarray, direction))
-        values.require("length of direction", lengths, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
+        checks.require("length of direction", lengths, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
     # Chosen here and not by `platform_dependent`, which is traced and batched twice as long.
     on_cpu = jax.default_backend() == "cpu"
     nearest = _nearest_by_two_loops if on_cpu else _nearest_by_one_loop

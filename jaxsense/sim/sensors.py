@@ -24,10 +24,10 @@ from jaxsense.config import (
     ConfigError,
     LidarConfig,
 )
-from jaxsense.config import values as checks
+from jaxsense.core import checks
+from jaxsense.core.types import Key, pytree
 from jaxsense.sim import amiro, disturbances, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
-from jaxsense.types import Key, pytree
 
 _LEAST_CHROMA = 0.1  # difference of a pixel's channels, 0 on walls, robots and in the dark
 _RANGE_TOLERANCE = 5.0  # standard deviations of the LiDAR's noise

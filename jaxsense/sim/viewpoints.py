@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense.config import ArenaConfig, ViewpointConfig
+from jaxsense.core.types import Key
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
-from jaxsense.types import Key
 
 NUM_CANDIDATES = 16
 

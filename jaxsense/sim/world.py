@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from jaxsense.config import Config, values
+from jaxsense.config import Config
+from jaxsense.core import checks
+from jaxsense.core.types import Key, others, pytree
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors, viewpoints
-from jaxsense.types import Key, others, pytree
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -106,8 +107,8 @@ def look(
     if not 0 <= robot < len(world.sensors):
         raise ValueError(f"robot = {robot}: must be one of the {len(world.sensors)} robots")
     chex.assert_rank(poi, 0, custom_message="poi")
-    values.require_index("poi", poi, world.config.arena.num_pois)
-    values.require_finite("scene.poses", scene.poses)
+    checks.require_index("poi", poi, world.config.arena.num_pois)
+    checks.require_finite("scene.poses", scene.poses)
     viewpoint_key, noise_key = jax.random.split(key)
     others = jnp.delete(scene.poses, robot, axis=0)
     pose, bearing = _viewpoint(viewpoint_key, world, scene.layout, others, poi)

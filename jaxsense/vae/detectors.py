@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxsense import networks
 from jaxsense.config import DetectorConfig
-from jaxsense.networks import MLP, Params
-from jaxsense.types import Key, pytree
-from jaxsense.vae import minibatch
-from jaxsense.vae.minibatch import FitState
+from jaxsense.core import networks, supervised
+from jaxsense.core.networks import MLP, Params
+from jaxsense.core.supervised import FitState
+from jaxsense.core.types import Key, pytree
 
 _MOST_TEMPERATURE = 4.0
 
@@ -68,7 +67,7 @@ def detect(detector: Detector, window: jax.Array) -> jax.Array:
 
 def start(detector: Detector, config: DetectorConfig) -> FitState:
     """The state before the first gradient step."""
-    return minibatch.start(detector.params, _optimiser(config))
+    return supervised.start(detector.params, _optimiser(config))
 
 
 def train(
@@ -104,7 +103,7 @@ def train(
         predicted = networks.apply(_network(detector), params, standard.T)
         return optax.softmax_cross_entropy_with_integer_labels(predicted, labels[rows], 0).mean()
 
-    return minibatch.fit(state, loss, rows, _optimiser(config), config.steps)
+    return supervised.fit(state, loss, rows, _optimiser(config), config.steps)
 
 
 def calibrate(detector: Detector, windows: jax.Array, labels: jax.Array) -> Detector:
@@ -139,4 +138,4 @@ def _network(detector: Detector) -> MLP:
 
 
 def _optimiser(config: DetectorConfig) -> optax.GradientTransformation:
-    return minibatch.adam(config.learning_rate, config.steps)
+    return supervised.adam(config.learning_rate, config.steps)

@@ -12,13 +12,13 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense import networks
-from jaxsense.config import FilterConfig, values
-from jaxsense.networks import MLP, Params
-from jaxsense.types import Belief, Key
-from jaxsense.vae import gaussian, minibatch
+from jaxsense.config import FilterConfig
+from jaxsense.core import checks, networks, supervised
+from jaxsense.core.networks import MLP, Params
+from jaxsense.core.supervised import FitState
+from jaxsense.core.types import Belief, Key
+from jaxsense.vae import gaussian
 from jaxsense.vae.jmvae import Jmvae
-from jaxsense.vae.minibatch import FitState
 
 LEAST_WEIGHT = 1e-5
 """Least probability of a class that a belief can hold in float32."""
@@ -76,10 +76,10 @@ def update(
       ValueError: if there is no such modality, features are no probabilities, or a belief is not
         finite or not positive.
     """
-    values.require_index("modality", modality, len(model.modalities))
+    checks.require_index("modality", modality, len(model.modalities))
     size = (model.feature_sizes[modality],)
     chex.assert_shape(features, size, custom_message=f"features of {model.modalities[modality]}")
-    values.require_probabilities("features", features)
+    checks.require_probabilities("features", features)
     chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
     chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
     found = evidence(params, model, features, modality)
@@ -92,7 +92,7 @@ def evidence(params: Params, model: Jmvae, features: jax.Array, modality: int) -
 
     Or `[C, B]` of `[D_m, B]`.
     """
-    values.require_index("modality", modality, len(model.modalities))
+    checks.require_index("modality", modality, len(model.modalities))
     hidden = tuple(
         layer["bias"].shape[0]
         for name, layer in sorted(_layers(params, model, modality).items())[:-1]
@@ -114,7 +114,7 @@ def mixture(classes: Belief, weights: jax.Array) -> Belief:
       weights: `[C]` of sum 1.
     """
     chex.assert_shape(weights, classes.mean.shape[:1], custom_message="weights")
-    values.require_probabilities("weights", weights)
+    checks.require_probabilities("weights", weights)
     mean = weights @ classes.mean
     spread = classes.std**2 + (classes.mean - mean[None]) ** 2
     return Belief(mean, jnp.sqrt(weights @ spread))
@@ -146,8 +146,8 @@ def weights(params: Params, belief: Belief) -> jax.Array:
     Returns:
       `[C]` probabilities of `LEAST_WEIGHT` at least.
     """
-    values.require_finite("belief.mean", belief.mean)
-    values.require_positive("belief.std", belief.std)
+    checks.require_finite("belief.mean", belief.mean)
+    checks.require_positive("belief.std", belief.std)
     found = jnp.maximum(params["inverse"] @ _moments(belief), LEAST_WEIGHT)
     unseen = params["unseen"]
     apart = jnp.maximum(jnp.abs(belief.mean - unseen.mean), jnp.abs(belief.std - unseen.std))
@@ -163,7 +163,7 @@ def entropy(weights: jax.Array) -> jax.Array:
 
 def start(params: Params, config: FilterConfig) -> FitState:
     """The state before the first gradient step: the networks alone are trained."""
-    return minibatch.start(params["networks"], minibatch.adam(config.learning_rate, config.steps))
+    return supervised.start(params["networks"], supervised.adam(config.learning_rate, config.steps))
 
 
 def train(
@@ -189,7 +189,7 @@ def train(
     Returns:
       The next state and the `[steps]` losses.
     """
-    values.require_one_each("bank", bank, model.modalities)
+    checks.require_one_each("bank", bank, model.modalities)
     classes = params["classes"]
 
     def loss(of_networks: Params, drawn, step: jax.Array) -> jax.Array:
@@ -206,8 +206,8 @@ def train(
         return jnp.mean(_divergence(truth, beliefs))
 
     drawn = _draw(key, bank, (steps, config.looks, config.batch))
-    optimiser = minibatch.adam(config.learning_rate, config.steps)
-    return minibatch.fit(state, loss, drawn, optimiser, config.steps)
+    optimiser = supervised.adam(config.learning_rate, config.steps)
+    return supervised.fit(state, loss, drawn, optimiser, config.steps)
 
 
 def _divergence(truth: Belief, beliefs: Belief) -> jax.Array:

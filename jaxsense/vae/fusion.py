@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense.config import values
-from jaxsense.networks import Params
-from jaxsense.types import Belief, Features
+from jaxsense.core import checks
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Belief, Features
 from jaxsense.vae import filtering, jmvae, metrics
 from jaxsense.vae.jmvae import Jmvae
 
@@ -49,12 +49,12 @@ def fuse(
     chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
     chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
     chex.assert_shape(seen, (len(model.modalities),), custom_message="seen")
-    values.require_finite("belief.mean", belief.mean)
-    values.require_positive("belief.std", belief.std)
+    checks.require_finite("belief.mean", belief.mean)
+    checks.require_positive("belief.std", belief.std)
     jmvae.check_features(model, features)
     for name, new in zip(model.modalities, features, strict=True):
         if new is not None:
-            values.require_probabilities(f"features of {name}", new)
+            checks.require_probabilities(f"features of {name}", new)
     generated = jmvae.decode(params, model, belief.mean)
     others = [m for m, new in enumerate(features) if new is None]
     entry = belief
@@ -86,7 +86,7 @@ def write(
     """
     if FILTER in params:
         return filtering.update(params[FILTER], model, belief, features, modality)
-    values.require_index("modality", modality, len(model.modalities))
+    checks.require_index("modality", modality, len(model.modalities))
     of_all = tuple(features if m == modality else None for m in range(len(model.modalities)))
     return fuse(params, model, belief, seen, of_all)
 
@@ -109,7 +109,7 @@ def most_likely_class(params: Params, class_means: jax.Array, belief: Belief) ->
 
 def unseen(model: Jmvae, variance: float) -> Belief:
     """Entry of an unseen PoI: mean 0 and the given variance in each dimension."""
-    values.require_positive("variance", variance)
+    checks.require_positive("variance", variance)
     return Belief(
         jnp.zeros(model.latent_size), jnp.full(model.latent_size, jnp.sqrt(jnp.float32(variance)))
     )

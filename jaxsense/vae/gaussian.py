@@ -4,7 +4,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import values
+from jaxsense.core import checks
 
 
 def kl_divergence(
@@ -63,7 +63,7 @@ def moment_match(mean: jax.Array, std: jax.Array) -> tuple[jax.Array, jax.Array]
     """
     chex.assert_rank(mean, 2, custom_message="mean")
     chex.assert_shape(std, mean.shape, custom_message="std")
-    values.require_number("number of components", len(mean))
-    values.require_positive("std", std)
+    checks.require_number("number of components", len(mean))
+    checks.require_positive("std", std)
     variance = jnp.mean(std**2, axis=0) + jnp.var(mean, axis=0)
     return jnp.mean(mean, axis=0), jnp.sqrt(variance)

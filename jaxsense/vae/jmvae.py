@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsense import networks
-from jaxsense.config import JmvaeConfig, values
-from jaxsense.networks import MLP, Params
-from jaxsense.types import Belief, Features, Key
-from jaxsense.vae import gaussian, minibatch
-from jaxsense.vae.minibatch import FitState
+from jaxsense.config import JmvaeConfig
+from jaxsense.core import checks, networks, supervised
+from jaxsense.core.networks import MLP, Params
+from jaxsense.core.supervised import FitState
+from jaxsense.core.types import Belief, Features, Key
+from jaxsense.vae import gaussian
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Jmvae:
             )
         if len(set(self.modalities)) < len(self.modalities):
             raise ValueError(f"modalities = {self.modalities}: must name none twice")
-        values.require_number("latent_size", self.latent_size)
+        checks.require_number("latent_size", self.latent_size)
         for name in ("feature_sizes", "hidden"):
             for size in getattr(self, name):
-                values.require_number(name, size)
+                checks.require_number(name, size)
 
     @property
     def subsets(self) -> tuple[tuple[int, ...], ...]:
@@ -127,7 +127,7 @@ def check_features(model: Jmvae, features: Features) -> None:
     for name, size, feature in zip(model.modalities, model.feature_sizes, features, strict=True):
         if feature is not None:
             chex.assert_shape(feature, (size,), custom_message=f"features of {name}")
-            values.require_finite(f"features of {name}", feature)
+            checks.require_finite(f"features of {name}", feature)
 
 
 def decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]:
@@ -181,7 +181,7 @@ def loss(
     Raises:
       ValueError: if a modality's features or its weight is missing.
     """
-    values.require_one_each("features", features, model.modalities)
+    checks.require_one_each("features", features, model.modalities)
     if any(x is None for x in features):
         raise ValueError(f"features = {features}: must hold every one of {model.modalities}")
     noise = jax.random.normal(key, (model.latent_size, 1))
@@ -249,7 +249,7 @@ def losses(
 
 def start(params: Params, config: JmvaeConfig) -> FitState:
     """The state before the first gradient step."""
-    return minibatch.start(params, _optimiser(config))
+    return supervised.start(params, _optimiser(config))
 
 
 def train(
@@ -274,8 +274,8 @@ def train(
     Returns:
       The next state and the `[steps]` losses.
     """
-    values.require_number("steps", steps)
-    values.require_one_each("bank", bank, model.modalities)
+    checks.require_number("steps", steps)
+    checks.require_one_each("bank", bank, model.modalities)
     for features, size in zip(bank, model.feature_sizes, strict=True):
         chex.assert_shape(features, (bank[0].shape[0], None, size), custom_message="bank")
 
@@ -293,7 +293,7 @@ def train(
         return jnp.mean(total)
 
     drawn = _draw(key, bank, (steps, config.batch), model.latent_size)
-    return minibatch.fit(state, batch_loss, drawn, _optimiser(config), config.steps)
+    return supervised.fit(state, batch_loss, drawn, _optimiser(config), config.steps)
 
 
 def _draw(
@@ -325,4 +325,4 @@ def annealed_beta(step: jax.Array, config: JmvaeConfig) -> jax.Array:
 
 
 def _optimiser(config: JmvaeConfig) -> optax.GradientTransformation:
-    return minibatch.adam(config.learning_rate, config.steps)
+    return supervised.adam(config.learning_rate, config.steps)

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense.config import values
-from jaxsense.types import Belief
+from jaxsense.core import checks
+from jaxsense.core.types import Belief
 from jaxsense.vae.gaussian import moment_match
 
 ACTIVE_VARIANCE = 0.01
@@ -18,7 +18,7 @@ _BINS = 15
 def sigma_norm(std: jax.Array) -> jax.Array:
     """`||sigma||_2` of `[..., D]` standard deviations, the colour in the paper's Fig. 4."""
     chex.assert_shape(std, (..., None), custom_message="std")
-    values.require_positive("std", std)
+    checks.require_positive("std", std)
     return jnp.linalg.norm(std, axis=-1)
 
 
@@ -58,9 +58,9 @@ def _check_belief(belief: Belief, class_means: jax.Array) -> None:
     chex.assert_rank(belief.mean, 1, custom_message="belief.mean")
     chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
     chex.assert_shape(class_means, (None, *belief.mean.shape), custom_message="class_means")
-    values.require_finite("belief.mean", belief.mean)
-    values.require_finite("class_means", class_means)
-    values.require_positive("belief.std", belief.std)
+    checks.require_finite("belief.mean", belief.mean)
+    checks.require_finite("class_means", class_means)
+    checks.require_positive("belief.std", belief.std)
 
 
 def negative_log_likelihood(probabilities: jax.Array, labels: jax.Array) -> jax.Array:

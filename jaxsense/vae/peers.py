@@ -4,8 +4,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import values
-from jaxsense.types import Belief
+from jaxsense.core import checks
+from jaxsense.core.types import Belief
 from jaxsense.vae.metrics import LEAST_PROBABILITY
 
 _LEAST_PRECISION = 1e-6
@@ -26,8 +26,8 @@ def log_likelihoods(features: jax.Array, label_of_class: jax.Array) -> jax.Array
     """
     chex.assert_rank(features, 1, custom_message="features")
     chex.assert_rank(label_of_class, 1, custom_message="label_of_class")
-    values.require_index("label_of_class", label_of_class, len(features))
-    values.require_probabilities("features", features)
+    checks.require_index("label_of_class", label_of_class, len(features))
+    checks.require_probabilities("features", features)
     label_of_class = jnp.asarray(label_of_class)
     prior = jnp.zeros(len(features)).at[label_of_class].add(1 / len(label_of_class))
     ratio = jnp.maximum(features[label_of_class], LEAST_PROBABILITY) / prior[label_of_class]
@@ -50,7 +50,7 @@ def bayes_update(
     chex.assert_rank(log_weights, 1, custom_message="log_weights")
     chex.assert_shape(label_of_class, log_weights.shape, custom_message="label_of_class")
     # Infinite if no class has any weight, NaN if one is.
-    values.require_finite("largest of log_weights", jnp.max(log_weights))
+    checks.require_finite("largest of log_weights", jnp.max(log_weights))
     return jax.nn.log_softmax(log_weights + log_likelihoods(features, label_of_class))
 
 
@@ -67,8 +67,8 @@ def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Beli
     """
     for name, each in (("belief", belief), ("posterior", posterior), ("prior", prior)):
         chex.assert_shape(each.std, each.mean.shape, custom_message=name)
-        values.require_finite(f"{name}.mean", each.mean)
-        values.require_positive(f"{name}.std", each.std)
+        checks.require_finite(f"{name}.mean", each.mean)
+        checks.require_positive(f"{name}.std", each.std)
     of_belief, of_posterior, of_prior = (x.std**-2 for x in (belief, posterior, prior))
     precision = jnp.maximum(of_belief + of_posterior - of_prior, _LEAST_PRECISION)
     total = of_belief * belief.mean + of_posterior * posterior.mean - of_prior * prior.mean

@@ -10,8 +10,8 @@ import pytest
 from toys import classes_mdp, noisy_mdp
 
 from jaxsense.config import MdpConfig
+from jaxsense.core.types import Belief
 from jaxsense.dqn import belief_mdp
-from jaxsense.types import Belief
 
 NOP = 3
 MDP = classes_mdp()

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from toys import paying_once_mdp
 
-from jaxsense import networks
 from jaxsense.config import DqnConfig
+from jaxsense.core import networks
 from jaxsense.dqn import belief_mdp, environments, policies, replay, training
 
 # Every episode is cut after one action: no value could be learnt beyond it, were a cut an end.

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from jaxsense.config import MdpConfig
+from jaxsense.core.types import Belief
 from jaxsense.dqn import belief_mdp, episodes, optimum, policies
 from jaxsense.dqn.belief_mdp import MapMdp
-from jaxsense.types import Belief
 from jaxsense.vae import filtering
 
 KEY = jax.random.key(0)

@@ -9,8 +9,8 @@ import pytest
 from toys import classes_mdp, paying_once_mdp
 
 from jaxsense.config import DqnConfig
+from jaxsense.core.types import Belief
 from jaxsense.dqn import belief_mdp, episodes, policies, training
-from jaxsense.types import Belief
 
 MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
 FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from toys import classes_mdp
 
+from jaxsense.core.types import Belief
 from jaxsense.dqn import belief_mdp, episodes, policies
-from jaxsense.types import Belief
 
 # The camera tells class 0 from the others, the LiDAR class 2.
 LABELS = ((1, 0, 0), (0, 0, 1))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import networks
+from jaxsense.core import networks
 from jaxsense.dqn import pooling, team_mdp
 from jaxsense.dqn.pooling import PoolingNetwork
 

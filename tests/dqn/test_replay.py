@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxsense.core.types import Transition
 from jaxsense.dqn import replay
-from jaxsense.types import Transition
 
 ROUNDS, BLOCKS, WIDTH = 4, 3, 2
 NUM_ENVS = BLOCKS * WIDTH

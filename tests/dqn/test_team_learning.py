@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from toys import classes_mdp, paying_once_mdp
 
-from jaxsense import networks
 from jaxsense.config import DqnConfig, TeamConfig, TravelConfig
+from jaxsense.core import networks
 from jaxsense.dqn import belief_mdp, environments, losses, policies, team_mdp, training
 from jaxsense.dqn.team_mdp import TeamMdp
 

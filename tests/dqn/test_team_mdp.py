@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from toys import classes_mdp, noisy_mdp
 
 from jaxsense.config import TeamConfig, TravelConfig
+from jaxsense.core.types import Belief
 from jaxsense.dqn import belief_mdp, team_mdp
 from jaxsense.dqn.team_mdp import Team, TeamMdp, TeamState
-from jaxsense.types import Belief
 
 TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
 NOP, CAMERA, LIDAR = 3, 0, 1

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from toys import classes_mdp
 
-from jaxsense import networks
 from jaxsense.config import DqnConfig, TeamConfig, ToursConfig, TravelConfig
+from jaxsense.core import networks, supervised
+from jaxsense.core.types import Belief
 from jaxsense.dqn import policies, team_mdp, tours
 from jaxsense.dqn.team_mdp import Team, TeamMdp
 from jaxsense.dqn.tours import Trials
-from jaxsense.types import Belief
-from jaxsense.vae import minibatch
 
 TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
 # In a row, 1.9 and 3.9 m from two robots at the origin; the third is not present.
@@ -138,14 +137,14 @@ def test_columns_are_written_and_only_those_with_a_trial_drawn():
 
 
 def test_training_finds_the_shorter_tour():
-    trials, optimiser = trials_of(), minibatch.adam(1e-2, 100)
+    trials, optimiser = trials_of(), supervised.adam(1e-2, 100)
     params = networks.init(jax.random.key(1), NETWORK, NETWORK.features * 3)
-    state = minibatch.start(params, optimiser)
+    state = supervised.start(params, optimiser)
 
     def loss(params, drawn, step):
         return tours.loss(NETWORK, params, trials, 2)
 
-    state, losses = jax.jit(lambda s: minibatch.fit(s, loss, jnp.zeros(100), optimiser))(state)
+    state, losses = jax.jit(lambda s: supervised.fit(s, loss, jnp.zeros(100), optimiser))(state)
     assert losses[-1] < 1e-3 < losses[0]
     learned = jax.jit(lambda x: tours.seconds(NETWORK, state.params, x, 2))(trials.observation)
     expected = (BACKWARDS - IN_ORDER) / 2

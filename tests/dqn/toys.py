@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense.config import MdpConfig
+from jaxsense.core.types import Belief
 from jaxsense.dqn.belief_mdp import MapMdp
-from jaxsense.types import Belief
 
 
 def classes_mdp(num_pois=3, num_modalities=2, **config):

@@ -23,13 +23,13 @@ import numpy as np
 import optax
 
 from jaxsense import cli, evaluate, export, train
+from jaxsense.core.supervised import FitState
 from jaxsense.dqn import training as dqn_training
 from jaxsense.dqn.training import DqnState
 from jaxsense.run.compilation import Program
 from jaxsense.show import plots
 from jaxsense.stages import Progress, Surveys
 from jaxsense.vae import detectors, jmvae
-from jaxsense.vae.minibatch import FitState
 
 NAN_STEP = 17
 TRAININGS = {

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from arenas import arena, known_layout, place, set_native  # noqa: F401
 from teams import CONFIG, NAIVE
 
 import jaxsense

@@ -9,11 +9,11 @@ import pytest
 from teams import CONFIG, NAIVE, with_values
 
 from jaxsense import mission
+from jaxsense.core.types import Belief
 from jaxsense.dqn import optimum
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.mission import POLICIES, decide
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, with_config
-from jaxsense.types import Belief
 from jaxsense.vae import filtering
 
 # The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.

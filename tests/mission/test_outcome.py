@@ -9,9 +9,9 @@ import pytest
 from teams import CONFIG
 
 from jaxsense import mission
+from jaxsense.core.types import Belief
 from jaxsense.mission import outcome
 from jaxsense.mission.state import DRIVING, ENDED, FAILED
-from jaxsense.types import Belief
 
 POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
 POSES = [[0.0, 0.0, 0.0], [0.0, 1.2, 0.0]]

@@ -8,8 +8,9 @@ import pytest
 from teams import CONFIG, NAIVE
 
 from jaxsense import mission
+from jaxsense.mission import navigation
 from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
-from jaxsense.sim import amiro, navigation
+from jaxsense.sim import amiro
 from jaxsense.sim import arena as arenas
 
 STEPS, CHUNK = 240, 40

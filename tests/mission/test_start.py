@@ -7,8 +7,7 @@ import pytest
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig, Config
-from jaxsense.mission import state
-from jaxsense.sim import roadmap
+from jaxsense.mission import roadmap, state
 
 # So narrow that from some places there is no way out.
 CONFIG = Config(arena=ArenaConfig(num_pois=16, poi_gap=0.1))

@@ -10,9 +10,9 @@ from teams import CONFIG, NAIVE, alone, with_values
 
 import jaxsense
 from jaxsense import mission
+from jaxsense.core.types import Belief
 from jaxsense.mission import POLICIES, act, decide, outcome
 from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
-from jaxsense.types import Belief
 
 TEAM = replace(CONFIG, robots=("camera", "camera", "lidar"))
 FIRST, SECOND, LIDAR = 0, 1, 2

@@ -1,46 +1,7 @@
-import jax
-import jax.numpy as jnp
-import mujoco
-import numpy as np
 import pytest
+from arenas import arena, known_layout, place, set_native  # noqa: F401
 
-from jaxsense import sim
-from jaxsense.config import ArenaConfig
 from jaxsense.sim import raycast
-
-
-@pytest.fixture(scope="session")
-def arena():
-    """An arena without contacts, in which robot 1 carries the laser scanner."""
-    return sim.build(ArenaConfig(), (False, True))
-
-
-@pytest.fixture(scope="session")
-def place(arena):
-    return jax.jit(lambda layout, poses: sim.place(arena, layout, poses))
-
-
-@pytest.fixture(scope="session")
-def set_native(arena):
-    """The state of C MuJoCo that equals an MJX state, after its own kinematics."""
-
-    def native(data, of=arena):
-        mj_data = mujoco.MjData(of.mj_model)
-        mj_data.mocap_pos[:] = data.mocap_pos
-        mj_data.mocap_quat[:] = data.mocap_quat
-        mj_data.qpos[:] = data.qpos
-        mujoco.mj_kinematics(of.mj_model, mj_data)
-        return mj_data
-
-    return native
-
-
-@pytest.fixture(scope="session")
-def known_layout():
-    """A green cylinder at the origin, a cube turned by 30 degrees at (0, 1), another at (1, -1)."""
-    position = jnp.array([[0.0, 0.0], [0.0, 1.0], [1.0, -1.0]])
-    yaw = jnp.array([0.0, np.radians(30.0), 0.0])
-    return sim.make_layout(ArenaConfig(), position, yaw, jnp.array([0, 2, 2]))
 
 
 @pytest.fixture(params=["_nearest_by_one_loop", "_nearest_by_two_loops"])

@@ -9,7 +9,8 @@ import pytest
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig, Attribute, CameraConfig, Config, LidarConfig, Shape
-from jaxsense.sim import navigation, sensors
+from jaxsense.mission import navigation
+from jaxsense.sim import sensors
 
 LIGHT = sim.Light(jnp.array([0.8, 0.0, 0.6]), diffuse=jnp.float32(0.5), ambient=jnp.float32(0.25))
 CONFIG = ArenaConfig(

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxsense.config import FilterConfig
-from jaxsense.types import Belief
+from jaxsense.core.types import Belief
 from jaxsense.vae import filtering, fusion, jmvae, peers
 from jaxsense.vae.jmvae import Jmvae
 

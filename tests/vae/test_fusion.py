@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.types import Belief
+from jaxsense.core.types import Belief
 from jaxsense.vae import fusion, jmvae
 from jaxsense.vae.jmvae import Jmvae
 

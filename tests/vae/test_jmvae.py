@@ -9,7 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from jaxsense.config import JmvaeConfig
-from jaxsense.types import Belief
+from jaxsense.core.types import Belief
 from jaxsense.vae import fusion, gaussian, jmvae, metrics
 from jaxsense.vae.jmvae import Jmvae
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from jaxsense.config import JmvaeConfig
-from jaxsense.vae import jmvae, minibatch
+from jaxsense.core import supervised
+from jaxsense.vae import jmvae
 
 MODEL = jmvae.Jmvae(("camera", "lidar"), (1, 2), 2, (3,))
 SETTINGS = JmvaeConfig(batch=64, steps=40)
@@ -18,7 +19,7 @@ LIDAR = np.tile(CLASSES + ROWS, (1, 1, 2))
 @pytest.fixture(scope="module")
 def drawn():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(minibatch, "fit", lambda state, loss, drawn, optimiser, total: drawn)
+        patch.setattr(supervised, "fit", lambda state, loss, drawn, optimiser, total: drawn)
         return jmvae.train(jax.random.key(0), None, MODEL, (CAMERA, LIDAR), SETTINGS, 20)
 
 
@@ -48,7 +49,7 @@ def test_a_bank_of_the_wrong_shape_is_named():
 
 
 def test_three_modalities_are_drawn_independently(monkeypatch):
-    monkeypatch.setattr(minibatch, "fit", lambda state, loss, drawn, optimiser, total: drawn)
+    monkeypatch.setattr(supervised, "fit", lambda state, loss, drawn, optimiser, total: drawn)
     model = jmvae.Jmvae(("camera", "lidar", "thermal"), (1, 2, 2), 2, (3,))
     _, features = jmvae.train(jax.random.key(0), None, model, (CAMERA, LIDAR, LIDAR), SETTINGS, 20)
     _, lidar, thermal = (np.asarray(x[:, 0]) for x in features)

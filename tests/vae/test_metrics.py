@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.types import Belief
+from jaxsense.core.types import Belief
 from jaxsense.vae import gaussian, metrics
 
 CLASS_MEANS = jnp.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]])

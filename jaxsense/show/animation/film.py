@@ -8,13 +8,13 @@ import jax
 import numpy as np
 
 from jaxsense.config import Config
+from jaxsense.core.types import Belief
 from jaxsense.mission import Record
 from jaxsense.run import files
 from jaxsense.run.missions import Recording
 from jaxsense.show.animation.svg import Timeline, add
 from jaxsense.show.animation.views import SIZE, ArenaView, MapView
 from jaxsense.show.colours import modality_colour
-from jaxsense.types import Belief
 
 WIDTH = 2 * SIZE + 40
 _SPEED = 2.0  # times real time

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxsense.config import ROBOT_RADIUS, Config
+from jaxsense.core.types import Belief
 from jaxsense.mission import MissionState, Record
 from jaxsense.mission.state import ENDED, FACING
 from jaxsense.show.animation.svg import Timeline, add
 from jaxsense.show.colours import as_hex, class_colour, modality_colour
-from jaxsense.types import Belief
 
 SIZE = 340  # px, of a view
 _FLASH = 6  # frames that a look is shown for

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxsense.networks import Params
-from jaxsense.types import pytree
+from jaxsense.core.networks import Params
+from jaxsense.core.types import pytree
 
 
 @pytree

@@ -10,7 +10,7 @@ from navigating import ARENA, PERIOD, SETTINGS, layout_of
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig
-from jaxsense.sim import navigation
+from jaxsense.mission import navigation
 
 LARGE = ArenaConfig(num_pois=16, side=6.0)
 AWAY = [[-1.2, -1.2, 0.0], [-1.2, 1.2, 0.0], [1.2, -1.2, 0.0]]

@@ -8,7 +8,7 @@ from scipy.sparse import csgraph
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig, Config, NavigationConfig
-from jaxsense.sim import roadmap
+from jaxsense.mission import roadmap
 
 CONFIG = Config()
 ALONE = Config(arena=ArenaConfig(num_pois=1))

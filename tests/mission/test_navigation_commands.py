@@ -9,7 +9,8 @@ from navigating import ARENA
 
 from jaxsense import sim
 from jaxsense.config import SHAPES
-from jaxsense.sim import amiro, navigation
+from jaxsense.mission import navigation
+from jaxsense.sim import amiro
 
 
 @pytest.mark.parametrize(

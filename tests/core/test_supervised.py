@@ -4,12 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxsense.vae import minibatch
+from jaxsense.core import supervised
 
 
 def fit(state, optimiser, batches):
     """Fits p to batches with the loss (p - batch)^2 / 2."""
-    return minibatch.fit(
+    return supervised.fit(
         state, lambda params, batch, step: 0.5 * (params - batch) ** 2, batches, optimiser
     )
 
@@ -17,7 +17,7 @@ def fit(state, optimiser, batches):
 def test_steps_of_gradient_descent_as_worked_by_hand():
     # p <- p - .5 (p - 3): 0, 1.5, and then towards 5: 1.5 + .5 x 3.5 = 3.25.
     optimiser = optax.sgd(0.5)
-    start = minibatch.start(jnp.float32(0), optimiser)
+    start = supervised.start(jnp.float32(0), optimiser)
     state, losses = fit(start, optimiser, jnp.array([3.0, 5.0]))
     np.testing.assert_allclose(state.params, 3.25)
     np.testing.assert_allclose(losses, [4.5, 6.125])  # 3^2 / 2; 3.5^2 / 2
@@ -25,8 +25,8 @@ def test_steps_of_gradient_descent_as_worked_by_hand():
 
 
 def test_chunks_go_on_where_the_last_one_stopped():
-    optimiser, batches = minibatch.adam(0.1, 6), jnp.full(6, 3.0)
-    start = minibatch.start(jnp.float32(0), optimiser)
+    optimiser, batches = supervised.adam(0.1, 6), jnp.full(6, 3.0)
+    start = supervised.start(jnp.float32(0), optimiser)
     whole, losses = fit(start, optimiser, batches)
     half, first = fit(start, optimiser, batches[:3])
     chunked, second = fit(half, optimiser, batches[3:])
@@ -36,8 +36,8 @@ def test_chunks_go_on_where_the_last_one_stopped():
 
 
 def test_adam_comes_to_rest_at_the_last_step():
-    optimiser = minibatch.adam(0.1, 6)
-    start = minibatch.start(jnp.float32(0), optimiser)
+    optimiser = supervised.adam(0.1, 6)
+    start = supervised.start(jnp.float32(0), optimiser)
     state, _ = fit(start, optimiser, jnp.full(6, 3.0))
     after, _ = fit(state, optimiser, jnp.full(3, 3.0))
     assert after.params == state.params
@@ -48,10 +48,10 @@ def test_adam_comes_to_rest_at_the_last_step():
 
 def test_the_loss_is_told_the_step_counted_from_the_start():
     optimiser = optax.sgd(0.0)
-    state = minibatch.start(jnp.float32(0), optimiser)
+    state = supervised.start(jnp.float32(0), optimiser)
     counted = []
     for _ in range(2):
-        state, steps = minibatch.fit(
+        state, steps = supervised.fit(
             state,
             lambda params, drawn, step: step.astype(jnp.float32),
             jnp.zeros(3),
@@ -64,13 +64,13 @@ def test_the_loss_is_told_the_step_counted_from_the_start():
 def test_the_last_loss_tells_of_parameters_that_are_not_finite():
     # sqrt(p) at p = 0 is 0, and its slope infinite.
     optimiser = optax.sgd(0.5)
-    start = minibatch.start({"p": jnp.float32(0), "q": jnp.float32(0)}, optimiser)
+    start = supervised.start({"p": jnp.float32(0), "q": jnp.float32(0)}, optimiser)
 
     def loss(params, drawn, step):
         return jnp.sqrt(params["p"]) + params["q"]
 
     for is_finite in ([False], [True, False]):
-        _, losses = minibatch.fit(start, loss, jnp.zeros(len(is_finite)), optimiser)
+        _, losses = supervised.fit(start, loss, jnp.zeros(len(is_finite)), optimiser)
         np.testing.assert_array_equal(np.isfinite(losses), is_finite)
 
 
@@ -80,9 +80,9 @@ def test_the_last_step_tells_of_it_also_where_a_chunk_has_more_steps_than_are_le
         return batch + 0.0 * jnp.sqrt(jnp.where(step == 4, 0.0 * params, 1.0))
 
     optimiser = optax.sgd(0.1)
-    state, told = minibatch.start(jnp.float32(1), optimiser), []
+    state, told = supervised.start(jnp.float32(1), optimiser), []
     for _ in range(2):
-        state, losses = minibatch.fit(state, loss, jnp.ones(3), optimiser, total=5)
+        state, losses = supervised.fit(state, loss, jnp.ones(3), optimiser, total=5)
         told.append(losses)
     assert state.step == 5
     assert np.isnan(state.params)

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense.config import NODES_PER_POI, Config
+from jaxsense.core.types import pytree
 from jaxsense.sim import viewpoints
 from jaxsense.sim.arena import Layout
-from jaxsense.types import pytree
 
 _LEEWAY = 0.035  # m, within which of a node the next one stays in view
 _MARGIN = 0.02  # m, extra distance of ways between nodes from PoIs

@@ -8,7 +8,7 @@ from navigating import ARENA, PERIOD, SETTINGS, layout_of
 
 from jaxsense import sim
 from jaxsense.config import Config
-from jaxsense.sim import navigation, roadmap
+from jaxsense.mission import navigation, roadmap
 
 CONFIG = Config()
 # A cube of half side 0.1 reaches 0.141421 from its centre, a robot is planned with 0.1.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from jaxsense import networks
+from jaxsense.core import networks
 
 
 def test_a_network_as_worked_by_hand():

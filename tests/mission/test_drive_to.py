@@ -8,7 +8,7 @@ import pytest
 from navigating import ARENA, PERIOD, SETTINGS, layout_of
 
 from jaxsense import sim
-from jaxsense.sim import navigation
+from jaxsense.mission import navigation
 
 
 def turned(angle, x, y):

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense.config import ArenaConfig, NavigationConfig
+from jaxsense.core.types import Index, others
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
-from jaxsense.types import Index, others
 
 BACKWARD_SPEED = 0.1  # m/s
 _SAMPLE_TIMES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0)  # shares of the horizon
