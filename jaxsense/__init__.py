@@ -25,11 +25,13 @@ from jaxsense.config import SensorConfig as SensorConfig
 from jaxsense.config import Shape as Shape
 from jaxsense.core.types import Belief as Belief
 from jaxsense.core.types import Transition as Transition
+from jaxsense.looks import Bank as Bank
+from jaxsense.looks import Live as Live
+from jaxsense.looks import detections as detections
+from jaxsense.looks import make_mdp as make_mdp
 from jaxsense.models import Models as Models
 from jaxsense.models import init as init
 from jaxsense.models import make_jmvae as make_jmvae
-from jaxsense.observe import bank_mdp as bank_mdp
-from jaxsense.observe import live_mdp as live_mdp
 from jaxsense.run.rundir import load as load
 from jaxsense.run.version import __version__ as __version__
-from jaxsense.stages import learn as learn
+from jaxsense.training import learn as learn

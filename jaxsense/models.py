@@ -1,21 +1,21 @@
 """All trained networks of a run, as one pytree."""
 
-import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from flax import linen as nn
 
 from jaxsense.config import Config
-from jaxsense.core import networks
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Belief, Key, pytree
-from jaxsense.dqn import optimum, policies
+from jaxsense.core.types import Belief, Fusion, Key, pytree
+from jaxsense.dqn import optimum
+from jaxsense.dqn.agents import MapAgent, TeamAgent
+from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.sim import sensors
-from jaxsense.vae import detectors, filtering, fusion, jmvae
+from jaxsense.vae import detectors, filter, fusion, jmvae, readout
+from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.detectors import Detector
-from jaxsense.vae.fusion import FILTER
 from jaxsense.vae.jmvae import Jmvae
 
 
@@ -25,114 +25,98 @@ class Models:
 
     Attributes:
       detectors: one for each modality.
-      jmvae: parameters of the JMVAE; those of the filter, if there is one, are its entry `filter`.
-      class_beliefs: `[C, D]` mean joint posterior of each class, to read the map with.
-      moments_inverse: `[C, 2D + 1]` from `filtering.moments_inverse`, to read the classes'
-        probabilities from the map with.
-      unseen: `[D]` entry of an unseen PoI.
-      look_values: for each modality, what a look is worth by dynamic programming.
+      jmvae: parameters of the JMVAE.
+      fusion: how looks update the map.
+      bayes: the exact Bayes filter over classes, to compare with.
+      look_values: for each modality, the value of a look by dynamic programming.
+      agent: how the Q-networks are used.
       q_networks: parameters of the Q-network of each modality; those of a team are the same.
       tours: parameters of the network that orders a team's looks, see `dqn.tours`; else None.
     """
 
     detectors: tuple[Detector, ...]
     jmvae: Params
-    class_beliefs: Belief
-    moments_inverse: jax.Array
-    unseen: Belief
+    fusion: Fusion
+    bayes: Bayes
     look_values: tuple[LookValues, ...]
+    agent: Agent
     q_networks: tuple[Params, ...]
     tours: Params | None
 
-    @property
-    def readout(self) -> Params:
-        """What `filtering.weights` reads the map with."""
-        return readout(self.moments_inverse, self.unseen)
-
-
-def readout(moments_inverse: jax.Array, unseen: Belief) -> Params:
-    """What `filtering.weights` reads the map with, see `Models`."""
-    return {"inverse": moments_inverse, "unseen": unseen}
-
 
 def make_jmvae(config: Config) -> Jmvae:
-    """The JMVAE for the modalities and classes of a configuration."""
+    """The shape of the JMVAE for the modalities and classes of a configuration."""
     sizes = tuple(len(config.labels(m)) for m in config.modalities)
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
 
-def _q_network(config: Config) -> tuple[nn.Module, int]:
-    """The Q-network, and the size of its input."""
-    num_pois, size, number = config.arena.num_pois, config.jmvae.latent_size, len(config.modalities)
-    if config.dqn.task == "team":
-        network = policies.team_network(size, number, config.dqn)
-        return network, network.features * num_pois
-    return policies.q_network(num_pois, config.dqn.hidden), 2 * size * num_pois
+def make_prior(config: Config) -> Belief:
+    """`[D]` belief before any look."""
+    return fusion.prior(make_jmvae(config), config.mdp.unseen_variance)
 
 
-def expected(
-    table: jax.Array, first: jax.Array, weights: jax.Array, is_seen: jax.Array
-) -> jax.Array:
-    """`[N]` values of a look at each PoI, from one table of `LookValues`.
-
-    Args:
-      table: `[P]` values by the classes' probabilities.
-      first: `[]` value of a look at an unseen PoI.
-      weights: `[N, C]` the classes' probabilities.
-      is_seen: `[N]` bool.
-    """
-    known = jax.vmap(functools.partial(optimum.interpolate, table))(weights)
-    return jnp.where(is_seen, known, first)
+def make_bayes(config: Config) -> Bayes:
+    """The exact Bayes filter over the classes of a configuration."""
+    return Bayes(jnp.array([config.label_of_class(m) for m in config.modalities]))
 
 
-def expected_gains(
-    readout: Params, look_values: tuple[LookValues, ...], belief: Belief, is_seen: jax.Array
-) -> jax.Array:
-    """`[M, N]` reward that each modality's look at each PoI promises, by what the map shows.
+def make_agent(config: Config) -> Agent:
+    """How the Q-networks are used, see `config.dqn.task`."""
+    dqn, latent_size = config.dqn, config.jmvae.latent_size
+    kinds: dict[str, Callable[[], Agent]] = {
+        "map": lambda: MapAgent(dqn.discount, config.arena.num_pois, latent_size, dqn.hidden),
+        "team": lambda: TeamAgent(
+            config.team, dqn.discount, latent_size, len(config.modalities), dqn.hidden
+        ),
+    }
+    return kinds[dqn.task]()
+
+
+def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InPlace:
+    """Fusion in place.
 
     Args:
-      readout: see `Models.readout`.
-      look_values: of each modality.
-      belief: `[N, D]` the map.
-      is_seen: `[N]` bool.
+      config: all settings.
+      params: of the JMVAE.
+      classes: `[C, D]` mean joint posterior of each class.
     """
-    on_map = jax.vmap(functools.partial(filtering.weights, readout))(belief)
-    of_each = jax.tree.map(lambda *x: jnp.stack(x), *look_values)
-    by_map = jax.vmap(expected, in_axes=(0, 0, None, None))
-    return by_map(of_each.gain, of_each.first_gain, on_map, is_seen)
+    matrix = readout.readout_matrix(classes)
+    return fusion.InPlace(params, classes, make_prior(config), matrix, make_jmvae(config))
 
 
 def init(key: Key, config: Config) -> Models:
-    """Models with random parameters, to try the functions before training."""
+    """Models with random parameters, to try the functions before training.
+
+    Args:
+      key: random key.
+      config: all settings.
+    """
     detector_key, jmvae_key, dqn_key = jax.random.split(key, 3)
-    filter_key = jax.random.fold_in(jmvae_key, 1)
-    num_labels = make_jmvae(config).feature_sizes
+    model, agent = make_jmvae(config), make_agent(config)
     keys = jax.random.split(detector_key, len(config.modalities))
-    trained = tuple(
+    untrained = tuple(
         detectors.init(k, jnp.zeros((2, s.window * s.channels)), size, config.detector)
-        for k, s, size in zip(keys, sensors.make(config), num_labels, strict=True)
+        for k, s, size in zip(keys, sensors.make(config), model.feature_sizes, strict=True)
     )
-    q_network, size = _q_network(config)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
-    tour_key = jax.random.fold_in(dqn_key, 1)
-    shape = (len(config.arena.classes), config.jmvae.latent_size)
-    params, classes = (
-        jmvae.init(jmvae_key, make_jmvae(config)),
-        Belief(jnp.zeros(shape), jnp.ones(shape)),
-    )
-    lattice = optimum.lattice(len(config.arena.classes), config.evaluation.value_points)
+    shape = len(config.arena.classes), model.latent_size
+    params, classes = jmvae.init(jmvae_key, model), Belief(jnp.zeros(shape), jnp.ones(shape))
+    filter_key = jax.random.fold_in(jmvae_key, 1)
+    fusions: dict[str, Callable[[], Fusion]] = {
+        "in_place": lambda: make_in_place(config, params, classes),
+        "filter": lambda: filter.init(
+            filter_key, model, classes, make_prior(config), config.filter
+        ),
+    }
+    lattice = optimum.lattice(shape[0], config.evaluation.value_points)
     no_values, nothing = jnp.zeros(len(lattice)), jnp.zeros(())
-    unseen = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
-    if config.jmvae.fusion == "filter":
-        inputs = make_jmvae(config), classes, unseen, config.filter
-        params[FILTER] = filtering.init(filter_key, *inputs)
     return Models(
-        detectors=trained,
+        detectors=untrained,
         jmvae=params,
-        class_beliefs=classes,
-        moments_inverse=filtering.moments_inverse(classes),
-        unseen=unseen,
+        fusion=fusions[config.jmvae.fusion](),
+        bayes=make_bayes(config),
         look_values=(LookValues(no_values, no_values, nothing, nothing),) * len(config.modalities),
-        q_networks=tuple(networks.init(k, q_network, size) for k in dqn_keys),
-        tours=networks.init(tour_key, q_network, size) if config.dqn.task == "team" else None,
+        agent=agent,
+        q_networks=tuple(agent.init(k) for k in dqn_keys),
+        tours=agent.init_tours(jax.random.fold_in(dqn_key, 1)),
     )

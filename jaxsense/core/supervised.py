@@ -1,78 +1,129 @@
-"""Minibatch training as one `lax.scan`."""
+"""The supervised fit that trains detectors, the JMVAE, the filter and tours: one `lax.scan`."""
 
-from collections.abc import Callable
-from typing import Any
+from typing import Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from jaxsense.core.networks import Params
-from jaxsense.core.types import pytree
+from jaxsense.core.types import Key, pytree
+
+D = TypeVar("D")
+
+
+class FitConfig(Protocol):
+    """Settings of a fit.
+
+    Attributes:
+      learning_rate: of Adam in the first step; it falls to zero along a cosine.
+      steps: gradient steps of the whole fit.
+    """
+
+    @property
+    def learning_rate(self) -> float:
+        """Of Adam in the first step."""
+        ...
+
+    @property
+    def steps(self) -> int:
+        """Of the whole fit."""
+        ...
+
+
+class Problem(Protocol, Generic[D]):
+    """What a fit minimises.
+
+    Attributes:
+      config: settings of the fit.
+    """
+
+    @property
+    def config(self) -> FitConfig:
+        """Settings of the fit."""
+        ...
+
+    def draw(self, key: Key, number: int) -> D:
+        """Everything random in `number` steps, as `[number, ...]` arrays.
+
+        Drawing all steps together is much cheaper than drawing in the loop.
+        """
+        ...
+
+    def loss(self, params: Params, drawn: D, step: jax.Array) -> jax.Array:
+        """`[]` loss of what was drawn for one step, which counts from the start of the fit."""
+        ...
 
 
 @pytree
 class FitState:
-    """Training state between two calls of `fit`.
+    """State of a fit between two chunks of steps.
 
     Attributes:
       params: of the network.
       optimiser: state of the optimiser.
       step: `[]` int32 gradient steps so far.
+      loss: `[]` mean loss of the last chunk; infinite before the first.
     """
 
     params: Params
     optimiser: optax.OptState
     step: jax.Array
+    loss: jax.Array
 
 
-def adam(learning_rate: float, steps: int) -> optax.GradientTransformation:
-    """Adam with a learning rate that falls from `learning_rate` to zero along a cosine."""
-    # As one vector: the networks are so small that each array costs more than its content.
-    return optax.flatten(optax.adam(optax.cosine_decay_schedule(learning_rate, steps)))
+def _adam(config: FitConfig) -> optax.GradientTransformation:
+    """Adam with a learning rate that falls to zero along a cosine."""
+    # Flattened: for networks this small, per-array overhead dominates.
+    return optax.flatten(
+        optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.steps))
+    )
 
 
-def start(params: Params, optimiser: optax.GradientTransformation) -> FitState:
-    """The state before the first step."""
-    return FitState(params, optimiser.init(params), jnp.int32(0))
-
-
-def fit(
-    state: FitState,
-    loss: Callable[[Params, Any, jax.Array], jax.Array],
-    drawn: Any,
-    optimiser: optax.GradientTransformation,
-    total: int | None = None,
-) -> tuple[FitState, jax.Array]:
-    """Makes gradient steps, at most up to the end of the whole training.
+def start(params: Params, config: FitConfig) -> FitState:
+    """The state before the first step.
 
     Args:
-      state: where to start.
-      loss: `(params, drawn, step) -> []`, where step counts from the start of the training.
-      drawn: pytree of `[steps, ...]` arrays, everything random in each step. Drawing all steps at
-        once is much cheaper than drawing in the loop.
-      optimiser: of optax.
-      total: steps of the whole training; by default no limit.
+      params: initial parameters.
+      config: settings of the fit.
+    """
+    return FitState(params, _adam(config).init(params), jnp.int32(0), jnp.float32(jnp.inf))
+
+
+def fit(key: Key, state: FitState, problem: Problem[D], number: int) -> tuple[FitState, jax.Array]:
+    """Takes some gradient steps, at most up to the end of the whole fit.
+
+    Args:
+      key: random key of what the steps draw.
+      state: from `start` or an earlier call.
+      problem: what to minimise.
+      number: how many steps to take; static.
 
     Returns:
-      The state after the last step and the `[steps]` losses; those beyond `total` mean nothing.
-      Non-finite values raise no error: the last meaningful loss is NaN if the parameters after it
-      are not finite.
+      The state after the last step and the `[number]` losses; those beyond the end of the fit mean
+      nothing. Non-finite values raise no error: the last meaningful loss is NaN if the parameters
+      after it are not finite.
     """
-    steps = jax.tree.leaves(drawn)[0].shape[0]
+    optimiser, total = _adam(problem.config), problem.config.steps
+    drawn = problem.draw(key, number)
 
-    def make_step(state: FitState, drawn: Any) -> tuple[FitState, jax.Array]:
-        value, gradient = jax.value_and_grad(loss)(state.params, drawn, state.step)
+    def make_step(state: FitState, drawn: D) -> tuple[FitState, jax.Array]:
+        value, gradient = jax.value_and_grad(problem.loss)(state.params, drawn, state.step)
         update, optimiser_state = optimiser.update(gradient, state.optimiser, state.params)
         params = optax.apply_updates(state.params, update)
-        after = FitState(params, optimiser_state, state.step + 1)
-        if total is not None and total % steps:
+        after = FitState(params, optimiser_state, state.step + 1, state.loss)
+        if total % number:
             goes_on = state.step < total
             after = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), after, state)
         return after, value
 
     after, losses = jax.lax.scan(make_step, state, drawn)
-    # Earlier parameters show in the loss of the next step.
+    losses = jnp.asarray(losses)
+    # Earlier non-finite parameters make the next loss NaN.
     is_finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(after.params)]).all()
     last = jnp.maximum(after.step - state.step - 1, 0)
-    return after, jnp.asarray(losses).at[last].mul(jnp.where(is_finite, 1.0, jnp.nan))
+    losses = losses.at[last].mul(jnp.where(is_finite, 1.0, jnp.nan))
+    counts = state.step + jnp.arange(number) < total
+    return FitState(
+        after.params, after.optimiser, after.step, jnp.mean(losses, where=counts)
+    ), losses

@@ -2,14 +2,15 @@
 
 import functools
 import json
-from collections.abc import Callable
-from typing import Any, TypeVar, dataclass_transform
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import export
+from jaxtyping import Array, Bool, Float, Int
 
 T = TypeVar("T")
 
@@ -21,6 +22,12 @@ Index = int | jax.Array
 
 Features = tuple[jax.Array | None, ...]
 """`[D_m]` features of each modality, or None where it is missing."""
+
+Scene = Any
+"""A pytree that looks see; MDPs only carry it."""
+
+Samples = tuple[jax.Array, ...]
+"""`[C, S, D_m]` features of each modality: S looks at every class."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(struct.field,))
@@ -56,12 +63,60 @@ class Belief:
     std: jax.Array
 
 
+class Fusion(Protocol):
+    """How the map takes in looks; a frozen pytree.
+
+    Attributes:
+      classes: `[C, D]` mean joint posterior of each class.
+      prior: `[D]` belief before any look.
+    """
+
+    @property
+    def classes(self) -> Belief:
+        """Mean joint posterior of each class."""
+        ...
+
+    @property
+    def prior(self) -> Belief:
+        """Belief before any look."""
+        ...
+
+    def update(
+        self,
+        belief: Belief,
+        seen: Bool[Array | np.ndarray, " M"],
+        features: Float[Array, " L"],
+        modality: int,
+    ) -> Belief:
+        """The belief after one more look.
+
+        Args:
+          belief: `[D]` before the look.
+          seen: `[M]` bool, which modalities have looked before.
+          features: `[D_m]` probabilities of the labels.
+          modality: index of the sensor; static.
+        """
+        ...
+
+    def together(self, looks: Mapping[int, Float[Array, " L"]]) -> Belief:
+        """The belief after looks by several sensors together, `[D_m]` features by modality."""
+        ...
+
+    def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
+        """The classes' probabilities that a `[D]` belief holds."""
+        ...
+
+    def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
+        """The class that a `[D]` belief shows, int32."""
+        ...
+
+
 @pytree
 class Transition:
     """One step of the map MDP for a Q-network to learn from, or a batch as columns.
 
     Attributes:
-      s_tm1: `[S, ...]` float32 observation before the action, see `belief_mdp.observation`.
+      s_tm1: `[S, ...]` float32 observation before the action, see `Agent.observe`.
       a_tm1: `[...]` int32 action, `N` being no operation.
       r_t: `[...]` float32 reward.
       discount_t: `[...]` float32 discount factor, 0 where the episode ended.

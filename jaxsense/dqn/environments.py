@@ -1,53 +1,221 @@
-"""What a Q-network learns in: the map MDP of one agent, or the MDP of a team."""
+"""The interface of agents, and of the environments in which they learn."""
 
-import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
-from jaxsense.config import DqnConfig
-from jaxsense.core import networks
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Index, Key, Transition, pytree
-from jaxsense.dqn import belief_mdp, policies, team_mdp
-from jaxsense.dqn.belief_mdp import MapMdp, Outcome
-from jaxsense.dqn.team_mdp import TeamMdp, TeamState
+from jaxsense.core.types import Belief, Index, Key, Transition, pytree
+from jaxsense.dqn import map_mdp, team_mdp
+from jaxsense.dqn.map_mdp import MapMdp, MapState, Outcome
+from jaxsense.dqn.team_mdp import Names, Places, Team, TeamMdp, TeamState
 
-State = Any
-"""A `MapState`, or a `Remembered` state of a team."""
+S = TypeVar("S")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Environment:
-    """An environment of one learner.
+class Agent(Protocol):
+    """How a Q-network is used; a frozen pytree. Its parameters are kept apart.
 
     Attributes:
-      num_actions: A; the last action is NOP.
-      init: `key -> parameters` of the Q-network.
-      reset: `key -> state`.
-      exists: `state -> [A] bool`, which actions do.
-      observation: `state -> [S]`, what the network reads.
-      step: `(key, state, observation [S], action) -> (state, Transition, Outcome)`.
-      values: `(parameters, [S, B]) -> [A, B]` values of actions, the highest of which is best.
-      learned: `(parameters, [S, B]) -> [A, B]` what learning predicts of each action: its reward
-        and the discounted best value after it.
+      counts_time: whether the values of `decide` include travel time, so that no other rule needs
+        to break ties.
     """
 
-    num_actions: int
-    init: Callable[[Key], Params]
-    reset: Callable[[Key], State]
-    exists: Callable[[State], jax.Array]
-    observation: Callable[[State], jax.Array]
-    step: Callable[[Key, State, jax.Array, jax.Array], tuple[State, Transition, Outcome]]
-    values: Callable[[Params, jax.Array], jax.Array]
-    learned: Callable[[Params, jax.Array], jax.Array]
+    @property
+    def counts_time(self) -> bool:
+        """Whether values include travel time."""
+        ...
+
+    def learner(self, modality: str) -> str:
+        """The name of what learns for robots of a modality; several may share it."""
+        ...
+
+    def plays(self, num_pois: int) -> bool:
+        """Whether the Q-network is for this number of PoIs."""
+        ...
+
+    def mdp(
+        self, of_number: Callable[[int], MapMdp], places: Places, names: Names
+    ) -> MapMdp | TeamMdp:
+        """The MDP in which the agent acts.
+
+        Args:
+          of_number: number of PoIs to the map MDP.
+          places: where PoIs and robots are in the MDP of a team.
+          names: of the sensors.
+        """
+        ...
+
+    def environment(self, mdp: Any, modality: Index) -> "Environment[Any]":
+        """What the agent learns in.
+
+        Args:
+          mdp: from `mdp`.
+          modality: index of the agent's own sensor.
+        """
+        ...
+
+    def init(self, key: Key) -> Params:
+        """Random parameters of the Q-network."""
+        ...
+
+    def init_tours(self, key: Key) -> Params | None:
+        """Random parameters of the network that orders looks; None if the agent has none."""
+        ...
+
+    def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
+        """What the network of a robot reads.
+
+        Args:
+          belief: `[N, D]` the map.
+          team: where everybody is.
+          robot: `[]` int32, the robot that chooses.
+        """
+        ...
+
+    def q(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """What learning predicts: each action's reward and the discounted best value after it.
+
+        Args:
+          params: of the Q-network.
+          observed: `[S]`, or `[S, B]`.
+
+        Returns:
+          `[A]`, or `[A, B]`; NOP's last.
+        """
+        ...
+
+    def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """Values of choosing actions now, the highest of which is best; see `q`."""
+        ...
+
+    def decide(
+        self,
+        params: Params,
+        tour_params: Params | None,
+        classes: Belief,
+        belief: Belief,
+        team: Team,
+        robot: Int[Array, ""],
+    ) -> Float[Array, " A"]:
+        """Values of a robot's actions in a mission, `[N + 1]`, NOP's last.
+
+        Args:
+          params: of the robot's Q-network.
+          tour_params: of the network of `tours`, if there is one.
+          classes: `[C, D]` joint posterior of each class.
+          belief: `[N, D]` the map.
+          team: where everybody is; PoIs that are not present are never chosen.
+          robot: `[]` int32, the robot that chooses.
+        """
+        ...
+
+
+class Environment(Protocol, Generic[S]):
+    """An environment of one learner; a frozen pytree.
+
+    Attributes:
+      agent: what learns.
+      num_actions: A; the last action is NOP.
+    """
+
+    @property
+    def agent(self) -> Agent:
+        """What learns."""
+        ...
+
+    @property
+    def num_actions(self) -> int:
+        """A."""
+        ...
+
+    def reset(self, key: Key) -> S:
+        """A random first state."""
+        ...
+
+    def action_mask(self, state: S) -> jax.Array:
+        """`[A]` bool, the actions that exist."""
+        ...
+
+    def observe(self, state: S) -> jax.Array:
+        """`[S]` what the agent's network reads."""
+        ...
+
+    def step(
+        self, key: Key, state: S, s_tm1: jax.Array, action: jax.Array
+    ) -> tuple[S, Transition, Outcome]:
+        """Takes an action.
+
+        Args:
+          key: random key.
+          state: the current state.
+          s_tm1: `[S]` what `observe` returned for it.
+          action: `[]` int32.
+
+        Returns:
+          The next state, the transition to learn from and the outcome.
+        """
+        ...
 
 
 @pytree
-class Remembered:
-    """A team, and what each robot saw and chose when it last set out.
+class MapEnvironment:
+    """The map MDP of one agent.
+
+    Attributes:
+      agent: what learns.
+      mdp: the MDP.
+      modality: index of the agent's own sensor, see `map_mdp.step`.
+      discount: `[]` discount factor of a step.
+    """
+
+    agent: Agent
+    mdp: MapMdp
+    modality: Index
+    discount: jax.Array | float
+
+    @property
+    def num_actions(self) -> int:
+        """A look at each PoI, and NOP."""
+        return self.mdp.num_pois + 1
+
+    def reset(self, key: Key) -> MapState:
+        """A random first state."""
+        return map_mdp.reset(key, self.mdp)
+
+    def action_mask(self, state: MapState) -> jax.Array:
+        """`[A]` bool: all actions exist."""
+        del state
+        return jnp.ones(self.num_actions, bool)
+
+    def observe(self, state: MapState) -> jax.Array:
+        """`[N * 2D]` the map."""
+        team = team_mdp.alone(self.mdp.num_pois, self.modality)
+        return self.agent.observe(state.belief, team, jnp.int32(0))
+
+    def step(
+        self, key: Key, state: MapState, s_tm1: jax.Array, action: jax.Array
+    ) -> tuple[MapState, Transition, Outcome]:
+        """Takes an action, see `Environment.step`.
+
+        Args:
+          key: random key.
+          state: the current state.
+          s_tm1: `[S]` what `observe` returned for it.
+          action: `[]` int32.
+        """
+        after, outcome = map_mdp.step(key, self.mdp, state, action, self.modality)
+        discount = jnp.where(outcome.terminated, 0.0, self.discount)
+        transition = Transition(s_tm1, action, outcome.reward, discount, self.observe(after))
+        return after, transition, outcome
+
+
+@pytree
+class SmdpState:
+    """A team, and what each robot observed and chose when it last set out.
 
     Attributes:
       now: the state.
@@ -60,93 +228,67 @@ class Remembered:
     action: jax.Array
 
 
-def environment(mdp: MapMdp | TeamMdp, modality: Index, config: DqnConfig) -> Environment:
-    """The environment of an agent.
+@pytree
+class TeamEnvironment:
+    """The MDP of a team, whose robots share one agent.
 
-    Args:
+    Attributes:
+      agent: what learns.
       mdp: the MDP.
-      modality: index of the agent's own sensor, see `belief_mdp.step`; a team has all of them.
-      config: the settings.
     """
-    return _of_team(mdp, config) if isinstance(mdp, TeamMdp) else _of_agent(mdp, modality, config)
 
+    agent: Agent
+    mdp: TeamMdp
 
-def _of_agent(mdp: MapMdp, modality: Index, config: DqnConfig) -> Environment:
-    network = policies.q_network(mdp.num_pois, config.hidden)
+    @property
+    def num_actions(self) -> int:
+        """A look at each PoI, and NOP."""
+        return self.mdp.map.num_pois + 1
 
-    def observation(state: belief_mdp.MapState) -> jax.Array:
-        return belief_mdp.observation(state.belief)
+    def reset(self, key: Key) -> SmdpState:
+        """A random first state, in which no robot has set out."""
+        now = team_mdp.reset(key, self.mdp)
+        observed = self.agent.observe(now.map.belief, now.team, now.agent)
+        num_robots, num_pois = len(now.team.works), self.mdp.map.num_pois
+        nothing = jnp.zeros((num_robots, len(observed)))
+        return SmdpState(now, nothing, jnp.full(num_robots, num_pois))
 
-    def step(key: Key, state: belief_mdp.MapState, s_tm1: jax.Array, action: jax.Array):
-        after, outcome = belief_mdp.step(key, mdp, state, action, modality)
-        discount = jnp.where(outcome.terminated, 0.0, config.discount)
-        return (
-            after,
-            Transition(s_tm1, action, outcome.reward, discount, observation(after)),
-            outcome,
-        )
+    def action_mask(self, state: SmdpState) -> jax.Array:
+        """`[A]` bool, PoIs that are present, and NOP."""
+        return jnp.append(state.now.team.present, True)
 
-    def values(params: Params, x: jax.Array) -> jax.Array:
-        return networks.apply(network, params, x)
+    def observe(self, state: SmdpState) -> jax.Array:
+        """`[F * N]` what the robot that chooses knows."""
+        now = state.now
+        return self.agent.observe(now.map.belief, now.team, now.agent)
 
-    return Environment(
-        num_actions=mdp.num_pois + 1,
-        init=lambda key: networks.init(key, network, 2 * mdp.num_pois * mdp.unseen.mean.size),
-        reset=lambda key: belief_mdp.reset(key, mdp),
-        exists=lambda state: jnp.ones(mdp.num_pois + 1, bool),
-        observation=observation,
-        step=step,
-        values=values,
-        learned=values,
-    )
+    def step(
+        self, key: Key, state: SmdpState, s_tm1: jax.Array, action: jax.Array
+    ) -> tuple[SmdpState, Transition, Outcome]:
+        """Lets one robot choose, see `Environment.step`.
 
+        Args:
+          key: random key.
+          state: the current state.
+          s_tm1: `[S]` what `observe` returned for it.
+          action: `[]` int32.
 
-def _of_team(mdp: TeamMdp, config: DqnConfig) -> Environment:
-    num_modalities, latent_size = mdp.map.num_modalities, mdp.map.unseen.mean.size
-    network = policies.team_network(latent_size, num_modalities, config)
-    size = network.features * mdp.map.num_pois
-
-    def observation(state: Remembered) -> jax.Array:
-        known = state.now.map.belief, state.now.team, state.now.agent
-        return team_mdp.observation(mdp.config.travel, *known, num_modalities).reshape(-1)
-
-    def reset(key: Key) -> Remembered:
-        now = team_mdp.reset(key, mdp)
-        num_robots = len(now.team.works)
-        nothing = jnp.full(num_robots, mdp.map.num_pois)
-        return Remembered(now, jnp.zeros((num_robots, size)), nothing)
-
-    def step(key: Key, state: Remembered, s_tm1: jax.Array, action: jax.Array):
+        Returns:
+          The next state; the transition of the robot that has just looked, from when it set out;
+          and the outcome.
+        """
         seen = state.observation.at[state.now.agent].set(s_tm1)
         chosen = state.action.at[state.now.agent].set(action)
-        now, outcome = team_mdp.step(key, mdp, state.now, action)
-        after = Remembered(now, seen, chosen)
-        # The way of the robot that has just looked is over. Without a look, the robot that chooses
-        # next has not chosen yet or has ended, and nothing is to be learned: an action that does
-        # not exist has value and target 0.
-        looked = chosen[now.agent] < mdp.map.num_pois
+        now, outcome = team_mdp.step(key, self.mdp, state.now, action)
+        after = SmdpState(now, seen, chosen)
+        # A transition is complete when a robot has looked. Otherwise emit an invalid action, whose
+        # value and target are 0.
+        looked = chosen[now.agent] < self.mdp.map.num_pois
         transition = Transition(
             s_tm1=seen[now.agent],
             a_tm1=jnp.where(looked, chosen[now.agent], -1),
             r_t=outcome.reward,
             discount_t=jnp.where(looked, 1.0, 0.0),
-            s_t=observation(after),
+            s_t=self.observe(after),
         )
         return after, transition, outcome
-
-    def learned(params: Params, x: jax.Array) -> jax.Array:
-        return networks.apply(network, params, x)
-
-    def values(params: Params, x: jax.Array) -> jax.Array:
-        return policies.of_ways(learned(params, x), x, latent_size, mdp.config, config)
-
-    return Environment(
-        num_actions=mdp.map.num_pois + 1,
-        init=lambda key: networks.init(key, network, size),
-        reset=reset,
-        exists=lambda state: jnp.append(state.now.team.present, True),
-        observation=observation,
-        step=step,
-        values=values,
-        learned=learned,
-    )

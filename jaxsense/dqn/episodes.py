@@ -2,21 +2,74 @@
 
 import itertools
 import random
+from collections.abc import Callable
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense.core.types import Index, Key
-from jaxsense.dqn import belief_mdp
-from jaxsense.dqn.belief_mdp import MapMdp, MapState
-from jaxsense.dqn.policies import Policy
+from jaxsense.core.types import Index, Key, call, pytree
+from jaxsense.dqn import map_mdp
+from jaxsense.dqn.map_mdp import MapMdp, MapState
+from jaxsense.dqn.policies import Known
+from jaxsense.dqn.team_mdp import alone
 
-MOST_STATES = 4096
+MAX_STATES = 4096
+
+
+class LogLikelihoods(Protocol):
+    """What the exact Bayes filter learns from a look; see `vae.bayes.Bayes`."""
+
+    def log_likelihoods(self, features: jax.Array, modality: int) -> jax.Array:
+        """`[C]` log-likelihoods of the classes, from `[D_m]` features of a static modality."""
+        ...
+
+
+@pytree
+class Start:
+    """A first state of an episode, with what policies know beyond it.
+
+    Attributes:
+      state: the state.
+      log_likelihood: `[N, C]` logarithms of the classes' likelihoods given all earlier looks.
+    """
+
+    state: MapState
+    log_likelihood: jax.Array
+
+
+def reset(
+    key: Key,
+    mdp: MapMdp,
+    exact: LogLikelihoods,
+    classes: jax.Array | None = None,
+    seen: jax.Array | None = None,
+) -> Start:
+    """Starts an episode, see `map_mdp.reset`.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      exact: the exact Bayes filter.
+      classes: see `map_mdp.reset`.
+      seen: see `map_mdp.reset`.
+    """
+    state, looks = map_mdp.reset_with_looks(key, mdp, classes, seen)
+    total = jnp.zeros((mdp.num_pois, mdp.num_classes))
+    for m, features in enumerate(looks):
+        of_pois = jax.vmap(lambda x: exact.log_likelihoods(x, m))(features)  # noqa: B023
+        total += jnp.where(state.seen[:, m : m + 1], of_pois, 0.0)
+    return Start(state, total)
 
 
 def run_episode(
-    key: Key, mdp: MapMdp, policy: Policy, start: MapState, modality: Index
+    key: Key,
+    mdp: MapMdp,
+    exact: LogLikelihoods,
+    act: Callable[[Key, Known], jax.Array],
+    start: Start,
+    modality: Index,
 ) -> tuple[jax.Array, jax.Array]:
     """Plays one episode with a policy.
 
@@ -26,40 +79,100 @@ def run_episode(
     Args:
       key: random key.
       mdp: the MDP.
-      policy: chooses the actions.
-      start: from `belief_mdp.reset`.
-      modality: index of the agent's own sensor, see `belief_mdp.step`.
+      exact: the exact Bayes filter, for policies that read its posterior.
+      act: `(key, known) -> []` int32 action, see `policies.best`.
+      start: from `reset`.
+      modality: index of the agent's own sensor, see `map_mdp.step`.
 
     Returns:
       `[]` total reward, without discount, and `[]` reward of the first action.
     """
-
-    def goes_on(carry) -> jax.Array:
-        return ~carry[1]
-
-    def act(carry):
-        state, _, total, first, times = carry
-        action = policy(jax.random.fold_in(policy_key, state.steps), state)
-        look_key = jax.random.fold_in(jax.random.fold_in(looks_key, action), times[action])
-        is_first = state.steps == start.steps
-        state, outcome = belief_mdp.step(look_key, mdp, state, action, modality)
-        first = jnp.where(is_first, outcome.reward, first)
-        terminated = outcome.terminated | outcome.truncated
-        return state, terminated, total + outcome.reward, first, times.at[action].add(1)
-
+    num_pois, team = mdp.num_pois, alone(mdp.num_pois, modality)
+    times = jnp.ones((1, num_pois))
     policy_key, looks_key = jax.random.split(key)
-    times = jnp.zeros(mdp.num_pois + 1, jnp.int32)
-    carry = (start, jnp.bool_(False), jnp.float32(0.0), jnp.float32(0.0), times)
-    _, _, total, first, _ = jax.lax.while_loop(goes_on, act, carry)
-    return total, first
+
+    def play(carry: _Carry) -> _Carry:
+        state, looks = carry.state, carry.looks
+        known = Known(
+            state.belief,
+            looks[:num_pois],
+            jax.nn.log_softmax(carry.log_likelihood),
+            team,
+            times,
+            jnp.int32(0),
+        )
+        action = act(jax.random.fold_in(policy_key, state.steps), known)
+        own = carry.own_looks[action]
+        look_key = jax.random.fold_in(jax.random.fold_in(looks_key, action), own)
+        poi = jnp.minimum(action, num_pois - 1)
+
+        def of_look(m: int) -> jax.Array:
+            # The same key yields the same look as in the step.
+            features, _ = mdp.looks.observe(look_key, state.scene, poi, m)
+            return exact.log_likelihoods(features, m)
+
+        found = jnp.where(action < num_pois, call(of_look, modality, mdp.num_modalities), 0.0)
+        after, outcome = map_mdp.step(look_key, mdp, state, action, modality)
+        is_first = state.steps == start.state.steps
+        return _Carry(
+            state=after,
+            looks=looks.at[action, modality].add(1),
+            own_looks=carry.own_looks.at[action].add(1),
+            log_likelihood=carry.log_likelihood.at[poi].add(found),
+            done=outcome.terminated | outcome.truncated,
+            total=carry.total + outcome.reward,
+            first=jnp.where(is_first, outcome.reward, carry.first),
+        )
+
+    looks = jnp.concatenate([start.state.seen, jnp.zeros((1, mdp.num_modalities), bool)])
+    carry = _Carry(
+        state=start.state,
+        looks=looks.astype(jnp.int32),
+        own_looks=jnp.zeros(num_pois + 1, jnp.int32),
+        log_likelihood=start.log_likelihood,
+        done=jnp.bool_(False),
+        total=jnp.float32(0.0),
+        first=jnp.float32(0.0),
+    )
+    end = jax.lax.while_loop(lambda carry: ~carry.done, play, carry)
+    return end.total, end.first
+
+
+@pytree
+class _Carry:
+    """An episode under way.
+
+    Attributes:
+      state: of the MDP.
+      looks: `[N + 1, M]` int32 looks at each PoI, and choices of NOP.
+      own_looks: `[N + 1]` int32 actions in this episode.
+      log_likelihood: `[N, C]` see `Start`.
+      done: `[]` bool.
+      total: `[]` reward so far.
+      first: `[]` reward of the first action.
+    """
+
+    state: MapState
+    looks: jax.Array
+    own_looks: jax.Array
+    log_likelihood: jax.Array
+    done: jax.Array
+    total: jax.Array
+    first: jax.Array
 
 
 def every_state(
-    num_pois: int, num_classes: int, num_modalities: int, most: int = MOST_STATES
+    num_pois: int, num_classes: int, num_modalities: int, limit: int = MAX_STATES
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lists the `C^N 2^(N M)` states of the map: every combination of classes, every set of looks.
 
-    Of more than `most` states, one random state, always the same, of each of that many equal parts.
+    Of more than `limit` states, a stratified sample, which is always the same.
+
+    Args:
+      num_pois: N.
+      num_classes: C.
+      num_modalities: M.
+      limit: maximum number of states.
 
     Returns:
       `[S, N]` int32 classes and `[S, N, M]` bool looks.
@@ -67,7 +180,7 @@ def every_state(
     # A state is a number: a digit for the class of each PoI, then a bit for each look.
     num_bits = num_pois * num_modalities
     number = num_classes**num_pois << num_bits
-    parts = min(number, most)
+    parts = min(number, limit)
     edges = [i * number // parts for i in range(parts + 1)]
     draw = random.Random(0)
     # Python's integers: the states of 25 PoIs overflow an int64.

@@ -18,8 +18,8 @@ import numpy as np
 
 from jaxsense.config import MdpConfig
 from jaxsense.core import checks
-from jaxsense.core.types import pytree
-from jaxsense.dqn.belief_mdp import reward
+from jaxsense.core.types import Belief, pytree
+from jaxsense.dqn.rewards import Reward
 
 MOST_POINTS = 2**13
 _MOST_STEPS = 512
@@ -31,16 +31,16 @@ class LookValues:
     """Expected rewards of one modality's looks at a PoI.
 
     Attributes:
-      gain: `[P]` of the next look alone, at the points of the lattice.
-      total: `[P]` of the next look and of all that pay after it.
-      first_gain: `[]` the gain of a PoI that nobody has looked at.
-      first_total: `[]` its total.
+      one_step: `[P]` of the next look alone, at the points of the lattice.
+      q: `[P]` of the next look and of all worthwhile looks after it.
+      one_step_unseen: `[]` of the next look alone, at a PoI that nobody has looked at.
+      q_unseen: `[]` of that look and of all worthwhile looks after it.
     """
 
-    gain: jax.Array
-    total: jax.Array
-    first_gain: jax.Array
-    first_total: jax.Array
+    one_step: jax.Array
+    q: jax.Array
+    one_step_unseen: jax.Array
+    q_unseen: jax.Array
 
 
 def steps_of_lattice(num_classes: int, most_points: int = MOST_POINTS) -> int:
@@ -77,7 +77,7 @@ def _rows(sums, steps: int):
       steps: of the lattice.
     """
     size = sums.shape[-1]
-    # What no row needs may be too large for an integer.
+    # Clip unused binomials that would overflow int32.
     table = [
         [min(math.comb(n, k), 2**31 - 1) for k in range(size + 1)] for n in range(steps + size)
     ]
@@ -122,29 +122,33 @@ def _corners(weights: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
     return _rows(base.astype(jnp.int32)[None, :] + walk, steps), falling[:-1] - falling[1:]
 
 
-def solve(
+def value_iteration(
     likelihoods: jax.Array,
-    information: Callable[[jax.Array], jax.Array],
+    reward: Reward,
+    mixture: Callable[[jax.Array], Belief],
+    prior: Belief,
     config: MdpConfig,
     horizon: int,
     most_points: int = MOST_POINTS,
-    unseen: jax.Array | None = None,
 ) -> LookValues:
     """The values of one modality's looks.
 
     Args:
       likelihoods: `[C, K, C]` logarithms of the likelihoods of all classes, up to a constant, in
         each of K equally likely looks at a PoI of each class.
-      information: `[C]` class probabilities to the `[]` information of the map's entry.
-      config: the rewards, and `max_steps`, which also limits the looks at one PoI.
-      horizon: most looks at one PoI; static.
+      reward: of a look.
+      mixture: `[C]` class probabilities to the `[D]` belief that holds them.
+      prior: `[D]` belief of an unseen PoI, whose classes are equally likely.
+      config: `max_steps`, which also limits the looks at one PoI.
+      horizon: maximum number of looks at one PoI; static.
       most_points: of the lattice; static.
-      unseen: `[]` information of the entry of an unseen PoI, whose classes are equally likely; by
-        default that of an entry written with equal probabilities.
 
     Returns:
-      The values at the points of the lattice. The optimal policy takes every look whose `total` is
+      The values at the points of the lattice. The optimal policy takes every look whose `q` is
       above 0, that of no operation.
+
+    Raises:
+      ValueError: if a likelihood is not finite or `horizon` is not positive.
     """
     chex.assert_rank(likelihoods, 3, custom_message="likelihoods")
     number, num_looks, _ = likelihoods.shape
@@ -155,30 +159,35 @@ def solve(
     steps = steps_of_lattice(number, len(points))
     # The unseen PoI is the last row, to which no look leads.
     points = jnp.concatenate([points, jnp.full((1, number), 1 / number)])
+
+    def information(probabilities: jax.Array) -> jax.Array:
+        return reward.information(mixture(probabilities), probabilities)
+
     before = jax.vmap(information)(points)
-    before = before if unseen is None else before.at[-1].set(unseen)
+    before = before.at[-1].set(reward.information(prior, points[-1]))
 
     def looks(row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         """`[C, K]` rewards of the looks, and the corners around the posteriors after them."""
-        weights, before = row
+        probabilities, before = row
 
-        def look(likelihood: jax.Array):
-            after = weights * jnp.exp(likelihood - jnp.max(likelihood))
-            # Where no class is possible that the look may show.
-            after = jnp.where(jnp.sum(after) > 0, after, weights)
+        def look(likelihood: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            after = probabilities * jnp.exp(likelihood - jnp.max(likelihood))
+            # Keep the prior if the look contradicts every class.
+            after = jnp.where(jnp.sum(after) > 0, after, probabilities)
             after /= jnp.sum(after)
-            return reward(information(after) - before, config), *_corners(after, steps)
+            rows, shares = _corners(after, steps)
+            return reward.of_gain(information(after) - before), rows, shares
 
         return jax.vmap(jax.vmap(look))(likelihoods)
 
     rewards, rows, shares = jax.lax.map(looks, (points, before), batch_size=_POINTS_AT_ONCE)
     chances = points[:, :, None] / num_looks
-    gain = jnp.sum(chances * rewards, axis=(1, 2))
+    one_step = jnp.sum(chances * rewards, axis=(1, 2))
 
-    def earlier(total: jax.Array, left: jax.Array) -> tuple[jax.Array, None]:
-        following = jnp.sum(shares * jnp.maximum(total, 0.0)[rows], axis=-1)
-        longer = gain + jnp.sum(chances * following, axis=(1, 2))
-        return jnp.where(left <= config.max_steps, longer, total), None
+    def earlier(q: jax.Array, left: jax.Array) -> tuple[jax.Array, None]:
+        following = jnp.sum(shares * jnp.maximum(q, 0.0)[rows], axis=-1)
+        longer = one_step + jnp.sum(chances * following, axis=(1, 2))
+        return jnp.where(left <= config.max_steps, longer, q), None
 
-    total, _ = jax.lax.scan(earlier, gain, jnp.arange(2, horizon + 1))
-    return LookValues(gain[:-1], total[:-1], gain[-1], total[-1])
+    q, _ = jax.lax.scan(earlier, one_step, jnp.arange(2, horizon + 1))
+    return LookValues(one_step[:-1], q[:-1], one_step[-1], q[-1])

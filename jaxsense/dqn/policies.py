@@ -1,230 +1,263 @@
-"""Policies: the DQN's and its baselines. Each is `(key, state) -> action`."""
+"""The table of policies, for the map MDP and for missions.
 
-import math
-from collections.abc import Callable
+A policy is a function of the trained models and of what a robot knows, and returns `[N + 1]` values
+of actions, the highest of which is taken; NOP's is the last. A policy of your own is one more entry
+of a table.
+"""
 
-import chex
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import DqnConfig, TeamConfig
-from jaxsense.core import checks, networks
-from jaxsense.core.networks import MLP, Params
-from jaxsense.core.types import Belief, Index, Key
-from jaxsense.dqn import belief_mdp, optimum, team_mdp, tours
-from jaxsense.dqn.belief_mdp import MapMdp, MapState
-from jaxsense.dqn.pooling import PoolingNetwork
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Belief, Fusion, Key, pytree
+from jaxsense.dqn import optimum, rules
+from jaxsense.dqn.environments import Agent
+from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team_mdp import Team
 
-Policy = Callable[[Key, MapState], jax.Array]
 
-_NOT_WORTH = -1e6  # s, below minus any tour
+@pytree
+class Known:
+    """What a robot knows when it chooses.
 
-
-def q_network(num_pois: int, hidden: tuple[int, ...]) -> MLP:
-    """The Q-network: `[N * 2D]` map to `[N + 1]` values, NOP's last."""
-    return MLP(hidden, num_pois + 1)
-
-
-def team_network(latent_size: int, num_modalities: int, config: DqnConfig) -> PoolingNetwork:
-    """The Q-network of a team, for any number of PoIs."""
-    return PoolingNetwork(config.hidden, team_mdp.num_features(latent_size, num_modalities))
-
-
-def greedy(mdp: MapMdp, params: Params, hidden: tuple[int, ...]) -> Policy:
-    """Takes a Q-network's best action, or -1, whose reward is NaN, if a value is NaN."""
-
-    def act(key: Key, state: MapState) -> jax.Array:
-        del key
-        seen = belief_mdp.observation(state.belief)
-        return _best(networks.apply(q_network(mdp.num_pois, hidden), params, seen))
-
-    return act
-
-
-def greedy_alone(
-    mdp: MapMdp, params: Params, modality: Index, team: TeamConfig, config: DqnConfig
-) -> Policy:
-    """Takes the best action of a team's Q-network for one robot that is alone, see `greedy`.
-
-    All is at one place, and so there is no order to choose, see `tours`.
-    """
-    latent_size = mdp.unseen.mean.shape[0]
-    network = team_network(latent_size, mdp.num_modalities, config)
-
-    def act(key: Key, state: MapState) -> jax.Array:
-        del key
-        alone = team_mdp.alone(mdp.num_pois, jnp.asarray(modality))
-        known = state.belief, alone, jnp.int32(0), mdp.num_modalities
-        seen = team_mdp.observation(team.travel, *known).reshape(-1)
-        after = networks.apply(network, params, seen)
-        return _best(of_ways(after, seen, latent_size, team, config))
-
-    return act
-
-
-def tour_values(
-    params: Params,
-    tour_params: Params,
-    belief: Belief,
-    team: Team,
-    agent: jax.Array,
-    num_modalities: int,
-    config: TeamConfig,
-    dqn: DqnConfig,
-) -> jax.Array:
-    """Values of a robot's actions, `[N + 1]`, in the order that ends the team's work soonest.
-
-    A look is worth it if its reward and what follows, as the Q-network predicts them, exceed the
-    price of the way. The value is then minus the predicted seconds of `tours`; that of NOP lies
-    below these, and those of other looks lowest.
-
-    Args:
-      params: of the Q-network.
-      tour_params: of the network of `tours`.
+    Attributes:
       belief: `[N, D]` the map.
-      team: where everybody is.
-      agent: `[]` int32, the robot that chooses.
-      num_modalities: M.
-      config: the price of time and the model of travel.
-      dqn: the sizes of both networks.
+      looks: `[N, M]` int32, looks of each modality at each PoI.
+      log_posterior: `[N, C]` logarithms of the classes' probabilities by exact Bayes.
+      team: where everybody is; PoIs that the robot has given up are not present.
+      times: `[R, N]` seconds until each robot has looked at each PoI, by the travel model.
+      robot: `[]` int32, the robot that chooses.
     """
-    latent_size = belief.mean.shape[1]
-    network = team_network(latent_size, num_modalities, dqn)
-    observed = team_mdp.observation(config.travel, belief, team, agent, num_modalities)
-    seen = observed.reshape(-1)
-    after = networks.apply(network, params, seen)[:-1]
-    is_worth_it = after > config.second_cost * team_mdp.own_seconds(observed, latent_size)
-    seconds = tours.seconds(network, tour_params, seen, latent_size)
-    of_pois = jnp.where(is_worth_it, -seconds, 2 * _NOT_WORTH)
-    # NaN is worth nothing in a comparison, but must not pass for a decision.
-    return jnp.append(jnp.where(jnp.isnan(after), after, of_pois), _NOT_WORTH)
+
+    belief: Belief
+    looks: jax.Array
+    log_posterior: jax.Array
+    team: Team
+    times: jax.Array
+    robot: jax.Array
+
+    @property
+    def modality(self) -> jax.Array:
+        """`[]` int32 index of the robot's own sensor."""
+        return self.team.modality[self.robot]
+
+    @property
+    def is_seen(self) -> jax.Array:
+        """`[N]` bool, PoIs that somebody has looked at."""
+        return jnp.any(self.looks > 0, axis=-1)
 
 
-def of_ways(
-    after: jax.Array, seen: jax.Array, latent_size: int, config: TeamConfig, dqn: DqnConfig
+class Trained(Protocol):
+    """What policies read of trained models; see `jaxsense.Models`."""
+
+    @property
+    def fusion(self) -> Fusion:
+        """How looks update the map."""
+        ...
+
+    @property
+    def look_values(self) -> tuple[LookValues, ...]:
+        """Values of looks, for each modality."""
+        ...
+
+    @property
+    def agent(self) -> Agent:
+        """How the Q-networks are used."""
+        ...
+
+    @property
+    def q_networks(self) -> tuple[Params, ...]:
+        """Parameters for each modality."""
+        ...
+
+    @property
+    def tours(self) -> Params | None:
+        """Parameters of the network that orders looks."""
+        ...
+
+
+Values = Callable[[Key, Trained, Known], jax.Array]
+"""`(key, models, known) -> [N + 1]` values of actions, NOP's last."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """A policy.
+
+    Attributes:
+      values: see `Values`.
+      counts_time: `agent -> bool`, whether the values include travel time, so that no other rule
+        needs to break ties.
+    """
+
+    values: Values
+    counts_time: Callable[[Agent], bool] = lambda agent: False
+
+
+def table(own: Mapping[str, Values | Policy] | None = None) -> dict[str, Policy]:
+    """All policies by name: `POLICIES`, and then those of your own."""
+    wrapped = {
+        name: each if isinstance(each, Policy) else Policy(each)
+        for name, each in (own or {}).items()
+    }
+    return {**POLICIES, **wrapped}
+
+
+def best(values: jax.Array) -> jax.Array:
+    """Action, `[]` int32, of the highest of `[N + 1]` values; -1, which is none, if one is NaN."""
+    return jnp.where(jnp.any(jnp.isnan(values)), -1, jnp.argmax(values)).astype(jnp.int32)
+
+
+def expected_gains(
+    fusion: Fusion, look_values: tuple[LookValues, ...], belief: Belief, is_seen: jax.Array
 ) -> jax.Array:
-    """Values of setting out for PoIs now, from the values when a robot has arrived there.
-
-    Until then time passes: `discount^t after - second_cost t`, with `t` the seconds of the way. NOP
-    takes none.
+    """Expected reward of each modality's next look at each PoI, by what the map shows.
 
     Args:
-      after: `[N + 1, ...]` rewards of the looks and best values after them; 0 for NOP.
-      seen: `[F * N, ...]` observation.
-      latent_size: D.
-      config: the price of time.
-      dqn: the discount of a second.
+      fusion: reads the map.
+      look_values: of each modality.
+      belief: `[N, D]` the map.
+      is_seen: `[N]` bool.
+
+    Returns:
+      `[M, N]`.
     """
-    num_pois = after.shape[0] - 1
-    observed = seen.reshape(-1, num_pois, *seen.shape[1:])
-    seconds = team_mdp.own_seconds(observed, latent_size)
-    of_pois = dqn.discount**seconds * after[:-1] - config.second_cost * seconds
-    return jnp.concatenate([of_pois, after[-1:]])
+    on_map = jax.vmap(fusion.class_probabilities)(belief)
+    of_each = jax.tree.map(lambda *x: jnp.stack(x), *look_values)
+    by_map = jax.vmap(_expected, in_axes=(0, 0, None, None))
+    return by_map(of_each.one_step, of_each.one_step_unseen, on_map, is_seen)
 
 
-def random(mdp: MapMdp) -> Policy:
-    """Takes every action with equal chance."""
-    return lambda key, state: jax.random.randint(key, (), 0, mdp.num_pois + 1)
+def _expected(
+    values: jax.Array, of_unseen: jax.Array, probabilities: jax.Array, is_seen: jax.Array
+) -> jax.Array:
+    """`[N]` values of looks, from a table `[P]`, that of an unseen PoI, and `[N, C]` posteriors."""
+    known = jax.vmap(lambda p: optimum.interpolate(values, p))(probabilities)
+    return jnp.where(is_seen, known, of_unseen)
 
 
-def naive(mdp: MapMdp, modality: Index) -> Policy:
-    """Explores naively: the first PoI that the own sensor has not seen; NOP after the last."""
-    checks.require_index("modality", modality, mdp.num_modalities)
+def latent(key: Key, models: Trained, known: Known) -> jax.Array:
+    """Asks the trained Q-network.
 
-    def act(key: Key, state: MapState) -> jax.Array:
-        del key
-        own = state.seen[:, modality]
-        return jnp.where(jnp.all(own), mdp.num_pois, jnp.argmin(own))
+    Args:
+      key: not used.
+      models: trained models.
+      known: what the robot knows.
+    """
+    del key
+    q_network = jax.tree.map(lambda *x: jnp.stack(x)[known.modality], *models.q_networks)
+    classes = models.fusion.classes
+    return models.agent.decide(
+        q_network, models.tours, classes, known.belief, known.team, known.robot
+    )
 
-    return act
+
+def greedy(key: Key, models: Trained, known: Known) -> jax.Array:
+    """Takes the look with the highest expected gain on the map.
+
+    Args:
+      key: not used.
+      models: trained models.
+      known: what the robot knows.
+    """
+    del key
+    return jnp.append(_gains(models, known)[known.robot], 0.0)
 
 
-def expected_rewards(key: Key, mdp: MapMdp, modality: Index, num_draws: int) -> jax.Array:
-    """Expected reward of a look, by class and earlier looks.
+def bayes(key: Key, models: Trained, known: Known) -> jax.Array:
+    """Takes the look with the highest expected gain on the exact posterior over the classes.
+
+    Args:
+      key: not used.
+      models: trained models.
+      known: what the robot knows.
+    """
+    del key
+    looks, exact = _own(models, known), jnp.exp(known.log_posterior)
+    gains = _expected(looks.one_step, looks.one_step_unseen, exact, known.is_seen)
+    return jnp.append(gains, 0.0)
+
+
+def optimal(key: Key, models: Trained, known: Known) -> jax.Array:
+    """Takes the look with the highest total gain by dynamic programming on the exact posterior.
+
+    Args:
+      key: not used.
+      models: trained models.
+      known: what the robot knows.
+    """
+    del key
+    looks, exact = _own(models, known), jnp.exp(known.log_posterior)
+    return jnp.append(_expected(looks.q, looks.q_unseen, exact, known.is_seen), 0.0)
+
+
+def naive(number: int) -> Values:
+    """Explores naively: every robot looks at every PoI `number` times."""
+
+    def values(key: Key, models: Trained, known: Known) -> jax.Array:
+        del key, models
+        times = known.looks[:, known.modality]
+        return jnp.append(jnp.where(times < number, 1.0, -1.0), 0.0)
+
+    return values
+
+
+def random(key: Key, models: Trained, known: Known) -> jax.Array:
+    """Takes every action with equal chance.
 
     Args:
       key: random key.
-      mdp: the MDP.
-      modality: index of the agent's own sensor, see `belief_mdp.step`.
-      num_draws: simulated looks for each entry of the table.
-
-    Returns:
-      `[2^M, C]` mean reward of looking at a PoI of class c after looks by the modalities m whose
-      bits m are set in the first index.
+      models: not used.
+      known: what the robot knows.
     """
-
-    def reward(key: Key, code: jax.Array, poi_class: jax.Array) -> jax.Array:
-        reset_key, look_key = jax.random.split(key)
-        bits = (code >> jnp.arange(mdp.num_modalities) & 1).astype(bool)
-        seen = jnp.broadcast_to(bits, (mdp.num_pois, mdp.num_modalities))
-        classes = jnp.full(mdp.num_pois, poi_class)
-        state = belief_mdp.reset(reset_key, mdp, classes, seen)
-        return belief_mdp.step(look_key, mdp, state, jnp.int32(0), modality)[1].reward
-
-    # In one batch: one `vmap` in another takes three times as long to compile.
-    shape = (2**mdp.num_modalities, mdp.num_classes, num_draws)
-    codes, classes, _ = jnp.unravel_index(jnp.arange(math.prod(shape)), shape)
-    rewards = jax.vmap(reward)(jax.random.split(key, math.prod(shape)), codes, classes)
-    return rewards.reshape(shape).mean(axis=-1)
+    del models
+    number = len(known.looks) + 1
+    return jax.nn.one_hot(jax.random.randint(key, (), 0, number), number)
 
 
-def optimal(mdp: MapMdp, rewards: jax.Array, label_of_class: jax.Array) -> Policy:
-    """Acts greedily on the true expected reward, given what the looks so far can reveal.
+def _by_rule(rule: rules.Rule) -> Values:
+    """A hand-written rule on expected gains and the team's travel times."""
 
-    Optimal for the total reward, because PoIs are independent: every look that pays is worth taking
-    and the order is free. It knows which looks were taken and their noise-free results, not the
-    noise of single detections.
-
-    Args:
-      mdp: the MDP.
-      rewards: `[2^M, C]` from `expected_rewards`, for the agent's own modality.
-      label_of_class: `[M, C]` int32, label that each modality detects for each class. Classes whose
-        labels match the true one's in all modalities that have looked are equally likely.
-
-    Returns:
-      The policy; it uses the hidden parts of the state. Its action is -1 if a reward is NaN.
-    """
-    shape = (mdp.num_modalities, mdp.num_classes)
-    chex.assert_shape(label_of_class, shape, custom_message="label_of_class")
-    chex.assert_shape(rewards, (2 ** shape[0], shape[1]), custom_message="rewards")
-    checks.require_finite("rewards", rewards)
-
-    def of_poi(seen: jax.Array, poi_class: jax.Array) -> jax.Array:
-        is_same = label_of_class == label_of_class[:, poi_class][:, None]
-        is_open = jnp.all(is_same | ~seen[:, None], axis=0)
-        code = jnp.sum(seen << jnp.arange(mdp.num_modalities))
-        return jnp.sum(rewards[code] * is_open) / jnp.sum(is_open)
-
-    def act(key: Key, state: MapState) -> jax.Array:
+    def values(key: Key, models: Trained, known: Known) -> jax.Array:
         del key
-        return _best(jnp.append(jax.vmap(of_poi)(state.seen, state.classes), 0.0))
+        gains = _gains(models, known)
+        return rule(gains, known.times, known.team, known.robot)
 
-    return act
-
-
-def by_posterior(
-    table: jax.Array, first: jax.Array, weights: Callable[[Belief], jax.Array]
-) -> Policy:
-    """Takes the look of the highest value, by what the map shows; NOP if none is above 0.
-
-    Args:
-      table: `[P]` values of a look, one of `optimum.LookValues`: with `total` the optimal policy,
-        with `gain` one that does not look ahead.
-      first: `[]` value of a look at an unseen PoI, `first_total` or `first_gain`.
-      weights: `belief [D] -> [C]`, the classes' probabilities that an entry of the map holds.
-    """
-
-    def of_poi(belief: Belief, seen: jax.Array) -> jax.Array:
-        return jnp.where(jnp.any(seen), optimum.interpolate(table, weights(belief)), first)
-
-    def act(key: Key, state: MapState) -> jax.Array:
-        del key
-        return _best(jnp.append(jax.vmap(of_poi)(state.belief, state.seen), 0.0))
-
-    return act
+    return values
 
 
-def _best(values: jax.Array) -> jax.Array:
-    """Action, `[]` int32, of the highest of `[N + 1]` values; -1, which is none, if one is NaN."""
-    return jnp.where(jnp.any(jnp.isnan(values)), -1, jnp.argmax(values))
+def _gains(models: Trained, known: Known) -> jax.Array:
+    """`[R, N]` expected gains of each robot's next look at each PoI, on the map."""
+    of_modality = expected_gains(models.fusion, models.look_values, known.belief, known.is_seen)
+    return of_modality[known.team.modality]
+
+
+def _own(models: Trained, known: Known) -> LookValues:
+    """The values of looks with the robot's own sensor."""
+    of_each = jax.tree.map(lambda *x: jnp.stack(x), *models.look_values)
+    return jax.tree.map(lambda x: x[known.modality], of_each)
+
+
+def _always(agent: Agent) -> bool:
+    del agent
+    return True
+
+
+POLICIES: dict[str, Policy] = {
+    "latent": Policy(latent, lambda agent: agent.counts_time),
+    "greedy": Policy(greedy),
+    "bayes": Policy(bayes),
+    "optimal": Policy(optimal),
+    "naive": Policy(naive(1)),
+    "naive_2": Policy(naive(2)),
+    "naive_3": Policy(naive(3)),
+    "random": Policy(random),
+    "nearest": Policy(_by_rule(rules.nearest), _always),
+    "auction": Policy(_by_rule(rules.auction), _always),
+    "rollout": Policy(_by_rule(rules.gain_rate), _always),
+}
+"""The policies of jaxsense, by name."""

@@ -1,20 +1,25 @@
 """Hand-written rules for choosing the next PoI of a team's robot, to compare learned policies with.
 
-All read expected gains of information and times of travel, and return `[N + 1]` values of actions,
-of which the highest counts; NOP's, the last, is 0.
+All read expected gains of information and travel times, and return `[N + 1]` values of actions, the
+highest of which is taken; NOP's, the last, is 0.
 """
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
 from jaxsense.dqn.team_mdp import Team
 
-_SURE = 1e3  # above the longest way, in seconds
-_TAKEN = 1e2  # s, what a robot rather drives than go where another is heading
+_USEFUL = 1e3  # s, above the longest travel time
+_TAKEN = 1e2  # s, detour that a robot prefers to a PoI where another is heading
+
+Rule = Callable[[jax.Array, jax.Array, Team, jax.Array], jax.Array]
+"""`(gains [R, N], times [R, N], team, agent []) -> [N + 1]` values; see `nearest`."""
 
 
 def nearest(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) -> jax.Array:
-    """Values PoIs of which the robot expects to learn by its time to look at them.
+    """Prefers the nearest PoI with a positive expected gain.
 
     Args:
       gains: `[R, N]` expected reward of each robot's look.
@@ -23,15 +28,21 @@ def nearest(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) ->
       agent: `[]` int32, the robot that chooses.
     """
     cost = times[agent] + _TAKEN * _is_taken(team, agent)
-    return _with_nop(_SURE - cost, _is_useful(gains, team)[agent])
+    return _with_nop(_USEFUL - cost, _is_useful(gains, team)[agent])
 
 
 def auction(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) -> jax.Array:
-    """Values most the PoI that the robot wins in an auction, then the others as in `nearest`.
+    """Ranks the PoI won in a sequential auction first, the rest as `nearest` does.
 
-    Each robot at work bids its time for each PoI of which it expects to learn. The lowest bid of
-    all wins its PoI, both leave, and so on (Koenig et al. 2006, sequential single-item auctions,
-    with one item each). See `nearest` for the arguments.
+    Each robot at work bids its travel time for each PoI with a positive expected gain. The lowest
+    bid wins its PoI, robot and PoI leave, and so on (Koenig et al. 2006, sequential single-item
+    auctions, with one item each).
+
+    Args:
+      gains: see `nearest`.
+      times: see `nearest`.
+      team: see `nearest`.
+      agent: see `nearest`.
     """
     bids = jnp.where(_is_useful(gains, team) & team.works[:, None], times, jnp.inf)
 
@@ -46,13 +57,17 @@ def auction(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) ->
     num_robots, num_pois = bids.shape
     nothing = jnp.full(num_robots, num_pois)
     won = jax.lax.fori_loop(0, num_robots, sell, (bids, nothing))[1][agent]
-    return nearest(gains, times, team, agent).at[won].add(jnp.where(won < num_pois, _SURE, 0.0))
+    return nearest(gains, times, team, agent).at[won].add(jnp.where(won < num_pois, _USEFUL, 0.0))
 
 
-def rollout(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) -> jax.Array:
-    """Values PoIs by what one step of the travel model yields: gain for each second.
+def gain_rate(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) -> jax.Array:
+    """Prefers the PoI with the highest expected gain for each second.
 
-    See `nearest` for the arguments.
+    Args:
+      gains: see `nearest`.
+      times: see `nearest`.
+      team: see `nearest`.
+      agent: see `nearest`.
     """
     rate = gains[agent] / times[agent]
     rate /= jnp.where(_is_taken(team, agent), _TAKEN, 1.0)

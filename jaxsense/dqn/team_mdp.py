@@ -11,17 +11,17 @@ it is near enough, and looks.
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import chex
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from jaxsense.config import TeamConfig, TravelConfig
 from jaxsense.core import checks
-from jaxsense.core.types import Belief, Key, pytree
-from jaxsense.dqn import belief_mdp
-from jaxsense.dqn.belief_mdp import MapMdp, MapState, Outcome
+from jaxsense.core.types import Belief, Index, Key, pytree
+from jaxsense.dqn import map_mdp
+from jaxsense.dqn.map_mdp import MapMdp, MapState, Outcome
 
 TIME_SCALE = 10.0
 """Seconds in which observations count travel."""
@@ -69,21 +69,68 @@ class TeamState:
     seconds: jax.Array
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+Names = tuple[str, ...]
+"""Names of the sensors, in the order of their indices."""
+
+
+@pytree
+class Places:
+    """Random places: each PoI in a cell of its own, robots anywhere.
+
+    Attributes:
+      sides: `[2]` shortest and longest side of an arena, in metres.
+      robot_radius: `[]` metres that a robot keeps from a wall.
+      poi_pitch: smallest distance of two PoIs' centres, in metres.
+      num_pois: N.
+      cells_per_side: cells along a side of an arena.
+    """
+
+    sides: tuple[jax.Array | float, jax.Array | float]
+    robot_radius: jax.Array | float
+    poi_pitch: float = struct.field(pytree_node=False)
+    num_pois: int = struct.field(pytree_node=False)
+    cells_per_side: int = struct.field(pytree_node=False)
+
+    def draw(self, key: Key, num_robots: int) -> tuple[jax.Array, jax.Array]:
+        """Draws an arena.
+
+        Args:
+          key: random key.
+          num_robots: R; static.
+
+        Returns:
+          `[N, 2]` positions of the PoIs, in metres, and `[R, 3]` poses of the robots.
+        """
+        num_pois, per_side = self.num_pois, self.cells_per_side
+        draws = jax.random.uniform(key, (1 + per_side**2 + 2 * num_pois + 3 * num_robots,))
+        side = self.sides[0] + (self.sides[1] - self.sides[0]) * draws[0]
+        order, draws = draws[1 : 1 + per_side**2], draws[1 + per_side**2 :]
+        cell = jnp.argsort(order)[:num_pois]
+        corner = jnp.stack([cell // per_side, cell % per_side], axis=-1)
+        play = jnp.maximum(side / per_side - self.poi_pitch, 0.0)
+        jitter = play * (draws[: 2 * num_pois].reshape(num_pois, 2) - 0.5)
+        positions = (corner + 0.5) * side / per_side - side / 2 + jitter
+        places = 2 * draws[2 * num_pois :].reshape(num_robots, 3) - 1
+        reach = side / 2 - self.robot_radius
+        poses = jnp.concatenate([reach * places[:, :2], jnp.pi * places[:, 2:]], axis=-1)
+        return positions, poses
+
+
+@pytree
 class TeamMdp:
     """The MDP of a team whose members share one map.
 
     Attributes:
       config: the teams, and the price of time.
       map: the map MDP, with the largest number of PoIs.
-      new_places: `(key, number of PoIs, R) -> (positions [N, 2], poses [R, 3])`.
+      places: where PoIs and robots are.
       modalities: names of the sensors, in the order of their indices.
     """
 
     config: TeamConfig
     map: MapMdp
-    new_places: Callable[[Key, jax.Array, int], tuple[jax.Array, jax.Array]]
-    modalities: tuple[str, ...]
+    places: Places
+    modalities: Names = struct.field(pytree_node=False)
 
 
 def travel_seconds(config: TravelConfig, pose: jax.Array, places: jax.Array) -> jax.Array:
@@ -103,8 +150,16 @@ def travel_seconds(config: TravelConfig, pose: jax.Array, places: jax.Array) -> 
     return config.look_seconds + jnp.abs(turn) / config.turn_rate + way / config.speed
 
 
-def ways(config: TravelConfig, team: Team) -> jax.Array:
-    """`[R, N]` seconds until each robot has looked at each PoI, see `travel_seconds`."""
+def travel_times(config: TravelConfig, team: Team) -> jax.Array:
+    """Time until each robot has looked at each PoI, see `travel_seconds`.
+
+    Args:
+      config: the travel model.
+      team: where everybody is.
+
+    Returns:
+      `[R, N]` seconds.
+    """
     return jax.vmap(lambda pose: travel_seconds(config, pose, team.positions))(team.poses)
 
 
@@ -160,7 +215,7 @@ def observation(
     """
     chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
     checks.require_positive("belief.std", belief.std)
-    times = ways(config, team)
+    times = travel_times(config, team)
     soon = jnp.exp(-times / TIME_SCALE)
     robots, pois = jnp.arange(team.poses.shape[0]), jnp.arange(team.positions.shape[0])
     is_other = team.works & (robots != agent)
@@ -184,8 +239,13 @@ def observation(
     return jnp.where(team.present[None], jnp.concatenate(rows, axis=0), 0.0)
 
 
-def alone(num_pois: int, modality: jax.Array) -> Team:
-    """The team of the paper's MDP: one robot, and all is at one place."""
+def alone(num_pois: int, modality: Index) -> Team:
+    """The team of the paper's MDP: one robot, and all PoIs share its position.
+
+    Args:
+      num_pois: N.
+      modality: index of the robot's sensor.
+    """
     return Team(
         positions=jnp.zeros((num_pois, 2)),
         present=jnp.ones(num_pois, bool),
@@ -218,7 +278,7 @@ def reset(key: Key, mdp: TeamMdp, modality: jax.Array | None = None) -> TeamStat
         checks.require_index("modality", modality, mdp.map.num_modalities)
         alone, works = jnp.bool_(False), jnp.ones(modality.shape, bool)
     num_robots = len(modality)
-    positions, poses = mdp.new_places(place_key, number, num_robots)
+    positions, poses = mdp.places.draw(place_key, num_robots)
     chex.assert_shape(positions, (num_pois, 2), custom_message="positions")
     chex.assert_shape(poses, (num_robots, 3), custom_message="poses")
 
@@ -227,7 +287,7 @@ def reset(key: Key, mdp: TeamMdp, modality: jax.Array | None = None) -> TeamStat
     # Of any share, so that the end of a mission is seen as often as its middle.
     share = jnp.where(starts_late, jax.random.uniform(share_key), 0.0)
     seen = jax.random.bernoulli(looks_key, share, (num_pois, mdp.map.num_modalities))
-    state = belief_mdp.reset(map_key, mdp.map, seen=seen)
+    state = map_mdp.reset(map_key, mdp.map, seen=seen)
     team = Team(
         positions=jnp.where(alone, 0.0, positions),
         present=jnp.arange(num_pois) < number,
@@ -246,7 +306,7 @@ def _look(
     """The map after a look or NOP, and the `[]` reward."""
 
     def look(m: int) -> tuple[MapState, jax.Array]:
-        after, outcome = belief_mdp.step(key, mdp, state, action, m)
+        after, outcome = map_mdp.step(key, mdp, state, action, m)
         return after, outcome.reward
 
     # Every sensor looks, and one look counts: under `vmap` a switch takes many times as long.

@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from jaxsense.config import ToursConfig
 from jaxsense.core import networks
@@ -32,7 +33,7 @@ _ERROR = 3.0  # s, above which an error counts linearly
 
 @pytree
 class Trials:
-    """What has become of some choices.
+    """Outcomes of tried choices.
 
     Attributes:
       observation: `[F * N, ...]` what the robot knew.
@@ -60,7 +61,7 @@ def try_choices(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, num
     Returns:
       `[..., B]` trials.
     """
-    # All that a lone robot looks at is at one place: no order to learn.
+    # Alone, all PoIs share a position, so there is no order to learn.
     mdp = dataclasses.replace(mdp, config=dataclasses.replace(mdp.config, alone=0.0))
     keys = jax.random.split(key, number)
     return jax.vmap(lambda key: _trial(key, mdp, policy, config), out_axes=-1)(keys)
@@ -79,9 +80,11 @@ def _trial(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig) -> Trial
     tried = jax.lax.top_k(rank, min(config.tries, num_pois))[1]
     seconds = jax.vmap(lambda poi: _seconds_to_end(play_key, mdp, policy, state, poi))(tried)
     is_choice = jnp.sum(is_open) > 1
-    known = state.map.belief, state.team, state.agent, mdp.map.num_modalities
+    observation = team_mdp.observation(
+        travel, state.map.belief, state.team, state.agent, mdp.map.num_modalities
+    )
     return Trials(
-        observation=team_mdp.observation(travel, *known).reshape(-1),
+        observation=observation.reshape(-1),
         is_tried=jnp.zeros(num_pois, bool).at[tried].set(is_open[tried] & is_choice),
         seconds=jnp.zeros(num_pois).at[tried].set(seconds),
     )
@@ -90,7 +93,7 @@ def _trial(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig) -> Trial
 def _some_way_on(
     key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, state: TeamState
 ) -> TeamState:
-    """A state up to `config.walk` choices later, in which a robot chooses."""
+    """Follows the policy for up to `config.walk` random choices."""
     number_key, step_key = jax.random.split(key)
     number = jax.random.randint(number_key, (), 0, config.walk + 1)
 
@@ -132,7 +135,13 @@ def _where(condition: jax.Array, ours: TeamState, theirs: TeamState) -> TeamStat
 
 
 def no_trials(num_features: int, num_pois: int, number: int) -> Trials:
-    """Room for the trials of a number of states."""
+    """An empty buffer of trials.
+
+    Args:
+      num_features: F, see `team_mdp.num_features`.
+      num_pois: N.
+      number: of states.
+    """
     return Trials(
         observation=jnp.zeros((num_features * num_pois, number)),
         is_tried=jnp.zeros((num_pois, number), bool),
@@ -141,20 +150,18 @@ def no_trials(num_features: int, num_pois: int, number: int) -> Trials:
 
 
 def write(trials: Trials, found: Trials, column: jax.Array) -> Trials:
-    """Writes the trials of some states over those from a column on."""
+    """Writes trials into a buffer.
+
+    Args:
+      trials: the buffer.
+      found: the trials of some states.
+      column: `[]` int32, the first to write.
+    """
     return jax.tree.map(
         lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, column, axis=1),
         trials,
         found,
     )
-
-
-def sample(key: Key, trials: Trials, shape: tuple[int, ...]) -> jax.Array:
-    """Random columns, int32, of states in which something was tried."""
-    counts = jnp.any(trials.is_tried, axis=0)
-    first = jnp.argsort(~counts)
-    drawn = jnp.floor(jax.random.uniform(key, shape) * jnp.sum(counts))
-    return first[drawn.astype(jnp.int32)]
 
 
 def seconds(
@@ -176,15 +183,40 @@ def seconds(
     return team_mdp.own_seconds(observed, latent_size) + TIME_SCALE * learned
 
 
-def loss(network: PoolingNetwork, params: Params, trials: Trials, latent_size: int) -> jax.Array:
-    """`[]` mean error of the differences between the choices tried from the same state."""
-    predicted = seconds(network, params, trials.observation, latent_size)
-    error = _differences(trials.seconds - predicted, trials.is_tried)
-    number = jnp.maximum(jnp.sum(trials.is_tried), 1)
-    return jnp.sum(jnp.where(trials.is_tried, pseudo_huber(error / _ERROR), 0.0)) / number
+@pytree
+class Fitting:
+    """The fit of a network to the differences between choices tried from the same state.
+
+    Attributes:
+      config: batch, learning rate and steps.
+      trials: all so far.
+      network: of a team.
+      latent_size: D.
+    """
+
+    config: ToursConfig
+    trials: Trials
+    network: PoolingNetwork = struct.field(pytree_node=False)
+    latent_size: int = struct.field(pytree_node=False)
+
+    def draw(self, key: Key, number: int) -> jax.Array:
+        """Columns of states in which something was tried, see `supervised.Problem.draw`."""
+        counts = jnp.any(self.trials.is_tried, axis=0)
+        first = jnp.argsort(~counts)
+        drawn = jax.random.uniform(key, (number, self.config.batch)) * jnp.sum(counts)
+        return first[jnp.floor(drawn).astype(jnp.int32)]
+
+    def loss(self, params: Params, drawn: jax.Array, step: jax.Array) -> jax.Array:
+        """`[]` mean error of a batch."""
+        del step
+        trials = jax.tree.map(lambda x: x[:, drawn], self.trials)
+        predicted = seconds(self.network, params, trials.observation, self.latent_size)
+        error = _differences(trials.seconds - predicted, trials.is_tried)
+        number = jnp.maximum(jnp.sum(trials.is_tried), 1)
+        return jnp.sum(jnp.where(trials.is_tried, pseudo_huber(error / _ERROR), 0.0)) / number
 
 
 def _differences(x: jax.Array, counts: jax.Array) -> jax.Array:
-    """`[N, ...]` less the mean of those that count."""
+    """Subtracts the mean over valid entries, `[N, ...]`."""
     number = jnp.maximum(jnp.sum(counts, axis=0), 1)
     return x - (jnp.sum(jnp.where(counts, x, 0.0), axis=0) / number)[None]

@@ -7,6 +7,7 @@ cost.
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
 import chex
 import jax
@@ -15,17 +16,16 @@ import optax
 
 from jaxsense.config import DqnConfig
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Index, Key, Transition, pytree
+from jaxsense.core.types import Key, Transition, pytree
 from jaxsense.dqn import losses, replay
-from jaxsense.dqn.belief_mdp import MapMdp
-from jaxsense.dqn.environments import Environment, State, environment
-from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.dqn.environments import Environment
 
+S = TypeVar("S")
 _EVALUATED = 10  # epochs
 
 
 @pytree
-class DqnState:
+class DqnState(Generic[S]):
     """Training state between two chunks of epochs.
 
     Attributes:
@@ -34,7 +34,7 @@ class DqnState:
       optimiser: state of Adam.
       replay: the replay memory.
       envs: `[E]` states of the environments.
-      needs_start: `[E]` bool, environments whose episode has ended.
+      done: `[E]` bool, environments whose episode has ended.
       total_reward: `[E]` reward of each environment's episode so far.
       epoch: `[]` int32 epochs so far.
     """
@@ -43,8 +43,8 @@ class DqnState:
     target: Params
     optimiser: optax.OptState
     replay: replay.Replay
-    envs: State
-    needs_start: jax.Array
+    envs: S
+    done: jax.Array
     total_reward: jax.Array
     epoch: jax.Array
 
@@ -57,9 +57,10 @@ class EpochInfo:
       loss: `[]` mean over the gradient steps.
       episode_return: `[]` mean total reward of the exploring policy's episodes that ended.
       episodes: `[]` int32 episodes that ended.
-      greedy_return: `[]` mean total reward of the greedy policy after the epoch; NaN after most.
+      greedy_return: `[]` mean total reward of the learned policy after the epoch; NaN except in
+        every tenth epoch.
       epsilon: `[]` chance of a random action.
-      is_finite: `[]` bool, whether values, rewards, loss and new parameters are.
+      is_finite: `[]` bool, whether values, rewards, loss and new parameters are finite.
     """
 
     loss: jax.Array
@@ -89,19 +90,18 @@ class _Draws:
     replay: jax.Array
 
 
-def init(key: Key, mdp: MapMdp | TeamMdp, config: DqnConfig, prepared: State) -> DqnState:
+def init(key: Key, environment: Environment[S], config: DqnConfig, prepared: S) -> DqnState[S]:
     """Fresh network, empty replay, and environments before their first start.
 
     Args:
       key: random key of the network.
-      mdp: the MDP.
+      environment: what to learn in.
       config: the settings.
-      prepared: from `starts`; only its shapes count.
+      prepared: from `starts`; only its shapes matter.
     """
     envs = jax.tree.map(lambda x: jnp.zeros((config.num_envs, *x.shape[1:]), x.dtype), prepared)
-    place = environment(mdp, 0, config)
-    size = jax.eval_shape(jax.vmap(place.observation), prepared).shape[1]
-    params = place.init(key)
+    size = jax.eval_shape(jax.vmap(environment.observe), prepared).shape[1]
+    params = environment.agent.init(key)
     rounds, blocks = config.replay_capacity // config.num_envs, config.num_envs // config.block
     return DqnState(
         params=params,
@@ -109,68 +109,67 @@ def init(key: Key, mdp: MapMdp | TeamMdp, config: DqnConfig, prepared: State) ->
         optimiser=_optimiser(config).init(params),
         replay=replay.init(size, rounds, blocks, config.block),
         envs=envs,
-        needs_start=jnp.ones(config.num_envs, bool),
+        done=jnp.ones(config.num_envs, bool),
         total_reward=jnp.zeros(config.num_envs),
         epoch=jnp.int32(0),
     )
 
 
-def starts(key: Key, mdp: MapMdp | TeamMdp, config: DqnConfig) -> State:
+def starts(key: Key, environment: Environment[S], config: DqnConfig) -> S:
     """Random states, `[num_starts]`, for episodes to start from.
 
-    A training prepares them once: a start looks at everything it has seen, which costs far more
-    than a step.
-    """
-    reset = environment(mdp, 0, config).reset
-    return jax.vmap(reset)(jax.random.split(key, config.num_starts))
-
-
-def train(
-    key: Key, mdp: MapMdp | TeamMdp, modality: Index, config: DqnConfig
-) -> tuple[DqnState, EpochInfo]:
-    """Trains one agent; `vmap` over `key` for several seeds, over `modality` for several agents.
+    A training prepares them once: a start looks at everything that has been seen, which costs far
+    more than a step.
 
     Args:
       key: random key.
-      mdp: the MDP.
-      modality: index of the agent's own sensor, see `belief_mdp.step`; a team has all of them.
+      environment: what to learn in.
+      config: the settings.
+    """
+    return jax.vmap(environment.reset)(jax.random.split(key, config.num_starts))
+
+
+def train(
+    key: Key, environment: Environment[S], config: DqnConfig
+) -> tuple[DqnState[S], EpochInfo]:
+    """Trains one agent; `vmap` over `key` for several seeds.
+
+    Args:
+      key: random key.
+      environment: what to learn in.
       config: the settings.
 
     Returns:
       The last state and the `[epochs]` infos.
     """
     init_key, start_key, chunk_key = jax.random.split(key, 3)
-    prepared = starts(start_key, mdp, config)
-    state = init(init_key, mdp, config, prepared)
+    prepared = starts(start_key, environment, config)
+    state = init(init_key, environment, config, prepared)
     keys = jax.random.split(chunk_key, config.epochs // config.chunk)
     state, infos = jax.lax.scan(
-        lambda state, key: train_chunk(key, mdp, modality, config, state, prepared),
-        state,
-        keys,
+        lambda state, key: train_chunk(key, environment, config, state, prepared), state, keys
     )
     return state, jax.tree.map(lambda x: x.reshape(-1), infos)
 
 
 def train_chunk(
     key: Key,
-    mdp: MapMdp | TeamMdp,
-    modality: Index,
+    environment: Environment[S],
     config: DqnConfig,
-    state: DqnState,
-    prepared: State,
+    state: DqnState[S],
+    prepared: S,
     evaluate: Callable[[Key, Params], jax.Array] | None = None,
-) -> tuple[DqnState, EpochInfo]:
+) -> tuple[DqnState[S], EpochInfo]:
     """Trains for `config.chunk` epochs.
 
     Args:
       key: random key.
-      mdp: the MDP.
-      modality: index of the agent's own sensor, see `belief_mdp.step`; a team has all of them.
+      environment: what to learn in.
       config: the settings.
       state: the current state.
       prepared: `[num_starts]` from `starts`. Each environment has a share of them, and starts every
         episode from a random one of its share.
-      evaluate: `(key, parameters) -> []` total reward of the greedy policy, called after every
+      evaluate: `(key, parameters) -> []` total reward of the learned policy, called after every
         tenth epoch, or after the last if ten do not divide the chunk.
 
     Returns:
@@ -179,14 +178,13 @@ def train_chunk(
     for part in jax.tree.leaves(prepared):
         chex.assert_axis_dimension(part, 0, config.num_starts, custom_message="prepared")
     shares = jax.tree.map(lambda x: x.reshape(config.num_envs, -1, *x.shape[1:]), prepared)
-    place = environment(mdp, modality, config)
     draws = _draw(key, config)
-    epoch = functools.partial(_epoch, place, config, shares)
+    epoch = functools.partial(_epoch, environment, config, shares)
     if evaluate is None:
         return jax.lax.scan(epoch, state, draws)
     every = _EVALUATED if config.chunk % _EVALUATED == 0 else config.chunk
 
-    def advance(state: DqnState, of_group: tuple[Key, _Draws]) -> tuple[DqnState, EpochInfo]:
+    def advance(state: DqnState[S], of_group: tuple[Key, _Draws]) -> tuple[DqnState[S], EpochInfo]:
         key, draws = of_group
         state, infos = jax.lax.scan(epoch, state, draws)
         found = infos.greedy_return.at[-1].set(evaluate(key, state.params))
@@ -214,19 +212,19 @@ def _draw(key: Key, config: DqnConfig) -> _Draws:
 
 
 def _epoch(
-    place: Environment,
+    environment: Environment[S],
     config: DqnConfig,
-    shares: State,
-    state: DqnState,
+    shares: S,
+    state: DqnState[S],
     draws: _Draws,
-) -> tuple[DqnState, EpochInfo]:
+) -> tuple[DqnState[S], EpochInfo]:
     """One step of each environment and `config.updates` gradient steps."""
     epsilon = jnp.maximum(
         config.epsilon_min, config.epsilon_start * config.epsilon_decay**state.epoch
     )
-    started = _restart(draws.start, state.envs, shares, state.needs_start)
+    started = _restart(draws.start, state.envs, shares, state.done)
     envs, has_ended, transitions, values = _explore(
-        place, config, state.params, started, epsilon, draws
+        environment, config, state.params, started, epsilon, draws
     )
     memory = replay.add(state.replay, transitions)
 
@@ -234,7 +232,7 @@ def _epoch(
     episodes = jnp.sum(has_ended)
     ended_reward = jnp.sum(jnp.where(has_ended, total_reward, 0.0))
 
-    params, optimiser, loss = _learn(config, place, state, memory, draws.replay)
+    params, optimiser, loss = _learn(config, environment, state, memory, draws.replay)
     is_copied = (state.epoch + 1) % config.target_period == 0
     target = jax.tree.map(lambda new, old: jnp.where(is_copied, new, old), params, state.target)
     checked = values, transitions.r_t, loss, params
@@ -253,7 +251,7 @@ def _epoch(
         optimiser=optimiser,
         replay=memory,
         envs=envs,
-        needs_start=has_ended,
+        done=has_ended,
         total_reward=jnp.where(has_ended, 0.0, total_reward),
         epoch=state.epoch + 1,
     )
@@ -261,23 +259,23 @@ def _epoch(
 
 
 def _explore(
-    place: Environment,
+    environment: Environment[S],
     config: DqnConfig,
     params: Params,
-    started: State,
+    started: S,
     epsilon: jax.Array,
     draws: _Draws,
-) -> tuple[State, jax.Array, Transition, jax.Array]:
+) -> tuple[S, jax.Array, Transition, jax.Array]:
     """Next states, which episodes have ended, transitions and `[A, E]` values before them."""
-    observations = jax.vmap(place.observation, out_axes=-1)
+    observations = jax.vmap(environment.observe, out_axes=-1)
     s_tm1 = observations(started)
-    values = place.values(params, s_tm1)
-    chex.assert_shape(values, (place.num_actions, None))
+    values = environment.agent.values(params, s_tm1)
+    chex.assert_shape(values, (environment.num_actions, None))
     greedy = jnp.argmax(values, axis=0).astype(jnp.int32)
-    a_tm1 = jnp.where(draws.coin < epsilon, _explored(place, started, draws.action), greedy)
+    a_tm1 = jnp.where(draws.coin < epsilon, _explored(environment, started, draws.action), greedy)
 
-    def step(key: Key, state: State, s_tm1: jax.Array, action: jax.Array):
-        after, learned, outcome = place.step(key, state, s_tm1, action)
+    def step(key: Key, state: S, s_tm1: jax.Array, action: jax.Array):
+        after, learned, outcome = environment.step(key, state, s_tm1, action)
         numbers = learned.a_tm1, learned.r_t, learned.discount_t
         return after, (learned.s_tm1, learned.s_t), numbers, outcome
 
@@ -287,17 +285,17 @@ def _explore(
     return envs, outcome.terminated | outcome.truncated, transitions, values
 
 
-def _explored(place: Environment, states: State, draws: jax.Array) -> jax.Array:
+def _explored(environment: Environment[S], states: S, draws: jax.Array) -> jax.Array:
     """Random `[E]` int32 actions among those that exist in `[E]` states, by `[E]` in [0, 1)."""
-    exists = jax.vmap(place.exists)(states)
-    number = jnp.floor(draws * jnp.sum(exists, axis=1)).astype(jnp.int32)
-    return jnp.argmax(jnp.cumsum(exists, axis=1) > number[:, None], axis=1).astype(jnp.int32)
+    exist = jax.vmap(environment.action_mask)(states)
+    number = jnp.floor(draws * jnp.sum(exist, axis=1)).astype(jnp.int32)
+    return jnp.argmax(jnp.cumsum(exist, axis=1) > number[:, None], axis=1).astype(jnp.int32)
 
 
 def _learn(
     config: DqnConfig,
-    place: Environment,
-    state: DqnState,
+    environment: Environment[S],
+    state: DqnState[S],
     memory: replay.Replay,
     draws: jax.Array,
 ) -> tuple[Params, optax.OptState, jax.Array]:
@@ -305,8 +303,8 @@ def _learn(
     optimiser = _optimiser(config)
 
     def loss(params: Params, batch: Transition) -> jax.Array:
-        q_tm1 = place.learned(params, batch.s_tm1)
-        q_t = place.values(state.target, batch.s_t)
+        q_tm1 = environment.agent.q(params, batch.s_tm1)
+        q_t = environment.agent.values(state.target, batch.s_t)
         error = losses.td_error(q_tm1, batch.a_tm1, batch.r_t, batch.discount_t, q_t)
         return jnp.mean(losses.pseudo_huber(error))
 
@@ -327,15 +325,15 @@ def _optimiser(config: DqnConfig) -> optax.GradientTransformation:
         config.epochs * config.updates,
         config.final_learning_rate / config.learning_rate,
     )
-    # As one vector: the network is so small that each array costs more than its content.
+    # Flattened: for networks this small, per-array overhead dominates.
     return optax.flatten(optax.adam(schedule))
 
 
-def _restart(rows: jax.Array, envs: State, shares: State, needs_start: jax.Array) -> State:
+def _restart(rows: jax.Array, envs: S, shares: S, done: jax.Array) -> S:
     """Restarts each environment that needs it from that row of its share."""
 
     def pick(env: jax.Array, share: jax.Array) -> jax.Array:
-        mask = needs_start.reshape(-1, *[1] * (env.ndim - 1))
+        mask = done.reshape(-1, *[1] * (env.ndim - 1))
         return jnp.where(mask, share[jnp.arange(len(rows)), rows], env)
 
     return jax.tree.map(pick, envs, shares)

@@ -13,8 +13,8 @@ from jaxsense.config import Config
 from jaxsense.core.types import Key
 from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.programs import Programs, padded
-from jaxsense.stages import Progress, Stage, Steps
+from jaxsense.run.programs import Programs, has_rows, is_saved, padded
+from jaxsense.training.stage import Output, Progress, Stage
 
 _SAVE_PERIOD = 60.0  # s
 
@@ -88,7 +88,7 @@ class _Loop:
         stages, done = self._programs.stages, dict[str, Future[Any]]()
         with ThreadPoolExecutor(len(stages)) as threads:
             for stage in stages:
-                before = {name: done[name] for name in stage.inputs}
+                before = {name: done[name] for name in stage.sources}
                 done[stage.name] = threads.submit(self._run_stage, stage, before)
             # A wait without timeout may not notice Ctrl-C.
             while wait(done.values(), timeout=0.2).not_done:
@@ -106,35 +106,35 @@ class _Loop:
     def _run_stage(self, stage: Stage, before: dict[str, Future[Any]]) -> Any:
         """The output of a stage, loaded if it was saved."""
         try:
-            found = self._load(stage) if stage.is_saved else None
+            found = self._load(stage) if is_saved(stage) else None
             if found is not None:
                 return found
             inputs = stage.select({name: future.result() for name, future in before.items()})
             self._monitor.check_stop()
             output = self._begin(stage, inputs)
-            if isinstance(stage, Steps):
+            if stage.chunks:
                 output = self._train(stage, output, inputs)
-            if not (isinstance(stage, Steps) and stage.is_optional):
+            if not stage.is_optional:
                 self._monitor.check_finite(stage.name, "results", output)
-            if stage.is_saved:
+            if is_saved(stage):
                 self._save(stage, output)
             return output
         except StageError as error:
             self._monitor.fail(error)
             raise
 
-    def _begin(self, stage: Stage, inputs: tuple[Any, ...]) -> Any:
+    def _begin(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The first state, or the output of a stage without steps."""
         key = stage.key(self._key)
         program, config = self._programs.of(stage).begin, self._config
-        if not stage.has_rows:
-            return program(key, config, *inputs)
+        if not has_rows(stage):
+            return program(key, config, inputs)
         number = len(jax.tree.leaves(inputs)[0])
-        found = program(key, config, *padded(inputs, self._programs.workers.number))
+        found = program(key, config, padded(inputs, self._programs.workers.number))
         # Joined parts lie on the host, and every program would transfer them again.
         return jax.device_put(jax.tree.map(lambda x: x[:number], found))
 
-    def _train(self, stage: Steps, state: Any, inputs: tuple[Any, ...]) -> Any:
+    def _train(self, stage: Stage, state: Output, inputs: dict[str, Output]) -> Output:
         """The output of a stage with steps, from its first state."""
         programs, config = self._programs.of(stage), self._config
         keys = stage.chunk_keys(self._key)
@@ -143,9 +143,10 @@ class _Loop:
 
         def advance(chunk: int, state: Any) -> tuple[Any, Curves]:
             begin = time.perf_counter()
-            state, progress = programs.advance(keys[chunk], config, state, *inputs)
+            state, progress = programs.advance(keys[chunk], config, state, inputs)
             seconds = time.perf_counter() - begin
-            curves = self._report(stage, chunk, progress, programs.finish(config, state, *inputs))
+            output = programs.finish(config, state, inputs)
+            curves = self._report(stage, chunk, progress, output)
             return state, {**curves, "seconds": [seconds]}
 
         try:
@@ -158,9 +159,9 @@ class _Loop:
             self._monitor.warn(f"{error}: left out")
             state, curves = _failed(state), self._no_curves(stage)
         self._curves[stage.name] = curves
-        return programs.finish(config, state, *inputs)
+        return programs.finish(config, state, inputs)
 
-    def _report(self, stage: Steps, chunk: int, progress: Progress, output: Any) -> Curves:
+    def _report(self, stage: Stage, chunk: int, progress: Progress, output: Any) -> Curves:
         """Reports a chunk, checks the output so far, and returns the steps' metrics."""
         size = len(progress.loss)
         done = min((chunk + 1) * size, stage.steps)
@@ -177,7 +178,7 @@ class _Loop:
 
     def _load(self, stage: Stage) -> Any:
         """The saved output of a finished stage; None if there is none."""
-        if isinstance(stage, Steps):
+        if stage.chunks:
             shapes = _as_arrays(self._no_curves(stage))
             curves = self._checkpoints.load_or_forget(f"curves_{stage.name}", shapes)
             if curves is None:
@@ -186,7 +187,7 @@ class _Loop:
         output = self._programs.of(stage).shapes.result().output
         return self._checkpoints.load_or_forget(stage.name, output)
 
-    def _no_curves(self, stage: Steps) -> Curves:
+    def _no_curves(self, stage: Stage) -> Curves:
         """The curves of a failed training."""
         metrics = self._programs.of(stage).shapes.result().progress.metrics
         return {**dict.fromkeys(metrics, [np.nan] * stage.steps), "seconds": [0.0] * stage.chunks}
@@ -200,7 +201,7 @@ class _Loop:
             return
 
         def save() -> None:
-            if isinstance(stage, Steps):
+            if stage.chunks:
                 curves = _as_arrays(self._curves[stage.name])
                 self._checkpoints.save(f"curves_{stage.name}", curves)
             self._checkpoints.save(stage.name, output)

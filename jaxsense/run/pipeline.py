@@ -8,9 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsense import examine, mission
+from jaxsense import mission
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Key
+from jaxsense.dqn import episodes
 from jaxsense.models import Models
 from jaxsense.run import missions
 from jaxsense.run.checkpoints import Checkpoints
@@ -20,7 +21,8 @@ from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs, compile_programs
 from jaxsense.sim.world import make_world
-from jaxsense.stages import agent, mission_key, models
+from jaxsense.training.agents import learner
+from jaxsense.training.stages import mission_key, models
 
 _UNAMBIGUOUS = 0.9  # share of looks in a single class, above which the class counts as one
 
@@ -67,7 +69,7 @@ def compiled(
       num_seeds: runs side by side, see `compile_programs`.
     """
     with Compiler(monitor, kept) as compiler:
-        yield compile_programs(config, make_world(config), compiler, workers, num_seeds)
+        yield compile_programs(config, make_world(config).arena, compiler, workers, num_seeds)
 
 
 def run(
@@ -98,6 +100,7 @@ def run(
     found = player.play(mission_key(key), networks, played, episodes)
     checkpoints.forget_unfinished()
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
+    latent = {f.name: getattr(latent, f.name) for f in dataclasses.fields(latent)}
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
     return RunResult(
         models=networks,
@@ -106,14 +109,16 @@ def run(
         posteriors=posteriors,
         rewards={
             n: {
-                name: np.array(trained.curves[agent(config, n)][name])
+                name: np.array(trained.curves[learner(config, n)][name])
                 for name in ("reward", "greedy")
             }
             for n in config.modalities
         },
         recording=found.recording,
         summary={
-            "detectors": jax.tree.map(lambda x: x.tolist(), detections.metrics),
+            "detectors": jax.tree.map(
+                lambda x: np.asarray(x).tolist(), trained.outputs["detector_metrics"]
+            ),
             "jmvae": _as_lists(latent),
             "belief": jax.tree.map(lambda x: np.asarray(x).tolist(), trained.outputs["beliefs"]),
             "dqn": {name: _of_agent(config, name, trained) for name in config.modalities},
@@ -126,15 +131,15 @@ def _of_agent(config: Config, modality: str, trained: Trained) -> dict[str, Any]
     """One modality's block in the summary's `dqn`."""
     total, first = map(np.asarray, trained.outputs[f"policies_{modality}"])
     env_steps = config.dqn.epochs * config.dqn.num_envs
-    seconds = sum(trained.curves[agent(config, modality)]["seconds"])
+    seconds = sum(trained.curves[learner(config, modality)]["seconds"])
     others = {
-        str(number): examine.returns(np.asarray(total), config)
+        str(number): returns(np.asarray(total), config)
         for number, (total, _) in zip(
             config.evaluation.num_pois, trained.outputs.get(f"numbers_{modality}", ()), strict=True
         )
     }
     return {
-        **examine.policy_metrics(total, first, config),
+        **policy_metrics(total, first, config),
         **({"other_numbers": others} if others else {}),
         "env_steps": env_steps,
         "env_steps_per_s": env_steps / seconds,
@@ -142,10 +147,61 @@ def _of_agent(config: Config, modality: str, trained: Trained) -> dict[str, Any]
 
 
 def _as_lists(metrics: dict[str, Any]) -> dict[str, Any]:
-    """The summary's block `jmvae` from the arrays of `examine.latent_space`."""
+    """The summary's block `jmvae` from the arrays of `latent_space`."""
     lists = jax.tree.map(lambda x: x.tolist(), metrics)
     lists["unambiguous"] = {
         name: [share > _UNAMBIGUOUS for share in shares]
         for name, shares in lists["unambiguous"].items()
     }
     return lists
+
+
+_NAMES = ("return", "optimal", "naive", "random")
+
+
+def returns(total: np.ndarray, config: Config) -> dict[str, float | None]:
+    """Mean return of each of `_NAMES` from random starts, and the share of the optimal one.
+
+    Args:
+      total: `[P, S]` from `compare_policies`.
+      config: all settings.
+    """
+    of_starts = total[:, -config.evaluation.num_starts :].mean(axis=1).tolist()
+    whole = dict(zip(_NAMES, of_starts, strict=True))
+    # Where no look pays, the optimum is 0.
+    fraction = whole["return"] / whole["optimal"] if whole["optimal"] else None
+    return {**whole, "fraction_of_optimal": fraction}
+
+
+def policy_metrics(total: np.ndarray, first: np.ndarray, config: Config) -> dict[str, Any]:
+    """One modality's block in the summary's `dqn`, without the speed.
+
+    Args:
+      total: `[P, S]` from `compare_policies`.
+      first: `[P, S]` from `compare_policies`.
+      config: all settings.
+    """
+    num_states = total.shape[1] - config.evaluation.num_starts
+    one_step = dict(zip(_NAMES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
+    missed = total[_NAMES.index("optimal"), :num_states] - total[0, :num_states]
+    is_optimal = missed <= 0.01
+    is_permutation = episodes.are_different(
+        episodes.every_state(
+            config.arena.num_pois,
+            len(config.arena.classes),
+            len(config.modalities),
+            config.evaluation.num_states,
+        )[0]
+    )
+    return {
+        **returns(total, config),
+        "one_step": {
+            "policy": one_step["return"],
+            "optimal": one_step["optimal"],
+            "random": one_step["random"],
+        },
+        "optimal_states": int(np.sum(is_optimal)),
+        "num_states": num_states,
+        "optimal_permutations": int(np.sum(is_optimal & is_permutation)),
+        "num_permutations": int(np.sum(is_permutation)),
+    }

@@ -13,12 +13,48 @@ import jax
 
 from jaxsense import mission
 from jaxsense.config import Config
+from jaxsense.core.types import Key
 from jaxsense.run import missions
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.together import SharedProgram, Trainings
-from jaxsense.sim.world import World
-from jaxsense.stages import Stage, Steps, stages
+from jaxsense.sim.arena import Arena
+from jaxsense.training.stage import Output, Stage
+from jaxsense.training.stages import stages
+
+_ROWS = ("survey",)
+"""Stages whose inputs and output have independent rows, so that devices can share them."""
+_SAVED = ("best_jmvae", "class_beliefs", "fusion", "look_values")
+"""Stages without chunks whose output a run saves; it saves that of every stage with chunks."""
+
+
+_SHARED = ("jmvae", "dqn", "policies", "numbers")
+"""First words of the names of stages that have the same functions, and so the same programs."""
+
+
+def has_rows(stage: Stage) -> bool:
+    """Whether devices can share the rows of a stage."""
+    return stage.name in _ROWS
+
+
+def is_saved(stage: Stage) -> bool:
+    """Whether a run saves the output of a stage, and does not repeat the stage when it resumes."""
+    return stage.chunks > 0 or stage.name in _SAVED
+
+
+def _runs_long(stage: Stage, config: Config) -> bool:
+    """Whether dense networks take nearly all of the time of a stage's chunks, on a CPU.
+
+    Accelerators train faster than they compile.
+    """
+    is_live = stage.name.startswith("dqn_") and config.dqn.observe == "live"
+    return _on_cpu() and not is_live
+
+
+def _program_name(stage: Stage) -> str:
+    """The name of a stage's programs, which stages with the same functions share."""
+    kind = stage.name.partition("_")[0]
+    return kind if kind in _SHARED else stage.name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,9 +75,9 @@ class StagePrograms:
     """The programs of a stage.
 
     Attributes:
-      begin: `(key, config, *inputs) -> state`, or the output of a stage without steps.
-      advance: `(key, config, state, *inputs) -> (state, Progress)`.
-      finish: `(config, state, *inputs) -> output`.
+      begin: `(key, config, inputs) -> state`, or the output of a stage without chunks.
+      advance: `(key, config, state, inputs) -> (state, Progress)`.
+      finish: `(config, state, inputs) -> output`.
       shapes: known once the programs are traced.
     """
 
@@ -58,7 +94,7 @@ class Programs:
     Attributes:
       config: all settings.
       stages: of the training.
-      of_stages: their programs, by `Stage.program`.
+      of_stages: their programs, by name.
       player: of the missions.
       workers: what shares rows and missions.
       trainings: those side by side.
@@ -73,7 +109,7 @@ class Programs:
 
     def of(self, stage: Stage) -> StagePrograms:
         """The programs of a stage."""
-        return self.of_stages[_name(stage)]
+        return self.of_stages[_program_name(stage)]
 
     def fail(self, error: BaseException) -> None:
         """Raises an error wherever a program is awaited, now or later."""
@@ -87,7 +123,7 @@ class Programs:
 
 def compile_programs(
     config: Config,
-    world: World,
+    arena: Arena,
     compiler: Compiler,
     workers: Workers = ALONE,
     num_seeds: int = 1,
@@ -96,23 +132,23 @@ def compile_programs(
 
     Args:
       config: all settings.
-      world: the simulation, without contacts.
+      arena: without contacts.
       compiler: compiles them.
       workers: what shares rows, missions and seeds.
       num_seeds: trainings side by side; each calls the programs from its own threads.
     """
-    found, trainings = stages(config, world), Trainings(num_seeds)
+    found, trainings = stages(config, arena), Trainings(num_seeds)
 
     def program(stage: Stage, part: str) -> Program | SharedProgram:
-        alone = Program(compiler, _name(stage), part)
-        is_shared = num_seeds > 1 and not stage.has_rows
+        alone = Program(compiler, _program_name(stage), part)
+        is_shared = num_seeds > 1 and not has_rows(stage)
         return SharedProgram(alone, trainings, workers) if is_shared else alone
 
     programs = Programs(
         config=config,
         stages=found,
         of_stages={
-            _name(stage): StagePrograms(
+            _program_name(stage): StagePrograms(
                 begin=program(stage, "begin"),
                 advance=program(stage, "advance"),
                 finish=program(stage, "finish"),
@@ -132,10 +168,6 @@ def compile_programs(
 
 
 _BEFORE_MISSIONS = 2  # stages that all others wait for
-
-
-def _name(stage: Stage) -> str:
-    return stage.program or stage.name
 
 
 def _on_cpu() -> bool:
@@ -175,26 +207,37 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
     outputs = {
         before.name: programs.of(before).shapes.result().output
         for before in programs.stages
-        if before.name in stage.inputs
+        if before.name in stage.sources
     }
     inputs = stage.select(outputs)
-    if isinstance(compiled.begin, Program) and stage.has_rows:
-        inputs = padded(inputs, programs.workers.number)
-        whole = {"workers": programs.workers, "whole": (0, 1)}
-        output = compiled.begin.compile(stage.begin, key, config, *inputs, **whole)
+
+    def begin(key: Key, config: Config, inputs: dict[str, Output]) -> Output:
+        return stage.begin(key, config, **inputs)
+
+    def advance(key: Key, config: Config, state: Output, inputs: dict[str, Output]) -> Output:
+        return stage.advance(key, config, state, **inputs)
+
+    def finish(config: Config, state: Output, inputs: dict[str, Output]) -> Output:
+        return stage.finish(config, state, **inputs)
+
+    if has_rows(stage):
+        split = padded(inputs, programs.workers.number)
+        output = compiled.begin.compile(
+            begin, key, config, split, workers=programs.workers, whole=(0, 1)
+        )
         number = len(jax.tree.leaves(outputs)[0])
         output = jax.tree.map(lambda x: x.update(shape=(number, *x.shape[1:])), output)
         compiled.shapes.set_result(Shapes(output))
         return
-    state = compiled.begin.compile(stage.begin, key, config, *inputs, whole=(1,))
-    if not isinstance(stage, Steps):
+    state = compiled.begin.compile(begin, key, config, inputs, whole=(1,))
+    if not stage.chunks:
         compiled.shapes.set_result(Shapes(state))
         return
-    runs_long = stage.is_dense and _on_cpu()
+    runs_long = _runs_long(stage, programs.config)
     _, progress = compiled.advance.compile(
-        stage.advance, key, config, state, *inputs, runs_long=runs_long, whole=(1,)
+        advance, key, config, state, inputs, runs_long=runs_long, whole=(1,)
     )
-    output = compiled.finish.compile(stage.finish, config, state, *inputs, whole=(0,))
+    output = compiled.finish.compile(finish, config, state, inputs, whole=(0,))
     compiled.shapes.set_result(Shapes(output, progress))
 
 

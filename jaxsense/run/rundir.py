@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 
-from jaxsense import models, stages
+from jaxsense import models, training
 from jaxsense.config import (
     PRESETS,
     Config,
@@ -27,7 +27,7 @@ from jaxsense.models import Models
 from jaxsense.run import files
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.version import __version__, versions
-from jaxsense.vae.fusion import FILTER
+from jaxsense.training.agents import learner
 
 BLOCKS = ("detectors", "jmvae", "belief", "dqn", "mission")
 """The blocks of a summary that hold results."""
@@ -281,22 +281,19 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
         return jax.device_put(found)
 
     found = {name: restore(name, shape) for name, shape in _named(shapes, config).items()}
-    return config, stages.models(found, config)
+    return config, training.models(found, config)
 
 
 def _named(models: Models, config: Config) -> dict[str, Any]:
     """The parts of the models, by the names of their stages and checkpoints."""
     detectors = zip(config.modalities, models.detectors, strict=True)
     q_networks = zip(config.modalities, models.q_networks, strict=True)
-    params = dict(models.jmvae)
-    filters = {FILTER: params.pop(FILTER)} if FILTER in params else {}
     return {
         **{f"detector_{name}": detector for name, detector in detectors},
-        "jmvae": params,
-        **filters,
-        "class_beliefs": models.class_beliefs,
+        "best_jmvae": models.jmvae,
+        "fusion": models.fusion,
         "look_values": models.look_values,
-        **{stages.agent(config, name): q_network for name, q_network in q_networks},
+        **{learner(config, name): q_network for name, q_network in q_networks},
         **({} if models.tours is None else {"tours": models.tours}),
     }
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from jaxsense import stages
 from jaxsense.config import Config, ConfigError
 from jaxsense.mission.compare import described
 from jaxsense.run import rundir
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.training.agents import learner
 
 Timing = dict[str, dict[str, float]]
 """Seconds of each stage, `compile_s` and `run_s`."""
@@ -106,7 +106,7 @@ def rewards(
     }
 
     def load(run: Path, modality: str) -> list[dict[str, np.ndarray]]:
-        directory, name = run / "checkpoints", f"curves_{stages.agent(config, modality)}"
+        directory, name = run / "checkpoints", f"curves_{learner(config, modality)}"
         try:
             found = Checkpoints(directory).load(name, shapes)
         except ConfigError as error:

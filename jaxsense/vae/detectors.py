@@ -9,12 +9,11 @@ import optax
 from flax import struct
 
 from jaxsense.config import DetectorConfig
-from jaxsense.core import networks, supervised
+from jaxsense.core import networks
 from jaxsense.core.networks import MLP, Params
-from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Key, pytree
 
-_MOST_TEMPERATURE = 4.0
+_MAX_TEMPERATURE = 4.0
 
 
 @pytree
@@ -65,45 +64,35 @@ def detect(detector: Detector, window: jax.Array) -> jax.Array:
     return jax.nn.softmax(logits(detector, window))
 
 
-def start(detector: Detector, config: DetectorConfig) -> FitState:
-    """The state before the first gradient step."""
-    return supervised.start(detector.params, _optimiser(config))
+@pytree
+class Fitting:
+    """The fit of a detector to labelled windows: the cross-entropy of its labels.
 
-
-def train(
-    key: Key,
-    state: FitState,
-    detector: Detector,
-    windows: jax.Array,
-    labels: jax.Array,
-    config: DetectorConfig,
-    steps: int,
-) -> tuple[FitState, jax.Array]:
-    """Trains a detector on the cross-entropy of its labels for some gradient steps.
-
-    Args:
-      key: random key.
-      state: from `start` or an earlier call.
+    Attributes:
+      config: batch, learning rate and steps.
       detector: from `init`.
-      windows: `[S, F]` simulated looks.
+      windows: `[S, F]` windows of simulated scans.
       labels: `[S]` int32.
-      config: batch, learning rate, and the number of steps of the whole training.
-      steps: how many of them to take.
-
-    Returns:
-      The next state, whose parameters are the detector's, and the `[steps]` losses.
     """
-    chex.assert_equal_shape_prefix([windows, labels], 1)
 
-    rows = jax.random.randint(key, (steps, config.batch), 0, windows.shape[0])
+    config: DetectorConfig
+    detector: Detector
+    windows: jax.Array
+    labels: jax.Array
 
-    def loss(params: Params, rows: jax.Array, step: jax.Array) -> jax.Array:
+    def draw(self, key: Key, number: int) -> jax.Array:
+        """Rows of the windows for `number` steps, see `supervised.Problem.draw`."""
+        shape = number, self.config.batch
+        return jax.random.randint(key, shape, 0, self.windows.shape[0])
+
+    def loss(self, params: Params, drawn: jax.Array, step: jax.Array) -> jax.Array:
+        """`[]` mean cross-entropy of a batch."""
         del step
-        standard = (windows[rows] - detector.offset[None]) / detector.scale
+        detector = self.detector
+        standard = (self.windows[drawn] - detector.offset[None]) / detector.scale
         predicted = networks.apply(_network(detector), params, standard.T)
-        return optax.softmax_cross_entropy_with_integer_labels(predicted, labels[rows], 0).mean()
-
-    return supervised.fit(state, loss, rows, _optimiser(config), config.steps)
+        cross_entropy = optax.softmax_cross_entropy_with_integer_labels
+        return cross_entropy(predicted, self.labels[drawn], 0).mean()
 
 
 def calibrate(detector: Detector, windows: jax.Array, labels: jax.Array) -> Detector:
@@ -125,7 +114,7 @@ def calibrate(detector: Detector, windows: jax.Array, labels: jax.Array) -> Dete
         scaled = sharpness * predicted
         return optax.softmax_cross_entropy_with_integer_labels(scaled, labels, 0).mean()
 
-    each = jnp.geomspace(1 / _MOST_TEMPERATURE, _MOST_TEMPERATURE, 257)
+    each = jnp.geomspace(1 / _MAX_TEMPERATURE, _MAX_TEMPERATURE, 257)
     best = each[jnp.argmin(jax.lax.map(loss, each))]
     layers = dict(detector.params["params"])
     last = f"Dense_{len(detector.hidden)}"
@@ -135,7 +124,3 @@ def calibrate(detector: Detector, windows: jax.Array, labels: jax.Array) -> Dete
 
 def _network(detector: Detector) -> MLP:
     return MLP(detector.hidden, detector.num_labels)
-
-
-def _optimiser(config: DetectorConfig) -> optax.GradientTransformation:
-    return supervised.adam(config.learning_rate, config.steps)

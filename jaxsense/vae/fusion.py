@@ -1,46 +1,98 @@
-"""Writing a detection into the map: fusion in place, or by a filter.
+"""The paper's fusion of looks into a belief, in place.
 
-Korthals et al. 2018, Sec. III and Fig. 3.
+Korthals et al. 2018, Sec. III and Fig. 3. `vae.filter` holds the second kind of fusion. A third
+kind is a new class with the attributes and methods of `core.types.Fusion`.
 """
 
 import itertools
+from collections.abc import Mapping
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core import checks
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Belief, Features
-from jaxsense.vae import filtering, jmvae, metrics
+from jaxsense.core.types import Belief, Features, pytree
+from jaxsense.vae import jmvae, latent, readout
 from jaxsense.vae.jmvae import Jmvae
 
-FILTER = "filter"
-"""Name of the filter among the parameters of a JMVAE."""
+
+@pytree
+class InPlace:
+    """The paper's fusion: a look replaces the belief.
+
+    The map does not keep the features of modalities that have looked before: they are decoded from
+    the belief's mean and encoded together with the new ones.
+
+    Attributes:
+      params: of the JMVAE.
+      classes: `[C, D]` mean joint posterior of each class.
+      prior: `[D]` belief before any look.
+      readout: `[C, 2D + 1]` of `readout.readout_matrix`.
+      model: shape of the JMVAE.
+    """
+
+    params: Params
+    classes: Belief
+    prior: Belief
+    readout: jax.Array
+    model: Jmvae = struct.field(pytree_node=False)
+
+    def update(
+        self,
+        belief: Belief,
+        seen: Bool[Array | np.ndarray, " M"],
+        features: Float[Array, " L"],
+        modality: int,
+    ) -> Belief:
+        """The belief after one more look, see `Fusion.update` and `fuse`.
+
+        Raises:
+          ValueError: if there is no such modality; see also `fuse`.
+        """
+        number = len(self.model.modalities)
+        checks.require_index("modality", modality, number)
+        of_all = tuple(features if m == modality else None for m in range(number))
+        return fuse(self.params, self.model, belief, seen, of_all)
+
+    def together(self, looks: Mapping[int, Float[Array, " L"]]) -> Belief:
+        """The posterior `q(z|x)` of looks by several sensors, `[D_m]` features by modality."""
+        features = tuple(looks.get(m) for m in range(len(self.model.modalities)))
+        return jmvae.posterior(self.params, self.model, features)
+
+    def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
+        """The classes' probabilities that a `[D]` belief holds."""
+        return readout.class_probabilities(self.readout, self.prior, belief)
+
+    def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
+        """The class whose joint posterior is nearest to a `[D]` belief, int32."""
+        return latent.nearest_class(belief, self.classes.mean)
 
 
 def fuse(
     params: Params,
     model: Jmvae,
     belief: Belief,
-    seen: jax.Array | np.ndarray,
+    seen: Bool[Array | np.ndarray, " M"],
     features: Features,
 ) -> Belief:
-    """Updates the map's entry of a PoI after a look by one sensor, or by several at once.
+    """Fuses looks by one sensor, or by several together, into a belief in place.
 
-    The first look writes `q(z|x)`. The map does not keep the features of modalities that have seen
-    the PoI before: they are decoded from the entry's mean and encoded together with the new ones.
+    The first look yields `q(z|x)`.
 
     Args:
       params: of the JMVAE.
       model: its shape.
-      belief: `[D]` current entry.
-      seen: `[M]` bool, which modalities have seen the PoI before.
-      features: for each modality `[D_m]` new detections, or None where it has not looked.
+      belief: `[D]` before the looks.
+      seen: `[M]` bool, which modalities have looked before.
+      features: for each modality `[D_m]` new features, or None where it has not looked.
 
     Returns:
-      The new entry. The old one enters it only through the decoder.
+      The new belief. The old one enters it only through the decoder.
 
     Raises:
       ValueError: if `features` lacks an entry for a modality, all are None, or one holds no
@@ -57,7 +109,7 @@ def fuse(
             checks.require_probabilities(f"features of {name}", new)
     generated = jmvae.decode(params, model, belief.mean)
     others = [m for m, new in enumerate(features) if new is None]
-    entry = belief
+    fused = belief
     # One encoder for each set of modalities that may have looked before; `seen` picks among them.
     for size in range(len(others) + 1):
         for subset in itertools.combinations(others, size):
@@ -65,50 +117,20 @@ def fuse(
             candidate = jmvae.posterior(params, model, inputs)
             is_subset = jnp.array([m in subset for m in others], bool)
             applies = jnp.all(jnp.asarray(seen)[jnp.array(others, int)] == is_subset)
-            entry = jax.tree.map(lambda new, old: jnp.where(applies, new, old), candidate, entry)  # noqa: B023
-    return entry
+            fused = jax.tree.map(lambda new, old: jnp.where(applies, new, old), candidate, fused)  # noqa: B023
+    return fused
 
 
-def write(
-    params: Params,
-    model: Jmvae,
-    belief: Belief,
-    seen: jax.Array,
-    features: jax.Array,
-    modality: int,
-) -> Belief:
-    """Writes a look by one sensor, `modality` its index, with its `[D_m]` features.
-
-    In place, or by the filter if `params` has one: it needs no `seen`.
-
-    Raises:
-      ValueError: if there is no such modality; see also `fuse`.
-    """
-    if FILTER in params:
-        return filtering.update(params[FILTER], model, belief, features, modality)
-    checks.require_index("modality", modality, len(model.modalities))
-    of_all = tuple(features if m == modality else None for m in range(len(model.modalities)))
-    return fuse(params, model, belief, seen, of_all)
-
-
-def most_likely_class(params: Params, class_means: jax.Array, belief: Belief) -> jax.Array:
-    """Class that an entry of the map shows, `[]` int32.
+def prior(model: Jmvae, variance: float) -> Belief:
+    """Belief before any look: mean 0 and the given variance in each dimension.
 
     Args:
-      params: of the JMVAE, with those of the filter if there is one.
-      class_means: `[C, D]` mean of the joint posterior of each class.
-      belief: `[D]`.
+      model: shape of the JMVAE.
+      variance: of each latent dimension.
 
-    Returns:
-      The nearest class; of a map that a filter writes, that of the highest weight.
+    Raises:
+      ValueError: if the variance is not positive.
     """
-    if FILTER in params:
-        return jnp.argmax(filtering.weights(params[FILTER], belief))
-    return metrics.nearest_class(belief, class_means)
-
-
-def unseen(model: Jmvae, variance: float) -> Belief:
-    """Entry of an unseen PoI: mean 0 and the given variance in each dimension."""
     checks.require_positive("variance", variance)
     return Belief(
         jnp.zeros(model.latent_size), jnp.full(model.latent_size, jnp.sqrt(jnp.float32(variance)))

@@ -12,14 +12,16 @@ import itertools
 import chex
 import jax
 import jax.numpy as jnp
-import optax
+from flax import struct
 
 from jaxsense.config import JmvaeConfig
 from jaxsense.core import checks, networks, supervised
 from jaxsense.core.networks import MLP, Params
-from jaxsense.core.supervised import FitState
-from jaxsense.core.types import Belief, Features, Key
+from jaxsense.core.types import Belief, Features, Key, Samples, pytree
 from jaxsense.vae import gaussian
+
+Drawn = tuple[jax.Array, tuple[jax.Array, ...]]
+"""Noise `[steps, D, B]`, and for each modality features `[steps, D_m, B]`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -234,81 +236,88 @@ def losses(
         chex.assert_shape(x, (size, batch), custom_message="features")
 
     *others, every = model.subsets
-    joint = _encode(params, model, every, features)
-    decoded = _decode(params, model, gaussian.sample(noise, *joint))
+    mean, log_var = _encode(params, model, every, features)
+    decoded = _decode(params, model, gaussian.sample(noise, mean, log_var))
     reconstruction = jnp.zeros(batch)
-    for x, mean, weight in zip(features, decoded, reconstruction_weights, strict=True):
-        reconstruction += weight * 0.5 * jnp.sum((x - mean) ** 2, axis=0)
-    prior = jax.vmap(gaussian.kl_to_standard_normal, in_axes=-1)(*joint)
+    for x, decoded_mean, weight in zip(features, decoded, reconstruction_weights, strict=True):
+        reconstruction += weight * 0.5 * jnp.sum((x - decoded_mean) ** 2, axis=0)
+    prior = jax.vmap(gaussian.kl_to_standard_normal, in_axes=-1)(mean, log_var)
     divergence, subsets = jax.vmap(gaussian.kl_divergence, in_axes=-1), jnp.zeros(batch)
     for subset in others:
-        subsets += divergence(*joint, *_encode(params, model, subset, features))
+        subset_mean, subset_log_var = _encode(params, model, subset, features)
+        subsets += divergence(mean, log_var, subset_mean, subset_log_var)
     parts = {"reconstruction": reconstruction, "prior": prior, "subsets": subsets}
     return reconstruction + beta * prior + alpha * subsets, parts
 
 
-def start(params: Params, config: JmvaeConfig) -> FitState:
-    """The state before the first gradient step."""
-    return supervised.start(params, _optimiser(config))
+@pytree
+class Fitting:
+    """The fit of a JMVAE to features.
 
+    A training example is one look by each modality, at the same class and otherwise independent.
 
-def train(
-    key: Key,
-    state: FitState,
-    model: Jmvae,
-    bank: tuple[jax.Array, ...],
-    config: JmvaeConfig,
-    steps: int,
-) -> tuple[FitState, jax.Array]:
-    """Trains a JMVAE on detections for some gradient steps.
-
-    Args:
-      key: random key.
-      state: from `start` or an earlier call.
-      model: the shape.
-      bank: for each modality `[C, S, D_m]` detections of every class. A training example is one
-        detection of each modality, of the same class and otherwise independent.
-      config: weights, batch, learning rate, and the number of steps of the whole training.
-      steps: how many of them to take.
-
-    Returns:
-      The next state and the `[steps]` losses.
+    Attributes:
+      config: weights, batch, learning rate and steps.
+      bank: the features to draw from.
+      model: shape of the JMVAE.
     """
-    checks.require_number("steps", steps)
-    checks.require_one_each("bank", bank, model.modalities)
-    for features, size in zip(bank, model.feature_sizes, strict=True):
-        chex.assert_shape(features, (bank[0].shape[0], None, size), custom_message="bank")
 
-    def batch_loss(params: Params, drawn, step: jax.Array) -> jax.Array:
+    config: JmvaeConfig
+    bank: Samples
+    model: Jmvae = struct.field(pytree_node=False)
+
+    def draw(self, key: Key, number: int) -> Drawn:
+        """Noise and features of `number` batches, see `supervised.Problem.draw`."""
+        shape = number, self.config.batch
+        columns = [jnp.moveaxis(x, -1, 0) for x in self.bank]
+        class_key, noise_key, *row_keys = jax.random.split(key, 2 + len(columns))
+        classes = jax.random.randint(class_key, shape, 0, self.bank[0].shape[0])
+        features = [
+            jnp.moveaxis(x[:, classes, jax.random.randint(k, shape, 0, x.shape[-1])], 1, 0)
+            for x, k in zip(columns, row_keys, strict=True)
+        ]
+        noise = jax.random.normal(noise_key, (number, self.model.latent_size, shape[1]))
+        return noise, tuple(features)
+
+    def loss(self, params: Params, drawn: Drawn, step: jax.Array) -> jax.Array:
+        """`[]` mean of the `losses` of a batch, with beta annealed."""
         noise, features = drawn
         total, _ = losses(
             noise,
             params,
-            model,
+            self.model,
             features,
-            alpha=config.alpha,
-            beta=annealed_beta(step, config),
-            reconstruction_weights=config.reconstruction_weights,
+            alpha=self.config.alpha,
+            beta=annealed_beta(step, self.config),
+            reconstruction_weights=self.config.reconstruction_weights,
         )
         return jnp.mean(total)
 
-    drawn = _draw(key, bank, (steps, config.batch), model.latent_size)
-    return supervised.fit(state, batch_loss, drawn, _optimiser(config), config.steps)
 
+def train(
+    key: Key, params: Params, model: Jmvae, bank: Samples, config: JmvaeConfig
+) -> tuple[Params, jax.Array]:
+    """Trains a JMVAE on features.
 
-def _draw(
-    key: Key, bank: tuple[jax.Array, ...], shape: tuple[int, int], latent_size: int
-) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    """Noise `[steps, D, B]` and features `[steps, D_m, B]` of batches, of a `(steps, B)` shape."""
-    columns = [jnp.moveaxis(x, -1, 0) for x in bank]
-    class_key, noise_key, *row_keys = jax.random.split(key, 2 + len(bank))
-    classes = jax.random.randint(class_key, shape, 0, bank[0].shape[0])
-    features = [
-        jnp.moveaxis(x[:, classes, jax.random.randint(k, shape, 0, x.shape[-1])], 1, 0)
-        for x, k in zip(columns, row_keys, strict=True)
-    ]
-    noise = jax.random.normal(noise_key, (shape[0], latent_size, shape[1]))
-    return noise, tuple(features)
+    Args:
+      key: random key.
+      params: from `init`.
+      model: the shape.
+      bank: for each modality `[C, S, D_m]` features of looks at every class.
+      config: weights, batch, learning rate and number of steps.
+
+    Returns:
+      The parameters and the `[steps]` losses.
+
+    Raises:
+      ValueError: unless each modality has features.
+    """
+    checks.require_one_each("bank", bank, model.modalities)
+    for features, size in zip(bank, model.feature_sizes, strict=True):
+        chex.assert_shape(features, (bank[0].shape[0], None, size), custom_message="bank")
+    state = supervised.start(params, config)
+    state, losses = supervised.fit(key, state, Fitting(config, bank, model), config.steps)
+    return state.params, losses
 
 
 def annealed_beta(step: jax.Array, config: JmvaeConfig) -> jax.Array:
@@ -318,11 +327,7 @@ def annealed_beta(step: jax.Array, config: JmvaeConfig) -> jax.Array:
     explains enough of the features. Started low, all classes may end up on one line, a local
     optimum in which the other dimensions are empty.
     """
-    # Without annealing the first step is beyond its end.
+    # With `annealing` = 0, beta is constant.
     annealing_steps = jnp.maximum(config.annealing * config.steps, 1e-6)
     remaining = jnp.where(config.annealing > 0, jnp.maximum(1.0 - step / annealing_steps, 0.0), 0.0)
     return config.beta * (config.initial_beta / config.beta) ** remaining
-
-
-def _optimiser(config: JmvaeConfig) -> optax.GradientTransformation:
-    return supervised.adam(config.learning_rate, config.steps)

@@ -1,14 +1,14 @@
-"""Other ways to fuse looks, to compare with: exact Bayes over the classes, product of experts."""
+"""Exact Bayes over the classes, and the product of experts: what fusion is compared with."""
 
 import chex
 import jax
 import jax.numpy as jnp
 
 from jaxsense.core import checks
-from jaxsense.core.types import Belief
-from jaxsense.vae.metrics import LEAST_PROBABILITY
+from jaxsense.core.types import Belief, pytree
+from jaxsense.vae.calibration import MIN_PROBABILITY
 
-_LEAST_PRECISION = 1e-6
+_MIN_PRECISION = 1e-6
 
 
 def log_likelihoods(features: jax.Array, label_of_class: jax.Array) -> jax.Array:
@@ -22,7 +22,10 @@ def log_likelihoods(features: jax.Array, label_of_class: jax.Array) -> jax.Array
       label_of_class: `[C]` int32, the label of each class in this modality.
 
     Returns:
-      `[C]` logarithms of the likelihoods, but for a constant.
+      `[C]` logarithms of the likelihoods, up to a constant.
+
+    Raises:
+      ValueError: if a label does not exist or the features are not probabilities.
     """
     chex.assert_rank(features, 1, custom_message="features")
     chex.assert_rank(label_of_class, 1, custom_message="label_of_class")
@@ -30,7 +33,7 @@ def log_likelihoods(features: jax.Array, label_of_class: jax.Array) -> jax.Array
     checks.require_probabilities("features", features)
     label_of_class = jnp.asarray(label_of_class)
     prior = jnp.zeros(len(features)).at[label_of_class].add(1 / len(label_of_class))
-    ratio = jnp.maximum(features[label_of_class], LEAST_PROBABILITY) / prior[label_of_class]
+    ratio = jnp.maximum(features[label_of_class], MIN_PROBABILITY) / prior[label_of_class]
     return jnp.log(ratio)
 
 
@@ -46,12 +49,57 @@ def bayes_update(
 
     Returns:
       `[C]` logarithms after the look, normalised.
+
+    Raises:
+      ValueError: if all classes are excluded, or a logarithm is NaN.
     """
     chex.assert_rank(log_weights, 1, custom_message="log_weights")
     chex.assert_shape(label_of_class, log_weights.shape, custom_message="label_of_class")
-    # Infinite if no class has any weight, NaN if one is.
+    # Rejects -inf (all classes excluded) and NaN.
     checks.require_finite("largest of log_weights", jnp.max(log_weights))
     return jax.nn.log_softmax(log_weights + log_likelihoods(features, label_of_class))
+
+
+@pytree
+class Bayes:
+    """Exact Bayes over the classes for all modalities.
+
+    Attributes:
+      labels: `[M, C]` int32, the label of each class in each modality.
+    """
+
+    labels: jax.Array
+
+    @property
+    def prior(self) -> jax.Array:
+        """`[C]` logarithms of equal probabilities."""
+        number = self.labels.shape[1]
+        return jnp.full(number, -jnp.log(number))
+
+    def log_likelihoods(self, features: jax.Array, modality: int) -> jax.Array:
+        """How likely each class makes a look, see the function `log_likelihoods`.
+
+        Args:
+          features: `[D_m]` probabilities of the labels.
+          modality: index of the sensor; static.
+
+        Returns:
+          `[C]`.
+        """
+        return log_likelihoods(features, self.labels[modality])
+
+    def update(self, log_posterior: jax.Array, features: jax.Array, modality: int) -> jax.Array:
+        """The posterior after one more look, see `bayes_update`.
+
+        Args:
+          log_posterior: `[C]` logarithms of the classes' probabilities before the look.
+          features: `[D_m]` probabilities of the labels.
+          modality: index of the sensor; static.
+
+        Returns:
+          `[C]`.
+        """
+        return bayes_update(log_posterior, features, self.labels[modality])
 
 
 def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Belief:
@@ -63,13 +111,16 @@ def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Beli
       prior: `[D]`, contained in both.
 
     Returns:
-      `[D]` normalised product; dimensions of no precision keep a little.
+      `[D]` normalised product; dimensions without precision keep a little.
+
+    Raises:
+      ValueError: if a belief is not finite, or a standard deviation is not positive.
     """
     for name, each in (("belief", belief), ("posterior", posterior), ("prior", prior)):
         chex.assert_shape(each.std, each.mean.shape, custom_message=name)
         checks.require_finite(f"{name}.mean", each.mean)
         checks.require_positive(f"{name}.std", each.std)
     of_belief, of_posterior, of_prior = (x.std**-2 for x in (belief, posterior, prior))
-    precision = jnp.maximum(of_belief + of_posterior - of_prior, _LEAST_PRECISION)
+    precision = jnp.maximum(of_belief + of_posterior - of_prior, _MIN_PRECISION)
     total = of_belief * belief.mean + of_posterior * posterior.mean - of_prior * prior.mean
     return Belief(total / precision, precision**-0.5)

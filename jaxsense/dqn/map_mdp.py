@@ -1,52 +1,100 @@
 """The shared map as a Markov decision process.
 
 Korthals et al. 2018, Sec. III and IV. The map holds a Gaussian belief for each of N points of
-interest. Action n < N looks at PoI n with the agent's own sensor and writes the detection into the
-map; action N is no operation (NOP) and ends the episode. The caller supplies the functions that
-look and write.
+interest. Action n < N looks at PoI n with the agent's own sensor and updates its belief; action N
+is no operation (NOP) and ends the episode.
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+from typing import Protocol, TypeVar
 
 import chex
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from jaxsense.config import MdpConfig
 from jaxsense.core import checks
-from jaxsense.core.types import Belief, Index, Key, call, pytree
+from jaxsense.core.types import Belief, Fusion, Index, Key, Scene, call, pytree
+from jaxsense.dqn.rewards import Reward
 
-Scene = Any
-"""Pytree that `observe` looks at; the MDP only carries it."""
+S = TypeVar("S")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class MapMdp:
-    """The MDP of one team.
+class Looks(Protocol):
+    """How an MDP looks at a scene; a frozen pytree.
 
     Attributes:
-      config: rewards and episode length.
-      num_pois: N.
-      num_classes: classes that a PoI can have.
       num_modalities: M.
-      unseen: `[D]` entry of an unseen PoI.
-      new_scene: `(key, classes [N]) -> scene`.
-      observe: `(key, scene, poi, modality) -> (features [D_m], scene)`.
-      write: `(belief [D], seen [M], features [D_m], modality) -> belief [D]`.
-      information: `belief [D] -> []`, what a look is rewarded for; by default the paper's.
     """
 
+    @property
+    def num_modalities(self) -> int:
+        """M."""
+        ...
+
+    def scene(self, key: Key, classes: jax.Array) -> Scene:
+        """A random scene with PoIs of the given classes.
+
+        Args:
+          key: random key.
+          classes: `[N]` int32.
+        """
+        ...
+
+    def observe(
+        self, key: Key, scene: Scene, poi: jax.Array, modality: int
+    ) -> tuple[jax.Array, Scene]:
+        """Looks at a PoI.
+
+        Args:
+          key: random key of the look.
+          scene: from `scene` or an earlier look.
+          poi: `[]` int32.
+          modality: index of the sensor; static.
+
+        Returns:
+          `[D_m]` features, and the scene after the look.
+        """
+        ...
+
+
+@pytree
+class MapMdp:
+    """The map MDP of one agent.
+
+    Attributes:
+      looks: how it looks at a scene.
+      fusion: how a look updates a belief.
+      reward: what a look is rewarded for.
+      config: length and starts of episodes.
+      num_pois: N.
+    """
+
+    looks: Looks
+    fusion: Fusion
+    reward: Reward
     config: MdpConfig
-    num_pois: int
-    num_classes: int
-    num_modalities: int
-    unseen: Belief
-    new_scene: Callable[[Key, jax.Array], Scene]
-    observe: Callable[[Key, Scene, jax.Array, int], tuple[jax.Array, Scene]]
-    write: Callable[[Belief, jax.Array, jax.Array, int], Belief]
-    information: Callable[[Belief], jax.Array] = lambda belief: information(belief.std)
+    num_pois: int = struct.field(pytree_node=False)
+
+    @property
+    def map(self) -> "MapMdp":
+        """The map MDP itself; of a `TeamMdp`, the one beneath it."""
+        return self
+
+    @property
+    def num_modalities(self) -> int:
+        """M, the number of sensors."""
+        return self.looks.num_modalities
+
+    @property
+    def num_classes(self) -> int:
+        """C, the number of classes that a PoI can have."""
+        return len(self.fusion.classes.mean)
+
+    def information(self, belief: Belief) -> jax.Array:
+        """`[]` information of a `[D]` belief, in units of the reward."""
+        return self.reward.information(belief, self.fusion.class_probabilities(belief))
 
 
 @pytree
@@ -55,9 +103,9 @@ class MapState:
 
     Attributes:
       belief: `[N, D]` the map.
-      seen: `[N, M]` bool, which modalities have seen which PoI; hidden from the policies.
+      seen: `[N, M]` bool, which modalities have looked at which PoI; hidden from the policies.
       classes: `[N]` int32 true classes; hidden from the policies.
-      scene: what `observe` looks at; hidden from the policies.
+      scene: what the looks see; hidden from the policies.
       steps: `[]` int32 actions so far.
     """
 
@@ -85,46 +133,16 @@ class Outcome:
     seconds: jax.Array | None = None
 
 
-def information(std: jax.Array) -> jax.Array:
-    """Information of a belief, `I = 1 / ||std||_2` (Korthals et al. 2018, Sec. IV).
-
-    Args:
-      std: `[..., D]` positive standard deviations.
-
-    Returns:
-      `[...]` information in inverse latent units; grows without bound as `std` -> 0.
-    """
-    chex.assert_shape(std, (..., None), custom_message="std")
-    checks.require_positive("std", std)
-    return 1.0 / jnp.linalg.norm(std, axis=-1)
-
-
-def reward(gain: jax.Array, config: MdpConfig) -> jax.Array:
-    """Reward of a look.
-
-    Args:
-      gain: `[...]` of information.
-      config: which reward, and its numbers.
-
-    Returns:
-      `[...]` the gain, with the paper's reward -1 in place of one that is not above `min_increase`,
-      and in nats less the cost of a look.
-    """
-    if config.reward == "nats":
-        return gain - config.look_cost
-    return jnp.where(gain <= config.min_increase, -1.0, gain)
-
-
-def observation(belief: Belief) -> jax.Array:
-    """Mean and standard deviation of each PoI's belief, `[N * 2D]`, as a Q-network reads them."""
-    chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
-    chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
-    checks.require_positive("belief.std", belief.std)
-    return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)
-
-
 def random_start(key: Key, mdp: MapMdp) -> tuple[jax.Array, jax.Array]:
-    """Independent `[N]` int32 classes, and `[N, M]` bool, which modality has seen which PoI."""
+    """Random classes and earlier looks.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+
+    Returns:
+      Independent `[N]` int32 classes, and `[N, M]` bool, which modality has looked at which PoI.
+    """
     class_key, seen_key = jax.random.split(key)
     classes = jax.random.randint(class_key, (mdp.num_pois,), 0, mdp.num_classes)
     shape = (mdp.num_pois, mdp.num_modalities)
@@ -134,17 +152,41 @@ def random_start(key: Key, mdp: MapMdp) -> tuple[jax.Array, jax.Array]:
 def reset(
     key: Key, mdp: MapMdp, classes: jax.Array | None = None, seen: jax.Array | None = None
 ) -> MapState:
-    """Starts an episode, in which some modalities have seen some of the PoIs.
+    """Starts an episode in which some modalities have looked at some of the PoIs.
 
     Args:
       key: random key.
       mdp: the MDP.
       classes: `[N]` int32 true classes; independent for each PoI by default.
-      seen: `[N, M]` bool, which modality has seen which PoI; random by default.
+      seen: `[N, M]` bool, which modality has looked at which PoI; random by default.
 
     Returns:
-      The state, whose map holds real detections. The looks at a PoI are written in the order of the
-      modalities, from a random one on.
+      The state, whose map holds real looks. Those at a PoI are fused in the order of the
+      modalities, starting from a random one.
+
+    Raises:
+      ValueError: if a class does not exist.
+    """
+    return reset_with_looks(key, mdp, classes, seen)[0]
+
+
+def reset_with_looks(
+    key: Key, mdp: MapMdp, classes: jax.Array | None = None, seen: jax.Array | None = None
+) -> tuple[MapState, tuple[jax.Array, ...]]:
+    """Starts an episode, see `reset`, and returns what it drew.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      classes: see `reset`.
+      seen: see `reset`.
+
+    Returns:
+      The state, and for each modality `[N, D_m]` features of a look at each PoI, of which those
+      that `seen` marks are in the map.
+
+    Raises:
+      ValueError: if a class does not exist.
     """
     start_key, scene_key, begin_key, look_key = jax.random.split(key, 4)
     if classes is None or seen is None:
@@ -153,13 +195,13 @@ def reset(
         seen = random_seen if seen is None else seen
     chex.assert_shape(classes, (mdp.num_pois,), custom_message="classes")
     checks.require_index("classes", classes, mdp.num_classes)
-    scene = mdp.new_scene(scene_key, classes)
+    scene = mdp.looks.scene(scene_key, classes)
     pois = jnp.arange(mdp.num_pois)
     looks = tuple(
-        jax.vmap(lambda key, poi: mdp.observe(key, scene, poi, m)[0])(keys, pois)  # noqa: B023
+        jax.vmap(lambda key, poi: mdp.looks.observe(key, scene, poi, m)[0])(keys, pois)  # noqa: B023
         for m, keys in enumerate(jax.random.split(look_key, (mdp.num_modalities, mdp.num_pois)))
     )
-    return begin(begin_key, mdp, scene, classes, seen, looks)
+    return begin(begin_key, mdp, scene, classes, seen, looks), looks
 
 
 def begin(
@@ -170,23 +212,28 @@ def begin(
     seen: jax.Array,
     looks: tuple[jax.Array, ...],
 ) -> MapState:
-    """Starts an episode in a given scene; `reset` explains how the map is written.
+    """Starts an episode in a given scene, see `reset`.
 
     Args:
       key: random key.
       mdp: the MDP.
-      scene: what `observe` will look at.
+      scene: what the looks see.
       classes: `[N]` int32 true classes.
-      seen: `[N, M]` bool, which modality has seen which PoI.
+      seen: `[N, M]` bool, which modality has looked at which PoI.
       looks: for each modality `[N, D_m]` features of a look at each PoI; ignored where `seen` is
         False.
+
+    Raises:
+      ValueError: if `seen` is not bool.
     """
     chex.assert_shape(seen, (mdp.num_pois, mdp.num_modalities), custom_message="seen")
     if seen.dtype != bool:
         raise ValueError(f"seen of dtype {seen.dtype}: must be bool")
     first = jax.random.randint(key, (mdp.num_pois,), 0, mdp.num_modalities)
-    entries = jax.vmap(lambda *poi: _looked_at(mdp, *poi))(looks, seen, first)
-    return MapState(entries, seen, classes, scene, jnp.int32(0))
+    beliefs = jax.vmap(lambda looks, seen, first: _looked_at(mdp, looks, seen, first))(
+        looks, seen, first
+    )
+    return MapState(beliefs, seen, classes, scene, jnp.int32(0))
 
 
 def step(
@@ -203,7 +250,7 @@ def step(
         modalities, and its range is not checked.
 
     Returns:
-      The next state and the outcome. The reward is that of the look, see `reward`; 0 for NOP; NaN
+      The next state and the outcome. The reward is that of the look, see `Reward`; 0 for NOP; NaN
       if the gain is NaN or the action does not exist.
 
     Raises:
@@ -215,11 +262,11 @@ def step(
     old = jax.tree.map(lambda x: x[poi], state.belief)
 
     def look(modality: int) -> tuple[Belief, Scene]:
-        features, scene = mdp.observe(key, state.scene, poi, modality)
-        return mdp.write(old, state.seen[poi], features, modality), scene
+        features, scene = mdp.looks.observe(key, state.scene, poi, modality)
+        return mdp.fusion.update(old, state.seen[poi], features, modality), scene
 
     new, scene = call(look, modality, mdp.num_modalities)
-    of_look = reward(mdp.information(new) - mdp.information(old), mdp.config)
+    of_look = mdp.reward.of_gain(mdp.information(new) - mdp.information(old))
     exists = (action >= 0) & (action <= mdp.num_pois)
 
     looked = dataclasses.replace(
@@ -243,13 +290,13 @@ def _check_step(mdp: MapMdp, state: MapState, action: jax.Array, modality: Index
     checks.require_index("modality", modality, mdp.num_modalities)
     chex.assert_rank(action, 0, custom_message="action")
     checks.require_index("action", action, mdp.num_pois + 1)
-    shape = (mdp.num_pois, *mdp.unseen.mean.shape)
+    shape = (mdp.num_pois, *mdp.fusion.prior.mean.shape)
     for part in (state.belief.mean, state.belief.std):
         chex.assert_shape(part, shape, custom_message="state.belief")
 
 
 def _random_seen(key: Key, shape: tuple[int, int], is_partial: bool) -> jax.Array:
-    """Fair coins; with `is_partial`, on condition that they differ."""
+    """Random bits; with `is_partial`, neither all zero nor all one."""
     if not is_partial:
         return jax.random.bernoulli(key, 0.5, shape)
     num_bits = shape[0] * shape[1]
@@ -258,14 +305,14 @@ def _random_seen(key: Key, shape: tuple[int, int], is_partial: bool) -> jax.Arra
 
 
 def _looked_at(mdp: MapMdp, looks: tuple[jax.Array, ...], seen, first) -> Belief:
-    """Entry of one PoI after the looks for which `[M]` `seen` is True, in rotated order."""
-    entry = mdp.unseen
+    """Belief after the looks marked in `seen`, taken in modality order starting from `first`."""
+    belief = mdp.fusion.prior
     for start in range(mdp.num_modalities):
         order = [(start + i) % mdp.num_modalities for i in range(mdp.num_modalities)]
-        written, seen_so_far = mdp.unseen, jnp.zeros(mdp.num_modalities, bool)
+        written, seen_so_far = mdp.fusion.prior, jnp.zeros(mdp.num_modalities, bool)
         for m in order:
-            new = mdp.write(written, seen_so_far, looks[m], m)
+            new = mdp.fusion.update(written, seen_so_far, looks[m], m)
             written = jax.tree.map(lambda n, o: jnp.where(seen[m], n, o), new, written)  # noqa: B023
             seen_so_far = seen_so_far.at[m].set(seen[m])
-        entry = jax.tree.map(lambda n, o: jnp.where(first == start, n, o), written, entry)  # noqa: B023
-    return entry
+        belief = jax.tree.map(lambda n, o: jnp.where(first == start, n, o), written, belief)  # noqa: B023
+    return belief

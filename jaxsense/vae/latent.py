@@ -1,4 +1,4 @@
-"""Metrics of a latent space for a run's summary, and the classes that a belief leaves open."""
+"""Metrics of a latent space, and the classes that a belief leaves open."""
 
 import chex
 import jax
@@ -11,8 +11,6 @@ from jaxsense.vae.gaussian import moment_match
 
 ACTIVE_VARIANCE = 0.01
 PLAUSIBLE_DISTANCE = 2.0
-LEAST_PROBABILITY = 1e-12
-_BINS = 15
 
 
 def sigma_norm(std: jax.Array) -> jax.Array:
@@ -61,56 +59,6 @@ def _check_belief(belief: Belief, class_means: jax.Array) -> None:
     checks.require_finite("belief.mean", belief.mean)
     checks.require_finite("class_means", class_means)
     checks.require_positive("belief.std", belief.std)
-
-
-def negative_log_likelihood(probabilities: jax.Array, labels: jax.Array) -> jax.Array:
-    """Mean of `-log p(label)`, `[]` in nats.
-
-    Args:
-      probabilities: `[S, L]` of each label.
-      labels: `[S]` int32 true labels.
-    """
-    chex.assert_rank(probabilities, 2, custom_message="probabilities")
-    chex.assert_shape(labels, (len(probabilities),), custom_message="labels")
-    right = jnp.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
-    return -jnp.mean(jnp.log(jnp.maximum(right, LEAST_PROBABILITY)))
-
-
-def calibration_error(probabilities: jax.Array, labels: jax.Array) -> jax.Array:
-    """Expected calibration error of the most likely labels, `[]` (Guo et al. 2017, Sec. 2).
-
-    The mean over all looks of the difference between the mean confidence of a bin of
-    `reliability` and its share of right labels.
-
-    Args:
-      probabilities: `[S, L]` of each label.
-      labels: `[S]` int32 true labels.
-    """
-    confidence, accuracy, share = reliability(probabilities, labels)
-    return jnp.sum(jnp.where(share > 0, share * jnp.abs(confidence - accuracy), 0.0))
-
-
-def reliability(
-    probabilities: jax.Array, labels: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The points of a reliability diagram: fifteen bins of equal width hold looks by confidence.
-
-    Args:
-      probabilities: `[S, L]` of each label.
-      labels: `[S]` int32 true labels.
-
-    Returns:
-      For each bin its mean confidence and its share of right labels, NaN if it is empty, and its
-      share of all looks.
-    """
-    chex.assert_rank(probabilities, 2, custom_message="probabilities")
-    chex.assert_shape(labels, (len(probabilities),), custom_message="labels")
-    confidence = jnp.max(probabilities, axis=1)
-    is_right = jnp.argmax(probabilities, axis=1) == labels
-    bins = jnp.clip(jnp.ceil(confidence * _BINS).astype(jnp.int32) - 1, 0, _BINS - 1)
-    of_looks = jnp.stack([confidence, is_right, jnp.ones(len(labels))])
-    sums = jnp.zeros((3, _BINS)).at[:, bins].add(of_looks)
-    return sums[0] / sums[2], sums[1] / sums[2], sums[2] / len(labels)
 
 
 def moment_matching_error(belief: Belief, components: Belief) -> jax.Array:

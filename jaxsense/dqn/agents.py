@@ -1,0 +1,261 @@
+"""Agents: what a Q-network reads and predicts, alone with the map or in a team.
+
+Another kind of agent is a new class with the attributes and methods of `environments.Agent`.
+"""
+
+from collections.abc import Callable
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from jaxsense.config import TeamConfig
+from jaxsense.core import checks, networks
+from jaxsense.core.networks import MLP, Params
+from jaxsense.core.types import Belief, Index, Key, pytree
+from jaxsense.dqn import team_mdp, tours
+from jaxsense.dqn.environments import MapEnvironment, TeamEnvironment
+from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn.pooling import PoolingNetwork
+from jaxsense.dqn.team_mdp import Names, Places, Team, TeamMdp
+
+_NOT_WORTH_IT = -1e6  # s, below minus any tour
+
+
+@pytree
+class MapAgent:
+    """An agent of the map MDP: a dense network for a fixed number of PoIs.
+
+    Attributes:
+      discount: `[]` discount factor of a step.
+      num_pois: N.
+      latent_size: D.
+      hidden: sizes of the hidden layers.
+    """
+
+    discount: jax.Array | float
+    num_pois: int = struct.field(pytree_node=False)
+    latent_size: int = struct.field(pytree_node=False)
+    hidden: tuple[int, ...] = struct.field(pytree_node=False)
+
+    @property
+    def counts_time(self) -> bool:
+        """False: looks take no time in the map MDP."""
+        return False
+
+    def learner(self, modality: str) -> str:
+        """The name of what learns for robots of a modality: the modality."""
+        return modality
+
+    def plays(self, num_pois: int) -> bool:
+        """Whether the Q-network is for this number of PoIs."""
+        return num_pois == self.num_pois
+
+    def mdp(self, of_number: Callable[[int], MapMdp], places: Places, names: Names) -> MapMdp:
+        """The map MDP of `of_number(num_pois)`; `places` and `names` do not matter."""
+        del places, names
+        return of_number(self.num_pois)
+
+    def environment(self, mdp: MapMdp, modality: Index) -> MapEnvironment:
+        """What the agent learns in.
+
+        Args:
+          mdp: from `mdp`.
+          modality: index of the agent's own sensor.
+        """
+        return MapEnvironment(self, mdp, modality, self.discount)
+
+    def init(self, key: Key) -> Params:
+        """Random parameters of the Q-network."""
+        return networks.init(key, self._network, 2 * self.num_pois * self.latent_size)
+
+    def init_tours(self, key: Key) -> None:
+        """None: without travel time there is no order to learn."""
+
+    def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
+        """The map, see `observation`; `team` and `robot` do not matter."""
+        del team, robot
+        return observation(belief)
+
+    def q(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """See `Agent.q`; the `observed` maps have `params` applied to them."""
+        return networks.apply(self._network, params, observed)
+
+    def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """The same as `q` of `params` and what is `observed`."""
+        return self.q(params, observed)
+
+    def decide(
+        self,
+        params: Params,
+        tour_params: Params | None,
+        classes: Belief,
+        belief: Belief,
+        team: Team,
+        robot: Int[Array, ""],
+    ) -> Float[Array, " A"]:
+        """Values of a robot's actions in a mission, see `Agent.decide`.
+
+        The network would count on learning more about a PoI that the robot has given up. Nothing is
+        left to learn about a PoI of a known class; since its class is unknown, the values are
+        means over all classes.
+        """
+        del tour_params
+
+        def values_if(known: Belief) -> jax.Array:
+            seen = jax.tree.map(
+                lambda own, known: jnp.where(team.present[:, None], own, known[None]),
+                belief,
+                known,
+            )
+            return self.values(params, self.observe(seen, team, robot))
+
+        return jnp.mean(jax.vmap(values_if)(classes), axis=0)
+
+    @property
+    def _network(self) -> MLP:
+        return MLP(self.hidden, self.num_pois + 1)
+
+
+@pytree
+class TeamAgent:
+    """An agent of the team MDP: one network for any number of PoIs and robots.
+
+    Attributes:
+      config: the travel model and the price of time.
+      discount: `[]` discount factor of a second.
+      latent_size: D.
+      num_modalities: M.
+      hidden: sizes of the hidden layers.
+    """
+
+    config: TeamConfig
+    discount: jax.Array | float
+    latent_size: int = struct.field(pytree_node=False)
+    num_modalities: int = struct.field(pytree_node=False)
+    hidden: tuple[int, ...] = struct.field(pytree_node=False)
+
+    @property
+    def counts_time(self) -> bool:
+        """True: driving takes time in the team MDP."""
+        return True
+
+    @property
+    def network(self) -> PoolingNetwork:
+        """The network of Q-values and of tours."""
+        features = team_mdp.num_features(self.latent_size, self.num_modalities)
+        return PoolingNetwork(self.hidden, features)
+
+    def learner(self, modality: str) -> str:
+        """The name of what learns for robots of a modality: all robots share one network."""
+        del modality
+        return "team"
+
+    def plays(self, num_pois: int) -> bool:
+        """True: the Q-network is for any number of PoIs."""
+        del num_pois
+        return True
+
+    def mdp(self, of_number: Callable[[int], MapMdp], places: Places, names: Names) -> TeamMdp:
+        """The MDP of a team.
+
+        Args:
+          of_number: number of PoIs to the map MDP.
+          places: where PoIs and robots are.
+          names: of the sensors.
+        """
+        return TeamMdp(self.config, of_number(self.config.num_pois[1]), places, names)
+
+    def environment(self, mdp: TeamMdp, modality: Index) -> TeamEnvironment:
+        """What the agent learns in; `mdp` is from `mdp`, and the `modality` does not matter."""
+        del modality
+        return TeamEnvironment(self, mdp)
+
+    def init(self, key: Key) -> Params:
+        """Random parameters of the Q-network."""
+        return networks.init(key, self.network, self.network.features * self.config.num_pois[1])
+
+    def init_tours(self, key: Key) -> Params:
+        """Random parameters of the network that orders looks, see `tours`."""
+        return self.init(key)
+
+    def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
+        """What a robot knows of each PoI, see `team_mdp.observation`.
+
+        Args:
+          belief: `[N, D]` the map.
+          team: where everybody is.
+          robot: `[]` int32, the robot that chooses.
+        """
+        travel, number = self.config.travel, self.num_modalities
+        return team_mdp.observation(travel, belief, team, robot, number).reshape(-1)
+
+    def q(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """Values once the robot has arrived, see `Agent.q`.
+
+        Args:
+          params: of the Q-network.
+          observed: `[F * N]`, or `[F * N, B]`.
+        """
+        return networks.apply(self.network, params, observed)
+
+    def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """Discounts values on arrival to the time of departure.
+
+        Until then time passes: `discount^t q - second_cost t`, with `t` the seconds of travel. NOP
+        takes none.
+
+        Args:
+          params: of the Q-network.
+          observed: `[F * N]`, or `[F * N, B]`.
+        """
+        after = self.q(params, observed)
+        seconds = self._own_seconds(observed)
+        of_pois = self.discount**seconds * after[:-1] - self.config.second_cost * seconds
+        return jnp.concatenate([of_pois, after[-1:]])
+
+    def decide(
+        self,
+        params: Params,
+        tour_params: Params | None,
+        classes: Belief,
+        belief: Belief,
+        team: Team,
+        robot: Int[Array, ""],
+    ) -> Float[Array, " A"]:
+        """Values of a robot's actions that rank PoIs by predicted completion time.
+
+        A look is worth it if its reward and what follows, as the Q-network predicts them, exceed
+        the price of the travel time. The value is then minus the predicted seconds of `tours`; that
+        of NOP lies below these, and those of other looks lowest. Without `tour_params`, the values
+        of `values`. See `Agent.decide` for the arguments; `classes` does not matter.
+        """
+        del classes
+        seen = self.observe(belief, team, robot)
+        if tour_params is None:
+            return self.values(params, seen)
+        after = self.q(params, seen)[:-1]
+        is_worth_it = after > self.config.second_cost * self._own_seconds(seen)
+        seconds = tours.seconds(self.network, tour_params, seen, self.latent_size)
+        of_pois = jnp.where(is_worth_it, -seconds, 2 * _NOT_WORTH_IT)
+        # Comparisons with NaN are false; propagate it instead.
+        return jnp.append(jnp.where(jnp.isnan(after), after, of_pois), _NOT_WORTH_IT)
+
+    def _own_seconds(self, observed: jax.Array) -> jax.Array:
+        """The robot's own time to look at each PoI, `[N, ...]`."""
+        features = observed.reshape(self.network.features, -1, *observed.shape[1:])
+        return team_mdp.own_seconds(features, self.latent_size)
+
+
+def observation(belief: Belief) -> Float[Array, " S"]:
+    """Mean and standard deviation of each PoI's belief, `[N * 2D]`, as a Q-network reads them.
+
+    Raises:
+      ValueError: if a standard deviation is not positive.
+    """
+    chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
+    chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
+    checks.require_positive("belief.std", belief.std)
+    return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)

@@ -1,0 +1,97 @@
+"""What a look is rewarded for: the paper's information, or nats. Another kind is a new class."""
+
+from typing import Protocol
+
+import chex
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsense.config import MdpConfig
+from jaxsense.core import checks
+from jaxsense.core.types import Belief, pytree
+
+
+class Reward(Protocol):
+    """The reward of a look; a frozen pytree."""
+
+    def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
+        """Information of a belief.
+
+        Args:
+          belief: `[D]`.
+          probabilities: `[C]` class probabilities that it holds.
+        """
+        ...
+
+    def of_gain(self, gain: Float[Array, "..."]) -> Float[Array, "..."]:
+        """`[...]` rewards of looks that gain `[...]` information."""
+        ...
+
+
+@pytree
+class Paper:
+    """The paper's reward: the gain of `1 / ||std||_2`, or -1 if it is too small.
+
+    Attributes:
+      min_increase: `[]` gain up to which the reward is -1, in inverse latent units.
+    """
+
+    min_increase: jax.Array | float
+
+    def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
+        """Information of a belief, see `information`; the `probabilities` do not matter."""
+        del probabilities
+        return information(belief.std)
+
+    def of_gain(self, gain: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The gain, or -1 where it is not above `min_increase`."""
+        return jnp.where(gain <= self.min_increase, -1.0, gain)
+
+
+@pytree
+class Nats:
+    """The entropy that a look removes, minus the cost of the look.
+
+    Attributes:
+      look_cost: `[]` in nats.
+    """
+
+    look_cost: jax.Array | float
+
+    def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
+        """Negative entropy of the class `probabilities`, in nats."""
+        del belief
+        return -entropy(probabilities)
+
+    def of_gain(self, gain: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The gain minus the cost of a look."""
+        return gain - self.look_cost
+
+
+def make(config: MdpConfig) -> Reward:
+    """The reward that the settings name."""
+    rewards = {"paper": Paper(config.min_increase), "nats": Nats(config.look_cost)}
+    return rewards[config.reward]
+
+
+def information(std: jax.Array) -> jax.Array:
+    """Information of a belief, `I = 1 / ||std||_2` (Korthals et al. 2018, Sec. IV).
+
+    Args:
+      std: `[..., D]` positive standard deviations.
+
+    Returns:
+      `[...]` information in inverse latent units; grows without bound as `std` -> 0.
+
+    Raises:
+      ValueError: if a standard deviation is not positive.
+    """
+    chex.assert_shape(std, (..., None), custom_message="std")
+    checks.require_positive("std", std)
+    return 1.0 / jnp.linalg.norm(std, axis=-1)
+
+
+def entropy(probabilities: Float[Array, "... C"]) -> Float[Array, "..."]:
+    """Entropy of `[..., C]` probabilities, `[...]` in nats."""
+    return -jnp.sum(jax.scipy.special.xlogy(probabilities, probabilities), axis=-1)

@@ -1,0 +1,221 @@
+"""Stages of agents: the values of looks, Q-learning, and the order of a team's looks."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense.config import Config
+from jaxsense.core import supervised
+from jaxsense.core.networks import Params
+from jaxsense.core.supervised import FitState
+from jaxsense.core.types import Belief, Fusion, Key
+from jaxsense.dqn import map_mdp, optimum, rewards, rules, team_mdp, tours
+from jaxsense.dqn import training as dqn
+from jaxsense.dqn.environments import Environment
+from jaxsense.dqn.map_mdp import Looks, MapMdp, MapState
+from jaxsense.dqn.optimum import LookValues
+from jaxsense.dqn.policies import expected_gains
+from jaxsense.dqn.team_mdp import TeamState
+from jaxsense.dqn.tours import Trials
+from jaxsense.looks import Bank, Live
+from jaxsense.models import make_agent, make_bayes, make_prior
+from jaxsense.sim.arena import Arena
+from jaxsense.sim.world import make_world
+from jaxsense.training import measures
+from jaxsense.training.mdp import held_out_mdp, mdp_of
+from jaxsense.training.perception import Detections, Starts
+from jaxsense.training.stage import Output, Progress, Stage, chunk_size, num_chunks
+from jaxsense.vae import readout
+from jaxsense.vae.detectors import Detector
+
+_MAX_LOOKS = 20  # at one PoI, in the values of looks
+
+State = dqn.DqnState[Output]
+
+
+def look_values(
+    key: Key, config: Config, *, classes: Belief, detections: Detections
+) -> tuple[LookValues, ...]:
+    """The value of a look with each modality, from the features for training.
+
+    Args:
+      key: not used.
+      config: all settings.
+      classes: `[C, D]` joint posterior of each class.
+      detections: of all sensors.
+    """
+    del key
+    settings, bayes = config.evaluation, make_bayes(config)
+
+    def of_modality(m: int) -> LookValues:
+        features = detections.bank[m][:, : settings.value_looks]
+        return optimum.value_iteration(
+            jax.vmap(jax.vmap(lambda x: bayes.log_likelihoods(x, m)))(features),
+            reward=rewards.make(config.mdp),
+            mixture=lambda probabilities: readout.mixture(classes, probabilities),
+            prior=make_prior(config),
+            config=config.mdp,
+            horizon=_MAX_LOOKS,
+            most_points=settings.value_points,
+        )
+
+    return tuple(map(of_modality, range(len(config.modalities))))
+
+
+def agent_stages(arena: Arena, config: Config) -> list[Stage]:
+    """The first states of episodes, and the training of each learner's Q-network.
+
+    Args:
+      arena: of live looks.
+      config: all settings.
+    """
+
+    def environment(
+        config: Config,
+        modality: jax.Array,
+        detections: Detections,
+        fusion: Fusion,
+        detectors: tuple[Detector, ...],
+    ) -> Environment[Output]:
+        looks: dict[str, Callable[[], Looks]] = {
+            "live": lambda: Live(make_world(config, arena=arena), detectors),
+            "bank": lambda: Bank(detections.bank),
+        }
+        mdp = mdp_of(config, fusion, looks[config.dqn.observe]())
+        return make_agent(config).environment(mdp, modality)
+
+    def starts(key: Key, config: Config, *, detections: Detections, **inputs: Output) -> Output:
+        """`[num_starts]` first states of episodes."""
+        learning = environment(config, jnp.int32(0), detections, **inputs)
+        if not detections.starts.classes.shape[0]:
+            return dqn.starts(key, learning, config.dqn)
+        return _surveyed_starts(key, learning.mdp, detections.starts, config.dqn.num_starts)
+
+    def begin(
+        key: Key, config: Config, *, modality: jax.Array, starts: Output, **inputs: Output
+    ) -> State:
+        return dqn.init(key, environment(config, modality, **inputs), config.dqn, starts)
+
+    def advance(
+        key: Key,
+        config: Config,
+        state: State,
+        *,
+        modality: jax.Array,
+        starts: Output,
+        detections: Detections,
+        fusion: Fusion,
+        detectors: tuple[Detector, ...],
+    ) -> tuple[State, Progress]:
+        mdp = held_out_mdp(config, fusion, detections)
+
+        def evaluate(key: Key, q_network: Params) -> jax.Array:
+            return measures.learned_return(key, modality, q_network, mdp, config)
+
+        learning = environment(config, modality, detections, fusion, detectors)
+        state, info = dqn.train_chunk(key, learning, config.dqn, state, starts, evaluate)
+        reward = jnp.where(info.episodes > 0, info.episode_return, jnp.nan)
+        loss = jnp.where(info.is_finite, info.loss, jnp.nan)
+        metrics = {"reward": reward, "greedy": info.greedy_return, "epsilon": info.epsilon}
+        return state, Progress(loss, metrics)
+
+    def finish(config: Config, state: State, **_: Output) -> Params:
+        del config
+        return state.params
+
+    names = tuple(f"detector_{name}" for name in config.modalities)
+    learned = {"detections": "detections", "fusion": "fusion", "detectors": names}
+    learners = {learner(config, name): m for m, name in enumerate(config.modalities)}
+    return [
+        Stage("starts", starts, learned),
+        *(
+            Stage(
+                name,
+                begin,
+                {"modality": m, "starts": "starts", **learned},
+                advance,
+                finish,
+                steps=config.dqn.epochs,
+                chunks=config.dqn.epochs // config.dqn.chunk,
+            )
+            for name, m in learners.items()
+        ),
+    ]
+
+
+def learner(config: Config, modality: str) -> str:
+    """Name of the stage that trains the Q-network of a modality's robots.
+
+    Args:
+      config: all settings.
+      modality: its name.
+    """
+    return f"dqn_{make_agent(config).learner(modality)}"
+
+
+def _surveyed_starts(key: Key, mdp: MapMdp, starts: Starts, number: int) -> MapState:
+    """`[number]` first states in surveyed scenes, with the looks of the surveys."""
+
+    def begin(key: Key, starts: Starts) -> MapState:
+        seen_key, begin_key = jax.random.split(key)
+        _, seen = map_mdp.random_start(seen_key, mdp)
+        return map_mdp.begin(begin_key, mdp, starts.scenes, starts.classes, seen, starts.features)
+
+    return jax.vmap(begin)(jax.random.split(key, number), starts)
+
+
+def tour_stages(config: Config) -> list[Stage]:
+    """The training of the network that orders a team's looks, see `tours`."""
+    agent = make_agent(config)
+    if not agent.counts_time:
+        return []
+    network, settings = agent.network, config.team.tours
+    size, chunks = chunk_size(settings.steps), num_chunks(settings.steps)
+    number = -(-settings.states // chunks)  # of states in which each chunk tries choices
+
+    def begin(key: Key, config: Config, **_: Output) -> tuple[FitState, Trials]:
+        fit = supervised.start(agent.init_tours(key), config.team.tours)
+        no_trials = tours.no_trials(network.features, config.team.num_pois[1], chunks * number)
+        return fit, no_trials
+
+    def advance(
+        key: Key,
+        config: Config,
+        state: tuple[FitState, Trials],
+        *,
+        look_values: tuple[LookValues, ...],
+        fusion: Fusion,
+        detections: Detections,
+    ) -> tuple[tuple[FitState, Trials], Progress]:
+        """Adds trials, and learns from all so far."""
+        fit, trials = state
+        settings = config.team.tours
+        try_key, draw_key = jax.random.split(key)
+        mdp = mdp_of(config, fusion, Bank(detections.bank))
+        followed = _auction(config, fusion, look_values)
+        found = tours.try_choices(try_key, mdp, followed, settings, number)
+        trials = tours.write(trials, found, fit.step // size * number)
+        problem = tours.Fitting(settings, trials, network, config.jmvae.latent_size)
+        fit, losses = supervised.fit(draw_key, fit, problem, size)
+        return (fit, trials), Progress(losses, {})
+
+    def finish(config: Config, state: tuple[FitState, Trials], **_: Output) -> Params:
+        del config
+        return state[0].params
+
+    inputs = {"look_values": "look_values", "fusion": "fusion", "detections": "detections"}
+    return [Stage("tours", begin, inputs, advance, finish, settings.steps, chunks)]
+
+
+def _auction(config: Config, fusion: Fusion, look_values: tuple[LookValues, ...]) -> tours.Policy:
+    """The policy that robots follow in trials: the auction of gains minus the price of travel."""
+
+    def policy(state: TeamState) -> jax.Array:
+        is_seen = jnp.any(state.map.seen, axis=-1)
+        gains = expected_gains(fusion, look_values, state.map.belief, is_seen)
+        times = team_mdp.travel_times(config.team.travel, state.team)
+        worth = gains[state.team.modality] - config.team.second_cost * times
+        return rules.auction(worth, times, state.team, state.agent)
+
+    return policy

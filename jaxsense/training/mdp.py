@@ -1,0 +1,66 @@
+"""The MDPs of a training, whose models are not complete."""
+
+import dataclasses
+
+from jaxsense.config import Config
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Fusion
+from jaxsense.dqn.map_mdp import Looks, MapMdp
+from jaxsense.dqn.optimum import LookValues
+from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.looks import Bank, make_mdp
+from jaxsense.models import Models, make_agent, make_bayes
+from jaxsense.training.perception import Detections
+
+
+def models_of(
+    config: Config,
+    fusion: Fusion,
+    look_values: tuple[LookValues, ...] = (),
+    q_networks: tuple[Params, ...] = (),
+) -> Models:
+    """The models that a training has so far.
+
+    Args:
+      config: all settings.
+      fusion: how looks update the map.
+      look_values: for each modality, the value of a look.
+      q_networks: parameters of the Q-network of each modality.
+    """
+    return Models(
+        detectors=(),
+        jmvae={},
+        fusion=fusion,
+        bayes=make_bayes(config),
+        look_values=look_values,
+        agent=make_agent(config),
+        q_networks=q_networks,
+        tours=None,
+    )
+
+
+def mdp_of(config: Config, fusion: Fusion, looks: Looks) -> MapMdp | TeamMdp:
+    """The MDP in which agents learn.
+
+    Args:
+      config: all settings.
+      fusion: how looks update the map.
+      looks: how to look at PoIs.
+    """
+    return make_mdp(config, models_of(config, fusion), looks)
+
+
+def held_out_mdp(
+    config: Config, fusion: Fusion, detections: Detections, num_pois: int | None = None
+) -> MapMdp:
+    """The map MDP with held-out features, in which policies are measured.
+
+    Args:
+      config: all settings.
+      fusion: how looks update the map.
+      detections: of all sensors.
+      num_pois: N; by default that of the arena.
+    """
+    mdp = mdp_of(config, fusion, Bank(detections.held_out)).map
+    number = config.arena.num_pois if num_pois is None else num_pois
+    return dataclasses.replace(mdp, num_pois=number)

@@ -1,0 +1,330 @@
+"""Stages of perception: scenes, detectors, the JMVAE and fusion."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense import looks
+from jaxsense.config import Config
+from jaxsense.core.networks import Params
+from jaxsense.core.supervised import FitState
+from jaxsense.core.types import Belief, Key, Samples, pytree
+from jaxsense.models import make_in_place, make_jmvae, make_prior
+from jaxsense.sim.arena import Arena
+from jaxsense.sim.world import Scene, make_world
+from jaxsense.training.fits import fit_stage
+from jaxsense.training.stage import Output, Stage
+from jaxsense.vae import detectors, filter, jmvae
+from jaxsense.vae.detectors import Detector
+from jaxsense.vae.filter import Filter
+from jaxsense.vae.fusion import InPlace
+
+Examples = tuple[jax.Array, jax.Array]
+"""Windows of a detector, and their labels."""
+
+
+@pytree
+class Surveys:
+    """Every robot's look at every PoI of `[S]` scenes.
+
+    Attributes:
+      classes: `[S, N]` int32 true classes.
+      scenes: `[S]` scenes.
+      windows: for each modality `[S, N, F]` the input of its detector.
+    """
+
+    classes: jax.Array
+    scenes: Scene
+    windows: tuple[jax.Array, ...]
+
+
+@pytree
+class Starts:
+    """Looks with which episodes start.
+
+    Attributes:
+      classes: `[S, N]` int32 true classes.
+      scenes: `[S]` scenes.
+      features: for each modality `[S, N, D_m]`.
+    """
+
+    classes: jax.Array
+    scenes: Scene
+    features: tuple[jax.Array, ...]
+
+
+@pytree
+class Detections:
+    """Features of surveys that no detector was trained on.
+
+    Attributes:
+      bank: for each modality `[C, S, D_m]` features for training.
+      held_out: the same from other scenes, to measure on.
+      starts: where episodes start; empty with a bank.
+      windows: for each modality `[C, 1, F]` one held-out look at each class.
+    """
+
+    bank: Samples
+    held_out: Samples
+    starts: Starts
+    windows: tuple[jax.Array, ...]
+
+
+def num_scenes(config: Config) -> tuple[int, int, int]:
+    """Numbers of scenes to train the detectors, for the bank, and to measure."""
+    num_pois, num_classes = config.arena.num_pois, len(config.arena.classes)
+    num_bank = -(-config.jmvae.samples_per_class * num_classes // num_pois)
+    num_held_out = -(-_held_out_per_class(config) * num_classes // num_pois)
+    num_train = -(-config.detector.num_scans // num_pois)
+    return num_train, max(num_bank, _num_starts(config)), num_held_out
+
+
+def _held_out_per_class(config: Config) -> int:
+    return -(-config.detector.num_held_out // len(config.arena.classes))
+
+
+def _num_starts(config: Config) -> int:
+    """Surveyed scenes in which episodes start; none with a bank."""
+    return config.dqn.num_starts if config.dqn.observe == "live" else 0
+
+
+def draw_scenes(key: Key, config: Config) -> tuple[Key, jax.Array]:
+    """Draws all scenes.
+
+    Args:
+      key: random key.
+      config: all settings.
+
+    Returns:
+      `[S]` keys of the scenes, and `[S, N]` classes of their PoIs.
+    """
+    class_key, scene_key = jax.random.split(key)
+    numbers = num_scenes(config)
+    keys = jax.random.split(class_key, len(numbers))
+    parts = [looks.balanced_classes(k, config, n) for k, n in zip(keys, numbers, strict=True)]
+    return jax.random.split(scene_key, sum(numbers)), jnp.concatenate(parts)
+
+
+def survey_stage(arena: Arena) -> Stage:
+    """Surveys all scenes together, as compiling takes longer than running."""
+
+    def survey(key: Key, config: Config, *, scenes: tuple[Key, jax.Array]) -> Surveys:
+        del key
+        keys, classes = scenes
+        seen, windows = looks.surveys(keys, make_world(config, arena=arena), classes)
+        return Surveys(classes, seen, windows)
+
+    return Stage("survey", survey, {"scenes": "scenes"})
+
+
+def split_examples(key: Key, config: Config, *, surveys: Surveys) -> tuple[Examples, ...]:
+    """What each detector is trained on.
+
+    Args:
+      key: not used.
+      config: all settings.
+      surveys: of all scenes.
+
+    Returns:
+      For each modality `[L, F]` windows and their `[L]` int32 labels.
+    """
+    del key
+    num_train = num_scenes(config)[0]
+    classes = surveys.classes[:num_train].reshape(-1)
+    return tuple(
+        (
+            windows[:num_train].reshape(-1, windows.shape[-1]),
+            jnp.array(config.label_of_class(name))[classes],
+        )
+        for name, windows in zip(config.modalities, surveys.windows, strict=True)
+    )
+
+
+def detector_stage(modality: int, name: str, config: Config) -> Stage:
+    """The training of one modality's detector.
+
+    Args:
+      modality: its index.
+      name: of the stage.
+      config: all settings.
+    """
+
+    def split(examples: tuple[Examples, ...]) -> tuple[Examples, Examples]:
+        """The looks to train on, and those to calibrate with."""
+        windows, labels = examples[modality]
+        number = config.detector.num_training(len(labels))
+        return (windows[:number], labels[:number]), (windows[number:], labels[number:])
+
+    def untrained(
+        key: Key, config: Config, *, examples: tuple[Examples, ...]
+    ) -> tuple[Detector, Params]:
+        num_labels = len(config.labels(config.modalities[modality]))
+        detector = detectors.init(key, split(examples)[0][0], num_labels, config.detector)
+        return detector, detector.params
+
+    def problem(
+        config: Config, detector: Detector, *, examples: tuple[Examples, ...]
+    ) -> detectors.Fitting:
+        windows, labels = split(examples)[0]
+        return detectors.Fitting(config.detector, detector, windows, labels)
+
+    def trained(
+        config: Config, detector: Detector, fit: FitState, *, examples: tuple[Examples, ...]
+    ) -> Detector:
+        found = dataclasses.replace(detector, params=fit.params)
+        windows, labels = split(examples)[1]
+        return detectors.calibrate(found, windows, labels) if len(labels) else found
+
+    return fit_stage(
+        name,
+        {"examples": "examples"},
+        config,
+        settings=lambda config: config.detector,
+        untrained=untrained,
+        problem=problem,
+        trained=trained,
+    )
+
+
+def detect(
+    key: Key, config: Config, *, surveys: Surveys, trained: tuple[Detector, ...]
+) -> Detections:
+    """Applies the detectors to the surveys that none was trained on.
+
+    Args:
+      key: not used.
+      config: all settings.
+      surveys: of all scenes.
+      trained: a detector for each modality.
+    """
+    del key
+    num_train, num_bank, _ = num_scenes(config)
+    others = jax.tree.map(lambda x: x[num_train:], surveys)
+    features = looks.detect_all(trained, others.windows)
+
+    def by_class(values: tuple[jax.Array, ...], part: slice, number: int) -> Samples:
+        num_classes = len(config.arena.classes)
+        return tuple(
+            looks.by_class(x[part], others.classes[part], num_classes, number) for x in values
+        )
+
+    for_bank, for_measuring = slice(None, num_bank), slice(num_bank, None)
+    starts = Starts(others.classes, others.scenes, features)
+    return Detections(
+        bank=by_class(features, for_bank, config.jmvae.samples_per_class),
+        held_out=by_class(features, for_measuring, _held_out_per_class(config)),
+        starts=jax.tree.map(lambda x: x[: _num_starts(config)], starts),
+        windows=by_class(others.windows, for_measuring, 1),
+    )
+
+
+def jmvae_stages(config: Config) -> list[Stage]:
+    """Trainings of the JMVAE from different random parameters, and the choice of the best."""
+
+    def untrained(key: Key, config: Config, *, detections: Detections) -> tuple[tuple[()], Params]:
+        del detections
+        return (), jmvae.init(key, make_jmvae(config))
+
+    def problem(config: Config, fitted: tuple[()], *, detections: Detections) -> jmvae.Fitting:
+        return jmvae.Fitting(config.jmvae, detections.bank, make_jmvae(config))
+
+    def trained(
+        config: Config, fitted: tuple[()], fit: FitState, *, detections: Detections
+    ) -> tuple[Params, jax.Array]:
+        """The parameters, and their `[]` mean loss in the last chunk."""
+        return fit.params, fit.loss
+
+    restart = fit_stage(
+        "jmvae",
+        {"detections": "detections"},
+        config,
+        settings=lambda config: config.jmvae,
+        untrained=untrained,
+        problem=problem,
+        trained=trained,
+        is_optional=config.jmvae.restarts > 1,
+    )
+    restarts = [
+        dataclasses.replace(restart, name=f"jmvae_{i + 1}") for i in range(config.jmvae.restarts)
+    ]
+    names = tuple(stage.name for stage in restarts)
+    return [*restarts, Stage("best_jmvae", _best_jmvae, {"restarts": names})]
+
+
+def _best_jmvae(
+    key: Key, config: Config, *, restarts: tuple[tuple[Params, jax.Array], ...]
+) -> Params:
+    """The restart with the lowest final loss; one that is not finite only if none is."""
+    del key, config
+    losses = jnp.stack([loss for _, loss in restarts])
+    best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
+    return jax.tree.map(lambda *x: jnp.stack(x)[best], *(params for params, _ in restarts))
+
+
+def class_beliefs(key: Key, config: Config, *, params: Params, detections: Detections) -> Belief:
+    """`[C, D]` mean joint posterior of each class, from features for training.
+
+    Args:
+      key: not used.
+      config: all settings.
+      params: of the JMVAE.
+      detections: see `detect`.
+    """
+    del key
+    model = make_jmvae(config)
+    encode = jax.vmap(jax.vmap(lambda *features: jmvae.posterior(params, model, features)))
+    return jax.tree.map(lambda x: x.mean(axis=1), encode(*detections.bank))
+
+
+def fusion_stages(config: Config) -> list[Stage]:
+    """The stages that make the fusion, the last of which is called `fusion`."""
+    kinds: dict[str, Callable[[Config], list[Stage]]] = {
+        "in_place": _in_place_stages,
+        "filter": _filter_stages,
+    }
+    return kinds[config.jmvae.fusion](config)
+
+
+def _in_place_stages(config: Config) -> list[Stage]:
+    del config
+
+    def begin(key: Key, config: Config, *, params: Params, classes: Belief) -> InPlace:
+        del key
+        return make_in_place(config, params, classes)
+
+    return [Stage("fusion", begin, {"params": "best_jmvae", "classes": "class_beliefs"})]
+
+
+def _filter_stages(config: Config) -> list[Stage]:
+    def untrained(
+        key: Key, config: Config, *, classes: Belief, detections: Detections
+    ) -> tuple[Filter, Params]:
+        found = filter.init(key, make_jmvae(config), classes, make_prior(config), config.filter)
+        return found, found.networks
+
+    def problem(
+        config: Config, fitted: Filter, *, classes: Belief, detections: Detections
+    ) -> filter.Fitting:
+        del classes
+        return filter.Fitting(config.filter, fitted, detections.bank)
+
+    def trained(config: Config, fitted: Filter, fit: FitState, **_: Output) -> Filter:
+        return dataclasses.replace(fitted, networks=fit.params)
+
+    training = fit_stage(
+        "filter",
+        {"classes": "class_beliefs", "detections": "detections"},
+        config,
+        settings=lambda config: config.filter,
+        untrained=untrained,
+        problem=problem,
+        trained=trained,
+    )
+    return [training, Stage("fusion", _same, {"fusion": "filter"})]
+
+
+def _same(key: Key, config: Config, *, fusion: Filter) -> Filter:
+    del key, config
+    return fusion

@@ -1,0 +1,162 @@
+"""A stage of a training: a name and pure functions, which both `learn` and a run go through."""
+
+import dataclasses
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense.config import Config
+from jaxsense.core.types import Key, pytree
+
+_MAX_CHUNKS = 20
+
+Output = Any
+"""A pytree of arrays."""
+
+Outputs = dict[str, Output]
+"""The outputs of stages, by name."""
+
+
+@pytree
+class Progress:
+    """Loss and metrics of some steps of a training.
+
+    Attributes:
+      loss: `[steps]`; NaN where an input or a parameter of the step is not finite.
+      metrics: `[steps]` each; NaN where a step has none.
+    """
+
+    loss: jax.Array
+    metrics: dict[str, jax.Array]
+
+
+def _no_progress(*_: Output, **__: Output) -> tuple[Output, Progress]:
+    raise TypeError("a stage without steps does not advance")
+
+
+def _as_it_is(config: Config, state: Output, **_: Output) -> Output:
+    del config
+    return state
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Stage:
+    """One stage of a training.
+
+    Attributes:
+      name: determines the random keys of the stage.
+      begin: `(key, config, **inputs) -> state`, the output of a stage without chunks.
+      inputs: for each argument the name of an earlier stage, whose output it is, the names of
+        several, or a number, which is passed as `[]` int32.
+      advance: `(key, config, state, **inputs) -> (state, Progress)`, one chunk of steps.
+      finish: `(config, state, **inputs) -> output`.
+      steps: number of steps.
+      chunks: calls of `advance`; the last one may have fewer steps.
+      is_optional: the stage may diverge: a later one picks among several.
+    """
+
+    name: str
+    begin: Callable[..., Output]
+    inputs: Mapping[str, str | tuple[str, ...] | int] = dataclasses.field(default_factory=dict)
+    advance: Callable[..., tuple[Output, Progress]] = _no_progress
+    finish: Callable[..., Output] = _as_it_is
+    steps: int = 0
+    chunks: int = 0
+    is_optional: bool = False
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the stages whose outputs it takes."""
+        named = [x for x in self.inputs.values() if not isinstance(x, int)]
+        return tuple(n for x in named for n in ((x,) if isinstance(x, str) else x))
+
+    def key(self, key: Key) -> Key:
+        """The key of `begin`, from the key of a training."""
+        return jax.random.fold_in(key_of(key, self.name), 0)
+
+    def chunk_keys(self, key: Key) -> Key:
+        """The `[chunks]` keys of `advance`, from the key of a training."""
+        own = key_of(key, self.name)
+        return jax.vmap(lambda i: jax.random.fold_in(own, i))(1 + jnp.arange(self.chunks))
+
+    def select(self, outputs: Mapping[str, Output]) -> dict[str, Output]:
+        """The inputs by argument, from the outputs of earlier stages."""
+
+        def of(source: str | tuple[str, ...] | int) -> Output:
+            if isinstance(source, int):
+                return jnp.int32(source)
+            return outputs[source] if isinstance(source, str) else tuple(map(of, source))
+
+        return {argument: of(source) for argument, source in self.inputs.items()}
+
+
+@pytree
+class Learned:
+    """The outputs of a training.
+
+    Attributes:
+      outputs: of every stage, by its name.
+      progress: `[steps]` of every stage that has steps, by its name.
+      is_finite: `[]` whether all losses and outputs are finite; optional stages are ignored.
+    """
+
+    outputs: Outputs
+    progress: dict[str, Progress]
+    is_finite: jax.Array
+
+
+def compose(key: Key, config: Config, stages: Sequence[Stage]) -> Learned:
+    """Goes through stages, with a `scan` over the chunks of each.
+
+    Args:
+      key: of the training.
+      config: all settings.
+      stages: each after its inputs.
+    """
+    outputs, progress = Outputs(), dict[str, Progress]()
+    finite = [jnp.bool_(True)]
+    for stage in stages:
+        inputs = stage.select(outputs)
+        state = stage.begin(stage.key(key), config, **inputs)
+        if stage.chunks:
+
+            def advance(state: Output, key: Key) -> tuple[Output, Progress]:
+                return stage.advance(key, config, state, **inputs)  # noqa: B023
+
+            state, chunks = jax.lax.scan(advance, state, stage.chunk_keys(key))
+            whole = jax.tree.map(lambda x: x.reshape(-1)[: stage.steps], chunks)  # noqa: B023
+            progress[stage.name] = whole
+        outputs[stage.name] = stage.finish(config, state, **inputs)
+        if not stage.is_optional:
+            losses = progress[stage.name].loss if stage.chunks else ()
+            finite.append(is_finite((outputs[stage.name], losses)))
+    return Learned(outputs, progress, jnp.stack(finite).all())
+
+
+def key_of(key: Key, name: str) -> Key:
+    """The key of a name, independent of all other names.
+
+    Args:
+      key: of a training.
+      name: for example of a stage.
+    """
+    return jax.random.fold_in(key, zlib.crc32(name.encode()))
+
+
+def chunk_size(steps: int) -> int:
+    """Steps of a chunk, for at most 20 chunks."""
+    return -(-steps // _MAX_CHUNKS)
+
+
+def num_chunks(steps: int) -> int:
+    """Chunks of `chunk_size` steps."""
+    return -(-steps // chunk_size(steps))
+
+
+def is_finite(values: Output) -> jax.Array:
+    """`[]` whether all real numbers in a pytree are finite."""
+    leaves = [x for x in jax.tree.leaves(values) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
+    return jnp.stack([jnp.isfinite(x).all() for x in leaves] or [jnp.bool_(True)]).all()

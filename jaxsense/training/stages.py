@@ -1,0 +1,110 @@
+"""The whole training, written once: the list of stages, and their composition.
+
+`learn` composes the list into one pure function, which you can `vmap` over seeds and settings.
+`jaxsense.run` walks the same list from the host, and reports, saves and stops between two chunks.
+Both use the same keys.
+"""
+
+from collections.abc import Mapping
+
+from jaxsense.config import Config
+from jaxsense.core.types import Key
+from jaxsense.models import Models, make_agent, make_bayes
+from jaxsense.sim.arena import Arena
+from jaxsense.sim.world import make_world
+from jaxsense.training import agents, measures, perception
+from jaxsense.training.stage import Learned, Output, Stage, compose, key_of
+
+
+def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
+    """The stages of a training, each after its inputs.
+
+    Args:
+      config: all settings; its static fields determine the stages and all sizes.
+      arena: of `sim.make_world(config)`, to reuse one.
+    """
+    arena = make_world(config).arena if arena is None else arena
+    detectors = tuple(f"detector_{name}" for name in config.modalities)
+    detections, fusion = {"detections": "detections"}, {"fusion": "fusion"}
+    classes, params = {"classes": "class_beliefs"}, {"params": "best_jmvae"}
+    policies = {
+        name: {
+            "modality": m,
+            "q_network": agents.learner(config, name),
+            "look_values": "look_values",
+            **fusion,
+            **detections,
+        }
+        for m, name in enumerate(config.modalities)
+    }
+    return [
+        Stage("scenes", perception.draw_scenes),
+        perception.survey_stage(arena),
+        Stage("examples", perception.split_examples, {"surveys": "survey"}),
+        *(perception.detector_stage(m, name, config) for m, name in enumerate(detectors)),
+        Stage("detections", perception.detect, {"surveys": "survey", "trained": detectors}),
+        Stage("detector_metrics", measures.detector_metrics, detections),
+        *perception.jmvae_stages(config),
+        Stage("class_beliefs", perception.class_beliefs, {**params, **detections}),
+        *perception.fusion_stages(config),
+        Stage("latent_space", measures.latent_space, {**fusion, **detections}),
+        Stage("look_values", agents.look_values, {**classes, **detections}),
+        Stage("beliefs", measures.beliefs, {**fusion, **detections}),
+        *agents.agent_stages(arena, config),
+        *agents.tour_stages(config),
+        *(Stage(f"policies_{n}", measures.play_policies, x) for n, x in policies.items()),
+        *(
+            Stage(f"numbers_{name}", measures.play_numbers, inputs)
+            for name, inputs in policies.items()
+            if config.evaluation.num_pois
+        ),
+    ]
+
+
+def learn(
+    key: Key, config: Config, arena: Arena | None = None, *, until: str | None = None
+) -> Learned:
+    """The whole training as one pure function.
+
+    Args:
+      key: the only source of randomness.
+      config: all settings. Fields declared `Traced` may be traced, so that `jax.vmap` varies them.
+      arena: of `sim.make_world(config)`, to reuse one.
+      until: name of the last stage to compose; all by default.
+
+    Returns:
+      The outputs of the stages: the trained networks, see `models`, and all that a run measures
+      except its missions.
+
+    Raises:
+      ValueError: if no stage has this name.
+    """
+    found = stages(config, arena)
+    names = [stage.name for stage in found]
+    if until is not None and until not in names:
+        raise ValueError(f"until = {until!r}: must be one of {', '.join(names)}")
+    return compose(key, config, found[: None if until is None else names.index(until) + 1])
+
+
+def models(outputs: Mapping[str, Output], config: Config) -> Models:
+    """The models among the outputs of all stages.
+
+    Args:
+      outputs: by the names of the stages.
+      config: all settings.
+    """
+    return Models(
+        detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
+        jmvae=outputs["best_jmvae"],
+        fusion=outputs["fusion"],
+        bayes=make_bayes(config),
+        look_values=outputs["look_values"],
+        agent=make_agent(config),
+        q_networks=tuple(outputs[agents.learner(config, name)] for name in config.modalities),
+        tours=outputs.get("tours"),
+    )
+
+
+def mission_key(key: Key) -> Key:
+    """The key of the missions that follow a training with this key."""
+    return key_of(key, "mission")

@@ -1,0 +1,58 @@
+"""Whether probabilities are right: likelihood, calibration error and reliability diagrams."""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+MIN_PROBABILITY = 1e-12
+_BINS = 15
+
+
+def negative_log_likelihood(probabilities: jax.Array, labels: jax.Array) -> jax.Array:
+    """Mean of `-log p(label)`, `[]` in nats.
+
+    Args:
+      probabilities: `[S, L]` of each label.
+      labels: `[S]` int32 true labels.
+    """
+    chex.assert_rank(probabilities, 2, custom_message="probabilities")
+    chex.assert_shape(labels, (len(probabilities),), custom_message="labels")
+    right = jnp.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
+    return -jnp.mean(jnp.log(jnp.maximum(right, MIN_PROBABILITY)))
+
+
+def calibration_error(probabilities: jax.Array, labels: jax.Array) -> jax.Array:
+    """Expected calibration error of the most likely labels, `[]` (Guo et al. 2017, Sec. 2).
+
+    The mean over all looks of the difference between the mean confidence of a bin of
+    `reliability` and its share of right labels.
+
+    Args:
+      probabilities: `[S, L]` of each label.
+      labels: `[S]` int32 true labels.
+    """
+    confidence, accuracy, share = reliability(probabilities, labels)
+    return jnp.sum(jnp.where(share > 0, share * jnp.abs(confidence - accuracy), 0.0))
+
+
+def reliability(
+    probabilities: jax.Array, labels: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The points of a reliability diagram: fifteen bins of equal width hold looks by confidence.
+
+    Args:
+      probabilities: `[S, L]` of each label.
+      labels: `[S]` int32 true labels.
+
+    Returns:
+      For each bin its mean confidence and its share of right labels, NaN if it is empty, and its
+      share of all looks.
+    """
+    chex.assert_rank(probabilities, 2, custom_message="probabilities")
+    chex.assert_shape(labels, (len(probabilities),), custom_message="labels")
+    confidence = jnp.max(probabilities, axis=1)
+    is_right = jnp.argmax(probabilities, axis=1) == labels
+    bins = jnp.clip(jnp.ceil(confidence * _BINS).astype(jnp.int32) - 1, 0, _BINS - 1)
+    of_looks = jnp.stack([confidence, is_right, jnp.ones(len(labels))])
+    sums = jnp.zeros((3, _BINS)).at[:, bins].add(of_looks)
+    return sums[0] / sums[2], sums[1] / sums[2], sums[2] / len(labels)

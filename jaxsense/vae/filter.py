@@ -1,0 +1,188 @@
+"""Fusion by a filter: one update for each look, any number of looks in any order.
+
+The JMVAE's alpha term draws the posterior of each subset of the modalities to the joint one. Taken
+from subsets to whole histories of looks, it is `E[sum_t KL(q*_c || q_t)]`: q*_c is the joint
+posterior of the true class c, and q_t the belief after t looks. Among Gaussians this divergence is
+smallest where q_t has the moments of the mixture `sum_c w_c q*_c` whose weights are the classes'
+probabilities after the looks. So the mean shows which classes are open, and the width how uncertain
+the belief is. The weights follow from the moments again: a belief is a sufficient memory.
+"""
+
+from collections.abc import Mapping
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsense.config import FilterConfig
+from jaxsense.core import checks, networks
+from jaxsense.core.networks import MLP, Params
+from jaxsense.core.types import Belief, Key, Samples, pytree
+from jaxsense.vae import gaussian, readout
+from jaxsense.vae.jmvae import Jmvae
+
+_MIN_FEATURE = 1e-6
+
+Drawn = tuple[jax.Array, jax.Array, tuple[jax.Array, ...]]
+"""Classes `[steps, B]`, sensors `[steps, T, B]`, and for each modality `[steps, D_m, T, B]`."""
+
+
+@pytree
+class Filter:
+    """A filter.
+
+    Attributes:
+      networks: by modality, parameters that map features to the classes' log-likelihoods.
+      classes: `[C, D]` mean joint posterior of each class.
+      prior: `[D]` belief before any look.
+      readout: `[C, 2D + 1]` of `readout.readout_matrix`.
+      model: shape of the JMVAE.
+      hidden: sizes of the networks' hidden layers.
+    """
+
+    networks: dict[str, Params]
+    classes: Belief
+    prior: Belief
+    readout: jax.Array
+    model: Jmvae = struct.field(pytree_node=False)
+    hidden: tuple[int, ...] = struct.field(pytree_node=False)
+
+    def update(
+        self,
+        belief: Belief,
+        seen: Bool[Array | np.ndarray, " M"],
+        features: Float[Array, " L"],
+        modality: int,
+    ) -> Belief:
+        """The belief after one more look, see `Fusion.update`; `seen` does not matter.
+
+        Raises:
+          ValueError: if there is no such modality, features are not probabilities, or a belief is
+            not finite or not positive.
+        """
+        del seen
+        model = self.model
+        checks.require_index("modality", modality, len(model.modalities))
+        name = f"features of {model.modalities[modality]}"
+        chex.assert_shape(features, (model.feature_sizes[modality],), custom_message=name)
+        checks.require_probabilities("features", features)
+        chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
+        chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
+        found = self.log_likelihood(self.networks, features, modality)
+        before = jnp.log(self.class_probabilities(belief))
+        return readout.mixture(self.classes, jax.nn.softmax(before + found))
+
+    def together(self, looks: Mapping[int, Float[Array, " L"]]) -> Belief:
+        """The belief after looks by several sensors, `[D_m]` features by modality."""
+        belief, nobody = self.prior, jnp.zeros(len(self.model.modalities), bool)
+        for modality, features in looks.items():
+            belief = self.update(belief, nobody, features, modality)
+        return belief
+
+    def log_likelihood(
+        self, params: dict[str, Params], features: Float[Array, "L ..."], modality: int
+    ) -> Float[Array, "C ..."]:
+        """Log-likelihood of each class given one look, up to a constant.
+
+        Args:
+          params: the networks, by modality.
+          features: `[D_m]` probabilities of the labels, or `[D_m, B]`.
+          modality: index of the sensor; static.
+
+        Returns:
+          `[C]`, or `[C, B]`.
+        """
+        network = MLP(self.hidden, len(self.classes.mean))
+        logarithm = jnp.log(jnp.maximum(features, _MIN_FEATURE))
+        return networks.apply(network, params[self.model.modalities[modality]], logarithm)
+
+    def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
+        """The classes' probabilities that a `[D]` belief holds."""
+        return readout.class_probabilities(self.readout, self.prior, belief)
+
+    def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
+        """The class of the highest probability in a `[D]` belief, int32."""
+        return jnp.argmax(self.class_probabilities(belief))
+
+
+def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterConfig) -> Filter:
+    """An untrained filter.
+
+    Args:
+      key: random key.
+      model: shape of the JMVAE.
+      classes: `[C, D]` mean joint posterior of each class.
+      prior: `[D]` belief before any look.
+      config: sizes of the networks.
+    """
+    chex.assert_shape(classes.mean, (None, model.latent_size), custom_message="classes.mean")
+    chex.assert_shape(classes.std, classes.mean.shape, custom_message="classes.std")
+    chex.assert_shape(prior.mean, (model.latent_size,), custom_message="prior.mean")
+    chex.assert_shape(prior.std, (model.latent_size,), custom_message="prior.std")
+    network = MLP(config.hidden, len(classes.mean))
+    keys = jax.random.split(key, len(model.modalities))
+    of_each = zip(keys, model.modalities, model.feature_sizes, strict=True)
+    return Filter(
+        networks={name: networks.init(k, network, size) for k, name, size in of_each},
+        classes=classes,
+        prior=prior,
+        readout=readout.readout_matrix(classes),
+        model=model,
+        hidden=config.hidden,
+    )
+
+
+@pytree
+class Fitting:
+    """The fit of a filter's networks to random histories of looks.
+
+    Attributes:
+      config: looks of a history, batch, learning rate and steps.
+      filter: from `init`.
+      bank: the detections to draw looks from.
+    """
+
+    config: FilterConfig
+    filter: Filter
+    bank: Samples
+
+    def draw(self, key: Key, number: int) -> Drawn:
+        """Histories of looks for `number` steps, see `supervised.Problem.draw`."""
+        bank, shape = self.bank, (number, self.config.looks, self.config.batch)
+        class_key, sensor_key, *row_keys = jax.random.split(key, 2 + len(bank))
+        classes = jax.random.randint(class_key, (number, self.config.batch), 0, len(bank[0]))
+        sensors = jax.random.randint(sensor_key, shape, 0, len(bank))
+        looks = tuple(
+            jnp.moveaxis(x[classes[:, None], jax.random.randint(k, shape, 0, x.shape[1])], -1, 1)
+            for x, k in zip(bank, row_keys, strict=True)
+        )
+        return classes, sensors, looks
+
+    def loss(self, params: dict[str, Params], drawn: Drawn, step: jax.Array) -> jax.Array:
+        """`[]` mean divergence from the true class's joint posterior to the beliefs."""
+        del step
+        true_class, sensor, looks = drawn
+        number, classes = len(self.bank), self.filter.classes
+        flat = [
+            self.filter.log_likelihood(params, x.reshape(len(x), -1), m)
+            for m, x in enumerate(looks)
+        ]
+        found = jnp.stack(flat).reshape(number, -1, sensor.shape[0], sensor.shape[1])
+        is_used = sensor[None, None] == jnp.arange(number)[:, None, None, None]
+        added = jnp.sum(jnp.where(is_used, found, 0.0), axis=0)
+        probabilities = jax.nn.softmax(jnp.cumsum(added, axis=1), axis=0)
+        mix = jax.vmap(jax.vmap(lambda p: readout.mixture(classes, p), -1, -1), -1, -1)
+        truth = jax.tree.map(lambda x: x[true_class].T[:, None], classes)
+        return jnp.mean(_divergence(truth, mix(probabilities)))
+
+
+def _divergence(truth: Belief, beliefs: Belief) -> jax.Array:
+    """`[T, B]` `KL(truth || belief)` of `[D, 1, B]` and `[D, T, B]` Gaussians."""
+    shape = beliefs.mean.shape
+    parts = (truth.mean, 2 * jnp.log(truth.std), beliefs.mean, 2 * jnp.log(beliefs.std))
+    mean_p, log_var_p, mean_q, log_var_q = (jnp.broadcast_to(part, shape) for part in parts)
+    divergence = jax.vmap(jax.vmap(gaussian.kl_divergence, -1, -1), -1, -1)
+    return divergence(mean_p, log_var_p, mean_q, log_var_q)
