@@ -18,7 +18,6 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from jaxsense.config import Config, ConfigError
 from jaxsense.run.compilation import Kept
-from jaxsense.sim import sensors
 
 T = TypeVar("T")
 
@@ -126,11 +125,12 @@ def keep_programs(program: str, directory: Path | None, config: Config) -> Kept 
       The programs with these settings; None, with a warning, if the directory cannot be used.
     """
     # Several processes can load a program only together.
-    if directory is None or jax.process_count() > 1:
+    # A custom sensor's program may change while its settings stay the same.
+    if directory is None or config.sensors or jax.process_count() > 1:
         return None
     try:
         directory = directory.expanduser()
-        kept = Kept(directory, jax.tree.structure(config), sensors.fingerprints(config))
+        kept = Kept(directory, jax.tree.structure(config))
     except (OSError, RuntimeError) as error:
         complain(f"{program}: programs cannot be kept in {directory} ({error})")
         return None

@@ -86,7 +86,8 @@ def main(argv: list[str] | None = None) -> None:
         workers = devices.start(arguments.devices)
         trained, models = rundir.load(arguments.run, arguments.trust)
         config = _elsewhere(arguments, trained)
-        played = _cases(arguments, config)
+        team = mission.make_mission(config)
+        played = _cases(arguments, team)
         path = arguments.run / "summary.json"
         # If these files cannot be written, fail now rather than after minutes of work.
         with files.locked(arguments.run, waits=True):
@@ -101,7 +102,6 @@ def main(argv: list[str] | None = None) -> None:
     kept = cli.keep_programs(PROGRAM, arguments.cache, config)
     console = rich.console.Console()
     key = jax.random.key(arguments.seed)
-    team = mission.make_mission(config)
     with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
         number = arguments.episodes * len(played)
         player = missions.Player(team, compiler, missions.batch_of(number), workers)
@@ -115,7 +115,9 @@ def main(argv: list[str] | None = None) -> None:
         compiling = compiler.monitor.seconds["mission"]["compile_s"]
     block = missions.summary(team, found)
     try:
-        written = _write(arguments, (trained, config), models.class_beliefs, block, found.recording)
+        written = _write(
+            arguments, (trained, config), models.fusion.classes, block, found.recording
+        )
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({cli.reason(error)})")
     rate = found.control_steps / seconds
@@ -238,16 +240,16 @@ def _elsewhere(arguments: Arguments, config: Config) -> Config:
     return dataclasses.replace(config, arena=arena, robots=robots, mdp=mdp)
 
 
-def _cases(arguments: Arguments, config: Config) -> dict[str, mission.Case]:
+def _cases(arguments: Arguments, team: mission.Mission) -> dict[str, mission.Case]:
     """The cases to play; raises `ConfigError` for an unknown policy or too many episodes."""
     # Checked like the number of a run's own missions.
-    settings = dataclasses.replace(config.mission, episodes=arguments.episodes)
-    dataclasses.replace(config, mission=settings)
-    cases = mission.cases(config)
+    settings = dataclasses.replace(team.config.mission, episodes=arguments.episodes)
+    dataclasses.replace(team.config, mission=settings)
+    cases = mission.cases(team)
     if arguments.policy == "all":
         return cases
     if arguments.policy == "policies":
-        return {name: cases[name] for name in mission.POLICIES}
+        return {name: cases[name] for name in team.policies}
     if arguments.policy not in cases:
         known = ", ".join(["all", "policies", *cases])
         raise ConfigError("policy", arguments.policy, f"must be one of {known}")

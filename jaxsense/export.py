@@ -23,10 +23,9 @@ from jaxsense import cli
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import require_types
 from jaxsense.interfaces.onboard import Function, functions
-from jaxsense.models import Models, make_jmvae
+from jaxsense.models import Models
 from jaxsense.run import files, rundir
 from jaxsense.run.version import __version__
-from jaxsense.vae import fusion
 
 PROGRAM = "jaxsense.export"
 PLATFORMS = ("cpu", "cuda", "tpu")
@@ -66,16 +65,16 @@ def _description(config: Config, models: Models) -> dict[str, Any]:
     """What a reader of the file needs besides the programs."""
     arena = config.arena
     versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib")}
-    unseen = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
+    prior = models.fusion.prior
     return {
         "modalities": config.modalities,
         "robots": config.carried,
         "classes": arena.classes,
         "labels": {name: config.labels(name) for name in config.modalities},
         "label_of_class": {name: config.label_of_class(name) for name in config.modalities},
-        "class_means": np.asarray(models.class_beliefs.mean).tolist(),
+        "class_means": np.asarray(models.fusion.classes.mean).tolist(),
         "num_pois": arena.num_pois,
-        "unseen": {name: np.asarray(x).tolist() for name, x in vars(unseen).items()},
+        "unseen": {name: np.asarray(x).tolist() for name, x in vars(prior).items()},
         "platforms": PLATFORMS,
         "versions": {"jaxsense": __version__, **versions},
     }

@@ -339,7 +339,7 @@ def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any], monitor
     config = run.settings.config
     monitor.check_stop()
     plots.write_plots(run.path, config, result)
-    film, beliefs = run.path / "mission.svg", result.models.class_beliefs
+    film, beliefs = run.path / "mission.svg", result.models.fusion.classes
     title = f"{config.mission.policies[0]} policy".replace("_", " ")
     animation.write(film, config, result.recording, beliefs, title)
     summary = {**_header(run, timing), **result.summary}

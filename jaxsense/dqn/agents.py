@@ -45,6 +45,10 @@ class MapAgent:
         """False: looks take no time in the map MDP."""
         return False
 
+    @property
+    def tour_network(self) -> None:
+        """None: without travel time there is no order to learn."""
+
     def learner(self, modality: str) -> str:
         """The name of what learns for robots of a modality: the modality."""
         return modality
@@ -147,6 +151,11 @@ class TeamAgent:
         """The network of Q-values and of tours."""
         features = team_mdp.num_features(self.latent_size, self.num_modalities)
         return PoolingNetwork(self.hidden, features)
+
+    @property
+    def tour_network(self) -> PoolingNetwork:
+        """The network that orders looks."""
+        return self.network
 
     def learner(self, modality: str) -> str:
         """The name of what learns for robots of a modality: all robots share one network."""

@@ -11,6 +11,7 @@ from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Index, Key, Transition, pytree
 from jaxsense.dqn import map_mdp, team_mdp
 from jaxsense.dqn.map_mdp import MapMdp, MapState, Outcome
+from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import Names, Places, Team, TeamMdp, TeamState
 
 S = TypeVar("S")
@@ -27,6 +28,11 @@ class Agent(Protocol):
     @property
     def counts_time(self) -> bool:
         """Whether values include travel time."""
+        ...
+
+    @property
+    def tour_network(self) -> PoolingNetwork | None:
+        """The network that orders looks; None if the agent has none."""
         ...
 
     def learner(self, modality: str) -> str:
@@ -119,12 +125,18 @@ class Environment(Protocol, Generic[S]):
 
     Attributes:
       agent: what learns.
+      mdp: the MDP.
       num_actions: A; the last action is NOP.
     """
 
     @property
     def agent(self) -> Agent:
         """What learns."""
+        ...
+
+    @property
+    def mdp(self) -> MapMdp | TeamMdp:
+        """The MDP."""
         ...
 
     @property

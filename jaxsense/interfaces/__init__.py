@@ -5,6 +5,3 @@ Import `jaxsense.interfaces.gymnax`, `.rejax`, `.gymnasium`, `.stable_baselines3
 """
 
 from jaxsense.interfaces.common import prepared_starts as prepared_starts
-from jaxsense.interfaces.mdps import detections as detections
-from jaxsense.interfaces.mdps import map_mdp as map_mdp
-from jaxsense.interfaces.mdps import team_mdp as team_mdp

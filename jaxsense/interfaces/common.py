@@ -4,8 +4,8 @@ import jax
 
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.dqn import belief_mdp
-from jaxsense.dqn.belief_mdp import MapMdp, MapState
+from jaxsense.dqn import map_mdp
+from jaxsense.dqn.map_mdp import MapMdp, MapState
 
 
 def check_modality(mdp: MapMdp, modality: int) -> None:
@@ -20,7 +20,7 @@ def num_actions(mdp: MapMdp) -> int:
 
 def observation_size(mdp: MapMdp) -> int:
     """Numbers in an observation, `N * 2D`."""
-    return 2 * mdp.num_pois * mdp.unseen.mean.size
+    return 2 * mdp.num_pois * mdp.fusion.prior.mean.size
 
 
 def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
@@ -32,7 +32,7 @@ def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
     checks.require_number("number", number)
 
     def reset(key: Key) -> MapState:
-        return belief_mdp.reset(key, mdp)
+        return map_mdp.reset(key, mdp)
 
     return jax.jit(lambda key: jax.vmap(reset)(jax.random.split(key, number)))(key)
 
@@ -46,6 +46,6 @@ def start(key: Key, mdp: MapMdp, starts: MapState | None) -> MapState:
       starts: `[S]` from `prepared_starts`, to pick a random one; by default the start is new.
     """
     if starts is None:
-        return belief_mdp.reset(key, mdp)
+        return map_mdp.reset(key, mdp)
     row = jax.random.randint(key, (), 0, starts.steps.shape[0])
     return jax.tree.map(lambda x: x[row], starts)

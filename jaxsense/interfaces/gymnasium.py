@@ -9,8 +9,9 @@ import numpy as np
 
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.dqn import belief_mdp
-from jaxsense.dqn.belief_mdp import MapMdp, MapState, Outcome
+from jaxsense.dqn import map_mdp
+from jaxsense.dqn.agents import observation
+from jaxsense.dqn.map_mdp import MapMdp, MapState, Outcome
 from jaxsense.interfaces import common
 from jaxsense.interfaces.extras import extra
 
@@ -156,9 +157,9 @@ def _step(
 ) -> tuple[Key, jax.Array, MapState, Outcome]:
     """Next key, `[E, N * 2D]` observations, `[E]` states and `[E]` outcomes."""
     next_key, key = jax.random.split(key)
-    step = jax.vmap(lambda k, s, a: belief_mdp.step(k, mdp, s, a, modality))
+    step = jax.vmap(lambda k, s, a: map_mdp.step(k, mdp, s, a, modality))
     states, outcome = step(jax.random.split(key, len(actions)), states, actions)
-    return next_key, jax.vmap(belief_mdp.observation)(states.belief), states, outcome
+    return next_key, jax.vmap(observation)(states.belief), states, outcome
 
 
 def _start(
@@ -178,4 +179,4 @@ def _start(
         return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     begun = fresh if states is None else jax.tree.map(pick, fresh, states)
-    return next_key, jax.vmap(belief_mdp.observation)(begun.belief), begun
+    return next_key, jax.vmap(observation)(begun.belief), begun

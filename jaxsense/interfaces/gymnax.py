@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxsense.core.types import Key
-from jaxsense.dqn import belief_mdp
-from jaxsense.dqn.belief_mdp import MapMdp, MapState
+from jaxsense.dqn import map_mdp
+from jaxsense.dqn.agents import observation
+from jaxsense.dqn.map_mdp import MapMdp, MapState
 from jaxsense.interfaces import common
 from jaxsense.interfaces.extras import extra
 
@@ -86,7 +87,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     ) -> tuple[jax.Array, MapEnvState, jax.Array, jax.Array, dict[Any, Any]]:
         """Takes one action, without a reset."""
         action = jnp.asarray(action, jnp.int32)
-        after, outcome = belief_mdp.step(key, self.mdp, state.map, action, self.modality)
+        after, outcome = map_mdp.step(key, self.mdp, state.map, action, self.modality)
         state = MapEnvState(time=after.steps, map=after, terminated=outcome.terminated)  # pyright: ignore
         info = {"discount": self.discount(state, params)}
         observation = self.observe(key, state, action, params)
@@ -95,7 +96,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     def observe(self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams) -> jax.Array:
         """The map, `[N * 2D]`."""
         del key, action, params
-        return belief_mdp.observation(state.map.belief)
+        return observation(state.map.belief)
 
     def is_terminated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
         """Whether the last action was NOP, `[]` bool."""

@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense.config import Config
-from jaxsense.core import networks
 from jaxsense.core.types import Belief
-from jaxsense.dqn import belief_mdp, policies
+from jaxsense.dqn.agents import observation
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.models import Models, make_jmvae
-from jaxsense.sim import sensors
-from jaxsense.vae import detectors, fusion, jmvae, metrics
+from jaxsense.sim import sensors, windows
+from jaxsense.vae import detectors, jmvae, latent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +45,7 @@ def functions(config: Config, models: Models) -> dict[str, Function]:
         found |= {
             f"window_{name}": _window(config, m),
             f"detect_{name}": _detect(models, m),
-            f"write_{name}": _write(models, model, m),
+            f"write_{name}": _update(models, model, m),
             f"decide_{name}": _decide(config, models, m),
         }
     for subset in model.subsets:
@@ -59,8 +58,8 @@ def _window(config: Config, m: int) -> Function:
     number = len(sensor.angles)
 
     def apply(readings: jax.Array, bearing: jax.Array) -> dict[str, jax.Array]:
-        rays = sensors.window_of(sensor, np.arange(number), bearing)
-        return {"window": sensors.as_window(sensor, readings[rays])}
+        rays = windows.window_of(sensor, np.arange(number), bearing)
+        return {"window": windows.as_window(sensor, readings[rays])}
 
     channels = () if sensor.channels == 1 else (sensor.channels,)
     inputs = {"readings": _floats(number, *channels), "bearing": _floats()}
@@ -78,10 +77,9 @@ def _detect(models: Models, m: int) -> Function:
     )
 
 
-def _write(models: Models, model: jmvae.Jmvae, m: int) -> Function:
+def _update(models: Models, model: jmvae.Jmvae, m: int) -> Function:
     def apply(mean: jax.Array, std: jax.Array, seen: jax.Array, features: jax.Array):
-        entry = fusion.write(models.jmvae, model, Belief(mean, std), seen, features, m)
-        return _named(entry)
+        return _named(models.fusion.update(Belief(mean, std), seen, features, m))
 
     inputs = {
         "mean": _floats(model.latent_size),
@@ -89,7 +87,7 @@ def _write(models: Models, model: jmvae.Jmvae, m: int) -> Function:
         "seen": jax.ShapeDtypeStruct((len(model.modalities),), bool),
         "features": _floats(model.feature_sizes[m]),
     }
-    return Function("the map's entry of a PoI after a look", inputs, apply)
+    return Function("the belief about a PoI after a look", inputs, apply)
 
 
 def _encode(models: Models, model: jmvae.Jmvae, subset: tuple[int, ...]) -> Function:
@@ -103,14 +101,12 @@ def _encode(models: Models, model: jmvae.Jmvae, subset: tuple[int, ...]) -> Func
 
 
 def _decide(config: Config, models: Models, m: int) -> Function:
-    if config.dqn.task == "team":
+    if models.agent.counts_time:
         return _decide_in_team(config, models, m)
     num_pois = config.arena.num_pois
-    q_network = policies.q_network(num_pois, config.dqn.hidden)
 
     def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
-        state = belief_mdp.observation(Belief(mean, std))
-        values = networks.apply(q_network, models.q_networks[m], state)
+        values = models.agent.values(models.q_networks[m], observation(Belief(mean, std)))
         return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
 
     shape = num_pois, config.jmvae.latent_size
@@ -133,9 +129,10 @@ def _decide_in_team(config: Config, models: Models, m: int) -> Function:
         robot: jax.Array,
     ) -> dict[str, jax.Array]:
         team = Team(positions, present, poses, modality, works, target)
-        known = Belief(mean, std), team, robot, len(config.modalities)
-        trained = models.q_networks[m], models.tours
-        values = policies.tour_values(*trained, *known, config.team, config.dqn)
+        classes, belief = models.fusion.classes, Belief(mean, std)
+        values = models.agent.decide(
+            models.q_networks[m], models.tours, classes, belief, team, robot
+        )
         return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
 
     shape = num_pois, config.jmvae.latent_size
@@ -157,13 +154,13 @@ def _decide_in_team(config: Config, models: Models, m: int) -> Function:
 
 
 def _classify(models: Models) -> Function:
-    means = models.class_beliefs.mean
+    means = models.fusion.classes.mean
 
     def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
         entry = Belief(mean, std)
         return {
-            "nearest": fusion.most_likely_class(models.jmvae, means, entry).astype(jnp.int32),
-            "plausible": metrics.plausible_classes(entry, means),
+            "nearest": models.fusion.most_likely_class(entry).astype(jnp.int32),
+            "plausible": latent.plausible_classes(entry, means),
         }
 
     inputs = {"mean": _floats(means.shape[1]), "std": _floats(means.shape[1])}

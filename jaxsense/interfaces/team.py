@@ -47,7 +47,7 @@ def check_team(mdp: TeamMdp, config: Config) -> None:
 
 def observation_size(mdp: TeamMdp) -> int:
     """Numbers in an observation of one robot, `F * N`."""
-    features = team_mdp.num_features(mdp.map.unseen.mean.size, mdp.map.num_modalities)
+    features = team_mdp.num_features(mdp.map.fusion.prior.mean.size, mdp.map.num_modalities)
     return features * mdp.map.num_pois
 
 
@@ -60,8 +60,9 @@ def observations(mdp: TeamMdp, state: TeamState) -> jax.Array:
     """What each robot knows, `[R, F * N]`, see `team_mdp.observation`."""
 
     def observation(robot: jax.Array) -> jax.Array:
-        known = state.map.belief, state.team, robot, mdp.map.num_modalities
-        return team_mdp.observation(mdp.config.travel, *known).reshape(-1)
+        belief, number = state.map.belief, mdp.map.num_modalities
+        travel = mdp.config.travel
+        return team_mdp.observation(travel, belief, state.team, robot, number).reshape(-1)
 
     return jax.vmap(observation)(jnp.arange(len(state.team.works)))
 

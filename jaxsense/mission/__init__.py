@@ -6,7 +6,6 @@ decides at its own time; one whose policy reads the map decides again when the m
 way. Everything is a pure function of one episode: `vmap` over episodes.
 """
 
-from jaxsense.config import POLICIES as POLICIES
 from jaxsense.mission.cases import Case as Case
 from jaxsense.mission.cases import cases as cases
 from jaxsense.mission.outcome import REASONS as REASONS
@@ -15,7 +14,6 @@ from jaxsense.mission.outcome import reason as reason
 from jaxsense.mission.rollout import rollout as rollout
 from jaxsense.mission.rollout import rollout_batch as rollout_batch
 from jaxsense.mission.rollout import step as step
-from jaxsense.mission.state import LATENT as LATENT
 from jaxsense.mission.state import Faults as Faults
 from jaxsense.mission.state import Mission as Mission
 from jaxsense.mission.state import MissionState as MissionState

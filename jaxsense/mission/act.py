@@ -4,9 +4,9 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from mujoco import mjx
 
 from jaxsense.core.types import Belief, Index, Key, call, others, pytree
+from jaxsense.looks import features_of
 from jaxsense.mission import navigation, roadmap
 from jaxsense.mission.decide import sees, standing_robots
 from jaxsense.mission.groups import where_due
@@ -23,12 +23,11 @@ from jaxsense.mission.state import (
     robot_of,
     with_robot,
 )
-from jaxsense.models import Models, make_jmvae
+from jaxsense.models import Models
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import sensors, viewpoints
+from jaxsense.sim import viewpoints, windows
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene
-from jaxsense.vae import detectors, fusion, peers
 
 _PROGRESS = 0.02  # m, least shortening of a way that counts as progress
 _PATIENCE = 2.0  # s without progress of another robot, then one that has ended makes room
@@ -205,21 +204,12 @@ def scan(
 
     of_robot = mission.config.modality_of_robot
     carried = sorted(set(of_robot))
-    # Robots with the same sensor look alike: the first of them takes the place of the one that
-    # scans, so that the program has one scan for each sensor and not for each robot.
-    first = jnp.array([of_robot.index(modality) for modality in of_robot])[robot]
-
-    def place(state: MissionState) -> mjx.Data:
-        layout, poses = state.scene.layout, state.scene.poses
-        exchanged = poses.at[robot].set(poses[first]).at[first].set(poses[robot])
-        return arenas.place(mission.world.arena, layout, exchanged)
-
     first_rows = jax.tree.map(lambda x: x[:, 0], (states.belief, states.log_posterior))
     nothing = jnp.zeros(len(keys), bool), *first_rows  # not seen, and so never written
 
     def look(i: int) -> tuple[jax.Array, Belief, jax.Array]:
         def scan_one(state: MissionState, aim: _Aim) -> tuple[jax.Array, Belief, jax.Array]:
-            return _look(mission, models, robot, carried[i], state, place(state), aim)
+            return _look(mission, models, robot, carried[i], state, aim)
 
         return where_due(aims.scans & ~states.done, scan_one, nothing, states, aims, parts=parts)
 
@@ -265,26 +255,23 @@ def _look(
     robot: Index,
     modality: int,
     state: MissionState,
-    data: mjx.Data,
     aim: _Aim,
 ) -> tuple[jax.Array, Belief, jax.Array]:
     """Whether the PoI is seen, `[]` bool, and its new entry and `[C]` posterior if it is."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
-    first = mission.config.modality_of_robot.index(modality)
-    readings = worlds.scan_around(aim.noise_key, world, scene, data, first, aim.bearing, modality)
+    data = arenas.place(world.arena, scene.layout, scene.poses)
+    readings = worlds.scan_around(aim.noise_key, world, scene, data, robot, aim.bearing, modality)
     is_blind = now(mission, state) >= state.faults.blind_at[robot]
     readings = jnp.where(is_blind, sensor.blind, readings)
     error = jnp.radians(mission.config.viewpoint.bearing_error)
     arena = mission.config.arena
-    shows = sensors.shows_poi(sensor, readings, aim.bearing, aim.distance, arena, error)
-    features = detectors.detect(models.detectors[modality], sensors.as_window(sensor, readings))
+    shows = windows.shows_poi(sensor, readings, aim.bearing, aim.distance, arena, error)
+    features = features_of(models.detectors[modality], sensor, readings)
     is_sure = jnp.max(features) >= mission.config.mission.least_confidence
     old = jax.tree.map(lambda x: x[aim.poi], state.belief)
-    shape, seen = make_jmvae(mission.config), state.seen[aim.poi]
-    entry = fusion.write(models.jmvae, shape, old, seen, features, modality)
-    labels = jnp.array(mission.config.label_of_class(mission.config.modalities[modality]))
-    posterior = peers.bayes_update(state.log_posterior[aim.poi], features, labels)
-    return shows & is_sure, entry, posterior
+    belief = models.fusion.update(old, state.seen[aim.poi], features, modality)
+    posterior = models.bayes.update(state.log_posterior[aim.poi], features, modality)
+    return shows & is_sure, belief, posterior
 
 
 def _write(

@@ -4,8 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from jaxsense.config import POLICIES, Config
-from jaxsense.mission.state import LATENT, Faults, no_faults
+from jaxsense.mission.state import Faults, Mission, no_faults
 
 FAULT_TIME = 6.0  # s
 
@@ -15,7 +14,7 @@ class Case:
     """A policy and faults to play missions with.
 
     Attributes:
-      policy: index into `POLICIES`.
+      policy: index into `Mission.policies`.
       faults: which robots fail, and when.
     """
 
@@ -23,21 +22,22 @@ class Case:
     faults: Faults
 
 
-def cases(config: Config) -> dict[str, Case]:
+def cases(mission: Mission) -> dict[str, Case]:
     """Lists the policies, each robot alone, and each robot failing in mid-mission.
 
-    Each of `POLICIES` is a case; in `ROBOT_alone` all other robots stand still from the start; in
-    `ROBOT_stops` and `ROBOT_blind` the robot stops or its sensor goes blind after 6 s. A robot has
+    Each of `Mission.policies` is a case; in `ROBOT_alone` all other robots stand still from the
+    start; in `ROBOT_stops` and `ROBOT_blind` the robot stops or its sensor goes blind after 6 s. A robot has
     the name of its modality, with a number if several share it, see `Config.robot_names`. Cases
     with faults use the latent policy.
     """
+    config, latent = mission.config, mission.policy("latent")
     healthy = no_faults(config)
-    found = {name: Case(policy, healthy) for policy, name in enumerate(POLICIES)}
+    found = {name: Case(policy, healthy) for policy, name in enumerate(mission.policies)}
     for r, name in enumerate(config.robot_names if len(config.carried) > 1 else ()):
         own = jnp.arange(len(config.carried)) == r
         alone = Faults(jnp.where(own, jnp.inf, 0.0), healthy.blind_at)
         failing = jnp.where(own, FAULT_TIME, jnp.inf)
-        found[f"{name}_alone"] = Case(LATENT, alone)
-        found[f"{name}_stops"] = Case(LATENT, Faults(failing, healthy.blind_at))
-        found[f"{name}_blind"] = Case(LATENT, Faults(healthy.stops_at, failing))
+        found[f"{name}_alone"] = Case(latent, alone)
+        found[f"{name}_stops"] = Case(latent, Faults(failing, healthy.blind_at))
+        found[f"{name}_blind"] = Case(latent, Faults(healthy.stops_at, failing))
     return found

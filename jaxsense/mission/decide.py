@@ -5,10 +5,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import KNOW_WAYS, POLICIES
-from jaxsense.core import networks
-from jaxsense.core.types import Belief, Index, Key, others
-from jaxsense.dqn import belief_mdp, policies, rules, team_mdp
+from jaxsense.core.types import Index, Key, others
+from jaxsense.dqn import team_mdp
+from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission import roadmap
 from jaxsense.mission.state import (
@@ -18,14 +17,13 @@ from jaxsense.mission.state import (
     FACING,
     FAILED,
     IDLE,
-    LATENT,
     Mission,
     MissionState,
     now,
     robot_of,
     with_robot,
 )
-from jaxsense.models import Models, expected, expected_gains
+from jaxsense.models import Models
 from jaxsense.sim import viewpoints
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
@@ -93,11 +91,13 @@ def _choose(
     config, robots = mission.config, state.robots
     settings, num_pois = config.mission, config.arena.num_pois
     given_up = robots.unreachable[robot] | robots.undetected[robot]
-    values = _values(key, mission, models, state, robot, given_up)
+    known = known_to(mission, state, robot, given_up)
+    values = _values(key, mission, models, known, state.policy)
+    counts_time = [policy.counts_time(models.agent) for policy in mission.policies.values()]
+    # Values that include travel time need no tie-breaking.
+    tolerance = jnp.where(jnp.array(counts_time), 0.0, settings.equal_values)[state.policy]
     of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
-    is_best = (of_pois >= jnp.max(of_pois) - _equal_values(mission, state)) & (
-        of_pois > values[num_pois]
-    )
+    is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > values[num_pois])
 
     place = state.scene.poses[robot, :2]
     distance = jnp.linalg.norm(state.scene.layout.position - place[None], axis=-1)
@@ -111,92 +111,39 @@ def _choose(
     return jnp.where(jnp.any(is_best), poi, num_pois)
 
 
-def _equal_values(mission: Mission, state: MissionState) -> jax.Array:
-    """`[]` difference of values that counts as none; 0 where ways are part of the values."""
-    knows_ways = [name in KNOW_WAYS for name in POLICIES]
-    if mission.config.dqn.task == "team":
-        knows_ways[LATENT] = True
-    of_policy = jnp.where(jnp.array(knows_ways), 0.0, mission.config.mission.equal_values)
-    return of_policy[state.policy]
-
-
 def _values(
-    key: Key,
-    mission: Mission,
-    models: Models,
-    state: MissionState,
-    robot: Index,
-    given_up: jax.Array,
+    key: Key, mission: Mission, models: Models, known: Known, policy: jax.Array
 ) -> jax.Array:
-    """`[N + 1]` values of the policy's actions, NOP's last."""
-    num_pois = mission.config.arena.num_pois
-    exact, is_seen = jnp.exp(state.log_posterior), jnp.any(state.seen, axis=-1)
-    modalities = jnp.array(mission.config.modality_of_robot)
-    modality = modalities[robot]
-    of_each = jax.tree.map(lambda *x: jnp.stack(x), *models.look_values)
-    looks = jax.tree.map(lambda x: x[modality], of_each)
-    known = models.readout, models.look_values, state.belief, is_seen
-    gains = expected_gains(*known)[modalities]
-    times = state.times_seen[:, modality]
-    team = team_of(mission, state, given_up)
-    ways = team_mdp.ways(mission.config.team.travel, team)
-    by_rule = gains, ways, team, jnp.asarray(robot)
-
-    of_pois = {
-        "greedy": gains[robot],
-        "bayes": expected(looks.gain, looks.first_gain, exact, is_seen),
-        "optimal": expected(looks.total, looks.first_total, exact, is_seen),
-        "naive": jnp.where(times < 1, 1.0, -1.0),
-        "naive_2": jnp.where(times < 2, 1.0, -1.0),
-        "naive_3": jnp.where(times < 3, 1.0, -1.0),
-    }
-    values = {
-        "latent": _q_values(mission, models, state, robot, given_up),
-        **{name: jnp.append(each, 0.0) for name, each in of_pois.items()},
-        "nearest": rules.nearest(*by_rule),
-        "auction": rules.auction(*by_rule),
-        "rollout": rules.rollout(*by_rule),
-        "random": jax.nn.one_hot(jax.random.randint(key, (), 0, num_pois + 1), num_pois + 1),
-    }
-    return jnp.stack([values[name] for name in POLICIES])[state.policy]
+    """`[N + 1]` values of a policy's actions, NOP's last."""
+    of_each = [each.values(key, models, known) for each in mission.policies.values()]
+    return jnp.stack(of_each)[policy]
 
 
-def _q_values(
-    mission: Mission, models: Models, state: MissionState, robot: Index, given_up: jax.Array
-) -> jax.Array:
-    """`[N + 1]` values of the trained policy."""
-    modality = jnp.array(mission.config.modality_of_robot)[robot]
-    q_network = jax.tree.map(lambda *x: jnp.stack(x)[modality], *models.q_networks)
+def known_to(mission: Mission, state: MissionState, robot: Index, given_up: jax.Array) -> Known:
+    """What a robot knows when it chooses.
 
-    if mission.config.dqn.task == "team":
-        known = state.belief, team_of(mission, state, given_up), jnp.asarray(robot)
-        config, number = mission.config, len(mission.config.modalities)
-        trained = q_network, models.tours
-        return policies.tour_values(*trained, *known, number, config.team, config.dqn)
-    network = policies.q_network(mission.config.arena.num_pois, mission.config.dqn.hidden)
-
-    def values_if(sure: Belief) -> jax.Array:
-        """The network's values as if all PoIs given up were known to be of one class."""
-        known = jax.tree.map(
-            lambda entry, sure: jnp.where(given_up[:, None], sure[None], entry), state.belief, sure
-        )
-        return networks.apply(network, q_network, belief_mdp.observation(known))
-
-    # The network would count on learning more about a PoI given up. Of a known one nothing is left
-    # to learn; since its class is unknown, all classes count alike.
-    return jnp.mean(jax.vmap(values_if)(models.class_beliefs), axis=0)
-
-
-def team_of(mission: Mission, state: MissionState, given_up: jax.Array) -> Team:
-    """Everybody's place as the travel model knows it, without PoIs `[N]` that are given up."""
+    Args:
+      mission: the mission.
+      state: the current state.
+      robot: index of the robot.
+      given_up: `[N]` bool, PoIs that the robot has given up.
+    """
     phase = state.robots.phase
-    return Team(
+    team = Team(
         positions=state.scene.layout.position,
         present=~given_up,
         poses=state.scene.poses,
         modality=jnp.array(mission.config.modality_of_robot),
         works=(phase != ENDED) & (phase != FAILED),
         target=state.robots.target,
+    )
+    return Known(
+        belief=state.belief,
+        looks=state.times_seen,
+        log_posterior=state.log_posterior,
+        team=team,
+        times=team_mdp.travel_times(mission.config.team.travel, team),
+        robot=jnp.asarray(robot),
     )
 
 

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense.config import Config
-from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import rewards
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
 from jaxsense.models import Models
-from jaxsense.vae import fusion, metrics
+from jaxsense.vae import latent
 
 REASONS = (
     "running",
@@ -56,11 +56,9 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
       and `reason`.
     """
     config = mission.config
-    means = models.class_beliefs.mean
-    shown = jax.vmap(lambda b: fusion.most_likely_class(models.jmvae, means, b))(state.belief)
-    plausible = jax.vmap(lambda b: metrics.plausible_classes(b, models.class_beliefs.mean))(
-        state.belief
-    )
+    means = models.fusion.classes.mean
+    shown = jax.vmap(models.fusion.most_likely_class)(state.belief)
+    plausible = jax.vmap(lambda b: latent.plausible_classes(b, means))(state.belief)
     is_seen = jnp.any(state.seen, axis=-1)
     is_right = is_seen & (shown == state.classes)
     told = {}
@@ -79,7 +77,7 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
         "collisions": state.contacts,
         "goals": jnp.sum(robots.goals),
         "goals_reached": jnp.sum(robots.reached),
-        "information": jnp.sum(belief_mdp.information(state.belief.std)),
+        "information": jnp.sum(rewards.information(state.belief.std)),
         "detections": robots.detections,
         "reason": reason(state),
     }

@@ -1,26 +1,24 @@
 """State of a mission, and its start."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import POLICIES, Config
+from jaxsense.config import Config, ConfigError
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, Key, pytree
+from jaxsense.dqn.policies import Policy, Values, table
 from jaxsense.mission import roadmap
 from jaxsense.mission.roadmap import Roadmap
-from jaxsense.models import make_jmvae
-from jaxsense.sim import arena as arenas
+from jaxsense.models import make_bayes, make_prior
+from jaxsense.sim import arena as arenas_of
 from jaxsense.sim import sensors
 from jaxsense.sim import world as worlds
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import Scene, World
-from jaxsense.vae import fusion
-
-LATENT = POLICIES.index("latent")
-"""Index of the trained policy."""
 
 IDLE, DRIVING, FACING, BACKING, ENDED, FAILED = range(6)
 """Phases of a robot: asking its policy, driving to a viewpoint, turning to a PoI and scanning it,
@@ -36,15 +34,24 @@ class Mission:
     Attributes:
       world: the simulation, with contacts or without.
       free_arena: its robots in an empty arena, see `motion.move`.
+      config: all settings.
+      policies: by name; a mission's policy is an index into them.
     """
 
     world: World
     free_arena: Arena
+    config: Config
+    policies: dict[str, Policy]
 
-    @property
-    def config(self) -> Config:
-        """All settings."""
-        return self.world.config
+    def policy(self, name: str) -> int:
+        """The index of a policy.
+
+        Raises:
+          ConfigError: if there is none of this name.
+        """
+        if name not in self.policies:
+            raise ConfigError("policy", name, f"must be one of {', '.join(self.policies)}")
+        return [*self.policies].index(name)
 
 
 @pytree
@@ -116,7 +123,7 @@ class MissionState:
       classes: `[N]` int32 true classes, hidden from the robots.
       roadmap: ways through the layout.
       faults: which robots will fail.
-      policy: `[]` int32 index into `POLICIES`.
+      policy: `[]` int32 index into `Mission.policies`; by default `latent`, the trained one.
       velocity: `[R, 3]` time derivative of the poses.
       warmstart: `[3 R]` MJX's last accelerations.
       belief: `[N, D]` the shared map.
@@ -185,17 +192,30 @@ class Record:
     clearance: jax.Array
 
 
-def make_mission(config: Config, *, contacts: bool = True) -> Mission:
-    """Compiles the arena of a mission, by default with contacts."""
-    world = worlds.make_world(config, config.carried, contacts=contacts)
+def make_mission(
+    config: Config,
+    policies: Mapping[str, Values | Policy] | None = None,
+    *,
+    contacts: bool = True,
+    arenas: tuple[Arena, Arena] | None = None,
+) -> Mission:
+    """Makes a mission.
+
+    Args:
+      config: all settings; numbers that are declared `Traced` may be traced.
+      policies: of your own, by name, besides `dqn.POLICIES`.
+      contacts: whether robots collide with PoIs, with each other and with the walls.
+      arenas: the arena and the empty arena of a mission with the same sizes, to reuse them; by
+        default they are compiled, which cannot be traced.
+    """
     carries_lidar = tuple(name == "lidar" for name in config.carried)
-    free = arenas.build(config.arena, carries_lidar, obstacles=False)
-    return Mission(world, free)
-
-
-def with_config(mission: Mission, config: Config) -> Mission:
-    """The same mission with other numbers, which may be traced; the arena stays as it is."""
-    return dataclasses.replace(mission, world=worlds.with_config(mission.world, config))
+    world, free = (None, None) if arenas is None else arenas
+    return Mission(
+        world=worlds.make_world(config, config.carried, arena=world, contacts=contacts),
+        free_arena=free or arenas_of.build(config.arena, carries_lidar, obstacles=False),
+        config=config,
+        policies=table(policies),
+    )
 
 
 def no_faults(config: Config) -> Faults:
@@ -207,7 +227,7 @@ def no_faults(config: Config) -> Faults:
 def reset(
     key: Key,
     mission: Mission,
-    policy: jax.Array | int = LATENT,
+    policy: jax.Array | int = 0,
     faults: Faults | None = None,
     classes: jax.Array | None = None,
 ) -> MissionState:
@@ -216,7 +236,7 @@ def reset(
     Args:
       key: random key, which alone determines the arena.
       mission: the mission.
-      policy: `[]` int32 index into `POLICIES`.
+      policy: `[]` int32 index into `Mission.policies`; by default `latent`, the trained one.
       faults: which robots will fail; none by default.
       classes: `[N]` int32 classes of the PoIs; independent by default.
 
@@ -228,7 +248,7 @@ def reset(
     num_pois = config.arena.num_pois
     if classes is None:
         classes = jax.random.randint(class_key, (num_pois,), 0, len(config.arena.classes))
-    layout = arenas.random_layout(layout_key, config.arena, classes)
+    layout = arenas_of.random_layout(layout_key, config.arena, classes)
     ways = roadmap.build(config, layout)
     poses = _random_poses(pose_key, config, layout, ways)
     scene = Scene(layout, sensors.random_light(light_key), poses)
@@ -250,10 +270,10 @@ def start(
     num_classes = len(config.arena.classes)
     chex.assert_shape(classes, (num_pois,), custom_message="classes")
     checks.require_index("classes", classes, num_classes)
-    checks.require_index("policy", policy, len(POLICIES))
+    checks.require_index("policy", policy, len(mission.policies))
     chex.assert_shape(scene.poses, (num_robots, 3), custom_message="scene.poses")
     _check_faults(faults, num_robots)
-    entry = fusion.unseen(make_jmvae(config), config.mdp.unseen_variance)
+    prior, exact = make_prior(config), make_bayes(config)
     ways = roadmap.build(config, scene.layout) if ways is None else ways
     return MissionState(
         scene=scene,
@@ -263,8 +283,8 @@ def start(
         policy=policy,
         velocity=jnp.zeros((num_robots, 3)),
         warmstart=jnp.zeros(3 * num_robots),
-        belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), entry),
-        log_posterior=jnp.full((num_pois, num_classes), -jnp.log(num_classes)),
+        belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), prior),
+        log_posterior=jnp.tile(exact.prior, (num_pois, 1)),
         times_seen=jnp.zeros((num_pois, len(config.modalities)), jnp.int32),
         version=jnp.int32(0),
         robots=_idle_robots(num_robots, *ways.is_free.shape),
@@ -310,7 +330,7 @@ def _idle_robots(num_robots: int, num_pois: int, num_views: int) -> Robots:
     )
 
 
-def _random_poses(key: Key, config: Config, layout: arenas.Layout, ways: Roadmap) -> jax.Array:
+def _random_poses(key: Key, config: Config, layout: arenas_of.Layout, ways: Roadmap) -> jax.Array:
     """Random `[R, 3]` poses with room around the robots and, where possible, ways to all PoIs."""
     num_robots, settings = len(config.carried), config.navigation
     draws = jax.random.uniform(key, (num_robots, 3, _FREE_DRAWS), minval=-1.0)

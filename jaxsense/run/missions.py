@@ -21,9 +21,9 @@ from jaxsense.mission.state import (
     Mission,
     MissionState,
     Record,
+    make_mission,
     no_faults,
     reset,
-    with_config,
 )
 from jaxsense.models import Models, init
 from jaxsense.run.compilation import Compiler, Program
@@ -95,10 +95,15 @@ class Player:
         chunk = chunk_of(config)
         self._lock = threading.Lock()
 
+        def with_numbers(config: Config) -> Mission:
+            return make_mission(
+                config, mission.policies, arenas=(mission.world.arena, mission.free_arena)
+            )
+
         def begin(
             key: Key, config: Config, episode: jax.Array, policies: jax.Array, faults: Faults
         ):
-            team = with_config(mission, config)
+            team = with_numbers(config)
 
             def begin_one(episode: jax.Array, policy: jax.Array, faults: Faults):
                 return reset(keys_of_episode(key, episode)[0], team, policy, faults)
@@ -113,7 +118,7 @@ class Player:
             number: jax.Array,
             state: MissionState,
         ):
-            team = with_config(mission, config)
+            team = with_numbers(config)
             keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(episode)
             keys = jax.vmap(jax.random.fold_in)(keys, number)
             state, records = rollout_batch(keys, team, models, state, chunk, share, parts)

@@ -22,7 +22,7 @@ class Stopped(Exception):  # noqa: N818 (nothing is wrong)
 
 def is_finite(values: Any) -> bool:
     """Whether all real numbers in arrays, or pytrees of them, are finite."""
-    leaves = [x for x in jax.tree.leaves(values) if jnp.issubdtype(x.dtype, jnp.inexact)]
+    leaves = [x for x in jax.tree.leaves(values) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
     return all(np.isfinite(leaf).all() for leaf in leaves)
 
 

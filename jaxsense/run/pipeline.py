@@ -94,9 +94,9 @@ def run(
     checkpoints = checkpoints or Checkpoints()
     trained = train(key, config, programs, monitor, checkpoints)
     networks = models(trained.outputs, config)
-    cases = mission.cases(config)
-    played = {name: cases[name] for name in config.mission.policies}
     player, episodes = programs.player.result(), config.mission.episodes
+    cases = mission.cases(player.mission)
+    played = {name: cases[name] for name in config.mission.policies}
     found = player.play(mission_key(key), networks, played, episodes)
     checkpoints.forget_unfinished()
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])

@@ -220,7 +220,7 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
     def finish(config: Config, state: Output, inputs: dict[str, Output]) -> Output:
         return stage.finish(config, state, **inputs)
 
-    if has_rows(stage):
+    if isinstance(compiled.begin, Program) and has_rows(stage):
         split = padded(inputs, programs.workers.number)
         output = compiled.begin.compile(
             begin, key, config, split, workers=programs.workers, whole=(0, 1)

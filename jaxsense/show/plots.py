@@ -23,7 +23,7 @@ from jaxsense.run.pipeline import RunResult
 from jaxsense.show import metrics
 from jaxsense.show.colours import RGB, as_srgb, class_colour
 from jaxsense.sim import sensors
-from jaxsense.vae.metrics import reliability
+from jaxsense.vae.calibration import reliability
 
 _MOST_ELLIPSES = 40
 _SMOOTHING = 20  # epochs

@@ -8,6 +8,7 @@ with contextlib.redirect_stdout(io.StringIO()):
     import mujoco.mjx as _  # noqa: F401
 
 from jaxsense.sim import sensors as sensors
+from jaxsense.sim import windows as windows
 from jaxsense.sim.arena import Arena as Arena
 from jaxsense.sim.arena import Layout as Layout
 from jaxsense.sim.arena import build as build
@@ -22,14 +23,16 @@ from jaxsense.sim.raycast import cast as cast
 from jaxsense.sim.raycast import cast_along as cast_along
 from jaxsense.sim.raycast import choose as choose
 from jaxsense.sim.raycast import cross_section as cross_section
+from jaxsense.sim.sensors import Fan as Fan
 from jaxsense.sim.sensors import Light as Light
+from jaxsense.sim.sensors import Pinhole as Pinhole
+from jaxsense.sim.sensors import Rays as Rays
 from jaxsense.sim.sensors import Sensor as Sensor
 from jaxsense.sim.sensors import Surfaces as Surfaces
-from jaxsense.sim.sensors import cut_out as cut_out
-from jaxsense.sim.sensors import fan as fan
 from jaxsense.sim.sensors import random_light as random_light
 from jaxsense.sim.sensors import scan as scan
 from jaxsense.sim.viewpoints import bearing as bearing
+from jaxsense.sim.windows import cut_out as cut_out
 from jaxsense.sim.world import Scene as Scene
 from jaxsense.sim.world import World as World
 from jaxsense.sim.world import look as look

@@ -1,38 +1,31 @@
-"""LiDAR scans and camera scanlines: thin layers over the ray-caster.
+"""Sensors: rays at one height of a robot, and what they read where they hit something.
 
-A sensor is a value: its rays, its height and how it turns hits into readings. `Config.sensors`
-names functions that make custom sensors; nothing else in the package names a sensor.
+A sensor is a value with methods. `Lidar` and `Camera` are built in; a sensor of your own is another
+subclass of `Sensor`, made by a function that `Config.sensors` names. Nothing else in the package
+asks which sensor it has.
 """
 
+import abc
 import dataclasses
-import hashlib
 import importlib
-import math
-from collections.abc import Callable
+from typing import Protocol
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from mujoco import mjx
 
-from jaxsense.config import (
-    LIDAR_HEIGHT,
-    ArenaConfig,
-    CameraConfig,
-    Config,
-    ConfigError,
-    LidarConfig,
-)
+from jaxsense.config import LIDAR_HEIGHT, CameraConfig, Config, ConfigError, LidarConfig
 from jaxsense.core import checks
-from jaxsense.core.types import Key, pytree
+from jaxsense.core.types import Index, Key, is_static, pytree
 from jaxsense.sim import amiro, disturbances, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
 
 _LEAST_CHROMA = 0.1  # difference of a pixel's channels, 0 on walls, robots and in the dark
 _RANGE_TOLERANCE = 5.0  # standard deviations of the LiDAR's noise
 _LEAST_RANGE_TOLERANCE = 0.001  # m, above the rounding of a distance
-_SHARE_OF_WIDTH = 0.7  # of a PoI, that a ray must meet
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour where a ray leaves the arena
 
 
@@ -56,62 +49,227 @@ Surfaces = dict[str, jax.Array]
 `arena.attributes`."""
 
 
-def _shows_all(readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
-    """Default of `Sensor.shows`: any ray can have met a PoI."""
-    del distance, extent
-    return jnp.ones(len(readings), bool)
+class Rays(Protocol):
+    """Directions of a sensor's rays; static, and so hashable."""
+
+    @property
+    def angles(self) -> np.ndarray:
+        """`[B]` float32 angles in the robot's frame, in radians, in the order of the readings."""
+        ...
+
+    def centre(self, bearing: jax.Array) -> jax.Array:
+        """Real index `[]` of the ray along a `[]` bearing, in radians."""
+        ...
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Sensor:
-    """A scanline sensor on a robot.
+@dataclasses.dataclass(frozen=True)
+class Fan:
+    """Rays at equal angles, from right to left.
 
     Attributes:
-      name: of the modality.
-      height: of its rays above the floor, in metres.
-      angles: `[B]` of its rays in the robot's frame, in radians, in the order of the readings.
-      centre: `bearing [] -> []` real index of the ray along a bearing, in radians.
-      window: number of rays that the detector reads.
-      read: `(key, hits of B rays, surfaces, light) -> [B, ...] readings`.
-      channels: numbers in the reading of one ray.
-      stride: step between the rays that the detector reads.
-      window_limit: highest reading in the detector's input.
-      shows: `(readings [B, ...], distance [], extent) -> [B]` bool, which rays can have met a PoI
-        of that extent [m] with its centre at that distance [m]; by default all.
-      lost: share of the rays that may read wrongly, on average.
-      blind: reading of every ray when the sensor has failed.
-      ray_bytes: size of one ray's reading in a ROS message.
+      num_rays: number of rays, B.
+      field_of_view: angle between the first and the last ray, in degrees.
     """
 
-    name: str
-    height: float
-    angles: np.ndarray
-    centre: Callable[[jax.Array], jax.Array]
-    window: int
-    read: Callable[[Key, raycast.Hit, Surfaces, Light], jax.Array]
-    channels: int = 1
-    stride: int = 1
-    window_limit: float = np.inf
-    shows: Callable[[jax.Array, jax.Array, float], jax.Array] = _shows_all
-    lost: float = 0.0
-    blind: float = 0.0
-    ray_bytes: int = 4  # float32
+    num_rays: int
+    field_of_view: float
+
+    def __post_init__(self):
+        checks.require_number("num_rays", self.num_rays)
+        is_angle = "must be above 0 and at most 360 degrees"
+        checks.require(
+            "field_of_view", self.field_of_view, lambda x: (x > 0) & (x <= 360), is_angle
+        )
+
+    @property
+    def _half(self) -> float:
+        return float(np.radians(self.field_of_view)) / 2
+
+    @property
+    def angles(self) -> np.ndarray:
+        """`[B]` float32 angles in the robot's frame, in radians."""
+        return np.linspace(-self._half, self._half, self.num_rays, dtype=np.float32)
+
+    def centre(self, bearing: jax.Array) -> jax.Array:
+        """Real index `[]` of the ray along a `[]` bearing, in radians."""
+        return (bearing + self._half) / (2 * self._half / max(self.num_rays - 1, 1))
+
+
+@dataclasses.dataclass(frozen=True)
+class Pinhole:
+    """Rays through the pixels of a pinhole camera's scanline, from left to right.
+
+    Attributes:
+      num_pixels: number of pixels, B.
+      field_of_view: angle between the outer edges of the first and the last pixel, in degrees.
+    """
+
+    num_pixels: int
+    field_of_view: float
+
+    def __post_init__(self):
+        checks.require_number("num_pixels", self.num_pixels)
+        is_angle = "must be above 0 and below 180 degrees"
+        checks.require("field_of_view", self.field_of_view, lambda x: (x > 0) & (x < 180), is_angle)
+
+    @property
+    def _middle(self) -> float:
+        return (self.num_pixels - 1) / 2
+
+    @property
+    def _focal_length(self) -> float:
+        return (self.num_pixels / 2) / float(np.tan(np.radians(self.field_of_view) / 2))
+
+    @property
+    def angles(self) -> np.ndarray:
+        """`[B]` float32 angles in the robot's frame, in radians."""
+        columns = np.arange(self.num_pixels)
+        return np.arctan((self._middle - columns) / self._focal_length).astype(np.float32)
+
+    def centre(self, bearing: jax.Array) -> jax.Array:
+        """Real index `[]` of the pixel along a `[]` bearing, in radians."""
+        return self._middle - self._focal_length * jnp.tan(bearing)
+
+
+class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
+    """A scanline sensor on a robot: a pytree with methods.
+
+    Subclasses define `read`, and `shows` if they can. They are dataclasses too, without a
+    decorator; their own fields are leaves unless declared `flax.struct.field(pytree_node=False)`.
+
+    Attributes:
+      name: of the modality; `make` sets it from the settings.
+      height: height of the rays above the floor, in metres; static.
+      rays: directions of the rays; static.
+      window: number of rays that the detector reads; static.
+      channels: numbers in the reading of one ray; static.
+      stride: step between the rays that the detector reads; static.
+      ray_bytes: size of one ray's reading in a ROS message; static.
+      window_limit: highest reading in the detector's input.
+      lost: mean share of rays with a wrong reading.
+      blind: reading of every ray when the sensor has failed.
+    """
+
+    name: str = struct.field(pytree_node=False, default="")
+    height: float = struct.field(pytree_node=False)
+    rays: Rays = struct.field(pytree_node=False)
+    window: int = struct.field(pytree_node=False)
+    channels: int = struct.field(pytree_node=False, default=1)
+    stride: int = struct.field(pytree_node=False, default=1)
+    ray_bytes: int = struct.field(pytree_node=False, default=4)  # float32
+    window_limit: float | jax.Array = np.inf
+    lost: float | jax.Array = 0.0
+    blind: float | jax.Array = 0.0
 
     def __post_init__(self):
         for field in ("window", "channels", "stride"):
             checks.require_number(field, getattr(self, field))
         checks.require_positive("height", self.height)
 
+    @abc.abstractmethod
+    def read(self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light) -> jax.Array:
+        """Turns the hits of one scan into readings, in pure JAX.
+
+        Args:
+          key: random key of the noise.
+          hits: `[B]` first hits of the rays.
+          surfaces: colour and attributes of each geom.
+          light: the light.
+
+        Returns:
+          `[B]` readings, or `[B, channels]` if there are several channels.
+        """
+
+    def shows(self, readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
+        """Which rays may have hit a PoI; by default all.
+
+        Args:
+          readings: `[B, ...]` readings.
+          distance: `[]` expected distance of the PoI's centre, in metres.
+          extent: greatest distance from the PoI's centre to its surface, in metres.
+
+        Returns:
+          `[B]` bool.
+        """
+        del distance, extent
+        return jnp.ones(len(readings), bool)
+
+    def centre(self, bearing: jax.Array) -> jax.Array:
+        """Real index `[]` of the ray along a `[]` bearing, in radians."""
+        return self.rays.centre(bearing)
+
+    @property
+    def angles(self) -> np.ndarray:
+        """`[B]` float32 angles of the rays in the robot's frame, in radians."""
+        return self.rays.angles
+
+    @property
+    def directions(self) -> np.ndarray:
+        """`[2, B]` float32 unit vectors along the rays in the robot's frame."""
+        angles = self.angles.astype(np.float64)
+        return np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
+
     @property
     def scan_bytes(self) -> int:
         """Size of a whole scan in a ROS message."""
         return self.ray_bytes * len(self.angles)
 
-    @property
-    def directions(self) -> np.ndarray:
-        """Unit vectors along the rays in the robot's frame, `[2, B]`."""
-        angles = self.angles.astype(np.float64)
-        return np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
+
+class Lidar(Sensor):
+    """The laser scanner: one distance in metres per beam, from right to left.
+
+    Attributes:
+      config: its settings.
+    """
+
+    config: LidarConfig
+
+    def read(self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light) -> jax.Array:
+        """See `Sensor.read`."""
+        del surfaces, light
+        return disturbances.measured_ranges(key, hits.distance, self.config)
+
+    def shows(self, readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
+        """Which beams read the distance of a PoI, within noise; see `Sensor.shows`."""
+        noise = self.config.range_noise + self.config.range_noise_growth * distance
+        tolerance = jnp.maximum(_RANGE_TOLERANCE * noise, _LEAST_RANGE_TOLERANCE)
+        return jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + tolerance
+
+
+class Camera(Sensor):
+    """The camera's scanline: linear RGB in [0, 1] per pixel, from left to right.
+
+    Attributes:
+      config: its settings.
+    """
+
+    config: CameraConfig
+
+    def read(self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light) -> jax.Array:
+        """See `Sensor.read`."""
+        normal_x, normal_y = hits.normal
+        facing = normal_x * light.direction[0] + normal_y * light.direction[1]
+        direct, gain = light.diffuse * jnp.maximum(facing, 0.0), None
+        if disturbances.changes_light(self.config):
+            gain, is_lit = disturbances.lighting(key, len(facing), self.config)
+            direct = direct * is_lit
+        shade = light.ambient + direct
+        noise = self.config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape))
+
+        def channel(given):
+            of_geom, of_background, noise, gain = given
+            lit = shade * raycast.choose(of_geom, hits.geom)
+            seen = jnp.where(hits.geom >= 0, lit, of_background)
+            return jnp.clip((seen if gain is None else seen * gain) + noise, 0.0, 1.0)
+
+        # A loop over the channels makes the compiler finish hits and noise before it shades them;
+        # fused with the ray-caster, each channel would cast the rays many times over.
+        return jax.lax.map(channel, (surfaces["colour"].T, jnp.array(_BACKGROUND), noise, gain)).T
+
+    def shows(self, readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
+        """Which pixels have a colour, unlike walls, robots and darkness; see `Sensor.shows`."""
+        del distance, extent
+        return readings.max(axis=-1) - readings.min(axis=-1) >= _LEAST_CHROMA
 
 
 def random_light(key: Key) -> Light:
@@ -123,94 +281,33 @@ def random_light(key: Key) -> Light:
     return Light(direction, diffuse=0.2 + 0.6 * diffuse, ambient=0.3 + 0.3 * ambient)
 
 
-def fan(num_rays: int, field_of_view: float) -> tuple[np.ndarray, Callable]:
-    """Spreads rays at equal angles, from right to left.
-
-    Args:
-      num_rays: how many.
-      field_of_view: angle between the first and the last, in degrees.
-
-    Returns:
-      A `Sensor`'s `angles` and `centre`.
-    """
-    checks.require_number("num_rays", num_rays)
-    is_angle = "must be above 0 and at most 360 degrees"
-    checks.require("field_of_view", field_of_view, lambda x: (x > 0) & (x <= 360), is_angle)
-    half = np.radians(field_of_view) / 2
-    angles = np.linspace(-half, half, num_rays, dtype=np.float32)
-    step = 2 * half / max(num_rays - 1, 1)
-    return angles, lambda bearing: (bearing + half) / step
-
-
-def lidar(config: LidarConfig) -> Sensor:
-    """The laser scanner: one distance in metres per beam, from right to left."""
-    angles, centre = fan(config.num_beams, config.field_of_view)
-
-    def read(key, hits, surfaces, light):
-        del surfaces, light
-        return disturbances.measured_ranges(key, hits.distance, config)
-
-    def shows(readings, distance, extent):
-        noise = config.range_noise + config.range_noise_growth * distance
-        tolerance = jnp.maximum(_RANGE_TOLERANCE * noise, _LEAST_RANGE_TOLERANCE)
-        return jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + tolerance
-
-    return Sensor(
+def lidar(config: LidarConfig) -> Lidar:
+    """Makes the laser scanner; its settings may be traced."""
+    return Lidar(
+        config,
         name="lidar",
         height=LIDAR_HEIGHT,
-        angles=angles,
-        centre=centre,
+        rays=Fan(config.num_beams, config.field_of_view),
         window=config.window,
-        read=read,
         stride=config.stride,
         window_limit=config.window_range,
-        shows=shows,
         lost=1 - (1 - config.dropout) * (1 - config.mixed_pixels),
         blind=config.max_range,
     )
 
 
-def camera(config: CameraConfig) -> Sensor:
-    """The camera's scanline: linear RGB in [0, 1] per pixel, from left to right."""
-    middle = (config.num_pixels - 1) / 2
-    focal_length = (config.num_pixels / 2) / np.tan(np.radians(config.field_of_view) / 2)
-    columns = np.arange(config.num_pixels)
-    angles = np.arctan((middle - columns) / focal_length).astype(np.float32)
-
-    def read(key, hits, surfaces, light):
-        normal_x, normal_y = hits.normal
-        facing = normal_x * light.direction[0] + normal_y * light.direction[1]
-        direct, gains = light.diffuse * jnp.maximum(facing, 0.0), ()
-        if disturbances.changes_light(config):
-            gain, is_lit = disturbances.lighting(key, len(facing), config)
-            direct, gains = direct * is_lit, (gain,)
-        shade = light.ambient + direct
-        noise = config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape))
-
-        def channel(of_geom, of_background, noise, *gain):
-            lit = shade * raycast.choose(of_geom, hits.geom)
-            seen = jnp.where(hits.geom >= 0, lit, of_background)
-            return jnp.clip(math.prod(gain, start=seen) + noise, 0.0, 1.0)
-
-        # A loop over the channels makes the compiler finish hits and noise before it shades them;
-        # fused with the ray-caster, each channel would cast the rays many times over.
-        inputs = surfaces["colour"].T, jnp.array(_BACKGROUND), noise, *gains
-        return jax.lax.map(lambda c: channel(*c), inputs).T
-
-    return Sensor(
+def camera(config: CameraConfig) -> Camera:
+    """Makes the camera; its settings may be traced."""
+    return Camera(
+        config,
         name="camera",
         height=amiro.CAMERA_HEIGHT,
-        angles=angles,
-        centre=lambda bearing: middle - focal_length * jnp.tan(bearing),
+        rays=Pinhole(config.num_pixels, config.field_of_view),
         window=config.window,
-        read=read,
         channels=3,
         stride=config.stride,
         window_limit=1.0,
-        shows=lambda readings, distance, extent: (
-            readings.max(axis=-1) - readings.min(axis=-1) >= _LEAST_CHROMA
-        ),
-        # In little light, it cannot tell a PoI from what covers it.
+        # In dim light it cannot tell a PoI from what covers it.
         lost=0.5 if disturbances.changes_light(config) else 0.0,
         ray_bytes=3,  # rgb8
     )
@@ -248,31 +345,6 @@ def _own(name: str, config: Config) -> Sensor:
     return dataclasses.replace(sensor, name=name)
 
 
-def fingerprints(config: Config) -> list[str]:
-    """Fingerprints of the custom sensors, which also cover what their functions compute.
-
-    Stored programs close over sensors, whose code is not in the configuration.
-    """
-    own = [sensor for sensor in make(config) if sensor.name in config.sensors]
-    return [_fingerprint(sensor, tuple(config.arena.attributes)) for sensor in own]
-
-
-def _fingerprint(sensor: Sensor, attributes: tuple[str, ...]) -> str:
-    def functions(key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light, x: jax.Array):
-        readings = sensor.read(key, hits, surfaces, light)
-        return readings, sensor.shows(readings, x, 0.1), sensor.centre(x)
-
-    rays = jnp.zeros(sensor.window)
-    hits = raycast.Hit(rays, rays.astype(jnp.int32), (rays, rays))
-    shown = {"colour": jnp.zeros((2, 3)), **{name: jnp.zeros(2) for name in attributes}}
-    light, x = Light(jnp.zeros(3), jnp.float32(0), jnp.float32(0)), jnp.float32(0)
-    program = jax.jit(functions).lower(jax.random.key(0), hits, shown, light, x).as_text()
-    settings = [getattr(sensor, f.name) for f in dataclasses.fields(sensor)]
-    text = repr([s for s in settings if not callable(s) and not isinstance(s, np.ndarray)])
-    whole = text.encode() + sensor.angles.tobytes() + program.encode()
-    return hashlib.sha256(whole).hexdigest()
-
-
 def surfaces(arena: Arena, layout: Layout) -> Surfaces:
     """Surfaces of all geoms: of PoIs from the layout, of others from model and settings."""
     poi = jnp.array(arena.poi_of_geom)
@@ -291,7 +363,7 @@ def scan(
     data: mjx.Data,
     layout: Layout,
     light: Light,
-    robot: int,
+    robot: Index,
     directions: jax.Array,
 ) -> jax.Array:
     """Scans along some rays of one robot's sensor.
@@ -313,105 +385,17 @@ def scan(
     chex.assert_shape(light.direction, (3,), custom_message="light.direction")
     check_layout(arena.config, layout)
     pose = robot_poses(data)[robot]
-    section = raycast.cross_section(arena, data, sensor.height, robot)
+    section = _section(arena, data, sensor.height, robot)
     in_world = raycast.turned((directions[0], directions[1]), pose[2])
     hits = raycast.cast_along(section, pose[:2], in_world)
     return sensor.read(key, hits, surfaces(arena, layout), light)
 
 
-def window_of(sensor: Sensor, values: np.ndarray, bearing: jax.Array) -> jax.Array:
-    """Values of those rays of a scan that the detector reads.
-
-    Args:
-      sensor: the sensor.
-      values: `[..., B]` of all rays, for example `sensor.angles`.
-      bearing: `[]` at the centre of these rays, in radians in the robot's frame; near the edge of
-        the field of view they stop at its last ray.
-
-    Returns:
-      `[..., window]` values.
-    """
-    chex.assert_rank(bearing, 0, custom_message="bearing")
-    *shape, number = values.shape
-    start = _first_ray(sensor, bearing)
-    # One slice of all rays a stride apart: XLA would recompute a list of indices for each ray, from
-    # the bearing on.
-    padded = np.pad(values, [(0, 0)] * len(shape) + [(0, -number % sensor.stride)])
-    strided = jnp.array(padded.reshape(*shape, -1, sensor.stride))
-    place = [0] * len(shape) + [start // sensor.stride, start % sensor.stride]
-    return jax.lax.dynamic_slice(strided, place, (*shape, sensor.window, 1))[..., 0]
-
-
-def _first_ray(sensor: Sensor, bearing: jax.Array) -> jax.Array:
-    """Index of the first ray that the detector reads around a bearing, `[]` int32."""
-    span = (sensor.window - 1) * sensor.stride
-    start = jnp.round(sensor.centre(bearing) - span / 2).astype(jnp.int32)
-    return jnp.clip(start, 0, len(sensor.angles) - 1 - span)
-
-
-def cut_out(sensor: Sensor, readings: jax.Array | np.ndarray, bearing: jax.Array | float):
-    """Cuts the detector's input out of a whole scan, recorded or simulated.
-
-    Args:
-      sensor: the sensor.
-      readings: `[B, ...]` of all its rays in their order: a LiDAR's in metres from right to left, a
-        camera's as linear RGB in [0, 1] from left to right.
-      bearing: `[]` of the PoI in the robot's frame, in radians, positive to the left.
-
-    Returns:
-      `[F]` input of `vae.detect`.
-    """
-    channels = () if sensor.channels == 1 else (sensor.channels,)
-    shape = (len(sensor.angles), *channels)
-    chex.assert_shape(readings, shape, custom_message=f"readings of {sensor.name}")
-    is_turn = "must be within -pi and pi: it is in radians"
-    checks.require("bearing", bearing, lambda x: np.abs(x) <= np.pi, is_turn)
-    dtype = jnp.result_type(readings)
-    if jnp.issubdtype(dtype, jnp.integer):
-        reason = "must be real numbers, in metres or from 0 to 1"
-        raise ValueError(f"readings of dtype {dtype}: {reason}")
-    at_least = "must be a number that is not negative"
-    checks.require(f"readings of {sensor.name}", readings, lambda x: x >= 0, at_least)
-    bearing = jnp.asarray(bearing, jnp.float32)
-    rays = _first_ray(sensor, bearing) + sensor.stride * jnp.arange(sensor.window)
-    return as_window(sensor, jnp.asarray(readings, jnp.float32)[rays])
-
-
-def shows_poi(
-    sensor: Sensor,
-    readings: jax.Array,
-    bearing: jax.Array,
-    distance: jax.Array,
-    arena: ArenaConfig,
-    bearing_error: jax.Array | float = 0.0,
-) -> jax.Array:
-    """Whether readings may show a PoI where it is expected.
-
-    The LiDAR judges by distance. The camera distinguishes a PoI from walls, robots and darkness by
-    its colour, but not from another PoI before or behind it: good viewpoints have none there.
-
-    Args:
-      sensor: the sensor.
-      readings: `[window, ...]` of the rays around the bearing.
-      bearing: `[]` at which the PoI is expected, in radians in the robot's frame.
-      distance: `[]` at which its centre is expected, in metres.
-      arena: sizes of PoIs.
-      bearing_error: `[]` largest error of the bearing, in radians.
-
-    Returns:
-      `[]` bool: a ray that may meet a PoI of this size can have met one, and so can all that must,
-      except for twice the share that the sensor loses on average. False for a covered or absent
-      PoI, or a failed sensor; of a camera whose light changes, for a failed one only.
-    """
-    angles = jnp.abs(window_of(sensor, sensor.angles, bearing) - bearing)
-    half_width = jnp.arcsin(jnp.minimum(arena.poi_half_width / distance, 1.0))
-    shows = sensor.shows(readings, distance, arena.poi_extent)
-    must = angles <= jnp.minimum(_SHARE_OF_WIDTH * half_width, half_width - bearing_error)
-    may = angles <= half_width + bearing_error
-    return jnp.any(may & shows) & (jnp.sum(must & ~shows) <= 2 * sensor.lost * jnp.sum(must))
-
-
-def as_window(sensor: Sensor, readings: jax.Array) -> jax.Array:
-    """Input of the detector, `[F]`, from the `[window, ...]` readings of its rays."""
-    chex.assert_axis_dimension(readings, 0, sensor.window, custom_message="readings")
-    return jnp.minimum(readings, sensor.window_limit).reshape(-1)
+def _section(arena: Arena, data: mjx.Data, height: float, robot: Index) -> raycast.CrossSection:
+    """The scene at a height, without the robot that looks."""
+    if is_static(robot):
+        return raycast.cross_section(arena, data, height, int(robot))
+    # Rays pass through outlines of no size.
+    section = raycast.cross_section(arena, data, height, -1)
+    is_own = jnp.array(arena.robot_of_geom[list(section.geom)]) == robot
+    return dataclasses.replace(section, half=jnp.where(is_own[:, None], 0.0, section.half))

@@ -1,33 +1,33 @@
 """Looks at points of interest in simulated arenas: the simulator's interface for training."""
 
 import dataclasses
-import functools
 
 import chex
 import jax
 import jax.numpy as jnp
+from flax import struct
 from mujoco import mjx
 
-from jaxsense.config import Config
+from jaxsense.config import Config, ViewpointConfig
 from jaxsense.core import checks
-from jaxsense.core.types import Key, others, pytree
+from jaxsense.core.types import Index, Key, others, pytree
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import sensors, viewpoints
+from jaxsense.sim import sensors, viewpoints, windows
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@struct.dataclass
 class World:
-    """The parts of a simulation that all scenes share. Static under `jit`.
+    """A simulation: what all its scenes share.
 
     Attributes:
-      config: all settings.
-      arena: the compiled arena.
-      sensors: the sensor of each modality; in a training robot m carries the m-th.
+      arena: the compiled arena; static.
+      sensors: the sensor of each modality; in training robot m carries the m-th.
+      viewpoint: the settings of viewpoints.
     """
 
-    config: Config
-    arena: arenas.Arena
+    arena: arenas.Arena = struct.field(pytree_node=False)
     sensors: tuple[sensors.Sensor, ...]
+    viewpoint: ViewpointConfig
 
 
 @pytree
@@ -46,24 +46,33 @@ class Scene:
 
 
 def make_world(
-    config: Config, robots: tuple[str, ...] | None = None, *, contacts: bool = False
+    config: Config,
+    robots: tuple[str, ...] | None = None,
+    *,
+    arena: arenas.Arena | None = None,
+    contacts: bool = False,
 ) -> World:
-    """Compiles the arena that `config` describes.
+    """Makes the simulation that `config` describes.
 
     Args:
-      config: all settings.
-      robots: the modality of each robot; by default one robot for each of `config.modalities`, as a
+      config: all settings; numbers that are declared `Traced` may be traced.
+      robots: the modality of each robot; by default one robot for each of `config.modalities`, as
         training needs.
+      arena: a compiled arena to reuse; by default it is compiled, which cannot be traced.
       contacts: see `arena.build`.
+
+    Returns:
+      The simulation.
+
+    Raises:
+      ValueError: if `arena` was compiled from other settings than `config.arena`.
     """
-    carries_lidar = tuple(name == "lidar" for name in robots or config.modalities)
-    arena = arenas.build(config.arena, carries_lidar, contacts=contacts)
-    return World(config, arena, sensors.make(config))
-
-
-def with_config(world: World, config: Config) -> World:
-    """Replaces a simulation's numbers, which may be traced; the arena stays the same."""
-    return dataclasses.replace(world, config=config, sensors=sensors.make(config))
+    if arena is None:
+        carries_lidar = tuple(name == "lidar" for name in robots or config.modalities)
+        arena = arenas.build(config.arena, carries_lidar, contacts=contacts)
+    elif arena.config != config.arena:
+        raise ValueError("arena: must be compiled from config.arena; it has other settings")
+    return World(arena, sensors.make(config), config.viewpoint)
 
 
 def random_scene(key: Key, world: World, classes: jax.Array) -> Scene:
@@ -78,8 +87,8 @@ def random_scene(key: Key, world: World, classes: jax.Array) -> Scene:
       The scene. Every robot stands at a random viewpoint of a random PoI.
     """
     layout_key, light_key, poi_key, *robot_keys = jax.random.split(key, 3 + len(world.sensors))
-    layout = arenas.random_layout(layout_key, world.config.arena, classes)
-    pois = jax.random.randint(poi_key, (len(robot_keys),), 0, world.config.arena.num_pois)
+    layout = arenas.random_layout(layout_key, world.arena.config, classes)
+    pois = jax.random.randint(poi_key, (len(robot_keys),), 0, world.arena.config.num_pois)
     poses = jnp.zeros((0, 3))
     for robot_key, poi in zip(robot_keys, pois, strict=True):
         pose, _ = _viewpoint(robot_key, world, layout, poses, poi)
@@ -107,15 +116,15 @@ def look(
     if not 0 <= robot < len(world.sensors):
         raise ValueError(f"robot = {robot}: must be one of the {len(world.sensors)} robots")
     chex.assert_rank(poi, 0, custom_message="poi")
-    checks.require_index("poi", poi, world.config.arena.num_pois)
+    checks.require_index("poi", poi, world.arena.config.num_pois)
     checks.require_finite("scene.poses", scene.poses)
     viewpoint_key, noise_key = jax.random.split(key)
     others = jnp.delete(scene.poses, robot, axis=0)
     pose, bearing = _viewpoint(viewpoint_key, world, scene.layout, others, poi)
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
     data = arenas.place(world.arena, scene.layout, scene.poses)
-    readings = scan_around(noise_key, world, scene, data, robot, bearing)
-    return sensors.as_window(world.sensors[robot], readings), scene
+    readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
+    return windows.as_window(world.sensors[robot], readings), scene
 
 
 def scan_around(
@@ -123,26 +132,27 @@ def scan_around(
     world: World,
     scene: Scene,
     data: mjx.Data,
-    robot: int,
+    robot: Index,
     bearing: jax.Array,
-    modality: int | None = None,
+    modality: int,
 ) -> jax.Array:
-    """Readings of a robot's sensor around a bearing from its current place.
+    """Scans around a bearing from where a robot stands.
 
     Args:
       key: random key of the noise.
       world: the simulation.
       scene: the scene.
       data: the MJX state of the scene, from `place`.
-      robot: index of the robot; static.
+      robot: index of the robot, which may be traced; a static one is a little faster, as it leaves
+        the robot's own parts out of the program.
       bearing: `[]` in the robot's frame, in radians.
-      modality: index of the robot's sensor; static, by default that of the robot.
+      modality: index of the robot's sensor; static, as sensors have different shapes.
 
     Returns:
       `[window, ...]` readings of the rays that the detector reads.
     """
-    sensor = world.sensors[robot if modality is None else modality]
-    rays = sensors.window_of(sensor, sensor.directions, bearing)
+    sensor = world.sensors[modality]
+    rays = windows.window_of(sensor, sensor.directions, bearing)
     return sensors.scan(key, sensor, world.arena, data, scene.layout, scene.light, robot, rays)
 
 
@@ -159,7 +169,7 @@ def survey(key: Key, world: World, classes: jax.Array) -> tuple[Scene, tuple[jax
     """
     scene_key, viewpoint_key, noise_key = jax.random.split(key, 3)
     scene = random_scene(scene_key, world, classes)
-    robots, pois = jnp.arange(len(world.sensors)), jnp.arange(world.config.arena.num_pois)
+    robots, pois = jnp.arange(len(world.sensors)), jnp.arange(world.arena.config.num_pois)
     shape = (len(robots), len(pois))
 
     def stand(key: Key, robot: jax.Array, poi: jax.Array):
@@ -172,21 +182,21 @@ def survey(key: Key, world: World, classes: jax.Array) -> tuple[Scene, tuple[jax
     each = jax.vmap(of_pois, in_axes=(0, 0, None))
     poses, bearing, data = each(jax.random.split(viewpoint_key, shape), robots, pois)
 
-    def read(robot: int, key: Key, poses: jax.Array, bearing: jax.Array, data: mjx.Data):
-        stood = dataclasses.replace(scene, poses=poses)
-        readings = scan_around(key, world, stood, data, robot, bearing)
-        return sensors.as_window(world.sensors[robot], readings)
+    noise_keys = jax.random.split(noise_key, shape)
 
-    inputs = jax.random.split(noise_key, shape), poses, bearing, data
-    windows = tuple(
-        jax.vmap(functools.partial(read, robot))(*jax.tree.map(lambda x: x[robot], inputs))  # noqa: B023
-        for robot in range(len(world.sensors))
-    )
-    return scene, windows
+    def read_all(robot: int) -> jax.Array:
+        def read(key: Key, poses: jax.Array, bearing: jax.Array, data: mjx.Data) -> jax.Array:
+            stood = dataclasses.replace(scene, poses=poses)
+            readings = scan_around(key, world, stood, data, robot, bearing, robot)
+            return windows.as_window(world.sensors[robot], readings)
+
+        of_robot = jax.tree.map(lambda x: x[robot], data)
+        return jax.vmap(read)(noise_keys[robot], poses[robot], bearing[robot], of_robot)
+
+    return scene, tuple(map(read_all, range(len(world.sensors))))
 
 
 def _viewpoint(key: Key, world: World, layout: arenas.Layout, others: jax.Array, poi: jax.Array):
-    config = world.config
     return viewpoints.random_viewpoint(
-        key, config.viewpoint, config.arena, layout, others[:, :2], poi
+        key, world.viewpoint, world.arena.config, layout, others[:, :2], poi
     )

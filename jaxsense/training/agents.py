@@ -1,6 +1,7 @@
 """Stages of agents: the values of looks, Q-learning, and the order of a team's looks."""
 
 from collections.abc import Callable
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from jaxsense.dqn.environments import Environment
 from jaxsense.dqn.map_mdp import Looks, MapMdp, MapState
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import expected_gains
-from jaxsense.dqn.team_mdp import TeamState
+from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.dqn.tours import Trials
 from jaxsense.looks import Bank, Live
 from jaxsense.models import make_agent, make_bayes, make_prior
@@ -90,7 +91,7 @@ def agent_stages(arena: Arena, config: Config) -> list[Stage]:
         learning = environment(config, jnp.int32(0), detections, **inputs)
         if not detections.starts.classes.shape[0]:
             return dqn.starts(key, learning, config.dqn)
-        return _surveyed_starts(key, learning.mdp, detections.starts, config.dqn.num_starts)
+        return _surveyed_starts(key, learning.mdp.map, detections.starts, config.dqn.num_starts)
 
     def begin(
         key: Key, config: Config, *, modality: jax.Array, starts: Output, **inputs: Output
@@ -167,10 +168,10 @@ def _surveyed_starts(key: Key, mdp: MapMdp, starts: Starts, number: int) -> MapS
 
 def tour_stages(config: Config) -> list[Stage]:
     """The training of the network that orders a team's looks, see `tours`."""
-    agent = make_agent(config)
-    if not agent.counts_time:
+    agent, settings = make_agent(config), config.team.tours
+    network = agent.tour_network
+    if network is None:
         return []
-    network, settings = agent.network, config.team.tours
     size, chunks = chunk_size(settings.steps), num_chunks(settings.steps)
     number = -(-settings.states // chunks)  # of states in which each chunk tries choices
 
@@ -192,7 +193,7 @@ def tour_stages(config: Config) -> list[Stage]:
         fit, trials = state
         settings = config.team.tours
         try_key, draw_key = jax.random.split(key)
-        mdp = mdp_of(config, fusion, Bank(detections.bank))
+        mdp = cast("TeamMdp", mdp_of(config, fusion, Bank(detections.bank)))
         followed = _auction(config, fusion, look_values)
         found = tours.try_choices(try_key, mdp, followed, settings, number)
         trials = tours.write(trials, found, fit.step // size * number)
