@@ -46,7 +46,7 @@ def rays(options: Options) -> Row:
 
 def _random_scenes(key: jax.Array, world: World, batch: int) -> mjx.Data:
     """`[B]` MJX states after kinematics, each robot at a viewpoint of a PoI."""
-    config = world.config.arena
+    config = world.arena.config
     class_key, scene_key = jax.random.split(key)
     classes = jax.random.randint(class_key, (batch, config.num_pois), 0, len(config.classes))
 

@@ -19,29 +19,23 @@ ROOM = 20.0  # degrees Celsius
 NOISE = 1.0  # degrees Celsius
 
 
-def thermal(config: Config) -> sim.Sensor:
-    """The sensor: one temperature for each of 64 rays over 60 degrees."""
-    angles, centre = sim.fan(num_rays=64, field_of_view=60.0)
+class Thermal(sim.Sensor):
+    """A thermal camera: one temperature per ray."""
 
-    def read(key: jax.Array, hits: sim.Hit, surfaces: sim.Surfaces, light: sim.Light) -> jax.Array:
+    def read(self, key, hits, surfaces, light):
+        """Temperatures in degrees Celsius."""
         temperature = sim.choose(surfaces["temperature"], hits.geom)
         temperature = jnp.where(hits.geom >= 0, temperature, ROOM)
         return temperature + NOISE * jax.random.normal(key, temperature.shape)
 
-    def shows(readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
-        # Whether there can be a PoI at all: even a cold one is warmer than the walls.
+    def shows(self, readings, distance, extent):
+        """Which rays may have hit a PoI: even a cold one is warmer than the walls."""
         return readings > ROOM + 4 * NOISE
 
-    return sim.Sensor(
-        name="thermal",
-        height=0.06,  # m
-        angles=angles,
-        centre=centre,
-        window=24,
-        read=read,
-        shows=shows,
-        blind=ROOM,
-    )
+
+def thermal(config: Config) -> sim.Sensor:
+    """Makes the sensor: 64 rays over 60 degrees, 0.06 m above the floor."""
+    return Thermal(height=0.06, rays=sim.Fan(64, 60.0), window=24, blind=ROOM)
 
 
 def change(config: Config) -> Config:

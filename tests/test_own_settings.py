@@ -45,11 +45,13 @@ def own_sensors(monkeypatch):
     return module
 
 
+class Thermal(sim.Sensor):
+    def read(self, key, hits, surfaces, light):
+        return hits.distance
+
+
 def thermal(config, **changed):
-    angles, centre = sim.fan(32, 60.0)
-    read = lambda key, hits, surfaces, light: hits.distance  # noqa: E731
-    inputs = {"height": 0.1, "angles": angles, "centre": centre, "window": 8, "read": read}
-    return sim.Sensor("any", **{**inputs, **changed})
+    return Thermal(**{"height": 0.1, "rays": sim.Fan(32, 60.0), "window": 8, **changed})
 
 
 def test_settings_survive_json():

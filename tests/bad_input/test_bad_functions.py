@@ -145,12 +145,12 @@ FUNCTIONS = {
         ),
         "length of direction = ",
     ),
-    "fan": (lambda w: sim.fan(0, 90.0), "num_rays = 0: must be a whole number greater than 0"),
-    "fan real": (lambda w: sim.fan(1.5, 90.0), "num_rays = 1.5"),
-    "fan bool": (lambda w: sim.fan(True, 90.0), "num_rays = True"),
-    "fan angle": (lambda w: sim.fan(3, 400.0), "field_of_view = 400.0: must be above 0"),
-    "fan nan": (lambda w: sim.fan(3, NAN), "field_of_view = nan"),
-    "fan negative": (lambda w: sim.fan(3, -90.0), "field_of_view = -90.0"),
+    "fan": (lambda w: sim.Fan(0, 90.0), "num_rays = 0: must be a whole number greater than 0"),
+    "fan real": (lambda w: sim.Fan(1.5, 90.0), "num_rays = 1.5"),
+    "fan bool": (lambda w: sim.Fan(True, 90.0), "num_rays = True"),
+    "fan angle": (lambda w: sim.Fan(3, 400.0), "field_of_view = 400.0: must be above 0"),
+    "fan nan": (lambda w: sim.Fan(3, NAN), "field_of_view = nan"),
+    "fan negative": (lambda w: sim.Fan(3, -90.0), "field_of_view = -90.0"),
     "cut_out nan": (lambda w: sim.cut_out(w.lidar, np.full(683, NAN), 0.0), "readings of lidar ="),
     "cut_out negative": (lambda w: sim.cut_out(w.lidar, np.full(683, -1.0), 0.0), "= -1.0: must"),
     "cut_out length": (lambda w: sim.cut_out(w.lidar, np.zeros(5), 0.0), "readings of lidar"),
@@ -397,7 +397,7 @@ def test_functions_refuse(given_world, name):
     ],
 )
 def test_a_mission_refuses(given_world, inputs, expected):
-    team = mission.Mission(given_world.world, given_world.world.arena)
+    team = mission.Mission(given_world.world, given_world.world.arena, SMOKE)
     base = {"classes": given_world.classes, "policy": 0, "faults": mission.no_faults(SMOKE)}
     with pytest.raises(ValueError, match=re.escape(expected)):
         mission.start(team, given_world.scene, **{**base, **inputs})

@@ -11,7 +11,7 @@ from teams import CONFIG, alone
 from jaxsense.mission import act
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults, with_config
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import sensors, world
+from jaxsense.sim import windows, world
 
 # PoI 0 is 0.8 m ahead of the robot under test, a red cube.
 POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
@@ -136,8 +136,10 @@ def test_a_poi_that_is_not_where_it_is_expected_is_not_shown(facing, robot, team
     @jax.jit
     def shows(scene, distance):
         data = arenas.place(team.world.arena, scene.layout, scene.poses)
-        readings = world.scan_around(jax.random.key(1), team.world, scene, data, robot, bearing)
-        return sensors.shows_poi(sensor, readings, bearing, distance, CONFIG.arena)
+        readings = world.scan_around(
+            jax.random.key(1), team.world, scene, data, robot, bearing, robot
+        )
+        return windows.shows_poi(sensor, readings, bearing, distance, CONFIG.arena)
 
     assert shows(scene, 0.8)
     assert not shows(gone, 0.8)

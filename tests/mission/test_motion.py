@@ -18,7 +18,7 @@ POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
 @pytest.mark.slow  # a minute, mostly compiling; before a release
 def test_missions_with_contacts_always_and_never_computed_take_the_same_decisions(team, models):
     never = mission.make_mission(CONFIG, contacts=False)
-    always = mission.Mission(team.world, team.world.arena)
+    always = mission.Mission(team.world, team.world.arena, team.config)
     keys = jax.random.split(jax.random.key(2), 6)
     records = []
     for each in (never, always):
@@ -54,7 +54,7 @@ def move(team):
     def of_three(states, pull):
         model = team.free_arena.model
         model = model.replace(actuator_gainprm=pull * model.actuator_gainprm)
-        weaker = mission.Mission(team.world, replace(team.free_arena, model=model))
+        weaker = mission.Mission(team.world, replace(team.free_arena, model=model), team.config)
         return motion.move(weaker, states)
 
     return lambda states, pull=1.0: of_three(states, jnp.float32(pull))

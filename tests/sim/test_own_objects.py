@@ -1,7 +1,5 @@
 """Colours, shapes and attributes that a user has declared, in arena and sensors."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +8,7 @@ import pytest
 from jaxsense import sim
 from jaxsense.config import ArenaConfig, Attribute, CameraConfig, Config, LidarConfig, Shape
 from jaxsense.mission import navigation
-from jaxsense.sim import sensors
+from jaxsense.sim import sensors, windows
 
 LIGHT = sim.Light(jnp.array([0.8, 0.0, 0.6]), diffuse=jnp.float32(0.5), ambient=jnp.float32(0.25))
 CONFIG = ArenaConfig(
@@ -87,11 +85,11 @@ def test_a_cylinder_is_as_high_as_all_pois_whatever_its_radius():
 def test_a_narrow_poi_is_looked_for_where_it_is():
     # The post at 1 m is 0.05 rad to either side; at 0.06 rad a beam reads the wall behind it.
     lidar = sensors.lidar(LidarConfig())
-    angles = sensors.window_of(lidar, lidar.angles, jnp.float32(0.0))
+    angles = windows.window_of(lidar, lidar.angles, jnp.float32(0.0))
     readings = jnp.where(jnp.abs(angles) < 0.05, 0.95, 1.4)
     inputs = lidar, readings, jnp.float32(0.0), jnp.float32(1.0)
-    assert sensors.shows_poi(*inputs, CONFIG)
-    assert not sensors.shows_poi(*inputs, ArenaConfig())
+    assert windows.shows_poi(*inputs, CONFIG)
+    assert not windows.shows_poi(*inputs, ArenaConfig())
 
 
 def test_a_recorded_scan_is_cut_where_the_simulated_one_is():
@@ -99,7 +97,7 @@ def test_a_recorded_scan_is_cut_where_the_simulated_one_is():
         shape = (len(sensor.angles), 3) if sensor.channels == 3 else (len(sensor.angles),)
         scan = np.random.default_rng(0).uniform(0.0, 2.0, shape)  # float64, as NumPy records
         for bearing in (-0.9, 0.123, 0.6):
-            rows = sensors.window_of(sensor, np.arange(len(scan)), jnp.float32(bearing))
+            rows = windows.window_of(sensor, np.arange(len(scan)), jnp.float32(bearing))
             expected = np.minimum(scan[np.asarray(rows)], sensor.window_limit).reshape(-1)
             found = sim.cut_out(sensor, scan, bearing)
             np.testing.assert_allclose(found, expected.astype(np.float32))
@@ -111,30 +109,3 @@ def test_bearings_are_counted_from_the_heading_to_the_left():
     pose, place = np.array([1.0, 0.0, np.pi / 2]), np.array([0.0, 0.0])
     assert sim.bearing(pose, place) == pytest.approx(np.pi / 2, abs=1e-6)
     assert sim.bearing(pose, np.array([2.0, 1.0])) == pytest.approx(-np.pi / 4, abs=1e-6)
-
-
-def test_a_sensor_of_ones_own_is_told_from_another_by_what_it_computes():
-    table = np.array([1.0, 2.0])
-
-    def sensor(factor, table=table, height=0.1):
-        angles, centre = sim.fan(32, 60.0)
-
-        def read(key, hits, surfaces, light):
-            return factor * hits.distance + jnp.asarray(table).sum() * surfaces["temperature"][0]
-
-        return sim.Sensor("own", height, angles, centre, window=8, read=read)
-
-    def fingerprint(made):
-        return sensors._fingerprint(made, ("temperature",))
-
-    first = fingerprint(sensor(1.0))
-    assert fingerprint(sensor(1.0)) == first
-    others = (
-        sensor(2.0),
-        sensor(1.0, table + 1),
-        sensor(1.0, height=0.2),
-        dataclasses.replace(sensor(1.0), centre=lambda bearing: bearing),
-        dataclasses.replace(sensor(1.0), shows=lambda readings, distance, extent: readings > 1),
-        dataclasses.replace(sensor(1.0), angles=sim.fan(32, 50.0)[0]),
-    )
-    assert len({first, *map(fingerprint, others)}) == 1 + len(others)

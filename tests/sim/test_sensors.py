@@ -8,7 +8,7 @@ import pytest
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig, CameraConfig, Config, LidarConfig
-from jaxsense.sim import sensors
+from jaxsense.sim import sensors, windows
 from jaxsense.sim.raycast import Hit
 
 # Towards +x and up by an elevation whose cosine is 0.8.
@@ -218,14 +218,14 @@ def test_rays_of_a_window_read_what_they_do_in_a_full_scan(
 ):
     data = place(known_layout, FACE_TO_FACE)
 
-    def windows(data, bearing):
+    def looks(data, bearing):
         for robot, sensor in enumerate(noiseless):
-            angles = sensors.window_of(sensor, sensor.angles, bearing)
-            rays = sensors.window_of(sensor, sensor.directions, bearing)
+            angles = windows.window_of(sensor, sensor.angles, bearing)
+            rays = windows.window_of(sensor, sensor.directions, bearing)
             key = jax.random.key(3)
             yield angles, sim.scan(key, sensor, arena, data, known_layout, LIGHT, robot, rays)
 
-    windows_at = jax.jit(lambda *args: tuple(windows(*args)))
+    windows_at = jax.jit(lambda *args: tuple(looks(*args)))
     for bearing in (-0.3, 0.05):
         of_robots = windows_at(data, jnp.float32(bearing))
         for sensor, (angles, readings), full in zip(noiseless, of_robots, view, strict=True):
@@ -234,7 +234,7 @@ def test_rays_of_a_window_read_what_they_do_in_a_full_scan(
 
 def test_windows_are_centred_on_the_bearing(noiseless):
     for sensor in noiseless:
-        rays = rays_of(sensor, sensors.window_of(sensor, sensor.angles, jnp.float32(0.2)))
+        rays = rays_of(sensor, windows.window_of(sensor, sensor.angles, jnp.float32(0.2)))
         assert rays.shape == (sensor.window,)
         np.testing.assert_array_equal(np.diff(rays), sensor.stride)
         # Between the two rays in its middle, 0.2 rad, to within half a ray.
@@ -249,15 +249,15 @@ def test_windows_stop_at_the_edges(noiseless):
     # 79 * 4 = 316; 128 beams span 127.
     cases = (camera, 0.69, 0), (camera, -0.69, 639 - 316), (lidar, 2.0, 682 - 127), (lidar, -2.0, 0)
     for sensor, bearing, first in cases:
-        rays = rays_of(sensor, sensors.window_of(sensor, sensor.angles, jnp.float32(bearing)))
+        rays = rays_of(sensor, windows.window_of(sensor, sensor.angles, jnp.float32(bearing)))
         np.testing.assert_array_equal(rays, first + sensor.stride * np.arange(sensor.window))
 
 
 def test_detector_input_is_flat_and_cut_off(noiseless):
     camera, lidar = noiseless
     ranges = jnp.linspace(0.0, 3.0, 128)
-    np.testing.assert_allclose(sensors.as_window(lidar, ranges), np.minimum(ranges, 1.5))
-    assert sensors.as_window(camera, jnp.zeros((80, 3))).shape == (240,)
+    np.testing.assert_allclose(windows.as_window(lidar, ranges), np.minimum(ranges, 1.5))
+    assert windows.as_window(camera, jnp.zeros((80, 3))).shape == (240,)
 
 
 def test_batch_of_scans_equals_a_loop_of_singles(scan, scans, known_layout):
@@ -291,11 +291,11 @@ def test_wrong_shapes_are_named_while_tracing(arena, noiseless, known_layout):
 
     with pytest.raises(AssertionError, match="directions"):
         jax.eval_shape(scan, jnp.zeros((3, 3)))
-    window = functools.partial(sensors.window_of, noiseless[0], noiseless[0].angles)
+    window = functools.partial(windows.window_of, noiseless[0], noiseless[0].angles)
     with pytest.raises(AssertionError, match="bearing"):
         jax.eval_shape(window, jnp.zeros(2))
     with pytest.raises(AssertionError, match="readings"):
-        jax.eval_shape(lambda r: sensors.as_window(noiseless[0], r), jnp.zeros((79, 3)))
+        jax.eval_shape(lambda r: windows.as_window(noiseless[0], r), jnp.zeros((79, 3)))
 
 
 def test_palette_colours_pois_from_the_layout_and_the_rest_from_the_model(arena, known_layout):
@@ -325,7 +325,7 @@ BEARING = 0.2
 
 def angles_from(sensor, bearing=BEARING):
     """Angles between the rays of a window and the bearing that it is centred on."""
-    return np.abs(sensors.window_of(sensor, sensor.angles, jnp.float32(bearing)) - bearing)
+    return np.abs(windows.window_of(sensor, sensor.angles, jnp.float32(bearing)) - bearing)
 
 
 def is_shown(sensor, shows, distance, error):
@@ -334,7 +334,7 @@ def is_shown(sensor, shows, distance, error):
     mask = jnp.array(shows).reshape(-1, *[1] * (sensor.channels > 1))
     readings = jnp.where(mask, seen, sensor.blind)
     bearing, distance = jnp.float32(BEARING), jnp.float32(distance)
-    return bool(sensors.shows_poi(sensor, readings, bearing, distance, ArenaConfig(), error))
+    return bool(windows.shows_poi(sensor, readings, bearing, distance, ArenaConfig(), error))
 
 
 @pytest.mark.parametrize("sensor", [sensors.lidar(NO_NOISE), sensors.camera(IN_ANY_LIGHT)])
