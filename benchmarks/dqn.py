@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxsense.dqn.belief_mdp import MapMdp
 
 from benchmarks import measure, peers
 from benchmarks.maps import MODALITY, Task, untrained_task
@@ -13,7 +14,6 @@ from benchmarks.measure import Options, Row, Side
 from jaxsense import models, observe
 from jaxsense.config import PRESETS, DqnConfig
 from jaxsense.dqn import training
-from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.sim import world as worlds
 
 _UNIT = "env-steps/s"

@@ -4,12 +4,12 @@ import dataclasses
 
 import jax
 import numpy as np
+from jaxsense.observe import Bank
 
 from benchmarks import measure, peers
 from benchmarks.measure import Options, Row
 from jaxsense.config import PRESETS
 from jaxsense.models import make_jmvae
-from jaxsense.observe import Bank
 from jaxsense.vae import jmvae as our_jmvae
 
 _STEPS, _STEPS_QUICK = 2000, 5

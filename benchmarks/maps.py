@@ -6,15 +6,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxsense.dqn.belief_mdp import MapMdp
+from jaxsense.observe import Bank
 
 from benchmarks.jmvae import random_bank
 from jaxsense import models, observe
 from jaxsense.config import PRESETS, Config, DqnConfig
 from jaxsense.core.networks import Params
 from jaxsense.dqn import belief_mdp, episodes, policies
-from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.models import Models
-from jaxsense.observe import Bank
 
 MODALITY = 0
 """The agent looks with the camera."""

@@ -4,11 +4,11 @@ import dataclasses
 import functools
 
 import jax
+from jaxsense.stages import learn
 
 from benchmarks.maps import Examiner, Task
 from jaxsense.config import PRESETS, DetectorConfig, DqnConfig, JmvaeConfig
 from jaxsense.sim import world as worlds
-from jaxsense.stages import learn
 
 _CONFIG = dataclasses.replace(
     PRESETS["default"],

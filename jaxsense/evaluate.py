@@ -245,7 +245,7 @@ def _cases(arguments: Arguments, team: mission.Mission) -> dict[str, mission.Cas
     # Checked like the number of a run's own missions.
     settings = dataclasses.replace(team.config.mission, episodes=arguments.episodes)
     dataclasses.replace(team.config, mission=settings)
-    cases = mission.cases(team)
+    cases = mission.cases(team.config, team.policies)
     if arguments.policy == "all":
         return cases
     if arguments.policy == "policies":

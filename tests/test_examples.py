@@ -8,12 +8,12 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from jaxsense.stages import learn
 
 import jaxsense
 from jaxsense import evaluate, sim, stages, train
 from jaxsense.config import PRESETS
 from jaxsense.run.rundir import RunDirectory, Settings
-from jaxsense.stages import learn
 
 SMALL = ("--preset", "smoke", "--mission.episodes", "1")
 THERMAL = (

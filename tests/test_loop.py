@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxsense.stages import Progress, Stage, Steps
 
 from jaxsense.config import PRESETS
 from jaxsense.run import loop, pipeline, programs
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.stages import Progress, Stage, Steps
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
 

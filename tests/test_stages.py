@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxsense.stages import learn
 
 from jaxsense import examine, models, observe, stages
 from jaxsense.config import (
@@ -27,7 +28,6 @@ from jaxsense.dqn import optimum
 from jaxsense.run import loop, missions, pipeline
 from jaxsense.run.monitor import Monitor
 from jaxsense.sim.world import make_world
-from jaxsense.stages import learn
 from jaxsense.vae import detectors, jmvae
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(7)

@@ -1,10 +1,13 @@
 """Cases to play missions with: policies, and robots that fail."""
 
 import dataclasses
+from collections.abc import Iterable
 
 import jax.numpy as jnp
 
-from jaxsense.mission.state import Faults, Mission, no_faults
+from jaxsense.config import Config
+from jaxsense.dqn.policies import POLICIES
+from jaxsense.mission.state import Faults, no_faults
 
 FAULT_TIME = 6.0  # s
 
@@ -22,17 +25,21 @@ class Case:
     faults: Faults
 
 
-def cases(mission: Mission) -> dict[str, Case]:
+def cases(config: Config, policies: Iterable[str] = POLICIES) -> dict[str, Case]:
     """Lists the policies, each robot alone, and each robot failing in mid-mission.
 
-    Each of `Mission.policies` is a case; in `ROBOT_alone` all other robots stand still from the
-    start; in `ROBOT_stops` and `ROBOT_blind` the robot stops or its sensor goes blind after 6 s. A robot has
+    Each policy is a case; in `ROBOT_alone` all other robots stand still from the start; in
+    `ROBOT_stops` and `ROBOT_blind` the robot stops or its sensor goes blind after 6 s. A robot has
     the name of its modality, with a number if several share it, see `Config.robot_names`. Cases
     with faults use the latent policy.
+
+    Args:
+      config: all settings.
+      policies: names in the order of `Mission.policies`.
     """
-    config, latent = mission.config, mission.policy("latent")
-    healthy = no_faults(config)
-    found = {name: Case(policy, healthy) for policy, name in enumerate(mission.policies)}
+    healthy, names = no_faults(config), tuple(policies)
+    found = {name: Case(policy, healthy) for policy, name in enumerate(names)}
+    latent = names.index("latent")
     for r, name in enumerate(config.robot_names if len(config.carried) > 1 else ()):
         own = jnp.arange(len(config.carried)) == r
         alone = Faults(jnp.where(own, jnp.inf, 0.0), healthy.blind_at)

@@ -95,7 +95,7 @@ def run(
     trained = train(key, config, programs, monitor, checkpoints)
     networks = models(trained.outputs, config)
     player, episodes = programs.player.result(), config.mission.episodes
-    cases = mission.cases(player.mission)
+    cases = mission.cases(config, player.mission.policies)
     played = {name: cases[name] for name in config.mission.policies}
     found = player.play(mission_key(key), networks, played, episodes)
     checkpoints.forget_unfinished()

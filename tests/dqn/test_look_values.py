@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxsense.dqn.belief_mdp import MapMdp
 
 from jaxsense.config import MdpConfig
 from jaxsense.core.types import Belief
 from jaxsense.dqn import belief_mdp, episodes, optimum, policies
-from jaxsense.dqn.belief_mdp import MapMdp
 from jaxsense.vae import filtering
 
 KEY = jax.random.key(0)

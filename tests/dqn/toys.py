@@ -2,10 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+from jaxsense.dqn.belief_mdp import MapMdp
 
 from jaxsense.config import MdpConfig
 from jaxsense.core.types import Belief
-from jaxsense.dqn.belief_mdp import MapMdp
 
 
 def classes_mdp(num_pois=3, num_modalities=2, **config):

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jaxsense.stages import Progress, Surveys
 
 from jaxsense import cli, evaluate, export, train
 from jaxsense.core.supervised import FitState
@@ -28,7 +29,6 @@ from jaxsense.dqn import training as dqn_training
 from jaxsense.dqn.training import DqnState
 from jaxsense.run.compilation import Program
 from jaxsense.show import plots
-from jaxsense.stages import Progress, Surveys
 from jaxsense.vae import detectors, jmvae
 
 NAN_STEP = 17

@@ -5,13 +5,13 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jaxsense.observe import Bank
 
 from jaxsense.config import MODALITIES, PRESETS, Config, JmvaeConfig, TeamConfig
 from jaxsense.dqn import belief_mdp, episodes, policies
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.interfaces import map_mdp, team_mdp
 from jaxsense.models import Models, init, make_jmvae
-from jaxsense.observe import Bank
 from jaxsense.vae import jmvae
 
 CONFIG = dataclasses.replace(

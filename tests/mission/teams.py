@@ -5,11 +5,26 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import POLICIES, PRESETS
+from jaxsense import dqn, mission
+from jaxsense.config import PRESETS
+from jaxsense.vae import readout
 
 # Untrained detectors are never sure; what they say is of no importance here.
 CONFIG = replace(PRESETS["smoke"], mission=replace(PRESETS["smoke"].mission, least_confidence=0.0))
-NAIVE = POLICIES.index("naive")
+POLICIES = tuple(dqn.POLICIES)
+LATENT, NAIVE = POLICIES.index("latent"), POLICIES.index("naive")
+
+
+def with_config(team, config):
+    """The same mission with other numbers, which may be traced."""
+    arenas = team.world.arena, team.free_arena
+    return mission.make_mission(config, team.policies, arenas=arenas)
+
+
+def with_class_beliefs(models, classes):
+    """The same models with other joint posteriors of the classes."""
+    fusion = replace(models.fusion, classes=classes, readout=readout.readout_matrix(classes))
+    return replace(models, fusion=fusion)
 
 
 def alone(function):

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, alone
+from teams import CONFIG, alone, with_config
 
 from jaxsense.mission import act
-from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults, with_config
+from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import windows, world
 

@@ -6,15 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, NAIVE, with_values
+from teams import CONFIG, LATENT, NAIVE, POLICIES, with_class_beliefs, with_config, with_values
 
-from jaxsense import mission
 from jaxsense.core.types import Belief
 from jaxsense.dqn import optimum
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.mission import POLICIES, decide
-from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, with_config
-from jaxsense.vae import filtering
+from jaxsense.mission import decide
+from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE
+from jaxsense.vae import readout
 
 # The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
 POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
@@ -37,7 +36,7 @@ def decides(team):
 
 @pytest.fixture(scope="module")
 def chosen(decides, models, arena_of):
-    def choose(values, policy=mission.LATENT, change=lambda state: state, **rules):
+    def choose(values, policy=LATENT, change=lambda state: state, **rules):
         state = change(arena_of(POSITIONS, POSES, policy=policy))
         return decides(with_values(models, values, values), state, **rules)
 
@@ -74,7 +73,7 @@ def test_when_nothing_beats_nop_the_robot_ends(chosen):
     assert state.robots.goals[0] == 0
 
 
-@pytest.mark.parametrize("policy", [mission.LATENT, NAIVE])
+@pytest.mark.parametrize("policy", [LATENT, NAIVE])
 @pytest.mark.parametrize(("is_nearest_first", "target"), [(True, 1), (False, 0)])
 def test_of_equal_values_the_nearest_or_else_the_first_is_taken(
     chosen, policy, is_nearest_first, target
@@ -83,7 +82,7 @@ def test_of_equal_values_the_nearest_or_else_the_first_is_taken(
     assert state.robots.target[0] == target
 
 
-@pytest.mark.parametrize("policy", [mission.LATENT, NAIVE])
+@pytest.mark.parametrize("policy", [LATENT, NAIVE])
 @pytest.mark.parametrize(("avoids", "target"), [(True, 0), (False, 1)])
 def test_of_equal_values_the_one_that_nobody_heads_for_is_taken(
     chosen, set_robot, policy, avoids, target
@@ -197,19 +196,14 @@ def by_tables(decides, models, arena_of):
     By the map, PoI n is of class n; by exact Bayes, of the class after that.
     """
     shares = jnp.eye(3)
-    belief = jax.vmap(lambda weights: filtering.mixture(SURE, weights))(shares)
+    belief = jax.vmap(lambda weights: readout.mixture(SURE, weights))(shares)
     posterior = jnp.log(jnp.roll(shares, 1, axis=1) + 1e-6)
 
     def choose(policy, gains, totals, seen=(1, 1, 1), **first):
         # The other robot's looks would be worth the most at what this one values least.
         own = replace(look_values(gains, totals), **first)
         of_each = own, look_values([-9 * g for g in gains], [9.0, 0.0, 0.0])
-        trained = replace(
-            models,
-            class_beliefs=SURE,
-            moments_inverse=filtering.moments_inverse(SURE),
-            look_values=of_each,
-        )
+        trained = replace(with_class_beliefs(models, SURE), look_values=of_each)
         state = seen_by(seen)(arena_of(POSITIONS, POSES, policy=POLICIES.index(policy)))
         return decides(trained, replace(state, belief=belief, log_posterior=posterior))
 
@@ -241,7 +235,7 @@ def test_policies_with_tables_end_where_no_look_has_a_value_above_0(by_tables, p
 
 @pytest.mark.parametrize("policy", ["greedy", "bayes", "optimal"])
 def test_a_poi_that_nobody_has_seen_has_the_value_of_a_first_look(by_tables, policy):
-    first = {"first_total" if policy == "optimal" else "first_gain": jnp.float32(2.0)}
+    first = {"q_unseen" if policy == "optimal" else "one_step_unseen": jnp.float32(2.0)}
     values = [1.0, -1.0, 0.5], [-1.0, 0.2, 1.0]
     assert by_tables(policy, *values, seen=(1, 1, 0), **first).robots.target[0] == 2
     assert by_tables(policy, *values, seen=(0, 1, 1), **first).robots.target[0] == 0
@@ -261,7 +255,7 @@ def test_random_takes_every_poi_and_nop_equally_often(team, models, arena_of):
 
 
 @pytest.mark.parametrize("phase", [DRIVING, FACING])
-@pytest.mark.parametrize("policy", [mission.LATENT, NAIVE])
+@pytest.mark.parametrize("policy", [LATENT, NAIVE])
 @pytest.mark.parametrize(
     ("version", "redecides", "target"), [(1, True, 2), (0, True, 0), (1, False, 0)]
 )
@@ -339,8 +333,8 @@ def after_giving_up(decides, models, arena_of, set_robot):
 
     def choose(entry, others, sure=SURE):
         networks = tuple(hoping(n, 0, 4 + entry, others) for n in models.q_networks)
-        trained = replace(models, class_beliefs=sure, q_networks=networks)
-        state = arena_of(POSITIONS, POSES, policy=mission.LATENT)
+        trained = replace(with_class_beliefs(models, sure), q_networks=networks)
+        state = arena_of(POSITIONS, POSES, policy=LATENT)
         state = set_robot(state, 0, undetected=jnp.array([False, True, False]))
         return int(decides(trained, state).robots.target[0])
 

@@ -54,7 +54,7 @@ def move(team):
     def of_three(states, pull):
         model = team.free_arena.model
         model = model.replace(actuator_gainprm=pull * model.actuator_gainprm)
-        weaker = mission.Mission(team.world, replace(team.free_arena, model=model), team.config)
+        weaker = replace(team, free_arena=replace(team.free_arena, model=model))
         return motion.move(weaker, states)
 
     return lambda states, pull=1.0: of_three(states, jnp.float32(pull))

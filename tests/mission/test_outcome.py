@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG
+from teams import CONFIG, POLICIES, with_class_beliefs
 
 from jaxsense import mission
 from jaxsense.core.types import Belief
@@ -21,7 +21,7 @@ MEANS = jnp.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
 
 @pytest.fixture(scope="module")
 def known(models):
-    return replace(models, class_beliefs=Belief(MEANS, jnp.full((3, 2), 0.3)))
+    return with_class_beliefs(models, Belief(MEANS, jnp.full((3, 2), 0.3)))
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ def test_bytes_of_a_detection_as_worked_by_hand(team):
 def test_cases_are_the_policies_and_every_failure_of_every_robot():
     cases = mission.cases(CONFIG)
     assert list(cases) == [
-        *mission.POLICIES,
+        *POLICIES,
         "camera_alone", "camera_stops", "camera_blind",
         "lidar_alone", "lidar_stops", "lidar_blind",
     ]  # fmt: skip
@@ -155,7 +155,7 @@ def test_cases_are_the_policies_and_every_failure_of_every_robot():
     np.testing.assert_array_equal(cases["naive"].faults.stops_at, [np.inf, np.inf])
     settings = replace(CONFIG.jmvae, reconstruction_weights=(1.0,))
     single = replace(CONFIG, modalities=("camera",), jmvae=settings)
-    assert list(mission.cases(single)) == list(mission.POLICIES)
+    assert list(mission.cases(single)) == list(POLICIES)
 
 
 def test_a_mission_of_another_size_is_named(team, arena_of):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from teams import CONFIG, NAIVE
+from teams import CONFIG, LATENT, NAIVE
 
 from jaxsense import mission
 from jaxsense.mission import navigation
@@ -208,7 +208,7 @@ def test_without_any_robot_the_mission_ends_at_once(played):
 def test_same_keys_give_the_same_mission_and_the_policy_does_not_change_the_arena(team):
     reset = jax.jit(lambda key, policy: mission.reset(key, team, policy))
     first, again = (reset(jax.random.key(3), NAIVE) for _ in range(2))
-    latent, other = reset(jax.random.key(3), mission.LATENT), reset(jax.random.key(4), 0)
+    latent, other = reset(jax.random.key(3), LATENT), reset(jax.random.key(4), 0)
     jax.tree.map(np.testing.assert_array_equal, first, again)
     jax.tree.map(np.testing.assert_array_equal, first.scene, latent.scene)
     assert not np.array_equal(first.scene.poses, other.scene.poses)

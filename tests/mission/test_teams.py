@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, NAIVE, alone, with_values
+from teams import CONFIG, LATENT, NAIVE, POLICIES, alone, with_class_beliefs, with_values
 
 import jaxsense
 from jaxsense import mission
 from jaxsense.core.types import Belief
-from jaxsense.mission import POLICIES, act, decide, outcome
+from jaxsense.mission import act, decide, outcome
 from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
 
 TEAM = replace(CONFIG, robots=("camera", "camera", "lidar"))
@@ -136,7 +136,7 @@ def decides(many):
 
 def test_each_robot_asks_the_network_of_its_own_sensor(decides, models, start_of):
     trained = with_values(models, [1.0, 0.0, 0.0, 0.5], [0.0, 0.0, 1.0, 0.5])
-    state = start_of(policy=mission.LATENT)
+    state = start_of(policy=LATENT)
     found = [int(decides(trained, state, jnp.int32(r)).robots.target[r]) for r in range(3)]
     assert found == [0, 0, 2]
 
@@ -150,7 +150,7 @@ def test_rules_for_teams_end_where_nothing_is_to_be_learned(decides, models, sta
 
 def gaining(models):
     """Models whose tables promise a gain by every look."""
-    values = tuple(replace(v, first_gain=jnp.float32(1.0)) for v in models.look_values)
+    values = tuple(replace(v, one_step_unseen=jnp.float32(1.0)) for v in models.look_values)
     return replace(models, look_values=values)
 
 
@@ -205,7 +205,7 @@ def test_what_is_measured_of_three_robots(many, models, start_of):
         detections=jnp.array([3, 1, 0]),
     )
     means = jnp.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
-    known = replace(models, class_beliefs=Belief(means, jnp.full((3, 2), 0.3)))
+    known = with_class_beliefs(models, Belief(means, jnp.full((3, 2), 0.3)))
     found = mission.measure(many, known, replace(state, robots=robots, done=jnp.bool_(True)))
     np.testing.assert_array_equal(found["detections"], [3, 1, 0])
     assert found["observations_per_poi"] == 2
