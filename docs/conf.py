@@ -15,7 +15,7 @@ from sphinx.util.docutils import SphinxDirective
 from sphinx.writers.html5 import HTML5Translator
 
 import jaxsense
-from jaxsense.show import metrics
+from jaxsense import summary
 
 project = "jaxsense"
 author = "the jaxsense authors"
@@ -136,9 +136,14 @@ class MetricsTable(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Writes one row for each metric."""
         rows = ["| key | name | meaning | paper |", "| --- | --- | --- | --- |"]
-        for block, listed in metrics.BLOCKS.items():
-            for metric in listed:
-                cells = f"`{block}.{metric.key}`", metric.label, metric.meaning, metric.paper
+        for block, listed in summary.BLOCKS.items():
+            for metric in listed.values():
+                cells = (
+                    f"`{block}.{metric.key}`".replace("`.", "`"),
+                    metric.label,
+                    metric.meaning,
+                    metric.paper,
+                )
                 rows.append("| " + " | ".join(cell.replace("*", r"\*") for cell in cells) + " |")
         return self.parse_text_to_nodes("\n".join(rows))
 

@@ -4,27 +4,28 @@ import contextlib
 import dataclasses
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
-import rich.box
 import rich.console
-import rich.table
 import tyro
 
-from jaxsense import cli, mission
+from jaxsense import cli, mission, summary
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import require, require_types
 from jaxsense.config.mission import MOST_EPISODES
 from jaxsense.core.types import Belief
-from jaxsense.mission import compare
 from jaxsense.run import devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
+from jaxsense.run.missions import Recording
 from jaxsense.run.monitor import Monitor, StageError
-from jaxsense.show import animation, metrics, page, plots
-from jaxsense.show.terminal import Display
+from jaxsense.show import animation, mission_plots, page, plots, tables
+from jaxsense.show.terminal import Display, print_table, say
 from jaxsense.sim.arena import TIMESTEP
+from jaxsense.summary import compare
+from jaxsense.summary.read import EVALUATIONS
 
 PROGRAM = "jaxsense.evaluate"
 
@@ -34,9 +35,9 @@ class ArenaArguments:
     """Another arena than the run's."""
 
     num_pois: int | None = None
-    """Number of points of interest, if another than the run's."""
+    """Number of points of interest; the run's by default."""
     side: float | None = None
-    """Inner length and width of the arena, in metres, if others than the run's."""
+    """Side of the arena, in metres; the run's by default."""
 
     def __post_init__(self):
         require_types(self)
@@ -59,8 +60,8 @@ class Arguments:
     or `all`."""
     arena: ArenaArguments = ArenaArguments()
     robots: tuple[str, ...] | None = None
-    """The robots, each the modality of its sensor, if others than the run's; for example
-    `camera camera lidar`."""
+    """Sensors of the robots, one per robot, for example `camera camera lidar`; the run's by
+    default."""
     devices: int | None = None
     """Accelerators, or threads on a CPU, that share the missions. By default all accelerators, or
     as many threads as cores, at most 8."""
@@ -88,13 +89,10 @@ def main(argv: list[str] | None = None) -> None:
         config = _elsewhere(arguments, trained)
         team = mission.make_mission(config)
         played = _cases(arguments, team)
-        path = arguments.run / "summary.json"
         # If these files cannot be written, fail now rather than after minutes of work.
-        with files.locked(arguments.run, waits=True):
-            summary = rundir.read_summary(arguments.run)
-            _pictures(arguments.run, trained, summary)
-            page.write(arguments.run, trained, summary)
-            rundir.write_json(path, summary)
+        with _locked(arguments.run):
+            _report(arguments.run, trained)
+            (arguments.run / EVALUATIONS).mkdir(exist_ok=True)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
@@ -113,105 +111,113 @@ def main(argv: list[str] | None = None) -> None:
             cli.fail(PROGRAM, str(error))
         seconds = time.perf_counter() - begin
         compiling = compiler.monitor.seconds["mission"]["compile_s"]
-    block = missions.summary(team, found)
+    block = summary.missions(team, found.metrics)
     try:
-        written = _write(
-            arguments, (trained, config), models.fusion.classes, block, found.recording
-        )
+        beliefs = models.fusion.classes
+        written = _write(arguments, trained, config, beliefs, block, found.recording)
+    except ConfigError as error:
+        cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({cli.reason(error)})")
     rate = found.control_steps / seconds
     with contextlib.suppress(OSError):  # as in `say`
-        _print_table(console, block)
-        console.print(
-            f"{number} missions in {seconds:.1f} s after {compiling:.0f} s of compilation: "
-            f"{rate:.0f} control steps/s, "
-            f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
-        )
-        for line in written:
-            console.print(line)
+        _print(console, block, arguments.episodes)
+    say(
+        f"{number} missions in {seconds:.1f} s after {compiling:.0f} s of compilation: "
+        f"{rate:.0f} control steps/s, "
+        f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
+    )
+    for line in written:
+        say(line)
 
 
 def _write(
     arguments: Arguments,
-    configs: tuple[Config, Config],
+    trained: Config,
+    config: Config,
     class_beliefs: Belief,
-    found: dict[str, Any],
-    recording: missions.Recording,
+    missions: summary.Missions,
+    recording: Recording,
 ) -> list[str]:
-    """Writes the metrics into the run's summary and page, and the animation if requested.
+    """Writes an evaluation, the page that shows it and, if requested, the film.
 
     Args:
       arguments: of the program.
-      configs: the settings of the run, and of these missions.
+      trained: the settings of the run.
+      config: the settings of these missions.
       class_beliefs: `[C, D]` beliefs of the classes.
-      found: the block of the missions.
+      missions: what was measured.
       recording: the first mission.
 
     Returns:
       Lines about where they are.
     """
-    path, written = arguments.run / "summary.json", []
-    trained, config = configs
+    run, written, place = arguments.run, [], _place(config)
     if arguments.animate:
-        name = next(iter(metrics.cases(found)))
-        place = "" if config == trained else f"-{_name(config)}"
-        film = arguments.run / f"mission-{name}-{arguments.seed}{place}.svg"
-        what = f" policy, seed {arguments.seed}"
-        if place:
-            what = f", {config.arena.num_pois} points, {len(config.carried)} robots"
-        title = f"{name}{what}".replace("_", " ")
-        animation.write(film, config, recording, class_beliefs, title)
+        name = next(iter(summary.cases(missions)))
+        title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
+        suffix = ""
+        if config != trained:
+            suffix = f"-{place}"
+            title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
+        film = run / f"mission-{name}-{arguments.seed}{suffix}.svg"
+        content = animation.draw(config, recording.records, recording.end, class_beliefs, title)
+        files.write(film, content)
         written.append(f"The first mission of {name} is in {film}.")
-    # Another evaluation may have written metrics since this one began.
-    with files.locked(arguments.run, waits=True):
-        summary = rundir.read_summary(arguments.run)
-        if config == trained:
-            summary["mission"] = _merge(summary["mission"], found, arguments)
-        else:
-            _add_elsewhere(summary, config, found, arguments)
-        pictures = _pictures(arguments.run, trained, summary)
-        rundir.write_json(path, summary)
-        for name, content in pictures.items():
-            files.write(arguments.run / name, content)
-        report = page.write(arguments.run, trained, summary)
+    for case in summary.cases(missions).values():
+        case["seed"] = arguments.seed
+    path = run / EVALUATIONS / f"{place}-seed-{arguments.seed}-{arguments.episodes}-missions.json"
+    with _locked(run):
+        # Another policy may have played in the same arenas before.
+        before = summary.read_evaluations(run).get(path.stem)
+        found: summary.Evaluation = {
+            **_place_of(config, {**(before["mission"] if before else {}), **missions}),
+            "seed": arguments.seed,
+            "episodes": arguments.episodes,
+        }
+        found["mission"] = compare.compared(found["mission"])
+        rundir.write_json(path, found)
+        files.write(path.with_suffix(".png"), plots.png(mission_plots.policies(found["mission"])))
+        report = _report(run, trained)
     return [*written, f"The metrics are in {path}, and with all others in {report}."]
 
 
-def _pictures(run: Path, config: Config, summary: dict[str, Any]) -> dict[str, bytes]:
-    """The plots of missions; raises `ConfigError` if the summary is not that of a run."""
-    with page.showing(run):
-        for place in (summary, *summary.get("elsewhere", {}).values()):
-            compare.compared(metrics.cases(place["mission"]))
-        return plots.of_missions(config, summary)
+def _report(run: Path, config: Config) -> Path:
+    """Writes the page of a run and `teams.png`; raises `ConfigError` if its figures are wrong."""
+    own, found = summary.read(run), summary.read_evaluations(run)
+    path, here = run / "report.html", _place_of(config, own["mission"])
+    episodes = max(case["episodes"] for case in summary.cases(own["mission"]).values())
+    places = [{**here, "seed": own["seed"], "episodes": episodes}, *found.values()]
+    if len({(p["num_pois"], p["side"], *p["robots"]) for p in places}) > 1:
+        files.write(run / "teams.png", plots.png(mission_plots.teams(places)))
+    files.write(path, page.render(run, config, own, found))
+    return path
 
 
-def _merge(before: dict[str, Any], found: dict[str, Any], arguments: Arguments) -> dict[str, Any]:
-    """The earlier blocks, with those of the cases played now and their seed."""
-    cases = metrics.cases(found).items()
-    new = {name: {**block, "seed": arguments.seed} for name, block in cases}
-    blocks = compare.compared({**metrics.cases(before), **new})
-    return {**before, **found, **blocks}
+@contextlib.contextmanager
+def _locked(run: Path) -> Iterator[None]:
+    """Locks a run; says so if another process holds it."""
+    with contextlib.ExitStack() as kept:
+        try:
+            kept.enter_context(files.locked(run, waits=False))
+        except BlockingIOError:
+            say(f"Waiting for another process that writes {run}.")
+            kept.enter_context(files.locked(run, waits=True))
+        yield
 
 
-def _add_elsewhere(
-    summary: dict[str, Any], config: Config, found: dict[str, Any], arguments: Arguments
-) -> None:
-    """Adds missions in another arena, or with other robots, to those that are there."""
-    places = summary.setdefault("elsewhere", {})
-    place = places.setdefault(
-        _name(config),
-        {
-            "num_pois": config.arena.num_pois,
-            "side": config.arena.side,
-            "robots": list(config.carried),
-            "mission": {},
-        },
-    )
-    place["mission"] = _merge(place["mission"], found, arguments)
+def _place_of(config: Config, missions: summary.Missions) -> summary.Place:
+    """Missions with their arena and team."""
+    arena = config.arena
+    return {
+        "num_pois": arena.num_pois,
+        "side": arena.side,
+        "robots": list(config.carried),
+        "mission": missions,
+    }
 
 
-def _name(config: Config) -> str:
+def _place(config: Config) -> str:
     """Name of an arena and a team, also for files, whose names are short."""
     numbers = {modality: config.carried.count(modality) for modality in config.carried}
     robots = "-".join(f"{number}-{modality}" for modality, number in numbers.items())
@@ -256,28 +262,16 @@ def _cases(arguments: Arguments, team: mission.Mission) -> dict[str, mission.Cas
     return {arguments.policy: cases[arguments.policy]}
 
 
-def _print_table(console: rich.console.Console, found: dict[str, Any]) -> None:
+def _print(console: rich.console.Console, missions: summary.Missions, episodes: int) -> None:
     """Prints the metrics of all cases."""
-    columns = metrics.headline(metrics.MISSIONS)
-    labels = [metric.label for metric in columns]
-    table = rich.table.Table("policy", *labels, box=rich.box.SIMPLE, pad_edge=False)
-    blocks = metrics.cases(found)
-    for name, block in blocks.items():
-        table.add_row(name, *(metric.text(block) for metric in columns))
-    console.print(table)
-    for metric in columns:
-        if metric.meaning:
-            console.print(f"{metric.label}: {metric.meaning}", markup=False, style="dim")
-    if {"latent", "naive"} <= set(blocks):
-        ratio = blocks["latent"]["time_s"] / blocks["naive"]["time_s"]
-        console.print(f"The latent policy takes {ratio:.2f} of the time of the naive one.")
-    for name, block in blocks.items():
-        others = {reason: n for reason, n in block["ended"].items() if reason != "finished"}
-        if others:
-            reasons = ", ".join(f"{n} {reason}" for reason, n in others.items())
-            console.print(f"{name}: of {block['episodes']} missions {reasons}")
-    size = found["bytes_per_detection"]
-    console.print(
+    caption = f"{episodes} missions of each policy, in the same arenas"
+    for table in (tables.missions(missions, caption), tables.failures(missions)):
+        if table is not None and table.rows:
+            print_table(console, table)
+    if verdict := compare.verdict(summary.cases(missions)):
+        say(verdict)
+    size = summary.traffic(missions)
+    say(
         f"A detection takes {size['latent']:.0f} bytes in the map, {size['features']:.0f} as the "
         f"detector's features and {size['raw']:.0f} as a raw scan."
     )

@@ -8,7 +8,7 @@ import shlex
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
@@ -17,10 +17,9 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 import rich.console
-import rich.table
 import tyro
 
-from jaxsense import cli
+from jaxsense import cli, summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import require_types
 from jaxsense.run import devices, files, pipeline, rundir, seeds
@@ -30,9 +29,11 @@ from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.pipeline import RunResult
 from jaxsense.run.programs import Programs
 from jaxsense.run.rundir import RunDirectory, Settings
-from jaxsense.show import animation, metrics, page, plots, tensorboard
-from jaxsense.show.terminal import Display, say
+from jaxsense.show import animation, page, plots, tables, tensorboard
+from jaxsense.show.terminal import Display, print_table, say
 from jaxsense.sim import sensors
+from jaxsense.summary import compare, statistics
+from jaxsense.summary.blocks import Header
 
 PROGRAM = "jaxsense.train"
 _MOST_SEEDS = 10_000
@@ -294,7 +295,7 @@ def _train_together(
     with displays[0]:
         monitor.begin(displays[0].show)
         results = devices.side_by_side(train, len(runs))
-        timing = seeds.share(time.perf_counter() - begin, monitor.seconds, len(runs))
+        timing = statistics.timing(time.perf_counter() - begin, monitor.seconds, len(runs))
         failed: dict[int, str] = {}
         for run, result in zip(runs, results, strict=True):
             try:
@@ -320,13 +321,13 @@ def _display(
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
     paths = [path for seed, path in seeds.paths(run).items() if seed not in failed]
-    timing, blocks = seeds.summarise(paths)
-    summary = {**_header(run, timing), **blocks}
+    timing, of_each, means = statistics.of_seeds([summary.read(path) for path in paths])
+    found: summary.Summary = {**_header(run), "timing": timing, "seeds": of_each, **means}
     if failed:
-        summary["failed"] = {str(seed): reason for seed, reason in failed.items()}
-    plots.write_seeds(run.path, seeds.rewards(paths, run.settings.config, _warn), summary)
-    page.write_seeds(run.path, run.settings.config, summary)
-    run.write_json("summary.json", summary)
+        found["failed"] = {str(seed): reason for seed, reason in failed.items()}
+    curves = seeds.rewards(paths, run.settings.config, _warn)
+    _write_page(run, plots.of_seeds(curves, means), found)
+    run.write_json("summary.json", found)
 
 
 def _warn(text: str) -> None:
@@ -334,52 +335,58 @@ def _warn(text: str) -> None:
     cli.complain(f"{PROGRAM}: {text}")
 
 
-def _write(run: RunDirectory, result: RunResult, timing: dict[str, Any], monitor: Monitor) -> None:
+def _write(run: RunDirectory, result: RunResult, timing: summary.Timing, monitor: Monitor) -> None:
     """Writes plots, the report and last the summary, which marks the run as finished."""
-    config = run.settings.config
+    config, recording = run.settings.config, result.recording
     monitor.check_stop()
-    plots.write_plots(run.path, config, result)
-    film, beliefs = run.path / "mission.svg", result.models.fusion.classes
+    pictures = plots.of_run(
+        config,
+        result.results,
+        result.posteriors,
+        result.rewards,
+        result.windows,
+        result.detections,
+    )
     title = f"{config.mission.policies[0]} policy".replace("_", " ")
-    animation.write(film, config, result.recording, beliefs, title)
-    summary = {**_header(run, timing), **result.summary}
-    page.write(run.path, config, summary)
+    beliefs = result.models.fusion.classes
+    film = animation.draw(config, recording.records, recording.end, beliefs, title)
+    found: summary.Summary = {**_header(run), "timing": timing, **result.results}
+    _write_page(run, {**pictures, "mission.svg": film}, found)
     monitor.check_stop()
-    run.write_json("summary.json", summary)
+    run.write_json("summary.json", found)
 
 
-def _header(run: RunDirectory, timing: dict[str, Any]) -> dict[str, Any]:
-    """A summary's fields about the run itself."""
-    settings = run.settings
+def _write_page(
+    run: RunDirectory, pictures: Mapping[str, bytes | str], found: summary.Summary
+) -> None:
+    """Writes pictures, and then the page that shows them."""
+    for name, content in pictures.items():
+        files.write(run.path / name, content)
+    files.write(run.path / "report.html", page.render(run.path, run.settings.config, found))
+
+
+def _header(run: RunDirectory) -> Header:
+    """A summary's keys about the run itself."""
     return {
-        "preset": settings.preset,
-        "seed": settings.seed,
+        "preset": run.settings.preset,
+        "seed": run.settings.seed,
         "versions": rundir.versions(),
         "devices": [device.device_kind for device in jax.devices()],
-        "timing": timing,
     }
 
 
 def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     """Prints the main metrics; of several seeds, mean and 95% interval."""
-    summary = rundir.read_summary(run.path)
-    settings, policies = run.settings, summary["dqn"]
-    which = f", seed {settings.seed}"
+    found, settings = summary.read(run.path), run.settings
+    which = f"seed {settings.seed}"
     if settings.num_seeds > 1:
-        last = settings.seed + settings.num_seeds - 1
-        which = f", seeds {settings.seed} to {last}: mean, 95% interval"
-    table = rich.table.Table("metric", *policies, title=f"{settings.preset} preset{which}")
-    detectors = [summary["detectors"][modality] for modality in policies]
-    blocks = [*((metric, detectors) for metric in metrics.DETECTORS)]
-    blocks += [(metric, [*policies.values()]) for metric in metrics.headline(metrics.AGENTS)]
-    for metric, columns in blocks:
-        table.add_row(metric.label, *map(metric.text, columns))
-    console.print(table)
-    units = metrics.LATENT_SPACE[0]
-    console.print(
-        f"{units.label}: {units.text(summary['jmvae'])}, "
-        f"total time: {summary['timing']['total_s']:.0f} s"
-    )
+        which = f"seeds {settings.seed} to {settings.seeds[-1]}: mean, 95% interval"
+    say(f"{settings.preset} preset, {which}, {found['timing']['total_s']:.0f} s in total")
+    missions = tables.missions(found["mission"], "Missions")
+    for table in (tables.detectors(found), tables.agents(found), missions):
+        print_table(console, table)
+    if verdict := compare.verdict(summary.cases(found["mission"])):
+        say(verdict)
 
 
 if __name__ == "__main__":

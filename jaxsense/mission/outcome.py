@@ -4,9 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jaxsense.config import Config
 from jaxsense.dqn import rewards
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
 from jaxsense.models import Models
@@ -80,72 +78,4 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
         "information": jnp.sum(rewards.information(state.belief.std)),
         "detections": robots.detections,
         "reason": reason(state),
-    }
-
-
-def summarise(config: Config, name: str, found: dict[str, Any]) -> dict[str, Any]:
-    """Summarises one case for `summary.json`.
-
-    Args:
-      config: all settings.
-      name: of the case.
-      found: `[E, ...]` from `Player.play`.
-
-    Returns:
-      Means over the missions, except the median of `time_s` and the sum of `collisions`. For a
-      robot alone also `told`, the accuracy of its sensor's labels, and `ambiguous_reported`, the
-      share of the PoIs it cannot distinguish that the map shows as ambiguous.
-    """
-    block: dict[str, Any] = {
-        "accuracy": float(found["is_right"].mean()),
-        "observations_per_poi": float(found["observations_per_poi"].mean()),
-        "time_s": float(np.median(found["time_s"])),
-        "mean_time_s": float(found["time_s"].mean()),
-        "collisions": int(found["collisions"].sum()),
-        "goals_reached_fraction": _share(found["goals_reached"].sum(), found["goals"].sum()),
-        "information": float(found["information"].mean()),
-        "episodes": len(found["time_s"]),
-        "ended": {
-            reason: int(np.sum(found["reason"] == code))
-            for code, reason in enumerate(REASONS)
-            if np.any(found["reason"] == code)
-        },
-    }
-    robot = name.removesuffix("_alone")
-    if robot != name:
-        modality = config.carried[config.robot_names.index(robot)]
-        labels = np.array(config.label_of_class(modality))
-        shares_label = np.array([np.sum(labels == label) > 1 for label in labels])
-        cannot_tell = shares_label[found["classes"]]
-        block["told"] = float(found["told"][modality].mean())
-        reported = found["ambiguous"][cannot_tell]
-        block["ambiguous_reported"] = _share(reported.sum(), reported.size)
-    return block
-
-
-def _share(part: Any, whole: Any) -> float | None:
-    """Share of a whole; None if that is 0."""
-    return float(part / whole) if whole else None
-
-
-def bytes_per_detection(mission: Mission, detections: np.ndarray) -> dict[str, float]:
-    """Network traffic of a detection, in bytes.
-
-    Args:
-      mission: the mission.
-      detections: `[R]` number of each robot's detections.
-
-    Returns:
-      `latent`, the size of an entry of the map; `features` and `raw`, the mean sizes of the
-      detections' features and scans; without detections the mean over the sensors.
-    """
-    detections = np.maximum(detections, 0 if np.any(detections) else 1)
-    config, size = mission.config, np.dtype(np.float32).itemsize
-    sensors = [mission.world.sensors[m] for m in config.modality_of_robot]
-    scans = np.array([sensor.scan_bytes for sensor in sensors])
-    features = np.array([size * len(config.labels(name)) for name in config.carried])
-    return {
-        "latent": float(2 * size * config.jmvae.latent_size),
-        "features": float(np.average(features, weights=detections)),
-        "raw": float(np.average(scans, weights=detections)),
     }

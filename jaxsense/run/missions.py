@@ -12,9 +12,8 @@ import numpy as np
 from jaxsense.config import MISSIONS_AT_ONCE, Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.mission import compare
 from jaxsense.mission.cases import Case
-from jaxsense.mission.outcome import bytes_per_detection, measure, summarise
+from jaxsense.mission.outcome import measure
 from jaxsense.mission.rollout import rollout_batch
 from jaxsense.mission.state import (
     Faults,
@@ -228,16 +227,3 @@ def _set_row(target: Any, row: int, source: Any, from_row: int) -> None:
         target[row] = source[from_row]
 
     jax.tree.map(copy, target, source)
-
-
-def summary(mission: Mission, played: Played) -> dict[str, Any]:
-    """The summary's block `mission`."""
-    config = mission.config
-    blocks = {name: summarise(config, name, found) for name, found in played.metrics.items()}
-    reference = played.metrics.get(compare.REFERENCE)
-    for name, found in played.metrics.items():
-        if reference is not None and name != compare.REFERENCE:
-            blocks[name]["intervals"] = compare.differences(found, reference)
-    detections = sum(found["detections"].sum(axis=0) for found in played.metrics.values())
-    size = bytes_per_detection(mission, np.asarray(detections))
-    return {**compare.compared(blocks), "bytes_per_detection": size}

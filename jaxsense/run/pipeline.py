@@ -3,15 +3,13 @@
 import contextlib
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import numpy as np
 
-from jaxsense import mission
+from jaxsense import mission, summary
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Key
-from jaxsense.dqn import episodes
 from jaxsense.models import Models
 from jaxsense.run import missions
 from jaxsense.run.checkpoints import Checkpoints
@@ -24,8 +22,6 @@ from jaxsense.sim.world import make_world
 from jaxsense.training.agents import learner
 from jaxsense.training.stages import mission_key, models
 
-_UNAMBIGUOUS = 0.9  # share of looks in a single class, above which the class counts as one
-
 
 @dataclasses.dataclass(frozen=True)
 class RunResult:
@@ -36,10 +32,11 @@ class RunResult:
       windows: for each modality `[C, 1, F]` one look at each class.
       detections: for each modality `[C, S', D_m]` held-out detections.
       posteriors: `[C, S', D]` beliefs of these, `joint` and for each modality.
-      rewards: for each modality the `[epochs]` mean total reward of the episodes that ended, as
-        `reward`, and of the greedy policy, as `greedy`; NaN in other epochs.
+      rewards: for each Q-network, named by its modality or `team`, the `[epochs]` mean total reward
+        of the episodes that ended, `reward`, and of the greedy policy of a robot that is alone on
+        the map, `greedy`; NaN in other epochs.
       recording: the first mission of the first of `config.mission.policies`.
-      summary: the blocks `detectors`, `jmvae`, `dqn` and `mission` of `summary.json`.
+      results: the blocks of `summary.json`.
     """
 
     models: Models
@@ -48,7 +45,7 @@ class RunResult:
     posteriors: dict[str, Belief]
     rewards: dict[str, dict[str, np.ndarray]]
     recording: missions.Recording
-    summary: dict[str, Any]
+    results: summary.Results
 
 
 @contextlib.contextmanager
@@ -108,100 +105,35 @@ def run(
         detections=dict(zip(config.modalities, detections.held_out, strict=True)),
         posteriors=posteriors,
         rewards={
-            n: {
-                name: np.array(trained.curves[learner(config, n)][name])
-                for name in ("reward", "greedy")
+            network.removeprefix("dqn_"): {
+                name: np.array(trained.curves[network][name]) for name in ("reward", "greedy")
             }
-            for n in config.modalities
+            for network in (learner(config, n) for n in config.modalities)
         },
         recording=found.recording,
-        summary={
+        results={
             "detectors": jax.tree.map(
                 lambda x: np.asarray(x).tolist(), trained.outputs["detector_metrics"]
             ),
-            "jmvae": _as_lists(latent),
-            "belief": jax.tree.map(lambda x: np.asarray(x).tolist(), trained.outputs["beliefs"]),
-            "dqn": {name: _of_agent(config, name, trained) for name in config.modalities},
-            "mission": missions.summary(player.mission, found),
+            "jmvae": summary.jmvae(latent),
+            "belief": summary.beliefs(trained.outputs["beliefs"]),
+            "dqn": {name: _agent(config, name, trained) for name in config.modalities},
+            "mission": summary.missions(player.mission, found.metrics),
         },
     )
 
 
-def _of_agent(config: Config, modality: str, trained: Trained) -> dict[str, Any]:
-    """One modality's block in the summary's `dqn`."""
+def _agent(config: Config, modality: str, trained: Trained) -> summary.Agent:
+    """One modality's block of `dqn`."""
     total, first = map(np.asarray, trained.outputs[f"policies_{modality}"])
-    env_steps = config.dqn.epochs * config.dqn.num_envs
-    seconds = sum(trained.curves[learner(config, modality)]["seconds"])
-    others = {
-        str(number): returns(np.asarray(total), config)
-        for number, (total, _) in zip(
-            config.evaluation.num_pois, trained.outputs.get(f"numbers_{modality}", ()), strict=True
-        )
-    }
-    return {
-        **policy_metrics(total, first, config),
-        **({"other_numbers": others} if others else {}),
-        "env_steps": env_steps,
-        "env_steps_per_s": env_steps / seconds,
-    }
-
-
-def _as_lists(metrics: dict[str, Any]) -> dict[str, Any]:
-    """The summary's block `jmvae` from the arrays of `latent_space`."""
-    lists = jax.tree.map(lambda x: x.tolist(), metrics)
-    lists["unambiguous"] = {
-        name: [share > _UNAMBIGUOUS for share in shares]
-        for name, shares in lists["unambiguous"].items()
-    }
-    return lists
-
-
-_NAMES = ("return", "optimal", "naive", "random")
-
-
-def returns(total: np.ndarray, config: Config) -> dict[str, float | None]:
-    """Mean return of each of `_NAMES` from random starts, and the share of the optimal one.
-
-    Args:
-      total: `[P, S]` from `compare_policies`.
-      config: all settings.
-    """
-    of_starts = total[:, -config.evaluation.num_starts :].mean(axis=1).tolist()
-    whole = dict(zip(_NAMES, of_starts, strict=True))
-    # Where no look pays, the optimum is 0.
-    fraction = whole["return"] / whole["optimal"] if whole["optimal"] else None
-    return {**whole, "fraction_of_optimal": fraction}
-
-
-def policy_metrics(total: np.ndarray, first: np.ndarray, config: Config) -> dict[str, Any]:
-    """One modality's block in the summary's `dqn`, without the speed.
-
-    Args:
-      total: `[P, S]` from `compare_policies`.
-      first: `[P, S]` from `compare_policies`.
-      config: all settings.
-    """
-    num_states = total.shape[1] - config.evaluation.num_starts
-    one_step = dict(zip(_NAMES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
-    missed = total[_NAMES.index("optimal"), :num_states] - total[0, :num_states]
-    is_optimal = missed <= 0.01
-    is_permutation = episodes.are_different(
-        episodes.every_state(
-            config.arena.num_pois,
-            len(config.arena.classes),
-            len(config.modalities),
-            config.evaluation.num_states,
-        )[0]
-    )
-    return {
-        **returns(total, config),
-        "one_step": {
-            "policy": one_step["return"],
-            "optimal": one_step["optimal"],
-            "random": one_step["random"],
+    others = trained.outputs.get(f"numbers_{modality}", ())
+    return summary.agent(
+        config,
+        total,
+        first,
+        trained.curves[learner(config, modality)]["seconds"],
+        {
+            number: np.asarray(total)
+            for number, (total, _) in zip(config.evaluation.num_pois, others, strict=True)
         },
-        "optimal_states": int(np.sum(is_optimal)),
-        "num_states": num_states,
-        "optimal_permutations": int(np.sum(is_optimal & is_permutation)),
-        "num_permutations": int(np.sum(is_permutation)),
-    }
+    )

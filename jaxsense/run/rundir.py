@@ -29,8 +29,6 @@ from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.version import __version__, versions
 from jaxsense.training.agents import learner
 
-BLOCKS = ("detectors", "jmvae", "belief", "dqn", "mission")
-"""The blocks of a summary that hold results."""
 _METRICS = "metrics.jsonl"
 
 
@@ -233,20 +231,6 @@ def read_settings(file: Path, trust: bool = False) -> Settings:
         that is unknown or wrong.
     """
     return _settings_of(_read_config(file, "config", file), trust)
-
-
-def read_summary(path: Path) -> dict[str, Any]:
-    """Reads the `summary.json` of a finished run; raises `ConfigError` if that fails."""
-    try:
-        summary = parse_json((path / "summary.json").read_text(encoding="utf-8"))
-        parts = {"timing", *BLOCKS}
-        if not isinstance(summary, dict) or not parts <= set(summary):
-            raise ValueError(f"must be an object with {', '.join(sorted(parts))}")
-        json.dumps(summary, allow_nan=False)  # raises what `write_json` would raise
-        return summary
-    except (OSError, ValueError) as error:
-        reason = f"must hold the summary.json of a finished run ({error})"
-        raise ConfigError("run", str(path), reason) from None
 
 
 def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:

@@ -3,12 +3,19 @@
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxsense.config import ArenaConfig
 
 RGB = tuple[float, float, float]
+MARKERS = "oDs^"
 
 _ROBOT_COLOURS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
+_POLICY_COLOURS = {
+    "latent": "#1558b0", "greedy": "C1", "bayes": "C2", "optimal": "C3", "nearest": "C4",
+    "auction": "C5", "rollout": "C6", "naive": "0.35", "naive_2": "0.5", "naive_3": "0.65",
+    "random": "0.75",
+}  # fmt: skip
 _APART = 0.25  # in RGB, which the eye distinguishes at a glance
 _DARKEST, _LIGHTEST = -0.75, 0.6
 
@@ -16,6 +23,11 @@ _DARKEST, _LIGHTEST = -0.75, 0.6
 def modality_colour(modality: int) -> str:
     """The colour of the robots that carry a sensor, by its index."""
     return _ROBOT_COLOURS[modality % len(_ROBOT_COLOURS)]
+
+
+def policy_colour(name: str) -> str:
+    """The colour of a policy, the same in all plots; those to compare with are grey."""
+    return _POLICY_COLOURS.get(name, "C9")
 
 
 def class_colour(arena: ArenaConfig, label: str) -> RGB:
@@ -52,3 +64,9 @@ def as_hex(colour: RGB) -> str:
 def as_srgb(linear: np.ndarray) -> np.ndarray:
     """Linear RGB in [0, 1] as sRGB (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def in_plane(values: ArrayLike) -> np.ndarray:
+    """`[..., D]` as `[..., 2]`: the first two latent dimensions, or zero."""
+    values = np.asarray(values)
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, 1)])[..., :2]

@@ -1,69 +1,90 @@
-"""The plots of a run: the paper's Fig. 4 and Fig. 5, and the sensors' scanlines."""
+"""The plots of a training: the paper's Fig. 4 and Fig. 5, scans, and calibration."""
 
 import io
-from pathlib import Path
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib import cm, colormaps
+from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogLocator, NullFormatter
 
-from jaxsense.config import POLICIES, Config
+from jaxsense.config import Config
 from jaxsense.core.types import Belief
-from jaxsense.mission.compare import interval
-from jaxsense.run import files
-from jaxsense.run.pipeline import RunResult
-from jaxsense.show import metrics
-from jaxsense.show.colours import RGB, as_srgb, class_colour
+from jaxsense.show import mission_plots
+from jaxsense.show.colours import MARKERS, RGB, as_srgb, class_colour, in_plane, policy_colour
 from jaxsense.sim import sensors
+from jaxsense.summary.blocks import AGENTS, Agent, Beliefs, Results
+from jaxsense.summary.compare import bounds
+from jaxsense.summary.metrics import mean
 from jaxsense.vae.calibration import reliability
 
-_MOST_ELLIPSES = 40
+Arrays = dict[str, np.ndarray]
+Curves = dict[str, Arrays]
+"""For each Q-network, named by its modality or `team`, `[epochs]` or `[K, epochs]` mean total
+rewards: `reward` of the exploring policy, and `greedy` of the greedy one alone on the map, NaN
+where it was not played."""
+
+_MAX_ELLIPSES = 40
+_COLUMNS = 4  # of pictures of classes
 _SMOOTHING = 20  # epochs
-_LEAST_SHARE = 1e-4  # of wrong points, which stands for all that is less
-_NUM_COLOURS = 10  # of matplotlib's cycle
+_MIN_LOOKS = 20  # in a bin of the calibration
 _FAR = 0.2  # sigma from the median of its class, beyond which a detection is an outlier
 
 
-def write_plots(path: Path, config: Config, result: RunResult) -> None:
-    """Writes the plots of a run into a directory, as `NAME.png`."""
-    summary = result.summary
-    plots = {
-        "latent_space": latent_space(config, result.posteriors),
-        "reward": rewards(result.rewards, summary["dqn"]),
-        "scanlines": scanlines(config, result.windows),
-        "calibration": calibration(config, result.detections, summary["belief"]),
-        "policies": missions(summary["mission"]),
+def of_run(
+    config: Config,
+    results: Results,
+    posteriors: dict[str, Belief],
+    rewards_of: Curves,
+    windows: Arrays,
+    detections: Arrays,
+) -> dict[str, bytes]:
+    """Draws the plots of a run.
+
+    Args:
+      config: all settings.
+      results: the blocks of the summary.
+      posteriors: see `latent_space`.
+      rewards_of: see `rewards`.
+      windows: see `scanlines`.
+      detections: see `calibration`.
+
+    Returns:
+      PNG files by their names.
+    """
+    return {
+        "latent_space.png": png(latent_space(config, posteriors)),
+        "scanlines.png": png(scanlines(config, windows)),
+        "calibration.png": png(calibration(config, detections, results["belief"])),
+        **of_seeds(rewards_of, results),
     }
-    for name, figure in plots.items():
-        files.write(path / f"{name}.png", _png(figure))
 
 
-def write_seeds(
-    path: Path, curves: dict[str, dict[str, np.ndarray]], summary: dict[str, Any]
-) -> None:
-    """Writes the plots of several seeds into a directory; for `curves` see `rewards`."""
-    figures = {"reward": rewards(curves, summary["dqn"]), "policies": missions(summary["mission"])}
-    for name, figure in figures.items():
-        files.write(path / f"{name}.png", _png(figure))
+def of_seeds(curves: Curves, results: Results) -> dict[str, bytes]:
+    """Draws the plots of several seeds.
+
+    Args:
+      curves: of all seeds.
+      results: the blocks of the summary.
+
+    Returns:
+      PNG files by their names.
+    """
+    return {
+        "reward.png": png(rewards(curves, results["dqn"])),
+        "policies.png": png(mission_plots.policies(results["mission"])),
+    }
 
 
-def of_missions(config: Config, summary: dict[str, Any]) -> dict[str, bytes]:
-    """The files `policies.png` and, with missions elsewhere, `teams.png`, by their names."""
-    figures = {"policies.png": missions(summary["mission"])}
-    if "elsewhere" in summary:
-        figures["teams.png"] = teams(config, summary)
-    return {name: _png(figure) for name, figure in figures.items()}
-
-
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """A figure as a PNG file."""
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=120)
     return content.getvalue()
@@ -80,7 +101,7 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     titles = {"joint": " & ".join(config.modalities)}
     figure = Figure(figsize=(3.6 * len(names) + 1.2, 7.6), layout="constrained")
     axes = figure.subplots(2, len(names), sharex=True, sharey=True, squeeze=False)
-    shown = {n: jax.tree.map(lambda x: x[:, :_MOST_ELLIPSES], posteriors[n]) for n in names}
+    shown = {n: jax.tree.map(lambda x: x[:, :_MAX_ELLIPSES], posteriors[n]) for n in names}
     norms = {name: np.linalg.norm(belief.std, axis=-1) for name, belief in shown.items()}
     scale = Normalize(min(x.min() for x in norms.values()), max(x.max() for x in norms.values()))
     sigma_map = colormaps["viridis"]
@@ -106,9 +127,11 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     return figure
 
 
-def _beliefs(axes: Any, belief: Belief, by_class: list[RGB], by_sigma: np.ndarray) -> int:
+def _beliefs(
+    axes: Sequence[Axes], belief: Belief, by_class: list[RGB], by_sigma: np.ndarray
+) -> int:
     """Draws `[C, S]` beliefs on two axes; returns how many lie far from their class."""
-    mean, std = _in_plane(belief.mean), _in_plane(belief.std)
+    mean, std = in_plane(belief.mean), in_plane(belief.std)
     centre, spread = np.median(mean, axis=1), np.median(std, axis=1)
     is_far = _apart(mean, centre[:, None], spread[:, None]) > _FAR
     for c, colour in enumerate(by_class):
@@ -121,8 +144,8 @@ def _beliefs(axes: Any, belief: Belief, by_class: list[RGB], by_sigma: np.ndarra
 
 def _fit(axes: np.ndarray, beliefs: list[Belief]) -> None:
     """Limits the axes to a square around all ellipses, with room for the names of classes."""
-    means = [_in_plane(belief.mean) for belief in beliefs]
-    radii = [_in_plane(belief.std) for belief in beliefs]
+    means = [in_plane(belief.mean) for belief in beliefs]
+    radii = [in_plane(belief.std) for belief in beliefs]
     low = np.min(np.subtract(means, radii), axis=(0, 1, 2))
     high = np.max(np.add(means, radii), axis=(0, 1, 2))
     half = 0.63 * np.max(high - low)
@@ -132,19 +155,13 @@ def _fit(axes: np.ndarray, beliefs: list[Belief]) -> None:
         ax.set_aspect("equal", adjustable="box")
 
 
-def _in_plane(values: Any) -> np.ndarray:
-    """`[..., D]` as `[..., 2]`: the first two, or zero."""
-    values = np.asarray(values)
-    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, 1)])[..., :2]
-
-
 def _apart(mean: np.ndarray, centre: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Distance of `[..., 2]` means from a centre, in standard deviations."""
     return np.linalg.norm((mean - centre) / np.maximum(spread, 1e-6), axis=-1)
 
 
 def _ellipses(
-    axes: Any, mean: np.ndarray, std: np.ndarray, colours: np.ndarray, is_far: np.ndarray
+    axes: Axes, mean: np.ndarray, std: np.ndarray, colours: np.ndarray, is_far: np.ndarray
 ) -> None:
     """Ellipses and their centres, `[S, 2]`, in the colours `[S, 3 or 4]`; crosses if far `[S]`."""
     for marker, line, chosen in ((".", "-", ~is_far), ("x", ":", is_far)):
@@ -158,7 +175,7 @@ def _ellipses(
         axes.scatter(*mean[chosen].T, s=25, marker=marker, c=colours[chosen])
 
 
-def _name_classes(axes: Any, centre: np.ndarray, spread: np.ndarray) -> None:
+def _name_classes(axes: Axes, centre: np.ndarray, spread: np.ndarray) -> None:
     """Writes the numbers of classes, `[C, 2]`, above their ellipses; joins those in one place."""
     waiting = list(range(len(centre)))
     while waiting:
@@ -178,41 +195,64 @@ def _name_classes(axes: Any, centre: np.ndarray, spread: np.ndarray) -> None:
         )
 
 
-def rewards(per_epoch: dict[str, dict[str, np.ndarray]], agents: dict[str, Any]) -> Figure:
-    """The paper's Fig. 5: reward of whole episodes over the epochs, with baselines as lines.
+def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:
+    """The paper's Fig. 5: reward of whole episodes over the epochs, with other policies as lines.
 
     Args:
-      per_epoch: for each modality the `[epochs]` rewards of the exploring policy, `reward`, and of
-        the greedy one, `greedy`, NaN where there are none; or `[K, epochs]` of several seeds, to
-        show their mean and its 95% interval.
+      curves: of one run or of several seeds.
       agents: the block `dqn` of the summary.
     """
-    figure = Figure(figsize=(5 * len(per_epoch), 4), layout="constrained")
-    axes = figure.subplots(1, len(per_epoch), squeeze=False)
-    for ax, (name, curves) in zip(axes[0], per_epoch.items(), strict=True):
-        exploring, greedy = (np.atleast_2d(curves[kind]) for kind in ("reward", "greedy"))
-        smooth = np.array([_smoothed(of_seed) for of_seed in exploring])
-        if len(smooth) > 0:
-            epochs = np.arange(exploring.shape[1] - smooth.shape[1], exploring.shape[1])
-            _curve(ax, epochs, smooth, "0.6", "DQN, exploring")
-            measured = np.flatnonzero(np.isfinite(greedy).any(axis=0))
-            _curve(ax, measured, greedy[:, measured], "C0", "DQN, greedy")
-        for i, key in enumerate(("return", "optimal", "naive", "random")):
-            style = ("-.", "--", ":", (0, (1, 4)))[i]
-            value = metrics.mean(agents[name][key])
-            ax.axhline(value, color=f"C{i + 1}", linestyle=style, label=metrics.label(key))
-        ax.set(title=f"{name} DQN", xlabel="epoch", ylabel="total reward of an episode")
-        ax.set_ylim(bottom=1.3 * min(metrics.mean(agents[name]["random"]), -0.1))
+    panels: list[tuple[str, Arrays, Agent | None]] = []
+    for name, of_network in curves.items():
+        if name in agents:
+            panels.append((f"{name}: a robot alone on the map", of_network, agents[name]))
+            continue
+        # Episodes of a team are another task than those of a robot that is alone on the map.
+        alone, agent = next(iter(agents.items()))
+        greedy = {"greedy": of_network["greedy"]}
+        panels.append((f"episodes of the whole {name}", {"reward": of_network["reward"]}, None))
+        panels.append((f"{name}: one {alone} robot alone on the map", greedy, agent))
+    figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for ax, (title, of_panel, agent) in zip(axes, panels, strict=True):
+        for kind, values in of_panel.items():
+            _draw_rewards(ax, kind, np.atleast_2d(values))
+        if agent is not None:
+            _draw_references(ax, agent)
+        ax.set(title=title, xlabel="epoch", ylabel="total reward of an episode")
         ax.grid(alpha=0.3)
-    axes[0, 0].legend(loc="lower right")
+        ax.legend(loc="lower right")
     return figure
 
 
-def _curve(ax: Any, epochs: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:
-    """The mean of `[K, E]` values; with several seeds also its 95% interval."""
-    ax.plot(epochs, values.mean(axis=0), color=colour, label=label, linewidth=1.2)
-    if len(values) > 1:
-        ax.fill_between(epochs, *interval(values), color=colour, alpha=0.2, linewidth=0)
+def _draw_rewards(ax: Axes, kind: str, values: np.ndarray) -> None:
+    """Draws `[K, epochs]` rewards: the mean, and of several seeds its 95% interval."""
+    if len(values) == 0:
+        return
+    if kind == "reward":
+        colour, label = "0.6", "exploring"
+        shown = np.array([_smoothed(of_seed) for of_seed in values])
+        epochs = np.arange(values.shape[1] - shown.shape[1], values.shape[1])
+    else:
+        colour, label = "C0", "greedy"
+        epochs = np.flatnonzero(np.isfinite(values).any(axis=0))
+        shown = values[:, epochs]
+    ax.plot(epochs, shown.mean(axis=0), color=colour, label=label, linewidth=1.2)
+    if len(shown) > 1:
+        ax.fill_between(epochs, *bounds(shown), color=colour, alpha=0.2, linewidth=0)
+
+
+def _draw_references(ax: Axes, agent: Agent) -> None:
+    """Draws the policies that an agent is compared with; random ones are far below."""
+    optimal, naive, random = (mean(agent[key]) for key in ("optimal", "naive", "random"))
+    ax.axhline(optimal, color="C2", linestyle="--", label=AGENTS["optimal"].label)
+    ax.axhline(naive, color=policy_colour("naive"), linestyle=":", label=AGENTS["naive"].label)
+    bottom = naive - max(0.5, optimal - naive)
+    ax.set_ylim(bottom=bottom)
+    if random < bottom:
+        ax.plot([], [], " ", label=f"random: {random:.2f}")
+    else:
+        ax.axhline(random, color=policy_colour("random"), linestyle=(0, (1, 4)), label="random")
 
 
 def _smoothed(reward: np.ndarray) -> np.ndarray:
@@ -223,30 +263,41 @@ def _smoothed(reward: np.ndarray) -> np.ndarray:
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)
 
 
-def scanlines(config: Config, windows: dict[str, np.ndarray]) -> Figure:
-    """One look at each class as each detector reads it, from left to right."""
+def scanlines(config: Config, windows: Arrays) -> Figure:
+    """One look at each class as each detector reads it, from left to right.
+
+    Args:
+      config: all settings.
+      windows: for each modality `[C, 1, F]` readings.
+    """
     classes = config.arena.classes
-    figure = Figure(figsize=(3.6 * len(classes), 2.6 * len(windows)), layout="constrained")
-    axes = figure.subplots(len(windows), len(classes), squeeze=False)
-    for row, sensor in zip(axes, sensors.make(config), strict=True):
-        name, ray = sensor.name, {"camera": "pixel", "lidar": "beam"}.get(sensor.name, "ray")
+    columns = min(len(classes), _COLUMNS)
+    lines = math.ceil(len(classes) / columns)
+    made = sensors.make(config)
+    heights = [0.8 if sensor.channels == 3 else 2.2 for sensor in made for _ in range(lines)]
+    figure = Figure(figsize=(3.2 * columns, sum(heights) + 0.6), layout="constrained")
+    axes = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
+    for m, sensor in enumerate(made):
+        rows = axes[m * lines : (m + 1) * lines].ravel()
         from_left = 1 if sensor.angles[0] > sensor.angles[-1] else -1
-        for ax, label, window in zip(row, classes, windows[name][:, 0], strict=True):
-            readings = window.reshape(sensor.window, sensor.channels)[::from_left]
-            ax.set(title=f"{name}: {label}", xlabel=f"{ray} of the window, left to right")
-            if name == "camera":
-                ax.imshow(as_srgb(readings)[None], aspect="auto", interpolation="nearest")
-                ax.set(yticks=[])
+        readings = windows[sensor.name][:, 0].reshape(-1, sensor.window, sensor.channels)
+        readings = readings[:, ::from_left]
+        top = 1.05 * np.max(readings, initial=0.0, where=np.isfinite(readings))
+        for ax, label, values in zip(rows, classes, readings, strict=False):
+            ax.set_title(f"{sensor.name}: {label}", fontsize=10)
+            if sensor.channels == 3:  # an image
+                ax.imshow(as_srgb(values)[None], aspect="auto", interpolation="nearest")
+                ax.set(yticks=[], xticks=[])
             else:
-                ax.plot(readings, ".", color=class_colour(config.arena, label), markersize=3)
-            if name == "lidar":
-                ax.set(ylabel="distance [m]", ylim=(0, None))
+                ax.plot(values, ".", color=class_colour(config.arena, label), markersize=3)
+                ax.set(ylim=(0, top or 1.0))
+        for ax in rows[len(classes) :]:
+            ax.set_axis_off()
+    figure.supxlabel("rays of the window, from left to right; distances in metres", fontsize=10)
     return figure
 
 
-def calibration(
-    config: Config, detections: dict[str, np.ndarray], belief: dict[str, Any]
-) -> Figure:
+def calibration(config: Config, detections: Arrays, belief: Beliefs) -> Figure:
     """Whether probabilities are right: of the detectors, and of the map after several looks.
 
     Args:
@@ -261,139 +312,19 @@ def calibration(
         labels = jnp.repeat(jnp.array(config.label_of_class(name)), looks.shape[1])
         flat = jnp.asarray(looks.reshape(-1, looks.shape[-1]))
         confidence, accuracy, share = map(np.asarray, reliability(flat, labels))
-        left.plot(confidence, accuracy, color=f"C{i}", linewidth=1)
-        # Hollow, for most lie on top of each other where detectors are sure.
-        style = {"marker": "oDs^"[i % 4], "facecolors": "none", "edgecolors": f"C{i}"}
-        left.scatter(confidence, accuracy, s=10 + 300 * share, label=name, **style)
+        is_shown = share * len(flat) > _MIN_LOOKS - 0.5
+        confidence, accuracy, share = (x[is_shown] for x in (confidence, accuracy, share))
+        style = {"color": f"C{i}", "marker": MARKERS[i % 4], "markersize": 4, "linewidth": 1}
+        left.plot(confidence, accuracy, label=name, markerfacecolor="none", **style)
+        # Hollow, for most lie on top of each other where detectors are confident.
+        left.scatter(confidence, accuracy, 10 + 300 * share, facecolors="none", edgecolors=f"C{i}")
     lowest = 1 / max(looks.shape[-1] for looks in detections.values())
     left.set(xlabel="confidence", ylabel="share of right labels", title="detectors")
     left.set(xlim=(lowest - 0.02, 1.02), ylim=(min(lowest, 0.5) - 0.1, 1.02))
-    looks = [metrics.mean(number) for number in belief["looks"]]
-    right.plot(looks, [*map(metrics.mean, belief["nll"])], "o-", label="map")
-    right.plot(looks, [*map(metrics.mean, belief["bayes_nll"])], "x--", label="exact Bayes")
+    right.plot(belief["looks"], belief["nll"], "o-", label="map")
+    right.plot(belief["looks"], belief["bayes_nll"], "x--", label="exact Bayes")
     right.set(xlabel="looks", ylabel="NLL of the true class [nats]", title="beliefs", yscale="log")
     for ax in (left, right):
         ax.grid(alpha=0.3)
         ax.legend()
     return figure
-
-
-def missions(block: dict[str, Any]) -> Figure:
-    """Share of wrong points in finished maps against looks and time, of every policy.
-
-    Args:
-      block: the block `mission` of the summary.
-    """
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    found = {name: case for name, case in metrics.cases(block).items() if name in POLICIES}
-    naive = [case for name, case in found.items() if name.startswith("naive")]
-    for ax, key in zip(axes, ("observations_per_poi", "time_s"), strict=True):
-        line = [metrics.mean(case[key]) for case in naive], [*map(_wrong, naive)]
-        ax.plot(*line, color="0.7", linewidth=1)
-        for i, (name, case) in enumerate(found.items()):
-            place = metrics.mean(case[key]), _wrong(case)
-            ax.plot(*place, "oDs^"[i % 4], color=f"C{i}", label=name.replace("_", " "))
-        metric = next(metric for metric in metrics.MISSIONS if metric.key == key)
-        ax.set(xlabel=metric.label, xlim=(0, None), yscale="log")
-        ax.grid(alpha=0.3)
-    axes[0].set_ylabel("share of wrong points")
-    axes[0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes[0].yaxis.set_major_formatter(lambda share, _: _percent(share))
-    if min(map(_wrong, found.values())) == _LEAST_SHARE:
-        axes[0].set_ylim(bottom=0.8 * _LEAST_SHARE)
-    axes[0].yaxis.set_minor_formatter(NullFormatter())
-    axes[1].legend(loc="upper left")
-    return figure
-
-
-def teams(config: Config, summary: dict[str, Any]) -> Figure:
-    """Median time of missions, of every policy, against numbers of PoIs and of robots.
-
-    Args:
-      config: all settings.
-      summary: of the run, with the block `elsewhere`.
-    """
-    own = {
-        "num_pois": config.arena.num_pois,
-        "side": config.arena.side,
-        "robots": list(config.carried),
-        "mission": summary["mission"],
-    }
-    places = [own, *summary["elsewhere"].values()]
-    of_arenas = [
-        (f"{number} points of interest in {side:g} m", "robots", group)
-        for (number, side), group in _groups(places, "num_pois", "side")
-        if len({len(place["robots"]) for place in group}) > 1
-    ]
-    drawn = [place for _, _, group in of_arenas for place in group]
-    panels = [
-        (f"robots: {_counted(team)}", "num_pois", group)
-        for (team,), group in _groups(places, "robots")
-        if len(group) > 1 or group[0] not in drawn
-    ]
-    panels += of_arenas
-    columns = min(len(panels), 3)
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(5 * columns, 4 * rows), layout="constrained")
-    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for ax, (title, key, group) in zip(axes, panels, strict=False):
-        _times(ax, group, key)
-        ax.set(title=title)
-    for ax in axes[len(panels) :]:
-        ax.set_axis_off()
-    handles = {
-        label: handle
-        for ax in figure.axes
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(handles.values(), handles.keys(), loc="outside right upper")
-    return figure
-
-
-def _groups(places: list[dict[str, Any]], *keys: str) -> list[tuple[list[Any], list[Any]]]:
-    """Places by the values of the keys, in the order in which these came first."""
-    found: dict[str, list[dict[str, Any]]] = {}
-    for place in places:
-        found.setdefault(str([place[key] for key in keys]), []).append(place)
-    return [([group[0][key] for key in keys], group) for group in found.values()]
-
-
-def _counted(team: list[str]) -> str:
-    """A team in words: `2 camera, 1 lidar`."""
-    return ", ".join(f"{team.count(modality)} {modality}" for modality in dict.fromkeys(team))
-
-
-def _times(ax: Any, places: list[dict[str, Any]], key: str) -> None:
-    """A line for each policy: the time of missions against the number of PoIs or of robots."""
-
-    def number(place: dict[str, Any]) -> int:
-        return place[key] if key == "num_pois" else len(place[key])
-
-    numbers = sorted(map(number, places))
-    # Places of one number differ in something else, and no line leads from one to the other.
-    line = "-" if len(set(numbers)) == len(numbers) else ""
-    for i, name in enumerate(POLICIES):
-        of_policy = [
-            (number(place), metrics.mean(place["mission"][name]["time_s"]))
-            for place in sorted(places, key=number)
-            if name in place["mission"]
-        ]
-        if of_policy:
-            # The last ones in the same colours have dashes.
-            style = "oDs^"[i % 4] + (line if i < _NUM_COLOURS else 2 * line)
-            ax.plot(*zip(*of_policy, strict=True), style, color=f"C{i}", label=name)
-    label = "points of interest" if key == "num_pois" else "robots"
-    ax.set(xlabel=label, ylabel="median time [s]", ylim=(0, None), xticks=sorted(set(numbers)))
-    ax.grid(alpha=0.3)
-
-
-def _wrong(case: dict[str, Any]) -> float:
-    """The share of wrong points of a case, above 0 for an axis of logarithms."""
-    return max(1 - metrics.mean(case["accuracy"]), _LEAST_SHARE)
-
-
-def _percent(share: float) -> str:
-    """A share of wrong points as text."""
-    is_least = share < 1.01 * _LEAST_SHARE
-    return f"{'≤ ' if is_least else ''}{100 * share:g}%"

@@ -4,9 +4,14 @@ import contextlib
 import time
 from collections.abc import Callable
 
+import rich.box
 import rich.console
 import rich.progress
+import rich.table
+import rich.text
 from rich.table import Column
+
+from jaxsense.show.tables import Table
 
 _LINE_PERIOD = 5.0  # s
 _WIDE = 110  # columns of a terminal, enough for a bar
@@ -119,3 +124,23 @@ def say(text: str) -> None:
     """Prints a line; ignores a closed output, which must not end a run."""
     with contextlib.suppress(OSError):
         print(text, flush=True)
+
+
+def print_table(console: rich.console.Console, table: Table) -> None:
+    """Prints a table; its texts may hold anything.
+
+    Args:
+      console: to print it on.
+      table: the table.
+    """
+    drawn = rich.table.Table("", box=rich.box.SIMPLE, pad_edge=False, title_justify="left")
+    drawn.title = rich.text.Text(table.caption)
+    for name in table.columns:
+        drawn.add_column(rich.text.Text(name), justify="right")
+    for r, (name, values) in enumerate(table.rows):
+        cells = (
+            rich.text.Text(value, "bold" if (r, i) in table.best else "")
+            for i, value in enumerate(values)
+        )
+        drawn.add_row(rich.text.Text(name), *cells)
+    console.print(drawn)

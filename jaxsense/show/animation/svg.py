@@ -79,7 +79,7 @@ class Timeline:
             keyTimes=";".join(times),
             calcMode=mode,
             dur=f"{self.duration:.2f}s",
-            repeatCount="indefinite",
+            repeatCount="3",
             **more,
         )
 

@@ -1,6 +1,5 @@
 """The two halves of the picture: the arena from above, and the shared map."""
 
-from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -11,7 +10,7 @@ from jaxsense.core.types import Belief
 from jaxsense.mission import MissionState, Record
 from jaxsense.mission.state import ENDED, FACING
 from jaxsense.show.animation.svg import Timeline, add
-from jaxsense.show.colours import as_hex, class_colour, modality_colour
+from jaxsense.show.colours import as_hex, class_colour, in_plane, modality_colour
 
 SIZE = 340  # px, of a view
 _FLASH = 6  # frames that a look is shown for
@@ -141,7 +140,7 @@ class MapView:
 
     def __init__(self, config: Config, end: MissionState, class_beliefs: Belief):
         self._config, self._end = config, end
-        self._classes = _in_plane(class_beliefs.mean), _in_plane(class_beliefs.std)
+        self._classes = in_plane(class_beliefs.mean), in_plane(class_beliefs.std)
         self._reach = 1.0 + float(np.max(np.abs(self._classes[0]) + self._classes[1]))
         self._scale = SIZE / 2 / self._reach
 
@@ -157,9 +156,9 @@ class MapView:
         # Before the first look each is wider than the view, a little less so than the one before.
         step = min(4.0, SIZE / 4 / num_pois)
         for n in range(num_pois):
-            mean = self._place(_smooth(_in_plane(record.belief.mean[:, n])))
+            mean = self._place(_smooth(in_plane(record.belief.mean[:, n])))
             widest = SIZE / 2 - 5 - step * n
-            std = self._scale * _in_plane(record.belief.std[:, n])
+            std = self._scale * in_plane(record.belief.std[:, n])
             radii = _smooth(np.minimum(std, widest))
             colour = colours[int(self._end.classes[n])]
             ellipse = add(parent, "ellipse", fill=colour, stroke=colour)
@@ -213,12 +212,6 @@ def _sector(radius: float, angle: float) -> str:
     return (
         f"M0,0L{x:.1f},{-y:.1f}A{radius:.1f},{radius:.1f} 0 {int(angle > 180)} 1 {x:.1f},{y:.1f}Z"
     )
-
-
-def _in_plane(values: Any) -> np.ndarray:
-    """`[..., D]` as `[..., 2]`: the first two, or zero."""
-    values = np.asarray(values)
-    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, 2)])[..., :2]
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:

@@ -1,0 +1,135 @@
+"""Compares policies that played in the same arenas."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import scipy.special
+
+from jaxsense.config import POLICIES
+from jaxsense.summary.blocks import Case, Differences, Missions, OfNaive, cases
+from jaxsense.summary.metrics import Interval, mean
+
+REFERENCE = "latent"
+"""The policy that the others are compared with."""
+
+Measured = Mapping[str, Any]
+"""`[E, ...]` metrics of the missions of a case, see `mission.measure`."""
+
+_CONFIDENCE = 0.95
+_NAIVE = ("naive", "naive_2", "naive_3")
+_AS_ACCURATE = 0.005  # difference of accuracies that does not matter
+
+
+def bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The 95% interval of the mean of `[K, ...]` values by Student's t; NaN if K is 1."""
+    average = values.mean(axis=0)
+    if len(values) == 1:
+        return np.full_like(average, np.nan), np.full_like(average, np.nan)
+    error = values.std(axis=0, ddof=1) / np.sqrt(len(values))
+    # `scipy.stats`, which calls the same function, takes a third of a second to import.
+    error = error * scipy.special.stdtrit(len(values) - 1, (1 + _CONFIDENCE) / 2)
+    return average - error, average + error
+
+
+def interval(values: np.ndarray) -> Interval:
+    """The mean of `[K]` values and its 95% interval, see `bounds`."""
+    low, high = (None if np.isnan(end) else float(end) for end in bounds(values))
+    return {"mean": float(values.mean()), "low": low, "high": high}
+
+
+def differences(found: Measured, reference: Measured) -> Differences:
+    """Mean differences of one case from another, arena by arena, with their 95% intervals.
+
+    Args:
+      found: metrics of the case.
+      reference: metrics of the other case, in the same arenas.
+    """
+
+    def of(name: str) -> Interval:
+        return interval(np.asarray(found[name] - reference[name], float))
+
+    own, other = (case["is_right"].mean(axis=-1) for case in (found, reference))
+    return {
+        "accuracy": interval(own - other),
+        "observations_per_poi": of("observations_per_poi"),
+        "time_s": of("time_s"),
+    }
+
+
+def of_naive(played: dict[str, Case], name: str) -> OfNaive | None:
+    """Compares looks and time of a policy with naive exploration of the same accuracy.
+
+    Interpolates linearly between naive exploration with one, two and three looks of each robot at
+    each PoI, and ignores looks that make it no more accurate. Compares a policy that is more
+    accurate than all of these with the most accurate one: naive exploration would need even more.
+
+    Args:
+      played: cases in the same arenas.
+      name: of the policy.
+
+    Returns:
+      The ratios; None if naive exploration was not played, or is more accurate with fewer looks.
+    """
+    if not {name, *_NAIVE} <= set(played):
+        return None
+    naive = [played[_NAIVE[0]]]
+    for each in _NAIVE[1:]:
+        if played[each]["accuracy"] > naive[-1]["accuracy"]:
+            naive.append(played[each])
+    case, accuracies = played[name], [each["accuracy"] for each in naive]
+    if case["accuracy"] < accuracies[0]:
+        return None
+
+    def ratio(own: float, of_naive: list[float]) -> float:
+        return float(own / np.interp(case["accuracy"], accuracies, of_naive))
+
+    return {
+        "observations_per_poi": ratio(
+            case["observations_per_poi"], [each["observations_per_poi"] for each in naive]
+        ),
+        "time_s": ratio(case["time_s"], [each["time_s"] for each in naive]),
+        "mean_time_s": ratio(case["mean_time_s"], [each["mean_time_s"] for each in naive]),
+    }
+
+
+def compared(missions: Missions) -> Missions:
+    """Missions in the same arenas, with the ratios `of_naive` computed anew."""
+    found, played = missions.copy(), cases(missions)
+    for name, case in played.items():
+        ratios, kept = of_naive(played, name), case.copy()
+        kept.pop("of_naive", None)
+        found[name] = kept if ratios is None else {**kept, "of_naive": ratios}
+    return found
+
+
+def verdict(played: dict[str, Case]) -> str | None:
+    """Says how fast the latent policy is beside naive exploration and beside the fastest policy.
+
+    Args:
+      played: cases in the same arenas.
+
+    Returns:
+      A sentence about median times; None unless both policies were played.
+    """
+    if not {REFERENCE, "naive"} <= set(played):
+        return None
+    own = played[REFERENCE]
+
+    def against(name: str) -> str:
+        percent = 100 * (mean(own["time_s"]) / mean(played[name]["time_s"]) - 1)
+        return f"{abs(percent):.0f} % {'faster' if percent < 0 else 'slower'} than "
+
+    text = f"The latent policy is {against('naive')}naive exploration"
+    faster = {
+        name: mean(case["time_s"])
+        for name, case in played.items()
+        if name in POLICIES
+        and not name.startswith("naive")
+        and mean(case["time_s"]) < mean(own["time_s"])
+        and mean(case["accuracy"]) > mean(own["accuracy"]) - _AS_ACCURATE
+    }
+    if faster:
+        best = min(faster, key=lambda name: faster[name])
+        text += f" (and {against(best)}`{best}`)"
+    return f"{text}."

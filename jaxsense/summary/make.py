@@ -1,0 +1,185 @@
+"""Makes the blocks of `summary.json` from arrays."""
+
+from collections.abc import Mapping, Sequence
+
+import jax
+import numpy as np
+
+from jaxsense.config import Config
+from jaxsense.dqn import episodes
+from jaxsense.mission.outcome import REASONS
+from jaxsense.mission.state import Mission
+from jaxsense.summary.blocks import (
+    Agent,
+    Beliefs,
+    Case,
+    Jmvae,
+    Missions,
+    Returns,
+    Traffic,
+    cases,
+)
+from jaxsense.summary.compare import REFERENCE, Measured, compared, differences
+
+MDP_POLICIES = ("return", "optimal", "naive", "random")
+"""The policies on the map: the greedy one of a Q-network, and those to compare it with."""
+
+_UNAMBIGUOUS = 0.9  # share of looks in a single class, above which the class counts as one
+_AS_GOOD = 0.01  # reward by which a policy may miss the optimum
+_FLOAT_BYTES = 4
+
+
+def jmvae(measured: Mapping[str, object]) -> Jmvae:
+    """The block `jmvae`.
+
+    Args:
+      measured: arrays under its keys, with shares of looks under `unambiguous`.
+    """
+    block: Jmvae = jax.tree.map(lambda x: np.asarray(x).tolist(), dict(measured))
+    for name, shares in block["unambiguous"].items():
+        block["unambiguous"][name] = [share > _UNAMBIGUOUS for share in shares]
+    return block
+
+
+def beliefs(measured: Mapping[str, jax.Array]) -> Beliefs:
+    """The block `belief` from arrays under its keys."""
+    return jax.tree.map(lambda x: np.asarray(x).tolist(), dict(measured))
+
+
+def agent(
+    config: Config,
+    total: np.ndarray,
+    first: np.ndarray,
+    seconds: Sequence[float],
+    others: Mapping[int, np.ndarray],
+) -> Agent:
+    """One modality's block of `dqn`.
+
+    Args:
+      config: all settings.
+      total: `[P, S]` total reward of each of `MDP_POLICIES` in an episode from every state of the
+        map, then from `config.evaluation.num_starts` random ones.
+      first: `[P, S]` reward of the first action.
+      seconds: of the training, chunk by chunk.
+      others: `total` with other numbers of PoIs, whose last starts are the random ones.
+    """
+    num_starts, env_steps = config.evaluation.num_starts, config.dqn.epochs * config.dqn.num_envs
+    num_states = total.shape[1] - num_starts
+    one_step = dict(zip(MDP_POLICIES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
+    missed = total[MDP_POLICIES.index("optimal"), :num_states] - total[0, :num_states]
+    is_optimal = missed <= _AS_GOOD
+    sizes = config.arena.num_pois, len(config.arena.classes), len(config.modalities)
+    states, _ = episodes.every_state(*sizes, config.evaluation.num_states)
+    is_permutation = episodes.are_different(states)
+    block: Agent = {
+        **_returns(total[:, num_states:]),
+        "one_step": {
+            "policy": one_step["return"],
+            "optimal": one_step["optimal"],
+            "random": one_step["random"],
+        },
+        "optimal_states": int(np.sum(is_optimal)),
+        "num_states": num_states,
+        "optimal_permutations": int(np.sum(is_optimal & is_permutation)),
+        "num_permutations": int(np.sum(is_permutation)),
+        "env_steps": env_steps,
+        "env_steps_per_s": env_steps / sum(seconds),
+    }
+    if others:
+        block["other_numbers"] = {
+            str(number): _returns(each[:, -num_starts:]) for number, each in others.items()
+        }
+    return block
+
+
+def _returns(total: np.ndarray) -> Returns:
+    """Means of `[P, S]` rewards from random starts."""
+    policy, optimal, naive, random = total.mean(axis=1).tolist()
+    return {
+        "return": policy,
+        "optimal": optimal,
+        "naive": naive,
+        "random": random,
+        # Where no look pays, the optimum is 0.
+        "fraction_of_optimal": policy / optimal if optimal else None,
+    }
+
+
+def missions(mission: Mission, played: Mapping[str, Measured]) -> Missions:
+    """The block `mission`.
+
+    Args:
+      mission: all robots and their arena.
+      played: metrics of the missions of each case, in the same arenas.
+    """
+    found: Missions = {name: case(mission.config, name, each) for name, each in played.items()}
+    for name, block in cases(found).items():
+        if REFERENCE in played and name != REFERENCE:
+            block["intervals"] = differences(played[name], played[REFERENCE])
+    detections = sum(each["detections"].sum(axis=0) for each in played.values())
+    return {**compared(found), "bytes_per_detection": traffic(mission, np.asarray(detections))}
+
+
+def case(config: Config, name: str, found: Measured) -> Case:
+    """One case of the block `mission`.
+
+    Args:
+      config: all settings.
+      name: of the case.
+      found: metrics of its missions.
+
+    Returns:
+      Means over the missions, except the median of `time_s` and the sum of `collisions`.
+    """
+    block: Case = {
+        "accuracy": float(found["is_right"].mean()),
+        "observations_per_poi": float(found["observations_per_poi"].mean()),
+        "time_s": float(np.median(found["time_s"])),
+        "mean_time_s": float(found["time_s"].mean()),
+        "collisions": int(found["collisions"].sum()),
+        "goals_reached_fraction": _share(found["goals_reached"].sum(), found["goals"].sum()),
+        "information": float(found["information"].mean()),
+        "episodes": len(found["time_s"]),
+        "ended": {
+            reason: int(np.sum(found["reason"] == code))
+            for code, reason in enumerate(REASONS)
+            if np.any(found["reason"] == code)
+        },
+    }
+    robot = name.removesuffix("_alone")
+    if robot != name:
+        modality = config.carried[config.robot_names.index(robot)]
+        labels = np.array(config.label_of_class(modality))
+        shares_label = np.array([np.sum(labels == label) > 1 for label in labels])
+        reported = found["ambiguous"][shares_label[found["classes"]]]
+        block["told"] = float(found["told"][modality].mean())
+        block["ambiguous_reported"] = _share(reported.sum(), reported.size)
+    return block
+
+
+def _share(part: int, whole: int) -> float | None:
+    """Share of a whole; None if that is 0."""
+    return float(part / whole) if whole else None
+
+
+def traffic(mission: Mission, detections: np.ndarray) -> Traffic:
+    """Network traffic of a detection.
+
+    Args:
+      mission: all robots and their sensors.
+      detections: `[R]` number of each robot's detections.
+
+    Returns:
+      Sizes in bytes: of a belief, and the means of the detections' features and scans; without
+      detections the means over the robots.
+    """
+    detections = np.maximum(detections, 0 if np.any(detections) else 1)
+    config = mission.config
+    sensors = [mission.world.sensors[m] for m in config.modality_of_robot]
+    scans = np.array([sensor.scan_bytes for sensor in sensors])
+    features = np.array([_FLOAT_BYTES * len(config.labels(name)) for name in config.carried])
+    return {
+        "latent": float(2 * _FLOAT_BYTES * config.jmvae.latent_size),
+        "features": float(np.average(features, weights=detections)),
+        "raw": float(np.average(scans, weights=detections)),
+    }

@@ -1,0 +1,88 @@
+"""Reads and checks `summary.json` and the evaluations beside it."""
+
+import json
+import types
+from pathlib import Path
+from typing import Annotated, NotRequired, Union, cast, get_args, get_origin, get_type_hints
+from typing import is_typeddict as is_block
+
+from jaxsense.config import ConfigError, parse_json
+from jaxsense.summary.blocks import Evaluation, Results, Summary, cases
+
+EVALUATIONS = "evaluations"
+"""The directory of evaluations in that of a run."""
+RESULTS = tuple(get_type_hints(Results))
+
+
+def read(run: Path) -> Summary:
+    """Reads the summary of a finished run, of one seed or of several.
+
+    Args:
+      run: its directory.
+
+    Raises:
+      ConfigError: if there is no summary, or a value in it is missing or wrong.
+    """
+    return cast(Summary, _read(run, run / "summary.json", Summary))
+
+
+def read_evaluations(run: Path) -> dict[str, Evaluation]:
+    """Reads the evaluations of a run, those in the summary of an older version first.
+
+    Args:
+      run: its directory.
+
+    Returns:
+      The evaluations, by the names of their files.
+
+    Raises:
+      ConfigError: if one cannot be read, or a value in it is missing or wrong.
+    """
+    found: dict[str, Evaluation] = {}
+    for name, place in read(run).get("elsewhere", {}).items():
+        first = next(iter(cases(place["mission"]).values()))
+        found[name] = {**place, "seed": first.get("seed", 0), "episodes": first["episodes"]}
+    for file in sorted((run / EVALUATIONS).glob("*.json")):
+        found[file.stem] = cast(Evaluation, _read(run, file, Evaluation))
+    return found
+
+
+def _read(run: Path, file: Path, kind: type) -> object:
+    try:
+        content = parse_json(file.read_text(encoding="utf-8"))
+        json.dumps(content, allow_nan=False)
+        # Of several seeds, only what each of them wrote is of this type.
+        has_seeds = isinstance(content, dict) and "seeds" in content
+        values, kind = (content["seeds"], dict[str, Results]) if has_seeds else (content, kind)
+        if wrong := _wrong(values, kind, file.stem):
+            raise ValueError(wrong)
+        return content
+    except (OSError, ValueError) as error:
+        reason = f"must hold the {file.relative_to(run)} of a finished run ({error})"
+        raise ConfigError("run", str(run), reason) from None
+
+
+def _wrong(value: object, kind: type, key: str) -> str | None:
+    """The first JSON value that is missing or not of its type; None if all are."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Annotated, NotRequired):
+        return _wrong(value, inner[0], key)
+    if origin in (Union, types.UnionType):
+        found = [_wrong(value, each, key) for each in inner]
+        return None if None in found else found[0]
+    if is_block(kind) and isinstance(value, dict):
+        hints = get_type_hints(kind, include_extras=True)
+        if missing := sorted(kind.__required_keys__ - set(value)):
+            return f"{key}.{missing[0]} is missing"
+        items = [(name, value[name], hints[name]) for name in hints if name in value]
+    elif origin is dict and isinstance(value, dict):
+        items = [(name, each, inner[1]) for name, each in value.items()]
+    elif origin is list and isinstance(value, list):
+        items = [(str(i), each, inner[0]) for i, each in enumerate(value)]
+    else:
+        kinds = (int, float) if kind is float else kind
+        is_right = not (is_block(kind) or origin) and isinstance(value, kinds)
+        is_right &= kind is bool or not isinstance(value, bool)
+        return None if is_right else f"{key} has the wrong type"
+    found = (_wrong(each, hint, f"{key}.{name}") for name, each, hint in items)
+    return next((wrong for wrong in found if wrong), None)
