@@ -170,12 +170,8 @@ def _write(
     with _locked(run):
         # Another policy may have played in the same arenas before.
         before = summary.read_evaluations(run).get(path.stem)
-        found: summary.Evaluation = {
-            **_place_of(config, {**(before["mission"] if before else {}), **missions}),
-            "seed": arguments.seed,
-            "episodes": arguments.episodes,
-        }
-        found["mission"] = compare.compared(found["mission"])
+        blocks = {**(before["mission"] if before else {}), **missions}
+        found = _evaluation(config, compare.compared(blocks))
         rundir.write_json(path, found)
         files.write(path.with_suffix(".png"), plots.png(mission_plots.policies(found["mission"])))
         report = _report(run, trained)
@@ -184,11 +180,9 @@ def _write(
 
 def _report(run: Path, config: Config) -> Path:
     """Writes the page of a run and `teams.png`; raises `ConfigError` if its figures are wrong."""
-    own, found = summary.read(run), summary.read_evaluations(run)
-    path, here = run / "report.html", _place_of(config, own["mission"])
-    episodes = max(case["episodes"] for case in summary.cases(own["mission"]).values())
-    places = [{**here, "seed": own["seed"], "episodes": episodes}, *found.values()]
-    if len({(p["num_pois"], p["side"], *p["robots"]) for p in places}) > 1:
+    own, found, path = summary.read(run), summary.read_evaluations(run), run / "report.html"
+    places = [_evaluation(config, own["mission"]), *found.values()]
+    if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:
         files.write(run / "teams.png", plots.png(mission_plots.teams(places)))
     files.write(path, page.render(run, config, own, found))
     return path
@@ -206,7 +200,7 @@ def _locked(run: Path) -> Iterator[None]:
         yield
 
 
-def _place_of(config: Config, missions: summary.Missions) -> summary.Place:
+def _evaluation(config: Config, missions: summary.Missions) -> summary.Evaluation:
     """Missions with their arena and team."""
     arena = config.arena
     return {
@@ -266,7 +260,7 @@ def _print(console: rich.console.Console, missions: summary.Missions, episodes: 
     """Prints the metrics of all cases."""
     caption = f"{episodes} missions of each policy, in the same arenas"
     for table in (tables.missions(missions, caption), tables.failures(missions)):
-        if table is not None and table.rows:
+        if table.rows:
             print_table(console, table)
     if verdict := compare.verdict(summary.cases(missions)):
         say(verdict)

@@ -340,13 +340,9 @@ def _write(run: RunDirectory, result: RunResult, timing: summary.Timing, monitor
     config, recording = run.settings.config, result.recording
     monitor.check_stop()
     pictures = plots.of_run(
-        config,
-        result.results,
-        result.posteriors,
-        result.rewards,
-        result.windows,
-        result.detections,
+        config, result.results, result.posteriors, result.windows, result.detections
     )
+    pictures |= plots.of_seeds(result.rewards, result.results)
     title = f"{config.mission.policies[0]} policy".replace("_", " ")
     beliefs = result.models.fusion.classes
     film = animation.draw(config, recording.records, recording.end, beliefs, title)

@@ -62,7 +62,7 @@ def teams(places: Iterable[Evaluation]) -> Figure:
       places: missions in two or more arenas or with two or more teams; of the same arena and team,
         those with the most missions are shown.
     """
-    ordered = sorted(places, key=lambda place: place["episodes"])
+    ordered = sorted(places, key=_num_missions)
     shown = [*{(p["num_pois"], p["side"], *p["robots"]): p for p in ordered}.values()]
     shown.sort(key=lambda place: (place["num_pois"], len(place["robots"])))
     of_arenas = [
@@ -91,6 +91,10 @@ def teams(places: Iterable[Evaluation]) -> Figure:
         ax.set_axis_off()
     figure.legend(handles.values(), handles.keys(), loc="outside right upper")
     return figure
+
+
+def _num_missions(place: Evaluation) -> int:
+    return max(case["episodes"] for case in cases(place["mission"]).values())
 
 
 def _groups(places: list[Evaluation], *keys: str) -> list[list[Evaluation]]:

@@ -42,40 +42,31 @@ def of_run(
     config: Config,
     results: Results,
     posteriors: dict[str, Belief],
-    rewards_of: Curves,
     windows: Arrays,
     detections: Arrays,
 ) -> dict[str, bytes]:
-    """Draws the plots of a run.
+    """Draws what only a run of one seed has, as PNG files by their names.
 
     Args:
       config: all settings.
       results: the blocks of the summary.
       posteriors: see `latent_space`.
-      rewards_of: see `rewards`.
       windows: see `scanlines`.
       detections: see `calibration`.
-
-    Returns:
-      PNG files by their names.
     """
     return {
         "latent_space.png": png(latent_space(config, posteriors)),
         "scanlines.png": png(scanlines(config, windows)),
         "calibration.png": png(calibration(config, detections, results["belief"])),
-        **of_seeds(rewards_of, results),
     }
 
 
 def of_seeds(curves: Curves, results: Results) -> dict[str, bytes]:
-    """Draws the plots of several seeds.
+    """Draws what a run and several seeds have, as PNG files by their names.
 
     Args:
-      curves: of all seeds.
+      curves: see `rewards`.
       results: the blocks of the summary.
-
-    Returns:
-      PNG files by their names.
     """
     return {
         "reward.png": png(rewards(curves, results["dqn"])),

@@ -5,7 +5,6 @@ from jaxsense.summary.blocks import Agent as Agent
 from jaxsense.summary.blocks import Case as Case
 from jaxsense.summary.blocks import Evaluation as Evaluation
 from jaxsense.summary.blocks import Missions as Missions
-from jaxsense.summary.blocks import Place as Place
 from jaxsense.summary.blocks import Results as Results
 from jaxsense.summary.blocks import Summary as Summary
 from jaxsense.summary.blocks import Timing as Timing

@@ -1,10 +1,9 @@
-"""What `summary.json` holds: a type for each block, and the meaning of each key beside it.
+"""What `summary.json` holds: each key with its type, its name, its meaning and its digits.
 
-The page, the plots, the terminal and the docs read names and meanings from here. Of several seeds,
-an `Interval` stands in place of each number.
+The page, the plots, the terminal and the docs read this table. Of several seeds, an `Interval`
+stands in place of each number.
 """
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Annotated, NotRequired, TypedDict, cast, get_args, get_origin, get_type_hints
 from typing import is_typeddict as is_block
@@ -16,140 +15,79 @@ PerClass = dict[str, list[float]]
 
 
 class StageTiming(TypedDict):
-    """`timing.stages.STAGE`."""
+    """`timing.stages.STAGE`; stages of one program share an entry."""
 
-    compile_s: Annotated[float, Metric("compile [s]", "Seconds of compiling.", digits=2)]
-    run_s: Annotated[
-        float,
-        Metric("run [s]", "Seconds of running. Stages of one program share an entry.", digits=2),
-    ]
+    compile_s: Annotated[float, "compile [s]", "", 2]
+    run_s: Annotated[float, "run [s]", "", 2]
 
 
 class Timing(TypedDict):
     """`timing`."""
 
-    total_s: Annotated[
-        float, Metric("total time [s]", "The whole command; its stages overlap.", digits=1)
-    ]
+    total_s: Annotated[float, "total time [s]", "The whole command; its stages overlap.", 1]
     stages: dict[str, StageTiming]
 
 
 class Detector(TypedDict):
     """`detectors.MODALITY`."""
 
-    accuracy: Annotated[
-        float, Metric("accuracy", "Share of right labels in scenes kept from training.", digits=4)
-    ]
-    ece: Annotated[
-        float,
-        Metric("calibration error", "Expected gap between confidence and accuracy.", digits=4),
-    ]
-    nll: Annotated[
-        float, Metric("NLL", "Mean negative log-probability of the right label, in nats.", digits=4)
-    ]
+    accuracy: Annotated[float, "accuracy", "Share of right labels in held-out scenes.", 4]
+    ece: Annotated[float, "calibration error", "Mean gap between confidence and accuracy.", 4]
+    nll: Annotated[float, "NLL", "Mean -log p of the right label, in nats.", 4]
 
 
 class Fusion(TypedDict):
     """`jmvae.fusion`: beliefs after one sensor's look and then another's; null with one sensor."""
 
-    accuracy: Annotated[
-        float | None,
-        Metric("fusion: right class", "Share of beliefs closest to the true class.", digits=4),
-    ]
-    mean_error: Annotated[
-        float | None,
-        Metric("fusion: error", "Distance from the joint belief, in standard deviations."),
-    ]
+    accuracy: Annotated[float | None, "fusion: right", "Share of beliefs in the true class.", 4]
+    mean_error: Annotated[float | None, "fusion: error", "Distance from the joint belief in sigma."]
     std_error: Annotated[
-        float | None,
-        Metric("fusion: error of sigma", "Mean |log(sigma ratio)| to the joint belief."),
+        float | None, "fusion: error of sigma", "Mean |log(ratio)| to the joint's."
     ]
 
 
 class Jmvae(TypedDict):
     """`jmvae`: the latent space."""
 
-    active_units: Annotated[
-        int, Metric("dimensions in use", "One of two in the paper's Fig. 4.", "1", 1)
-    ]
-    sigma_norm: Annotated[
-        PerClass,
-        Metric(
-            "sigma norm", "Mean ||sigma|| of each class, `joint` and by sensor.", "1.05 to 1.25"
-        ),
-    ]
+    active_units: Annotated[int, "dimensions in use", "One of two in the paper's Fig. 4."]
+    sigma_norm: Annotated[PerClass, "sigma norm", "Mean of each class, `joint` and by sensor."]
     unambiguous: Annotated[
         dict[str, list[bool]],
-        Metric(
-            "unambiguous",
-            "Whether over 90% of a class's looks leave the true class plausible and no other.",
-            "Table I",
-        ),
+        "unambiguous",
+        "Whether over 90% of its looks leave a class plausible and no other (Table I).",
     ]
     consistent: Annotated[
         PerClass,
-        Metric(
-            "consistent",
-            "Share of a class's looks that leave exactly the classes that the sensor cannot tell "
-            "apart. Stricter than Table I: the true class must be among them.",
-        ),
+        "consistent",
+        "Share of looks that leave exactly the classes that the sensor cannot tell apart.",
     ]
     moment_matching_error: Annotated[
-        float,
-        Metric(
-            "error of moments",
-            "Distance of a sensor's belief from the best Gaussian over the possible classes.",
-            "0 in theory",
-        ),
+        float, "error of moments", "Distance from the best Gaussian over the possible classes."
     ]
     fusion: Fusion
 
 
 class Beliefs(TypedDict):
-    """`belief`: the map after random looks at one PoI, beside exact Bayes."""
+    """`belief`: the map after random looks at one PoI, beside exact Bayes on the same looks."""
 
-    looks: Annotated[list[int], Metric("looks", "Numbers of looks, 1 to 6.")]
-    nll: Annotated[
-        list[float], Metric("NLL of the map", "Mean -log p of the true class, as the map has it.")
-    ]
-    bayes_nll: Annotated[
-        list[float], Metric("NLL of exact Bayes", "The same for the exact filter over classes.")
-    ]
-    accuracy: Annotated[
-        list[float], Metric("accuracy of the map", "Share of PoIs whose likeliest class is right.")
-    ]
-    bayes_accuracy: Annotated[
-        list[float], Metric("accuracy of exact Bayes", "The same for the exact filter.")
-    ]
+    looks: Annotated[list[int], "looks", "1 to 6."]
+    nll: Annotated[list[float], "NLL of the map", "Mean -log p of the true class."]
+    bayes_nll: Annotated[list[float], "NLL of exact Bayes"]
+    accuracy: Annotated[list[float], "accuracy of the map", "Share of right likeliest classes."]
+    bayes_accuracy: Annotated[list[float], "accuracy of exact Bayes"]
     doubt_correlation: Annotated[
-        float,
-        Metric(
-            "sigma and uncertainty",
-            "Correlation of ||sigma|| with the entropy of the exact posterior.",
-        ),
+        float, "sigma and uncertainty", "Correlation of ||sigma|| with the exact entropy."
     ]
 
 
 Returns = TypedDict(
     "Returns",
     {
-        "return": Annotated[
-            float,
-            Metric("Q-network", "Total reward of its greedy policy in an episode.", "Fig. 5"),
-        ],
-        "optimal": Annotated[
-            float,
-            Metric(
-                "optimal",
-                "Knows the mean reward of each look; with a filter, by dynamic programming.",
-                "0.550*",
-            ),
-        ],
-        "naive": Annotated[float, Metric("naive", "Looks at each PoI once, whatever it knows.")],
-        "random": Annotated[float, Metric("random", "Random looks, and a random end.")],
-        "fraction_of_optimal": Annotated[
-            float | None, Metric("fraction of optimal", "Q-network over optimal.")
-        ],
+        "return": Annotated[float, "Q-network", "Reward of an episode with its greedy policy."],
+        "optimal": Annotated[float, "optimal", "Knows the mean reward of each look."],
+        "naive": Annotated[float, "naive", "Looks at each PoI once, whatever the map holds."],
+        "random": Annotated[float, "random"],
+        "fraction_of_optimal": Annotated[float | None, "of optimal", "Q-network over optimal."],
     },
 )
 """Mean rewards of episodes on the map, from random starts."""
@@ -158,106 +96,61 @@ Returns = TypedDict(
 class OneStep(TypedDict):
     """`dqn.MODALITY.one_step`: the reward of the first step, as in the authors' code."""
 
-    policy: Annotated[float, Metric("one step: Q-network", "", "0.340, 0.385*")]
-    optimal: Annotated[float, Metric("one step: optimal", "", "0.426*")]
-    random: Annotated[float, Metric("one step: random", "", "-0.302*")]
+    policy: Annotated[float, "one step: Q-network"]
+    optimal: Annotated[float, "one step: optimal"]
+    random: Annotated[float, "one step: random"]
 
 
 class Agent(Returns):
     """`dqn.MODALITY`: a robot alone on the map."""
 
     one_step: OneStep
-    optimal_states: Annotated[
-        int, Metric("optimal in", "States with a reward within 0.01 of the optimum's.", digits=1)
-    ]
-    num_states: Annotated[
-        int, Metric("states", "Combinations of classes and looks; a sample of 4,096 if more.")
-    ]
-    optimal_permutations: Annotated[
-        int, Metric("optimal permutations", "The same where all PoIs differ in class.", digits=1)
-    ]
-    num_permutations: Annotated[int, Metric("permutations", "States of different classes.", "384")]
+    optimal_states: Annotated[int, "optimal in", "States with a reward within 0.01 of optimal.", 1]
+    num_states: Annotated[int, "states", "Combinations of classes and looks, or 4,096 of them.", 0]
+    optimal_permutations: Annotated[int, "optimal permutations", "", 1]
+    num_permutations: Annotated[int, "permutations", "States in which all classes differ.", 0]
     other_numbers: NotRequired[
-        Annotated[
-            dict[str, Returns],
-            Metric("other numbers", "Rewards with the numbers of PoIs in `evaluation.num_pois`."),
-        ]
+        Annotated[dict[str, Returns], "other numbers", "Rewards with `evaluation.num_pois` PoIs."]
     ]
-    env_steps: Annotated[
-        int, Metric("steps of training", "In all environments together.", "2,000 epochs")
-    ]
-    env_steps_per_s: Annotated[
-        float, Metric("steps per second", "In all environments, with learning.", digits=0)
-    ]
+    env_steps: Annotated[int, "steps of training", "In all environments together.", 0]
+    env_steps_per_s: Annotated[float, "steps per second", "In all environments, learning.", 0]
 
 
 class Differences(TypedDict):
-    """`mission.POLICY.intervals`: differences from the latent policy, arena by arena."""
+    """`mission.POLICY.intervals`: from the latent policy, arena by arena, with 95% intervals."""
 
-    accuracy: Annotated[Interval, Metric("right, difference", "From `latent`, with 95% interval.")]
-    observations_per_poi: Annotated[
-        Interval, Metric("looks, difference", "From `latent`, with 95% interval.", digits=2)
-    ]
-    time_s: Annotated[
-        Interval,
-        Metric("mean time, difference [s]", "From `latent`, with 95% interval.", digits=1),
-    ]
+    accuracy: Annotated[Interval, "right, difference", "From `latent`, with 95% interval."]
+    observations_per_poi: Annotated[Interval, "looks, difference", "From `latent`.", 2]
+    time_s: Annotated[Interval, "mean time, difference [s]", "From `latent`.", 1]
 
 
 class OfNaive(TypedDict):
-    """`mission.POLICY.of_naive`: ratios to naive exploration of the same accuracy."""
+    """`mission.POLICY.of_naive`: ratios to naive exploration, see `compare.of_naive`."""
 
     observations_per_poi: Annotated[
-        float,
-        Metric(
-            "looks, of naive",
-            "Ratio to naive exploration of the same accuracy, between its one, two and three "
-            "looks; to three if these are less accurate.",
-            digits=2,
-        ),
+        float, "looks, of naive", "Ratio to naive exploration of the same accuracy.", 2
     ]
-    time_s: Annotated[float, Metric("time, of naive", "The same for the median time.", digits=2)]
-    mean_time_s: Annotated[
-        float, Metric("mean time, of naive", "The same for the mean time.", digits=2)
-    ]
+    time_s: Annotated[float, "time, of naive", "", 2]
+    mean_time_s: Annotated[float, "mean time, of naive", "", 2]
 
 
 class Case(TypedDict):
     """`mission.POLICY`: missions of one policy, or with a robot that fails."""
 
-    accuracy: Annotated[float, Metric("right", "Share of PoIs whose likeliest class is right.")]
-    observations_per_poi: Annotated[float, Metric("looks per PoI", digits=2)]
-    time_s: Annotated[float, Metric("time [s]", "Median time until all robots are done.", digits=1)]
-    mean_time_s: Annotated[
-        float, Metric("mean time [s]", "Long missions lift it above the median.", digits=1)
-    ]
-    collisions: Annotated[
-        int, Metric("collisions", "Control periods in which a robot touched something.", digits=0)
-    ]
-    goals_reached_fraction: Annotated[
-        float | None, Metric("goals reached", "Share of chosen viewpoints that were reached.")
-    ]
-    information: Annotated[
-        float, Metric("information", "Sum of 1 / sigma norm over the map.", digits=2)
-    ]
-    episodes: Annotated[int, Metric("missions", digits=0)]
-    ended: Annotated[dict[str, int], Metric("ends", "Number of missions by how they ended.")]
-    told: NotRequired[
-        Annotated[
-            float, Metric("right labels", "A robot alone: share of PoIs with the right label.")
-        ]
-    ]
+    accuracy: Annotated[float, "right", "Share of PoIs whose likeliest class is right."]
+    observations_per_poi: Annotated[float, "looks per PoI", "", 2]
+    time_s: Annotated[float, "time [s]", "Median time until all robots are done.", 1]
+    mean_time_s: Annotated[float, "mean time [s]", "Long missions lift it above the median.", 1]
+    collisions: Annotated[int, "collisions", "Control periods with contact.", 0]
+    goals_reached_fraction: Annotated[float | None, "goals reached", "Share of chosen viewpoints."]
+    information: Annotated[float, "information", "Sum of 1 / sigma norm over the map.", 2]
+    episodes: Annotated[int, "missions", "", 0]
+    ended: Annotated[dict[str, int], "ends", "Number of missions by how they ended."]
+    told: NotRequired[Annotated[float, "right labels", "A robot alone: share of PoIs."]]
     ambiguous_reported: NotRequired[
-        Annotated[
-            float | None,
-            Metric(
-                "reported as ambiguous",
-                "A robot alone: share of the PoIs that it cannot tell apart which the map shows as "
-                "ambiguous.",
-            ),
-        ]
+        Annotated[float | None, "reported as ambiguous", "Of the PoIs that it cannot tell apart."]
     ]
-    seed: NotRequired[Annotated[int, Metric("seed", "Of the arenas of an evaluation.")]]
+    seed: NotRequired[Annotated[int, "seed", "Of the arenas of an evaluation."]]
     intervals: NotRequired[Differences]
     of_naive: NotRequired[OfNaive]
 
@@ -265,13 +158,9 @@ class Case(TypedDict):
 class Traffic(TypedDict):
     """`mission.bytes_per_detection`."""
 
-    latent: Annotated[float, Metric("bytes in the map", "Size of a belief.", digits=0)]
-    features: Annotated[
-        float, Metric("bytes of features", "Mean size of the detections' features.", digits=0)
-    ]
-    raw: Annotated[
-        float, Metric("bytes of a scan", "Mean size of the detections' scans.", digits=0)
-    ]
+    latent: Annotated[float, "bytes in the map", "Size of a belief.", 0]
+    features: Annotated[float, "bytes of features", "Mean size of a detection's features.", 0]
+    raw: Annotated[float, "bytes of a scan", "Mean size of a detection's scan.", 0]
 
 
 _TRAFFIC = "bytes_per_detection"
@@ -289,8 +178,8 @@ class Results(TypedDict):
     mission: Missions
 
 
-class Place(TypedDict):
-    """Missions in one arena, of one team; `elsewhere.NAME` in summaries of older versions."""
+class Evaluation(TypedDict):
+    """Missions of `evaluate` in the same arenas: `RUN/evaluations/NAME.json`."""
 
     num_pois: int
     side: float
@@ -298,33 +187,22 @@ class Place(TypedDict):
     mission: Missions
 
 
-class Evaluation(Place):
-    """Missions of `evaluate` in the same arenas: `RUN/evaluations/NAME.json`."""
-
-    seed: int
-    episodes: int
-
-
 class Header(TypedDict):
     """The keys of a summary about the run itself."""
 
-    preset: Annotated[str, Metric("preset", "Origin of the settings.")]
-    seed: Annotated[int, Metric("seed", "Of all randomness; of several, the first.")]
-    versions: Annotated[dict[str, str], Metric("versions", "Of Python and of libraries.")]
-    devices: Annotated[list[str], Metric("devices", "Kinds of the accelerators, or `cpu`.")]
-    seeds: NotRequired[
-        Annotated[dict[str, Results], Metric("seeds", "The results of each of several seeds.")]
-    ]
-    failed: NotRequired[
-        Annotated[dict[str, str], Metric("failed", "Seeds whose training failed, and why.")]
-    ]
+    preset: Annotated[str, "preset", "Origin of the settings."]
+    seed: Annotated[int, "seed", "Of all randomness; of several, the first."]
+    versions: Annotated[dict[str, str], "versions", "Of Python and of libraries."]
+    devices: Annotated[list[str], "devices", "The kind of each accelerator, or `cpu`."]
+    seeds: NotRequired[Annotated[dict[str, Results], "seeds", "The results of each of several."]]
+    failed: NotRequired[Annotated[dict[str, str], "failed", "Seeds that failed, and why."]]
 
 
 class Summary(Header, Results):
     """The whole file."""
 
     timing: Timing
-    elsewhere: NotRequired[dict[str, Place]]
+    elsewhere: NotRequired[dict[str, Evaluation]]  # of older versions
 
 
 def cases(missions: Missions) -> dict[str, Case]:
@@ -343,28 +221,24 @@ def _metrics(block: type, prefix: str = "") -> Iterator[Metric]:
         if is_block(inner):
             yield from _metrics(inner, f"{prefix}{name}.")
         elif get_origin(inner) is Annotated:
-            yield dataclasses.replace(inner.__metadata__[0], key=f"{prefix}{name}")
+            yield Metric(f"{prefix}{name}", *inner.__metadata__)
 
 
+def _table(block: type) -> dict[str, Metric]:
+    return {metric.key: metric for metric in _metrics(block)}
+
+
+DETECTORS, JMVAE, BELIEF, AGENTS = map(_table, (Detector, Jmvae, Beliefs, Agent))
+MISSIONS, STAGES = _table(Case), _table(StageTiming)
 BLOCKS = {
-    place: {metric.key: metric for metric in _metrics(block)}
-    for place, block in {
-        "": Header,
-        "timing": Timing,
-        "timing.stages.STAGE": StageTiming,
-        "detectors.MODALITY": Detector,
-        "jmvae": Jmvae,
-        "belief": Beliefs,
-        "dqn.MODALITY": Agent,
-        "mission.POLICY": Case,
-        "mission.bytes_per_detection": Traffic,
-    }.items()
+    "": _table(Header),
+    "timing.": _table(Timing),
+    "timing.stages.STAGE.": STAGES,
+    "detectors.MODALITY.": DETECTORS,
+    "jmvae.": JMVAE,
+    "belief.": BELIEF,
+    "dqn.MODALITY.": AGENTS,
+    "mission.POLICY.": MISSIONS,
+    f"mission.{_TRAFFIC}.": _table(Traffic),
 }
-"""The metrics of each block of `summary.json`, by their keys: the one table of all."""
-DETECTORS, JMVAE, BELIEF, AGENTS, MISSIONS, STAGES = (
-    BLOCKS[place]
-    for place in (
-        *("detectors.MODALITY", "jmvae", "belief", "dqn.MODALITY", "mission.POLICY"),
-        "timing.stages.STAGE",
-    )
-)
+"""All metrics, by the beginning of their keys in `summary.json` and by the rest."""

@@ -1,4 +1,4 @@
-"""One metric of `summary.json`: its name, its meaning and its text."""
+"""Numbers of `summary.json`, their names and their text."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from typing import TypedDict
 
 
 class Interval(TypedDict):
-    """A mean and its 95% interval by Student's t; no interval of a single value."""
+    """A mean and its 95% interval by Student's t; a single value has no interval."""
 
     mean: float
     low: float | None
@@ -19,21 +19,19 @@ Number = float | Interval
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """What a value of `summary.json` is; see `blocks`.
+    """One value of a block.
 
     Attributes:
+      key: its place in the block; a dot leads into an inner block.
       label: its name.
       meaning: what it measures; empty if the label is enough.
-      paper: the paper's value; with a star, the output of its authors' code.
       digits: after the point.
-      key: its place in its block; a dot leads into an inner block.
     """
 
+    key: str
     label: str
     meaning: str = ""
-    paper: str = ""
     digits: int = 3
-    key: str = ""
 
     def value(self, block: Mapping[str, object]) -> object:
         """Its value in a block; None if there is none."""
@@ -53,22 +51,15 @@ def mean(value: Number) -> float:
 
 
 def text(value: object, digits: int = 3) -> str:
-    """Formats a metric.
+    """A number, with its interval if it has one; a hyphen for None.
 
     Args:
       value: a number, a `Number` of several seeds, or None.
       digits: after the point; whole numbers have none.
-
-    Returns:
-      The number, with its interval if it has one; a hyphen for None.
     """
     if isinstance(value, Mapping):
-        middle, low, high = (value.get(name) for name in ("mean", "low", "high"))
-        # Also where all seeds agree, so that a column reads alike.
-        around = "" if low is None else f" ({text(low, digits)} to {text(high, digits)})"
-        middle = text(None if middle is None else float(middle), digits)
-        return f"{middle}{around}"
+        middle, low, high = (text(value.get(name), digits) for name in ("mean", "low", "high"))
+        return middle if low == "-" else f"{middle} ({low} to {high})"
     if isinstance(value, float):
-        # No "-0.00"; and an interval's ends may be whole.
-        return f"{round(value, digits) + 0.0:,.{digits}f}"
+        return f"{round(value, digits) + 0.0:,.{digits}f}"  # no "-0.00"
     return f"{value:,}" if isinstance(value, int) else "-"

@@ -7,7 +7,7 @@ from typing import Annotated, NotRequired, Union, cast, get_args, get_origin, ge
 from typing import is_typeddict as is_block
 
 from jaxsense.config import ConfigError, parse_json
-from jaxsense.summary.blocks import Evaluation, Results, Summary, cases
+from jaxsense.summary.blocks import Evaluation, Results, Summary
 
 EVALUATIONS = "evaluations"
 """The directory of evaluations in that of a run."""
@@ -38,13 +38,9 @@ def read_evaluations(run: Path) -> dict[str, Evaluation]:
     Raises:
       ConfigError: if one cannot be read, or a value in it is missing or wrong.
     """
-    found: dict[str, Evaluation] = {}
-    for name, place in read(run).get("elsewhere", {}).items():
-        first = next(iter(cases(place["mission"]).values()))
-        found[name] = {**place, "seed": first.get("seed", 0), "episodes": first["episodes"]}
-    for file in sorted((run / EVALUATIONS).glob("*.json")):
-        found[file.stem] = cast(Evaluation, _read(run, file, Evaluation))
-    return found
+    files = sorted((run / EVALUATIONS).glob("*.json"))
+    found = {file.stem: cast(Evaluation, _read(run, file, Evaluation)) for file in files}
+    return {**read(run).get("elsewhere", {}), **found}
 
 
 def _read(run: Path, file: Path, kind: type) -> object:
