@@ -97,7 +97,6 @@ def run(
     found = player.play(mission_key(key), networks, played, episodes)
     checkpoints.forget_unfinished()
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
-    latent = {f.name: getattr(latent, f.name) for f in dataclasses.fields(latent)}
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
     return RunResult(
         models=networks,
@@ -115,7 +114,7 @@ def run(
             "detectors": jax.tree.map(
                 lambda x: np.asarray(x).tolist(), trained.outputs["detector_metrics"]
             ),
-            "jmvae": summary.jmvae(latent),
+            "jmvae": summary.jmvae(vars(latent)),
             "belief": summary.beliefs(trained.outputs["beliefs"]),
             "dqn": {name: _agent(config, name, trained) for name in config.modalities},
             "mission": summary.missions(player.mission, found.metrics),

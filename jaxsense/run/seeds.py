@@ -84,5 +84,5 @@ def rewards(
             for name in ("reward", "greedy")
         }
 
-    networks = dict.fromkeys(stages.agent(config, name) for name in config.modalities)
+    networks = dict.fromkeys(learner(config, name) for name in config.modalities)
     return {network.removeprefix("dqn_"): load_all(network) for network in networks}
