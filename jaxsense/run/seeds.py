@@ -12,6 +12,7 @@ from jaxsense.config import Config, ConfigError
 from jaxsense.run import rundir
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.training.agents import learner
 
 
 def paths(run: RunDirectory) -> dict[int, Path]:

@@ -125,8 +125,9 @@ def latent_space(
 
 def _beliefs(fusion: Fusion, bank: Samples, members: Iterable[int]) -> Belief:
     """`[C, S, D]` beliefs after looks by some of the modalities together."""
-    looks = {m: bank[m] for m in members}
-    return jax.vmap(jax.vmap(fusion.together))(looks)
+    order = tuple(members)  # that of a dictionary would be lost in `vmap`
+    together = lambda features: fusion.together({m: features[m] for m in order})  # noqa: E731
+    return jax.vmap(jax.vmap(together))(bank)
 
 
 def _moment_matching_error(joint: Belief, alone: list[Belief], config: Config) -> jax.Array:
