@@ -104,7 +104,13 @@ def build(
     # By itself MJX takes the first device of all processes.
     device = jax.local_devices()[0]
     model = mjx.put_model(mj_model, device=device, impl="jax")
-    return Arena(config, mj_model, model, mjx.make_data(model, device=device), len(lidar_robots))
+    model, data = _as_float32((model, mjx.make_data(model, device=device)))
+    return Arena(config, mj_model, model, data, len(lidar_robots))
+
+
+def _as_float32(tree):
+    """The simulation runs in float32 even where JAX has 64 bits."""
+    return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, tree)
 
 
 def _mjcf(
@@ -181,9 +187,10 @@ def make_layout(
     checks.require_finite("position", position)
     checks.require_finite("yaw", yaw)
     checks.require_index("classes", classes, len(config.classes))
-    shapes = jnp.array([list(config.shapes.values()).index(s) for s in config.values("shape")])
-    colours = jnp.array(config.values("colour"))
-    values = {name: jnp.array(config.values(name)) for name in config.attributes}
+    known = list(config.shapes.values())
+    shapes = jnp.array([known.index(s) for s in config.values("shape")], jnp.int32)
+    colours = jnp.array(config.values("colour"), jnp.float32)
+    values = {name: jnp.array(config.values(name), jnp.float32) for name in config.attributes}
     of_pois = {name: numbers[classes] for name, numbers in values.items()}
     return Layout(position, yaw, shapes[classes], colours[classes], of_pois)
 
@@ -207,7 +214,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: jax.Array) -> Layout:
         int(np.ceil(np.sqrt(2 * config.num_pois))), int(np.floor(config.side / config.poi_pitch))
     )
     cell_side = config.side / per_side
-    draws = jax.random.uniform(key, (per_side**2 + 3 * config.num_pois,))
+    draws = jax.random.uniform(key, (per_side**2 + 3 * config.num_pois,), jnp.float32)
     cell = jnp.argsort(draws[: per_side**2])[: config.num_pois]
     x, y, turn = draws[per_side**2 :].reshape(3, config.num_pois)
     corner = jnp.stack([cell // per_side, cell % per_side], axis=-1) * cell_side - config.side / 2
@@ -229,7 +236,7 @@ def place(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
     Returns:
       The state after MJX's kinematics, with `geom_xpos` and `geom_xmat`.
     """
-    return mjx.kinematics(arena.model, put(arena, layout, poses))
+    return _as_float32(mjx.kinematics(arena.model, put(arena, layout, poses)))
 
 
 def put(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
@@ -278,7 +285,7 @@ def drive(arena: Arena, data: mjx.Data, wheel_speeds: jax.Array) -> mjx.Data:
     chex.assert_shape(wheel_speeds, (arena.num_robots, 2), custom_message="wheel_speeds")
     # MJX promotes ranks, which the caller may have forbidden.
     with jax.numpy_rank_promotion("allow"):
-        return mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds)))
+        return _as_float32(mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds))))
 
 
 def as_control(wheel_speeds: jax.Array) -> jax.Array:

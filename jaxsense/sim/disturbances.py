@@ -29,7 +29,7 @@ def measured_ranges(key: Key, distance: jax.Array, config: LidarConfig) -> jax.A
     spread = config.range_noise
     if config.range_noise_growth > 0:
         spread += config.range_noise_growth * jnp.minimum(met, config.max_range)
-    noise = spread * jax.random.normal(key, met.shape)
+    noise = spread * jax.random.normal(key, met.shape, jnp.float32)
     measured = jnp.clip(met + noise, config.min_range, config.max_range)
     return jnp.where(met <= config.max_range, measured, config.max_range)
 
@@ -37,7 +37,7 @@ def measured_ranges(key: Key, distance: jax.Array, config: LidarConfig) -> jax.A
 def _disturbed(key: Key, distance: jax.Array, config: LidarConfig) -> jax.Array:
     """`[B]` distances with mixed pixels and without the beams that drop out."""
     # The key itself draws the noise, as it does without disturbances.
-    uniform = jax.random.uniform(jax.random.fold_in(key, 1), (3, *distance.shape))
+    uniform = jax.random.uniform(jax.random.fold_in(key, 1), (3, *distance.shape), jnp.float32)
     # The last beam has no next one. Beyond its range, the scanner meets nothing.
     within = jnp.minimum(distance, config.max_range)
     following = jnp.append(within[1:], within[-1:])
@@ -66,8 +66,8 @@ def lighting(key: Key, num_pixels: int, config: CameraConfig) -> tuple[jax.Array
     """
     # The key itself draws the noise, as it does without disturbances.
     normal_key, uniform_key = jax.random.split(jax.random.fold_in(key, 1))
-    brightness, *casts = jax.random.normal(normal_key, (4,))
-    missing, falls, edge, side = jax.random.uniform(uniform_key, (4,))
+    brightness, *casts = jax.random.normal(normal_key, (4,), jnp.float32)
+    missing, falls, edge, side = jax.random.uniform(uniform_key, (4,), jnp.float32)
     logarithm = config.exposure_error * brightness + config.colour_cast * jnp.stack(casts)
     gain = (1 - config.low_light * missing) * jnp.exp(logarithm)
     is_beyond = jnp.arange(num_pixels) >= edge * num_pixels

@@ -254,7 +254,7 @@ class Camera(Sensor):
             gain, is_lit = disturbances.lighting(key, len(facing), self.config)
             direct = direct * is_lit
         shade = light.ambient + direct
-        noise = self.config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape))
+        noise = self.config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape), jnp.float32)
 
         def channel(given):
             of_geom, of_background, noise, gain = given
@@ -264,7 +264,8 @@ class Camera(Sensor):
 
         # A loop over the channels makes the compiler finish hits and noise before it shades them;
         # fused with the ray-caster, each channel would cast the rays many times over.
-        return jax.lax.map(channel, (surfaces["colour"].T, jnp.array(_BACKGROUND), noise, gain)).T
+        background = jnp.array(_BACKGROUND, jnp.float32)
+        return jax.lax.map(channel, (surfaces["colour"].T, background, noise, gain)).T
 
     def shows(self, readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
         """Which pixels have a colour, unlike walls, robots and darkness; see `Sensor.shows`."""
@@ -274,7 +275,7 @@ class Camera(Sensor):
 
 def random_light(key: Key) -> Light:
     """Draws a light of random strength from any side, 20 to 70 degrees high."""
-    side, height, diffuse, ambient = jax.random.uniform(key, (4,))
+    side, height, diffuse, ambient = jax.random.uniform(key, (4,), jnp.float32)
     side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)
     flat = jnp.cos(height)
     direction = jnp.stack([flat * jnp.cos(side), flat * jnp.sin(side), jnp.sin(height)])

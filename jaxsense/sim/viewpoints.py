@@ -41,7 +41,7 @@ def random_viewpoint(
     chex.assert_shape(others, (None, 2), custom_message="others")
     chex.assert_rank(poi, 0, custom_message="poi")
     # One draw for everything: each use of the random generator takes long to compile.
-    draws = jax.random.uniform(key, (2 * NUM_CANDIDATES + 2,))
+    draws = jax.random.uniform(key, (2 * NUM_CANDIDATES + 2,), jnp.float32)
     near, far = config.min_distance, config.max_distance
     distance = near + (far - near) * draws[:NUM_CANDIDATES]
     side = jnp.pi * (2 * draws[NUM_CANDIDATES:-2] - 1)
@@ -121,6 +121,6 @@ def free_room(
     # fused with the work for each obstacle, they would be recomputed every time.
     is_target = jnp.arange(arena.num_pois) == poi
     of_pois = jnp.where(is_target, -jnp.inf, arena.poi_extent)
-    of_robots = jnp.full(len(others), amiro.BODY_RADIUS)
+    of_robots = jnp.full(len(others), amiro.BODY_RADIUS, jnp.float32)
     obstacles = jnp.concatenate([layout.position, others]), jnp.append(of_pois, of_robots)
     return jax.lax.scan(around, to_wall, obstacles)[0]

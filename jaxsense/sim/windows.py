@@ -31,7 +31,8 @@ def window_of(sensor: Sensor, values: np.ndarray, bearing: jax.Array) -> jax.Arr
     # the bearing on.
     padded = np.pad(values, [(0, 0)] * len(shape) + [(0, -number % sensor.stride)])
     strided = jnp.array(padded.reshape(*shape, -1, sensor.stride))
-    place = [0] * len(shape) + [start // sensor.stride, start % sensor.stride]
+    zero = jnp.int32(0)  # of the same type as the other indices also with 64 bits
+    place = [zero] * len(shape) + [start // sensor.stride, start % sensor.stride]
     return jax.lax.dynamic_slice(strided, place, (*shape, sensor.window, 1))[..., 0]
 
 

@@ -1,6 +1,7 @@
 import dataclasses
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -187,6 +188,10 @@ def test_random_light_is_a_unit_vector_from_20_to_70_degrees():
     assert 68 < height.max() <= 70.001
     for quarter in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         assert (np.sign(light.direction[:, :2]) == quarter).all(axis=-1).mean() > 0.15
+    # Between the weakest and the strongest light, to within 1 % of 500 draws.
+    for strength, low, high in ((light.diffuse, 0.2, 0.8), (light.ambient, 0.3, 0.6)):
+        assert low <= strength.min() < low + 0.02 * (high - low)
+        assert high - 0.02 * (high - low) < strength.max() <= high + 1e-6
 
 
 def test_lidar_ranges_in_a_known_scene(view):
@@ -278,6 +283,21 @@ def test_a_robot_does_not_see_itself_but_sees_the_other(scans, known_layout):
     assert ranges[341] == pytest.approx(1.5 + 0.9, abs=1e-4)
 
 
+def test_a_traced_robot_sees_what_a_static_one_does(arena, place, noiseless, known_layout):
+    data = place(known_layout, FACE_TO_FACE)
+
+    def scan(robot, modality):
+        sensor, key = noiseless[modality], jax.random.key(0)
+        rays = jnp.array(sensor.directions)
+        return sim.scan(key, sensor, arena, data, known_layout, LIGHT, robot, rays)
+
+    for modality in (0, 1):
+        traced = jax.jit(functools.partial(scan, modality=modality))
+        for robot in (0, 1):
+            expected = jax.jit(functools.partial(scan, robot, modality))()
+            np.testing.assert_allclose(traced(robot), expected, atol=1e-6)
+
+
 def test_make_follows_the_order_of_the_modalities():
     config = dataclasses.replace(Config(), modalities=("lidar", "camera"))
     assert [s.name for s in sensors.make(config)] == ["lidar", "camera"]
@@ -314,6 +334,42 @@ def test_the_lidar_takes_for_a_poi_what_five_deviations_of_its_noise_allow(noise
     readings = jnp.array([0.86, 0.86, 1.0, 1.0]) + deviation * jnp.array([-5.5, -4.5, 4.5, 5.5])
     shown = lidar.shows(readings, jnp.float32(1.0), 0.14)
     np.testing.assert_array_equal(shown, [False, True, True, False])
+
+
+def test_the_tolerance_of_the_lidar_grows_as_its_noise_does():
+    # At 2 m the standard deviation is 0.01 + 0.02 * 2 = 0.05 m. A PoI of extent 0.14 m is hit from
+    # 1.86 m to 2 m, give or take five deviations.
+    lidar = sensors.lidar(LidarConfig(range_noise=0.01, range_noise_growth=0.02))
+    readings = jnp.array([1.60, 1.62, 2.24, 2.26])
+    shown = lidar.shows(readings, jnp.float32(2.0), 0.14)
+    np.testing.assert_array_equal(shown, [False, True, True, False])
+
+
+def test_rays_that_drop_out_and_rays_at_edges_are_lost():
+    # 0.9 of the beams return, and 0.8 of these hit one surface alone: 1 - 0.72 are lost.
+    lidar = sensors.lidar(LidarConfig(dropout=0.1, mixed_pixels=0.2))
+    assert lidar.lost == pytest.approx(0.28)
+    assert sensors.lidar(LidarConfig(mixed_pixels=0.2)).lost == pytest.approx(0.2)
+
+
+def test_sensors_of_traced_settings_are_inputs_of_a_program():
+    @jax.jit
+    def window(config, readings):
+        made = sensors.make(config)
+        assert isinstance(made[1].window_limit, jax.core.Tracer)
+        return windows.as_window(made[1], readings)
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def given(sensor, readings):
+        return windows.as_window(sensor, readings)
+
+    readings = jnp.linspace(0.0, 3.0, 128)
+    for limit in (0.5, 2.0):
+        config = Config(lidar=LidarConfig(window_range=limit))
+        expected = np.minimum(readings, np.float32(limit))
+        np.testing.assert_array_equal(window(config, readings), expected)
+        np.testing.assert_array_equal(given(sensors.make(config)[1], readings), expected)
 
 
 ERROR = np.radians(2.0)

@@ -1,3 +1,5 @@
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -162,6 +164,51 @@ def test_surveys_equal_single_ones(simulation):
     for i in range(5):
         alone = single(keys[i], classes[i])
         chex.assert_trees_all_close(jax.tree.map(lambda x: x[i], together), alone, atol=1e-5)  # noqa: B023
+
+
+def test_the_world_of_other_settings_keeps_the_arena():
+    config = Config()
+    made = world.make_world(config)
+    ahead = dataclasses.replace(config.viewpoint, max_bearing=0.0)
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def turns(config):
+        here = world.make_world(config, arena=made.arena)
+        assert here.arena is made.arena
+        scene = world.random_scene(jax.random.key(0), here, CLASSES)
+        bearings = jax.vmap(jax.vmap(sim.bearing, (None, 0)), (0, None))
+        return jnp.abs(bearings(scene.poses, scene.layout.position)).min(axis=-1)
+
+    # Each robot faces a PoI, up to 20 degrees to either side or not at all.
+    assert turns(config).max() > 0.01
+    assert turns(dataclasses.replace(config, viewpoint=ahead)).max() < 1e-5
+    other = dataclasses.replace(config, arena=ArenaConfig(side=4.0))
+    with pytest.raises(ValueError, match="arena: must be compiled"):
+        world.make_world(other, arena=made.arena)
+
+
+def test_a_world_is_an_input_of_a_program(simulation):
+    key = jax.random.key(0)
+    survey = jax.jit(world.survey)
+    closed = jax.jit(lambda key: world.survey(key, simulation, CLASSES))(key)
+    chex.assert_trees_all_close(survey(key, simulation, CLASSES), closed, atol=1e-5)
+
+
+def test_looks_are_the_same_where_jax_has_64_bits(simulation):
+    def look(simulation):
+        survey_key, look_key, drive_key = jax.random.split(jax.random.key(0), 3)
+        scene, windows = world.survey(survey_key, simulation, CLASSES)
+        window, scene = world.look(look_key, simulation, scene, 1, jnp.int32(0))
+        data = sim.place(simulation.arena, scene.layout, scene.poses)
+        speeds = jax.random.uniform(drive_key, (2, 2), jnp.float32)
+        return windows, window, sim.drive(simulation.arena, data, speeds).qpos
+
+    expected = jax.jit(look)(simulation)
+    with jax.enable_x64(True):
+        found = jax.jit(look)(sim.make_world(Config()))
+    assert {x.dtype for x in jax.tree.leaves(found)} == {np.dtype("float32")}
+    chex.assert_trees_all_close(found, expected, atol=1e-4)
 
 
 def test_wrong_shapes_are_named_while_tracing(simulation):
