@@ -17,6 +17,7 @@ import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from jaxsense.config import Config, ConfigError
+from jaxsense.run import compilation
 from jaxsense.run.compilation import Kept
 
 T = TypeVar("T")
@@ -122,19 +123,21 @@ def keep_programs(program: str, directory: Path | None, config: Config) -> Kept 
       config: all settings.
 
     Returns:
-      The programs with these settings; None, with a warning, if the directory cannot be used.
+      The programs with these settings; None if the settings name custom sensors, whose code may
+      change, and, with a warning, if the directory cannot be used.
     """
     # Several processes can load a program only together.
-    # A custom sensor's program may change while its settings stay the same.
-    if directory is None or config.sensors or jax.process_count() > 1:
+    if directory is None or jax.process_count() > 1:
         return None
     try:
         directory = directory.expanduser()
-        kept = Kept(directory, jax.tree.structure(config))
+        if config.sensors:
+            compilation.use_cache(directory)
+            return None
+        return Kept(directory, jax.tree.structure(config))
     except (OSError, RuntimeError) as error:
         complain(f"{program}: programs cannot be kept in {directory} ({error})")
         return None
-    return kept
 
 
 def _texts_of_wrong_types() -> ConstructorRegistry:

@@ -7,18 +7,22 @@ import subprocess
 import sys
 import time
 from concurrent.futures import CancelledError, ThreadPoolExecutor
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+from flax import struct
 
-from jaxsense.config import PRESETS
-from jaxsense.core.types import Belief
+import jaxsense
+from jaxsense import cli
+from jaxsense.config import PRESETS, SensorConfig
+from jaxsense.core.types import Belief, pytree
 from jaxsense.run import compilation, files
 from jaxsense.run.compilation import Compiler, Kept, Program
 from jaxsense.run.monitor import Monitor
-from jaxsense.vae.detectors import Detector
 
 
 def test_compiling_and_running_are_timed_apart_and_reported():
@@ -93,10 +97,45 @@ def test_a_program_that_was_kept_is_not_traced_again(tmp_path):
     np.testing.assert_array_equal(values.mean, function(key, other)[0].mean)
 
 
-def test_what_is_no_array_is_kept_as_well(tmp_path):
-    detector = Detector({"w": jnp.ones(2)}, jnp.zeros(3), jnp.float32(1), (4, 5), 2)
-    call(Kept(tmp_path), lambda x: x, detector)
-    assert call(Kept(tmp_path), never, detector).hidden == (4, 5)
+@pytree
+class Labelled:
+    """A value with a static field that JSON has no word for."""
+
+    value: jax.Array
+    labels: frozenset[str] = struct.field(pytree_node=False)
+
+
+STATES = {
+    "static field": Labelled(jnp.ones(2), frozenset({"red"})),
+    "optax": optax.chain(optax.clip(1.0), optax.adam(optax.linear_schedule(1.0, 0.0, 9))).init(
+        {"w": jnp.ones(2)}
+    ),
+    "dictionary": {"b": jnp.ones(1), "a": [None, (jnp.int32(3), jax.random.key(0))]},
+}
+
+
+@pytest.mark.parametrize("state", STATES.values(), ids=STATES)
+def test_all_pytrees_are_kept(tmp_path, state):
+    call(Kept(tmp_path), lambda x: (x, jnp.zeros(1)), state)
+    again, zero = call(Kept(tmp_path), never, state)
+    assert jax.tree.structure(again) == jax.tree.structure(state)
+    assert all(jax.tree.leaves(jax.tree.map(lambda x, y: (x == y).all(), again, state)))
+    assert zero == 0
+
+
+REGISTERED = """
+import importlib, optax
+from jax import export
+export.register_namedtuple_serialization(optax.ScaleByAdamState, serialized_name="theirs")
+import jaxsense.train, jaxsense.core.types
+importlib.reload(jaxsense.core.types)
+"""
+
+
+def test_nothing_is_registered_with_jax_so_modules_can_be_reloaded():
+    command = [sys.executable, "-c", REGISTERED]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
 
 
 def test_other_settings_shapes_and_names_are_other_programs(tmp_path):
@@ -246,13 +285,13 @@ def test_the_oldest_programs_are_forgotten(tmp_path, monkeypatch):
     for age, path in enumerate(paths):
         os.utime(path, (age, age))
     assert kept.find("stage-run", (jnp.ones(0),)) is not None  # used just now
-    monkeypatch.setattr(compilation, "_MOST_KEPT", 2)
+    monkeypatch.setattr(compilation, "_MAX_KEPT", 2)
     Kept(tmp_path)
     assert [path.exists() for path in paths] == [True, False, False, True]
 
 
 def test_nothing_of_the_user_is_ever_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr(compilation, "_MOST_KEPT", 0)
+    monkeypatch.setattr(compilation, "_MAX_KEPT", 0)
     kept = Kept(tmp_path)
     name = f"stage-run-{32 * '0'}.stablehlo"
     theirs = [tmp_path / "mine" / name, kept.path / "mine" / name, kept.path / f"{name}.txt"]
@@ -266,12 +305,74 @@ def test_nothing_of_the_user_is_ever_removed(tmp_path, monkeypatch):
     assert len(list(kept.path.iterdir())) == 4
 
 
+def test_programs_of_all_stages_are_forgotten(tmp_path, monkeypatch):
+    kept, x = Kept(tmp_path), jnp.ones(1)
+    names = "mission-go_on", "detector_Wärme-begin", "policies_lidar-begin", "jmvae-advance"
+    for name in names:
+        assert kept.find_or_trace(name, lambda x: x, (x,)) is not None
+    assert len(list(kept.path.iterdir())) == 4
+    monkeypatch.setattr(compilation, "_MAX_KEPT", 1)
+    Kept(tmp_path)
+    assert len(list(kept.path.iterdir())) == 1
+
+
+def test_another_source_or_processor_is_another_program(tmp_path, monkeypatch):
+    def is_there():
+        return Kept(tmp_path).find("stage-run", (jnp.float32(3),)) is not None
+
+    processor = tmp_path / "cpuinfo"
+    monkeypatch.setattr(compilation, "_CPU_INFO", processor)
+    processor.write_text("model name : Abacus\ncpu MHz : 1\nflags : add\n")
+    call(Kept(tmp_path), lambda x: 2 * x, jnp.float32(3))
+    processor.write_text("model name : Abacus\ncpu MHz : 2\nflags : add\n")
+    assert is_there()
+    for other in ("model name : Abacus\nflags : add mul\n", "model name : Sum\nflags : add\n"):
+        processor.write_text(other)
+        assert not is_there()
+    processor.write_text("model name : Abacus\nflags : add\n")
+    assert is_there()
+    (name, digest), *others = compilation._SOURCE
+    monkeypatch.setattr(compilation, "_SOURCE", [(name, digest[::-1]), *others])
+    assert not is_there()
+
+
+def test_the_source_is_that_of_the_whole_package():
+    names = {name for name, _ in compilation._SOURCE}
+    assert {"compilation.py", "detectors.py", "__init__.py", "cli.py"} <= names
+    root = Path(jaxsense.__file__).parent
+    assert len(compilation._SOURCE) == len(list(root.rglob("*.py")))
+
+
+def test_programs_of_custom_sensors_are_not_kept(tmp_path):
+    """Their code may change while their settings stay."""
+    config = PRESETS["smoke"]
+    sensors = {"thermal": SensorConfig("thermal:make", "colour")}
+    own = dataclasses.replace(config, sensors=sensors, modalities=("lidar", "thermal"))
+    assert cli.keep_programs("train", tmp_path, own) is None
+    assert [path.name for path in tmp_path.iterdir()] == ["compiled"]
+    kept = cli.keep_programs("train", tmp_path, config)
+    assert kept is not None
+    assert kept.path == tmp_path / "traced"
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no users")
+def test_what_another_user_owns_is_not_run(tmp_path, monkeypatch):
+    kept, x = Kept(tmp_path), jnp.float32(3)
+    call(kept, lambda x: 2 * x, x)
+    assert kept.find("stage-run", (x,)) is not None
+    own = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: own + 1)
+    assert kept.find("stage-run", (x,)) is None
+    with pytest.raises(PermissionError, match="compiled must be a directory of your own"):
+        Kept(tmp_path)
+
+
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no modes of files")
 def test_a_directory_that_others_may_write_is_refused(tmp_path):
     Kept(tmp_path)
-    for name in ("traced", "compiled"):
+    for name in ("compiled", "traced"):
         (tmp_path / name).chmod(0o770)
-        with pytest.raises(PermissionError, match=f"{name} must be a directory of yours alone"):
+        with pytest.raises(PermissionError, match=f"{name} must be a directory of your own"):
             Kept(tmp_path)
         (tmp_path / name).chmod(0o700)
 

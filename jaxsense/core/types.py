@@ -1,7 +1,6 @@
 """Types shared by `sim`, `vae`, `dqn` and the modules that join them."""
 
 import functools
-import json
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol, TypeVar, dataclass_transform
 
@@ -9,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import export
 from jaxtyping import Array, Bool, Float, Int
 
 T = TypeVar("T")
@@ -32,20 +30,8 @@ Samples = tuple[jax.Array, ...]
 
 @dataclass_transform(frozen_default=True, field_specifiers=(struct.field,))
 def pytree(cls: type[T]) -> type[T]:
-    """Makes a frozen dataclass a pytree that `jax.export` can serialise."""
-    made: Any = struct.dataclass(cls)
-
-    def as_tuples(value: Any) -> Any:
-        return tuple(map(as_tuples, value)) if isinstance(value, list) else value
-
-    # Static fields are numbers, texts, or tuples of them.
-    export.register_pytree_node_serialization(
-        made,
-        serialized_name=f"{made.__module__}.{made.__qualname__}",
-        serialize_auxdata=lambda fixed: json.dumps(fixed).encode(),
-        deserialize_auxdata=lambda content: as_tuples(json.loads(content)),
-    )
-    return made
+    """Makes a class a frozen dataclass and a pytree; its static fields may be any hashable value."""
+    return struct.dataclass(cls)
 
 
 @pytree

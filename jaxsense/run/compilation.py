@@ -1,8 +1,9 @@
-"""Compiles programs in the background, and keeps them for later runs."""
+"""Compiles programs in the background and caches their traces for later runs."""
 
 import contextlib
 import hashlib
 import os
+import pickle
 import platform
 import re
 import stat
@@ -11,84 +12,106 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import NamedTuple, TypeAlias
 
 import jax
-import optax
 from jax import export
 from jax.experimental import multihost_utils
+from jaxtyping import PyTree
 
 from jaxsense.run import devices, files
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.version import versions
 
+Function: TypeAlias = Callable[..., PyTree]
+
 # Read at import, so that it matches the code that runs.
 _SOURCE = [
     (path.name, hashlib.sha256(path.read_bytes()).hexdigest())
     for path in sorted(Path(__file__).parents[1].rglob("*.py"))
 ]
-_MOST_KEPT = 512  # traced programs; a run has about twenty
-_MOST_BYTES = 2**31  # of compiled programs
-_FILE = re.compile(r"[a-z0-9_]+-[a-z]+-[0-9a-f]{32}\.stablehlo")
+_MAX_KEPT = 512  # traced programs; a run has about twenty
+_MAX_BYTES = 2**31  # of compiled programs
+_FILE = re.compile(r".+-[0-9a-f]{32}\.stablehlo")
+_CPU_INFO = Path("/proc/cpuinfo")
 
-for _state in (optax.ScaleByAdamState, optax.ScaleByScheduleState, optax.EmptyState):
-    export.register_namedtuple_serialization(_state, serialized_name=f"optax.{_state.__name__}")
+
+class Traced(NamedTuple):
+    """A traced program that takes and returns flat leaves, and the structure of its results.
+
+    `jax.export` could write structures itself, but only of classes that are registered with it,
+    once per process and name.
+    """
+
+    flat: export.Exported
+    structure: jax.tree_util.PyTreeDef
+
+    @property
+    def results(self) -> PyTree[jax.ShapeDtypeStruct]:
+        """Shapes and dtypes of the results."""
+        avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in self.flat.out_avals]
+        return jax.tree.unflatten(self.structure, avals)
+
+    def __call__(self, *args: PyTree) -> PyTree:
+        """Calls the program with arguments of the structure with which it was traced."""
+        leaves = self.flat.call(*jax.tree.leaves(args))
+        return jax.tree.unflatten(self.structure, leaves)
 
 
 class Kept:
-    """Programs of earlier runs, in a directory.
+    """Cache of traced programs in a directory.
 
-    JAX's compilation cache finds compiled programs by their traces. This directory keeps the traces
-    and finds them by all that tracing depends on: tracing takes as long as all the rest.
+    JAX's compilation cache finds compiled programs by their traces. Tracing takes as long as
+    everything else, so this directory holds the traces, found by all that tracing depends on.
 
     Attributes:
       path: the directory of traced programs.
     """
 
-    def __init__(self, directory: Path, *settings: Any):
-        """Opens the directory, and removes the least recently used programs.
+    def __init__(self, directory: Path, *settings: object):
+        """Opens the cache, and removes the least recently used programs.
 
         Args:
-          directory: where programs are kept, and JAX's compilation cache.
-          *settings: all that programs close over outside jaxsense's source, as values that differ
-            in their `repr`.
+          directory: holds the traced programs, and JAX's compilation cache.
+          *settings: everything outside jaxsense's source that programs close over, as values whose
+            `repr` tells them apart.
 
         Raises:
-          OSError: if the directory cannot be made, or other users may write it: a program that is
-            loaded is code that runs.
+          OSError: if the directory cannot be made, or if other users may write to it: loading a
+            program runs it.
         """
+        use_cache(directory)
         self.path = directory / "traced"
         _make_private(self.path)
-        _make_private(directory / "compiled")
         self._depends = repr((settings, _SOURCE, _surroundings())).encode()
-        # Another run may remove some at the same time.
+        # Another run may be removing some too.
         with contextlib.suppress(FileNotFoundError):
             self._forget_oldest()
-        _use_cache_of_jax(directory / "compiled")
 
     def _forget_oldest(self) -> None:
-        """Removes the least recently used programs, and nothing else."""
+        """Removes the least recently used programs, and no other file."""
         ours = [
             path
             for path in self.path.iterdir()
             if _FILE.fullmatch(path.name) and path.is_file() and not path.is_symlink()
         ]
-        for path in sorted(ours, key=lambda path: path.stat().st_mtime)[:-_MOST_KEPT]:
+        for path in sorted(ours, key=lambda path: path.stat().st_mtime)[:-_MAX_KEPT]:
             path.unlink(missing_ok=True)
         files.remove_unfinished(self.path)
 
-    def find(self, name: str, args: Any) -> export.Exported | None:
-        """Finds a kept program.
+    def find(self, name: str, args: PyTree) -> Traced | None:
+        """Finds a cached program.
 
         Args:
           name: of the program.
           args: its arguments or their shapes.
 
         Returns:
-          The traced program; None if its file is missing or damaged.
+          The program; None if its file is missing or damaged.
         """
-        # Whatever is wrong with a file, tracing again repairs it.
+        # Tracing the program again repairs any file.
         with contextlib.suppress(Exception):
             path = self._file(name, args)
             with path.open("rb") as file:
@@ -96,44 +119,67 @@ class Kept:
                     return None
                 content = file.read()
             # A single wrong bit could end the process.
-            found = export.deserialize(bytearray(files.without_digest(content)))
+            structure, flat = pickle.loads(files.without_digest(content))
+            found = Traced(export.deserialize(bytearray(flat)), structure)
             path.touch()
             return found
         return None
 
-    def find_or_trace(
-        self, name: str, function: Callable[..., Any], args: Any
-    ) -> export.Exported | None:
-        """A kept program, or a new one that is kept from now on; None if JAX cannot export it."""
+    def find_or_trace(self, name: str, function: Function, args: PyTree) -> Traced | None:
+        """Finds a cached program, or traces and caches a new one.
+
+        Args:
+          name: of the program.
+          function: what to trace.
+          args: its arguments or their shapes.
+
+        Returns:
+          The program; None if it cannot be exported or written.
+        """
         found = self.find(name, args)
         if found is not None:
             return found
-        leaves, tree = jax.tree.flatten(args)
-        flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(tree, leaves)))
-        # A run must not end because the next one will be slower: on a full disk, or where your own
-        # sensor calls something that JAX cannot export.
+        leaves, structure = jax.tree.flatten(args)
+        results: list[jax.tree_util.PyTreeDef] = []
+
+        def flat(*leaves: jax.Array) -> list[jax.Array]:
+            output = function(*jax.tree.unflatten(structure, leaves))
+            results.append(jax.tree.structure(output))
+            return jax.tree.leaves(output)
+
+        # A run must not end because the next one will be slower: on a full disk, or where a
+        # program calls something that JAX cannot export.
         with contextlib.suppress(Exception):
-            traced = export.export(flat)(*shapes_of(leaves))
-            content = files.with_digest(bytes(traced.serialize()))
-            files.write(self._file(name, args), content, mode=0o600)
+            traced = Traced(export.export(jax.jit(flat))(*shapes_of(leaves)), results[-1])
+            content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
+            files.write(self._file(name, args), files.with_digest(content), mode=0o600)
             return traced
         return None
 
-    def _file(self, name: str, args: Any) -> Path:
+    def _file(self, name: str, args: PyTree) -> Path:
         """The file of a program."""
         shapes = repr(shapes_of(args)).encode()
         digest = hashlib.sha256(self._depends + shapes).hexdigest()[:32]
         return self.path / f"{name}-{digest}.stablehlo"
 
 
-def _use_cache_of_jax(path: Path) -> None:
-    """Sets JAX's compilation cache, also for small programs, unless the user has set it."""
-    # A cache that cannot be read or written costs time, on a full disk for example, and no result.
+def use_cache(directory: Path) -> None:
+    """Makes JAX cache all compiled programs, also small ones, unless the user has set a cache.
+
+    Args:
+      directory: holds them, in `compiled`.
+
+    Raises:
+      OSError: if the directory cannot be made, or if other users may write to it.
+    """
+    path = directory / "compiled"
+    _make_private(path)
+    # A cache that cannot be read or written, for example on a full disk, only costs time.
     warnings.filterwarnings("ignore", category=UserWarning, module=r"jax\._src\.compiler")
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
     jax.config.update("jax_compilation_cache_dir", str(path))
-    jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)
+    jax.config.update("jax_compilation_cache_max_size", _MAX_BYTES)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
@@ -142,8 +188,8 @@ class Compiler:
     """Compiles the programs of a run in its own threads.
 
     Attributes:
-      monitor: receives the time that it takes.
-      kept: where programs are kept, if anywhere.
+      monitor: receives compile times.
+      kept: cache of traced programs, if any.
     """
 
     def __init__(self, monitor: Monitor, kept: Kept | None = None):
@@ -154,13 +200,22 @@ class Compiler:
     def __enter__(self) -> "Compiler":
         return self
 
-    def __exit__(self, *error: Any) -> None:
-        """Cancels what still waits, which would otherwise hold up the process."""
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Cancels pending work, which would keep the process alive."""
         self._is_closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     def check_open(self) -> None:
-        """Raises `CancelledError` once the run is over."""
+        """Checks that the run is not over.
+
+        Raises:
+          CancelledError: if it is.
+        """
         if self._is_closed:
             raise CancelledError
 
@@ -172,35 +227,44 @@ class Compiler:
 class Program:
     """A function of a stage, compiled in the background.
 
-    Callable before `compile`, from another thread; blocks until compiled.
+    May be called before `compile`, from another thread; the call blocks until it is compiled.
     """
 
     def __init__(self, compiler: Compiler, stage: str, name: str):
-        """Names a program, uniquely within a stage of a run."""
+        """Names a program.
+
+        Args:
+          compiler: compiles it.
+          stage: to which it belongs.
+          name: unique within the stage.
+        """
         self._compiler, self._monitor = compiler, compiler.monitor
         self._stage, self._name = stage, name
-        self._compiled: Future[Callable[..., Any]] = Future()
+        self._compiled: Future[Function] = Future()
         self._workers, self._whole = ALONE, ()
 
     def compile(
         self,
-        function: Callable[..., Any],
-        *args: Any,
+        function: Function,
+        *args: PyTree,
         runs_long: bool = False,
         workers: Workers = ALONE,
         whole: tuple[int, ...] = (),
-    ) -> Any:
-        """Traces a function, unless its trace was kept, and starts to compile it.
+    ) -> PyTree[jax.ShapeDtypeStruct]:
+        """Traces a function, unless its trace is cached, and starts to compile it.
 
         Args:
           function: what to compile.
           *args: arguments or their shapes, for example the result of another program's `compile`.
           runs_long: see `devices.compiler_options`.
-          workers: what shares the rows of the arguments; their number divides the rows.
+          workers: share the rows of the arguments; their number must divide the rows.
           whole: positions of arguments that every worker gets undivided.
 
         Returns:
-          Shapes and dtypes of the results, as a pytree.
+          Shapes and dtypes of the results.
+
+        Raises:
+          CancelledError: if the run is over.
         """
         self._compiler.check_open()
         begin = time.perf_counter()
@@ -219,28 +283,22 @@ class Program:
                 self.fail(error)
                 return
             self._monitor.add(self._stage, "compile_s", time.perf_counter() - begin)
-            with contextlib.suppress(InvalidStateError):  # failed already for another reason
+            with contextlib.suppress(InvalidStateError):  # `fail` was called before
                 self._compiled.set_result(compiled)
 
         self._compiler.submit(compile_lowered)
         return devices.of_all_parts(results, workers.threads)
 
-    def _lower(self, function: Callable[..., Any], args: Any) -> tuple[jax.stages.Lowered, Any]:
+    def _lower(self, function: Function, args: PyTree) -> tuple[jax.stages.Lowered, PyTree]:
         """A function ready to be compiled, and the shapes of its results; see `compile`."""
         kept = self._compiler.kept
         # A program split over devices cannot be called from one that is not.
         if kept is not None and self._workers.mesh is None:
             found = kept.find_or_trace(f"{self._stage}-{self._name}", function, args)
             if found is not None:
-                call = jax.jit(lambda *args: found.call(*jax.tree.leaves(args)))
-                avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in found.out_avals]
-                return call.lower(*shapes_of(args)), jax.tree.unflatten(found.out_tree, avals)
-        options: dict[str, Any] = {}
-        if self._is_of_many:
-            assert self._workers.mesh is not None
-            places = devices.shardings(self._workers.mesh, len(args), self._whole)
-            options = {"in_shardings": places}
-        traced = jax.jit(function, **options).trace(*args)
+                return jax.jit(found.__call__).lower(*shapes_of(args)), found.results
+        places = self._places(len(args)) if self._is_of_many else None
+        traced = jax.jit(function, in_shardings=places).trace(*args)
         return traced.lower(), traced.out_info
 
     @property
@@ -248,13 +306,26 @@ class Program:
         """Whether several processes run the program together."""
         return self._workers.mesh is not None and jax.process_count() > 1
 
+    def _places(self, number: int) -> tuple[jax.sharding.NamedSharding, ...]:
+        """Where each of a number of arguments lies, if several processes run the program."""
+        assert self._workers.mesh is not None
+        return devices.shardings(self._workers.mesh, number, self._whole)
+
     def fail(self, error: BaseException) -> None:
         """Makes all calls raise an error, unless the program is compiled already."""
         with contextlib.suppress(InvalidStateError):
             self._compiled.set_exception(error)
 
-    def wait(self) -> Callable[..., Any]:
-        """Blocks until compiled and returns the program; raises `Stopped` if the run must stop."""
+    def wait(self) -> Function:
+        """Blocks until the program is compiled.
+
+        Returns:
+          The compiled program.
+
+        Raises:
+          Stopped: if the run must stop.
+          StageError: if a stage beside this one failed.
+        """
         if not self._compiled.done():
             self._monitor.announce(self._stage)
         while not self._compiled.done():
@@ -262,16 +333,15 @@ class Program:
             wait((self._compiled,), timeout=0.2)
         return self._compiled.result()
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         """Runs the program, and blocks until its results are ready."""
         compiled = self.wait()
         begin, number = time.perf_counter(), self._workers.threads
 
         if self._is_of_many:
-            assert self._workers.mesh is not None
-            args = devices.put(args, devices.shardings(self._workers.mesh, len(args), self._whole))
+            args = devices.put(args, self._places(len(args)))
 
-        def run(i: int) -> Any:
+        def run(i: int) -> PyTree:
             return jax.block_until_ready(compiled(*devices.part(args, i, number, self._whole)))
 
         output = devices.joined(devices.side_by_side(run, number))
@@ -281,8 +351,8 @@ class Program:
         return output
 
 
-def shapes_of(args: Any) -> Any:
-    """Shapes and dtypes of arguments; Python numbers count as those of JAX."""
+def shapes_of(args: PyTree) -> PyTree[jax.ShapeDtypeStruct]:
+    """Shapes and dtypes of arguments; Python numbers count as JAX arrays."""
     return jax.eval_shape(lambda args: args, args)
 
 
@@ -292,20 +362,20 @@ def _make_private(path: Path) -> None:
         path.mkdir(mode=0o700, parents=True)
     found = path.lstat()
     if not (stat.S_ISDIR(found.st_mode) and _is_private(found, 0o077)):
-        raise PermissionError(f"{path} must be a directory of yours alone, with mode 0700")
+        raise PermissionError(f"{path} must be a directory of your own, with mode 0700")
 
 
 def _is_private(found: os.stat_result, others: int) -> bool:
-    """Whether a file belongs to this user, and others have none of these rights."""
+    """Whether this user owns a file, and other users have none of the rights `others`."""
     is_own = not hasattr(os, "getuid") or found.st_uid == os.getuid()
     return is_own and found.st_mode & others == 0
 
 
-def _surroundings() -> list[Any]:
-    """All else that tracing and compiling depend on: versions, options, devices and processor."""
+def _surroundings() -> list[object]:
+    """Versions, options, devices and processor, on which tracing and compiling depend."""
     features = set()
     with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        lines = _CPU_INFO.read_text(encoding="utf-8").splitlines()
         features = {line for line in lines if line.startswith(("flags", "model name", "Features"))}
     variables = [item for item in os.environ.items() if item[0].startswith(("JAX_", "XLA_"))]
     return [
@@ -320,5 +390,5 @@ def _surroundings() -> list[Any]:
 
 
 def _sets_cache(option: str) -> bool:
-    """Whether an option sets where and how JAX keeps what it compiles: it changes no program."""
+    """Whether an option concerns JAX's cache alone, so that it changes no program."""
     return "cache" in option.lower()
