@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -90,7 +89,7 @@ def main(argv: list[str] | None = None) -> None:
         team = mission.make_mission(config)
         played = _cases(arguments, team)
         # If these files cannot be written, fail now rather than after minutes of work.
-        with _locked(arguments.run):
+        with files.locked(arguments.run, on_wait=say):
             _report(arguments.run, trained)
             (arguments.run / EVALUATIONS).mkdir(exist_ok=True)
     except ConfigError as error:
@@ -167,7 +166,7 @@ def _write(
     for case in summary.cases(missions).values():
         case["seed"] = arguments.seed
     path = run / EVALUATIONS / f"{place}-seed-{arguments.seed}-{arguments.episodes}-missions.json"
-    with _locked(run):
+    with files.locked(run, on_wait=say):
         # Another policy may have played in the same arenas before.
         before = summary.read_evaluations(run).get(path.stem)
         blocks = {**(before["mission"] if before else {}), **missions}
@@ -186,18 +185,6 @@ def _report(run: Path, config: Config) -> Path:
         files.write(run / "teams.png", plots.png(mission_plots.teams(places)))
     files.write(path, page.render(run, config, own, found))
     return path
-
-
-@contextlib.contextmanager
-def _locked(run: Path) -> Iterator[None]:
-    """Locks a run; says so if another process holds it."""
-    with contextlib.ExitStack() as kept:
-        try:
-            kept.enter_context(files.locked(run, waits=False))
-        except BlockingIOError:
-            say(f"Waiting for another process that writes {run}.")
-            kept.enter_context(files.locked(run, waits=True))
-        yield
 
 
 def _evaluation(config: Config, missions: summary.Missions) -> summary.Evaluation:

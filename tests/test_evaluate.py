@@ -87,7 +87,7 @@ def test_an_evaluation_waits_for_another_one_that_writes(evaluated, tmp_path):
         evaluate._write(arguments, (config, config), models.class_beliefs, found, None)
 
     with ThreadPoolExecutor(1) as executor:
-        with files.locked(path, waits=False):
+        with files.locked(path):
             writing = executor.submit(write)
             assert not wait((writing,), timeout=0.5).done
             summary["mission"]["naive"]["seed"] = 8
@@ -268,7 +268,7 @@ def test_bad_options_of_evaluate_are_named_in_one_line(smoke_run, options, expec
 
 def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
     line = error_line([str(tmp_path / "none")], capsys, evaluate)
-    assert f"run = {str(tmp_path / 'none')!r}: must hold a run's settings" in line
+    assert f"run = {str(tmp_path / 'none')!r}: is not a run directory: it has" in line
     versions = {"jaxsense": jaxsense.__version__}
     stored = {"versions": versions, "config": {"colour": 1}}
     (tmp_path / "config.json").write_text(json.dumps(stored))

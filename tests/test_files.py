@@ -2,6 +2,7 @@
 
 import errno
 import os
+import queue
 import stat
 import subprocess
 import sys
@@ -56,22 +57,25 @@ def test_many_writers_of_one_file_never_mix(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_directory_is_kept_for_one_at_a_time(tmp_path):
-    order = []
+def test_a_directory_is_kept_for_one_at_a_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "_WAIT_BEFORE_NOTICE", 0.1)
+    order, said = [], queue.Queue()
 
     def wait():
-        with files.locked(tmp_path, waits=True):
+        with files.locked(tmp_path, on_wait=said.put):
             order.append("second")
 
-    with files.locked(tmp_path, waits=False):
-        with pytest.raises(BlockingIOError), files.locked(tmp_path, waits=False):
+    with files.locked(tmp_path, on_wait=pytest.fail):
+        with pytest.raises(BlockingIOError), files.locked(tmp_path):
             pass
         waiting = threading.Thread(target=wait)
         waiting.start()
-        waiting.join(0.2)
+        line = said.get(timeout=10)
+        assert line == f"Waiting for another process to finish writing to {tmp_path}."
         order.append("first")
     waiting.join()
     assert order == ["first", "second"]
+    assert said.empty()
 
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
@@ -83,7 +87,7 @@ def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, number):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with pytest.raises(OSError, match=os.strerror(number)), files.locked(tmp_path, waits=False):
+    with pytest.raises(OSError, match=os.strerror(number)), files.locked(tmp_path):
         pass
     settings = Settings("smoke", 0, PRESETS["smoke"])
     with (
@@ -100,9 +104,9 @@ from pathlib import Path
 sys.modules["fcntl"] = None
 import jaxsense.train, jaxsense.evaluate
 from jaxsense.run import files
-with tempfile.TemporaryDirectory() as folder, files.locked(Path(folder), waits=False):
+with tempfile.TemporaryDirectory() as folder, files.locked(Path(folder)):
     try:
-        with files.locked(Path(folder), waits=False):
+        with files.locked(Path(folder)):
             print("twice")
     except BlockingIOError:
         print("once")
@@ -154,7 +158,7 @@ def test_every_damage_is_noticed_and_named_and_put_aside(tmp_path, damage):
     assert checkpoints.load_or_forget("tree", SHAPES) is None
     (line,) = said
     assert "tree.msgpack': is damaged" in line
-    assert "trained again" in line
+    assert line.endswith("retraining it")
     assert (tmp_path / "tree.msgpack.damaged").read_bytes() == damaged
     checkpoints.save("tree", TREE)
     assert checkpoints.load_or_forget("tree", SHAPES) is not None
@@ -209,7 +213,7 @@ def test_all_that_is_damaged_is_named_once_also_what_nobody_loads(tmp_path):
     checkpoints.check(is_begun=False)
     assert not said
     checkpoints.check(is_begun=True)
-    assert "checkpoints': is missing; everything is trained again" in said.pop()
+    assert "checkpoints': is missing; retraining everything" in said.pop()
     for name in ("jmvae", "class_beliefs", "detectors"):
         checkpoints.save(name, TREE)
     file = tmp_path / "checkpoints" / "class_beliefs.msgpack"
@@ -287,7 +291,7 @@ def test_a_checkpoint_of_other_shapes_is_named(tmp_path, shapes, expected):
 
 
 def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_path):
-    checkpoints = Checkpoints(tmp_path)
+    checkpoints = Checkpoints(tmp_path, pytest.fail)
     state = [FitState({"w": np.ones(2, np.float32)}, (np.int32(3),), np.int32(7))]
     saved = Unfinished(2, state, {"loss": [1.5, float("nan")], "none": []})
     checkpoints.save_unfinished("jmvae", saved)
@@ -299,5 +303,29 @@ def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_pa
     np.testing.assert_array_equal(curves["loss"], [1.5, np.nan])
     assert curves["none"] == []
     checkpoints.forget_unfinished()
+    assert not (tmp_path / "unfinished").exists()
     assert checkpoints.load_unfinished("jmvae", state) is None
     assert checkpoints.load("tree", SHAPES) is not None
+    checkpoints.check()  # nothing is missing
+
+
+def test_files_of_others_beside_checkpoints_stay(tmp_path):
+    """Here `checkpoints` is a link to a directory where somebody keeps files of the same suffix."""
+    theirs, said = tmp_path / "theirs", []
+    precious = [theirs / name for name in ("a.msgpack", "unfinished/b.msgpack", "c/d.msgpack")]
+    for path in precious:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("precious", encoding="utf-8")
+    (tmp_path / "checkpoints").symlink_to(theirs)
+    checkpoints = Checkpoints(tmp_path / "checkpoints", said.append)
+    checkpoints.save_unfinished("jmvae", Unfinished(1, TREE, {}))
+    (theirs / "saved.msgpack").unlink()
+    for _ in range(2):
+        checkpoints.check()
+    assert [line.partition("saved.msgpack")[2] for line in said] == [
+        "': is missing; resuming from all checkpoints found"
+    ]
+    assert checkpoints.load_unfinished("jmvae", TREE) is not None
+    checkpoints.forget_unfinished()
+    assert checkpoints.load_unfinished("jmvae", TREE) is None
+    assert all(path.read_text(encoding="utf-8") == "precious" for path in precious)

@@ -90,7 +90,7 @@ def test_a_stopped_run_says_how_to_go_on(stops):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (shutil.rmtree, "must hold a run's settings (config.json: No such file"),
+        (shutil.rmtree, "is not a run directory: it has no config.json"),
         (lambda path: (path / "summary.json").write_text("{}"), "is finished"),
         (lambda path: edit(path, "versions", {"jaxsense": "0.0.1"}), "was written by jaxsense 0.0"),
         (lambda path: edit(path, "versions", None), "was written by an older jaxsense"),
@@ -177,10 +177,10 @@ def test_a_config_reproduces_its_run(resumed, smoke_run, capsys):
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        (None, "must hold a run's settings (config.json: No such file or directory)"),
-        ('{"config": {"dqn"', "is no JSON"),
+        (None, "config.json cannot be read (No such file or directory)"),
+        ('{"config": {"dqn"', "is not JSON"),
         ("[1]", "must hold an object"),
-        ('{"colour": 1}', "colour = 1: is no field of a run's config.json"),
+        ('{"colour": 1}', "colour = 1: unknown field of a run's config.json"),
         ('{"seed": 1.5}', "seed = 1.5: must be a whole number"),
         (
             '{"preset": "best"}',

@@ -2,8 +2,10 @@
 
 import json
 import os
+import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -102,3 +104,59 @@ def test_a_directory_with_something_like_an_unfinished_file_is_somebodys(tmp_pat
     ):
         pass
     assert (tmp_path / ".config.json.d" / ".notes.unfinished").exists()
+
+
+def test_steps_that_a_killed_process_has_reported_are_not_reported_again(tmp_path):
+    """It wrote steps 1 to 4, was killed, and its last checkpoint was of step 2."""
+    path = tmp_path / "run"
+    with RunDirectory.create(path, SETTINGS) as run:
+        for step in (1, 2, 3, 4):
+            run.append_metrics(stage="jmvae", step=step, loss=10.0 - step)
+        for step in (0, 0, 1):  # of missions, several reports may be alike
+            run.append_metrics(stage="mission", step=step)
+    with RunDirectory.resume(path) as run:
+        run.append_metrics(stage="dqn", step=1, loss=3.0)
+        for step in (3, 4, 5):
+            run.append_metrics(stage="jmvae", step=step, loss=10.0 - step)
+    lines = list(map(json.loads, (path / "metrics.jsonl").read_text("utf-8").splitlines()))
+    steps = {n: [x["step"] for x in lines if x["stage"] == n] for n in ("jmvae", "dqn", "mission")}
+    assert steps == {"jmvae": [1, 2, 3, 4, 5], "dqn": [1], "mission": [0, 0, 1]}
+    assert [x["loss"] for x in lines if "loss" in x] == [9, 8, 7, 6, 3, 5]
+
+
+@pytest.mark.parametrize("error", [ConfigError("a", 1, "is wrong"), KeyboardInterrupt()])
+def test_a_run_that_is_refused_before_it_begins_leaves_no_directory(tmp_path, error):
+    def fail(path, *, begun):
+        with pytest.raises(type(error)), RunDirectory.create(path, SETTINGS) as run:
+            if begun:
+                run.append_metrics(stage="jmvae", step=1)
+            raise error
+
+    fail(tmp_path / "new", begun=False)
+    assert not list(tmp_path.iterdir())
+    fail(tmp_path / "begun", begun=True)
+    assert (tmp_path / "begun" / "config.json").exists()
+
+
+def test_a_run_records_the_commit_of_its_source(tmp_path):
+    def git(folder, *command):
+        who = ["-c", "user.name=A", "-c", "user.email=a@b.c"]
+        command = ["git", "-C", str(folder), *who, *command]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    assert rundir.commit(tmp_path) is None
+    git(tmp_path, "init")
+    (tmp_path / "file").write_text("1")
+    git(tmp_path, "add", "file")
+    git(tmp_path, "commit", "-m", "first")
+    git(tmp_path, "tag", "v1")
+    head = git(tmp_path, "rev-parse", "HEAD")
+    assert rundir.commit(tmp_path) == head
+    (tmp_path / "file").write_text("2")
+    assert rundir.commit(tmp_path) == f"{head}-dirty"
+    root = Path(__file__).parents[1]
+    with RunDirectory.create(tmp_path / "run", SETTINGS) as run:
+        content = json.loads((run.path / "config.json").read_text("utf-8"))
+    # Tests may run away from the source tree.
+    expected = git(root, "rev-parse", "HEAD") if Path(rundir.__file__).parents[2] == root else None
+    assert (content["commit"] or "").removesuffix("-dirty") == (expected or "")

@@ -30,7 +30,7 @@ Samples = tuple[jax.Array, ...]
 
 @dataclass_transform(frozen_default=True, field_specifiers=(struct.field,))
 def pytree(cls: type[T]) -> type[T]:
-    """Makes a class a frozen dataclass and a pytree; its static fields may be any hashable value."""
+    """Makes a frozen dataclass that is a pytree; static fields may hold any hashable value."""
     return struct.dataclass(cls)
 
 

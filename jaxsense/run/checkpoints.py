@@ -1,52 +1,53 @@
-"""Checkpoints of a run: finished stages, and trainings under way.
+"""Checkpoints of a run: finished stages and unfinished trainings.
 
 A checkpoint is one file: a SHA-256 digest, then arrays in the format of `flax.serialization`.
 """
 
-import shutil
+import contextlib
 import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
 from flax import serialization
+from jaxtyping import PyTree
 
 from jaxsense.config import ConfigError
 from jaxsense.run import files
 
 T = TypeVar("T")
 
-_SUFFIX = ".msgpack"
-_AGAIN = "its content is trained again"
-_LIST = "saved"
-"""The checkpoint that lists all others, to detect a missing file."""
-
 Curves = dict[str, list[float]]
 """Metrics of a training so far, by name."""
 
+_SUFFIX = ".msgpack"
+_UNFINISHED = "unfinished"
+_RETRAINED = "retraining it"
+_LIST = "saved"  # the checkpoint that lists all others, to detect a missing file
+
 
 class Unfinished(NamedTuple):
-    """A training under way.
+    """An unfinished training.
 
     Attributes:
-      done: chunks so far.
+      done: number of chunks so far.
       state: input of the next chunk.
       curves: metrics of the chunks so far.
     """
 
     done: int
-    state: Any
+    state: PyTree
     curves: Curves
 
 
 class Checkpoints:
     """The checkpoints of a run in a directory; without one, nothing is saved or found.
 
-    A damaged checkpoint is put aside and trained again, with the same result: a run follows from
-    its seed and settings.
+    A damaged checkpoint is set aside and its content is trained again, with the same result, since
+    seed and settings determine a run.
 
     Attributes:
       path: the directory.
@@ -57,7 +58,12 @@ class Checkpoints:
         path: Path | None = None,
         warn: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
     ):
-        """Takes the directory, and a function that receives warnings of damaged checkpoints."""
+        """Opens a directory, which need not exist.
+
+        Args:
+          path: the directory.
+          warn: receives a line about each damaged checkpoint.
+        """
         self.path, self._warn = path, warn
         self._lock = threading.Lock()
 
@@ -65,8 +71,16 @@ class Checkpoints:
         """Whether anything was saved."""
         return self.path is not None and self.path.exists()
 
-    def save(self, name: str, tree: Any) -> None:
-        """Saves something finished; an `OSError` names a file that cannot be written."""
+    def save(self, name: str, tree: PyTree) -> None:
+        """Saves a pytree.
+
+        Args:
+          name: of the checkpoint.
+          tree: of arrays.
+
+        Raises:
+          OSError: if the file cannot be written.
+        """
         if self.path is None:
             return
         self._file(name).parent.mkdir(parents=True, exist_ok=True)
@@ -77,83 +91,102 @@ class Checkpoints:
         with self._lock:
             self._list(self._listed() | {name})
 
-    def load(self, name: str, shapes: Any) -> Any:
-        """Loads what `save` saved.
+    def load(self, name: str, shapes: PyTree[T]) -> PyTree[np.ndarray] | None:
+        """Loads a checkpoint.
 
         Args:
           name: as in `save`.
           shapes: a tree of the same structure and shapes.
 
         Returns:
-          The tree, with arrays on the host; None if nothing was saved.
+          The tree, with arrays on the host; None if it was not saved.
 
         Raises:
-          ConfigError: names a file that is damaged, missing, or of other shapes.
+          ConfigError: if the file is damaged, missing, or holds arrays of other shapes.
         """
         return self._load(name, lambda found: _like(shapes, found))
 
-    def load_or_forget(self, name: str, shapes: Any) -> Any:
-        """`load`, but warns of a file that cannot be used, puts it aside and returns None."""
+    def load_or_forget(self, name: str, shapes: PyTree[T]) -> PyTree[np.ndarray] | None:
+        """Loads a checkpoint, or warns and sets its file aside if it cannot be used.
+
+        Args:
+          name: as in `save`.
+          shapes: a tree of the same structure and shapes.
+
+        Returns:
+          The tree, as in `load`, or None.
+        """
         return self._or_forget(name, lambda found: _like(shapes, found))
 
     def save_unfinished(self, stage: str, unfinished: Unfinished) -> None:
-        """Saves a training under way over its last checkpoint; see `save`."""
+        """Saves an unfinished training over its previous checkpoint.
+
+        Args:
+          stage: its name.
+          unfinished: the training so far.
+
+        Raises:
+          OSError: if the file cannot be written.
+        """
         curves = {name: np.array(values, np.float64) for name, values in unfinished.curves.items()}
         saved = {"done": np.int64(unfinished.done), "state": unfinished.state, "curves": curves}
         self.save(_unfinished(stage), saved)
 
-    def load_unfinished(self, stage: str, state: Any) -> Unfinished | None:
-        """Loads a training under way.
+    def load_unfinished(self, stage: str, state: PyTree) -> Unfinished | None:
+        """Loads an unfinished training.
 
         Args:
           stage: its name.
           state: any state of it, for structure and shapes.
 
         Returns:
-          The training as last saved; None if it was not, or if the file is damaged.
+          The training as last saved; None if there is none, or its file is damaged.
         """
 
-        def restore(found: Any) -> Unfinished:
+        def restore(found: PyTree) -> Unfinished:
             curves = {name: values.tolist() for name, values in found["curves"].items()}
             return Unfinished(int(found["done"]), _like(state, found["state"]), curves)
 
         return self._or_forget(_unfinished(stage), restore)
 
     def forget_unfinished(self) -> None:
-        """Removes all trainings under way, once the run is finished."""
-        if self.path is not None:
-            shutil.rmtree(self.path / _unfinished(""), ignore_errors=True)
-            with self._lock:
-                self._list(
-                    {name for name in self._listed() if not name.startswith(_unfinished(""))}
-                )
+        """Removes the checkpoints of unfinished trainings, once the run is finished."""
+        if self.path is None:
+            return
+        with self._lock:
+            listed = self._listed()
+            forgotten = {name for name in listed if name.startswith(_unfinished(""))}
+            self._list(listed - forgotten)
+        with contextlib.suppress(OSError):
+            for name in forgotten:
+                self._file(name).unlink(missing_ok=True)
+            # Stays if it holds files of others, or is a link.
+            (self.path / _UNFINISHED).rmdir()
 
     def check(self, is_begun: bool = False) -> None:
-        """Warns of checkpoints that are damaged or missing, and puts them aside.
+        """Warns of checkpoints that are damaged or missing, and sets their files aside.
 
         Args:
-          is_begun: whether training has begun, so that an absent directory is missing.
+          is_begun: whether training has begun, so that the directory should exist.
         """
         if self.path is None:
             return
         if not self.path.exists():
             if is_begun:
                 error = ConfigError("checkpoints", str(self.path), "is missing")
-                self._warn(f"{error}; everything is trained again")
+                self._warn(f"{error}; retraining everything")
             return
-        there = self._there()
-        if there or self._file(_LIST).exists():
-            self._check(_LIST, "the run resumes from all checkpoints found")
-        expected = sorted(self._listed() | there)
-        sound = {name for name in expected if self._check(name)}
+        if self._sound() or self._file(_LIST).exists():
+            self._check(_LIST, "resuming from all checkpoints found")
+        sound = {name for name in sorted(self._listed()) if self._check(name)}
         self._write(_LIST, sorted(sound))
 
-    def _check(self, name: str, consequence: str = _AGAIN) -> bool:
-        """Whether a checkpoint is as it was saved; if not, warns and puts it aside."""
+    def _check(self, name: str, consequence: str = _RETRAINED) -> bool:
+        """Whether a checkpoint is intact; if not, warns and sets it aside."""
         try:
             _read(self._file(name))
         except (OSError, ValueError) as error:
-            self._forget(name, _what_is_wrong(error), consequence)
+            self._forget(name, _reason(error), consequence)
             return False
         return True
 
@@ -161,30 +194,40 @@ class Checkpoints:
         """The existing directories of checkpoints."""
         if self.path is None:
             return []
-        return [p for p in (self.path, self.path / _unfinished("")) if p.is_dir()]
+        return [p for p in (self.path, self.path / _UNFINISHED) if p.is_dir()]
 
-    def _there(self) -> set[str]:
-        """Names of all checkpoints on disk, except the list."""
+    def _sound(self) -> set[str]:
+        """Names of all intact checkpoints on disk, except the list; other files are the user's."""
+
+        def is_sound(file: Path) -> bool:
+            try:
+                _read(file)
+            except (OSError, ValueError):
+                return False
+            return True
+
         assert self.path is not None
-        found = (file.relative_to(self.path).as_posix() for file in self.path.rglob(f"*{_SUFFIX}"))
-        return {name.removesuffix(_SUFFIX) for name in found} - {_LIST}
+        there = [file for place in self.directories() for file in place.glob(f"*{_SUFFIX}")]
+        names = {file.relative_to(self.path).as_posix() for file in there if is_sound(file)}
+        return {name.removesuffix(_SUFFIX) for name in names} - {_LIST}
 
     def _listed(self) -> set[str]:
-        """Names of all checkpoints that were saved; those on disk if the list is damaged."""
+        """Names of all checkpoints that were saved; of all intact ones if the list is damaged."""
         try:
             return set(_read(self._file(_LIST)))
         except (OSError, ValueError):
-            return self._there()
+            return self._sound()
 
     def _list(self, names: set[str]) -> None:
+        """Writes the list if it has changed."""
         if names != self._listed():
             self._write(_LIST, sorted(names))
 
-    def _write(self, name: str, content: Any) -> None:
+    def _write(self, name: str, content: PyTree) -> None:
         packed = serialization.msgpack_serialize(content)
         files.write(self._file(name), files.with_digest(packed))
 
-    def _load(self, name: str, restore: Callable[[Any], T]) -> T | None:
+    def _load(self, name: str, restore: Callable[[PyTree], T]) -> T | None:
         """Applies `restore` to a checkpoint's content; see `load`."""
         if self.path is None:
             return None
@@ -195,17 +238,18 @@ class Checkpoints:
         try:
             return restore(_read(self._file(name)))
         except (OSError, ValueError, KeyError) as error:
-            raise self._error(name, _what_is_wrong(error)) from None
+            raise self._error(name, _reason(error)) from None
 
-    def _or_forget(self, name: str, restore: Callable[[Any], T]) -> T | None:
+    def _or_forget(self, name: str, restore: Callable[[PyTree], T]) -> T | None:
+        """Applies `restore` to a checkpoint's content; see `load_or_forget`."""
         try:
             return self._load(name, restore)
         except ConfigError as error:
             self._forget(name, error.expected)
             return None
 
-    def _forget(self, name: str, reason: str, consequence: str = _AGAIN) -> None:
-        """Puts a checkpoint aside, with a warning."""
+    def _forget(self, name: str, reason: str, consequence: str = _RETRAINED) -> None:
+        """Sets a checkpoint aside, with a warning."""
         file = self._file(name)
         if file.exists():
             file.replace(file.with_name(f"{file.name}.damaged"))
@@ -220,16 +264,16 @@ class Checkpoints:
 
 
 def _unfinished(stage: str) -> str:
-    """The checkpoint's name of a training under way."""
-    return f"unfinished/{stage}"
+    """Name of the checkpoint of an unfinished training."""
+    return f"{_UNFINISHED}/{stage}"
 
 
-def _read(file: Path) -> Any:
-    """A checkpoint's content as nested dictionaries; raises `ValueError` if it is damaged."""
+def _read(file: Path) -> PyTree:
+    """A checkpoint's content in nested dictionaries; raises `ValueError` if it is damaged."""
     return serialization.msgpack_restore(files.without_digest(file.read_bytes()))
 
 
-def _what_is_wrong(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """Why a checkpoint cannot be used."""
     if isinstance(error, FileNotFoundError):
         return "is missing"
@@ -238,15 +282,14 @@ def _what_is_wrong(error: Exception) -> str:
     return f"is damaged or of other settings ({str(error).splitlines()[0]})"
 
 
-def _like(shapes: Any, found: Any) -> Any:
+def _like(shapes: PyTree[T], found: PyTree) -> PyTree[np.ndarray]:
     """A tree like `shapes` from nested dictionaries; raises `ValueError` if they differ."""
 
-    def check(expected: Any, found: Any) -> np.ndarray:
+    def check(expected: jax.ShapeDtypeStruct, found: np.ndarray) -> np.ndarray:
         found = np.asarray(found)
         if (found.shape, found.dtype) != (expected.shape, expected.dtype):
-            raise ValueError(
-                f"{found.dtype}{found.shape} in place of {expected.dtype}{expected.shape}"
-            )
+            wanted = f"{expected.dtype}{expected.shape}"
+            raise ValueError(f"{found.dtype}{found.shape} in place of {wanted}")
         return found
 
     if jax.tree.structure(serialization.to_state_dict(shapes)) != jax.tree.structure(found):

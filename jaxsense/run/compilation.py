@@ -46,7 +46,7 @@ class Traced(NamedTuple):
     """
 
     flat: export.Exported
-    structure: jax.tree_util.PyTreeDef
+    structure: object
 
     @property
     def results(self) -> PyTree[jax.ShapeDtypeStruct]:
@@ -140,7 +140,7 @@ class Kept:
         if found is not None:
             return found
         leaves, structure = jax.tree.flatten(args)
-        results: list[jax.tree_util.PyTreeDef] = []
+        results: list[object] = []
 
         def flat(*leaves: jax.Array) -> list[jax.Array]:
             output = function(*jax.tree.unflatten(structure, leaves))

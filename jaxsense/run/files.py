@@ -1,4 +1,4 @@
-"""Writes files as a whole or not at all, and locks directories."""
+"""Atomic writes of files, and locks of directories."""
 
 import contextlib
 import errno
@@ -6,15 +6,15 @@ import hashlib
 import os
 import re
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
 import filelock
 
 _DIGEST = hashlib.sha256().digest_size
-_UNFINISHED_NAME = re.compile(r"\.(.+)\.[0-9a-f]{16}\.unfinished")
-"""Names of partial files."""
+_PARTIAL_NAME = re.compile(r"\.(.+)\.[0-9a-f]{16}\.unfinished")
+_WAIT_BEFORE_NOTICE = 1.0  # s
 
 
 class WriteError(OSError):
@@ -22,15 +22,15 @@ class WriteError(OSError):
 
 
 def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
-    """Writes a file so that a reader never sees a part of it, even after a power failure.
+    """Writes a file atomically: readers never see a part of it, even after a power failure.
 
     Args:
       path: the file; an existing one is replaced.
-      content: of the file; text as UTF-8.
-      mode: of the file, before the umask.
+      content: of the file; text is encoded as UTF-8.
+      mode: permissions of the file, before the umask.
 
     Raises:
-      WriteError: names the file, which is then unchanged.
+      WriteError: if the file cannot be written; it is then unchanged.
     """
     unfinished = _unfinished(path)
     try:
@@ -50,14 +50,19 @@ def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
 
 
 def is_unfinished(path: Path, name: str | None = None) -> bool:
-    """Whether this is a partial file of a killed `write`, of the file `name` if given."""
-    found = _UNFINISHED_NAME.fullmatch(path.name)
+    """Whether a killed `write` left this partial file.
+
+    Args:
+      path: the file.
+      name: of the file that was being written; any by default.
+    """
+    found = _PARTIAL_NAME.fullmatch(path.name)
     is_ours = found is not None and name in (None, found[1])
     return is_ours and path.is_file() and not path.is_symlink()
 
 
 def remove_unfinished(directory: Path) -> None:
-    """Removes partial files of a killed `write` from a directory."""
+    """Removes the partial files of a killed `write` from a directory."""
     for path in filter(is_unfinished, directory.iterdir()):
         with contextlib.suppress(OSError):
             path.unlink()
@@ -65,7 +70,10 @@ def remove_unfinished(directory: Path) -> None:
 
 @contextlib.contextmanager
 def new(path: Path) -> Iterator[IO[bytes]]:
-    """Opens a new file, which has its name only once it is whole.
+    """Opens a new file, which appears under its name only once it is complete.
+
+    Args:
+      path: the file.
 
     Raises:
       FileExistsError: if the path exists, now or at the end.
@@ -87,23 +95,31 @@ def new(path: Path) -> Iterator[IO[bytes]]:
 
 
 def _name(unfinished: Path, path: Path) -> None:
-    """Names a file; raises `FileExistsError` if another has this name."""
+    """Gives a file its name; raises `FileExistsError` if the name is taken."""
     try:
         os.link(unfinished, path)
     except FileExistsError:
         raise
-    except OSError:  # without links
+    except OSError:  # the file system has no links
         path.open("xb").close()
         unfinished.replace(path)
 
 
 def _unfinished(path: Path) -> Path:
-    """A name for a partial file, unique as another process may write the same file."""
+    """A unique name for a partial file, since another process may write the same file."""
     return path.with_name(f".{path.name}.{secrets.token_hex(8)}.unfinished")
 
 
 def append(path: Path, line: str) -> None:
-    """Adds a line to a text file; a `WriteError` names a file that cannot be written."""
+    """Adds a line to a text file.
+
+    Args:
+      path: the file.
+      line: without its end.
+
+    Raises:
+      WriteError: if the file cannot be written.
+    """
     try:
         with path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")
@@ -112,7 +128,7 @@ def append(path: Path, line: str) -> None:
 
 
 def _sync(directory: Path) -> None:
-    """Makes the names in a directory durable, where the system can."""
+    """Makes the names in a directory durable, where the system supports it."""
     with contextlib.suppress(OSError):
         number = os.open(directory, os.O_RDONLY)
         try:
@@ -122,22 +138,26 @@ def _sync(directory: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(directory: Path, *, waits: bool) -> Iterator[None]:
-    """Locks a directory for this process, by the file `.lock` in it.
+def locked(directory: Path, on_wait: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Locks a directory for this process, with the file `.lock` in it.
 
     Args:
       directory: must exist.
-      waits: wait until another process releases the directory.
+      on_wait: receives one line if another process still holds the lock after a second. Without
+        it, `locked` does not wait.
 
     Raises:
-      BlockingIOError: if another process holds the lock, and `waits` is False.
+      BlockingIOError: if another process holds the lock and there is no `on_wait`.
       OSError: if the lock cannot be taken.
     """
-    lock = filelock.FileLock(directory / ".lock", timeout=-1 if waits else 0)
+    lock = filelock.FileLock(directory / ".lock")
     try:
-        lock.acquire()
+        lock.acquire(timeout=0 if on_wait is None else _WAIT_BEFORE_NOTICE)
     except filelock.Timeout:
-        raise BlockingIOError(f"{directory} is kept by another process") from None
+        if on_wait is None:
+            raise BlockingIOError(f"another process holds {directory}") from None
+        on_wait(f"Waiting for another process to finish writing to {directory}.")
+        lock.acquire(timeout=-1)
     try:
         yield
     finally:
@@ -145,13 +165,20 @@ def locked(directory: Path, *, waits: bool) -> Iterator[None]:
 
 
 def with_digest(content: bytes) -> bytes:
-    """A file's content after its SHA-256 digest."""
+    """Prefixes a file's content with its SHA-256 digest."""
     return hashlib.sha256(content).digest() + content
 
 
 def without_digest(whole: bytes) -> bytes:
-    """The content of a file from `with_digest`; raises `ValueError` if it is damaged."""
+    """Removes the digest from a file's content.
+
+    Args:
+      whole: from `with_digest`.
+
+    Raises:
+      ValueError: if the content is damaged.
+    """
     content = whole[_DIGEST:]
     if hashlib.sha256(content).digest() != whole[:_DIGEST]:
-        raise ValueError("its content does not have its digest")
+        raise ValueError("wrong digest")
     return content

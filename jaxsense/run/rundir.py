@@ -1,4 +1,4 @@
-"""The directory of a run: writes it, resumes in it, and reads it back."""
+"""Run directories: creates, resumes and reads them."""
 
 import contextlib
 import dataclasses
@@ -7,9 +7,9 @@ import hashlib
 import itertools
 import json
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 
@@ -29,18 +29,20 @@ from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.version import __version__, versions
 from jaxsense.training.agents import learner
 
+Json: TypeAlias = dict[str, Any]
 _METRICS = "metrics.jsonl"
+_ROOT = Path(__file__).parents[2]
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """All that determines a run's results, on the same devices and versions.
+    """Everything that determines a run's results, on the same devices and versions.
 
     Attributes:
-      preset: origin of the settings.
-      seed: of all randomness.
-      config: the settings.
-      num_seeds: number of seeds to train, from `seed` on.
+      preset: name of the preset that the settings started from.
+      seed: of all randomness; the first one if there are several.
+      config: all settings.
+      num_seeds: number of seeds to train.
     """
 
     preset: str
@@ -55,7 +57,7 @@ class Settings:
 
 
 class RunDirectory:
-    """Writes the files of one run, and never overwrites those of another.
+    """Writes the files of one run, and never overwrites files of another.
 
     Attributes:
       path: the directory.
@@ -64,18 +66,31 @@ class RunDirectory:
     """
 
     def __init__(self, path: Path, settings: Settings):
-        """Takes an existing directory; see `create` and `resume`."""
+        """Use `create` or `resume` instead.
+
+        Args:
+          path: an existing directory.
+          settings: of the run.
+        """
         self.path, self.settings = path, settings
         self.checkpoints = Checkpoints(path / "checkpoints")
+        self._reported: dict[str, int] = {}
 
     @classmethod
     @contextlib.contextmanager
     def create(cls, path: Path, settings: Settings) -> "Iterator[RunDirectory]":
         """Makes the directory with its `config.json`, and locks it for this process.
 
+        If a `ConfigError` or Ctrl-C ends the run before anything else is written, the directory is
+        removed.
+
+        Args:
+          path: a new or empty directory.
+          settings: of the run.
+
         Raises:
-          ConfigError: if the directory is not empty or cannot be written, or another process
-            locks it.
+          ConfigError: if the directory is not empty, cannot be written, or is locked by another
+            process.
         """
         content = {
             "preset": settings.preset,
@@ -86,67 +101,107 @@ class RunDirectory:
             "commit": commit(),
         }
         content["digest"] = _digest(content)
-        reason = "cannot be written ({}); must be a new directory"
         with contextlib.ExitStack() as kept:
             try:
                 path.mkdir(parents=True, exist_ok=True)
-                # Before the lock too, so as to add no file to another directory.
+                # Also before locking, which adds a file.
                 _check_empty(path)
                 kept.enter_context(_locked(path, "out"))
                 run = cls(path, settings)
-                run._remove_unfinished()
+                run._remove_partial()
                 _check_empty(path)
                 write_json(path / "config.json", content)
             except OSError as error:
-                raise ConfigError("out", str(path), reason.format(error.strerror)) from None
-            yield run
+                reason = f"cannot be written ({error.strerror}); must be a new directory"
+                raise ConfigError("out", str(path), reason) from None
+            try:
+                yield run
+            except (ConfigError, KeyboardInterrupt):
+                run._withdraw()
+                raise
 
     @classmethod
     @contextlib.contextmanager
     def resume(cls, path: Path, trust: bool = False) -> "Iterator[RunDirectory]":
         """Opens the directory of a stopped run, and locks it for this process.
 
+        Args:
+          path: the directory.
+          trust: see `resumable`.
+
         Raises:
-          ConfigError: as `resumable`, or if another process locks the directory.
+          ConfigError: see `resumable`; also if another process locks the directory.
         """
         settings = resumable(path, trust)
         with _locked(path, "resume"):
             run = cls(path, settings)
-            run._remove_unfinished()
+            run._remove_partial()
             run.checkpoints.check(is_begun=(path / _METRICS).exists())
-            run._drop_unfinished_line()
+            run._read_metrics()
             yield run
 
-    def write_json(self, name: str, content: Any) -> None:
-        """Writes a file of the run, see the function `write_json`."""
+    def write_json(self, name: str, content: Mapping[str, object]) -> None:
+        """Writes a JSON file of the run; see the function `write_json`."""
         write_json(self.path / name, content)
 
     def save_models(self, models: Models) -> None:
-        """Saves trained models for `load`; raises `OSError` if they cannot be written."""
+        """Saves trained models for `load`; see `Checkpoints.save`."""
         for name, tree in _named(models, self.settings.config).items():
             self.checkpoints.save(name, tree)
 
-    def append_metrics(self, **metrics: Any) -> None:
-        """Adds a line to `metrics.jsonl`."""
-        files.append(self.path / _METRICS, json.dumps(metrics))
+    def append_metrics(self, *, stage: str, step: int, **metrics: float) -> None:
+        """Adds a line to `metrics.jsonl`, unless this run wrote it before it was killed.
 
-    def _remove_unfinished(self) -> None:
+        Args:
+          stage: that reports.
+          step: number of steps so far.
+          **metrics: after that step.
+
+        Raises:
+          WriteError: if the file cannot be written.
+        """
+        if step > self._reported.get(stage, -1):
+            line = json.dumps({"stage": stage, "step": step, **metrics})
+            files.append(self.path / _METRICS, line)
+
+    def _remove_partial(self) -> None:
         """Removes partial files of a killed process."""
         for place in (self.path, *self.checkpoints.directories()):
             files.remove_unfinished(place)
 
-    def _drop_unfinished_line(self) -> None:
-        """Removes the partial last line of a killed process from `metrics.jsonl`."""
+    def _withdraw(self) -> None:
+        """Removes the directory if the run has written only its settings."""
+        ours = {".lock", "config.json"}
+        with contextlib.suppress(OSError):
+            if {path.name for path in self.path.iterdir()} <= ours:
+                for name in ours:
+                    (self.path / name).unlink(missing_ok=True)
+                self.path.rmdir()
+
+    def _read_metrics(self) -> None:
+        """Reads the last step of each stage from `metrics.jsonl`, and cuts off a partial line."""
         path = self.path / _METRICS
-        if path.exists():
-            content = path.read_bytes()
-            whole = content[: content.rfind(b"\n") + 1]
-            if whole != content:
-                files.write(path, whole)
+        if not path.exists():
+            return
+        content = path.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        if whole != content:
+            files.write(path, whole)
+        for line in whole.splitlines():
+            with contextlib.suppress(ValueError, KeyError, TypeError):
+                found = json.loads(line)
+                stage, step = found["stage"], int(found["step"])
+                self._reported[stage] = max(step, self._reported.get(stage, -1))
 
 
 def unused(path: Path) -> Path:
     """Makes a new directory, with a number after its name if the name is taken.
+
+    Args:
+      path: the directory.
+
+    Returns:
+      The directory made.
 
     Raises:
       ConfigError: if it cannot be made.
@@ -166,18 +221,21 @@ def unused(path: Path) -> Path:
 
 
 def _check_empty(path: Path) -> None:
-    """Raises `ConfigError` if a directory holds more than a lock."""
-    # A process killed at once may leave a lock and a partial file.
+    """Raises `ConfigError` if a directory holds more than a lock and a partial `config.json`."""
     if any(f.name != ".lock" and not files.is_unfinished(f, "config.json") for f in path.iterdir()):
         raise ConfigError("out", str(path), "is not empty; must be a new directory")
 
 
 def resumable(path: Path, trust: bool = False) -> Settings:
-    """The settings of a stopped run.
+    """Reads the settings of a stopped run.
+
+    Args:
+      path: the directory.
+      trust: whether `config.json` may name custom sensors, whose code runs.
 
     Raises:
-      ConfigError: if there is no run, another version wrote it, it is finished, or it names code
-        without trust.
+      ConfigError: if there is no run, if another version wrote it, if it is finished, or if it
+        names custom sensors without trust.
     """
     content = _read_config(path / "config.json", "resume", path)
     _check_origin(content, "resume", path)
@@ -188,19 +246,22 @@ def resumable(path: Path, trust: bool = False) -> Settings:
 
 @contextlib.contextmanager
 def _locked(path: Path, field: str) -> Iterator[None]:
-    """Locks a directory; raises `ConfigError` about `field` if another process holds it."""
+    """Locks a directory; raises `ConfigError` about `field` if another process holds the lock."""
     with contextlib.ExitStack() as kept:
         try:
-            kept.enter_context(files.locked(path, waits=False))
+            kept.enter_context(files.locked(path))
         except BlockingIOError:
-            reason = "is being written by another process; wait for its end"
+            reason = "is being written by another process; wait for it to end"
             raise ConfigError(field, str(path), reason) from None
         yield
 
 
-def commit() -> str | None:
-    """The commit of jaxsense's source, with `-dirty` if changed; None outside Git."""
-    source = Path(__file__).parents[1]
+def commit(source: Path = _ROOT) -> str | None:
+    """The commit of a source tree, with `-dirty` if files have changed; None outside Git.
+
+    Args:
+      source: the root of the tree, by default the one this package was imported from.
+    """
     if not (source / ".git").exists():
         return None
     command = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=40"]
@@ -212,23 +273,32 @@ def commit() -> str | None:
     return found.stdout.strip()
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Writes a JSON file, see `files.write`."""
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Writes a JSON file.
+
+    Args:
+      path: the file.
+      content: finite numbers, texts, lists and dictionaries.
+
+    Raises:
+      WriteError: if the file cannot be written.
+      ValueError: if a number is not finite.
+    """
     files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def read_settings(file: Path, trust: bool = False) -> Settings:
-    """Reads the settings in the `config.json` of a run.
+    """Reads the settings in a `config.json`.
 
-    Missing ones come from the preset that it names, by default `default`, with seed 0.
+    Missing ones come from the preset that it names, `default` if it names none, with seed 0.
 
     Args:
       file: the file.
-      trust: whether it may name code, which runs when its sensors are made.
+      trust: whether it may name custom sensors, whose code runs when they are made.
 
     Raises:
-      ConfigError: if the file cannot be read or names code without trust; otherwise names the field
-        that is unknown or wrong.
+      ConfigError: if the file cannot be read, a field is unknown or wrong, or if it names custom
+        sensors without trust.
     """
     return _settings_of(_read_config(file, "config", file), trust)
 
@@ -238,14 +308,14 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
 
     Args:
       path: the run's directory.
-      trust: whether to run the functions that its `config.json` names for your own sensors.
+      trust: whether its `config.json` may name custom sensors, whose code runs.
 
     Returns:
       The settings and the models, on the default device.
 
     Raises:
-      ConfigError: if the directory holds no finished run, a run of another version, a damaged
-        checkpoint, or settings that name code without trust.
+      ConfigError: if the directory holds no finished run, a run of another version or a damaged
+        checkpoint, or if the run names custom sensors without trust.
     """
     path = Path(path)
     content = _read_config(path / "config.json", "run", path)
@@ -282,29 +352,33 @@ def _named(models: Models, config: Config) -> dict[str, Any]:
     }
 
 
-def _read_config(file: Path, field: str, value: Path) -> dict[str, Any]:
-    """Reads a `config.json`; raises `ConfigError` about `field = value` if that fails."""
+def _read_config(file: Path, field: str, path: Path) -> Json:
+    """The content of a `config.json`.
+
+    Raises `ConfigError` about `field = path`, which is the file or its run's directory.
+    """
     try:
         if file.exists() and not (file.is_file() or file.is_dir()):
-            raise OSError(errno.EINVAL, "Not a regular file")  # it may never end
+            raise OSError(errno.EINVAL, "Not a regular file")  # a pipe might never end
         content = parse_json(file.read_text(encoding="utf-8"))
     except OSError as error:
-        reason = f"must hold a run's settings ({file.name}: {error.strerror})"
-        raise ConfigError(field, str(value), reason) from None
+        reason = f"{file.name} cannot be read ({error.strerror})"
+        if path != file and isinstance(error, FileNotFoundError | NotADirectoryError):
+            reason = f"is not a run directory: it has no {file.name}"
+        raise ConfigError(field, str(path), reason) from None
     except ValueError as error:
-        reason = f"must hold a run's settings ({file.name} is no JSON: {error})"
-        raise ConfigError(field, str(value), reason) from None
+        raise ConfigError(field, str(path), f"{file.name} is not JSON: {error}") from None
     if not isinstance(content, dict):
-        raise ConfigError(field, str(value), f"{file.name} must hold an object")
+        raise ConfigError(field, str(path), f"{file.name} must hold an object")
     return content
 
 
-def _settings_of(content: dict[str, Any], trust: bool) -> Settings:
-    """The settings in the content of a `config.json`."""
+def _settings_of(content: Json, trust: bool) -> Settings:
+    """The settings in a `config.json`; raises `ConfigError` if one is unknown or wrong."""
     known = {"preset", "seed", "num_seeds", "config", "versions", "commit", "digest"}
     unknown = sorted(set(content) - known)
     if unknown:
-        raise ConfigError(unknown[0], content[unknown[0]], "is no field of a run's config.json")
+        raise ConfigError(unknown[0], content[unknown[0]], "unknown field of a run's config.json")
     preset = content.get("preset", "default")
     if not isinstance(preset, str) or preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
@@ -318,16 +392,16 @@ def _settings_of(content: dict[str, Any], trust: bool) -> Settings:
     return Settings(preset, config=config, **numbers)
 
 
-def _digest(content: dict[str, Any]) -> str:
-    """SHA-256 of the content of a `config.json`, without its digest."""
+def _digest(content: Json) -> str:
+    """SHA-256 of the content of a `config.json`, apart from its digest."""
     rest = {name: value for name, value in content.items() if name != "digest"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
-def _check_origin(content: dict[str, Any], field: str, path: Path) -> None:
-    """Raises `ConfigError` about a `config.json` to which the run's checkpoints may not belong.
+def _check_origin(content: Json, field: str, path: Path) -> None:
+    """Raises `ConfigError` if the run's checkpoints may not fit its `config.json`.
 
-    A version whose checkpoints may differ wrote it, or it has changed since the run began.
+    That is so if another version wrote it, or if it has changed since the run began.
     """
     recorded = content.get("versions")
     wrote = recorded.get("jaxsense") if isinstance(recorded, dict) else None
