@@ -8,7 +8,7 @@ import shlex
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
@@ -38,7 +38,6 @@ from jaxsense.summary.blocks import Header
 PROGRAM = "jaxsense.train"
 _MOST_SEEDS = 10_000
 _MOST_TOGETHER = 16  # seeds in one program on an accelerator
-_LEAVE_TIMEOUT = 10.0  # s
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,20 +101,21 @@ def main(
     """
     begin = time.perf_counter()
     arguments = parse(sys.argv[1:] if argv is None else argv, change)
+    is_quiet, is_first = arguments.quiet, not arguments.process_index
+    if not is_first:
+        arguments = dataclasses.replace(arguments, quiet=True, tensorboard=False)
     console = rich.console.Console(quiet=arguments.quiet)
     try:
-        devices.join(
-            arguments.coordinator,
-            arguments.num_processes,
-            arguments.process_index,
-            begins=lambda: _say_waits(arguments),
-        )
-        workers = devices.start(arguments.devices)
-        if jax.process_index() > 0:
-            _help(begin, arguments, workers)
-            return
+        # Before joining, so that no process waits for a first one that refuses its options.
         with _open(arguments) as run:
-            _train(begin, arguments, run, workers, console)
+            seeds.check(run)
+            devices.join(
+                arguments.coordinator,
+                arguments.num_processes,
+                arguments.process_index,
+                begins=lambda: None if is_quiet else _say_waits(arguments),
+            )
+            _train(begin, arguments, run, devices.start(arguments.devices), console)
         devices.leave()
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
@@ -124,6 +124,8 @@ def main(
         cli.fail(PROGRAM, f"cannot write {cli.reason(error)}; what was saved before is still there")
     except OSError as error:
         cli.fail(PROGRAM, f"{cli.reason(error)}; what was saved before is still there")
+    if not is_first:
+        return
     if not arguments.quiet:
         with contextlib.suppress(OSError):  # as in `say`
             _print_summary(console, run)
@@ -132,16 +134,6 @@ def main(
     say(f"Everything is in {run.path}; open {run.path / 'report.html'} first.")
     trust = " --trust" if arguments.config.sensors else ""
     say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
-
-
-def _help(begin: float, arguments: Arguments, workers: Workers) -> None:
-    """Runs along with the first process, and discards its own files."""
-    quiet = dataclasses.replace(arguments, quiet=True, tensorboard=False)
-    with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder) / "run"
-        with RunDirectory.create(place, arguments.settings) as run:
-            _train(begin, quiet, run, workers, rich.console.Console(quiet=True))
-    devices.leave()
 
 
 def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: config) -> Arguments:
@@ -156,6 +148,9 @@ def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: c
         )
         arguments = cli.parse(PROGRAM, Arguments, argv, default)
         sensors.make(arguments.config)
+        devices.check(arguments.devices)
+        if arguments.tensorboard:
+            tensorboard.require()
         if not 0 <= arguments.seed < 2**32:
             raise ConfigError("seed", arguments.seed, "must be within 0 and 2^32 - 1")
         if arguments.seed + arguments.num_seeds > 2**32:
@@ -199,17 +194,28 @@ def _option(argv: list[str], name: str) -> str | None:
 
 def _say_waits(arguments: Arguments) -> None:
     """Announces that this process waits for the others of its run."""
-    if not arguments.quiet:
-        say(f"Waiting for the other processes at {arguments.coordinator}.")
+    say(f"Waiting for the other processes at {arguments.coordinator}.")
 
 
 def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:
-    """The run directory: a new one, or the one to resume."""
+    """The run directory: a new one, the one to resume, or that of a process that only helps."""
+    if arguments.process_index:
+        return _discarded(arguments.settings)
     if arguments.resume is not None:
         return RunDirectory.resume(arguments.resume, arguments.trust)
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
     path = arguments.out or rundir.unused(Path("runs") / name)
     return RunDirectory.create(path, arguments.settings)
+
+
+@contextlib.contextmanager
+def _discarded(settings: Settings) -> Iterator[RunDirectory]:
+    """A run directory that is removed at the end."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        RunDirectory.create(Path(folder) / "run", settings) as run,
+    ):
+        yield run
 
 
 def _train(
@@ -221,7 +227,6 @@ def _train(
 ) -> None:
     """Trains all seeds with the same programs, and writes their results."""
     settings, failed = run.settings, dict[int, str]()
-    seeds.check(run)
     kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config)
     monitor = Monitor(warn=_warn)
 
@@ -255,7 +260,7 @@ def _train(
             again += " with the same processes" if jax.process_count() > 1 else ""
             cli.complain(f"Stopped; all training so far is saved. To resume: {again}")
         # Another process may wait for this one, where it is not to be stopped.
-        devices.leave(timeout=_LEAVE_TIMEOUT)
+        devices.leave(devices.LEAVE_TIMEOUT)
         sys.exit(cli.INTERRUPTED)
     if len(failed) == settings.num_seeds:
         sys.exit(2)

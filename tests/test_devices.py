@@ -17,6 +17,7 @@ import pytest
 from same_figures import different_across_compilers
 from smoke import without_times
 
+from jaxsense import train
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import devices
 from jaxsense.run.compilation import Compiler, Program
@@ -93,9 +94,7 @@ TRAIN = [sys.executable, "-m", "jaxsense.train", "--quiet", "--cache", "None"]
 
 def two_processes(options):
     """Two processes that share a run."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        address = f"localhost:{free.getsockname()[1]}"
+    address = f"localhost:{free_port()}"
     shared = [*TRAIN, *options, "--coordinator", address, "--num-processes", "2"]
     return [
         subprocess.Popen(
@@ -168,9 +167,88 @@ def test_processes_that_cannot_be_are_named(given, expected):
 
 def test_who_joins_is_told_before_it_waits_for_others(monkeypatch):
     called = []
-    monkeypatch.setattr(jax.distributed, "initialize", lambda *given: called.append(given))
+    initialise = lambda *given, **_: called.append(given)  # noqa: E731
+    monkeypatch.setattr(jax.distributed, "initialize", initialise)
     devices.join("localhost:1", 2, 0, begins=lambda: called.append("begins"))
     assert called == ["begins", ("localhost:1", 2, 0)]
+
+
+def free_port():
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        return free.getsockname()[1]
+
+
+def test_processes_that_do_not_come_are_named(monkeypatch):
+    monkeypatch.setattr(devices, "_JOIN_TIMEOUT", 0.5)
+    address = f"localhost:{free_port()}"
+    with pytest.raises(ConfigError, match=r"first process does not listen \(Connection refused"):
+        devices.join(address, 2, 1)
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: time.sleep(9))
+    with pytest.raises(ConfigError, match="not all 2 processes have joined within"):
+        devices.join(address, 2, 0)
+
+
+LISTENS = """
+import socket, sys
+from jaxsense.run import devices
+port = int(sys.argv[1])
+devices.join(f"127.0.0.1:{port}", 1, 0)
+socket.create_connection(("127.0.0.1", port), timeout=5).close()
+try:
+    socket.create_connection(("127.0.0.2", port), timeout=5)
+except ConnectionRefusedError:
+    print("refused")
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="has one loopback address")
+def test_the_first_process_listens_at_its_address_alone():
+    command = [sys.executable, "-c", LISTENS, str(free_port())]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (0, "refused\n"), ended.stderr
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_ctrl_c_ends_a_process_that_waits_for_the_others(tmp_path, index):
+    shared = ["--coordinator", f"localhost:{free_port()}", "--num-processes", "2"]
+    command = [sys.executable, "-m", "jaxsense.train", "--cache", "None", "--preset", "smoke"]
+    out = tmp_path / "run"
+    process = subprocess.Popen(
+        [*command, *shared, "--process-index", str(index), "--out", str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout.readline().startswith("Waiting for the other processes at localhost:")
+    time.sleep(1)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=20) == ("", "Interrupted.\n")
+    assert process.returncode == 130
+    assert not out.exists()
+
+
+def test_the_first_process_checks_its_options_before_others_join(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(devices, "join", lambda *_, **__: pytest.fail("joined"))
+    (tmp_path / "file").write_text("precious")
+    shared = ["--coordinator", "localhost:1", "--num-processes", "2", "--process-index", "0"]
+    for options, expected in (
+        (["--out", str(tmp_path)], "is not empty"),
+        (["--devices", "999"], "devices = 999: must be within 1 and 256"),
+        (["--resume", str(tmp_path)], "is not a run directory"),
+    ):
+        with pytest.raises(SystemExit):
+            train.main([*shared, *options])
+        assert expected in capsys.readouterr().err
+
+
+def test_a_system_that_cannot_tell_its_cores(monkeypatch):
+    monkeypatch.setenv("NPROC", "7")
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    assert devices.start(3) == Workers(threads=3)
+    monkeypatch.delenv("NPROC")
+    devices.start(64)
+    assert os.environ["NPROC"] == str(max(128, os.cpu_count()))
 
 
 def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):

@@ -127,14 +127,15 @@ def test_steps_that_a_killed_process_has_reported_are_not_reported_again(tmp_pat
 @pytest.mark.parametrize("error", [ConfigError("a", 1, "is wrong"), KeyboardInterrupt()])
 def test_a_run_that_is_refused_before_it_begins_leaves_no_directory(tmp_path, error):
     def fail(path, *, begun):
-        with pytest.raises(type(error)), RunDirectory.create(path, SETTINGS) as run:
+        with RunDirectory.create(path, SETTINGS) as run:
             if begun:
                 run.append_metrics(stage="jmvae", step=1)
             raise error
 
-    fail(tmp_path / "new", begun=False)
-    assert not list(tmp_path.iterdir())
-    fail(tmp_path / "begun", begun=True)
+    for name, begun in (("new", False), ("begun", True)):
+        with pytest.raises(type(error)):
+            fail(tmp_path / name, begun=begun)
+    assert [path.name for path in tmp_path.iterdir()] == ["begun"]
     assert (tmp_path / "begun" / "config.json").exists()
 
 

@@ -5,8 +5,9 @@ import functools
 import os
 import socket
 import threading
+import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
 import jax
@@ -14,32 +15,36 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
 
 from jaxsense.config import ConfigError
 
 T = TypeVar("T")
+Row = TypeVar("Row", jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 
 AXIS = "devices"
 NUM_THREADS = min(os.cpu_count() or 1, 8)
-_MOST_DEVICES = 256
+_MAX_DEVICES = 256
+_JOIN_TIMEOUT = 300.0  # s
+LEAVE_TIMEOUT = 10.0  # s
 
 
 def compiler_options(*, runs_long: bool = False) -> dict[str, Any]:
-    """Compiler options that minimise the time to compile and run a program.
+    """Compiler options that minimise the total time of compiling and running a program.
 
-    On a CPU, level 1 compiles a third faster than level 3, and its programs are as fast. The older
-    code generator saves another third, but the program may run a third slower. On an accelerator,
+    On a CPU, level 1 compiles a third faster than level 3, with equally fast programs. The older
+    code generator saves another third, but its programs may be a third slower. On an accelerator,
     autotuning of matrix products would take most of the time.
 
     Args:
-      runs_long: the program runs far longer than it compiles.
+      runs_long: whether the program runs much longer than it compiles.
 
     Returns:
-      The options that the installed compiler knows; none if JAX is set to compile quickly.
+      The options that the installed compiler supports; none if JAX is set to compile quickly.
     """
     if jax.config.values["jax_disable_most_optimizations"]:
         return {}
-    wanted: dict[str, Any] = {}
+    wanted: dict[str, int | bool] = {}
     if jax.default_backend() == "cpu":
         wanted = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": runs_long}
     elif jax.default_backend() == "gpu" and not runs_long:
@@ -48,10 +53,11 @@ def compiler_options(*, runs_long: bool = False) -> dict[str, Any]:
 
 
 @functools.cache
-def _is_known(option: str, value: Any) -> bool:
-    """Whether the installed compiler has an option; options change with its version."""
+def _is_known(option: str, value: int | bool) -> bool:
+    """Whether the installed compiler supports an option, which depends on its version."""
+    options: dict[str, Any] = {option: value}
     try:
-        jax.jit(lambda: 0).lower().compile(compiler_options={option: value})
+        jax.jit(lambda: 0).lower().compile(compiler_options=options)
     except jax.errors.JaxRuntimeError:
         return False
     return True
@@ -59,10 +65,10 @@ def _is_known(option: str, value: Any) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Workers:
-    """What shares the rows of a batch: threads of a CPU, or the devices of a mesh.
+    """Threads of a CPU, or devices of a mesh, that share the rows of a batch.
 
     Attributes:
-      threads: how many, each with its own call of a program; 1 with a mesh.
+      threads: number of threads, each with its own call of a program; 1 with a mesh.
       mesh: from `make_mesh`; None for a single device.
     """
 
@@ -78,6 +84,19 @@ class Workers:
 ALONE = Workers()
 
 
+def check(number: int | None) -> None:
+    """Checks a number of devices before any is used.
+
+    Args:
+      number: as in `start`.
+
+    Raises:
+      ConfigError: if no machine has so many.
+    """
+    if number is not None and not 1 <= number <= _MAX_DEVICES:
+        raise ConfigError("devices", number, f"must be within 1 and {_MAX_DEVICES}")
+
+
 def start(number: int | None) -> Workers:
     """Selects the devices of a program.
 
@@ -86,33 +105,36 @@ def start(number: int | None) -> Workers:
         threads as cores, at most 8.
 
     Returns:
-      The workers that share scenes and missions. A training stays on one device, as exchanging
+      The workers that share scenes and missions. A training stays on one device, because exchanging
       gradients takes longer than computing them.
 
     Raises:
       ConfigError: if there are fewer devices.
     """
     jax.config.update("jax_default_matmul_precision", "highest")
-    if number is not None and not 1 <= number <= _MOST_DEVICES:
-        raise ConfigError("devices", number, f"must be within 1 and {_MOST_DEVICES}")
+    check(number)
     _make_room(number or NUM_THREADS)
     if jax.default_backend() == "cpu" and jax.process_count() == 1:
         return Workers(threads=number or NUM_THREADS)
     there = jax.device_count()
     number = there if number is None else number
     if number > there:
+        # All processes refuse; one that ends without the others makes them abort.
+        leave(LEAVE_TIMEOUT)
         raise ConfigError("devices", number, f"must be within 1 and {there}")
     return Workers(mesh=make_mesh(number) if number > 1 else None)
 
 
 def _make_room(threads: int) -> None:
-    """Makes XLA's pool of threads larger than the number of programs side by side.
+    """Makes XLA's thread pool larger than the number of programs that run side by side.
 
-    A large batch of Cholesky decompositions, as in the physics of six robots, is shared out to the
-    pool by a member of the pool, which waits for the others. If every member does, all wait for
-    ever. XLA reads the size when it makes the backend; by itself it takes the number of cores.
+    A member of the pool splits a large batch of Cholesky decompositions, as in the physics of six
+    robots, among the pool, and waits for the others. If every member does so, all wait forever.
+    XLA reads the size when it creates the backend; its default is the number of cores.
     """
-    cores = len(os.sched_getaffinity(0))  # a process may be held to some of them
+    # A process may be restricted to some of the cores.
+    is_known = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if is_known else os.cpu_count() or 1
     os.environ.setdefault("NPROC", str(max(2 * threads, cores)))
 
 
@@ -120,7 +142,7 @@ def make_mesh(number: int | None = None) -> Mesh:
     """A row of devices.
 
     Args:
-      number: how many, over all processes; all by default.
+      number: of devices over all processes; all by default.
 
     Returns:
       The mesh, with the axis `AXIS`.
@@ -145,14 +167,17 @@ def join(
 ) -> None:
     """Joins the processes that share a run; does nothing without arguments.
 
+    Ctrl-C ends the wait for the other processes.
+
     Args:
-      coordinator: `HOST:PORT` at which the first process listens.
+      coordinator: `HOST:PORT` of the first process, which listens at this address only.
       number: of processes.
       index: of this process, from 0.
-      begins: called once the arguments are found to be right, before it waits for the others.
+      begins: called once the arguments are found to be right, before waiting for the others.
 
     Raises:
-      ConfigError: if only some are given, or a value is wrong.
+      ConfigError: if only some arguments are given, if a value is wrong, or if the others do not
+        come within five minutes.
     """
     given = {"coordinator": coordinator, "num_processes": number, "process_index": index}
     if set(given.values()) == {None}:
@@ -172,16 +197,57 @@ def join(
         raise ConfigError("num_processes", number, "must be greater than 0")
     if not 0 <= index < number:
         raise ConfigError("process_index", index, f"must be within 0 and {number - 1}")
+    address = host.strip("[]"), int(port)
     try:
-        socket.getaddrinfo(host.strip("[]"), int(port))
+        socket.getaddrinfo(*address)
     except OSError as error:
         raise ConfigError("coordinator", coordinator, f"cannot be found ({error})") from None
     begins()
+    joined: Future[None] = Future()
+
+    def initialise() -> None:
+        try:
+            jax.distributed.initialize(
+                coordinator,
+                number,
+                index,
+                coordinator_bind_address=coordinator if index == 0 else None,
+                # JAX ends the process when this is over, so it must come second.
+                initialization_timeout=int(2 * _JOIN_TIMEOUT),
+            )
+            joined.set_result(None)
+        except BaseException as error:
+            joined.set_exception(error)
+
+    end = time.monotonic() + _JOIN_TIMEOUT
+    if index > 0:
+        _wait_for_listener(address, end)
+    # A signal is not noticed in the thread that waits within JAX.
+    threading.Thread(target=initialise, daemon=True).start()
+    while not joined.done() and time.monotonic() < end:
+        wait((joined,), timeout=0.2)
     try:
-        jax.distributed.initialize(coordinator, number, index)
+        joined.result(timeout=0)
+    except TimeoutError:
+        reason = f"not all {number} processes have joined within {_JOIN_TIMEOUT:.0f} s"
+        raise ConfigError("coordinator", coordinator, reason) from None
     except (RuntimeError, ValueError) as error:
         reason = f"cannot be joined ({str(error).splitlines()[0]})"
         raise ConfigError("coordinator", coordinator, reason) from None
+
+
+def _wait_for_listener(address: tuple[str, int], end: float) -> None:
+    """Waits until the first process listens, or raises `ConfigError` at `end`, in monotonic s."""
+    while True:
+        try:
+            socket.create_connection(address, timeout=1.0).close()
+            return
+        except OSError as error:
+            if time.monotonic() > end:
+                where, reason = ":".join(map(str, address)), error.strerror or str(error)
+                expected = f"the first process does not listen ({reason})"
+                raise ConfigError("coordinator", where, expected) from None
+            time.sleep(0.2)
 
 
 def of_first_process(values: np.ndarray) -> np.ndarray:
@@ -193,7 +259,7 @@ def leave(timeout: float | None = None) -> None:
     """Waits for the other processes of the run, if any, and disconnects.
 
     Args:
-      timeout: seconds to wait for processes that may not end; without it, as long as they need.
+      timeout: seconds to wait for processes that may not end; by default without limit.
     """
     if jax.process_count() > 1:
         waiting = threading.Thread(target=jax.distributed.shutdown, daemon=True)
@@ -202,21 +268,32 @@ def leave(timeout: float | None = None) -> None:
 
 
 def shardings(mesh: Mesh, number: int, whole: tuple[int, ...]) -> tuple[NamedSharding, ...]:
-    """Places of arguments: a part of their rows on each device, or all rows if in `whole`."""
+    """Shardings of arguments along their first axis.
+
+    Args:
+      mesh: from `make_mesh`.
+      number: of arguments.
+      whole: positions of arguments that every device gets undivided.
+    """
     return tuple(
         NamedSharding(mesh, PartitionSpec() if i in whole else PartitionSpec(AXIS))
         for i in range(number)
     )
 
 
-def put(args: tuple[Any, ...], places: tuple[NamedSharding, ...]) -> tuple[Any, ...]:
-    """Distributes arguments that every process has over the devices of all processes."""
+def put(args: tuple[PyTree, ...], places: tuple[NamedSharding, ...]) -> tuple[PyTree, ...]:
+    """Distributes arguments that every process has over the devices of all processes.
 
-    def put_one(x: Any, place: NamedSharding) -> jax.Array:
+    Args:
+      args: pytrees of arrays.
+      places: their shardings.
+    """
+
+    def put_one(x: jax.Array, place: NamedSharding) -> jax.Array:
         if jnp.issubdtype(jnp.result_type(x), jax.dtypes.prng_key):
             return jax.random.wrap_key_data(put_one(jax.random.key_data(x), place))
-        x = np.asarray(x, jnp.result_type(x))
-        return jax.make_array_from_callback(x.shape, place, lambda index: x[index])
+        local = np.asarray(x, jnp.result_type(x))
+        return jax.make_array_from_callback(local.shape, place, lambda index: local[index])
 
     return tuple(
         jax.tree.map(lambda x: put_one(x, place), arg)  # noqa: B023
@@ -225,16 +302,16 @@ def put(args: tuple[Any, ...], places: tuple[NamedSharding, ...]) -> tuple[Any, 
 
 
 def spread(
-    function: Callable[..., Any], mesh: Mesh | None, whole: tuple[int, ...] = ()
-) -> Callable[..., Any]:
-    """Splits a function's inputs and outputs along their first axis, a part on each device.
+    function: Callable[..., PyTree], mesh: Mesh | None, whole: tuple[int, ...] = ()
+) -> Callable[..., PyTree]:
+    """Splits a function's inputs and outputs along their first axis, with a part on each device.
 
-    XLA's partitioner finds the split. Under `shard_map`, jaxlib 0.11.2 crashes while it compiles a
-    step of MJX, on a CPU and on accelerators: its Shardy drops inputs that the body does not use
+    XLA's partitioner decides how. Under `shard_map`, jaxlib 0.11.2 crashes while it compiles a step
+    of MJX, on a CPU and on accelerators: its Shardy drops inputs that the body does not use
     (`ManualComputationUnusedInputsPattern`), and MJX closes over a hundred constants.
 
     Args:
-      function: of arrays, or pytrees of them, with a batch of independent rows as first axis.
+      function: of pytrees of arrays, whose first axis is a batch of independent rows.
       mesh: from `make_mesh`; its size must divide the batch. Without one nothing is split.
       whole: positions of arguments that every device gets undivided.
 
@@ -244,7 +321,7 @@ def spread(
     if mesh is None:
         return function
 
-    def partitioned(*args: Any) -> Any:
+    def partitioned(*args: PyTree) -> PyTree:
         rows = NamedSharding(mesh, PartitionSpec(AXIS))
         constrain = jax.lax.with_sharding_constraint
         args = tuple(x if i in whole else constrain(x, rows) for i, x in enumerate(args))
@@ -254,7 +331,15 @@ def spread(
 
 
 def side_by_side(function: Callable[[int], T], number: int) -> list[T]:
-    """Calls `function(0)`, `function(1)` and so on, each in a thread to use all cores."""
+    """Calls a function with 0, 1 and so on, each in a thread of its own, to use all cores.
+
+    Args:
+      function: of an index.
+      number: of calls.
+
+    Returns:
+      The results, in order.
+    """
     if number == 1:
         return [function(0)]
     with ThreadPoolExecutor(number) as executor:
@@ -266,20 +351,20 @@ def side_by_side(function: Callable[[int], T], number: int) -> list[T]:
 
 
 def part(
-    args: tuple[Any, ...], i: int, number: int, whole: tuple[int, ...] = ()
-) -> tuple[Any, ...]:
+    args: tuple[PyTree, ...], i: int, number: int, whole: tuple[int, ...] = ()
+) -> tuple[PyTree, ...]:
     """The i-th of `number` equal parts of arguments, along their first axis.
 
     Args:
-      args: arrays, their shapes, or pytrees of them; `number` divides their first axis.
-      i: which part.
+      args: pytrees of arrays or of their shapes; `number` divides their first axis.
+      i: index of the part.
       number: of parts.
       whole: positions of arguments that every part gets undivided.
     """
     if number == 1:
         return args
 
-    def cut(x: Any) -> Any:
+    def cut(x: Row) -> Row:
         rows = x.shape[0] // number
         if isinstance(x, jax.ShapeDtypeStruct):
             return x.update(shape=(rows, *x.shape[1:]))
@@ -288,8 +373,13 @@ def part(
     return tuple(x if j in whole else jax.tree.map(cut, x) for j, x in enumerate(args))
 
 
-def of_all_parts(shapes: Any, number: int) -> Any:
-    """The shapes of the joined results of `number` parts, from those of one."""
+def of_all_parts(shapes: PyTree, number: int) -> PyTree[jax.ShapeDtypeStruct]:
+    """Shapes of the joined results of some parts.
+
+    Args:
+      shapes: of the results of one part.
+      number: of parts.
+    """
     if number == 1:
         return shapes
     return jax.tree.map(
@@ -297,7 +387,7 @@ def of_all_parts(shapes: Any, number: int) -> Any:
     )
 
 
-def joined(parts: list[Any]) -> Any:
+def joined(parts: list[PyTree]) -> PyTree:
     """Joins the results of parts, on the host if there are several."""
     if len(parts) == 1:
         return parts[0]

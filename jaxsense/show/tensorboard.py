@@ -1,25 +1,30 @@
 """Optional event files for TensorBoard."""
 
+import importlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from jaxsense.config import ConfigError
 
 
-def make_writer(path: Path) -> Callable[..., None]:
-    """Returns a function that writes reported metrics to event files in a directory.
+def require() -> None:
+    """Checks that event files can be written.
 
     Raises:
       ConfigError: if tensorboardX is not installed.
     """
     try:
-        # An optional dependency.
-        from tensorboardX import SummaryWriter  # noqa: PLC0415
+        importlib.import_module("tensorboardX")
     except ImportError:
         reason = "needs tensorboardX: pip install 'jaxsense[tensorboard]'"
         raise ConfigError("tensorboard", True, reason) from None
-    writer: Any = SummaryWriter(str(path))
+
+
+def make_writer(path: Path) -> Callable[..., None]:
+    """Returns a function that writes reported metrics to event files in a directory."""
+    from tensorboardX import SummaryWriter  # noqa: PLC0415 (an optional dependency)
+
+    writer = SummaryWriter(str(path))
 
     def write(*, stage: str, step: int, **metrics: float) -> None:
         for name, value in metrics.items():
