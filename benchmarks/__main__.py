@@ -16,7 +16,7 @@ import tyro
 from benchmarks import ROWS
 from benchmarks.measure import Options, Row
 from jaxsense import cli
-from jaxsense.config.checks import require_types
+from jaxsense.config.checks import check_fields
 
 PROGRAM = "benchmarks"
 _WIDTH_OF_FILES = 160
@@ -34,7 +34,7 @@ class Arguments:
     quick: Annotated[bool, tyro.conf.arg(help="Tiny sizes, to see that everything runs.")] = False
 
     def __post_init__(self):
-        require_types(self)
+        check_fields(self)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -16,7 +16,7 @@ import jax
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from jaxsense.config import Config, ConfigError
+from jaxsense.config import Config, ConfigError, require_32_bits
 from jaxsense.run import compilation
 from jaxsense.run.compilation import Kept
 
@@ -42,6 +42,7 @@ def parse(program: str, arguments: type[T], argv: list[str], default: T | None =
     """
     more: dict[str, Any] = {} if default is None else {"default": default}
     try:
+        require_32_bits()
         with contextlib.redirect_stderr(io.StringIO()):
             found, unknown = tyro.cli(
                 arguments,

@@ -13,8 +13,8 @@ import tyro
 
 from jaxsense import cli, mission, summary
 from jaxsense.config import Config, ConfigError
-from jaxsense.config.checks import require, require_types
-from jaxsense.config.mission import MOST_EPISODES
+from jaxsense.config.checks import check_fields, require
+from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.core.types import Belief
 from jaxsense.run import devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
@@ -33,13 +33,14 @@ PROGRAM = "jaxsense.evaluate"
 class ArenaArguments:
     """Another arena than the run's."""
 
+    PLACE = "arena"
     num_pois: int | None = None
     """Number of points of interest; the run's by default."""
     side: float | None = None
     """Side of the arena, in metres; the run's by default."""
 
     def __post_init__(self):
-        require_types(self)
+        check_fields(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,9 +73,9 @@ class Arguments:
     """Run the functions that the run's `config.json` names for your own sensors."""
 
     def __post_init__(self):
-        require_types(self, bits=64)
-        most = f"must be within 1 and {MOST_EPISODES:,}"
-        require(1 <= self.episodes <= MOST_EPISODES, self, "episodes", most)
+        check_fields(self, bits=64)
+        most = f"must be within 1 and {MAX_EPISODES:,}"
+        require(1 <= self.episodes <= MAX_EPISODES, self, "episodes", most)
         require(0 <= self.seed < 2**32, self, "seed", "must be within 0 and 2^32 - 1")
         cli.require_directory("cache", self.cache)
 

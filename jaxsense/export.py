@@ -21,7 +21,7 @@ from jax import export
 
 from jaxsense import cli
 from jaxsense.config import Config, ConfigError
-from jaxsense.config.checks import require_types
+from jaxsense.config.checks import check_fields
 from jaxsense.interfaces.onboard import Function, functions
 from jaxsense.models import Models
 from jaxsense.run import files, rundir
@@ -98,7 +98,7 @@ class Arguments:
     """Run the functions that the run's `config.json` names for your own sensors."""
 
     def __post_init__(self):
-        require_types(self)
+        check_fields(self)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -21,7 +21,7 @@ import tyro
 
 from jaxsense import cli, summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
-from jaxsense.config.checks import require_types
+from jaxsense.config.checks import check_fields
 from jaxsense.run import devices, files, pipeline, rundir, seeds
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
@@ -81,7 +81,7 @@ class Arguments:
     def __post_init__(self):
         if isinstance(self.file, str):
             raise ConfigError("config", self.file, "must be a path of printable characters")
-        require_types(self, bits=64)
+        check_fields(self, bits=64)
         cli.require_directory("cache", self.cache)
 
     @property

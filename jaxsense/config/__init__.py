@@ -1,10 +1,11 @@
-"""Every setting of a run: frozen dataclasses, checked when made, and the presets.
+"""Settings of a run: frozen dataclasses that check themselves when they are made, and presets.
 
 An invalid value raises `ConfigError`, a `ValueError` whose one line names the field, its value and
 what would be right. The attribute docstrings are the text of `--help`.
 """
 
 from jaxsense.config.checks import ConfigError as ConfigError
+from jaxsense.config.checks import require_32_bits as require_32_bits
 from jaxsense.config.learning import DetectorConfig as DetectorConfig
 from jaxsense.config.learning import DqnConfig as DqnConfig
 from jaxsense.config.learning import EvaluationConfig as EvaluationConfig
@@ -18,6 +19,7 @@ from jaxsense.config.mission import KNOW_WAYS as KNOW_WAYS
 from jaxsense.config.mission import MISSIONS_AT_ONCE as MISSIONS_AT_ONCE
 from jaxsense.config.mission import NODES_PER_POI as NODES_PER_POI
 from jaxsense.config.mission import POLICIES as POLICIES
+from jaxsense.config.mission import VIEW_SIDES as VIEW_SIDES
 from jaxsense.config.mission import MissionConfig as MissionConfig
 from jaxsense.config.mission import NavigationConfig as NavigationConfig
 from jaxsense.config.objects import COLOURS as COLOURS

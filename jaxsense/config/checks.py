@@ -1,12 +1,25 @@
-"""Checks of a new section, and the error of a failed check."""
+"""Checks of settings: the type and the limits of each field, and the error of a failed check.
 
+A field declares its limits with `limited`. A dataclass calls `check_fields` when it is made, so
+that settings from Python, JSON and command lines pass one check.
+"""
+
+import contextlib
+import dataclasses
+import functools
 import types
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-_MOST_SHOWN = 200  # characters of a value
-_LEAST, _MOST = 1e-30, 1e30  # a product of two still fits float32
-_WITHIN = {"travel": "team.", "tours": "team."}  # sections that are part of another
+import jax
+
+from jaxsense.config.frozen import FrozenDict
+
+T = TypeVar("T")
+
+_MAX_SHOWN = 200  # characters of a value
+_SMALLEST, _LARGEST = 1e-30, 1e30  # a product of two still fits float32
 
 
 class ConfigError(ValueError):
@@ -16,105 +29,178 @@ class ConfigError(ValueError):
         super().__init__(f"{field} = {_shown(value)}: {expected}")
         self.expected = expected
 
-
-def require(condition: bool, section: object, field: str, expected: str) -> None:
-    """Raises `ConfigError` for a field of a section unless the condition holds."""
-    if not condition:
-        # All settings together, and the options of a program, have no name before their fields.
-        name = type(section).__name__.removesuffix("Config").removesuffix("Arguments").lower()
-        place = f"{_WITHIN.get(name, '')}{name}.{field}".lstrip(".")
-        raise ConfigError(place, getattr(section, field), expected)
+    def __reduce__(self):
+        return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
-def require_types(section: Any, bits: int = 31) -> None:
-    """Raises `ConfigError` unless each field has its declared type.
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Limits of a number, or of each number in a field; None where there is no limit."""
 
-    Whole numbers in real fields become real, because JAX distinguishes them.
+    above: float | None = None
+    at_least: float | None = None
+    below: float | None = None
+    at_most: float | None = None
+    min_items: int | None = None
+    max_items: int | None = None
+
+    def __str__(self) -> str:
+        numbers = {
+            "greater than": self.above,
+            "at least": self.at_least,
+            "below": self.below,
+            "at most": self.at_most,
+        }
+        found = [f"{words} {limit:,}" for words, limit in numbers.items() if limit is not None]
+        limits = " and ".join(found)
+        if self.min_items is None:
+            return f"must be {limits}"
+        most = "or more" if self.max_items is None else f"to {self.max_items}"
+        return f"must have {self.min_items} {most} values" + (limits and f", each {limits}")
+
+    def allow(self, value: object) -> bool:
+        """Whether all numbers of a value, and their number, are within the limits."""
+        if isinstance(value, tuple):
+            fewest = self.min_items or 0
+            most = len(value) if self.max_items is None else self.max_items
+            return fewest <= len(value) <= most and all(map(self.allow, value))
+        if not isinstance(value, int | float):
+            return True
+        return (
+            (self.above is None or value > self.above)
+            and (self.at_least is None or value >= self.at_least)
+            and (self.below is None or value < self.below)
+            and (self.at_most is None or value <= self.at_most)
+        )
+
+
+def limited(
+    default: T,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    below: float | None = None,
+    at_most: float | None = None,
+    min_items: int | None = None,
+    max_items: int | None = None,
+) -> T:
+    """Declares a field with limits, which hold for each number in a tuple or a dictionary.
 
     Args:
-      section: the dataclass.
-      bits: most bits of a whole number; real numbers must be finite and fit 32 bits.
+      default: the field's default value.
+      above: every number is greater than this.
+      at_least: smallest number.
+      below: every number is less than this.
+      at_most: largest number.
+      min_items: smallest length of a tuple.
+      max_items: largest length of a tuple; needs `min_items`.
     """
-    hints = get_type_hints(type(section))
-    for name, kind in hints.items():
-        value = getattr(section, name)
-        require(_is_a(value, kind), section, name, f"must be {_described(kind)}")
-        is_small = kind is not int or abs(value) < 2**bits
-        require(is_small, section, name, f"must be below 2^{bits}")
-        if kind is float:
-            object.__setattr__(section, name, float(value))
+    limits = Limits(above, at_least, below, at_most, min_items, max_items)
+    return cast(T, dataclasses.field(default=default, metadata={"limits": limits}))
 
 
-def require_positive(section: object, *fields: str) -> None:
-    """Raises `ConfigError` unless each field is greater than 0."""
-    for field in fields:
-        require(getattr(section, field) > 0, section, field, "must be a number greater than 0")
+def require(condition: bool, section: object, field: str, expected: str) -> None:
+    """Checks a condition on a field of a dataclass.
+
+    Args:
+      condition: whether the field is valid.
+      section: the dataclass; its class attribute `PLACE`, if any, precedes the field's name.
+      field: name of the field.
+      expected: what would be right.
+
+    Raises:
+      ConfigError: if the condition is False.
+    """
+    if not condition:
+        raise ConfigError(_place(section, field), getattr(section, field), expected)
 
 
-def require_not_negative(section: object, *fields: str) -> None:
-    """Raises `ConfigError` unless each field is at least 0."""
-    for field in fields:
-        is_right = getattr(section, field) >= 0
-        require(is_right, section, field, "must be a number that is not negative")
+def check_fields(section: object, bits: int = 31) -> None:
+    """Checks the type and the limits of all fields of a dataclass.
+
+    Values take their declared form: whole numbers become real where the type is `float`, lists
+    become tuples, and dictionaries become immutable.
+
+    Args:
+      section: the dataclass, possibly frozen.
+      bits: all whole numbers are below `2**bits`. Real numbers must be finite and fit 32 bits.
+
+    Raises:
+      ConfigError: names the first invalid field.
+    """
+    for name, kind, limits in _fields(type(section)):
+        try:
+            value = _converted(getattr(section, name), kind)
+        except TypeError:
+            require(False, section, name, f"must be {_described(kind)}")
+            raise  # never reached
+        object.__setattr__(section, name, value)
+        fits = not isinstance(value, int) or abs(value) < 2**bits
+        require(fits, section, name, f"must be below 2^{bits}")
+        for place, each in _parts(_place(section, name), value):
+            if limits is not None and not limits.allow(each):
+                raise ConfigError(place, each, str(limits))
 
 
-def require_at_most(section: object, **most: float) -> None:
-    """Raises `ConfigError` for a field that exceeds its limit."""
-    for field, limit in most.items():
-        require(getattr(section, field) <= limit, section, field, f"must be at most {limit:,}")
+def require_32_bits() -> None:
+    """Raises `ConfigError` if JAX computes in 64 bits, which jaxsense does not support."""
+    if jax.config.read("jax_enable_x64"):
+        raise ConfigError("JAX_ENABLE_X64", True, "must be off, as jaxsense computes in 32 bits")
 
 
-def require_sizes(section: object, field: str) -> None:
-    """Raises `ConfigError` unless a field holds layer sizes."""
-    sizes = getattr(section, field)
-    require(
-        len(sizes) > 0 and all(size > 0 for size in sizes),
-        section,
-        field,
-        "must be one or more layer sizes, each greater than 0",
-    )
+def _place(section: object, field: str) -> str:
+    """Name of a field, with its section."""
+    return f"{getattr(section, 'PLACE', '')}.{field}".lstrip(".")
 
 
-def require_window(section, num_rays: int) -> None:
-    """Raises `ConfigError` unless a sensor's window fits its rays."""
-    require_positive(section, "window", "stride")
-    require_at_most(section, stride=num_rays)
-    most = (num_rays - 1) // section.stride + 1
-    require(
-        section.window <= most,
-        section,
-        "window",
-        f"at most {most} of {num_rays} rays fit with a stride of {section.stride}",
-    )
+@functools.cache
+def _fields(cls: Any) -> list[tuple[str, Any, Limits | None]]:
+    """Name, type and limits of each field of a dataclass."""
+    hints = get_type_hints(cls)
+    return [(f.name, hints[f.name], f.metadata.get("limits")) for f in dataclasses.fields(cls)]
 
 
-def _is_a(value: Any, kind: Any) -> bool:
-    """Whether a value is of a field's declared type."""
+def _parts(place: str, value: object) -> Iterator[tuple[str, object]]:
+    """The items of a dictionary and their places, or the value itself."""
+    if isinstance(value, FrozenDict):
+        yield from ((f"{place}.{name}", each) for name, each in value.items())
+    else:
+        yield place, value
+
+
+def _converted(value: Any, kind: Any) -> Any:
+    """A value in its declared form; raises `TypeError` if it is of another type."""
     origin, inner = get_origin(kind), get_args(kind)
-    if origin is Literal:
-        return any(type(value) is type(each) and value == each for each in inner)
     if origin in (Union, types.UnionType):
-        return any(_is_a(value, each) for each in inner)
-    if origin in (tuple, dict):
-        return isinstance(value, origin) and _holds(value, inner)
-    if kind in (int, float):
-        return _is_number(value, kind)
-    return isinstance(value, kind)
+        for each in inner:
+            with contextlib.suppress(TypeError):
+                return _converted(value, each)
+    elif origin is tuple and isinstance(value, tuple | list):
+        kinds = inner[:1] * len(value) if ... in inner else inner
+        if len(kinds) == len(value):
+            return tuple(map(_converted, value, kinds))
+    elif origin is Mapping and isinstance(value, Mapping):
+        to_key, to_value = (functools.partial(_converted, kind=each) for each in inner)
+        return FrozenDict({to_key(name): to_value(each) for name, each in value.items()})
+    elif origin is Literal and any(type(value) is type(n) and value == n for n in inner):
+        return value
+    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if value == 0 or _SMALLEST <= abs(value) <= _LARGEST:
+            return float(value)
+    elif isinstance(kind, type) and isinstance(value, kind) and (kind, type(value)) != (int, bool):
+        return value
+    raise TypeError
 
 
-def _holds(values: Any, kinds: tuple[Any, ...]) -> bool:
-    """Whether the items of a tuple or a dictionary are of their declared types."""
-    if isinstance(values, dict):
-        return all(_holds(pair, kinds) for pair in values.items())
-    kinds = kinds[:1] * len(values) if ... in kinds else kinds
-    return len(values) == len(kinds) and all(map(_is_a, values, kinds))
-
-
-def _is_number(value: Any, kind: Any) -> bool:
-    """Whether a value is a whole number, or a real one that 32 bits can hold."""
-    if isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
-        return False
-    return kind is int or value == 0 or _LEAST <= abs(value) <= _MOST
+_SIZES = f"of a size from {_SMALLEST} to {_LARGEST} or 0"
+_ONE_AND_MANY: dict[type, tuple[str, str]] = {
+    int: ("a whole number", "whole numbers"),
+    float: (f"a finite number, {_SIZES}", f"finite numbers, {_SIZES}"),
+    bool: ("True or False", "True or False"),
+    str: ("text", "texts"),
+    Path: ("a path of printable characters", "paths of printable characters"),
+    types.NoneType: ("None", "None"),
+}
 
 
 def _described(kind: Any, *, many: bool = False) -> str:
@@ -123,29 +209,21 @@ def _described(kind: Any, *, many: bool = False) -> str:
     if origin is Literal:
         return f"one of {', '.join(map(str, inner))}"
     if origin in (Union, types.UnionType):
-        return " or ".join(_described(each) for each in inner)
+        return " or ".join(map(_described, inner))
     if origin is tuple:
         number = "" if ... in inner else f"{len(inner)} "
-        return f"{'tuples' if many else 'a tuple'} of {number}{_described(inner[0], many=True)}"
-    if origin is dict:
+        return f"{'lists' if many else 'a list'} of {number}{_described(inner[0], many=True)}"
+    if origin is Mapping:
         return f"a dictionary from names to {_described(inner[1], many=True)}"
-    sizes = f"of a size from {_LEAST} to {_MOST} or 0"
-    one, several = {
-        int: ("a whole number", "whole numbers"),
-        float: (f"a finite number, {sizes}", f"finite numbers, {sizes}"),
-        bool: ("True or False", "True or False"),
-        str: ("text", "texts"),
-        Path: ("a path of printable characters", "paths of printable characters"),
-        types.NoneType: ("None", "None"),
-    }.get(kind, (f"of type {kind.__name__}", f"values of type {kind.__name__}"))
-    return several if many else one
+    name = kind.__name__
+    return _ONE_AND_MANY.get(kind, (f"of type {name}", f"values of type {name}"))[many]
 
 
 def _shown(value: object) -> str:
     """A value in one short line."""
     try:
         text = repr(value)
-    except (RecursionError, ValueError):  # of more than 4300 digits or a thousand levels
+    except (RecursionError, ValueError):  # a thousand levels, or more than 4300 digits
         return f"a huge {type(value).__name__}"
     text = " ".join(line.strip() for line in text.splitlines())
-    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."

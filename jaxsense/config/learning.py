@@ -1,250 +1,203 @@
-"""Settings of learning: detectors, the JMVAE, the map MDP and its Q-networks."""
+"""Settings of learning: detectors, the JMVAE, the MDPs and their Q-networks."""
 
+import itertools
 import math
 from typing import Literal
 
-from jaxsense.config.checks import (
-    require,
-    require_at_most,
-    require_not_negative,
-    require_positive,
-    require_sizes,
-    require_types,
-)
-from jaxsense.config.section import Traced, section
+from jaxsense.config.checks import limited, require
+from jaxsense.config.section import Section, Sizes, Traced
 
-_MOST_BLOCKS = 32
-_MOST_WEIGHT = 1_000_000
+_MAX_BLOCKS = 32
+_MAX_WEIGHT = 1_000_000
 
 
-@section
-class DetectorConfig:
+class DetectorConfig(Section, place="detector"):
     """The scanline detectors f_x and f_w."""
 
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = limited((64, 64), above=0, min_items=1)
     """Sizes of the hidden layers."""
-    num_scans: int = 98304
+    num_scans: int = limited(98304, above=0)
     """Simulated scans to train on, per modality."""
-    calibration: float = 0.0
+    calibration: float = limited(0.0, at_least=0, at_most=0.5)
     """Share of these scans that calibrates the detector instead: their likelihood sets the
     temperature of its probabilities."""
-    num_held_out: int = 8192
-    """Held-out simulated scans, to measure accuracy."""
-    steps: int = 4000
+    num_held_out: int = limited(8192, above=0)
+    """Simulated scans that measure the accuracy."""
+    steps: int = limited(4000, above=0)
     """Gradient steps."""
-    batch: int = 512
+    batch: int = limited(512, above=0)
     """Scans per gradient step."""
-    learning_rate: Traced[float] = 2e-3
-    """Highest learning rate of Adam; decays to zero by a cosine."""
-
-    def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_sizes(self, "hidden")
-        require_positive(self, "num_scans", "num_held_out", "steps", "batch", "learning_rate")
-        require_at_most(self, learning_rate=1)
-        reason = "must be at least 0, at most 0.5"
-        require(0 <= self.calibration <= 0.5, self, "calibration", reason)
+    learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
+    """Initial learning rate of Adam; decays to zero along a cosine."""
 
     def num_training(self, number: int) -> int:
         """How many of a number of scans are left to train on."""
         return number - math.ceil(self.calibration * number)
 
+    def arrays(self, sizes: Sizes) -> dict[str, int]:
+        """How many numbers each large array holds."""
+        return {
+            "hidden": _weights(sizes.window, *self.hidden, sizes.labels),
+            "num_scans num_held_out": max(self.num_scans, self.num_held_out) * sizes.window,
+            "batch steps": self.batch * max(self.steps, sizes.window),
+        }
 
-@section
-class JmvaeConfig:
+
+class JmvaeConfig(Section, place="jmvae"):
     """The joint multi-modal VAE."""
 
-    latent_size: int = 2
+    latent_size: int = limited(2, above=0, at_most=256)
     """Dimensions of the latent space, D_z."""
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = limited((64, 64), above=0, min_items=1)
     """Sizes of the hidden layers of every encoder and decoder."""
-    alpha: Traced[float] = 0.1
+    alpha: Traced[float] = limited(0.1, at_least=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to each subset's."""
-    beta: Traced[float] = 0.001
+    beta: Traced[float] = limited(0.001, above=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to the prior."""
-    initial_beta: Traced[float] = 0.7
-    """Start value of beta; far above beta, latent dimensions come into use one by one."""
-    annealing: Traced[float] = 0.5
+    initial_beta: Traced[float] = limited(0.7, above=0, at_most=_MAX_WEIGHT)
+    """Initial value of beta; far above beta, latent dimensions come into use one by one."""
+    annealing: Traced[float] = limited(0.5, at_least=0, at_most=1)
     """Share of the training during which beta falls from initial_beta to beta."""
-    reconstruction_weights: Traced[tuple[float, ...]] = (10.0, 10.0)
+    reconstruction_weights: Traced[tuple[float, ...]] = limited(
+        (10.0, 10.0), at_least=0, at_most=_MAX_WEIGHT, min_items=1
+    )
     """Weight of each modality's reconstruction, in the order of `modalities`."""
     fusion: Literal["in_place", "filter"] = "in_place"
-    """How a look is written into the map. `in_place` is the paper's: it replaces the entry.
-    `filter` accumulates looks, see the section filter."""
-    restarts: int = 3
+    """How a look updates a belief. `in_place`, as in the paper, replaces it. `filter` accumulates
+    looks, see the section filter."""
+    restarts: int = limited(3, above=0, at_most=1000)
     """Trainings from different random parameters; the one with the lowest loss is kept."""
-    samples_per_class: int = 10000
+    samples_per_class: int = limited(10000, above=0)
     """Detections per class and modality in the training set."""
-    steps: int = 3000
+    steps: int = limited(3000, above=0)
     """Gradient steps."""
-    batch: int = 256
+    batch: int = limited(256, above=0)
     """Sets of detections, one of each modality, per gradient step."""
-    learning_rate: Traced[float] = 2e-3
-    """Highest learning rate of Adam; decays to zero by a cosine."""
+    learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
+    """Initial learning rate of Adam; decays to zero along a cosine."""
 
-    def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_sizes(self, "hidden")
-        require_positive(self, "latent_size", "samples_per_class", "steps", "batch")
-        require_positive(self, "learning_rate", "restarts")
-        require_positive(self, "beta", "initial_beta")
-        require_not_negative(self, "alpha")
-        require_at_most(self, latent_size=256, restarts=1000, learning_rate=1)
-        require_at_most(self, alpha=_MOST_WEIGHT, beta=_MOST_WEIGHT, initial_beta=_MOST_WEIGHT)
-        require(0 <= self.annealing <= 1, self, "annealing", "must be within 0 and 1")
-        require(
-            all(0 <= weight <= _MOST_WEIGHT for weight in self.reconstruction_weights),
-            self,
-            "reconstruction_weights",
-            f"must be numbers within 0 and {_MOST_WEIGHT:,}",
-        )
+    def arrays(self, sizes: Sizes) -> dict[str, int]:
+        """How many numbers each large array holds."""
+        latent = self.latent_size
+        encoder = _weights(sizes.labels, *self.hidden, 2 * latent)
+        return {
+            "hidden": 2**sizes.modalities * encoder,
+            "samples_per_class": self.samples_per_class * sizes.classes * sizes.window,
+            "batch steps": self.batch * self.steps * (latent + sizes.labels),
+        }
 
 
-@section
-class FilterConfig:
+class FilterConfig(Section, place="filter"):
     """The filter, trained after the JMVAE if `jmvae.fusion` is `filter`."""
 
-    hidden: tuple[int, ...] = (32,)
+    hidden: tuple[int, ...] = limited((32,), above=0, min_items=1)
     """Sizes of the hidden layers of each modality's network."""
-    looks: int = 6
-    """Looks of a history in training."""
-    steps: int = 2000
+    looks: int = limited(6, above=0, at_most=100)
+    """Looks in each sequence that it is trained on."""
+    steps: int = limited(2000, above=0)
     """Gradient steps."""
-    batch: int = 256
-    """Histories per gradient step."""
-    learning_rate: Traced[float] = 5e-3
-    """Highest learning rate of Adam; decays to zero by a cosine."""
+    batch: int = limited(256, above=0)
+    """Sequences per gradient step."""
+    learning_rate: Traced[float] = limited(5e-3, above=0, at_most=1)
+    """Initial learning rate of Adam; decays to zero along a cosine."""
 
-    def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_sizes(self, "hidden")
-        require_positive(self, "looks", "steps", "batch", "learning_rate")
-        require_at_most(self, looks=100, learning_rate=1)
+    def arrays(self, sizes: Sizes) -> dict[str, int]:
+        """How many numbers each large array holds."""
+        return {
+            "hidden": _weights(sizes.labels, *self.hidden, sizes.classes),
+            "batch looks steps": self.batch * self.looks * self.steps * sizes.labels,
+        }
 
 
-@section
-class MdpConfig:
+class MdpConfig(Section, place="mdp"):
     """The map of beliefs as a Markov decision process."""
 
-    unseen_variance: Traced[float] = 20.0
-    """Variance of each latent dimension of an unseen PoI."""
+    unseen_variance: Traced[float] = limited(20.0, above=0, at_most=_MAX_WEIGHT)
+    """Variance of each latent dimension of the prior, the belief before any look."""
     reward: Literal["paper", "nats"] = "paper"
     """What a look is rewarded for. `paper`: the gain of 1 / ||sigma||, or -1, see `min_increase`.
-    `nats`: the entropy of the classes that it removes, less `look_cost`; needs the filter."""
-    look_cost: Traced[float] = 0.05
-    """Cost of a look with the reward in nats."""
-    min_increase: Traced[float] = 0.05
+    `nats`: the information gained about the class, minus `look_cost`; needs the filter."""
+    look_cost: Traced[float] = limited(0.05, at_least=0, at_most=_MAX_WEIGHT)
+    """Cost of a look with the reward `nats`."""
+    min_increase: Traced[float] = limited(0.05, at_least=0)
     """Gain of information, in inverse latent units, up to which a look's reward is -1."""
-    max_steps: Traced[int] = 20
-    """Longest episode, in actions."""
+    max_steps: Traced[int] = limited(20, above=0, at_most=10_000)
+    """Maximum length of an episode, in actions."""
     partly_seen_starts: bool = False
     """Exclude starts in which all modalities have seen all PoIs, or none any."""
 
-    def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_positive(self, "unseen_variance", "max_steps")
-        require_not_negative(self, "min_increase", "look_cost")
-        require_at_most(
-            self, look_cost=_MOST_WEIGHT, unseen_variance=_MOST_WEIGHT, max_steps=10_000
-        )
 
-
-@section
-class TravelConfig:
+class TravelConfig(Section, place="team.travel"):
     """The model of travel: a robot turns to a PoI, drives straight until it is near, and looks."""
 
-    speed: Traced[float] = 0.2
-    """Speed of driving, in metres per second."""
-    turn_rate: Traced[float] = 1.2
-    """Rate of turning, in radians per second."""
-    view_distance: Traced[float] = 0.96
+    speed: Traced[float] = limited(0.2, above=0)
+    """Driving speed, in metres per second."""
+    turn_rate: Traced[float] = limited(1.2, above=0)
+    """Turning rate, in radians per second."""
+    view_distance: Traced[float] = limited(0.96, at_least=0)
     """Distance from which a robot looks at a PoI, in metres."""
-    look_seconds: Traced[float] = 0.7
-    """Time of a look itself, in seconds."""
-
-    def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_positive(self, "speed", "turn_rate", "look_seconds")
-        require_not_negative(self, "view_distance")
+    look_seconds: Traced[float] = limited(0.7, above=0)
+    """Duration of a look, in seconds."""
 
 
-@section
-class ToursConfig:
-    """How a team learns in which order to visit its points, see `jaxsense.dqn.tours`."""
+class ToursConfig(Section, place="team.tours"):
+    """Training of the order in which a team visits its PoIs, see `jaxsense.dqn.tours`."""
 
-    states: int = 65536
-    """States in which choices are tried, and a few more that fill the last chunk."""
-    tries: int = 4
+    states: int = limited(65536, above=0)
+    """States in which choices are tried, rounded up to whole chunks."""
+    tries: int = limited(4, at_least=2)
     """Choices tried in each state."""
-    walk: Traced[int] = 8
-    """Most choices before such a state."""
-    steps: int = 3200
+    walk: Traced[int] = limited(8, at_least=0, at_most=10_000)
+    """Maximum number of choices before the state in which alternatives are tried."""
+    steps: int = limited(3200, above=0)
     """Gradient steps."""
-    batch: int = 1024
-    """States in one gradient step."""
-    learning_rate: Traced[float] = 2e-3
-    """Learning rate of Adam at the start; it falls to zero along a cosine."""
+    batch: int = limited(1024, above=0)
+    """States per gradient step."""
+    learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
+    """Initial learning rate of Adam; decays to zero along a cosine."""
 
-    def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_positive(self, "states", "steps", "batch", "learning_rate")
-        require_not_negative(self, "walk")
-        require(self.tries >= 2, self, "tries", "must be at least 2, to compare choices")
-        require_at_most(self, walk=10_000, learning_rate=1)
+    def arrays(self, sizes: Sizes) -> dict[str, int]:
+        """How many numbers each large array holds."""
+        return {
+            "states tries": self.states * self.tries * sizes.state,
+            "batch steps": self.batch * max(self.steps, 2 * sizes.state),
+        }
 
 
-@section
-class TeamConfig:
-    """The map MDP in which a team learns with `dqn.task` = team: with places, robots and time."""
+class TeamConfig(Section, place="team"):
+    """The MDP of a team (`dqn.task` = team), in which robots have positions and looks take time."""
 
     travel: TravelConfig = TravelConfig()
-    """How long a robot takes to look at a point."""
+    """Model of the time that a robot takes to look at a PoI."""
     tours: ToursConfig = ToursConfig()
-    """How it learns which point comes first."""
-    num_pois: tuple[int, int] = (3, 8)
-    """Fewest and most points of interest in an episode."""
-    robots_each: int = 2
-    """Most robots of each modality in an episode; the fewest is one."""
-    sides: Traced[tuple[float, float]] = (3.0, 6.0)
-    """Shortest and longest side of the arena of an episode, in metres."""
-    alone: Traced[float] = 0.25
+    """Training of the network that orders a team's visits."""
+    num_pois: tuple[int, int] = limited((3, 8), at_least=1, at_most=64)
+    """Minimum and maximum number of PoIs in an episode."""
+    robots_each: int = limited(2, above=0, at_most=8)
+    """Maximum number of robots per modality in an episode; the minimum is one."""
+    sides: Traced[tuple[float, float]] = limited((3.0, 6.0), above=0, at_most=100)
+    """Shortest and longest side of an episode's arena, in metres."""
+    alone: Traced[float] = limited(0.25, at_least=0, at_most=1)
     """Share of episodes of the paper's MDP: one robot is alone, and nothing is far away."""
-    partly_seen: Traced[float] = 0.5
+    partly_seen: Traced[float] = limited(0.5, at_least=0, at_most=1)
     """Share of the other episodes that start with some looks taken."""
-    second_cost: Traced[float] = 0.0
-    """Price of a second, in units of the reward."""
-    max_steps: Traced[int] = 300
-    """Longest episode, in choices."""
+    second_cost: Traced[float] = limited(0.0, at_least=0)
+    """Cost of a second, in units of the reward."""
+    max_steps: Traced[int] = limited(300, above=0, at_most=100_000)
+    """Maximum length of an episode, in choices."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        fewest, most = self.num_pois
-        expected = "must be a number greater than 0 and one that is not below it"
-        require(1 <= fewest <= most, self, "num_pois", expected)
-        require(most <= 64, self, "num_pois", "must be numbers from 1 to 64")
-        require_positive(self, "robots_each", "max_steps")
-        require_at_most(self, robots_each=8, max_steps=100_000)
-        is_right = 0 < self.sides[0] <= self.sides[1] <= 100
-        require(is_right, self, "sides", "must be two lengths of at most 100 m, the shorter first")
-        for name in ("alone", "partly_seen"):
-            require(0 <= getattr(self, name) <= 1, self, name, "must be within 0 and 1")
-        require_not_negative(self, "second_cost")
+        """Checks that each minimum is at most its maximum; raises `ConfigError`."""
+        for field, (least, most) in {"num_pois": self.num_pois, "sides": self.sides}.items():
+            require(least <= most, self, field, "must be a minimum and a maximum, in this order")
 
     @property
     def cells_per_side(self) -> int:
-        """Cells along a side of an arena, one of which each PoI has to itself."""
+        """Cells along a side of an arena, each of which holds at most one PoI."""
         return math.ceil(math.sqrt(2 * self.num_pois[1]))
 
 
-@section
-class DqnConfig:
+class DqnConfig(Section, place="dqn"):
     """The deep Q-network of each modality."""
 
     task: Literal["map", "team"] = "map"
@@ -254,115 +207,98 @@ class DqnConfig:
     observe: Literal["live", "bank"] = "live"
     """`live` casts a scan in the environment's own arena at every step; `bank` draws from stored
     detections."""
-    hidden: tuple[int, ...] = (24, 24)
+    hidden: tuple[int, ...] = limited((24, 24), above=0, min_items=1)
     """Sizes of the hidden layers."""
-    num_envs: int = 512
-    """Environments that step side by side."""
-    epochs: int = 800
+    num_envs: int = limited(512, above=0)
+    """Environments that step in parallel."""
+    epochs: int = limited(800, above=0)
     """Epochs, each of one step per environment and `updates` gradient steps."""
-    updates: int = 64
+    updates: int = limited(64, above=0)
     """Gradient steps per epoch."""
-    batch: int = 512
+    batch: int = limited(512, above=0)
     """Transitions per gradient step."""
-    replay_capacity: int = 512000
+    replay_capacity: int = limited(512000, above=0)
     """Capacity of the replay, in transitions; a multiple of num_envs."""
-    discount: Traced[float] = 0.5
-    """Discount factor, gamma: of a step, or with `task` = team of a second."""
-    learning_rate: Traced[float] = 1e-3
-    """Learning rate of Adam."""
-    final_learning_rate: Traced[float] = 1e-5
+    discount: Traced[float] = limited(0.5, at_least=0, at_most=1)
+    """Discount factor, gamma: per step, or with `task` = team per second."""
+    learning_rate: Traced[float] = limited(1e-3, above=0, at_most=1)
+    """Initial learning rate of Adam."""
+    final_learning_rate: Traced[float] = limited(1e-5, at_least=0, at_most=1)
     """Learning rate of the last epoch, reached along a cosine."""
-    epsilon_start: Traced[float] = 1.0
+    epsilon_start: Traced[float] = limited(1.0, at_least=0, at_most=1)
     """Probability of a random action in the first epoch, epsilon."""
-    epsilon_min: Traced[float] = 0.01
-    """Lowest probability of a random action."""
-    epsilon_decay: Traced[float] = 0.99
+    epsilon_min: Traced[float] = limited(0.01, at_least=0)
+    """Minimum probability of a random action."""
+    epsilon_decay: Traced[float] = limited(0.99, above=0, at_most=1)
     """Factor on epsilon per epoch."""
-    target_period: Traced[int] = 50
+    target_period: Traced[int] = limited(50, above=0)
     """Epochs between updates of the target network."""
-    num_starts: int = 8192
-    """Start states, prepared once and shared out among the environments; a multiple of num_envs."""
-    chunk: int = 100
+    num_starts: int = limited(8192, above=0)
+    """Start states, prepared once and divided among the environments; a multiple of num_envs."""
+    chunk: int = limited(100, above=0)
     """Epochs between reports of progress."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_sizes(self, "hidden")
-        require_positive(self, "num_envs", "epochs", "updates", "batch", "replay_capacity")
-        require_positive(self, "learning_rate", "target_period", "num_starts", "chunk")
-        require_not_negative(self, "final_learning_rate", "epsilon_start", "epsilon_min")
-        require(0 <= self.discount <= 1, self, "discount", "must be within 0 and 1")
-        require(0 < self.epsilon_decay <= 1, self, "epsilon_decay", "must be above 0, at most 1")
-        require_at_most(self, learning_rate=1, final_learning_rate=1)
-        require_at_most(self, epsilon_start=1)
-        require(
-            self.epsilon_min <= self.epsilon_start,
-            self,
-            "epsilon_min",
-            f"must be at most epsilon_start = {self.epsilon_start}",
-        )
-        require(
-            self.replay_capacity % self.num_envs == 0,
-            self,
-            "replay_capacity",
-            f"must be a multiple of num_envs = {self.num_envs}",
-        )
-        require(
-            self.num_starts % self.num_envs == 0,
-            self,
-            "num_starts",
-            f"must be a multiple of num_envs = {self.num_envs}",
-        )
-        require(
-            self.epochs % self.chunk == 0,
-            self,
-            "epochs",
-            f"must be a multiple of chunk = {self.chunk}",
-        )
+        """Checks epsilon and what must divide what; raises `ConfigError`."""
+        is_lower = self.epsilon_min <= self.epsilon_start
+        most = f"must be at most epsilon_start = {self.epsilon_start}"
+        require(is_lower, self, "epsilon_min", most)
+        for field, unit in (
+            ("replay_capacity", "num_envs"),
+            ("num_starts", "num_envs"),
+            ("epochs", "chunk"),
+        ):
+            size = getattr(self, unit)
+            is_multiple = getattr(self, field) % size == 0
+            require(is_multiple, self, field, f"must be a multiple of {unit} = {size}")
 
     @property
     def block(self) -> int:
         """Size of a block of environments in the replay, see `dqn.replay`."""
-        return math.gcd(self.num_envs, self.batch) // math.gcd(
-            self.num_envs, self.batch, _MOST_BLOCKS
-        )
+        shared = math.gcd(self.num_envs, self.batch)
+        return shared // math.gcd(shared, _MAX_BLOCKS)
+
+    def arrays(self, sizes: Sizes) -> dict[str, int]:
+        """How many numbers each large array holds."""
+        start = max(sizes.state, sizes.pois * sizes.window)
+        return {
+            "hidden": _weights(sizes.state, *self.hidden, sizes.pois + 1),
+            "replay_capacity": self.replay_capacity * (2 * sizes.state + 3),
+            "num_starts": self.num_starts * start,
+            "num_envs chunk": self.num_envs * max(5 * self.chunk, start),
+            "batch updates chunk": 2 * self.batch * max(self.chunk * self.updates, sizes.state),
+        }
 
 
-@section
-class EvaluationConfig:
+class EvaluationConfig(Section, place="evaluation"):
     """Evaluation of the trained policies."""
 
-    num_starts: int = 512
+    num_starts: int = limited(512, above=0)
     """Start states of the episodes."""
-    num_repeats: Traced[int] = 96
+    num_repeats: Traced[int] = limited(96, above=0)
     """Episodes per start state, to average over the noise of detections; an eighth as many for the
     naive and the random policy."""
-
-    num_histories: int = 8190
-    """Random histories of looks at a PoI, after which the map is compared with exact Bayes."""
-    num_pois: tuple[int, ...] = ()
+    num_histories: int = limited(8190, above=0, at_most=10_000_000)
+    """Random sequences of looks at a PoI, after which the map is compared with exact Bayes."""
+    num_pois: tuple[int, ...] = limited((), at_least=1, at_most=64)
     """Further numbers of PoIs for which a team's policy is compared with the optimum of the map
     MDP."""
-    num_states: int = 4096
-    """Most states of the map in which policies are compared, one by one; of more, as many at even
-    distances."""
-    value_points: int = 2048
-    """Most points of the lattice on which the values of looks stand, see `dqn.optimum`."""
-    value_looks: int = 32
-    """Looks at each class that stand for all looks in these values."""
+    num_states: int = limited(4096, above=0, at_most=100_000)
+    """Maximum number of map states in which policies are compared; of more, a stratified sample."""
+    value_points: int = limited(2048, above=0, at_most=100_000)
+    """Maximum size of the grid on which look values are tabulated, see `dqn.optimum`."""
+    value_looks: int = limited(32, above=0, at_most=10_000)
+    """Sample looks per class that approximate the distribution of looks."""
 
-    def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_positive(self, "num_starts", "num_repeats", "num_states", "num_histories")
-        require_positive(self, "value_points", "value_looks")
-        is_right = all(0 < number <= 64 for number in self.num_pois)
-        require(is_right, self, "num_pois", "must be numbers from 1 to 64")
-        require_at_most(
-            self,
-            num_histories=10_000_000,
-            num_states=100_000,
-            value_points=100_000,
-            value_looks=10_000,
-        )
+    def arrays(self, sizes: Sizes) -> dict[str, int]:
+        """How many numbers each large array holds."""
+        looks = 2 * self.value_points * self.value_looks
+        return {
+            "num_starts num_repeats": self.num_starts * self.num_repeats * sizes.state,
+            "value_points value_looks": looks * sizes.classes**2,
+        }
+
+
+def _weights(*sizes: int) -> int:
+    """Weights of a dense network with layers of these sizes."""
+    return sum(before * after for before, after in itertools.pairwise(sizes))

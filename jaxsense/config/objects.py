@@ -1,75 +1,71 @@
 """Colours, shapes and custom attributes of points of interest."""
 
-import dataclasses
 import re
 from collections.abc import Mapping
 from typing import Literal
 
-from jaxsense.config.checks import ConfigError, require, require_types
+from jaxsense.config.checks import ConfigError, limited, require
+from jaxsense.config.frozen import FrozenDict
+from jaxsense.config.section import Checked
 
-LEAST_SHARE = 0.5
-"""Smallest half side of a shape; sensors may miss a narrower one that they face."""
-
-_LONGEST_NAME = 64  # letters; it becomes part of the names of files
+_MIN_SHARE = 0.5  # sensors may miss a narrower shape that they face
+_MAX_NAME = 64  # letters; it becomes part of the names of files
 
 
-@dataclasses.dataclass(frozen=True)
-class Shape:
+class Shape(Checked, place="shape"):
     """An upright solid of the ray-caster, as high as all PoIs."""
 
     primitive: Literal["cylinder", "box"]
     """The solid."""
-    half_sides: tuple[float, float] = (1.0, 1.0)
+    half_sides: tuple[float, float] = limited((1.0, 1.0), at_least=_MIN_SHARE, at_most=1)
     """Half the sides of a box, or the radius of a cylinder twice, as shares of arena.poi_radius
     from 0.5 to 1."""
 
-    def __post_init__(self):
-        require_types(self)
-        require(
-            all(LEAST_SHARE <= share <= 1 for share in self.half_sides),
-            self,
-            "half_sides",
-            f"must be two shares of poi_radius, each from {LEAST_SHARE} to 1",
-        )
-        require(
-            self.primitive == "box" or self.half_sides[0] == self.half_sides[1],
-            self,
-            "half_sides",
-            "must be the same number twice, for a cylinder is round",
-        )
+    def check(self) -> None:
+        """Checks that a cylinder is round; raises `ConfigError`."""
+        is_round = self.primitive == "box" or self.half_sides[0] == self.half_sides[1]
+        require(is_round, self, "half_sides", "must be the same number twice for a cylinder")
 
 
-@dataclasses.dataclass(frozen=True)
-class Attribute:
+class Attribute(Checked, place="attribute"):
     """A number of each PoI besides colour and shape, for example a temperature."""
 
-    values: dict[str, float] = dataclasses.field(hash=False)
+    values: Mapping[str, float]
     """Number of each word that a class can have."""
     elsewhere: float = 0.0
     """The number of walls and robots."""
 
-    def __post_init__(self):
-        require_types(self)
+    def check(self) -> None:
+        """Checks the words; raises `ConfigError`."""
         require_words(self.values, "attribute.values")
+        require(len(self.values) > 0, self, "values", "must name one or more")
 
 
-COLOURS: dict[str, tuple[float, float, float]] = {
-    "red": (0.8, 0.1, 0.1),
-    "green": (0.1, 0.7, 0.1),
-    "blue": (0.1, 0.2, 0.8),
-    "yellow": (0.8, 0.7, 0.1),
-}
+COLOURS: Mapping[str, tuple[float, float, float]] = FrozenDict(
+    {
+        "red": (0.8, 0.1, 0.1),
+        "green": (0.1, 0.7, 0.1),
+        "blue": (0.1, 0.2, 0.8),
+        "yellow": (0.8, 0.7, 0.1),
+    }
+)
 """Built-in colours: albedo, linear RGB in [0, 1]."""
 
-SHAPES: dict[str, Shape] = {"cylinder": Shape("cylinder"), "cube": Shape("box")}
+SHAPES: Mapping[str, Shape] = FrozenDict({"cylinder": Shape("cylinder"), "cube": Shape("box")})
 """Built-in shapes."""
 
 
-def require_words(named: Mapping[str, object], field: str) -> None:
-    """Raises `ConfigError` unless there is a name, and each is one word."""
-    for name in named:
-        if not re.fullmatch(rf"[\w-]{{1,{_LONGEST_NAME}}}", name):
-            reason = f"must be a word of 1 to {_LONGEST_NAME} letters, digits, - and _"
+def require_words(names: Mapping[str, object], field: str) -> None:
+    """Checks that each name is one word.
+
+    Args:
+      names: a dictionary from names.
+      field: the setting.
+
+    Raises:
+      ConfigError: if a name is something else.
+    """
+    for name in names:
+        if not re.fullmatch(rf"[\w-]{{1,{_MAX_NAME}}}", name):
+            reason = f"must be a word of 1 to {_MAX_NAME} letters, digits, - and _"
             raise ConfigError(field, name, reason)
-    if not named:
-        raise ConfigError(field, named, "must name one or more")

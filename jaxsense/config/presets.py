@@ -1,7 +1,9 @@
 """Presets: settings to start a run from."""
 
+from collections.abc import Mapping
 from typing import Literal
 
+from jaxsense.config.frozen import FrozenDict
 from jaxsense.config.learning import (
     DetectorConfig,
     DqnConfig,
@@ -12,7 +14,7 @@ from jaxsense.config.learning import (
     ToursConfig,
     TravelConfig,
 )
-from jaxsense.config.mission import POLICIES, MissionConfig, NavigationConfig
+from jaxsense.config.mission import MissionConfig, NavigationConfig
 from jaxsense.config.scene import ArenaConfig, CameraConfig, LidarConfig, ViewpointConfig
 from jaxsense.config.whole import Config
 
@@ -87,7 +89,15 @@ _NOISY = Config(
     team=TeamConfig(travel=TravelConfig(view_distance=3.5), sides=(4.0, 9.0)),
     evaluation=EvaluationConfig(num_histories=65520, value_points=8192, value_looks=128),
     navigation=NavigationConfig(view_distances=(0.5, 0.9), view_range=4.0),
-    mission=MissionConfig(policies=POLICIES, episodes=64, least_confidence=0.0, equal_values=0.05),
+    mission=MissionConfig(
+        policies=(
+            *("latent", "greedy", "bayes", "optimal", "naive", "naive_2", "naive_3", "random"),
+            *("nearest", "auction", "rollout"),
+        ),
+        episodes=64,
+        least_confidence=0.0,
+        equal_values=0.05,
+    ),
 )
 
 _TEAM = Config(
@@ -112,14 +122,10 @@ _TEAM = Config(
 PresetName = Literal["default", "paper", "noisy", "team", "smoke"]
 """The names of `PRESETS`."""
 
-PRESETS: dict[str, Config] = {
-    "default": Config(),
-    "paper": _PAPER,
-    "noisy": _NOISY,
-    "team": _TEAM,
-    "smoke": _SMOKE,
-}
-"""`default`: the best settings we know. `paper`: those of the paper where it states them, otherwise
-chosen to reproduce its figures, see `docs/differences.md`. `noisy`: sensors that are often unsure,
-and beliefs that accumulate looks. `team`: one policy for any number of PoIs and robots, for which
-time counts. `smoke`: the whole pipeline in seconds, for tests."""
+PRESETS: Mapping[str, Config] = FrozenDict(
+    {"default": Config(), "paper": _PAPER, "noisy": _NOISY, "team": _TEAM, "smoke": _SMOKE}
+)
+"""`default`: the best settings we know. `paper`: the paper's where it states them, otherwise
+chosen to reproduce its figures, see `docs/differences.md`. `noisy`: sensors that are often
+uncertain, and beliefs that accumulate looks. `team`: one policy for any number of PoIs and robots
+that takes travel time into account. `smoke`: the whole pipeline in seconds, for tests."""

@@ -1,20 +1,12 @@
 """Settings of the arena, the sensors in it, and viewpoints."""
 
-import dataclasses
 import math
-from typing import Any
+from collections.abc import Mapping
 
-from jaxsense.config.checks import (
-    ConfigError,
-    require,
-    require_at_most,
-    require_not_negative,
-    require_positive,
-    require_types,
-    require_window,
-)
+from jaxsense.config.checks import ConfigError, limited, require
+from jaxsense.config.frozen import FrozenDict
 from jaxsense.config.objects import COLOURS, SHAPES, Attribute, Shape, require_words
-from jaxsense.config.section import Traced, section
+from jaxsense.config.section import Checked, Section, Traced
 
 ROBOT_RADIUS = 0.0495
 """Radius of an AMiRo, in metres."""
@@ -25,88 +17,76 @@ LIDAR_HEIGHT = 0.152
 TIMESTEP = 0.01
 """Step of the physics, in seconds."""
 
-MODALITIES: dict[str, str] = {"camera": "colour", "lidar": "shape"}
+MODALITIES: Mapping[str, str] = FrozenDict({"camera": "colour", "lidar": "shape"})
 """Built-in sensors, and the attribute of a PoI that each distinguishes."""
 
+Value = tuple[float, float, float] | Shape | float
+"""Value of a word of a class: RGB, a shape, or a number."""
 
-@section
-class ArenaConfig:
+
+class ArenaConfig(Section, place="arena"):
     """The square arena, its points of interest (PoIs) and the classes they are drawn from."""
 
-    side: float = 3.0
+    side: float = limited(3.0, above=0, at_most=100)
     """Inner length and width of the arena, in metres."""
-    num_pois: int = 3
+    num_pois: int = limited(3, above=0, at_most=64)
     """Number of points of interest."""
-    poi_radius: float = 0.1
+    poi_radius: float = limited(0.1, above=0)
     """Radius of a cylinder and half the side of a cube, in metres; unit of custom shapes."""
-    poi_height: float = 0.2
+    poi_height: float = limited(0.2, above=LIDAR_HEIGHT, at_most=10)
     """Height of a PoI, in metres; more than 0.152, or the LiDAR looks over it."""
-    poi_gap: float = 0.3
+    poi_gap: float = limited(0.3, above=0)
     """Smallest gap between two PoIs, in metres; a robot needs 0.1 to pass."""
-    classes: tuple[str, ...] = ("green cylinder", "red cylinder", "red cube")
+    classes: tuple[str, ...] = limited(("green cylinder", "red cylinder", "red cube"), min_items=2)
     """Equally likely classes of PoIs, each `"COLOUR SHAPE"` and a word for each of `attributes`."""
-    colours: dict[str, tuple[float, float, float]] = dataclasses.field(
-        default_factory=COLOURS.copy, hash=False
-    )
+    colours: Mapping[str, tuple[float, float, float]] = limited(COLOURS, at_least=0, at_most=1)
     """Albedo of each colour, linear RGB in [0, 1]."""
-    shapes: dict[str, Shape] = dataclasses.field(default_factory=SHAPES.copy, hash=False)
+    shapes: Mapping[str, Shape] = SHAPES
     """Solid of each shape. Every PoI carries all of them, and rays are cast at each."""
-    attributes: dict[str, Attribute] = dataclasses.field(default_factory=dict, hash=False)
+    attributes: Mapping[str, Attribute] = FrozenDict()
     """Attributes besides colour and shape, for custom sensors."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_positive(self, "side", "num_pois", "poi_radius", "poi_height", "poi_gap")
-        require_at_most(self, side=100, num_pois=64, poi_height=10)
-        reason = f"must be more than {LIDAR_HEIGHT} m"
-        require(self.poi_height > LIDAR_HEIGHT, self, "poi_height", reason)
-        require_words(self.colours, "arena.colours")
-        require_words(self.shapes, "arena.shapes")
-        for name, rgb in self.colours.items():
-            if not all(0 <= part <= 1 for part in rgb):
-                field = f"arena.colours.{name}"
-                raise ConfigError(field, rgb, "must be red, green and blue, each within 0 and 1")
-        if self.attributes:
-            require_words(self.attributes, "arena.attributes")
+        """Checks names, classes and room for the PoIs; raises `ConfigError`."""
+        for field, names in (("colours", self.colours), ("shapes", self.shapes)):
+            require_words(names, f"arena.{field}")
+            require(len(names) > 0, self, field, "must name one or more")
+        require_words(self.attributes, "arena.attributes")
         for name in ("colour", "shape"):
             if name in self.attributes:
-                raise ConfigError("arena.attributes", name, "is there already; must be a new name")
+                raise ConfigError("arena.attributes", name, "already exists")
         self._check_classes()
         most = math.floor(self.side / self.poi_pitch) ** 2
-        require(
-            self.num_pois <= most,
-            self,
-            "num_pois",
-            f"at most {most} PoIs of radius {self.poi_radius} m with gaps of {self.poi_gap} m "
-            f"fit an arena of side {self.side} m",
+        expected = (
+            f"must be at most {most}: so many PoIs of radius {self.poi_radius} m with gaps of "
+            f"{self.poi_gap} m fit into an arena of side {self.side} m"
         )
+        require(self.num_pois <= most, self, "num_pois", expected)
 
     def _check_classes(self) -> None:
+        """Classes must consist of known words, and differ in what sensors measure."""
         form = " ".join(name.upper() for name in self._words)
-        require(len(self.classes) > 0, self, "classes", f'must name a class, "{form}"')
         kinds = " and ".join(f"a {n} of {', '.join(known)}" for n, known in self._words.items())
         for name in self.classes:
             words = name.split(" ")
-            require(
-                len(words) == len(self._words)
-                and all(w in known for w, known in zip(words, self._words.values(), strict=True)),
-                self,
-                "classes",
-                f'{name!r} must be "{form}" with {kinds}',
+            is_known = len(words) == len(self._words) and all(
+                w in known for w, known in zip(words, self._words.values(), strict=True)
             )
-        require(
-            len(set(self.classes)) == len(self.classes), self, "classes", "must name no class twice"
-        )
+            require(is_known, self, "classes", f'{name!r} must be "{form}" with {kinds}')
+        is_once = len(set(self.classes)) == len(self.classes)
+        require(is_once, self, "classes", "must name no class twice")
         for name in self._words:
-            of_words: dict[Any, str] = {}
+            of_values: dict[object, str] = {}
             for word in self.labels(name):
-                what = self._words[name][word]
+                value = self._words[name][word]
                 # A PoI may have any yaw.
-                look = (what.primitive, *sorted(what.half_sides)) if name == "shape" else what
-                twin = of_words.setdefault(look, word)
-                reason = f"must not use both {twin!r} and {word!r}, which no sensor can distinguish"
-                require(twin == word, self, "classes", reason)
+                turned = sorted(value.half_sides) if isinstance(value, Shape) else ()
+                same = (value.primitive, *turned) if isinstance(value, Shape) else value
+                twin = of_values.setdefault(same, word)
+                expected = (
+                    f"must not use both {twin!r} and {word!r}, which no sensor can distinguish"
+                )
+                require(twin == word, self, "classes", expected)
 
     @property
     def poi_extent(self) -> float:
@@ -125,12 +105,12 @@ class ArenaConfig:
         return min(min(shape.half_sides) for shape in used) * self.poi_radius
 
     @property
-    def _words(self) -> dict[str, dict[str, Any]]:
+    def _words(self) -> dict[str, Mapping[str, Value]]:
         """For each word of a class, its attribute and the possible values."""
         own = {name: attribute.values for name, attribute in self.attributes.items()}
         return {"colour": self.colours, "shape": self.shapes, **own}
 
-    def values(self, attribute: str) -> tuple[Any, ...]:
+    def values(self, attribute: str) -> tuple[Value, ...]:
         """For each class, the value of its word: RGB, a `Shape`, or a number."""
         known = self._words[attribute]
         return tuple(known[word] for word in self._words_of_classes(attribute))
@@ -154,118 +134,91 @@ class ArenaConfig:
         return [name.split(" ")[position] for name in self.classes]
 
 
-@section
-class LidarConfig:
+class LidarConfig(Section, place="lidar"):
     """The Hokuyo URG-04LX on the AMiRo."""
 
-    num_beams: int = 683
+    num_beams: int = limited(683, above=0, at_most=100_000)
     """Beams per scan."""
-    field_of_view: float = 240.0
+    field_of_view: float = limited(240.0, above=0, at_most=360)
     """Angle between the first and the last beam, in degrees."""
-    min_range: Traced[float] = 0.08
+    min_range: Traced[float] = limited(0.08, above=0)
     """Shortest measured distance, in metres."""
-    max_range: Traced[float] = 5.0
+    max_range: Traced[float] = limited(5.0, above=0, at_most=1000)
     """Longest measured distance, in metres; also the reading of a beam without a return."""
-    range_noise: Traced[float] = 0.01
+    range_noise: Traced[float] = limited(0.01, at_least=0)
     """Standard deviation of a measured distance, in metres; see `range_noise_growth`."""
-    range_noise_growth: float = 0.0
+    range_noise_growth: float = limited(0.0, at_least=0, at_most=1)
     """Growth of that standard deviation with the distance, in metres per metre."""
-    mixed_pixels: float = 0.0
+    mixed_pixels: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam also meets the surface that the next beam meets, and measures a
-    distance between the two: at edges, one where nothing is."""
-    dropout: float = 0.0
+    distance between the two: at edges, a distance at which there is nothing."""
+    dropout: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam has no return."""
-    window: int = 128
+    window: int = limited(128, above=0)
     """Beams around the PoI's bearing that the detector reads."""
-    stride: int = 1
+    stride: int = limited(1, above=0)
     """Step between the beams that the detector reads, in beams."""
-    window_range: Traced[float] = 1.5
+    window_range: Traced[float] = limited(1.5, above=0)
     """Longest distance in the detector's input, in metres: cuts off the background."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_positive(
-            self, "num_beams", "field_of_view", "min_range", "max_range", "window_range"
-        )
-        require_not_negative(self, "range_noise", "range_noise_growth", "mixed_pixels", "dropout")
-        require_at_most(self, num_beams=100_000, max_range=1000, range_noise=self.max_range)
-        require_at_most(self, range_noise_growth=1, mixed_pixels=1, dropout=1)
-        require(self.field_of_view <= 360.0, self, "field_of_view", "must be at most 360 degrees")
-        require(self.max_range > self.min_range, self, "max_range", "must be above min_range")
-        require(self.window_range > self.min_range, self, "window_range", "must be above min_range")
-        require_window(self, self.num_beams)
+        """Checks the order of distances, and the window; raises `ConfigError`."""
+        least, most = f"above min_range = {self.min_range}", f"at most max_range = {self.max_range}"
+        require(self.max_range > self.min_range, self, "max_range", f"must be {least}")
+        require(self.window_range > self.min_range, self, "window_range", f"must be {least}")
+        require(self.range_noise <= self.max_range, self, "range_noise", f"must be {most}")
+        _check_window(self, self.num_beams)
 
 
-@section
-class CameraConfig:
+class CameraConfig(Section, place="camera"):
     """One line of pixels of the camera on the AMiRo."""
 
-    num_pixels: int = 640
+    num_pixels: int = limited(640, above=0, at_most=100_000)
     """Pixels of the scanline."""
-    field_of_view: float = 80.0
+    field_of_view: float = limited(80.0, above=0, below=180)
     """Horizontal field of view, in degrees."""
-    pixel_noise: Traced[float] = 0.007
+    pixel_noise: Traced[float] = limited(0.007, at_least=0, at_most=1)
     """Standard deviation of a pixel's value, where 1 is full scale."""
-    exposure_error: float = 0.0
+    exposure_error: float = limited(0.0, at_least=0, at_most=10)
     """Standard deviation of the natural logarithm of an image's brightness."""
-    colour_cast: float = 0.0
+    colour_cast: float = limited(0.0, at_least=0, at_most=10)
     """Standard deviation of the natural logarithm of each channel's brightness in an image."""
-    low_light: float = 0.0
-    """Largest share of the light that may be missing in an image, within 0 and 1; the share is
-    uniform."""
-    shadow: float = 0.0
-    """Probability that a shadow falls into the view. One of its sides has ambient light only, from
-    a random pixel on."""
-    window: int = 80
+    low_light: float = limited(0.0, at_least=0, at_most=1)
+    """Largest share of the light that may be missing in an image; the share is uniform."""
+    shadow: float = limited(0.0, at_least=0, at_most=1)
+    """Probability that a shadow falls into the view. From a random pixel on, one of its sides has
+    ambient light only."""
+    window: int = limited(80, above=0)
     """Pixels around the PoI's bearing that the detector reads."""
-    stride: int = 4
+    stride: int = limited(4, above=0)
     """Step between the pixels that the detector reads, in pixels."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_positive(self, "num_pixels", "field_of_view")
-        require_not_negative(self, "pixel_noise", "exposure_error", "colour_cast")
-        require_not_negative(self, "low_light", "shadow")
-        require_at_most(self, num_pixels=100_000, pixel_noise=1, exposure_error=10, colour_cast=10)
-        require_at_most(self, low_light=1, shadow=1)
-        require(self.field_of_view < 180.0, self, "field_of_view", "must be below 180 degrees")
-        require_window(self, self.num_pixels)
+        """Checks the window; raises `ConfigError`."""
+        _check_window(self, self.num_pixels)
 
 
-@section
-class ViewpointConfig:
+class ViewpointConfig(Section, place="viewpoint"):
     """Viewpoints from which a robot looks at a PoI."""
 
-    min_distance: Traced[float] = 0.3
+    min_distance: Traced[float] = limited(0.3, above=0)
     """Shortest distance from the sensor to the PoI's centre, in metres."""
-    max_distance: Traced[float] = 1.2
+    max_distance: Traced[float] = limited(1.2, above=0)
     """Longest distance from the sensor to the PoI's centre, in metres."""
-    max_bearing: Traced[float] = 20.0
+    max_bearing: Traced[float] = limited(20.0, at_least=0, at_most=30)
     """Largest angle between the robot's heading and the PoI, to either side, in degrees."""
-    bearing_error: Traced[float] = 1.0
+    bearing_error: Traced[float] = limited(1.0, at_least=0, at_most=10)
     """Largest error of the bearing on which the detector's window is centred, in degrees."""
-    clearance: Traced[float] = 0.03
+    clearance: Traced[float] = limited(0.03, at_least=0)
     """Free space around the robot at a viewpoint, in metres."""
 
     def check(self) -> None:
-        """Raises `ConfigError` for an invalid field."""
-        require_types(self)
-        require_positive(self, "min_distance", "max_distance")
-        require_not_negative(self, "max_bearing", "bearing_error", "clearance")
-        require(self.max_bearing <= 30, self, "max_bearing", "must be at most 30 degrees")
-        require(self.bearing_error <= 10, self, "bearing_error", "must be at most 10 degrees")
-        require(
-            self.max_distance > self.min_distance,
-            self,
-            "max_distance",
-            "must be above min_distance",
-        )
+        """Checks the order of distances; raises `ConfigError`."""
+        expected = f"must be above min_distance = {self.min_distance}"
+        require(self.max_distance > self.min_distance, self, "max_distance", expected)
 
 
-@dataclasses.dataclass(frozen=True)
-class SensorConfig:
+class SensorConfig(Checked, place="sensor"):
     """A custom sensor, carried like a camera or a LiDAR."""
 
     make: str
@@ -274,8 +227,17 @@ class SensorConfig:
     attribute: str
     """Attribute that it distinguishes: `colour`, `shape` or one of `arena.attributes`."""
 
-    def __post_init__(self):
-        require_types(self)
+    def check(self) -> None:
+        """Checks that `make` can be the name of a function; raises `ConfigError`."""
         module, _, function = self.make.partition(":")
         is_name = function.isidentifier() and all(p.isidentifier() for p in module.split("."))
         require(is_name, self, "make", "must be package.module:function")
+
+
+def _check_window(sensor: LidarConfig | CameraConfig, num_rays: int) -> None:
+    """Raises `ConfigError` unless a sensor's window fits its rays."""
+    stride = sensor.stride
+    require(stride <= num_rays, sensor, "stride", f"must be at most {num_rays}, its rays")
+    most = (num_rays - 1) // stride + 1
+    expected = f"must be at most {most}: it has {num_rays} rays, with a stride of {stride}"
+    require(sensor.window <= most, sensor, "window", expected)

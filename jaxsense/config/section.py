@@ -5,10 +5,12 @@ shapes a program is structure.
 """
 
 import dataclasses
-from typing import Annotated, Any, TypeVar, dataclass_transform, get_args, get_type_hints
+from typing import Annotated, ClassVar, NamedTuple, TypeVar, dataclass_transform, get_type_hints
 
 import jax
 import numpy as np
+
+from jaxsense.config.checks import check_fields
 
 T = TypeVar("T")
 
@@ -17,52 +19,79 @@ Traced = Annotated[T, _LEAF]
 """A setting that only enters the arithmetic: a number, or a JAX array, traced or not."""
 
 
-@dataclasses.dataclass(frozen=True)
-class _Structure:
-    """Settings of a section that are not leaves; equal if all of them are."""
+class Sizes(NamedTuple):
+    """Sizes of arrays that follow from several sections."""
 
-    values: tuple[Any, ...]
-
-    def __hash__(self) -> int:
-        return hash(repr(self.values))  # a dictionary has no hash
+    pois: int
+    """PoIs in a mission."""
+    classes: int
+    """Classes of PoIs."""
+    modalities: int
+    """Trained modalities."""
+    labels: int
+    """Labels of all modalities."""
+    window: int
+    """Numbers in the largest window."""
+    state: int
+    """Numbers in a state of the MDP."""
+    views: int
+    """Viewpoints in an arena."""
 
 
 @dataclass_transform(frozen_default=True)
-def section(cls: type[T]) -> type[T]:
-    """Makes a frozen dataclass and a pytree, whose leaves are the fields declared `Traced`.
+class Checked:
+    """Base of frozen dataclasses that check their fields when they are made.
 
-    Sections of plain values call their method `check` when made; arrays and JAX's placeholders have
-    no values to check.
+    A subclass states its name as in `class LidarConfig(Section, place="lidar")`; error messages
+    show it before the name of a field.
     """
 
-    def check(self: Any) -> None:
-        if all(map(_is_plain, jax.tree.leaves([getattr(self, name) for name in leaves]))):
-            self.check()
+    PLACE: ClassVar[str] = ""
 
-    cls.__post_init__ = check  # pyright: ignore[reportAttributeAccessIssue]
-    made: Any = dataclasses.dataclass(frozen=True)(cls)
-    hints = get_type_hints(made, include_extras=True)
-    leaves = [field.name for field in dataclasses.fields(made) if _is_leaf(hints[field.name])]
-    others = [field.name for field in dataclasses.fields(made) if field.name not in leaves]
+    def __init_subclass__(cls, place: str = "") -> None:
+        cls.PLACE = place
+        dataclasses.dataclass(frozen=True)(cls)
 
-    def flatten(value: Any) -> tuple[list[tuple[Any, Any]], _Structure]:
-        children = [(jax.tree_util.GetAttrKey(name), getattr(value, name)) for name in leaves]
-        return children, _Structure(tuple(getattr(value, name) for name in others))
+    def __post_init__(self):
+        check_fields(self)
+        self.check()
 
-    def unflatten(structure: _Structure, children: Any) -> Any:
-        values = zip(others, structure.values, strict=True)
-        return made(**dict(values), **dict(zip(leaves, children, strict=True)))
-
-    jax.tree_util.register_pytree_with_keys(made, flatten, unflatten)
-    return made
+    def check(self) -> None:
+        """Checks relations between fields; raises `ConfigError`."""
 
 
-def _is_leaf(kind: Any) -> bool:
+class Section(Checked):
+    """Base of the sections: a pytree whose leaves are the fields declared `Traced`, and sections.
+
+    Arrays and JAX's placeholders have no values to check: sections that hold them are not checked.
+    """
+
+    _LEAVES: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls, place: str = "") -> None:
+        super().__init_subclass__(place)
+        hints = get_type_hints(cls, include_extras=True)
+        names = [field.name for field in dataclasses.fields(cls)]
+        cls._LEAVES = tuple(name for name in names if _is_leaf(hints[name]))
+        others = [name for name in names if name not in cls._LEAVES]
+        jax.tree_util.register_dataclass(cls, data_fields=cls._LEAVES, meta_fields=others)
+
+    def __post_init__(self):
+        if all(map(_is_plain, jax.tree.leaves([getattr(self, name) for name in self._LEAVES]))):
+            super().__post_init__()
+
+    def arrays(self, sizes: Sizes) -> dict[str, int]:
+        """How many numbers each large array holds, by the fields that determine its size."""
+        return {}
+
+
+def _is_leaf(kind: object) -> bool:
     """Whether a field holds leaves: it is declared `Traced` or is a section."""
-    return _LEAF in get_args(kind)[1:] or hasattr(kind, "check")
+    is_section = isinstance(kind, type) and issubclass(kind, Section)
+    return is_section or _LEAF in getattr(kind, "__metadata__", ())
 
 
-def _is_plain(value: Any) -> bool:
+def _is_plain(value: object) -> bool:
     """Whether a value is Python's or NumPy's, not a placeholder of JAX."""
     is_of_python = type(value).__module__ == "builtins" and type(value) is not object
     return is_of_python or isinstance(value, np.generic)

@@ -3,9 +3,8 @@
 import dataclasses
 import difflib
 import json
-from typing import Any
-
-import dacite
+from collections.abc import Iterator
+from typing import Any, get_args, get_type_hints
 
 from jaxsense.config.checks import ConfigError
 from jaxsense.config.whole import Config
@@ -16,7 +15,7 @@ def as_plain(config: Config) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def from_plain(stored: Any, base: Config | None = None) -> Config:
+def from_plain(stored: object, base: Config | None = None) -> Config:
     """Makes settings from plain data, the inverse of `as_plain`.
 
     Args:
@@ -26,27 +25,7 @@ def from_plain(stored: Any, base: Config | None = None) -> Config:
     Raises:
       ConfigError: names a field that is unknown, of the wrong type, or invalid.
     """
-    if not isinstance(stored, dict):
-        raise ConfigError("config", stored, "must be an object with a section for each part")
-    for name in ("modalities", "robots"):
-        if isinstance(stored.get(name), str | dict):  # which would be taken apart
-            raise ConfigError(name, stored[name], "must be a list of names")
-    # Each section checks the types of its fields itself.
-    rules = dacite.Config(strict=True, check_types=False, type_hooks={float: _number})
-    try:
-        return dacite.from_dict(Config, _with_tuples(_over(base or Config(), stored)), rules)
-    except dacite.UnexpectedDataError as error:
-        unknown = sorted(error.keys)[0]
-        names = {name.rpartition(".")[2]: name for name in _names(Config)}
-        near = difflib.get_close_matches(unknown, names, 1)
-        hint = f"; perhaps {names[near[0]]}" if near else ""
-        raise ConfigError(unknown, _find(stored, unknown), f"is no setting{hint}") from None
-    except dacite.MissingValueError as error:
-        raise ConfigError(str(error.field_path), None, "must be given") from None
-    except ConfigError:
-        raise
-    except (dacite.DaciteError, AttributeError, RecursionError, TypeError, ValueError) as error:
-        raise ConfigError("config", stored, f"cannot be used ({error})") from None
+    return _made(Config, stored, Config() if base is None else base, "")
 
 
 def parse_json(text: str) -> Any:
@@ -72,49 +51,55 @@ def _without_twins(fields: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def require_trust(config: Config) -> None:
-    """Raises a `ConfigError` if settings name code of custom sensors, which would run."""
+    """Raises `ConfigError` if settings name code of custom sensors, which would run."""
     for name, sensor in config.sensors.items():
         reason = "names code that would be run; pass --trust (trust=True) if you trust it"
         raise ConfigError(f"sensors.{name}.make", sensor.make, reason)
 
 
-def _find(stored: dict[str, Any], name: str) -> Any:
-    """Value of the first field of a name, in any section."""
-    if name in stored:
-        return stored[name]
-    sections = (section for section in stored.values() if isinstance(section, dict))
-    found = (_find(section, name) for section in sections)
-    return next((value for value in found if value is not None), None)
+def _made(kind: Any, stored: Any, base: Any, place: str) -> Any:
+    """A value of a declared type; the dataclasses among them check their fields.
 
-
-def _over(base: Any, stored: dict[str, Any]) -> dict[str, Any]:
-    """Plain settings of `base`, with the stored fields in place of its own, in every section."""
-    plain = dataclasses.asdict(base)
+    Args:
+      kind: the type.
+      stored: its plain form.
+      base: source of missing fields, if it is a dataclass.
+      place: name of the setting, empty for all settings.
+    """
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        if isinstance(stored, dict) and len(get_args(kind)) == 2:
+            inner = get_args(kind)[1]
+            return {n: _made(inner, each, None, f"{place}.{n}") for n, each in stored.items()}
+        return stored
+    if not isinstance(stored, dict):
+        raise ConfigError(place or "config", stored, "must be an object with names and values")
+    kinds, given = get_type_hints(kind), {}
     for name, value in stored.items():
-        own = getattr(base, name, None)
-        merges = dataclasses.is_dataclass(own) and isinstance(value, dict)
-        plain[name] = _over(own, value) if merges else value
-    return plain
+        path = f"{place}.{name}".lstrip(".")
+        if name not in kinds:
+            raise ConfigError(path, value, f"unknown setting{_suggestion(path)}")
+        given[name] = _made(kinds[name], value, getattr(base, name, None), path)
+    if base is not None:
+        return dataclasses.replace(base, **given)
+    for field in dataclasses.fields(kind):
+        if field.name not in given and field.default is dataclasses.MISSING:
+            raise ConfigError(f"{place}.{field.name}", None, "must be given")
+    return kind(**given)
 
 
-def _with_tuples(value: Any) -> Any:
-    """Replaces lists, JSON's form of tuples."""
-    if isinstance(value, dict):
-        return {name: _with_tuples(each) for name, each in value.items()}
-    return tuple(map(_with_tuples, value)) if isinstance(value, list | tuple) else value
+def _suggestion(path: str) -> str:
+    """A question about the known setting whose name is nearest to an unknown one's, if any is."""
+    names = list(_names(Config))
+    last = path.rpartition(".")[2]
+    near = difflib.get_close_matches(last, {name.rpartition(".")[2] for name in names})
+    alike = [name for name in names if name.rpartition(".")[2] in near]
+    best = difflib.get_close_matches(path, alike, 1, cutoff=0.0)
+    return f"; did you mean {best[0]}?" if best else ""
 
 
-def _number(value: Any) -> Any:
-    """Makes whole numbers real: JSON may write 1 for 1.0."""
-    is_whole = isinstance(value, int) and not isinstance(value, bool)
-    return float(value) if is_whole and abs(value) < 2**1000 else value
-
-
-def _names(section: Any, prefix: str = "") -> list[str]:
+def _names(section: Any, prefix: str = "") -> Iterator[str]:
     """Names of all settings with their sections."""
-    names = []
     for field in dataclasses.fields(section):
-        names.append(prefix + field.name)
+        yield prefix + field.name
         if dataclasses.is_dataclass(field.type):
-            names += _names(field.type, f"{prefix}{field.name}.")
-    return names
+            yield from _names(field.type, f"{prefix}{field.name}.")

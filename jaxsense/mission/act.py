@@ -29,6 +29,10 @@ from jaxsense.sim import viewpoints, windows
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene
 
+GOAL_ANGLE = 6.0  # degrees, largest angle to the PoI at which a robot scans it
+STUCK_TIME = 6.0  # s without progress, then a robot backs off and tries another viewpoint
+RECOVERY_TIME = 1.0  # s that a robot backs off
+_GOAL_DISTANCE = 0.2  # m, at which a viewpoint counts as reached if the PoI is in view
 _PROGRESS = 0.02  # m, least shortening of a way that counts as progress
 _PATIENCE = 2.0  # s without progress of another robot, then one that has ended makes room
 _NEARBY = 1.0  # m, between their middles
@@ -46,7 +50,7 @@ def approach(mission: Mission, state: MissionState, robot: Index) -> MissionStat
     progresses = is_driving & (way.length < own.way_left - _PROGRESS)
     waits = time - own.progress_at
     is_stuck = is_driving & ~way.is_there & ~is_taken & ~progresses
-    is_stuck &= waits > config.navigation.stuck_time
+    is_stuck &= waits > STUCK_TIME
     is_back = (own.phase == BACKING) & (time >= own.backs_off_until)
 
     failed, gives_up = _fail(own, is_stuck, config.mission.attempts)
@@ -61,9 +65,7 @@ def approach(mission: Mission, state: MissionState, robot: Index) -> MissionStat
         excluded=jnp.where(is_taken, failed.excluded.at[own.view].set(True), failed.excluded),
         way_left=jnp.where(progresses, way.length, own.way_left),
         progress_at=jnp.where(progresses | arrives, time, own.progress_at),
-        backs_off_until=jnp.where(
-            is_stuck, time + config.navigation.recovery_time, own.backs_off_until
-        ),
+        backs_off_until=jnp.where(is_stuck, time + RECOVERY_TIME, own.backs_off_until),
     )
     makes_room = (after.phase == ENDED) & _is_in_the_way(mission, state, robot)
     makes_room &= time < state.faults.stops_at[robot]
@@ -100,7 +102,7 @@ def _way(mission: Mission, state: MissionState, robot: Index, own: Robots) -> _W
         config, scene.layout, state.roadmap, position, standing, poi, goal
     )
     place = state.roadmap.viewpoints[poi, goal]
-    is_near = jnp.linalg.norm(place - position) <= config.navigation.goal_distance
+    is_near = jnp.linalg.norm(place - position) <= _GOAL_DISTANCE
     room = viewpoints.free_room(
         place[:1], place[1:], config.navigation.margin, config.arena, scene.layout, standing, poi
     )
@@ -229,7 +231,7 @@ def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
     error_key, noise_key = jax.random.split(key)
     poi = jnp.minimum(robots.target[robot], config.arena.num_pois - 1)
     bearing = _bearing(scene, robot, poi)
-    is_aligned = jnp.abs(bearing) <= jnp.radians(config.navigation.goal_angle)
+    is_aligned = jnp.abs(bearing) <= jnp.radians(GOAL_ANGLE)
     is_calm = jnp.abs(robots.command[robot, 1]) <= _TURNS_SLOWLY
     # It waits for a robot that drives through the view, but not for long.
     place = scene.poses[robot, :2]
@@ -238,7 +240,7 @@ def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
         place[:1], place[1:], 0.0, config.arena, scene.layout, standing, poi
     )
     waits = now(mission, state) - robots.progress_at[robot]
-    is_ready = is_aligned & is_calm & ((room[0] > 0) | (waits > config.navigation.stuck_time))
+    is_ready = is_aligned & is_calm & ((room[0] > 0) | (waits > STUCK_TIME))
     error = jnp.radians(config.viewpoint.bearing_error)
     return _Aim(
         scans=(robots.phase[robot] == FACING) & is_ready,

@@ -18,6 +18,8 @@ from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
 
 BACKWARD_SPEED = 0.1  # m/s
+_NUM_SPEEDS = 6  # that the planner tries, one of them backwards
+_NUM_TURN_RATES = 21  # that it tries; odd, so that one goes straight
 _SAMPLE_TIMES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0)  # shares of the horizon
 # Robots may leave an arc from half the horizon on; earlier, standing still would score as well.
 _MAY_LEAVE = _SAMPLE_TIMES.index(0.5)
@@ -304,8 +306,8 @@ def sidestep(
 
 def _arcs(settings: NavigationConfig) -> _Arcs:
     """Arcs of all commands that the planner tries."""
-    forward = np.linspace(0.0, amiro.MAX_SPEED, settings.speed_samples - 1)
-    turns = np.linspace(-amiro.MAX_TURN_RATE, amiro.MAX_TURN_RATE, settings.turn_samples)
+    forward = np.linspace(0.0, amiro.MAX_SPEED, _NUM_SPEEDS - 1)
+    turns = np.linspace(-amiro.MAX_TURN_RATE, amiro.MAX_TURN_RATE, _NUM_TURN_RATES)
     speeds = np.concatenate([[-BACKWARD_SPEED], forward])
     samples = np.stack(np.meshgrid(speeds, turns, indexing="ij"), axis=-1).reshape(-1, 2)
     samples = samples.astype(np.float32)

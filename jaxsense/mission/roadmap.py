@@ -13,7 +13,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxsense.config import NODES_PER_POI, Config
+from jaxsense.config import NODES_PER_POI, VIEW_SIDES, Config
 from jaxsense.core.types import pytree
 from jaxsense.sim import viewpoints
 from jaxsense.sim.arena import Layout
@@ -142,7 +142,7 @@ def _radius(config: Config) -> float:
 def _viewpoints(config: Config, layout: Layout) -> tuple[jax.Array, jax.Array]:
     """`[N, V, 2]` places around each PoI, and whether they are free and see it."""
     settings, num_pois = config.navigation, config.arena.num_pois
-    sides = 2 * jnp.pi * jnp.arange(settings.view_sides) / settings.view_sides
+    sides = 2 * jnp.pi * jnp.arange(VIEW_SIDES) / VIEW_SIDES
     distances = jnp.array(settings.view_distances)
     ring = jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
     offsets = (distances[:, None, None] * ring[None]).reshape(-1, 2)

@@ -218,7 +218,7 @@ def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
     approach, facing, set_robot
 ):
     # It wants to a viewpoint on the far side of the PoI.
-    patience = CONFIG.navigation.stuck_time
+    patience = act.STUCK_TIME
     start = facing(CAMERA)
     still = approach(driving(start, set_robot, 0, patience - 0.1, 0.0), CAMERA)
     assert still.robots.phase[CAMERA] == DRIVING
@@ -232,7 +232,7 @@ def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
     assert goes_on.robots.phase[CAMERA] == DRIVING
     assert goes_on.robots.way_left[CAMERA] < 9.0
     # And after the time of recovery it asks again.
-    later = patience + 0.2 + CONFIG.navigation.recovery_time + 0.1
+    later = patience + 0.2 + act.RECOVERY_TIME + 0.1
     steps = jnp.int32(round(later / CONFIG.mission.control_period))
     assert approach(replace(stuck, steps=steps), CAMERA).robots.phase[CAMERA] == IDLE
 

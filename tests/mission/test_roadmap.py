@@ -54,17 +54,17 @@ def around_circle(start, end, centre, radius):
 
 @pytest.mark.parametrize("poi", [0, 1])
 def test_viewpoints_lie_all_around_at_the_configured_distances(poi):
-    config = Config(navigation=NavigationConfig(view_distances=(0.4, 0.7, 0.9), view_sides=8))
+    config = Config(navigation=NavigationConfig(view_distances=(0.4, 0.7, 0.9)))
     position = np.array([[0.3, -0.2], [-0.9, 0.9], [1.0, 1.0]])
     _, _, ways = planned(config, position)
-    assert ways.viewpoints.shape == (3, 3 * 8, 2)
+    assert ways.viewpoints.shape == (3, 3 * 16, 2)
     away = np.array(ways.viewpoints[poi]) - position[poi]
-    distance = np.linalg.norm(away, axis=-1).reshape(3, 8)
-    expected = np.repeat([[0.4], [0.7], [0.9]], 8, axis=1)
+    distance = np.linalg.norm(away, axis=-1).reshape(3, 16)
+    expected = np.repeat([[0.4], [0.7], [0.9]], 16, axis=1)
     np.testing.assert_allclose(distance, expected, atol=1e-6)
-    # Every 360 / 8 = 45 degrees, from 0 to 315.
-    side = np.degrees(np.arctan2(away[:, 1], away[:, 0])).reshape(3, 8)
-    turned = (side - 45 * np.arange(8) + 180) % 360 - 180
+    # Every 360 / 16 = 22.5 degrees, from 0 to 337.5.
+    side = np.degrees(np.arctan2(away[:, 1], away[:, 0])).reshape(3, 16)
+    turned = (side - 22.5 * np.arange(16) + 180) % 360 - 180
     np.testing.assert_allclose(turned, 0, atol=1e-4)
 
 

@@ -8,7 +8,7 @@ import pytest
 from teams import CONFIG, LATENT, NAIVE
 
 from jaxsense import mission
-from jaxsense.mission import navigation
+from jaxsense.mission import act, navigation
 from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
 from jaxsense.sim import amiro
 from jaxsense.sim import arena as arenas
@@ -139,7 +139,7 @@ def test_scans_are_taken_in_range_and_facing_the_poi(healthy):
     assert len(distance) >= 0.9 * 2 * NUM_POIS * NUM_ARENAS
     assert np.all(distance >= CONFIG.viewpoint.min_distance)
     assert np.all(distance <= CONFIG.navigation.view_range + 1e-3)
-    assert np.max(np.abs(bearing)) <= np.radians(CONFIG.navigation.goal_angle) + 1e-3
+    assert np.max(np.abs(bearing)) <= np.radians(act.GOAL_ANGLE) + 1e-3
 
 
 def test_the_map_changes_where_something_was_detected_and_nowhere_else(healthy):
