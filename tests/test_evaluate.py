@@ -272,7 +272,7 @@ def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
     versions = {"jaxsense": jaxsense.__version__}
     stored = {"versions": versions, "config": {"colour": 1}}
     (tmp_path / "config.json").write_text(json.dumps(stored))
-    assert "colour = 1: is no setting" in error_line([str(tmp_path)], capsys, evaluate)
+    assert "colour = 1: unknown setting" in error_line([str(tmp_path)], capsys, evaluate)
     (tmp_path / "config.json").write_text(json.dumps({"versions": versions}))
     line = error_line([str(tmp_path)], capsys, evaluate)
     assert "must be a finished run (there is no checkpoint 'detector_camera')" in line

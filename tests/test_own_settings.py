@@ -1,16 +1,21 @@
-"""What a user has declared, in the settings: checks, and the way back from JSON."""
+"""Custom colours, shapes, attributes and sensors in the settings: checks, copies and JSON."""
 
+import copy
 import dataclasses
 import json
+import pickle
 import sys
 import types
 import typing
 
+import jax
 import pytest
 
 from jaxsense import sim
 from jaxsense.config import (
     COLOURS,
+    MODALITIES,
+    PRESETS,
     SHAPES,
     ArenaConfig,
     Attribute,
@@ -76,7 +81,7 @@ def test_a_team_of_robots_survives_json():
 @pytest.mark.parametrize("name", ["robots", "modalities"])
 @pytest.mark.parametrize("given", ["camera", {"camera": 1}])
 def test_names_of_sensors_are_a_list(name, given):
-    with pytest.raises(ConfigError, match=rf"{name} = .*camera.*: must be a list of names"):
+    with pytest.raises(ConfigError, match=rf"{name} = .*camera.*: must be a list of texts"):
         from_plain({name: given})
 
 
@@ -92,11 +97,65 @@ def test_robots_carry_the_sensors_of_the_settings():
     assert Config().modality_of_robot == (0, 1)
 
 
-def test_changing_the_dictionaries_of_one_leaves_the_others():
-    first = ArenaConfig()
-    first.colours["pink"] = (0.9, 0.5, 0.6)
-    assert "pink" not in ArenaConfig().colours
-    assert "pink" not in COLOURS
+DICTIONARIES = {
+    "COLOURS": COLOURS,
+    "SHAPES": SHAPES,
+    "MODALITIES": MODALITIES,
+    "PRESETS": PRESETS,
+    "colours": OWN.arena.colours,
+    "shapes": OWN.arena.shapes,
+    "attributes": OWN.arena.attributes,
+    "values": OWN.arena.attributes["temperature"].values,
+    "sensors": OWN.sensors,
+}
+CHANGES = {
+    "set": lambda found: found.__setitem__("pink", (0.9, 0.5, 0.6)),
+    "delete": lambda found: found.__delitem__(next(iter(found))),
+    "or": lambda found: found.__ior__({"pink": 1}),
+    "clear": lambda found: found.clear(),
+    "pop": lambda found: found.pop(next(iter(found))),
+    "popitem": lambda found: found.popitem(),
+    "setdefault": lambda found: found.setdefault("pink", 1),
+    "update": lambda found: found.update(pink=1),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+@pytest.mark.parametrize("found", DICTIONARIES.values(), ids=DICTIONARIES)
+def test_dictionaries_of_settings_cannot_be_changed(found, change):
+    before = dict(found)
+    with pytest.raises(TypeError, match="settings are immutable"):
+        change(found)
+    assert dict(found) == before
+
+
+def test_a_dictionary_of_the_caller_is_copied():
+    values = {"cold": 5.0}
+    found = Attribute(values)
+    values["hot"] = 60.0
+    assert found.values == {"cold": 5.0}
+
+
+@pytest.mark.parametrize(
+    "again",
+    [copy.copy, copy.deepcopy, lambda config: pickle.loads(pickle.dumps(config))],
+    ids=["copy", "deepcopy", "pickle"],
+)
+def test_settings_can_be_copied(again):
+    found = again(OWN)
+    assert found == OWN
+    assert hash(found) == hash(OWN)
+    with pytest.raises(TypeError, match="settings are immutable"):
+        found.arena.colours["pink"] = (0.0, 0.0, 0.0)
+
+
+def test_the_order_of_colours_is_part_of_the_settings():
+    # It orders the labels, so that programs compiled for one order are wrong for another.
+    turned = dataclasses.replace(OWN.arena, colours=dict(reversed(OWN.arena.colours.items())))
+    assert turned.labels("colour") == OWN.arena.labels("colour")[::-1]
+    assert turned != OWN.arena
+    assert jax.tree.structure(turned) != jax.tree.structure(OWN.arena)
+    assert dataclasses.replace(turned, colours=OWN.arena.colours) == OWN.arena
 
 
 def test_labels_follow_the_declaration():
@@ -112,27 +171,36 @@ def test_labels_follow_the_declaration():
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
-        (lambda: ArenaConfig(classes=("pink cube",)), "'pink cube' must be \"COLOUR SHAPE\" with"),
-        (lambda: ArenaConfig(classes=("red slab",)), "a shape of cylinder, cube"),
-        (lambda: ArenaConfig(classes=("red cube hot",)), "'red cube hot' must be"),
         (
-            lambda: dataclasses.replace(WARM, classes=("red cube",)),
+            lambda: ArenaConfig(classes=("pink cube", "red cube")),
+            "'pink cube' must be \"COLOUR SHAPE\" with",
+        ),
+        (lambda: ArenaConfig(classes=("red slab", "red cube")), "a shape of cylinder, cube"),
+        (lambda: ArenaConfig(classes=("red cube hot", "red cube")), "'red cube hot' must be"),
+        (
+            lambda: dataclasses.replace(WARM, classes=("red cube", "green cube hot")),
             "'red cube' must be \"COLOUR SHAPE TEMPERATURE\" with a colour of red",
         ),
         (
-            lambda: dataclasses.replace(WARM, classes=("red cube warm",)),
+            lambda: dataclasses.replace(WARM, classes=("red cube warm", "red cube hot")),
             "a temperature of cold, hot",
         ),
-        (lambda: ArenaConfig(colours={"red": (1.0, 0.0, 2.0)}), "arena.colours.red = (1.0, 0.0"),
+        (
+            lambda: ArenaConfig(colours={"red": (1.0, 0.0, 2.0)}),
+            "arena.colours.red = (1.0, 0.0, 2.0): must each be from 0 to 1",
+        ),
         (lambda: ArenaConfig(colours={"sky blue": (0.0, 0.0, 1.0)}), "'sky blue': must be a word"),
         (lambda: ArenaConfig(shapes={}), "arena.shapes = {}: must name one or more"),
         (lambda: Shape("cone"), "shape.primitive = 'cone': must be one of cylinder, box"),  # pyright: ignore
-        (lambda: Shape("box", (1.0, 0.1)), "shape.half_sides = (1.0, 0.1): must be two shares"),
-        (lambda: Shape("cylinder", (1.0, 0.5)), "for a cylinder is round"),
+        (
+            lambda: Shape("box", (1.0, 0.1)),
+            "shape.half_sides = (1.0, 0.1): must each be from 0.5 to 1",
+        ),
+        (lambda: Shape("cylinder", (1.0, 0.5)), "must be the same number twice for a cylinder"),
         (lambda: Attribute({"hot": float("inf")}), "from names to finite numbers"),
         (
             lambda: ArenaConfig(attributes={"shape": TEMPERATURE["temperature"]}),
-            "arena.attributes = 'shape': is there already",
+            "arena.attributes = 'shape': already exists",
         ),
         (lambda: SensorConfig("thermal", "colour"), "sensor.make = 'thermal': must be package."),
         (
@@ -141,11 +209,11 @@ def test_labels_follow_the_declaration():
         ),
         (
             lambda: Config(sensors={"lidar": SensorConfig("a:b", "shape")}),
-            "sensors = 'lidar': is there already",
+            "sensors = 'lidar': already exists",
         ),
         (
             lambda: Config(sensors={"joint": SensorConfig("a:b", "shape")}),
-            "sensors = 'joint': is there already; must be a new name",
+            "sensors = 'joint': already exists",
         ),
         (
             lambda: dataclasses.replace(OWN, modalities=("lidar", "sonar")),

@@ -35,7 +35,7 @@ class ConfigError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Limits of a number, or of each number in a field; None where there is no limit."""
+    """Limits of each number in a field, and of its number of items; None where there is none."""
 
     above: float | None = None
     at_least: float | None = None
@@ -44,19 +44,21 @@ class Limits:
     min_items: int | None = None
     max_items: int | None = None
 
-    def __str__(self) -> str:
-        numbers = {
+    def expected(self, value: object) -> str:
+        """What would be right for a field with a value."""
+        words = {
             "greater than": self.above,
             "at least": self.at_least,
             "below": self.below,
             "at most": self.at_most,
         }
-        found = [f"{words} {limit:,}" for words, limit in numbers.items() if limit is not None]
-        limits = " and ".join(found)
-        if self.min_items is None:
-            return f"must be {limits}"
-        most = "or more" if self.max_items is None else f"to {self.max_items}"
-        return f"must have {self.min_items} {most} values" + (limits and f", each {limits}")
+        limits = " and ".join(f"{each} {x:,}" for each, x in words.items() if x is not None)
+        if self.at_least is not None and self.at_most is not None:
+            limits = f"from {self.at_least:,} to {self.at_most:,}"
+        if self.min_items is not None:
+            most = "or more" if self.max_items is None else f"to {self.max_items}"
+            return f"must have {self.min_items} {most} values" + (limits and f", each {limits}")
+        return f"must each be {limits}" if isinstance(value, tuple) else f"must be {limits}"
 
     def allow(self, value: object) -> bool:
         """Whether all numbers of a value, and their number, are within the limits."""
@@ -139,7 +141,7 @@ def check_fields(section: object, bits: int = 31) -> None:
         require(fits, section, name, f"must be below 2^{bits}")
         for place, each in _parts(_place(section, name), value):
             if limits is not None and not limits.allow(each):
-                raise ConfigError(place, each, str(limits))
+                raise ConfigError(place, each, limits.expected(each))
 
 
 def require_32_bits() -> None:

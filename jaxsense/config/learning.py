@@ -14,18 +14,18 @@ _MAX_WEIGHT = 1_000_000
 class DetectorConfig(Section, place="detector"):
     """The scanline detectors f_x and f_w."""
 
-    hidden: tuple[int, ...] = limited((64, 64), above=0, min_items=1)
+    hidden: tuple[int, ...] = limited((64, 64), at_least=1, min_items=1)
     """Sizes of the hidden layers."""
-    num_scans: int = limited(98304, above=0)
+    num_scans: int = limited(98304, at_least=1)
     """Simulated scans to train on, per modality."""
     calibration: float = limited(0.0, at_least=0, at_most=0.5)
     """Share of these scans that calibrates the detector instead: their likelihood sets the
     temperature of its probabilities."""
-    num_held_out: int = limited(8192, above=0)
+    num_held_out: int = limited(8192, at_least=1)
     """Simulated scans that measure the accuracy."""
-    steps: int = limited(4000, above=0)
+    steps: int = limited(4000, at_least=1)
     """Gradient steps."""
-    batch: int = limited(512, above=0)
+    batch: int = limited(512, at_least=1)
     """Scans per gradient step."""
     learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
     """Initial learning rate of Adam; decays to zero along a cosine."""
@@ -46,9 +46,9 @@ class DetectorConfig(Section, place="detector"):
 class JmvaeConfig(Section, place="jmvae"):
     """The joint multi-modal VAE."""
 
-    latent_size: int = limited(2, above=0, at_most=256)
+    latent_size: int = limited(2, at_least=1, at_most=256)
     """Dimensions of the latent space, D_z."""
-    hidden: tuple[int, ...] = limited((64, 64), above=0, min_items=1)
+    hidden: tuple[int, ...] = limited((64, 64), at_least=1, min_items=1)
     """Sizes of the hidden layers of every encoder and decoder."""
     alpha: Traced[float] = limited(0.1, at_least=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to each subset's."""
@@ -65,13 +65,13 @@ class JmvaeConfig(Section, place="jmvae"):
     fusion: Literal["in_place", "filter"] = "in_place"
     """How a look updates a belief. `in_place`, as in the paper, replaces it. `filter` accumulates
     looks, see the section filter."""
-    restarts: int = limited(3, above=0, at_most=1000)
+    restarts: int = limited(3, at_least=1, at_most=1000)
     """Trainings from different random parameters; the one with the lowest loss is kept."""
-    samples_per_class: int = limited(10000, above=0)
+    samples_per_class: int = limited(10000, at_least=1)
     """Detections per class and modality in the training set."""
-    steps: int = limited(3000, above=0)
+    steps: int = limited(3000, at_least=1)
     """Gradient steps."""
-    batch: int = limited(256, above=0)
+    batch: int = limited(256, at_least=1)
     """Sets of detections, one of each modality, per gradient step."""
     learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
     """Initial learning rate of Adam; decays to zero along a cosine."""
@@ -90,13 +90,13 @@ class JmvaeConfig(Section, place="jmvae"):
 class FilterConfig(Section, place="filter"):
     """The filter, trained after the JMVAE if `jmvae.fusion` is `filter`."""
 
-    hidden: tuple[int, ...] = limited((32,), above=0, min_items=1)
+    hidden: tuple[int, ...] = limited((32,), at_least=1, min_items=1)
     """Sizes of the hidden layers of each modality's network."""
-    looks: int = limited(6, above=0, at_most=100)
+    looks: int = limited(6, at_least=1, at_most=100)
     """Looks in each sequence that it is trained on."""
-    steps: int = limited(2000, above=0)
+    steps: int = limited(2000, at_least=1)
     """Gradient steps."""
-    batch: int = limited(256, above=0)
+    batch: int = limited(256, at_least=1)
     """Sequences per gradient step."""
     learning_rate: Traced[float] = limited(5e-3, above=0, at_most=1)
     """Initial learning rate of Adam; decays to zero along a cosine."""
@@ -121,7 +121,7 @@ class MdpConfig(Section, place="mdp"):
     """Cost of a look with the reward `nats`."""
     min_increase: Traced[float] = limited(0.05, at_least=0)
     """Gain of information, in inverse latent units, up to which a look's reward is -1."""
-    max_steps: Traced[int] = limited(20, above=0, at_most=10_000)
+    max_steps: Traced[int] = limited(20, at_least=1, at_most=10_000)
     """Maximum length of an episode, in actions."""
     partly_seen_starts: bool = False
     """Exclude starts in which all modalities have seen all PoIs, or none any."""
@@ -143,15 +143,15 @@ class TravelConfig(Section, place="team.travel"):
 class ToursConfig(Section, place="team.tours"):
     """Training of the order in which a team visits its PoIs, see `jaxsense.dqn.tours`."""
 
-    states: int = limited(65536, above=0)
+    states: int = limited(65536, at_least=1)
     """States in which choices are tried, rounded up to whole chunks."""
     tries: int = limited(4, at_least=2)
     """Choices tried in each state."""
     walk: Traced[int] = limited(8, at_least=0, at_most=10_000)
     """Maximum number of choices before the state in which alternatives are tried."""
-    steps: int = limited(3200, above=0)
+    steps: int = limited(3200, at_least=1)
     """Gradient steps."""
-    batch: int = limited(1024, above=0)
+    batch: int = limited(1024, at_least=1)
     """States per gradient step."""
     learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
     """Initial learning rate of Adam; decays to zero along a cosine."""
@@ -173,7 +173,7 @@ class TeamConfig(Section, place="team"):
     """Training of the network that orders a team's visits."""
     num_pois: tuple[int, int] = limited((3, 8), at_least=1, at_most=64)
     """Minimum and maximum number of PoIs in an episode."""
-    robots_each: int = limited(2, above=0, at_most=8)
+    robots_each: int = limited(2, at_least=1, at_most=8)
     """Maximum number of robots per modality in an episode; the minimum is one."""
     sides: Traced[tuple[float, float]] = limited((3.0, 6.0), above=0, at_most=100)
     """Shortest and longest side of an episode's arena, in metres."""
@@ -183,7 +183,7 @@ class TeamConfig(Section, place="team"):
     """Share of the other episodes that start with some looks taken."""
     second_cost: Traced[float] = limited(0.0, at_least=0)
     """Cost of a second, in units of the reward."""
-    max_steps: Traced[int] = limited(300, above=0, at_most=100_000)
+    max_steps: Traced[int] = limited(300, at_least=1, at_most=100_000)
     """Maximum length of an episode, in choices."""
 
     def check(self) -> None:
@@ -207,17 +207,17 @@ class DqnConfig(Section, place="dqn"):
     observe: Literal["live", "bank"] = "live"
     """`live` casts a scan in the environment's own arena at every step; `bank` draws from stored
     detections."""
-    hidden: tuple[int, ...] = limited((24, 24), above=0, min_items=1)
+    hidden: tuple[int, ...] = limited((24, 24), at_least=1, min_items=1)
     """Sizes of the hidden layers."""
-    num_envs: int = limited(512, above=0)
+    num_envs: int = limited(512, at_least=1)
     """Environments that step in parallel."""
-    epochs: int = limited(800, above=0)
+    epochs: int = limited(800, at_least=1)
     """Epochs, each of one step per environment and `updates` gradient steps."""
-    updates: int = limited(64, above=0)
+    updates: int = limited(64, at_least=1)
     """Gradient steps per epoch."""
-    batch: int = limited(512, above=0)
+    batch: int = limited(512, at_least=1)
     """Transitions per gradient step."""
-    replay_capacity: int = limited(512000, above=0)
+    replay_capacity: int = limited(512000, at_least=1)
     """Capacity of the replay, in transitions; a multiple of num_envs."""
     discount: Traced[float] = limited(0.5, at_least=0, at_most=1)
     """Discount factor, gamma: per step, or with `task` = team per second."""
@@ -231,11 +231,11 @@ class DqnConfig(Section, place="dqn"):
     """Minimum probability of a random action."""
     epsilon_decay: Traced[float] = limited(0.99, above=0, at_most=1)
     """Factor on epsilon per epoch."""
-    target_period: Traced[int] = limited(50, above=0)
+    target_period: Traced[int] = limited(50, at_least=1)
     """Epochs between updates of the target network."""
-    num_starts: int = limited(8192, above=0)
+    num_starts: int = limited(8192, at_least=1)
     """Start states, prepared once and divided among the environments; a multiple of num_envs."""
-    chunk: int = limited(100, above=0)
+    chunk: int = limited(100, at_least=1)
     """Epochs between reports of progress."""
 
     def check(self) -> None:
@@ -273,21 +273,21 @@ class DqnConfig(Section, place="dqn"):
 class EvaluationConfig(Section, place="evaluation"):
     """Evaluation of the trained policies."""
 
-    num_starts: int = limited(512, above=0)
+    num_starts: int = limited(512, at_least=1)
     """Start states of the episodes."""
-    num_repeats: Traced[int] = limited(96, above=0)
+    num_repeats: Traced[int] = limited(96, at_least=1)
     """Episodes per start state, to average over the noise of detections; an eighth as many for the
     naive and the random policy."""
-    num_histories: int = limited(8190, above=0, at_most=10_000_000)
+    num_histories: int = limited(8190, at_least=1, at_most=10_000_000)
     """Random sequences of looks at a PoI, after which the map is compared with exact Bayes."""
     num_pois: tuple[int, ...] = limited((), at_least=1, at_most=64)
     """Further numbers of PoIs for which a team's policy is compared with the optimum of the map
     MDP."""
-    num_states: int = limited(4096, above=0, at_most=100_000)
+    num_states: int = limited(4096, at_least=1, at_most=100_000)
     """Maximum number of map states in which policies are compared; of more, a stratified sample."""
-    value_points: int = limited(2048, above=0, at_most=100_000)
+    value_points: int = limited(2048, at_least=1, at_most=100_000)
     """Maximum size of the grid on which look values are tabulated, see `dqn.optimum`."""
-    value_looks: int = limited(32, above=0, at_most=10_000)
+    value_looks: int = limited(32, at_least=1, at_most=10_000)
     """Sample looks per class that approximate the distribution of looks."""
 
     def arrays(self, sizes: Sizes) -> dict[str, int]:

@@ -41,7 +41,7 @@ class MissionConfig(Section, place="mission"):
 
     policies: tuple[str, ...] = limited(("latent", "naive", "random"), min_items=1)
     """Policies to play missions with at the end of a run; `jaxsense.evaluate` plays all."""
-    episodes: int = limited(128, above=0, at_most=MAX_EPISODES)
+    episodes: int = limited(128, at_least=1, at_most=MAX_EPISODES)
     """Missions per policy at the end of a run."""
     time_limit: Traced[float] = limited(120.0, above=0, at_most=3600)
     """Maximum length of a mission, in seconds."""
@@ -58,7 +58,7 @@ class MissionConfig(Section, place="mission"):
     """Whether a robot prefers, of equally good PoIs, those that no other robot heads for."""
     least_confidence: Traced[float] = limited(0.98, at_least=0, below=1)
     """Minimum probability of the most likely label for a scan to update the map."""
-    attempts: Traced[int] = limited(3, above=0)
+    attempts: Traced[int] = limited(3, at_least=1)
     """Failed looks or goals after which a robot gives up a PoI. If it was stuck, it tries as often
     once more before it ends."""
 

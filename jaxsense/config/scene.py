@@ -29,7 +29,7 @@ class ArenaConfig(Section, place="arena"):
 
     side: float = limited(3.0, above=0, at_most=100)
     """Inner length and width of the arena, in metres."""
-    num_pois: int = limited(3, above=0, at_most=64)
+    num_pois: int = limited(3, at_least=1, at_most=64)
     """Number of points of interest."""
     poi_radius: float = limited(0.1, above=0)
     """Radius of a cylinder and half the side of a cube, in metres; unit of custom shapes."""
@@ -113,7 +113,7 @@ class ArenaConfig(Section, place="arena"):
     def values(self, attribute: str) -> tuple[Value, ...]:
         """For each class, the value of its word: RGB, a `Shape`, or a number."""
         known = self._words[attribute]
-        return tuple(known[word] for word in self._words_of_classes(attribute))
+        return tuple(known[word] for word in self.words(attribute))
 
     def labels(self, attribute: str) -> tuple[str, ...]:
         """Distinct colours, shapes or other words of the classes, in order of declaration.
@@ -121,15 +121,16 @@ class ArenaConfig(Section, place="arena"):
         By default ("red", "green") and ("cylinder", "cube"): the order of `colours` and `shapes`,
         and of the paper's feature vectors.
         """
-        used = self._words_of_classes(attribute)
+        used = self.words(attribute)
         return tuple(label for label in self._words[attribute] if label in used)
 
     def label_of_class(self, attribute: str) -> tuple[int, ...]:
         """For each class, the index of its colour, shape or other word in `labels(attribute)`."""
         labels = self.labels(attribute)
-        return tuple(labels.index(word) for word in self._words_of_classes(attribute))
+        return tuple(labels.index(word) for word in self.words(attribute))
 
-    def _words_of_classes(self, attribute: str) -> list[str]:
+    def words(self, attribute: str) -> list[str]:
+        """For each class, its word for an attribute."""
         position = list(self._words).index(attribute)
         return [name.split(" ")[position] for name in self.classes]
 
@@ -137,7 +138,7 @@ class ArenaConfig(Section, place="arena"):
 class LidarConfig(Section, place="lidar"):
     """The Hokuyo URG-04LX on the AMiRo."""
 
-    num_beams: int = limited(683, above=0, at_most=100_000)
+    num_beams: int = limited(683, at_least=1, at_most=100_000)
     """Beams per scan."""
     field_of_view: float = limited(240.0, above=0, at_most=360)
     """Angle between the first and the last beam, in degrees."""
@@ -154,9 +155,9 @@ class LidarConfig(Section, place="lidar"):
     distance between the two: at edges, a distance at which there is nothing."""
     dropout: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam has no return."""
-    window: int = limited(128, above=0)
+    window: int = limited(128, at_least=1)
     """Beams around the PoI's bearing that the detector reads."""
-    stride: int = limited(1, above=0)
+    stride: int = limited(1, at_least=1)
     """Step between the beams that the detector reads, in beams."""
     window_range: Traced[float] = limited(1.5, above=0)
     """Longest distance in the detector's input, in metres: cuts off the background."""
@@ -173,7 +174,7 @@ class LidarConfig(Section, place="lidar"):
 class CameraConfig(Section, place="camera"):
     """One line of pixels of the camera on the AMiRo."""
 
-    num_pixels: int = limited(640, above=0, at_most=100_000)
+    num_pixels: int = limited(640, at_least=1, at_most=100_000)
     """Pixels of the scanline."""
     field_of_view: float = limited(80.0, above=0, below=180)
     """Horizontal field of view, in degrees."""
@@ -188,9 +189,9 @@ class CameraConfig(Section, place="camera"):
     shadow: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a shadow falls into the view. From a random pixel on, one of its sides has
     ambient light only."""
-    window: int = limited(80, above=0)
+    window: int = limited(80, at_least=1)
     """Pixels around the PoI's bearing that the detector reads."""
-    stride: int = limited(4, above=0)
+    stride: int = limited(4, at_least=1)
     """Step between the pixels that the detector reads, in pixels."""
 
     def check(self) -> None:

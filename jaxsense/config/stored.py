@@ -88,13 +88,15 @@ def _made(kind: Any, stored: Any, base: Any, place: str) -> Any:
 
 
 def _suggestion(path: str) -> str:
-    """A question about the known setting whose name is nearest to an unknown one's, if any is."""
-    names = list(_names(Config))
-    last = path.rpartition(".")[2]
-    near = difflib.get_close_matches(last, {name.rpartition(".")[2] for name in names})
-    alike = [name for name in names if name.rpartition(".")[2] in near]
-    best = difflib.get_close_matches(path, alike, 1, cutoff=0.0)
-    return f"; did you mean {best[0]}?" if best else ""
+    """A question about the known settings whose name is nearest to an unknown one's, if any is."""
+    section, _, last = path.rpartition(".")
+    names = [name.rpartition(".") for name in _names(Config)]
+    inside = [name for name in names if name[0] == section]
+    for known in (inside, names):
+        for near in difflib.get_close_matches(last, [name[2] for name in known], 1):
+            alike = ["".join(name) for name in known if name[2] == near]
+            return f"; did you mean {' or '.join(alike)}?"
+    return ""
 
 
 def _names(section: Any, prefix: str = "") -> Iterator[str]:

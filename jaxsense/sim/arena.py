@@ -98,7 +98,11 @@ def build(
 
     Returns:
       The arena; its `data` holds every robot and PoI at the origin.
+
+    Raises:
+      ConfigError: if JAX computes in 64 bits.
     """
+    require_32_bits()
     mjcf = _mjcf(config, lidar_robots, contacts, obstacles)
     mj_model = mujoco.MjModel.from_xml_string(mjcf)  # pyright: ignore[reportAttributeAccessIssue]
     # By itself MJX takes the first device of all processes.
@@ -187,8 +191,7 @@ def make_layout(
     checks.require_finite("position", position)
     checks.require_finite("yaw", yaw)
     checks.require_index("classes", classes, len(config.classes))
-    known = list(config.shapes.values())
-    shapes = jnp.array([known.index(s) for s in config.values("shape")], jnp.int32)
+    shapes = jnp.array([list(config.shapes).index(w) for w in config.words("shape")], jnp.int32)
     colours = jnp.array(config.values("colour"), jnp.float32)
     values = {name: jnp.array(config.values(name), jnp.float32) for name in config.attributes}
     of_pois = {name: numbers[classes] for name, numbers in values.items()}

@@ -4,7 +4,6 @@ import pytest
 
 from jaxsense.config import LIDAR_HEIGHT, TIMESTEP, ArenaConfig, ConfigError, MissionConfig
 from jaxsense.config import mission as mission_settings
-from jaxsense.config import scene as scene_settings
 
 
 def test_settings_and_simulation_agree(arena):
@@ -14,11 +13,10 @@ def test_settings_and_simulation_agree(arena):
     assert low < LIDAR_HEIGHT < high
 
 
-def test_a_poi_must_be_higher_than_the_beams(monkeypatch):
-    monkeypatch.setattr(scene_settings, "LIDAR_HEIGHT", 0.19)
-    ArenaConfig(poi_height=0.191)
-    with pytest.raises(ConfigError, match=r"arena.poi_height = 0.19: must be more than 0.19 m"):
-        ArenaConfig(poi_height=0.19)
+def test_a_poi_must_be_higher_than_the_beams():
+    ArenaConfig(poi_height=LIDAR_HEIGHT + 0.001)
+    with pytest.raises(ConfigError, match=r"arena.poi_height = 0.152: must be greater than 0.152"):
+        ArenaConfig(poi_height=LIDAR_HEIGHT)
 
 
 def test_a_control_period_is_some_steps_of_the_physics(monkeypatch):
