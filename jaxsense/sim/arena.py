@@ -16,7 +16,7 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
-from jaxsense.config import TIMESTEP, ArenaConfig, Shape
+from jaxsense.config import TIMESTEP, ArenaConfig, Shape, require_32_bits
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.sim import amiro
