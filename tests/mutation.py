@@ -1,107 +1,313 @@
-"""Mutation testing: breaks one place at a time and prints what the tests let pass.
+"""Mutation testing: breaks one line of the package at a time and prints what the tests let pass.
 
-    pip install cosmic-ray
-    python tests/mutation.py                        # all modules below
-    python tests/mutation.py jaxsense/dqn/losses.py
+    python tests/mutation.py                                    # 60 mutants of the whole package
+    python tests/mutation.py jaxsense/vae jaxsense/models.py --number 20
 
-It works on a copy of the checkout. Of each module it draws the same `NUMBER` mutants every time;
-those that no test could miss, such as shifts of floating-point numbers, are left out.
+The same seed draws the same lines while the package stays as it is. Mutants that no test could miss
+or notice are left out: annotations, decorators, texts, assertions of shapes, floating-point
+constants, and the numbers among settings and constants. Each mutant meets the tests of its module,
+then those of its package, then all that import the package, until one fails.
 """
 
+import argparse
+import ast
+import copy
 import os
+import queue
 import random
+import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-
-from cosmic_ray.work_db import use_db  # pyright: ignore[reportMissingImports]
-from cosmic_ray.work_item import WorkerOutcome, WorkResult  # pyright: ignore[reportMissingImports]
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
-NUMBER, SEED = 20, 0
-TESTS = {
-    "jaxsense/dqn/losses.py": "tests/dqn/test_losses.py",
-    "jaxsense/dqn/belief_mdp.py": "tests/dqn/test_belief_mdp.py tests/dqn/test_not_finite.py",
-    "jaxsense/dqn/policies.py": "tests/dqn/test_policies.py tests/dqn/test_not_finite.py",
-    "jaxsense/dqn/replay.py": "tests/dqn/test_replay.py",
-    "jaxsense/dqn/training.py": "tests/dqn/test_not_finite.py tests/dqn/test_dqn_training.py",
-    "jaxsense/sim/raycast.py": "tests/sim/test_raycast_plane.py"
-    " tests/sim/test_raycast_gradients.py tests/sim/test_raycast.py",
-    "jaxsense/vae/gaussian.py": "tests/vae/test_gaussian.py",
-    "jaxsense/vae/fusion.py": "tests/vae/test_fusion.py",
-    "jaxsense/vae/jmvae.py": "tests/vae/test_jmvae_draws.py"
-    " tests/vae/test_jmvae_equation.py tests/vae/test_jmvae.py -k 'not trained and not lowers'",
-}
-CONFIG = """
-[cosmic-ray]
-module-path = "{module}"
-timeout = 300.0
-excluded-modules = []
-test-command = "{python} -m pytest -o addopts= -p no:cacheprovider -q -x {tests}"
-
-[cosmic-ray.distributor]
-name = "local"
-
-[cosmic-ray.filters.operators-filter]
-exclude-operators = [
-  "core/ReplaceBinaryOperator_\\\\w+_(Mod|FloorDiv|Pow|LShift|RShift|BitOr|BitXor|BitAnd)",
-  "core/ReplaceBinaryOperator_BitOr_\\\\w+",
-  "core/ReplaceComparisonOperator_\\\\w+_Is(Not)?",
-  "core/ReplaceUnaryOperator_\\\\w+_(Not|Invert)",
-]
-"""
+PROGRAMS = ("show", "cli.py", "train.py", "evaluate.py")  # drawn from if named
+LAST = "tests/test_same_numbers.py"  # trains once, and compares all figures
+TEST_SECONDS = 200
+ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
+PAIRS = (
+    *((ast.Eq, ast.NotEq), (ast.Is, ast.IsNot), (ast.In, ast.NotIn), (ast.And, ast.Or)),
+    *((ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.BitAnd, ast.BitOr)),
+)
+SWAPS = (
+    *((a, b) for a in ORDERS for b in ORDERS if a is not b),
+    *PAIRS,
+    *((b, a) for a, b in PAIRS),
+    *((ast.FloorDiv, ast.Mult), (ast.Mod, ast.FloorDiv), (ast.Pow, ast.Mult)),
+)
+NAMES = (
+    *(("min", "max"), ("minimum", "maximum"), ("argmin", "argmax"), ("any", "all")),
+    *(("zeros", "ones"), ("sin", "cos"), ("floor", "ceil")),
+)
+RENAMED = {**dict(NAMES), **{b: a for a, b in NAMES}}
+Change = tuple[ast.expr | ast.stmt, ast.expr | str]
 
 
-def survivors(module: str, copy: Path) -> tuple[int, list[str]]:
-    """How many mutants of a module were tried, and the changes that its tests let pass."""
-    scripts, session = Path(sys.executable).parent, copy / "session.sqlite"
-    config = copy / "cosmic-ray.toml"
-    config.write_text(CONFIG.format(module=module, python=sys.executable, tests=TESTS[module]))
-    session.unlink(missing_ok=True)
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(copy),
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        "JAX_COMPILATION_CACHE_DIR": str(copy / "cache"),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-    }
+class Mutant(NamedTuple):
+    """Another text for the bytes from `start` to `end` of a module."""
 
-    def run(*command: str | Path) -> None:
-        subprocess.run(list(map(str, command)), cwd=copy, env=environment, check=True)
+    module: Path
+    line: int
+    start: int
+    end: int
+    text: str
 
-    run(scripts / "cosmic-ray", "init", config, session)
-    run(scripts / "cr-filter-operators", session, config)
-    with use_db(str(session)) as db:
-        mutants = sorted(
-            db.pending_work_items,
-            key=lambda item: (item.mutations[0].start_pos, item.mutations[0].operator_name),
+    def describe(self, root: Path) -> str:
+        """The place, and what is there before and after.
+
+        Args:
+          root: The checkout.
+        """
+        before = (root / self.module).read_bytes()[self.start : self.end].decode()
+        return f"{self.module}:{self.line}: " + " ".join(f"{before}  ->  {self.text}".split())
+
+
+def changes(node: ast.AST, is_setting: bool) -> Iterator[Change]:
+    """Expressions and statements, each with what may stand in its place.
+
+    Args:
+      node: An expression or a statement, with `test` or without.
+      is_setting: Whether it is outside of functions.
+    """
+
+    def but(**fields: object) -> Change:
+        changed = copy.copy(node)
+        vars(changed).update(fields)
+        return node, changed
+
+    match node:
+        case ast.Compare(ops=[op]):
+            yield from (but(ops=[b()]) for a, b in SWAPS if type(op) is a)
+        case ast.BinOp(op=op) | ast.BoolOp(op=op) | ast.AugAssign(op=op):
+            if not (is_setting and isinstance(op, ast.BitOr)):  # an alias of types
+                yield from (but(op=b()) for a, b in SWAPS if type(op) is a)
+        case ast.UnaryOp(operand=operand) if not isinstance(operand, ast.Constant):
+            yield node, operand
+        case ast.Constant(value=bool(value)):
+            yield but(value=not value)
+        case ast.Constant(value=int(value)) if not is_setting:
+            yield from (but(value=value + shift) for shift in (-1, 1))
+        case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test):
+            yield test, ast.UnaryOp(ast.Not(), test)
+        case ast.Expr(value=ast.Call()) | ast.Raise(exc=ast.expr()):
+            yield node, "pass"
+        case ast.Call(func=ast.Attribute(attr="replace"), keywords=given) if all(
+            keyword.arg for keyword in given
+        ):
+            yield from (but(keywords=given[:i] + given[i + 1 :]) for i in range(len(given)))
+        case ast.Attribute(attr=name) if name in RENAMED:
+            yield but(attr=RENAMED[name])
+        case ast.Name(id=name) if name in RENAMED:
+            yield but(id=RENAMED[name])
+
+
+def _places(node: ast.AST, is_setting: bool = True) -> Iterator[tuple[ast.AST, bool]]:
+    """The nodes of a tree to change, and whether they are outside of functions."""
+    yield node, is_setting
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST) and not _is_left_out(child):
+                inside = isinstance(node, ast.FunctionDef)
+                yield from _places(child, is_setting and not inside)
+
+
+def _is_left_out(node: ast.AST) -> bool:
+    match node:
+        case ast.JoinedStr() | ast.Assert():
+            return True
+        case ast.Expr(value=ast.Call(func=ast.Attribute(value=ast.Name(id="chex")))):
+            return True
+    return False
+
+
+def mutants(module: Path, source: str) -> Iterator[Mutant]:
+    """All mutants of a module.
+
+    Args:
+      module: Its path in the checkout.
+      source: Its text.
+    """
+    starts = [0]
+    for line in source.encode().splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+    for node, is_setting in _places(ast.parse(source)):
+        for old, new in changes(node, is_setting):
+            assert old.end_lineno is not None
+            assert old.end_col_offset is not None
+            yield Mutant(
+                module,
+                old.lineno,
+                starts[old.lineno - 1] + old.col_offset,
+                starts[old.end_lineno - 1] + old.end_col_offset,
+                new if isinstance(new, str) else _text(new),
+            )
+
+
+def _text(new: ast.AST) -> str:
+    text = ast.unparse(new)
+    return f"({text})" if isinstance(new, ast.expr) else text
+
+
+def draw(root: Path, modules: list[Path], number: int, seed: int) -> list[Mutant]:
+    """Mutants of lines drawn at random, one of each.
+
+    Args:
+      root: The checkout.
+      modules: Modules, as paths in it.
+      number: How many lines; fewer if there are not so many.
+      seed: Of the draw.
+    """
+    lines = defaultdict(list)
+    for module in modules:
+        for mutant in mutants(module, (root / module).read_text()):
+            lines[module, mutant.line].append(mutant)
+    chance = random.Random(seed)
+    drawn = chance.sample(sorted(lines), min(number, len(lines)))
+    return [chance.choice(lines[line]) for line in drawn]
+
+
+def tests_of(root: Path, module: Path) -> list[str]:
+    """Test files for a module, the nearest first.
+
+    Args:
+      root: The checkout.
+      module: Its path in it.
+    """
+    package = Path(module.parts[1]).stem
+    imports = re.compile(rf"jaxsense\.{package}\b|from jaxsense import\b.*\b{package}\b")
+
+    def distance(test: Path) -> int:
+        near = test.parent in (root / "tests", root / "tests" / package)
+        if near and f"_{module.stem}_" in f"{test.stem}_":
+            return 0
+        if test.parent.name == package or f"{test.stem}_".startswith(f"test_{package}_"):
+            return 1
+        if test == root / LAST:
+            return 2
+        return 3 if imports.search(test.read_text()) else 4
+
+    found = sorted((distance(test), test) for test in (root / "tests").rglob("test_*.py"))
+    return [str(test.relative_to(root)) for away, test in found if away < 4]
+
+
+def run_tests(
+    root: Path, tests: list[str], *options: str, limit: float | None = None
+) -> int | None:
+    """Status of pytest, or None if it takes too long.
+
+    Args:
+      root: A checkout.
+      tests: Test files in it.
+      *options: Options of pytest.
+      limit: Seconds.
+    """
+    command = [sys.executable, "-m", "pytest", "-o", "addopts=", "-m", "not slow", "-q", "-x"]
+    command += ["-p", "no:cacheprovider", "--timeout", str(TEST_SECONDS)]
+    command += ["--basetemp", str(root.parent / f"{root.name}.tmp"), *options, *tests]
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(root), environment.get("PYTHONPATH", "")])
+    environment["JAX_COMPILATION_CACHE_DIR"] = str(root.parent / "cache")
+    environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+    with (root.parent / f"{root.name}.log").open("w") as log:
+        process = subprocess.Popen(
+            command, cwd=root, env=environment, stdout=log, stderr=log, start_new_session=True
         )
-        tried = random.Random(SEED).sample(mutants, min(NUMBER, len(mutants)))
-        for item in mutants:
-            if item not in tried:
-                db.set_result(item.job_id, WorkResult(WorkerOutcome.SKIPPED))
-    run(scripts / "cosmic-ray", "baseline", config)
-    run(scripts / "cosmic-ray", "exec", config, session)
-    with use_db(str(session)) as db:
-        ids = {item.job_id for item in tried}
-        results = [result for id_, result in db.results if id_ in ids]
-        return len(tried), [str(r.diff) for r in results if not r.is_killed]
+        try:
+            return process.wait(limit)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+
+
+def is_killed(root: Path, mutant: Mutant, limit: float) -> bool:
+    """Whether a test fails on a mutant in time.
+
+    Args:
+      root: A checkout, which is as before afterwards.
+      mutant: What to change in it.
+      limit: Seconds.
+
+    Raises:
+      RuntimeError: If pytest finds no tests.
+    """
+    path = root / mutant.module
+    whole = path.read_bytes()
+    path.write_bytes(whole[: mutant.start] + mutant.text.encode() + whole[mutant.end :])
+    try:
+        status = run_tests(root, tests_of(root, mutant.module), limit=limit)
+    finally:
+        path.write_bytes(whole)
+    if status in (4, 5):
+        raise RuntimeError((root.parent / f"{root.name}.log").read_text())
+    return status not in (0, None)
+
+
+def modules_of(root: Path, names: list[str]) -> list[Path]:
+    """Modules of the named files and folders, or of the package.
+
+    Args:
+      root: The checkout.
+      names: Paths in it.
+    """
+    left_out = () if names else PROGRAMS
+    paths = [root / name for name in names or ["jaxsense"]]
+    files = {file for path in paths for file in (path.rglob("*.py") if path.is_dir() else [path])}
+    modules = sorted(file.relative_to(root) for file in files if file.name != "__init__.py")
+    return [module for module in modules if module.parts[1] not in left_out]
 
 
 def main() -> None:
-    """Tries the modules that are named, or all, and prints the share that was killed."""
-    number, alive = 0, []
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "copy"
-        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", "runs", "docs"))
-        for module in sys.argv[1:] or TESTS:
-            tried, passed = survivors(module, copy)
-            number, alive = number + tried, alive + passed
-            print(f"{module}: {tried - len(passed)} of {tried} killed", *passed, sep="\n")
-            sys.stdout.flush()
-    print(f"{number - len(alive)} of {number} killed, {1 - len(alive) / number:.1%}")
+    """Tries mutants side by side, and prints the survivors and the share that was killed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="PATH", help="modules and folders of jaxsense/")
+    parser.add_argument("--number", type=int, default=60, help="mutants (default: 60)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="at the same time")
+    parser.add_argument("--limit", type=float, default=300, help="seconds for each (default: 300)")
+    parser.add_argument("--list", action="store_true", help="only print the mutants")
+    given = parser.parse_args()
+    drawn = draw(ROOT, modules_of(ROOT, given.names), given.number, given.seed)
+    if given.list:
+        print(*(mutant.describe(ROOT) for mutant in drawn), sep="\n")
+        return
+    tried, killed = Counter(), Counter()
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.jobs) as pool:
+        copies: queue.Queue[Path] = queue.Queue()
+        ignored = shutil.ignore_patterns(".*", "runs", "_build", "generated", "__pycache__")
+        for i in range(given.jobs):
+            copies.put(Path(shutil.copytree(ROOT, Path(folder) / str(i), ignore=ignored)))
+
+        def attempt(mutant: Mutant) -> bool:
+            root = copies.get()
+            try:
+                return is_killed(root, mutant, given.limit)
+            finally:
+                copies.put(root)
+
+        # Without mutants the tests must pass; they leave compiled programs for those with one.
+        tests = sorted({test for mutant in drawn for test in tests_of(ROOT, mutant.module)})
+        if run_tests(Path(folder) / "0", tests, "-n", str(given.jobs), "--dist", "loadfile") != 0:
+            sys.exit((Path(folder) / "0.log").read_text())
+        for mutant, is_dead in zip(drawn, pool.map(attempt, drawn), strict=True):
+            package = str(Path(*mutant.module.parts[:2]))
+            tried[package] += 1
+            killed[package] += is_dead
+            if not is_dead:
+                print("survived", mutant.describe(ROOT), flush=True)
+    for package in sorted(tried):
+        print(f"{package}: {killed[package]} of {tried[package]} killed")
+    print(f"{killed.total()} of {tried.total()} killed, {killed.total() / tried.total():.1%}")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ EXPECTED = (
     "multivae",
     # Not a package of Python.
     "none of chromium",
+    "Python 3.11 is not installed",
+    "Python 3.12 is not installed",
 )
 """How the reasons of expected skips begin."""
 
