@@ -135,16 +135,10 @@ class MetricsTable(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """Writes one row for each metric."""
-        rows = ["| key | name | meaning | paper |", "| --- | --- | --- | --- |"]
-        for block, listed in summary.BLOCKS.items():
-            for metric in listed.values():
-                cells = (
-                    f"`{block}.{metric.key}`".replace("`.", "`"),
-                    metric.label,
-                    metric.meaning,
-                    metric.paper,
-                )
-                rows.append("| " + " | ".join(cell.replace("*", r"\*") for cell in cells) + " |")
+        rows = ["| key | name | meaning |", "| --- | --- | --- |"]
+        for place, block in summary.BLOCKS.items():
+            for metric in block.values():
+                rows.append(f"| `{place}{metric.key}` | {metric.label} | {metric.meaning} |")
         return self.parse_text_to_nodes("\n".join(rows))
 
 

@@ -14,14 +14,14 @@ from jaxsense.show.colours import modality_colour
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def parse(path, steps=60):
-    animation.write(path, CONFIG, recording(steps), CLASS_BELIEFS, "latent policy")
-    return ElementTree.fromstring(path.read_text())
+def draw(config=CONFIG, played=None):
+    played = played or recording()
+    return animation.draw(config, played.records, played.end, CLASS_BELIEFS, "latent policy")
 
 
 @pytest.fixture(scope="module")
-def picture(tmp_path_factory):
-    return parse(tmp_path_factory.mktemp("film") / "mission.svg")
+def picture():
+    return ElementTree.fromstring(draw())
 
 
 def part(picture, name):
@@ -85,11 +85,10 @@ def test_robots_and_beliefs_are_where_they_were(picture):
 def test_headings_tell_what_a_robot_does_and_the_time(picture):
     moving = part(picture, "film-moving")
     texts = {t.text: t for t in moving.iter(f"{SVG}text")}
-    assert {"camera asks", "camera drives to 2", "camera looks at 2", "camera has ended"} <= set(
-        texts
-    )
-    assert {"0 s", "1 s", "5 s", "6.0 s", "lidar has ended"} <= set(texts)
-    (track,) = tracks(texts["camera looks at 2"])
+    for doing in ("choosing", "driving to 2", "looking at 2", "done"):
+        assert f"camera: {doing}" in texts
+    assert {"0 s", "1 s", "5 s", "6.0 s", "lidar: done"} <= set(texts)
+    (track,) = tracks(texts["camera: looking at 2"])
     # Periods 30 to 39, in frames 31 to 40, of 0.05 s each in 6 s.
     shown = [value_at(track, (frame + 0.5) * 0.05 / 6.0)[0] for frame in range(60)]
     np.testing.assert_array_equal(np.flatnonzero(shown), np.arange(31, 41))
@@ -104,16 +103,20 @@ def test_without_motion_the_end_is_shown(picture):
     assert not tracks(still)
     for track_less in (moving, still):  # where nothing plays, attributes are as in the file
         texts = [t.text for t in track_less.iter(f"{SVG}text") if t.get("opacity", "1") == "1"]
-        assert {"camera has ended", "6.0 s"} <= set(texts)
-        assert "camera drives to 2" not in texts
+        assert {"camera: done", "6.0 s"} <= set(texts)
+        assert "camera: driving to 2" not in texts
 
 
-def test_the_longest_mission_is_still_small(tmp_path):
-    parse(tmp_path / "mission.svg", steps=1200)
-    assert (tmp_path / "mission.svg").stat().st_size < 300_000
+def test_the_longest_mission_is_still_small():
+    assert len(draw(played=recording(1200))) < 300_000
 
 
-def test_six_robots_are_drawn_and_named(tmp_path):
+def test_a_film_stops_after_three_times(picture):
+    # What moves beside a text for more than five seconds must come to an end (WCAG 2.2.2).
+    assert {track.get("repeatCount") for track in tracks(picture)} == {"3"}
+
+
+def test_six_robots_are_drawn_and_named():
     robots = ("camera", "lidar", "camera", "camera", "lidar", "camera")
     config = dataclasses.replace(CONFIG, robots=robots)
     two = recording()
@@ -124,9 +127,7 @@ def test_six_robots_are_drawn_and_named(tmp_path):
     record.poses[:, :, 1] += np.linspace(-0.5, 0.5, 6)
     faults = SimpleNamespace(blind_at=np.full(6, np.inf))
     end = SimpleNamespace(**{**vars(two.end), "faults": faults})
-    path = tmp_path / "mission.svg"
-    animation.write(path, config, type(two)(end, record), CLASS_BELIEFS, "latent policy")
-    picture = ElementTree.fromstring(path.read_text())
+    picture = ElementTree.fromstring(draw(config, type(two)(end, record)))
     assert "robots with camera and lidar look at 3 points" in picture.find(f"{SVG}title").text
     names = ("camera 1", "lidar 1", "camera 2", "camera 3", "lidar 2", "camera 4")
     for name in ("film-moving", "film-still"):
@@ -138,8 +139,8 @@ def test_six_robots_are_drawn_and_named(tmp_path):
         colours = [modality_colour(robot == "lidar") for robot in robots]
         assert [trail.get("stroke") for trail in trails] == colours
         # A line of text with a mark for each, below one another and within the picture.
-        lines = [t for t in half.iter(f"{SVG}text") if t.text and t.text.endswith("has ended")]
-        assert [line.text for line in lines] == [f"{name} has ended" for name in names]
+        lines = [t for t in half.iter(f"{SVG}text") if t.text and t.text.endswith(": done")]
+        assert [line.text for line in lines] == [f"{name}: done" for name in names]
         heights = [float(line.get("y")) for line in lines]
         assert np.all(np.diff(heights) > 20)
         assert heights[-1] < float(picture.get("viewBox").split()[3])
@@ -147,8 +148,7 @@ def test_six_robots_are_drawn_and_named(tmp_path):
     assert len(fields) == 6
 
 
-def test_a_film_of_one_kind_of_robots_names_no_other(tmp_path):
+def test_a_film_of_one_kind_of_robots_names_no_other():
     config = dataclasses.replace(CONFIG, robots=("camera", "camera"))
-    animation.write(tmp_path / "film.svg", config, recording(), CLASS_BELIEFS, "latent policy")
-    picture = ElementTree.fromstring((tmp_path / "film.svg").read_text())
+    picture = ElementTree.fromstring(draw(config))
     assert "robots with camera look at" in picture.find(f"{SVG}title").text

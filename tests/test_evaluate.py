@@ -15,6 +15,8 @@ from xml.etree import ElementTree
 import jax
 import numpy as np
 import pytest
+import rich.console
+from recordings import recording
 from smoke import MISSION_KEYS, error_line
 
 import jaxsense
@@ -38,12 +40,19 @@ def evaluated(smoke_run, tmp_path_factory, cache):
     return path, before, printed.getvalue()
 
 
-def test_evaluate_writes_the_mission_block_of_the_summary_and_no_other(evaluated):
+NAME = "3-points-3-m-1-camera-1-lidar-seed-0-1-missions"
+
+
+def read(path, name=NAME):
+    return json.loads((path / "evaluations" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def test_evaluate_writes_a_file_of_its_own_and_leaves_the_runs_figures(evaluated):
     path, before, _ = evaluated
-    after = json.loads((path / "summary.json").read_text())
-    blocks = after.pop("mission")
-    before.pop("mission")
-    assert after == before
+    assert json.loads((path / "summary.json").read_text()) == before
+    found = read(path)
+    blocks = found.pop("mission")
+    assert found == {"num_pois": 3, "side": 3.0, "robots": ["camera", "lidar"]}
     assert set(blocks) == {*mission.POLICIES, "bytes_per_detection"}
     for policy in mission.POLICIES:
         # The policies of an untrained team may be less accurate than naive exploration.
@@ -51,50 +60,65 @@ def test_evaluate_writes_the_mission_block_of_the_summary_and_no_other(evaluated
         assert set(blocks[policy]) | compared == MISSION_KEYS | {"seed"} | compared
         assert ("intervals" in blocks[policy]) == (policy != "latent")
         assert (blocks[policy]["episodes"], blocks[policy]["seed"]) == (1, 0)
+    assert (path / "evaluations" / f"{NAME}.png").read_bytes()[:4] == b"\x89PNG"
 
 
-@pytest.mark.slow  # plays twice; the next test has what is kept of a summary, without playing
-def test_an_evaluation_keeps_what_another_one_has_written_meanwhile(
-    evaluated, tmp_path, cache, monkeypatch
-):
-    path, play, is_first = tmp_path / "run", missions.Player.play, [True]
-    shutil.copytree(evaluated[0], path)
-    begin = ["--episodes", "7", *cache]  # a batch whose programs are there
-
-    def meanwhile(*args):
-        if is_first.pop() if is_first else False:
-            evaluate.main([str(path), "--policy", "naive", "--seed", "3", *begin])
-        return play(*args)
-
-    monkeypatch.setattr(missions.Player, "play", meanwhile)
-    evaluate.main([str(path), "--policy", "latent", "--seed", "4", *begin])
-    blocks = json.loads((path / "summary.json").read_text(encoding="utf-8"))["mission"]
-    expected = {**dict.fromkeys(mission.POLICIES, 0), "latent": 4, "naive": 3}
-    assert {name: blocks[name]["seed"] for name in mission.POLICIES} == expected
-    # Nothing compares policies of different arenas.
-    assert not any({"intervals", "of_naive"} & set(block) for block in blocks.values())
+def write(arguments, missions):
+    config, models = jaxsense.load(arguments.run)
+    played = recording()
+    return evaluate._write(arguments, config, config, models.fusion.classes, missions, played)
 
 
-def test_an_evaluation_waits_for_another_one_that_writes(evaluated, tmp_path):
+def test_policies_that_play_in_the_same_arenas_share_a_file(evaluated, tmp_path):
     path = tmp_path / "run"
     shutil.copytree(evaluated[0], path)
-    config, models = jaxsense.load(path)
-    summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
-    found = {"latent": summary["mission"]["latent"]}
-    arguments = evaluate.Arguments(path, seed=7)
+    blocks = read(path)["mission"]
+    one = {name: blocks[name] for name in ("nearest", "bytes_per_detection")}
+    one["nearest"]["time_s"] = 99.0
+    write(evaluate.Arguments(path, episodes=1), one)
+    assert read(path)["mission"]["nearest"]["time_s"] == 99.0
+    assert set(read(path)["mission"]) == set(blocks)
+    # Of another seed, nothing is compared with them.
+    write(evaluate.Arguments(path, episodes=1, seed=3), one)
+    of_seed = read(path, NAME.replace("seed-0", "seed-3"))["mission"]
+    assert set(of_seed) == {"nearest", "bytes_per_detection"}
+    assert of_seed["nearest"]["seed"] == 3
+    page = (path / "report.html").read_text(encoding="utf-8")
+    assert page.count("Evaluation: 3 PoIs in 3 m") == 2
 
-    def write():
-        evaluate._write(arguments, (config, config), models.class_beliefs, found, None)
 
+def test_an_evaluation_waits_for_another_one_that_writes_and_says_so(evaluated, tmp_path, capsys):
+    path = tmp_path / "run"
+    shutil.copytree(evaluated[0], path)
+    blocks, said = read(path)["mission"], ""
+    one = {name: blocks[name] for name in ("latent", "bytes_per_detection")}
     with ThreadPoolExecutor(1) as executor:
         with files.locked(path):
-            writing = executor.submit(write)
-            assert not wait((writing,), timeout=0.5).done
-            summary["mission"]["naive"]["seed"] = 8
-            (path / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+            writing = executor.submit(write, evaluate.Arguments(path, episodes=1), one)
+            while not said:
+                assert not wait((writing,), timeout=0.1).done
+                said = capsys.readouterr().out
+            blocks["naive"]["time_s"] = 77.0
+            changed = {**read(path), "mission": blocks}
+            (path / "evaluations" / f"{NAME}.json").write_text(json.dumps(changed))
         writing.result()
-    blocks = json.loads((path / "summary.json").read_text(encoding="utf-8"))["mission"]
-    assert (blocks["latent"]["seed"], blocks["naive"]["seed"]) == (7, 8)
+    assert said == f"Waiting for another process to finish writing to {path}.\n"
+    assert read(path)["mission"]["naive"]["time_s"] == 77.0
+
+
+def test_paths_are_printed_as_they_are(evaluated, tmp_path, capsys):
+    path = tmp_path / f"a[b]{'c' * 90}"
+    shutil.copytree(evaluated[0], path)
+    blocks = read(path)["mission"]
+    for line in write(evaluate.Arguments(path, episodes=1, animate=True), blocks):
+        evaluate.say(line)
+    film, metrics = capsys.readouterr().out.splitlines()
+    assert film == f"The first mission of latent is in {path}/mission-latent-0.svg."
+    assert f" {path}/evaluations/{NAME}.json, and with all others in {path}/report.html." in metrics
+    evaluate._print(rich.console.Console(width=80), blocks, 1)
+    printed = capsys.readouterr().out
+    assert "The latent policy is" in printed
+    assert max(map(len, printed.split("The latent")[0].splitlines())) <= 80
 
 
 def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):
@@ -125,34 +149,12 @@ def test_evaluate_prints_the_comparison(evaluated):
         "latent",
         "naive",
         "random",
-        "accuracy",
-        "goals",
+        "right",
+        "against",
         "control steps/s",
         "11 missions",  # one of each policy
     ):
         assert words in printed
-
-
-@pytest.mark.parametrize(
-    ("place", "change"),
-    [
-        ("home", {"time_s": None}),
-        ("home", {"accuracy": "all"}),
-        ("home", {"observations_per_poi": {}}),
-        ("elsewhere", {"time_s": {}}),
-    ],
-)
-def test_a_summary_that_no_plot_can_show_is_refused(place, change):
-    case = {"episodes": 2, "accuracy": 1.0, "observations_per_poi": 2.0, "time_s": 9.0}
-    arena = {"num_pois": 8, "side": 4.0, "robots": ["camera"]}
-    sound = {"naive": case, "naive_2": case, "latent": case}
-    broken = {**sound, "naive": {**case, **change}}
-    summary = {"mission": sound, "elsewhere": {"there": {**arena, "mission": sound}}}
-    pictures = evaluate._pictures(Path("run"), PRESETS["smoke"], summary)
-    assert [*pictures] == ["policies.png", "teams.png"]
-    (summary if place == "home" else summary["elsewhere"]["there"])["mission"] = broken
-    with pytest.raises(ConfigError, match=r"run = 'run': must hold the summary.json of a finished"):
-        evaluate._pictures(Path("run"), PRESETS["smoke"], summary)
 
 
 def test_missions_elsewhere_have_the_settings_that_are_asked_for():
@@ -163,10 +165,10 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
     there = evaluate._elsewhere(arguments, config)
     assert (there.arena.side, there.arena.num_pois) == (4.0, 3)
     assert there.carried == ("camera", "camera", "lidar")
-    assert evaluate._name(there) == "3-points-4-m-2-camera-1-lidar"
+    assert evaluate._place(there) == "3-points-4-m-2-camera-1-lidar"
     # Also 64 robots have a name that a file may bear.
     crowd = dataclasses.replace(there, robots=("camera", "lidar") * 32)
-    assert evaluate._name(crowd) == "3-points-4-m-32-camera-32-lidar"
+    assert evaluate._place(crowd) == "3-points-4-m-32-camera-32-lidar"
     # However it is named, a team plays in the same arenas.
     mixed = evaluate.Arguments(
         path, arena=evaluate.ArenaArguments(side=4.0), robots=("camera", "lidar", "camera")
@@ -199,34 +201,31 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
 def test_other_robots_play_apart_from_a_runs_own(smoke_run, tmp_path, cache):
     path = tmp_path / "run"
     shutil.copytree(smoke_run, path)
-    before = json.loads((path / "summary.json").read_text(encoding="utf-8"))
     options = "--robots", "camera", "camera", "lidar", "--episodes", "3", "--animate"
     for policy in ("nearest", "camera_2_alone"):
         evaluate.main([str(path), *options, "--policy", policy, *cache])
-    after = json.loads((path / "summary.json").read_text(encoding="utf-8"))
-    (name, place), *others = after.pop("elsewhere").items()
-    assert not others
-    assert after == before
-    assert name == "3-points-3-m-2-camera-1-lidar"
-    assert (place["num_pois"], place["side"]) == (3, 3.0)
-    assert place["robots"] == ["camera", "camera", "lidar"]
+    (file,) = (path / "evaluations").glob("*.json")
+    assert file.stem == "3-points-3-m-2-camera-1-lidar-seed-0-3-missions"
+    found = read(path, file.stem)
+    assert (found["num_pois"], found["side"]) == (3, 3.0)
+    assert found["robots"] == ["camera", "camera", "lidar"]
     # Of both evaluations.
-    assert set(place["mission"]) == {"nearest", "camera_2_alone", "bytes_per_detection"}
-    assert {"told", "ambiguous_reported"} <= set(place["mission"]["camera_2_alone"])
-    film = ElementTree.parse(path / f"mission-nearest-0-{name}.svg")
+    assert set(found["mission"]) == {"nearest", "camera_2_alone", "bytes_per_detection"}
+    assert {"told", "ambiguous_reported"} <= set(found["mission"]["camera_2_alone"])
+    film = ElementTree.parse(path / "mission-nearest-0-3-points-3-m-2-camera-1-lidar.svg")
     lines = {text.text for text in film.iter("{http://www.w3.org/2000/svg}text")}
-    assert {"camera 1 asks", "camera 2 asks", "lidar asks"} <= lines
+    assert {"camera 1: choosing", "camera 2: choosing", "lidar: choosing"} <= lines
     assert (path / "teams.png").read_bytes()[:4] == b"\x89PNG"
-    assert "with other robots" in (path / "report.html").read_text(encoding="utf-8")
+    assert "2 camera, 1 lidar" in (path / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(smoke_run, evaluated):
     path, _, _ = evaluated
     for report, episodes, films in ((smoke_run, 4, 1), (path, 1, 2)):
         text = (report / "report.html").read_text()
-        assert text.count("<img") == 5
-        assert text.count("<use") == films
-        assert f"<td>{episodes}</td>" in text
+        assert text.count("image/svg+xml") == 2 * films
+        assert text.count("image/png") == 4 + films  # policies for each set of arenas
+        assert f"{episodes} missions of each policy" in text
 
 
 def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cache):

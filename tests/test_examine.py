@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import examine
+from jaxsense import examine, summary
 from jaxsense.config import (
-    ArenaConfig,
     Config,
     DqnConfig,
     EvaluationConfig,
@@ -222,7 +221,7 @@ def played():
 def test_policies_are_played_from_every_state_and_from_random_starts(played):
     total, first = map(np.asarray, played(jnp.array([0.0, 0.0, 0.0, 1.0]), EXACT))
     assert total.shape == first.shape == (4, NUM_STATES + 16)
-    of = dict(zip(examine.MDP_POLICIES, total, strict=True))
+    of = dict(zip(summary.MDP_POLICIES, total, strict=True))
     np.testing.assert_array_equal(of["return"], 0.0)  # always NOP
     # The means over all states; a policy is at best as good.
     optimal, naive, uniform = (
@@ -231,7 +230,7 @@ def test_policies_are_played_from_every_state_and_from_random_starts(played):
     assert optimal > naive > uniform
     # It goes on where the camera has not seen all: bits 0, 2 and 4 of the number of a state.
     goes_on = np.arange(NUM_STATES) % 64 & 0b010101 != 0b010101
-    of_naive = first[examine.MDP_POLICIES.index("naive"), :NUM_STATES]
+    of_naive = first[summary.MDP_POLICIES.index("naive"), :NUM_STATES]
     np.testing.assert_array_equal(of_naive != 0, goes_on)
     # The camera's own looks alone: no state pays more than three of the best, from a variance of
     # 20 in three dimensions to sqrt(3).
@@ -261,7 +260,7 @@ def test_with_a_filter_the_optimum_is_by_the_total_of_the_own_sensors_looks():
         inputs = modality, with_bias(jnp.zeros(4)), params, values, EXACT, filtered
         return examine.compare_policies(jax.random.key(0), *inputs)
 
-    optimal = examine.MDP_POLICIES.index("optimal")
+    optimal = summary.MDP_POLICIES.index("optimal")
     total, first = play(jnp.int32(0))
     np.testing.assert_array_equal(total[optimal], 0.0)
     total, first = play(jnp.int32(1))
@@ -280,33 +279,3 @@ def test_the_return_of_the_greedy_policy_is_the_mean_over_random_starts():
     total = returned(jnp.array([1.0, 0.0, 0.0, 0.0]))
     assert -8 < total < -7 + 1 / 3**0.5
     assert np.isnan(returned(jnp.array([jnp.nan, 0.0, 0.0, 1.0])))
-
-
-# Two PoIs of two classes and one sensor: 2^2 x 2^2 states, of which half hold both classes.
-SMALL = Config(
-    modalities=("camera",),
-    arena=ArenaConfig(num_pois=2, classes=("green cylinder", "red cylinder")),
-    jmvae=JmvaeConfig(reconstruction_weights=(1.0,)),
-    evaluation=EvaluationConfig(num_starts=3),
-)
-
-
-def test_figures_of_policies_as_worked_by_hand():
-    # Sixteen states and three random starts, of which the figures are means.
-    of_states = np.zeros((4, 16))
-    # .02 and .009 below the optimum, of which .01 is let pass; more than the optimum is too. The
-    # classes of the first and last four states are equal, of the others different.
-    of_states[1, [0, 1, 4, 5, 10]] = 0.02, 0.009, 0.02, 0.009, 0.5
-    of_states[0, 15] = 1.0
-    of_starts = np.array([[0.9, 1.0, 1.1], [1.0, 1.1, 1.2], [0.5, 0.5, 0.8], [-1.0, 0.0, -0.5]])
-    total = np.concatenate([of_states, of_starts], axis=1)
-    figures = examine.policy_metrics(total, total / 2, SMALL)
-    expected = {"return": 1.0, "optimal": 1.1, "naive": 0.6, "random": -0.5}
-    assert {name: figures[name] for name in expected} == pytest.approx(expected)
-    assert figures["fraction_of_optimal"] == pytest.approx(1 / 1.1)
-    one_step = {"policy": 0.5, "optimal": 0.55, "random": -0.25}
-    assert figures["one_step"] == pytest.approx(one_step)
-    assert (figures["optimal_states"], figures["num_states"]) == (13, 16)
-    assert (figures["optimal_permutations"], figures["num_permutations"]) == (6, 8)
-    nothing = examine.policy_metrics(np.zeros((4, 19)), np.zeros((4, 19)), SMALL)
-    assert nothing["fraction_of_optimal"] is None

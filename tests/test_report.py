@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxsense.config import PRESETS, SHAPES, ArenaConfig, Attribute, Shape
+from jaxsense.config import POLICIES, PRESETS, SHAPES, ArenaConfig, Attribute, Shape
 from jaxsense.core.types import Belief
-from jaxsense.show import colours, plots
+from jaxsense.show import colours, mission_plots, plots
 from jaxsense.sim import sensors
 
 CONFIG = PRESETS["smoke"]
@@ -56,7 +56,7 @@ def test_a_latent_space_of_one_dimension_is_drawn():
 
 @pytest.fixture(scope="module")
 def scanlines():
-    """Axes of a plot in which camera and LiDAR look at a place 0.4 full scale, on the left 0.8."""
+    """Axes of a plot in which camera and LiDAR see a position 0.4 full scale, on the left 0.8."""
     windows = {}
     for sensor in sensors.make(CONFIG):
         is_left = sensor.angles[:: sensor.stride][: sensor.window]
@@ -69,13 +69,36 @@ def scanlines():
 
 
 def test_camera_and_lidar_are_drawn_from_left_to_right(scanlines):
-    for ax in scanlines.flat:
-        assert ax.get_xlabel().endswith("of the window, left to right")
     row = scanlines[0, 0].images[0].get_array()[0]
     assert row.shape == (CONFIG.camera.window, 3)
     ranges = scanlines[1, 0].lines[0].get_ydata()
     for left, *_, right in (row[:, 0], ranges):
         assert left > right
+    # All distances on one scale.
+    for ax in scanlines[1]:
+        assert ax.get_ylim() == (0.0, pytest.approx(1.05 * 0.8))
+
+
+def test_plots_of_sixteen_classes_have_room_for_all(recwarn):
+    shapes = {**SHAPES, "post": Shape("cylinder", (0.5, 0.5)), "slab": Shape("box", (1.0, 0.5))}
+    paints = {"red": (0.8, 0.1, 0.1), "green": (0.1, 0.7, 0.1), "blue": (0.1, 0.1, 0.8)}
+    paints["grey"] = (0.5, 0.5, 0.5)
+    classes = tuple(f"{colour} {shape}" for colour in paints for shape in shapes)
+    arena = ArenaConfig(shapes=shapes, colours=paints, classes=classes)
+    config = replace(CONFIG, arena=arena, jmvae=replace(CONFIG.jmvae, latent_size=8))
+    sizes = {sensor.name: sensor.window * sensor.channels for sensor in sensors.make(config)}
+    windows = {name: np.full((16, 1, size), 0.5) for name, size in sizes.items()}
+    belief = Belief(np.random.default_rng(0).normal(size=(16, 9, 8)), np.full((16, 9, 8), 0.1))
+    of_all = dict.fromkeys(("joint", "camera", "lidar"), belief)
+    for figure in (plots.scanlines(config, windows), plots.latent_space(config, of_all)):
+        figure.draw_without_rendering()
+        width, height = figure.get_size_inches()
+        assert width < 16
+        for ax in figure.axes:
+            box = ax.get_position()
+            assert box.width * width > 0.1
+            assert box.height * height > 0.3
+    assert not recwarn.list
 
 
 def test_pixels_are_drawn_with_the_gamma_of_screens(scanlines):
@@ -125,65 +148,104 @@ def test_a_class_is_drawn_in_the_colour_of_its_pois_or_else_darker():
     np.testing.assert_allclose(found, [[0.1, 0.7, 0.1], [0.8, 0.1, 0.1], [0.4, 0.05, 0.05]])
 
 
+CURVES = {"reward": np.arange(40.0), "greedy": np.full(40, np.nan)}
+CURVES["greedy"][[9, 19, 29, 39]] = [1.0, 2.0, 3.0, 4.0]
+AGENT = {"return": 4.0, "optimal": 4.5, "naive": 3.0, "random": -1.0}
+
+
 def test_the_greedy_policy_is_drawn_where_it_was_played():
-    curves = {"reward": np.arange(40.0), "greedy": np.full(40, np.nan)}
-    curves["greedy"][[9, 19, 29, 39]] = [1.0, 2.0, 3.0, 4.0]
-    agent = {"return": 4.0, "optimal": 4.5, "naive": 1.0, "random": -1.0}
-    figure = plots.rewards({"camera": curves}, {"camera": agent})
+    figure = plots.rewards({"camera": CURVES}, {"camera": AGENT})
     lines = {line.get_label(): line for line in figure.axes[0].lines}
-    np.testing.assert_array_equal(lines["DQN, greedy"].get_xdata(), [9, 19, 29, 39])
-    np.testing.assert_array_equal(lines["DQN, greedy"].get_ydata(), [1, 2, 3, 4])
+    np.testing.assert_array_equal(lines["greedy"].get_xdata(), [9, 19, 29, 39])
+    np.testing.assert_array_equal(lines["greedy"].get_ydata(), [1, 2, 3, 4])
     # The mean of the last 20 epochs, from 20 to 39.
-    assert lines["DQN, exploring"].get_ydata()[-1] == 29.5
+    assert lines["exploring"].get_ydata()[-1] == 29.5
+    assert lines["optimal"].get_ydata()[0] == 4.5
+    # The axis begins as far below naive exploration as the optimum is above; a text has the rest.
+    assert figure.axes[0].get_ylim()[0] == 1.5
+    assert "random: -1.00" in lines
 
 
-def test_every_policy_stands_at_its_looks_and_its_share_of_wrong_points():
-    def case(accuracy, looks, seconds):
-        return {"accuracy": accuracy, "observations_per_poi": looks, "time_s": seconds}
+def test_episodes_of_a_team_are_not_drawn_beside_those_of_a_robot_alone():
+    figure = plots.rewards({"team": CURVES}, {"camera": AGENT, "lidar": AGENT})
+    of_team, alone = ({line.get_label() for line in ax.lines} for ax in figure.axes)
+    assert of_team == {"exploring"}
+    assert alone == {"greedy", "optimal", "naive", "random: -1.00"}
+    assert figure.axes[1].get_title() == "team: one camera robot alone on the map"
 
+
+def test_curves_of_several_seeds_have_a_band():
+    two = {kind: np.stack([values, values + 2]) for kind, values in CURVES.items()}
+    axes = plots.rewards({"camera": two}, {"camera": AGENT}).axes[0]
+    lines = {line.get_label(): line for line in axes.lines}
+    np.testing.assert_array_equal(lines["greedy"].get_ydata(), [2, 3, 4, 5])
+    assert len(axes.collections) == 2
+    nothing = {kind: np.zeros((0, 40)) for kind in CURVES}
+    plots.rewards({"camera": nothing}, {"camera": AGENT}).draw_without_rendering()
+
+
+def test_policies_stand_in_rows_by_their_time():
+    def case(accuracy, looks, seconds, **more):
+        of_case = {"accuracy": accuracy, "observations_per_poi": looks, "mean_time_s": seconds}
+        return {**of_case, **more}
+
+    slower = {"mean": 15.0, "low": 12.0, "high": 18.0}
+    more = {"mean": 3.5, "low": 3.0, "high": 4.0}
     block = {
         "latent": case(0.98, 2.5, 40.0),
-        "naive": case(0.9, 2.0, 42.0),
-        "naive_2": case(0.95, 4.0, 50.0),
-        "naive_3": case(1.0, 6.0, 55.0),
+        "naive_3": case(1.0, 6.0, 55.0, intervals={"observations_per_poi": more, "time_s": slower}),
+        "random": case(0.5, 1.0, 20.0),
         "camera_alone": case(0.5, 1.0, 20.0),
         "bytes_per_detection": {"latent": 16, "raw": 2000},
     }
-    by_looks, by_time = plots.missions(block).axes
-    line, latent, *naive = by_looks.lines
-    np.testing.assert_array_equal(line.get_xdata(), [2, 4, 6])
-    # All right is below every share of wrong points, at the end of the axis.
-    np.testing.assert_allclose(line.get_ydata(), [0.1, 0.05, 1e-4])
-    assert (latent.get_label(), latent.get_xdata()) == ("latent", [2.5])
-    np.testing.assert_allclose(latent.get_ydata(), [0.02])
-    assert [point.get_label() for point in naive] == ["naive", "naive 2", "naive 3"]
-    assert by_time.lines[1].get_xdata() == [40.0]
+    by_looks, by_time = mission_plots.policies(block).axes
+    names = [label.get_text() for label in by_looks.get_yticklabels()]
+    assert names == ["naive 3", "latent", "random"]  # upwards
+    wrong = [text.get_text() for text in by_time.texts]
+    assert wrong == ["0.0 % of PoIs wrong", "2.0 % of PoIs wrong", "50.0 % of PoIs wrong"]
+    assert by_looks.lines[0].get_xdata() == [6.0]
+    # A bar for the difference of naive exploration from the latent policy, around its own value.
+    (bar,) = by_time.collections
+    ((low, high),) = bar.get_segments()
+    assert (low.tolist(), high.tolist()) == ([52.0, 0.0], [58.0, 0.0])
+
+
+def test_of_several_seeds_the_bars_are_those_of_the_means():
+    value = {"mean": 2.0, "low": 1.5, "high": 2.5}
+    keys = "accuracy", "observations_per_poi", "mean_time_s"
+    ax, _ = mission_plots.policies({"latent": {key: value for key in keys}}).axes
+    ((low, high),) = ax.collections[0].get_segments()
+    assert (low[0], high[0]) == (1.5, 2.5)
+
+
+def test_a_policy_has_one_colour_in_all_plots():
+    assert len({colours.policy_colour(name) for name in POLICIES}) == len(POLICIES)
 
 
 def test_every_place_of_missions_stands_in_a_picture_of_times():
-    def place(number, robots, seconds, side=CONFIG.arena.side):
-        mission = {"latent": {"time_s": seconds}, "naive": {"time_s": seconds + 1}}
-        team = robots.split()
-        return {"num_pois": number, "side": side, "robots": team, "mission": mission}
+    def place(number, robots, seconds, side=CONFIG.arena.side, episodes=8):
+        times = {"latent": seconds, "naive": seconds + 1}
+        mission = {n: {"time_s": time, "episodes": episodes} for n, time in times.items()}
+        return {"num_pois": number, "side": side, "robots": robots.split(), "mission": mission}
 
-    elsewhere = [
+    places = [
+        place(3, "camera lidar", 12.0),
         place(16, "camera camera lidar lidar", 45.0),
         place(8, "camera lidar", 36.0),
         place(8, "camera camera lidar lidar", 20.0),
+        place(8, "camera camera lidar lidar", 99.0, episodes=7),  # in fewer arenas
         place(8, "lidar lidar lidar", 50.0, side=9.0),
     ]
-    own = place(3, "camera lidar", 12.0)["mission"]
-    summary = {"mission": own, "elsewhere": dict(enumerate(elsewhere))}
     found = {
         ax.get_title(): np.transpose(ax.lines[0].get_data()).tolist()
-        for ax in plots.teams(CONFIG, summary).axes
+        for ax in mission_plots.teams(places).axes
         if ax.axison
     }
     assert found == {
         "robots: 1 camera, 1 lidar": [[3, 12.0], [8, 36.0]],
         "robots: 2 camera, 2 lidar": [[8, 20.0], [16, 45.0]],
         "robots: 3 lidar": [[8, 50.0]],
-        "8 points of interest in 3 m": [[2, 36.0], [4, 20.0]],
+        "8 PoIs in 3 m": [[2, 36.0], [4, 20.0]],
     }
 
 
@@ -193,6 +255,9 @@ def test_a_detector_that_is_calibrated_lies_on_the_diagonal():
     looks = np.array([[right] * 9 + [wrong], [right] * 9 + [wrong], [wrong] * 9 + [right]])
     belief = {"looks": [1, 2], "nll": [0.5, 0.2], "bayes_nll": [0.4, 0.1]}
     detectors, beliefs = plots.calibration(CONFIG, {"lidar": looks}, belief).axes
+    # A bin of fewer than twenty looks, six with .8, is left out.
+    looks = np.concatenate([looks, np.tile([0.8, 0.2], (3, 2, 1))], axis=1)
+    detectors, _ = plots.calibration(CONFIG, {"lidar": looks}, belief).axes
     confidence, accuracy = detectors.lines[1].get_data()
     np.testing.assert_allclose(confidence[np.isfinite(confidence)], [0.9], rtol=1e-6)
     np.testing.assert_allclose(accuracy[np.isfinite(accuracy)], [0.9], rtol=1e-6)

@@ -89,10 +89,15 @@ def test_summary_keeps_its_contract(smoke_run):
 def test_the_film_is_named_after_the_policy_that_it_shows(tmp_path, monkeypatch):
     first = dataclasses.replace(PRESETS["smoke"].mission, policies=("naive_2", "latent"))
     config, titles = dataclasses.replace(PRESETS["smoke"], mission=first), []
-    monkeypatch.setattr(train.animation, "write", lambda *inputs: titles.append(inputs[-1]))
-    monkeypatch.setattr(train.plots, "write_plots", lambda *inputs: None)
-    monkeypatch.setattr(train.page, "write", lambda *inputs: None)
-    result = SimpleNamespace(models=SimpleNamespace(class_beliefs=None), recording=None, summary={})
+    draw = lambda *inputs: titles.append(inputs[-1]) or ""  # noqa: E731
+    monkeypatch.setattr(train.animation, "draw", draw)
+    for name in ("of_run", "of_seeds"):
+        monkeypatch.setattr(train.plots, name, lambda *inputs: {})
+    monkeypatch.setattr(train.page, "render", lambda *inputs: "")
+    names = ("posteriors", "windows", "detections", "rewards")
+    recorded = SimpleNamespace(records=None, end=None)
+    models = SimpleNamespace(class_beliefs=None)
+    result = SimpleNamespace(models=models, recording=recorded, results={}, **dict.fromkeys(names))
     with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as run:
         train._write(run, result, {}, Monitor())  # pyright: ignore
     assert titles == ["naive 2 policy"]

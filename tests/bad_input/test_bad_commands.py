@@ -285,8 +285,8 @@ def test_other_commands_refuse(program, argv, expected, run, place, capsys):
 
 PARTS = {part: {} for part in ("timing", "detectors", "jmvae", "dqn", "mission")}
 SUMMARIES = [
-    (b"{}", "must be an object with belief, detectors"),
-    (b"[]", "must be an object with belief, detectors"),
+    (b"{}", "must hold the summary.json of a finished run"),
+    (b"[]", "must hold the summary.json of a finished run"),
     (b"\xff", "must hold the summary.json of a finished run"),
     (b"[" * 100_000, "nested too deeply"),
     (json.dumps({**PARTS, "belief": {}, "dqn": math.nan}).encode(), "not JSON compliant"),

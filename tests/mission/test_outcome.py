@@ -10,7 +10,6 @@ from teams import CONFIG, POLICIES, with_class_beliefs
 
 from jaxsense import mission
 from jaxsense.core.types import Belief
-from jaxsense.mission import outcome
 from jaxsense.mission.state import DRIVING, ENDED, FAILED
 
 POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
@@ -90,56 +89,6 @@ def _phases(state, *phases):
 def _flags(state, name):
     flags = one(getattr(state.robots, name), 1, 2)
     return replace(state, robots=replace(state.robots, **{name: flags}))
-
-
-def test_summary_of_a_case_as_worked_by_hand():
-    found = {
-        "classes": np.array([[0, 1, 2], [2, 2, 1]]),
-        "is_right": np.array([[True, True, False], [True, True, True]]),
-        "ambiguous": np.array([[False, True, False], [True, True, False]]),
-        "told": {"camera": np.array([2 / 3, 1.0]), "lidar": np.array([1 / 3, 2 / 3])},
-        "observations_per_poi": np.array([1.0, 2.0]),
-        "time_s": np.array([10.0, 20.0]),
-        "collisions": np.array([0, 2]),
-        "goals": np.array([4, 6]),
-        "goals_reached": np.array([4, 5]),
-        "information": np.array([5.0, 6.0]),
-        "detections": np.array([[2, 3], [2, 3]]),
-        "reason": np.array([1, 2]),
-    }
-    block = outcome.summarise(CONFIG, "latent", found)
-    assert block == {
-        "accuracy": pytest.approx(5 / 6),
-        "observations_per_poi": 1.5,
-        "time_s": 15.0,
-        "mean_time_s": 15.0,
-        "collisions": 2,
-        "goals_reached_fraction": 0.9,
-        "information": 5.5,
-        "episodes": 2,
-        "ended": {"finished": 1, "time limit": 1},
-    }
-    # LiDAR alone cannot tell the two cylinders apart: classes 0 and 1, of which one of three is
-    # reported as ambiguous.
-    alone = outcome.summarise(CONFIG, "lidar_alone", found)
-    assert alone["told"] == pytest.approx(0.5)
-    assert alone["ambiguous_reported"] == pytest.approx(1 / 3)
-    # Nothing of nothing is no number.
-    nothing = {**found, "goals": np.zeros(2, int), "goals_reached": np.zeros(2, int)}
-    assert outcome.summarise(CONFIG, "latent", nothing)["goals_reached_fraction"] is None
-    # The camera cannot tell red ones apart: classes 1 and 2; three of five.
-    assert outcome.summarise(CONFIG, "camera_alone", found)["ambiguous_reported"] == pytest.approx(
-        3 / 5
-    )
-
-
-def test_bytes_of_a_detection_as_worked_by_hand(team):
-    # Two float32 for each of two latent dimensions; 640 pixels of 3 bytes, 683 beams of 4.
-    size = outcome.bytes_per_detection(team, np.array([1, 3]))
-    assert (size["latent"], size["features"]) == (16, 8)
-    assert size["raw"] == pytest.approx((1 * 1920 + 3 * 2732) / 4)
-    # Without any detection, the mean of both.
-    assert outcome.bytes_per_detection(team, np.zeros(2))["raw"] == (1920 + 2732) / 2
 
 
 def test_cases_are_the_policies_and_every_failure_of_every_robot():

@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from jaxsense.mission import compare
+from jaxsense.summary import compare
 
 
 def test_the_interval_is_that_of_student():
     # 1 and 3: the mean 2, its error 1, and t(.975, 1 degree of freedom) 12.706; 2 and 2 have none.
-    low, high = compare.interval(np.array([[1.0, 2.0], [3.0, 2.0]]))
+    low, high = compare.bounds(np.array([[1.0, 2.0], [3.0, 2.0]]))
     np.testing.assert_allclose(low, [2 - 12.706, 2], atol=1e-3)
     np.testing.assert_allclose(high, [2 + 12.706, 2], atol=1e-3)
 
 
 def test_a_single_value_has_no_interval():
-    assert compare.described(np.array([3.0])) == {"mean": 3.0, "low": None, "high": None}
+    assert compare.interval(np.array([3.0])) == {"mean": 3.0, "low": None, "high": None}
 
 
 def test_differences_are_taken_arena_by_arena():
@@ -84,20 +84,29 @@ def test_there_is_nothing_to_compare_with_below_one_look_or_without_all_three():
     assert compare.of_naive(NAIVE, "latent") is None
 
 
-def test_only_cases_in_the_same_arenas_are_compared():
-    latent = block(0.97, 1.5, 30.0)
+def test_ratios_are_computed_anew_beside_what_stays():
+    latent = block(0.97, 1.5, 30.0, of_naive={"time_s": 7.0})
     of_latent = {"accuracy": {"mean": -0.01, "low": -0.02, "high": 0.0}}
     naive = {name: {**each, "intervals": of_latent} for name, each in NAIVE.items()}
-    found = compare.compared({**naive, "latent": latent})
+    size = {"latent": 16.0, "features": 8.0, "raw": 2000.0}
+    found = compare.compared({**naive, "latent": latent, "bytes_per_detection": size})
     assert found["latent"]["of_naive"] == compare.of_naive({**NAIVE, "latent": latent}, "latent")
     assert all(found[name]["intervals"] == of_latent for name in NAIVE)
-    # Once the latent policy has played in other arenas, or in fewer of them, nothing is left.
-    for change in ({"seed": 3}, {"episodes": 7}):
-        after = compare.compared({**found, "latent": {**found["latent"], **change}})
-        assert after == {**NAIVE_ALONE, "latent": {**latent, **change}}
-    # Other arenas of all of them are the same for all.
-    elsewhere = {name: {**each, "seed": 3} for name, each in found.items()}
-    assert compare.compared(elsewhere) == elsewhere
+    assert found["bytes_per_detection"] == size
+    # Without naive exploration, nothing of it is left.
+    assert compare.compared({"latent": latent}) == {"latent": block(0.97, 1.5, 30.0)}
 
 
-NAIVE_ALONE = compare.compared(NAIVE)
+def test_the_verdict_names_naive_exploration_and_the_fastest_policy():
+    latent = block(0.97, 1.5, 36.0)
+    # 36 / 40 = .9 and 36 / 30 = 1.2; `random` is faster, but wrong, and nobody alone counts.
+    others = {"auction": block(0.97, 2.0, 30.0), "nearest": block(0.98, 2.0, 33.0)}
+    wrong = {"random": block(0.5, 1.0, 9.0), "camera_alone": block(0.99, 1.0, 8.0)}
+    faster = "The latent policy is 10 % faster than naive exploration"
+    assert compare.verdict({**NAIVE, "latent": latent, **wrong}) == f"{faster}."
+    found = compare.verdict({**NAIVE, "latent": latent, **others, **wrong})
+    assert found == f"{faster} (and 20 % slower than `auction`)."
+    assert compare.verdict(NAIVE) is None
+    seeds = {"mean": 50.0, "low": 40.0, "high": 60.0}
+    slow = {**latent, "time_s": seeds}
+    assert "25 % slower than naive" in compare.verdict({**NAIVE, "latent": slow})

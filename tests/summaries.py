@@ -1,0 +1,42 @@
+"""A whole summary, made up."""
+
+AGENT = {
+    "return": 1.2345, "optimal": 1.25, "naive": 1.0, "random": -1.5, "fraction_of_optimal": 0.9876,
+    "one_step": {"policy": 0.86, "optimal": 0.87, "random": -0.1}, "optimal_states": 1700,
+    "num_states": 1728, "optimal_permutations": 380, "num_permutations": 384,
+    "env_steps": 409600, "env_steps_per_s": 50000.4,
+}  # fmt: skip
+CASE = {
+    "accuracy": 0.998, "observations_per_poi": 1.68, "time_s": 13.8, "mean_time_s": 14.5,
+    "collisions": 0, "goals_reached_fraction": None, "information": 5.8, "episodes": 128,
+    "ended": {"finished": 127, "time limit": 1},
+}  # fmt: skip
+BYTES = {"latent": 16.0, "features": 8.0, "raw": 2326.5}
+UNAMBIGUOUS = {"joint": [True] * 3, "camera": [True, False, False], "lidar": [False, True, True]}
+DETECTOR = {"accuracy": 0.9995, "ece": 0.01, "nll": 0.02}
+CURVES = "looks", "nll", "bayes_nll", "accuracy", "bayes_accuracy"
+SUMMARY = {
+    "preset": "smoke",
+    "seed": 90210,
+    "versions": {"jaxsense": "0.1.0", "jax": "<0.10>"},
+    "devices": ["cpu", "cpu"],
+    "timing": {"total_s": 23.7, "stages": {"jmvae": {"compile_s": 1.5, "run_s": 4.5}}},
+    "detectors": {"camera": DETECTOR, "lidar": DETECTOR},
+    "jmvae": {
+        "active_units": 2,
+        "fusion": {"accuracy": 0.9996, "mean_error": 0.021, "std_error": 0.03},
+        "moment_matching_error": 0.0067,
+        "sigma_norm": {name: [0.5, 1.25, 1.5] for name in UNAMBIGUOUS},
+        "unambiguous": UNAMBIGUOUS,
+        "consistent": {name: [0.995, 1.0, 0.5] for name in UNAMBIGUOUS},
+    },
+    "belief": {"doubt_correlation": 0.9375, **{name: [1, 2] for name in CURVES}},
+    "dqn": {"camera": AGENT, "lidar": AGENT},
+    "mission": {"latent": CASE, "bytes_per_detection": BYTES},
+}
+EVALUATION = {
+    "num_pois": 16,
+    "side": 6.0,
+    "robots": ["camera", "camera", "lidar"],
+    "mission": {"latent": {**CASE, "seed": 7, "accuracy": 0.75}, "bytes_per_detection": BYTES},
+}

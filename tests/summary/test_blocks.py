@@ -1,0 +1,57 @@
+"""The one table of metrics: every key that it names exists, and every key is named."""
+
+import json
+from pathlib import Path
+
+import pytest
+from summaries import SUMMARY
+
+from jaxsense.summary import BLOCKS, metrics
+
+KEYS = {place + key for place, block in BLOCKS.items() for key in block}
+# Only in some runs: of several seeds, of a team, or of one robot alone.
+RARE = {"seeds", "failed", "dqn.MODALITY.other_numbers", "mission.POLICY.seed"}
+RARE |= {f"mission.POLICY.{key}" for key in ("told", "ambiguous_reported")}
+OF_ALL_NAIVE = {key for key in KEYS if ".of_naive." in key}
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def keys(value, key=""):
+    """The keys of a summary up to those in the table, with MODALITY, POLICY and STAGE for names."""
+    if not isinstance(value, dict) or key in KEYS:
+        return {key}
+    place = {"detectors": "MODALITY", "dqn": "MODALITY", "timing.stages": "STAGE"}.get(key)
+    names = {name: place or name for name in value}
+    if key == "mission":
+        names = {n: n if n == "bytes_per_detection" else "POLICY" for n in value}
+    parts = [keys(value[name], f"{key}.{named}".lstrip(".")) for name, named in names.items()]
+    return set().union(*parts)
+
+
+def test_a_real_summary_has_every_documented_key_and_no_other(smoke_run):
+    found = keys(json.loads((smoke_run / "summary.json").read_text()))
+    assert found == KEYS - RARE - OF_ALL_NAIVE
+    # What tests of the page and the terminal show is a summary too.
+    assert keys(SUMMARY) == {key for key in found if ".intervals." not in key}
+
+
+def test_the_page_about_runs_shows_this_table():
+    # Which `docs/conf.py` makes of it.
+    assert "```{metrics}" in (DOCS / "getting-started.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "expected"),
+    [
+        (0.12345, 3, "0.123"),
+        (-0.0001, 2, "0.00"),
+        (1728, 1, "1,728"),
+        (12345.6, 0, "12,346"),
+        (None, 3, "-"),
+        ({"mean": 1.0, "low": 0.0, "high": 2.0}, 1, "1.0 (0.0 to 2.0)"),
+        ({"mean": 1.0, "low": 1.0, "high": 1.0}, 2, "1.00 (1.00 to 1.00)"),
+        ({"mean": 1.0, "low": None, "high": None}, 2, "1.00"),
+    ],
+)
+def test_numbers_as_text(value, digits, expected):
+    assert metrics.text(value, digits) == expected

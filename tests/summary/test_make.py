@@ -1,0 +1,114 @@
+"""The blocks of a summary, from made-up arrays."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import mission
+from jaxsense.config import PRESETS, ArenaConfig, Config, EvaluationConfig, JmvaeConfig
+from jaxsense.summary import make
+
+CONFIG = PRESETS["smoke"]
+RETURNS = "return", "optimal", "naive", "random", "fraction_of_optimal"
+
+FOUND = {
+    "classes": np.array([[0, 1, 2], [2, 2, 1]]),
+    "is_right": np.array([[True, True, False], [True, True, True]]),
+    "ambiguous": np.array([[False, True, False], [True, True, False]]),
+    "told": {"camera": np.array([2 / 3, 1.0]), "lidar": np.array([1 / 3, 2 / 3])},
+    "observations_per_poi": np.array([1.0, 2.0]),
+    "time_s": np.array([10.0, 20.0]),
+    "collisions": np.array([0, 2]),
+    "goals": np.array([4, 6]),
+    "goals_reached": np.array([4, 5]),
+    "information": np.array([5.0, 6.0]),
+    "detections": np.array([[2, 3], [2, 3]]),
+    "reason": np.array([1, 2]),
+}
+
+
+def test_more_than_nine_of_ten_looks_make_a_class_unambiguous():
+    measured = {"active_units": jnp.int32(2), "fusion": {"accuracy": None}}
+    measured["unambiguous"] = {"joint": jnp.array([0.9, 0.91, 1.0])}
+    block = make.jmvae(measured)
+    assert block["unambiguous"] == {"joint": [False, True, True]}
+    assert (block["active_units"], block["fusion"]) == (2, {"accuracy": None})
+
+
+# Two PoIs of two classes and one sensor: 2^2 x 2^2 states, of which half hold both classes.
+SMALL = Config(
+    modalities=("camera",),
+    arena=ArenaConfig(num_pois=2, classes=("green cylinder", "red cylinder")),
+    jmvae=JmvaeConfig(reconstruction_weights=(1.0,)),
+    evaluation=EvaluationConfig(num_starts=3),
+)
+
+
+def test_figures_of_policies_as_worked_by_hand():
+    # Sixteen states and three random starts, of which the figures are means.
+    of_states = np.zeros((4, 16))
+    # .02 and .009 below the optimum, of which .01 is let pass; more than the optimum is too. The
+    # classes of the first and last four states are equal, of the others different.
+    of_states[1, [0, 1, 4, 5, 10]] = 0.02, 0.009, 0.02, 0.009, 0.5
+    of_states[0, 15] = 1.0
+    of_starts = np.array([[0.9, 1.0, 1.1], [1.0, 1.1, 1.2], [0.5, 0.5, 0.8], [-1.0, 0.0, -0.5]])
+    total = np.concatenate([of_states, of_starts], axis=1)
+    figures = make.agent(SMALL, total, total / 2, [2.0, 3.0], {9: total})
+    expected = {"return": 1.0, "optimal": 1.1, "naive": 0.6, "random": -0.5}
+    assert {name: figures[name] for name in expected} == pytest.approx(expected)
+    assert figures["fraction_of_optimal"] == pytest.approx(1 / 1.1)
+    assert figures["other_numbers"]["9"] == {name: figures[name] for name in RETURNS}
+    assert figures["env_steps_per_s"] == figures["env_steps"] / 5
+    one_step = {"policy": 0.5, "optimal": 0.55, "random": -0.25}
+    assert figures["one_step"] == pytest.approx(one_step)
+    assert (figures["optimal_states"], figures["num_states"]) == (13, 16)
+    assert (figures["optimal_permutations"], figures["num_permutations"]) == (6, 8)
+    none = np.zeros((4, 19))
+    nothing = make.agent(SMALL, none, none, [1.0], {})
+    assert "other_numbers" not in nothing
+    assert nothing["fraction_of_optimal"] is None
+
+
+def test_summary_of_a_case_as_worked_by_hand():
+    block = make.case(CONFIG, "latent", FOUND)
+    assert block == {
+        "accuracy": pytest.approx(5 / 6),
+        "observations_per_poi": 1.5,
+        "time_s": 15.0,
+        "mean_time_s": 15.0,
+        "collisions": 2,
+        "goals_reached_fraction": 0.9,
+        "information": 5.5,
+        "episodes": 2,
+        "ended": {"finished": 1, "time limit": 1},
+    }
+    # LiDAR alone cannot tell the two cylinders apart: classes 0 and 1, of which one of three is
+    # reported as ambiguous.
+    alone = make.case(CONFIG, "lidar_alone", FOUND)
+    assert alone["told"] == pytest.approx(0.5)
+    assert alone["ambiguous_reported"] == pytest.approx(1 / 3)
+    # Nothing of nothing is no number.
+    nothing = {**FOUND, "goals": np.zeros(2, int), "goals_reached": np.zeros(2, int)}
+    assert make.case(CONFIG, "latent", nothing)["goals_reached_fraction"] is None
+    # The camera cannot tell red ones apart: classes 1 and 2; three of five.
+    assert make.case(CONFIG, "camera_alone", FOUND)["ambiguous_reported"] == pytest.approx(3 / 5)
+
+
+def test_bytes_of_a_detection_as_worked_by_hand():
+    # Two float32 for each of two latent dimensions; 640 pixels of 3 bytes, 683 beams of 4.
+    size = make.traffic(mission.make_mission(CONFIG), np.array([1, 3]))
+    assert (size["latent"], size["features"]) == (16, 8)
+    assert size["raw"] == pytest.approx((1 * 1920 + 3 * 2732) / 4)
+    # Without any detection, the mean of both.
+    assert make.traffic(mission.make_mission(CONFIG), np.zeros(2))["raw"] == (1920 + 2732) / 2
+
+
+def test_policies_are_compared_with_the_latent_one_arena_by_arena():
+    found = {**FOUND, "time_s": np.array([12.0, 22.0])}
+    block = make.missions(mission.make_mission(CONFIG), {"latent": FOUND, "naive": found})
+    assert set(block) == {"latent", "naive", "bytes_per_detection"}
+    assert "intervals" not in block["latent"]
+    assert block["naive"]["intervals"]["time_s"] == {"mean": 2.0, "low": 2.0, "high": 2.0}
+    # Ten looks of the camera and six of the LiDAR, of both cases.
+    raw = (8 * 1920 + 12 * 2732) / 20
+    assert block["bytes_per_detection"]["raw"] == pytest.approx(raw)

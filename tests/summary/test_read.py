@@ -1,0 +1,63 @@
+"""A summary that cannot be used is refused in one line."""
+
+import copy
+import json
+
+import pytest
+from summaries import CASE, EVALUATION, SUMMARY
+
+from jaxsense import summary
+from jaxsense.config import ConfigError
+
+
+def written(path, content, name="summary.json"):
+    (path / name).parent.mkdir(exist_ok=True)
+    (path / name).write_text(json.dumps(content))
+    return path
+
+
+def test_a_summary_is_read_with_keys_of_later_versions(tmp_path):
+    content = {**SUMMARY, "later": 1}
+    assert summary.read(written(tmp_path, content)) == content
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "reason"),
+    [
+        ("dqn.camera.return", None, "summary.dqn.camera.return is missing"),
+        ("timing", None, "summary.timing is missing"),
+        ("mission.latent.time_s", "x", "summary.mission.latent.time_s has the wrong type"),
+        ("mission.latent.time_s", {}, "summary.mission.latent.time_s has the wrong type"),
+        ("mission.latent.accuracy", True, "accuracy has the wrong type"),
+        ("mission.bytes_per_detection", 3, "bytes_per_detection has the wrong type"),
+        ("jmvae.unambiguous.joint", [1], "summary.jmvae.unambiguous.joint.0 has the wrong type"),
+        ("belief", [], "summary.belief has the wrong type"),
+        ("elsewhere", {"there": {}}, "summary.elsewhere.there.mission is missing"),
+        ("seeds", {"3": {}}, "summary.3.belief is missing"),
+    ],
+)
+def test_what_is_missing_or_wrong_is_named(tmp_path, place, value, reason):
+    content = copy.deepcopy(SUMMARY)
+    *blocks, key = place.split(".")
+    block = content
+    for name in blocks:
+        block = block[name]
+    block.pop(key, None)
+    if value is not None:
+        block[key] = value
+    with pytest.raises(ConfigError) as error:
+        summary.read(written(tmp_path, content))
+    assert "must hold the summary.json of a finished run" in str(error.value)
+    assert reason in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_evaluations_are_read_with_those_of_an_older_version(tmp_path):
+    written(tmp_path, {**SUMMARY, "elsewhere": {"there": EVALUATION}})
+    assert summary.read_evaluations(tmp_path) == {"there": EVALUATION}
+    written(tmp_path, EVALUATION, "evaluations/here.json")
+    assert [*summary.read_evaluations(tmp_path)] == ["there", "here"]
+    wrong = {**EVALUATION, "mission": {"latent": {**CASE, "time_s": None}}}
+    written(tmp_path, wrong, "evaluations/here.json")
+    with pytest.raises(ConfigError, match=r"must hold the evaluations/here\.json of a finished"):
+        summary.read_evaluations(tmp_path)
