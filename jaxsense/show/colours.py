@@ -33,8 +33,12 @@ def policy_colour(name: str) -> str:
 def class_colour(arena: ArenaConfig, label: str) -> RGB:
     """The colour of a class, RGB in [0, 1], unique in the arena.
 
-    The colour of its PoIs or, if an earlier class has taken it, a shade: half as bright, half way
+    It is the colour of the PoIs or, if an earlier class has it, a shade: half as bright, half way
     to white or, if those are taken too, the shade that differs most from all others.
+
+    Args:
+      arena: with the colours.
+      label: of the class.
     """
     classes, taken = arena.classes, []
     for each in classes[: classes.index(label) + 1]:

@@ -3,6 +3,7 @@
 import base64
 import contextlib
 import json
+import operator
 import shlex
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -38,6 +39,7 @@ def render(
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
+    stem = operator.attrgetter("stem")  # so that the run's own film comes first
     here = _missions(f"{summary['preset']} preset", summary["mission"], run / "policies.png")
     elsewhere = [
         _missions(_title(found), found["mission"], run / EVALUATIONS / f"{name}.png")
@@ -67,7 +69,7 @@ def render(
         plot=lambda name: _data(run / f"{name}.png"),
         # A browser runs no script of an image and loads nothing that it names, so that a film may
         # come from anywhere.
-        films={path.stem: _data(path) for path in sorted(run.glob("mission*.svg"), key=_stem)},
+        films={path.stem: _data(path) for path in sorted(run.glob("mission*.svg"), key=stem)},
     )
 
 
@@ -92,10 +94,6 @@ def _title(found: Evaluation) -> str:
         f"Evaluation: {found['num_pois']} PoIs in {found['side']:g} m; robots: "
         f"{counted(found['robots'])}; seed {', '.join(map(str, sorted(seeds)))}"
     )
-
-
-def _stem(path: Path) -> str:
-    return path.stem
 
 
 def _data(path: Path) -> str | None:

@@ -87,6 +87,10 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     Colours show classes above and `||sigma||` below. The first column shows detections by all
     modalities together, the others by each alone, in the first two latent dimensions. Crosses mark
     detections far from the others of their class.
+
+    Args:
+      config: all settings.
+      posteriors: for `joint` and for each modality `[C, S, D]` beliefs.
     """
     names = ["joint", *config.modalities]
     titles = {"joint": " & ".join(config.modalities)}
@@ -230,7 +234,8 @@ def _draw_rewards(ax: Axes, kind: str, values: np.ndarray) -> None:
         shown = values[:, epochs]
     ax.plot(epochs, shown.mean(axis=0), color=colour, label=label, linewidth=1.2)
     if len(shown) > 1:
-        ax.fill_between(epochs, *bounds(shown), color=colour, alpha=0.2, linewidth=0)
+        low, high = bounds(shown)
+        ax.fill_between(epochs, low, high, color=colour, alpha=0.2, linewidth=0)
 
 
 def _draw_references(ax: Axes, agent: Agent) -> None:

@@ -59,7 +59,14 @@ class Display:
         self._progress.stop()
 
     def show(self, stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
-        """Shows a report of a `Monitor`; a total of 0 means that a stage compiles."""
+        """Shows a report of a `Monitor`.
+
+        Args:
+          stage: its name.
+          done: its steps so far.
+          total: all its steps; 0 means that it compiles.
+          metrics: to show and to record.
+        """
         if total:
             for record in self._records:
                 record(stage=stage, step=done, **metrics)

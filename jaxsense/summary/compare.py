@@ -1,7 +1,7 @@
 """Compares policies that played in the same arenas."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import scipy.special
@@ -81,15 +81,13 @@ def of_naive(played: dict[str, Case], name: str) -> OfNaive | None:
     if case["accuracy"] < accuracies[0]:
         return None
 
-    def ratio(own: float, of_naive: list[float]) -> float:
-        return float(own / np.interp(case["accuracy"], accuracies, of_naive))
+    def ratio(key: Literal["observations_per_poi", "time_s", "mean_time_s"]) -> float:
+        return float(case[key] / np.interp(case["accuracy"], accuracies, [n[key] for n in naive]))
 
     return {
-        "observations_per_poi": ratio(
-            case["observations_per_poi"], [each["observations_per_poi"] for each in naive]
-        ),
-        "time_s": ratio(case["time_s"], [each["time_s"] for each in naive]),
-        "mean_time_s": ratio(case["mean_time_s"], [each["mean_time_s"] for each in naive]),
+        "observations_per_poi": ratio("observations_per_poi"),
+        "time_s": ratio("time_s"),
+        "mean_time_s": ratio("mean_time_s"),
     }
 
 

@@ -68,8 +68,12 @@ def agent(
     one_step = dict(zip(MDP_POLICIES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
     missed = total[MDP_POLICIES.index("optimal"), :num_states] - total[0, :num_states]
     is_optimal = missed <= _AS_GOOD
-    sizes = config.arena.num_pois, len(config.arena.classes), len(config.modalities)
-    states, _ = episodes.every_state(*sizes, config.evaluation.num_states)
+    states, _ = episodes.every_state(
+        config.arena.num_pois,
+        len(config.arena.classes),
+        len(config.modalities),
+        config.evaluation.num_states,
+    )
     is_permutation = episodes.are_different(states)
     block: Agent = {
         **_returns(total[:, num_states:]),

@@ -136,7 +136,7 @@ def _strip(
     """Draws a text that changes, `texts` frame by frame."""
     for text in dict.fromkeys(texts):
         element = add(parent, "text", text, x=x, y=y, class_=class_)
-        timeline.set(element, "opacity", [float(t == text) for t in texts])
+        timeline.animate(element, "opacity", [float(t == text) for t in texts], jumps=True)
 
 
 def _doing(phase: int, target: int, num_pois: int) -> str:

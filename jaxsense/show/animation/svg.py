@@ -1,7 +1,6 @@
 """Elements of an SVG, and how they change while it plays (SMIL)."""
 
 import dataclasses
-from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -9,8 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
-def add(parent: Element, tag: str, text: str | None = None, **attributes: Any) -> Element:
-    """Adds an element; `class_` is `class`, and `_` in other names of attributes is `-`."""
+def add(parent: Element, tag: str, text: str | None = None, **attributes: ArrayLike) -> Element:
+    """Adds an element.
+
+    Args:
+      parent: of the element.
+      tag: of the element.
+      text: in the element.
+      **attributes: numbers or texts; `class_` is `class`, and `_` in other names is `-`.
+    """
     names = (name.rstrip("_").replace("_", "-") for name in attributes)
     values = (_text(value) for value in attributes.values())
     element = ElementTree.SubElement(parent, tag, dict(zip(names, values, strict=True)))
@@ -18,9 +24,9 @@ def add(parent: Element, tag: str, text: str | None = None, **attributes: Any) -
     return element
 
 
-def _text(value: Any) -> str:
-    """Numbers with a tenth of a pixel, which nobody sees, and no more."""
-    return value if isinstance(value, str) else f"{round(float(value), 2):g}"
+def _text(value: ArrayLike) -> str:
+    """Numbers to a hundredth of a pixel."""
+    return value if isinstance(value, str) else f"{round(float(np.asarray(value)), 2):g}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,27 +43,20 @@ class Timeline:
     duration: float
     moves: bool = True
 
-    def set(self, element: Element, attribute: str, values: ArrayLike) -> None:
-        """Lets an attribute jump from value to value, `[F]`; where nothing plays, it has the last.
+    def animate(
+        self, element: Element, attribute: str, values: ArrayLike, *, jumps: bool = False
+    ) -> None:
+        """Lets an attribute run through its values; where nothing plays, it has the last.
 
-        Numbers and text are both possible.
+        Args:
+          element: whose attribute changes.
+          attribute: its name, or `translate` or `rotate` for a transformation.
+          values: `[F]` numbers or texts, degrees for `rotate`, `[F, 2]` for `translate`.
+          jumps: whether it jumps from value to value.
         """
-        self._animate(
-            element, attribute, [_text(v) for v in np.asarray(values).tolist()], "discrete"
-        )
-
-    def vary(self, element: Element, attribute: str, values: ArrayLike) -> None:
-        """Lets an attribute, a number, run smoothly through `[F]` values; see `set`."""
-        self._animate(element, attribute, [_text(v) for v in np.asarray(values).tolist()], "linear")
-
-    def move(self, element: Element, places: np.ndarray, *, jumps: bool = False) -> None:
-        """Lets an element run, or jump, through `[F, 2]` translations; see `set`."""
-        values = [f"{_text(x)} {_text(y)}" for x, y in places]
-        self._animate(element, "translate", values, "discrete" if jumps else "linear")
-
-    def turn(self, element: Element, angles: np.ndarray) -> None:
-        """Lets an element run through `[F]` rotations in degrees; see `set`."""
-        self._animate(element, "rotate", [_text(angle) for angle in angles], "linear")
+        rows = np.asarray(values).tolist()
+        texts = [" ".join(map(_text, row)) if isinstance(row, list) else _text(row) for row in rows]
+        self._animate(element, attribute, texts, "discrete" if jumps else "linear")
 
     def _animate(self, element: Element, attribute: str, values: list[str], mode: str) -> None:
         is_transform = attribute in ("translate", "rotate")

@@ -27,7 +27,13 @@ class ArenaView:
         self._scale = SIZE / config.arena.side
 
     def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
-        """Adds it to a group whose origin is the view's upper left corner."""
+        """Adds the view.
+
+        Args:
+          parent: group whose origin is the view's upper left corner.
+          timeline: when the frames are shown.
+          record: `[F]` frames of the mission.
+        """
         for r in range(len(self._config.carried)):
             self._draw_trail(parent, timeline, record, r)
         fields = add(parent, "g")
@@ -60,7 +66,7 @@ class ArenaView:
         )
         if length[-1] > 0:
             line.set("stroke-dasharray", f"{length[-1] + 1:.1f}")
-            timeline.vary(line, "stroke-dashoffset", length[-1] + 1 - length)
+            timeline.animate(line, "stroke-dashoffset", length[-1] + 1 - length)
 
     def _draw_poi(self, parent: Element, timeline: Timeline, record: Record, n: int) -> None:
         layout, arena = self._end.scene.layout, self._config.arena
@@ -92,7 +98,7 @@ class ArenaView:
                 fill=modality_colour(m),
                 stroke="#fff",
             )
-            timeline.set(mark, "opacity", record.seen[:, n, m])
+            timeline.animate(mark, "opacity", record.seen[:, n, m], jumps=True)
 
     def _draw_looks(self, parent: Element, timeline: Timeline, record: Record, r: int) -> None:
         """A line from the robot to what it scans."""
@@ -106,7 +112,7 @@ class ArenaView:
             line = add(parent, "line", x1=x1, y1=y1, x2=x2, y2=y2, stroke=self._colour(r))
             line.set("stroke-width", "3")
             since = np.arange(len(record.time)) - i
-            timeline.vary(
+            timeline.animate(
                 line, "opacity", np.where(since < 0, 0.0, np.maximum(1 - since / _FLASH, 0.0))
             )
 
@@ -118,10 +124,10 @@ class ArenaView:
         colour, radius = self._colour(r), self._scale * ROBOT_RADIUS
         field, robot = (add(each, "g") for each in (fields, parent))
         for group in (field, robot):
-            timeline.move(group, places)
+            timeline.animate(group, "translate", places)
         field, body = (add(each, "g") for each in (field, robot))
         for group in (field, body):
-            timeline.turn(group, angles)
+            timeline.animate(group, "rotate", angles)
         settings = getattr(self._config, self._config.carried[r], None)
         shape = _sector(
             self._scale * self._config.navigation.view_range,
@@ -130,7 +136,9 @@ class ArenaView:
         view = add(field, "path", d=shape, fill=colour)
         phase, is_blind = record.phase[:, r], record.time >= self._end.faults.blind_at[r]
         opacity = np.where(phase == FACING, 0.34, 0.16)
-        timeline.set(view, "opacity", np.where((phase >= ENDED) | is_blind, 0.0, opacity))
+        timeline.animate(
+            view, "opacity", np.where((phase >= ENDED) | is_blind, 0.0, opacity), jumps=True
+        )
         add(body, "circle", r=radius + 2, fill=colour, stroke="#fff", stroke_width=1.5)
         add(body, "path", d=f"M1,0H{radius:.1f}", stroke="#fff", stroke_width=2.5)
 
@@ -145,7 +153,13 @@ class MapView:
         self._scale = SIZE / 2 / self._reach
 
     def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
-        """Adds it to a group whose origin is the view's upper left corner."""
+        """Adds the view.
+
+        Args:
+          parent: group whose origin is the view's upper left corner.
+          timeline: when the frames are shown.
+          record: `[F]` frames of the mission.
+        """
         arena = self._config.arena
         colours = [as_hex(class_colour(arena, label)) for label in arena.classes]
         for colour, mean in zip(colours, self._classes[0], strict=True):
@@ -164,13 +178,15 @@ class MapView:
             ellipse = add(parent, "ellipse", fill=colour, stroke=colour)
             ellipse.set("stroke-width", "2.5")
             for name, values in zip(("cx", "cy", "rx", "ry"), (*mean.T, *radii.T), strict=True):
-                timeline.vary(ellipse, name, values)
+                timeline.animate(ellipse, name, values)
             is_seen = record.seen[:, n].any(axis=-1)
-            timeline.set(ellipse, "stroke-dasharray", np.where(is_seen, "1 0", "2 5").tolist())
-            timeline.set(ellipse, "fill-opacity", 0.1 * is_seen)
+            timeline.animate(
+                ellipse, "stroke-dasharray", np.where(is_seen, "1 0", "2 5").tolist(), jumps=True
+            )
+            timeline.animate(ellipse, "fill-opacity", 0.1 * is_seen, jumps=True)
             # Numbers of PoIs at the same place in the map stand side by side.
             number = add(numbers, "g")
-            timeline.move(number, mean + _beside(n, num_pois))
+            timeline.animate(number, "translate", mean + _beside(n, num_pois))
             add(number, "text", str(n + 1), class_="film-number film-on-light", fill=colour)
         self._draw_labels(parent, colours)
 
