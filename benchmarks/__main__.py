@@ -11,12 +11,12 @@ from typing import Annotated
 import jax
 import rich.console
 import rich.table
-import tyro
 
 from benchmarks import ROWS
 from benchmarks.measure import Options, Row
 from jaxsense import cli
 from jaxsense.config.checks import check_fields
+from jaxsense.config.options import Name
 
 PROGRAM = "benchmarks"
 _WIDTH_OF_FILES = 160
@@ -26,12 +26,14 @@ _WIDTH_OF_FILES = 160
 class Arguments:
     """Measure each stage, and with --peers those who do the same, and print one table."""
 
-    names: tyro.conf.Positional[
-        Annotated[tuple[str, ...], tyro.conf.arg(help=f"Rows, of {', '.join(ROWS)}; all if none.")]
-    ] = ()
-    peers: Annotated[bool, tyro.conf.arg(help="Measure peers on the same work, in turn.")] = False
-    json: Annotated[Path | None, tyro.conf.arg(help="File to write; must be new.")] = None
-    quick: Annotated[bool, tyro.conf.arg(help="Tiny sizes, to see that everything runs.")] = False
+    names: Annotated[tuple[str, ...], Name("ROWS")] = ()
+    """Rows to measure; all by default. A wrong one lists them."""
+    peers: bool = False
+    """Also measure other libraries on the same work, in turn."""
+    json: Path | None = None
+    """File to write; must be new."""
+    quick: bool = False
+    """Use tiny sizes, to check that everything runs."""
 
     def __post_init__(self):
         check_fields(self)

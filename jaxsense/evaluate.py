@@ -9,12 +9,13 @@ from typing import Annotated
 
 import jax
 import rich.console
-import tyro
+import rich.table
 
 from jaxsense import cli, mission, summary
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.mission import MAX_EPISODES
+from jaxsense.config.options import Name
 from jaxsense.core.types import Belief
 from jaxsense.run import devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
@@ -45,32 +46,33 @@ class ArenaArguments:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Play missions with the policies of a finished run, and compare them in the same arenas."""
+    """Plays missions with the policies of a finished run, and compares them in the same arenas."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Directory of the run."""
+    run: Annotated[Path, Name("RUN")]
+    """The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
+    newest one in `runs/`."""
     episodes: int = 256
-    """Missions of each policy."""
+    """Number of missions of each policy."""
     seed: int = 0
     """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
     policy: str = "all"
     """`latent`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3`, `random`, `nearest`,
-    `auction` or `rollout`; `policies` for all; `ROBOT_alone`, `ROBOT_stops` or `ROBOT_blind`, as in
-    `camera_alone`, for the latent policy where that robot is alone, stops or goes blind after 6 s;
-    or `all`."""
+    `auction` or `rollout`, or all of these: `policies`. `ROBOT_alone`, `ROBOT_stops` or
+    `ROBOT_blind`, such as `camera_alone`, is the latent policy where that robot is alone, stops or
+    goes blind after 6 s. `all` plays everything."""
     arena: ArenaArguments = ArenaArguments()
     robots: tuple[str, ...] | None = None
     """Sensors of the robots, one per robot, for example `camera camera lidar`; the run's by
     default."""
     devices: int | None = None
-    """Accelerators, or threads on a CPU, that share the missions. By default all accelerators, or
-    as many threads as cores, at most 8."""
+    """Number of accelerators, or of CPU threads, that share the missions. By default all
+    accelerators, or one thread per core, at most 8."""
     cache: Path | None = cli.CACHE
-    """Directory to keep compiled programs in for later runs; `None` keeps none."""
+    """Directory of compiled programs for later runs, or `none`."""
     animate: bool = False
-    """Also write an animation of the first mission as `mission-POLICY-SEED.svg`."""
+    """Also write an animation of the first mission, `mission-POLICY-SEED.svg`."""
     trust: bool = False
-    """Run the functions that the run's `config.json` names for your own sensors."""
+    """Run the code of custom sensors that the run's `config.json` names."""
 
     def __post_init__(self):
         check_fields(self, bits=64)
@@ -84,6 +86,7 @@ def main(argv: list[str] | None = None) -> None:
     """Runs the program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
+        arguments = dataclasses.replace(arguments, run=cli.find_run(arguments.run))
         workers = devices.start(arguments.devices)
         trained, models = rundir.load(arguments.run, arguments.trust)
         config = _elsewhere(arguments, trained)

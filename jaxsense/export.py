@@ -12,16 +12,16 @@ import json
 import sys
 import zipfile
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Protocol
 
 import jax
 import numpy as np
-import tyro
 from jax import export
 
 from jaxsense import cli
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import check_fields
+from jaxsense.config.options import Name
 from jaxsense.interfaces.onboard import Function, functions
 from jaxsense.models import Models
 from jaxsense.run import files, rundir
@@ -30,6 +30,13 @@ from jaxsense.run.version import __version__
 PROGRAM = "jaxsense.export"
 PLATFORMS = ("cpu", "cuda", "tpu")
 """Platforms that the programs of a file run on."""
+
+
+class _Aval(Protocol):
+    """Shape and dtype of an input or an output."""
+
+    shape: tuple[object, ...]
+    dtype: np.dtype
 
 
 def exported(function: Function) -> export.Exported:
@@ -41,7 +48,12 @@ def exported(function: Function) -> export.Exported:
 
 
 def archive(config: Config, models: Models) -> bytes:
-    """The content of the file."""
+    """Returns the content of the file.
+
+    Args:
+      config: settings of the run.
+      models: its trained models.
+    """
     content, programs = io.BytesIO(), {}
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as files:
         for name, function in functions(config, models).items():
@@ -61,7 +73,7 @@ def archive(config: Config, models: Models) -> bytes:
     return content.getvalue()
 
 
-def _description(config: Config, models: Models) -> dict[str, Any]:
+def _description(config: Config, models: Models) -> dict[str, object]:
     """What a reader of the file needs besides the programs."""
     arena = config.arena
     versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib")}
@@ -80,7 +92,7 @@ def _description(config: Config, models: Models) -> dict[str, Any]:
     }
 
 
-def _described(aval: Any) -> dict[str, Any]:
+def _described(aval: _Aval) -> dict[str, object]:
     """Dtype and shape, with the names of axes of any size, such as "batch"."""
     shape = [n if isinstance(n, int) else str(n) for n in aval.shape]
     return {"shape": shape, "dtype": aval.dtype.name}
@@ -88,14 +100,15 @@ def _described(aval: Any) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Write a run's detectors, encoders and policies into one file that runs without jaxsense."""
+    """Writes a run's detectors, encoders and policies into one file that runs without jaxsense."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Directory of the run."""
+    run: Annotated[Path, Name("RUN")]
+    """The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
+    newest one in `runs/`."""
     out: Path | None = None
-    """The file to write; must be new. By default `exported.zip` in the run's directory."""
+    """File to write; it must not exist yet. By default `exported.zip` in the run's directory."""
     trust: bool = False
-    """Run the functions that the run's `config.json` names for your own sensors."""
+    """Run the code of custom sensors that the run's `config.json` names."""
 
     def __post_init__(self):
         check_fields(self)
@@ -104,9 +117,11 @@ class Arguments:
 def main(argv: list[str] | None = None) -> None:
     """Runs the program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    path = arguments.out or arguments.run / "exported.zip"
+    path = arguments.out
     try:
-        config, models = rundir.load(arguments.run, arguments.trust)
+        run = cli.find_run(arguments.run)
+        path = path or run / "exported.zip"
+        config, models = rundir.load(run, arguments.trust)
         with files.new(path) as file:
             content = archive(config, models)
             file.write(content)

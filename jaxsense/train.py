@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import itertools
-import re
 import shlex
 import sys
 import tempfile
@@ -12,16 +11,17 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, cast
 
 import jax
 import numpy as np
 import rich.console
-import tyro
+import rich.table
 
 from jaxsense import cli, summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
+from jaxsense.config.options import Name, OptionError, read_some
 from jaxsense.run import devices, files, pipeline, rundir, seeds
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
@@ -40,43 +40,51 @@ _MOST_SEEDS = 10_000
 _MOST_TOGETHER = 16  # seeds in one program on an accelerator
 
 
+_COMMON = (
+    *("--preset", "--seed", "--num-seeds", "--out", "--config", "--resume", "--devices"),
+    *("--cache", "--quiet", "--tensorboard", "--trust", "--modalities", "--robots"),
+    *("--arena.side", "--arena.num-pois", "--arena.classes", "--jmvae.fusion", "--jmvae.alpha"),
+    *("--dqn.task", "--dqn.epochs", "--mission.episodes"),
+)
+"""Options that `--help` shows."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Train detectors, the JMVAE and one Q-network per modality, and write a run directory."""
+    """Trains detectors, the JMVAE and one Q-network per modality, and writes a run directory."""
 
-    config: Annotated[Config, tyro.conf.arg(name="")]
+    config: Annotated[Config, Name("--")]
     preset: PresetName = "default"
-    """Settings to start from; every option below changes one of them."""
+    """Settings to start from; the other options change them."""
     seed: int = 0
     """Seed of all randomness, from 0 to 2^32 - 1."""
     out: Path | None = None
-    """Directory to write; must be new. By default `runs/DATE-TIME-PRESET`."""
+    """Directory to write; it must not exist yet or be empty. By default `runs/DATE-TIME-PRESET`."""
     num_seeds: int = 1
-    """Number of seeds to train with the same programs, from `seed` on. Each has its own directory
-    within the run, which holds their means and 95% intervals."""
-    file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
-    """The `config.json` of a run, to start from its preset, seed and settings."""
+    """Number of seeds to train, starting from `--seed`. Each has its own directory within the run,
+    which reports their means and 95 % confidence intervals."""
+    file: Annotated[Path | None, Name("--config")] = None
+    """The `config.json` of a run. A new run starts from its preset, seed and settings."""
     resume: Path | None = None
-    """Directory of a stopped run, to resume it with its settings."""
+    """Directory of a stopped run to continue, with its own settings."""
     trust: bool = False
-    """Run the functions that the `config.json` of `--config` or `--resume` names for your own
-    sensors."""
+    """Run the code of custom sensors that the `config.json` of `--config` or `--resume` names."""
     quiet: bool = False
-    """Show only errors, the path of the results and the next command."""
+    """Print only errors, the path of the results and the next command."""
     tensorboard: bool = False
-    """Also write event files for TensorBoard to `tensorboard/` in the run."""
+    """Also write event files for TensorBoard, to `tensorboard/` in the run."""
     devices: int | None = None
-    """Accelerators, or threads on a CPU, that share scenes and missions. By default all
-    accelerators, or as many threads as cores, at most 8."""
+    """Number of accelerators, or of CPU threads, that share scenes and missions. By default all
+    accelerators, or one thread per core, at most 8."""
     coordinator: str | None = None
-    """`HOST:PORT` of the first of several processes that share scenes and missions. Start all with
-    the same options except `--process-index`; the first one writes the run."""
+    """`HOST:PORT` of the first of several processes that share scenes and missions. Start all of
+    them with the same options except `--process-index`; the first one writes the run."""
     num_processes: int | None = None
     """Number of processes that share the run."""
     process_index: int | None = None
     """Index of this process, from 0."""
     cache: Path | None = cli.CACHE
-    """Directory to keep compiled programs in for later runs; `None` keeps none."""
+    """Directory of compiled programs for later runs, or `none`."""
 
     def __post_init__(self):
         if isinstance(self.file, str):
@@ -121,9 +129,9 @@ def main(
         cli.fail(PROGRAM, str(error))
     except files.WriteError as error:
         # Usually a full disk. Every file is written as a whole or not at all.
-        cli.fail(PROGRAM, f"cannot write {cli.reason(error)}; what was saved before is still there")
+        cli.fail(PROGRAM, f"cannot write {cli.reason(error)}; earlier checkpoints are intact")
     except OSError as error:
-        cli.fail(PROGRAM, f"{cli.reason(error)}; what was saved before is still there")
+        cli.fail(PROGRAM, f"{cli.reason(error)}; earlier checkpoints are intact")
     if not is_first:
         return
     if not arguments.quiet:
@@ -131,24 +139,34 @@ def main(
             _print_summary(console, run)
     first = next(path for path in seeds.paths(run).values() if (path / "report.html").exists())
     # A quiet run prints only these two lines.
-    say(f"Everything is in {run.path}; open {run.path / 'report.html'} first.")
+    say(f"Results are in {run.path}. Start with {run.path / 'report.html'}.")
     trust = " --trust" if arguments.config.sensors else ""
     say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
 
 
 def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: config) -> Arguments:
-    """Reads the command line; ends the program with status 2 and one line if it is wrong."""
+    """Reads the command line; ends the program with status 2 and one line if it is wrong.
+
+    Args:
+      argv: the command line without the program.
+      change: changes a preset before the other options do.
+
+    Returns:
+      The options.
+
+    Raises:
+      SystemExit: with status 2 if the command line is wrong, with status 0 after the help.
+    """
     try:
         stored = _stored(argv, change)
-        default: Any = Arguments(
+        default = Arguments(
             config=stored.config,
-            preset=stored.preset,  # pyright: ignore[reportArgumentType]
+            preset=cast(PresetName, stored.preset),
             seed=stored.seed,
             num_seeds=stored.num_seeds,
         )
-        arguments = cli.parse(PROGRAM, Arguments, argv, default)
+        arguments = cli.parse(PROGRAM, Arguments, argv, default, _COMMON)
         sensors.make(arguments.config)
-        devices.check(arguments.devices)
         if arguments.tensorboard:
             tensorboard.require()
         if not 0 <= arguments.seed < 2**32:
@@ -158,8 +176,8 @@ def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: c
         if not 1 <= arguments.num_seeds <= _MOST_SEEDS:
             reason = f"must be within 1 and {_MOST_SEEDS:,}"
             raise ConfigError("num_seeds", arguments.num_seeds, reason)
-        if arguments.file is not None and _option(argv, "preset"):
-            raise ConfigError("config", str(arguments.file), "names a preset; omit --preset")
+        if arguments.file is not None and arguments.preset != stored.preset:
+            raise ConfigError("config", str(arguments.file), "has a preset; omit --preset")
         if arguments.resume is not None:
             if arguments.out is not None or arguments.file is not None:
                 reason = "resumes in its own directory; omit --out and --config"
@@ -167,29 +185,23 @@ def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: c
             if arguments.settings != stored:
                 reason = "resumes with its own settings; omit others"
                 raise ConfigError("resume", str(arguments.resume), reason)
-    except ConfigError as error:
+    except (ConfigError, OptionError) as error:
         cli.fail(PROGRAM, str(error))
     return arguments
 
 
 def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     """The settings that the other options change, needed before those are read."""
-    resume, file = _option(argv, "resume"), _option(argv, "config")
-    trust = [each for each in argv if each in {"--trust", "--no-trust"}][-1:] == ["--trust"]
-    if resume:
-        return rundir.resumable(Path(resume), trust)
-    if file:
-        return rundir.read_settings(Path(file), trust)
-    preset = _option(argv, "preset") or "default"
+    given = read_some(Arguments, argv, ("resume", "file", "trust", "preset"))
+    is_trusted = given.get("trust") is True
+    if isinstance(resume := given.get("resume"), Path):
+        return rundir.resumable(resume, is_trusted)
+    if isinstance(file := given.get("file"), Path):
+        return rundir.read_settings(file, is_trusted)
+    preset = str(given.get("preset", "default"))
     if preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
     return Settings(preset, 0, change(PRESETS[preset]))
-
-
-def _option(argv: list[str], name: str) -> str | None:
-    """The last value of an option, if any."""
-    found = re.findall(rf"(?:^|\0)--{name}(?:=|\0)([^\0]+)", "\0".join(argv))
-    return found[-1] if found else None
 
 
 def _say_waits(arguments: Arguments) -> None:
@@ -233,7 +245,7 @@ def _train(
     def stop() -> None:
         monitor.stop()
         if not arguments.quiet:
-            say("Stopping once everything is saved; Ctrl-C again stops at once.")
+            say("Saving and stopping. Press Ctrl-C again to quit immediately.")
 
     paths = seeds.paths(run).items()
     is_left = np.array([not (path / "summary.json").exists() for _, path in paths])
@@ -259,7 +271,7 @@ def _train(
             again += " --trust" if settings.config.sensors else ""
             again += " with the same processes" if jax.process_count() > 1 else ""
             cli.complain(f"Stopped; all training so far is saved. To resume: {again}")
-        # Another process may wait for this one, where it is not to be stopped.
+        # Other processes may be blocked in a collective; wait only briefly.
         devices.leave(devices.LEAVE_TIMEOUT)
         sys.exit(cli.INTERRUPTED)
     if len(failed) == settings.num_seeds:
@@ -309,7 +321,7 @@ def _train_together(
                 _write(run, result, timing, monitor)
             except StageError as error:
                 failed[run.settings.seed] = str(error)
-                _warn(f"{error}; what was saved before is in {run.path}")
+                _warn(f"{error}; earlier checkpoints are in {run.path}")
     return failed
 
 

@@ -20,7 +20,7 @@ from recordings import recording
 from smoke import MISSION_KEYS, error_line
 
 import jaxsense
-from jaxsense import cli, evaluate, mission
+from jaxsense import cli, evaluate, export, mission
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import devices, files, missions
 from jaxsense.run.compilation import Compiler
@@ -256,7 +256,7 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
         (["--policy", "best"], "policy = 'best': must be one of all, policies, latent, greedy"),
         (["--episodes", "0"], "episodes = 0: must be within 1 and 100,000"),
         (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
-        (["--episode", "3"], "'--episode': must be one of the program; perhaps --episodes"),
+        (["--episode", "3"], "unknown option --episode. Did you mean --episodes?"),
     ],
 )
 def test_bad_options_of_evaluate_are_named_in_one_line(smoke_run, options, expected, capsys):
@@ -267,7 +267,7 @@ def test_bad_options_of_evaluate_are_named_in_one_line(smoke_run, options, expec
 
 def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
     line = error_line([str(tmp_path / "none")], capsys, evaluate)
-    assert f"run = {str(tmp_path / 'none')!r}: is not a run directory: it has" in line
+    assert f"{tmp_path / 'none'} is not a run directory: it has no config.json" in line
     versions = {"jaxsense": jaxsense.__version__}
     stored = {"versions": versions, "config": {"colour": 1}}
     (tmp_path / "config.json").write_text(json.dumps(stored))
@@ -275,3 +275,22 @@ def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
     (tmp_path / "config.json").write_text(json.dumps({"versions": versions}))
     line = error_line([str(tmp_path)], capsys, evaluate)
     assert "must be a finished run (there is no checkpoint 'detector_camera')" in line
+
+
+@pytest.mark.parametrize("program", [evaluate, export])
+def test_the_latest_run_is_the_newest_finished_one_in_runs(program, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for number, name in enumerate(["second", "third", "first", "unfinished"]):
+        run = tmp_path / "runs" / name
+        run.mkdir(parents=True)
+        (run / "config.json").write_text("{}")
+        began = {"first": 1, "second": 2, "third": 3, "unfinished": 4}[name]
+        os.utime(run / "config.json", (began, began))
+        if name != "unfinished":
+            (run / "summary.json").write_text("{}")
+            os.utime(run / "summary.json", (10 - number, 10 - number))
+    line = error_line(["latest"], capsys, program)
+    assert "run = 'runs/third': was written by an older jaxsense" in line
+    # A directory of that name comes first.
+    Path("latest").mkdir()
+    assert "latest is not a run directory" in error_line(["latest"], capsys, program)

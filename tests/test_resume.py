@@ -77,7 +77,7 @@ def test_a_stopped_run_goes_on_and_ends_the_same(resumed, smoke_run):
     for stage in ("detector_camera", "detector_lidar", "jmvae_1", "dqn_camera", "dqn_lidar"):
         assert steps(path, stage) == steps(smoke_run, stage), stage
     assert printed.splitlines() == [
-        f"Everything is in {path}; open {path / 'report.html'} first.",
+        f"Results are in {path}. Start with {path / 'report.html'}.",
         f"Next: python -m jaxsense.evaluate {path} --animate",
     ]
 
@@ -154,7 +154,7 @@ def test_a_full_disk_is_named_and_nothing_is_lost(smoke_run, cache, tmp_path):
     (line,) = ended.stderr.strip().splitlines()
     assert line.startswith("jaxsense.train: cannot write ")
     assert "File too large" in line
-    assert line.endswith("; what was saved before is still there")
+    assert line.endswith("; earlier checkpoints are intact")
     before = (path / "config.json").read_text()
     assert not (path / "summary.json").exists()
     train.main(["--resume", str(path), "--quiet", *cache])

@@ -127,7 +127,7 @@ def test_a_seed_that_fails_leaves_the_others(seeds, cache, tmp_path, monkeypatch
     monkeypatch.setattr(Program, "__call__", call)
     train.main(["--resume", str(path), "--quiet", *cache])
     (line,) = capsys.readouterr().err.splitlines()
-    assert "survey: results are not finite; what was saved before is in" in line
+    assert "survey: results are not finite; earlier checkpoints are in" in line
     summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
     assert summary["failed"] == {"4": "survey: results are not finite"}
     assert list(summary["seeds"]) == ["5"]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -13,8 +14,8 @@ import pytest
 from smoke import MISSION_KEYS, SMOKE, error_line
 
 import jaxsense
-from jaxsense import train
-from jaxsense.config import PRESETS, Config
+from jaxsense import evaluate, export, train
+from jaxsense.config import PRESETS, Config, Shape
 from jaxsense.run.compilation import Program
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.rundir import RunDirectory, Settings
@@ -167,8 +168,8 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
             ["--preset", "best"],
             "preset = 'best': must be one of default, paper, noisy, team, smoke",
         ),
-        (["--taste", "sweet"], "train: option = '--taste': must be one of the program"),
-        (["--jmvae.hiden", "3"], "of the program; perhaps --jmvae.hidden (--help"),
+        (["--taste", "sweet"], "train: unknown option --taste. See --help-all."),
+        (["--jmvae.hiden", "3"], "unknown option --jmvae.hiden. Did you mean --jmvae.hidden?"),
         (["--arena.side", "x"], "arena.side = 'x': must be a finite number"),
         (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
         (["--seed", "one"], "seed = 'one': must be a whole number"),
@@ -198,14 +199,88 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path, capsys):
     assert file.read_text() == "kept"
 
 
-def test_help_explains_every_field(capsys):
+def help_of(argv, program, capsys, monkeypatch):
+    """The help of a program on a terminal of 80 columns."""
+    monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit) as stop:
-        train.main(["--help"])
+        program.main(argv)
     assert stop.value.code == 0
-    text = " ".join(capsys.readouterr().out.split())
-    for option in ("--preset", "--seed", "--out", "--arena.side", "--dqn.epsilon-decay"):
-        assert option in text
-    assert "in metres" in text
+    return capsys.readouterr().out
+
+
+def test_help_shows_common_options_on_a_page(capsys, monkeypatch):
+    text = help_of(["--preset", "paper", "--help"], train, capsys, monkeypatch)
+    lines = text.splitlines()
+    assert len(lines) <= 70
+    assert max(map(len, lines)) <= 80
+    # Paragraphs fill their lines, whatever the breaks of the docstrings.
+    assert (
+        "      Number of seeds to train, starting from --seed. Each has its own\n"
+        "      directory within the run, which reports their means and 95 % confidence\n"
+        "      intervals. (default: 1)\n"
+    ) in text
+    assert "--jmvae.alpha NUMBER" in text
+    assert "(default: 1.0)" in text  # of the preset
+    assert "epsilon" not in text
+    assert "None" not in text
+
+
+@pytest.mark.parametrize("program", [evaluate, export])
+def test_help_of_other_commands_fits_the_terminal(program, capsys, monkeypatch):
+    text = help_of(["-h"], program, capsys, monkeypatch)
+    assert text.startswith(f"usage: python -m {program.PROGRAM} [OPTIONS] RUN\n")
+    assert max(map(len, text.splitlines())) <= 80
+    assert "None" not in text
+
+
+def test_all_help_explains_every_field(capsys, monkeypatch):
+    text = help_of(["--help-all"], train, capsys, monkeypatch)
+    assert max(map(len, text.splitlines())) <= 80
+    options = re.findall(r"^  (--\S+)", text, re.MULTILINE)
+    common = help_of(["--help"], train, capsys, monkeypatch)
+    assert common.endswith(f"--help-all lists all {len(options)} options.\n")
+    assert {"--process-index", "--arena.side", "--dqn.epsilon-decay"} <= set(options)
+    assert "  --arena.side NUMBER\n      Inner length and width of the arena, in metres." in text
+    assert "(default: on; --mission.no-redecides turns it off)" in " ".join(text.split())
+    # Each option has a text.
+    assert not re.search(r"^  --.*\n(?!      \S)", text, re.MULTILINE)
+
+
+def test_every_kind_of_option_is_read(tmp_path):
+    words = """--preset smoke --arena.side 4 --arena.num_pois=4 --mdp.partly-seen-starts
+        --mission.no-redecides --arena.colours.red 1 0 .5 --arena.shapes.cube.half-sides .5 .5
+        --team.travel.speed .3 --robots camera camera lidar --cache NONE --quiet --no-quiet
+        --devices none --dqn.hidden 8 --dqn.observe live --seed 3 --seed 4"""
+    arguments = train.parse(words.split())
+    config, smoke = arguments.config, PRESETS["smoke"]
+    assert (arguments.seed, arguments.cache, arguments.devices) == (4, None, None)
+    assert arguments.quiet is False
+    assert (config.arena.side, config.arena.num_pois) == (4.0, 4)
+    assert config.arena.colours == {**smoke.arena.colours, "red": (1.0, 0.0, 0.5)}
+    assert config.arena.shapes == {**smoke.arena.shapes, "cube": Shape("box", (0.5, 0.5))}
+    assert config.mdp.partly_seen_starts is True
+    assert config.mission == dataclasses.replace(smoke.mission, redecides=False)
+    assert config.team == dataclasses.replace(
+        smoke.team, travel=dataclasses.replace(smoke.team.travel, speed=0.3)
+    )
+    assert config.robots == ("camera", "camera", "lidar")
+    assert config.dqn == dataclasses.replace(smoke.dqn, hidden=(8,), observe="live")
+    # Of a stored run, of which other options change settings; then without an option's value.
+    with RunDirectory.create(tmp_path / "run", Settings("smoke", 7, config)):
+        file = str(tmp_path / "run" / "config.json")
+        again = train.parse(["--config", file, "--robots", "None", "--arena.side", "5"])
+        resumed = train.parse(["--resume", str(tmp_path / "run")])
+    assert (again.seed, again.preset, again.config.robots) == (7, "smoke", None)
+    assert again.config.arena == dataclasses.replace(config.arena, side=5.0)
+    assert resumed.settings == Settings("smoke", 7, config)
+
+
+def test_tensorboard_is_refused_before_anything_is_written(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    out = tmp_path / "run"
+    line = error_line([*SMOKE, "--tensorboard", "--out", str(out)], capsys)
+    assert "tensorboard = True: needs tensorboardX: pip install" in line
+    assert not out.exists()
 
 
 def test_whoever_reads_the_help_may_stop_reading():
