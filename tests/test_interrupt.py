@@ -31,7 +31,7 @@ def test_the_first_signal_stops_in_order_and_the_second_one_at_once(first, secon
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 128 + second
     assert ended.stdout == "stopping\nstill here\n"
-    assert ended.stderr == "Stopped at once; what was saved before is still there.\n"
+    assert ended.stderr == "Aborted; earlier checkpoints are intact.\n"
 
 
 def test_what_was_there_before_comes_back_and_what_is_ignored_stays_so():

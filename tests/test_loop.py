@@ -1,5 +1,9 @@
 """The loop that drives the stages of a training from the host."""
 
+import signal
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -129,6 +133,37 @@ def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
     done, state, curves = checkpoints.load_unfinished("jmvae", start)
     assert (done, curves) == (2, {"chunk": [0, 1]})
     np.testing.assert_array_equal(state["x"], [2, 2])
+
+
+KILLED = """
+import os, signal, sys, time
+from pathlib import Path
+import numpy as np
+from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run.loop import run_chunks
+from jaxsense.run.monitor import Monitor
+
+clock = [0.0]
+time.monotonic = lambda: clock[0]
+
+def run(chunk, state):
+    if chunk == 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+    clock[0] += 25.0
+    return state + 1, {"chunk": [chunk]}
+
+run_chunks("jmvae", np.float32(0), 9, run, Monitor(), Checkpoints(Path(sys.argv[1])))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no SIGKILL")
+def test_a_killed_training_loses_no_more_than_a_minute(tmp_path):
+    # Five chunks of 25 s: it is saved after 75 s, and would be after 150 s.
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    state = np.float32(0)
+    done, state, curves = Checkpoints(tmp_path).load_unfinished("jmvae", state)
+    assert (done, state, curves) == (3, 3, {"chunk": [0, 1, 2]})
 
 
 def test_a_stop_is_heard_after_every_chunk(tmp_path):

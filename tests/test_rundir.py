@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.run import rundir
+from jaxsense.run import rundir, version
 from jaxsense.run.rundir import RunDirectory, Settings
 
 SETTINGS = Settings("smoke", 3, PRESETS["smoke"])
@@ -145,19 +145,19 @@ def test_a_run_records_the_commit_of_its_source(tmp_path):
         command = ["git", "-C", str(folder), *who, *command]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
-    assert rundir.commit(tmp_path) is None
+    assert version.commit(tmp_path) is None
     git(tmp_path, "init")
     (tmp_path / "file").write_text("1")
     git(tmp_path, "add", "file")
     git(tmp_path, "commit", "-m", "first")
     git(tmp_path, "tag", "v1")
     head = git(tmp_path, "rev-parse", "HEAD")
-    assert rundir.commit(tmp_path) == head
+    assert version.commit(tmp_path) == head
     (tmp_path / "file").write_text("2")
-    assert rundir.commit(tmp_path) == f"{head}-dirty"
+    assert version.commit(tmp_path) == f"{head}-dirty"
     root = Path(__file__).parents[1]
     with RunDirectory.create(tmp_path / "run", SETTINGS) as run:
         content = json.loads((run.path / "config.json").read_text("utf-8"))
     # Tests may run away from the source tree.
-    expected = git(root, "rev-parse", "HEAD") if Path(rundir.__file__).parents[2] == root else None
+    expected = git(root, "rev-parse", "HEAD") if Path(version.__file__).parents[2] == root else None
     assert (content["commit"] or "").removesuffix("-dirty") == (expected or "")

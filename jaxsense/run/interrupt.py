@@ -1,4 +1,4 @@
-"""Stops a run in order on Ctrl-C or at the end of a job's time."""
+"""Graceful stop of a run on Ctrl-C, or on SIGTERM at the end of a job's time."""
 
 import contextlib
 import os
@@ -11,11 +11,11 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextlib.contextmanager
 def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
-    """Calls `stop` at the first Ctrl-C or SIGTERM; the second one ends the process at once.
+    """Calls `stop` at the first Ctrl-C or SIGTERM; the second one aborts the process.
 
-    Call it in the main thread, where Python handles signals.
+    Enter it in the main thread, where Python handles signals.
     """
-    # The parent process may ignore signals that are meant for another one.
+    # Signals that the parent process made this one ignore stay ignored.
     before = {
         number: handler
         for number in _SIGNALS
@@ -27,9 +27,9 @@ def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, handler)
 
     def end(number: int, frame: FrameType | None) -> None:
-        # Threads that compile or save would hold up any other way out.
+        # Any other exit would wait for threads that compile or save.
         with contextlib.suppress(OSError):
-            os.write(2, b"Stopped at once; what was saved before is still there.\n")
+            os.write(2, b"Aborted; earlier checkpoints are intact.\n")
         os._exit(128 + number)
 
     def handle(number: int, frame: FrameType | None) -> None:

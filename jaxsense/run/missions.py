@@ -1,13 +1,14 @@
-"""Many missions in batches, to compare policies and failures."""
+"""Plays many missions in batches, to compare policies and failures."""
 
 import dataclasses
 import math
 import threading
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxsense.config import MISSIONS_AT_ONCE, Config
 from jaxsense.core import checks
@@ -29,6 +30,7 @@ from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 
 _CHUNK_TIME = 2.5  # s
+Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +38,8 @@ class Recording:
     """A whole mission.
 
     Attributes:
-      end: the state in which it ended.
-      records: `[steps]` of all control periods; after its end, the last one repeats.
+      end: its last state.
+      records: `[steps]` records of all control periods; after the end, the last one repeats.
     """
 
     end: MissionState
@@ -49,48 +51,70 @@ class Played:
     """The results of many missions.
 
     Attributes:
-      metrics: `[episodes, ...]` metrics of each case, see `mission.measure`.
+      metrics: `[episodes, ...]` metrics of each case; see `mission.measure`.
       recording: the first mission of the first case.
-      control_steps: control periods of all missions until their end.
+      control_steps: total number of control periods, until each mission's end.
     """
 
-    metrics: dict[str, dict[str, Any]]
+    metrics: dict[str, Measured]
     recording: Recording
     control_steps: int
 
 
 def chunk_of(config: Config) -> int:
-    """Control periods between two reports; no number that may change without compiling enters."""
+    """Control periods between two reports. Traced settings must not enter: it is a size."""
     return math.ceil(_CHUNK_TIME / config.mission.control_period)
 
 
 def batch_of(total: int) -> int:
-    """How many missions to play side by side: fewer than `total`, as some last long."""
+    """How many missions to play side by side: fewer than all, since some last long.
+
+    Args:
+      total: number of missions.
+
+    Raises:
+      ValueError: if it is not a number greater than 0.
+    """
     checks.require_number("total", total)
     return min(MISSIONS_AT_ONCE, -(-total // 3))
 
 
 def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
-    """Keys of an episode's arena and of its events; fold a chunk's number into the latter."""
+    """Keys of an episode's arena and of its events.
+
+    Args:
+      key: of all missions.
+      episode: its index.
+
+    Returns:
+      The two keys; fold a chunk's index into the second one.
+    """
     arena_key, play_key = jax.random.split(key)
     return jax.random.fold_in(arena_key, episode), jax.random.fold_in(play_key, episode)
 
 
 class Player:
-    """Plays missions in batches, with programs compiled once, before any model is trained.
+    """Plays missions in batches, with programs that are compiled before any model is trained.
 
-    Episode i has the same arena in every case and batch.
+    Episode i has the same arena in every case.
 
     Attributes:
       mission: the mission.
     """
 
     def __init__(self, mission: Mission, compiler: Compiler, batch: int, workers: Workers = ALONE):
-        """Compiles for about `batch` missions side by side, shared by the workers."""
+        """Starts to compile the programs.
+
+        Args:
+          mission: to play.
+          compiler: compiles in the background.
+          batch: number of missions side by side, rounded up to a multiple of the workers.
+          workers: share the missions.
+        """
         batch = -(-batch // workers.number) * workers.number
         self.mission, self._monitor, self._batch = mission, compiler.monitor, batch
         config, share = mission.config, batch // workers.number
-        parts = 1 if workers.mesh is None else workers.number  # a thread sees its own rows alone
+        parts = 1 if workers.mesh is None else workers.number  # a thread sees only its own rows
         chunk = chunk_of(config)
         self._lock = threading.Lock()
 
@@ -152,26 +176,29 @@ class Player:
           episodes: missions of each case.
 
         Raises:
-          StageError: if the models or the map of a mission are not finite; a policy would take NaN
-            for the end of its mission.
+          StageError: if the models or the beliefs of a mission are not finite, which policies would
+            take for the end of the mission.
+          Stopped: if the run was asked to stop.
         """
-        with self._lock:  # one call fills the machine
+        with self._lock:  # one call uses the whole machine
             return self._play(key, models, played, episodes)
 
     def _starts(
         self, key: Key, played: dict[str, Case], episodes: int
     ) -> tuple[np.ndarray, MissionState]:
-        """Episodes and first states of all missions, the first ones repeated to fill a batch."""
+        """Episodes and first states of all missions; the first ones repeat to fill a batch."""
         total = episodes * len(played)
         row = np.arange(-(-total // self._batch) * self._batch, dtype=np.int32) % total
         case, episode = row // episodes, row % episodes
         policies = np.array([c.policy for c in played.values()], np.int32)[case]
         faults = jax.tree.map(lambda *x: np.stack(x)[case], *[c.faults for c in played.values()])
-        inputs = episode, policies, faults
 
         def begin(first: int) -> MissionState:
-            part = jax.tree.map(lambda x: x[first : first + self._batch], inputs)
-            return jax.tree.map(np.asarray, self._begin(key, self.mission.config, *part))
+            rows = slice(first, first + self._batch)
+            some = jax.tree.map(lambda x: x[rows], faults)
+            config = self.mission.config
+            state = self._begin(key, config, episode[rows], policies[rows], some)
+            return jax.tree.map(np.asarray, state)
 
         begun = [begin(first) for first in range(0, len(row), self._batch)]
         return episode, jax.tree.map(lambda *x: np.concatenate(x), *begun)
@@ -182,12 +209,12 @@ class Player:
         config, total = self.mission.config, episodes * len(played)
         episode, starts = self._starts(key, played, episodes)
 
-        # A mission that is over makes room for the next one, so that short ones do not wait.
+        # The next mission takes the slot of one that is done, so that short ones do not wait.
         state = jax.tree.map(lambda x: x[: self._batch].copy(), starts)
         playing, waiting = np.arange(self._batch), iter(range(self._batch, total))
         chunk, done = np.zeros(self._batch, np.int32), np.zeros(len(episode), bool)
-        results: Any = None
-        first: list[tuple[MissionState, Record]] = []
+        results: Measured | None = None
+        ends, recorded = list[MissionState](), list[Record]()
         control_steps = 0
         while not done[:total].all():
             self._monitor.check_stop()
@@ -196,7 +223,8 @@ class Player:
             at = f"beliefs after {chunk.max() + 1} chunks"
             self._monitor.check_finite("mission", at, state.belief)
             if not done[0]:
-                first.append(jax.tree.map(lambda x: x[0].copy(), (state, records)))
+                ends.append(jax.tree.map(lambda x: x[0].copy(), state))
+                recorded.append(jax.tree.map(lambda x: x[0].copy(), records))
             if results is None:
                 results = jax.tree.map(
                     lambda x: np.zeros((len(done), *x.shape[1:]), x.dtype), found
@@ -211,8 +239,7 @@ class Player:
                     playing[slot], chunk[slot] = following, 0
                     _set_row(state, slot, starts, following)
             self._monitor.progress("mission", int(done[:total].sum()), total)
-        ends, chunks_of_records = zip(*first, strict=True)
-        whole = jax.tree.map(lambda *parts: np.concatenate(parts), *chunks_of_records)
+        whole = jax.tree.map(lambda *parts: np.concatenate(parts), *recorded)
         metrics = {
             name: jax.tree.map(lambda x: x[i * episodes : (i + 1) * episodes], results)  # noqa: B023
             for i, name in enumerate(played)
@@ -220,8 +247,8 @@ class Player:
         return Played(metrics, Recording(ends[-1], whole), control_steps)
 
 
-def _set_row(target: Any, row: int, source: Any, from_row: int) -> None:
-    """Copies a row of every array of one tree into another."""
+def _set_row(target: PyTree, row: int, source: PyTree, from_row: int) -> None:
+    """Copies a row of every array of one tree into those of another."""
 
     def copy(target: np.ndarray, source: np.ndarray) -> None:
         target[row] = source[from_row]

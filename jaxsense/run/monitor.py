@@ -2,26 +2,26 @@
 
 import threading
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 Listener = Callable[[str, int, int, dict[str, float]], None]
 """`(stage, done, total, metrics)`, called from the host between two chunks of work."""
 
 
 class StageError(RuntimeError):
-    """A training that cannot continue; names the stage and the step."""
+    """A stage that cannot continue; the message names the stage and the step."""
 
 
 class Stopped(Exception):  # noqa: N818 (nothing is wrong)
-    """A run that was asked to stop, with all its training saved."""
+    """A run that was asked to stop, after all its training was saved."""
 
 
-def is_finite(values: Any) -> bool:
-    """Whether all real numbers in arrays, or pytrees of them, are finite."""
+def is_finite(values: PyTree) -> bool:
+    """Whether all floats in a pytree of arrays are finite."""
     leaves = [x for x in jax.tree.leaves(values) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
     return all(np.isfinite(leaf).all() for leaf in leaves)
 
@@ -50,28 +50,28 @@ class Monitor:
         self.begin(listener)
 
     def begin(self, listener: Listener) -> None:
-        """Begins another run, with times from zero and another listener."""
+        """Begins another run: resets the times and replaces the listener."""
         self.seconds: dict[str, dict[str, float]] = {}
         self._failure: StageError | None = None
         self._one_listener = listener
 
     def beside(self, listener: Listener) -> "Monitor":
-        """The monitor of another run side by side, which stops with this one."""
+        """Returns a monitor for a concurrent run that shares this one's stop flag."""
         other = Monitor(listener, self.warn)
         other._stop = self._stop
         return other
 
     def _listener(self, stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
-        """Calls the listener, from one stage at a time."""
+        """Calls the listener, for one stage at a time."""
         with self._lock:
             self._one_listener(stage, done, total, metrics)
 
     def stop(self) -> None:
-        """Asks the stages to save and to stop."""
+        """Asks the stages to save their training and stop."""
         self._stop.set()
 
     def fail(self, failure: StageError) -> None:
-        """Ends the stages that run side by side with a failed one."""
+        """Stops the stages that run beside a failed one."""
         self._failure = failure
 
     @property
@@ -80,27 +80,41 @@ class Monitor:
         return self._stop.is_set() or self._failure is not None
 
     def check_stop(self) -> None:
-        """Raises `Stopped` if the stages must stop, or the failure of another stage."""
+        """Checks whether the run goes on.
+
+        Raises:
+          Stopped: if it was asked to stop.
+          StageError: if a stage has failed.
+        """
         if self._failure is not None:
             raise self._failure
         if self.is_stopping:
             raise Stopped
 
     def announce(self, stage: str) -> None:
-        """Reports that a stage compiles."""
+        """Reports that a stage is compiling."""
         self._listener(stage, 0, 0, {})
 
     def progress(self, stage: str, done: int, total: int) -> None:
-        """Reports progress of a stage without a loss."""
+        """Reports progress of a stage without a loss.
+
+        Args:
+          stage: its name.
+          done: units of work so far.
+          total: units of work of the whole stage.
+        """
         self._listener(stage, done, total, {})
 
-    def check_finite(self, stage: str, name: str, values: Any) -> None:
-        """Raises a `StageError` that names the stage and the values if any is not finite.
+    def check_finite(self, stage: str, name: str, values: PyTree) -> None:
+        """Checks that values are finite.
 
         Args:
           stage: its name.
           name: of the values, for example "parameters at step 20 of 40".
-          values: arrays, or pytrees of them.
+          values: a pytree of arrays.
+
+        Raises:
+          StageError: if any is not; names the stage and the values.
         """
         if not is_finite(values):
             raise StageError(f"{stage}: {name} are not finite")
@@ -111,7 +125,7 @@ class Monitor:
         done: int,
         total: int,
         losses: np.ndarray,
-        params: Any = (),
+        params: PyTree = (),
         **metrics: float,
     ) -> None:
         """Reports a chunk of training.
@@ -122,7 +136,7 @@ class Monitor:
           total: steps of the whole stage.
           losses: `[steps]` of the chunk; their mean is reported.
           params: parameters after the chunk.
-          **metrics: others to report.
+          **metrics: other metrics.
 
         Raises:
           StageError: if a loss or a parameter is not finite; names the step.
@@ -135,7 +149,13 @@ class Monitor:
         self._listener(stage, done, total, {"loss": float(np.mean(losses)), **metrics})
 
     def add(self, stage: str, kind: str, seconds: float) -> None:
-        """Adds to the time of a stage; `kind` is "compile_s" or "run_s"."""
+        """Adds to the time of a stage.
+
+        Args:
+          stage: its name.
+          kind: "compile_s" or "run_s".
+          seconds: to add.
+        """
         with self._lock:
             entry = self.seconds.setdefault(stage, {"compile_s": 0.0, "run_s": 0.0})
             entry[kind] += seconds

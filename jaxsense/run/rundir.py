@@ -6,7 +6,6 @@ import errno
 import hashlib
 import itertools
 import json
-import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -26,12 +25,11 @@ from jaxsense.config import (
 from jaxsense.models import Models
 from jaxsense.run import files
 from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.version import __version__, versions
+from jaxsense.run.version import __version__, commit, versions
 from jaxsense.training.agents import learner
 
 Json: TypeAlias = dict[str, Any]
 _METRICS = "metrics.jsonl"
-_ROOT = Path(__file__).parents[2]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,23 +260,6 @@ def _locked(path: Path, field: str) -> Iterator[None]:
             reason = "is being written by another process; wait for it to end"
             raise ConfigError(field, str(path), reason) from None
         yield
-
-
-def commit(source: Path = _ROOT) -> str | None:
-    """The commit of a source tree, with `-dirty` if files have changed; None outside Git.
-
-    Args:
-      source: the root of the tree, by default the one this package was imported from.
-    """
-    if not (source / ".git").exists():
-        return None
-    command = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=40"]
-    command += ["--exclude", "*"]
-    try:
-        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return found.stdout.strip()
 
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:

@@ -23,18 +23,28 @@ def paths(run: RunDirectory) -> dict[int, Path]:
 
 
 def check(run: RunDirectory) -> None:
-    """Raises `ConfigError` if the directory of one of several seeds holds another run."""
+    """Checks that the directories of several seeds belong to this run.
+
+    Raises:
+      ConfigError: if one holds another run.
+    """
     for seed, path in paths(run).items():
         if path == run.path or not (path / "config.json").exists():
             continue
-        # Only compared: no code that they name runs.
+        # The settings are only compared: no custom sensor is made.
         if rundir.read_settings(path / "config.json", trust=True) != _settings_of(run, seed):
             reason = f"must have the settings of {run.path / 'config.json'}, with seed {seed}"
             raise ConfigError("resume", str(path), reason)
 
 
 def open_run(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager[RunDirectory]:
-    """The run directory of one seed, like a run of that seed alone."""
+    """Opens the run directory of one seed, which is as if that seed were trained alone.
+
+    Args:
+      run: the run of all seeds.
+      seed: the seed.
+      path: its directory, from `paths`.
+    """
     if path == run.path:
         return contextlib.nullcontext(run)
     if (path / "config.json").exists():

@@ -1,30 +1,33 @@
-"""Runs several trainings side by side on an accelerator: their calls of a program become one.
+"""Runs several trainings side by side on an accelerator, with one call for all of them.
 
-Each training has its own threads, and saves, stops and fails by itself. They share their programs:
-`vmap` stacks calls of the same program into one.
+Each training has its own threads, and saves, stops and fails independently. They share programs:
+their calls of the same program are stacked, along an axis that `vmap` adds.
 """
 
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from jaxsense.run.compilation import Program, shapes_of
 from jaxsense.run.devices import ALONE, Workers
 
-_PATIENCE = 0.5  # s without another call, after which those that wait stop waiting for the others
+_PATIENCE = 0.5  # s; then a call goes ahead without the trainings that have not made it yet
+
+_Call: TypeAlias = tuple[tuple[PyTree, ...], Future[PyTree]]
 
 
 class Trainings:
     """Trainings side by side.
 
     Attributes:
-      number: the most trainings at a time.
-      active: trainings that have begun and not ended.
+      number: maximum number of trainings at a time.
+      active: number of trainings that are running.
     """
 
     def __init__(self, number: int):
@@ -36,7 +39,7 @@ class Trainings:
         self.active = number
 
     def leave(self) -> None:
-        """Ends one training; the others stop waiting for it."""
+        """Ends one training, for which the others no longer wait."""
         with self._lock:
             self.active -= 1
 
@@ -49,24 +52,34 @@ class SharedProgram:
 
         Args:
           program: compiles and runs the stacked calls.
-          trainings: call it.
-          workers: accelerators that share the trainings, if their number divides theirs.
+          trainings: that call it.
+          workers: accelerators that share the trainings, if they divide evenly among them.
         """
         self._program, self._trainings = program, trainings
         self._workers = workers if trainings.number % workers.number == 0 else ALONE
         self._whole: tuple[int, ...] = ()
         self._lock = threading.Lock()
-        self._waiting: list[tuple[tuple[Any, ...], Future[Any]]] = []
+        self._waiting: list[_Call] = []
         self._last = 0.0
 
     def compile(
         self,
-        function: Callable[..., Any],
-        *args: Any,
+        function: Callable[..., PyTree],
+        *args: PyTree,
         runs_long: bool = False,
         whole: tuple[int, ...] = (),
-    ) -> Any:
-        """See `Program.compile`; all trainings share the arguments in `whole`."""
+    ) -> PyTree[jax.ShapeDtypeStruct]:
+        """Starts to compile the stacked function; see `Program.compile`.
+
+        Args:
+          function: of one training.
+          *args: arguments of one training, or their shapes.
+          runs_long: see `devices.compiler_options`.
+          whole: positions of arguments that all trainings share.
+
+        Returns:
+          Shapes and dtypes of one training's results.
+        """
         self._whole, number = whole, self._trainings.number
         axes = tuple(None if i in whole else 0 for i in range(len(args)))
         shapes = shapes_of(args)
@@ -87,13 +100,13 @@ class SharedProgram:
         """See `Program.fail`."""
         self._program.fail(error)
 
-    def wait(self) -> Any:
+    def wait(self) -> Callable[..., PyTree]:
         """See `Program.wait`."""
         return self._program.wait()
 
-    def __call__(self, *args: Any) -> Any:
-        """Runs the program for all trainings that call it now, and returns this one's results."""
-        mine: Future[Any] = Future()
+    def __call__(self, *args: PyTree) -> PyTree:
+        """Runs the program for all trainings that call it now; returns this training's results."""
+        mine: Future[PyTree] = Future()
         with self._lock:
             self._waiting.append((args, mine))
             self._last = time.monotonic()
@@ -105,8 +118,8 @@ class SharedProgram:
                 wait((mine,), timeout=_PATIENCE / 10)
         return mine.result()
 
-    def _take(self) -> list[tuple[tuple[Any, ...], Future[Any]]]:
-        """The calls to make now: one per training, or all that have waited too long."""
+    def _take(self) -> list[_Call]:
+        """The calls to make now: one of each training, or all that have waited too long."""
         with self._lock:
             is_late = time.monotonic() - self._last > _PATIENCE
             if not (len(self._waiting) >= self._trainings.active or is_late):
@@ -115,8 +128,8 @@ class SharedProgram:
             calls, self._waiting = self._waiting[:number], self._waiting[number:]
             return calls
 
-    def _run(self, calls: list[tuple[tuple[Any, ...], Future[Any]]]) -> None:
-        """Makes calls together; an empty place repeats the first call."""
+    def _run(self, calls: list[_Call]) -> None:
+        """Makes some calls together; the first one fills the places of missing ones."""
         rows = [args for args, _ in calls]
         rows += rows[:1] * (self._trainings.number - len(rows))
         stacked = [
@@ -133,5 +146,5 @@ class SharedProgram:
             future.set_result(jax.tree.map(lambda x: x[i], results))  # noqa: B023
 
 
-def _with_rows(x: Any, number: int) -> jax.ShapeDtypeStruct:
+def _with_rows(x: jax.ShapeDtypeStruct, number: int) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((number, *x.shape), x.dtype)

@@ -1,12 +1,32 @@
-"""Versions of jaxsense, and of the packages that results depend on."""
+"""Versions of jaxsense and of the packages that results depend on."""
 
 import importlib.metadata
+import subprocess
+from pathlib import Path
 
 __version__ = "0.2.0"
+_ROOT = Path(__file__).parents[2]
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
 def versions() -> dict[str, str]:
-    """Versions of jaxsense and of the packages that results depend on."""
+    """Versions of jaxsense and of the packages that results depend on, by name."""
     others = {package: importlib.metadata.version(package) for package in _PACKAGES}
     return {"jaxsense": __version__, **others}
+
+
+def commit(source: Path = _ROOT) -> str | None:
+    """The commit of a source tree, with `-dirty` if files have changed; None outside Git.
+
+    Args:
+      source: the root of the tree, by default the one this package was imported from.
+    """
+    if not (source / ".git").exists():
+        return None
+    command = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=40"]
+    command += ["--exclude", "*"]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip()

@@ -15,7 +15,7 @@ from jaxsense.models import init
 from jaxsense.run import devices, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
-from jaxsense.run.monitor import Monitor
+from jaxsense.run.monitor import Monitor, StageError
 
 # The package gives its function this name.
 ROLLOUT = importlib.import_module("jaxsense.mission.rollout")
@@ -42,39 +42,78 @@ WORKERS = {
 }
 
 
-@pytest.mark.parametrize("split", WORKERS)
-def test_the_whole_first_mission_is_recorded(split, team, monkeypatch):
+@pytest.fixture
+def play(team, monkeypatch):
+    """Plays nine missions of the naive policy with `fake_step`, four at a time."""
     state = jax.jit(lambda: mission.reset(KEY, team, NAIVE))()
 
     def fake_reset(key, team, policy, faults):
         poses = jax.random.normal(key, state.scene.poses.shape)
         return dataclasses.replace(state, scene=dataclasses.replace(state.scene, poses=poses))
 
+    def measure(team, models, s):
+        return {"steps": s.steps, "poses": s.scene.poses}
+
     monkeypatch.setattr(ROLLOUT, "step", fake_step)
     monkeypatch.setattr(missions, "reset", fake_reset)
-    monkeypatch.setattr(missions, "measure", lambda team, models, s: {"steps": s.steps})
-    with Compiler(Monitor()) as compiler:
-        player = missions.Player(team, compiler, 4, WORKERS[split]())
-        models = init(jax.random.key(0), CONFIG)
-        played = player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, 9)
-    np.testing.assert_array_equal(played.metrics["naive"]["steps"], np.full(9, LAST))
+    monkeypatch.setattr(missions, "measure", measure)
 
-    arena_key, play_key = missions.keys_of_episode(KEY, 0)
+    def run(workers):
+        with Compiler(Monitor()) as compiler:
+            player = missions.Player(team, compiler, 4, workers)
+            models = init(jax.random.key(0), CONFIG)
+            return player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, 9)
+
+    return run
+
+
+def walk_of(episode, shape):
+    """`[LAST, ...]` poses of an episode, whose second chunk starts with a key of its own."""
+    arena_key, play_key = missions.keys_of_episode(KEY, episode)
     step_keys = [
         key
         for number in range(2)
         for key in jax.random.split(jax.random.fold_in(play_key, number), CHUNK)
     ]
-    moves = [jax.random.normal(key, state.scene.poses.shape) for key in step_keys[:LAST]]
-    start = np.asarray(jax.random.normal(arena_key, state.scene.poses.shape))
-    walk = start + np.cumsum(moves, axis=0)
+    moves = [jax.random.normal(key, shape) for key in step_keys[:LAST]]
+    return np.asarray(jax.random.normal(arena_key, shape)) + np.cumsum(moves, axis=0)
+
+
+@pytest.mark.parametrize("split", WORKERS)
+def test_the_whole_first_mission_is_recorded(split, play):
+    played = play(WORKERS[split]())
+    np.testing.assert_array_equal(played.metrics["naive"]["steps"], np.full(9, LAST))
     records, end = played.recording.records, played.recording.end
+    walk = walk_of(0, end.scene.poses.shape)
     assert len(records.time) == 2 * CHUNK
     np.testing.assert_array_equal(records.time, np.minimum(np.arange(2 * CHUNK) + 1, LAST))
     np.testing.assert_allclose(records.poses[:LAST], walk, atol=1e-4)
     np.testing.assert_array_equal(records.poses[LAST:], records.poses[LAST - 1 : -1])
     np.testing.assert_array_equal(end.scene.poses, records.poses[-1])
     assert end.done
+    assert played.control_steps == 9 * LAST
+
+
+def test_events_of_a_mission_do_not_depend_on_when_it_is_played(play):
+    """Missions 4 to 8 take the places of missions that are over."""
+    poses = play(Workers()).metrics["naive"]["poses"]
+    for episode in (0, 3, 4, 8):
+        walk = walk_of(episode, poses.shape[1:])
+        np.testing.assert_allclose(poses[episode], walk[-1], atol=1e-4)
+
+
+def test_a_map_that_is_not_finite_ends_the_missions(play, monkeypatch):
+    def diverging(keys, team, models, states, parts):
+        states, record = fake_step(keys, team, models, states, parts)
+        is_bad = (states.steps > CHUNK)[:, None, None]
+        belief = dataclasses.replace(
+            states.belief, std=jnp.where(is_bad, jnp.nan, states.belief.std)
+        )
+        return dataclasses.replace(states, belief=belief), record
+
+    monkeypatch.setattr(ROLLOUT, "step", diverging)
+    with pytest.raises(StageError, match="mission: beliefs after 2 chunks are not finite"):
+        play(Workers())
 
 
 def test_a_short_time_limit_changes_no_program():
