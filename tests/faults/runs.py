@@ -79,6 +79,10 @@ class Runs:
             ended = self.train(*again)
             require(ended.returncode == 0, f"{path.name}: {ended.stderr}")
         require(summary(path) == self.whole(*arguments), f"{path.name}: another summary")
+        for file in path.rglob("metrics.jsonl"):
+            reported = map(json.loads, file.read_text(encoding="utf-8").splitlines())
+            steps = [(line["stage"], line["step"]) for line in reported if "loss" in line]
+            require(len(set(steps)) == len(steps), f"{file}: steps reported twice")
 
 
 class Process:
