@@ -147,7 +147,12 @@ class RunDirectory:
             yield run
 
     def write_json(self, name: str, content: Mapping[str, object]) -> None:
-        """Writes a JSON file of the run; see the function `write_json`."""
+        """Writes a JSON file of the run; see the function `write_json`.
+
+        Args:
+          name: of the file.
+          content: of the file.
+        """
         write_json(self.path / name, content)
 
     def save_models(self, models: Models) -> None:
