@@ -11,6 +11,7 @@ then those of its package, then all that import the package, until one fails.
 
 import argparse
 import ast
+import contextlib
 import copy
 import os
 import queue
@@ -31,6 +32,7 @@ ROOT = Path(__file__).parents[1]
 PROGRAMS = ("show", "cli.py", "train.py", "evaluate.py")  # drawn from if named
 LAST = "tests/test_same_numbers.py"  # trains once, and compares all figures
 TEST_SECONDS = 200
+RUNNING: set[int] = set()  # process groups
 ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 PAIRS = (
     *((ast.Eq, ast.NotEq), (ast.Is, ast.IsNot), (ast.In, ast.NotIn), (ast.And, ast.Or)),
@@ -221,13 +223,20 @@ def run_tests(
         process = subprocess.Popen(
             command, cwd=root, env=environment, stdout=log, stderr=log, start_new_session=True
         )
+        RUNNING.add(process.pid)
         try:
             return process.wait(limit)
         except subprocess.TimeoutExpired:
             return None
         finally:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
+            _kill(process.pid)
+
+
+def _kill(pid: int) -> None:
+    """Ends pytest and the programs that it has started."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(pid, signal.SIGKILL)
+    RUNNING.discard(pid)
 
 
 def is_killed(root: Path, mutant: Mutant, limit: float) -> bool:
@@ -275,12 +284,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the draw (default: 0)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="at the same time")
     parser.add_argument("--limit", type=float, default=300, help="seconds for each (default: 300)")
+    parser.add_argument("--trust", action="store_true", help="do not run the tests unbroken first")
     parser.add_argument("--list", action="store_true", help="only print the mutants")
     given = parser.parse_args()
     drawn = draw(ROOT, modules_of(ROOT, given.names), given.number, given.seed)
     if given.list:
         print(*(mutant.describe(ROOT) for mutant in drawn), sep="\n")
         return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     tried, killed = Counter(), Counter()
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.jobs) as pool:
         copies: queue.Queue[Path] = queue.Queue()
@@ -295,16 +306,23 @@ def main() -> None:
             finally:
                 copies.put(root)
 
-        # Without mutants the tests must pass; they leave compiled programs for those with one.
-        tests = sorted({test for mutant in drawn for test in tests_of(ROOT, mutant.module)})
-        if run_tests(Path(folder) / "0", tests, "-n", str(given.jobs), "--dist", "loadfile") != 0:
-            sys.exit((Path(folder) / "0.log").read_text())
-        for mutant, is_dead in zip(drawn, pool.map(attempt, drawn), strict=True):
-            package = str(Path(*mutant.module.parts[:2]))
-            tried[package] += 1
-            killed[package] += is_dead
-            if not is_dead:
-                print("survived", mutant.describe(ROOT), flush=True)
+        try:
+            # The tests must pass unbroken; they leave compiled programs behind for the others.
+            tests = sorted({test for mutant in drawn for test in tests_of(ROOT, mutant.module)})
+            options = "-n", str(given.jobs), "--dist", "loadfile"
+            if not given.trust and run_tests(Path(folder) / "0", tests, *options) != 0:
+                sys.exit((Path(folder) / "0.log").read_text())
+            for mutant, is_dead in zip(drawn, pool.map(attempt, drawn), strict=True):
+                package = str(Path(*mutant.module.parts[:2]))
+                tried[package] += 1
+                killed[package] += is_dead
+                if not is_dead:
+                    print("survived", mutant.describe(ROOT), flush=True)
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for pid in list(RUNNING):
+                _kill(pid)
+            raise
     for package in sorted(tried):
         print(f"{package}: {killed[package]} of {tried[package]} killed")
     print(f"{killed.total()} of {tried.total()} killed, {killed.total() / tried.total():.1%}")
