@@ -156,7 +156,7 @@ def _place(section: object, field: str) -> str:
 
 
 @functools.cache
-def _fields(cls: Any) -> list[tuple[str, Any, Limits | None]]:
+def _fields(cls: Any) -> list[tuple[str, object, Limits | None]]:
     """Name, type and limits of each field of a dataclass."""
     hints = get_type_hints(cls)
     return [(f.name, hints[f.name], f.metadata.get("limits")) for f in dataclasses.fields(cls)]
@@ -170,7 +170,7 @@ def _parts(place: str, value: object) -> Iterator[tuple[str, object]]:
         yield place, value
 
 
-def _converted(value: Any, kind: Any) -> Any:
+def _converted(value: object, kind: object) -> object:
     """A value in its declared form; raises `TypeError` if it is of another type."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
@@ -205,7 +205,7 @@ _ONE_AND_MANY: dict[type, tuple[str, str]] = {
 }
 
 
-def _described(kind: Any, *, many: bool = False) -> str:
+def _described(kind: object, *, many: bool = False) -> str:
     """Description of a declared type, after "must be"."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin is Literal:
@@ -217,6 +217,7 @@ def _described(kind: Any, *, many: bool = False) -> str:
         return f"{'lists' if many else 'a list'} of {number}{_described(inner[0], many=True)}"
     if origin is Mapping:
         return f"a dictionary from names to {_described(inner[1], many=True)}"
+    assert isinstance(kind, type)
     name = kind.__name__
     return _ONE_AND_MANY.get(kind, (f"of type {name}", f"values of type {name}"))[many]
 

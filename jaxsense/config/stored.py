@@ -40,7 +40,7 @@ def parse_json(text: str) -> Any:
         raise ValueError("nested too deeply") from None
 
 
-def _without_twins(fields: list[tuple[str, Any]]) -> dict[str, Any]:
+def _without_twins(fields: list[tuple[str, object]]) -> dict[str, object]:
     """Object of JSON; raises `ValueError` if two of its fields share a name."""
     found = dict(fields)
     if len(found) < len(fields):
@@ -57,7 +57,7 @@ def require_trust(config: Config) -> None:
         raise ConfigError(f"sensors.{name}.make", sensor.make, reason)
 
 
-def _made(kind: Any, stored: Any, base: Any, place: str) -> Any:
+def _made(kind: object, stored: object, base: Any, place: str) -> Any:
     """A value of a declared type; the dataclasses among them check their fields.
 
     Args:

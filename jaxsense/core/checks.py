@@ -4,7 +4,6 @@ Traced values are unknown: their checks pass and cost nothing.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,15 +11,18 @@ from jax.core import Tracer
 
 
 def require(
-    name: str, value: Any, is_right: Callable[[np.ndarray], np.ndarray], expected: str
+    name: str, value: object, is_right: Callable[[np.ndarray], np.ndarray], expected: str
 ) -> None:
-    """Raises a `ValueError` that names the first wrong number of an array.
+    """Checks every number of an array.
 
     Args:
-      name: of the argument.
-      value: the array.
+      name: name of the argument.
+      value: the array, or anything that NumPy can convert to one.
       is_right: `array -> bool array`, which of its numbers are right.
       expected: what would be right.
+
+    Raises:
+      ValueError: names the first wrong number.
     """
     if isinstance(value, Tracer):
         return
@@ -32,26 +34,59 @@ def require(
         raise ValueError(f"{name} = {wrong.flat[0]}: {expected}")
 
 
-def require_positive(name: str, value: Any) -> None:
-    """Raises a `ValueError` unless all numbers are finite and greater than 0."""
+def require_positive(name: str, value: object) -> None:
+    """Checks that all numbers are finite and greater than 0.
+
+    Args:
+      name: name of the argument.
+      value: an array.
+
+    Raises:
+      ValueError: names the first wrong number.
+    """
     require(name, value, lambda x: np.isfinite(x) & (x > 0), "must be greater than 0")
 
 
-def require_finite(name: str, value: Any) -> None:
-    """Raises a `ValueError` unless all numbers are finite."""
+def require_finite(name: str, value: object) -> None:
+    """Checks that all numbers are finite.
+
+    Args:
+      name: name of the argument.
+      value: an array.
+
+    Raises:
+      ValueError: names the first wrong number.
+    """
     require(name, value, np.isfinite, "must be finite")
 
 
-def require_probabilities(name: str, value: Any) -> None:
-    """Raises a `ValueError` unless all numbers are within 0 and 1, and their sum is 1."""
+def require_probabilities(name: str, value: object) -> None:
+    """Checks that all numbers are within 0 and 1, and that they sum to 1.
+
+    Args:
+      name: name of the argument.
+      value: `[..., C]` array.
+
+    Raises:
+      ValueError: names the first wrong number, or the first wrong sum.
+    """
     require(name, value, lambda x: (x >= 0) & (x <= 1), "must be probabilities, within 0 and 1")
     if not isinstance(value, Tracer):
         total = np.sum(np.asarray(value), axis=-1)
         require(f"sum of {name}", total, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
 
 
-def require_index(name: str, value: Any, number: int) -> None:
-    """Raises a `ValueError` unless all numbers are whole and within 0 and `number - 1`."""
+def require_index(name: str, value: object, number: int) -> None:
+    """Checks that all numbers are indices of a sequence.
+
+    Args:
+      name: name of the argument.
+      value: an array.
+      number: length of the sequence.
+
+    Raises:
+      ValueError: unless all are whole and from 0 to `number - 1`.
+    """
     expected = f"must be a whole number from 0 to {number - 1}"
     dtype = jnp.result_type(value)
     if not jnp.issubdtype(dtype, jnp.integer):
@@ -59,15 +94,31 @@ def require_index(name: str, value: Any, number: int) -> None:
     require(name, value, lambda x: (x >= 0) & (x < number), expected)
 
 
-def require_number(name: str, value: Any) -> None:
-    """Raises a `ValueError` unless the value is one whole number greater than 0."""
-    is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not is_whole or value < 1:
+def require_number(name: str, value: object) -> None:
+    """Checks that a value is one whole number greater than 0.
+
+    Args:
+      name: name of the argument.
+      value: the value.
+
+    Raises:
+      ValueError: if it is something else.
+    """
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name} = {value!r}: must be a whole number greater than 0")
 
 
-def require_one_each(name: str, values: Sequence[Any], modalities: Sequence[str]) -> None:
-    """Raises a `ValueError` unless each modality has one value."""
+def require_one_each(name: str, values: Sequence[object], modalities: Sequence[str]) -> None:
+    """Checks that each modality has one value.
+
+    Args:
+      name: name of the argument.
+      values: the values.
+      modalities: names of the modalities.
+
+    Raises:
+      ValueError: if there are more values, or fewer.
+    """
     if len(values) != len(modalities):
         raise ValueError(
             f"{name} has {len(values)} entries: must be {len(modalities)}, one for each of "

@@ -478,10 +478,6 @@ def test_an_error_survives_pickling():
     [
         ({"dqn": {"epoch": 3}}, "dqn.epoch = 3: unknown setting; did you mean dqn.epochs?"),
         (
-            {"robots_eac": 4, "arena": {"side": 4.0}},
-            "robots_eac = 4: unknown setting; did you mean team.robots_each?",
-        ),
-        (
             {"num_poi": 4},
             "num_poi = 4: unknown setting; did you mean arena.num_pois or team.num_pois or "
             "evaluation.num_pois?",
