@@ -28,7 +28,7 @@ NUMBERS = {
     "lidar.range-noise": "0.02",
     "camera.pixel-noise": "0.01",
     "viewpoint.max-bearing": "15",
-    "navigation.goal-angle": "5",
+    "navigation.inflation": "0.08",
     "mission.equal-values": "0.2",
     "mission.attempts": "2",
     "mission.time-limit": "2",
