@@ -131,11 +131,12 @@ def check_fields(section: object, bits: int = 31) -> None:
       ConfigError: names the first invalid field.
     """
     for name, kind, limits in _fields(type(section)):
+        value = getattr(section, name)
         try:
-            value = _converted(getattr(section, name), kind)
+            value = _converted(value, kind)
         except TypeError:
-            require(False, section, name, f"must be {_described(kind)}")
-            raise  # never reached
+            expected = f"must be {_described(kind)}"
+            raise ConfigError(_place(section, name), value, expected) from None
         object.__setattr__(section, name, value)
         fits = not isinstance(value, int) or abs(value) < 2**bits
         require(fits, section, name, f"must be below 2^{bits}")
