@@ -108,7 +108,7 @@ def test_figures_stand_in_tables(read):
 
 def test_main_results_stand_beside_what_they_are_compared_with(tmp_path):
     naive = {**CASE, "observations_per_poi": 2.0, "time_s": 15.0}
-    others = {"naive": naive, "random": {**CASE, "accuracy": 0.5}}
+    others = {"naive": naive, "random": {**CASE, "accuracy": 0.5, "time_s": 9.0}}
     content = {**SUMMARY, "mission": {**SUMMARY["mission"], **others}}
     text = page.render(write_run(tmp_path), CONFIG, content)
     # 1.68 / 2 = .84 and 13.8 / 15 = .92
@@ -116,6 +116,8 @@ def test_main_results_stand_beside_what_they_are_compared_with(tmp_path):
         assert f"<small>{expected}</small>" in text
     # Random looks are fewer, but wrong: naive ones are not better than those of the latent policy.
     assert "<td><b>1.68</b></td>" in text
+    assert "<td><b>13.8</b></td>" in text
+    assert "<b>9.0</b>" not in text
     assert "The latent policy is 8 % faster than naive exploration." in text
 
 

@@ -164,6 +164,11 @@ def test_the_greedy_policy_is_drawn_where_it_was_played():
     # The axis begins as far below naive exploration as the optimum is above; a text has the rest.
     assert figure.axes[0].get_ylim()[0] == 1.5
     assert "random: -1.00" in lines
+    # A bad policy is shown too: .5 below it.
+    bad = {"return": -2.0, "optimal": 3.0, "naive": 3.0, "random": -1.0}
+    axes = plots.rewards({"camera": CURVES}, {"camera": bad}).axes[0]
+    assert axes.get_ylim()[0] == -2.5
+    assert "random" in {line.get_label() for line in axes.lines}
 
 
 def test_episodes_of_a_team_are_not_drawn_beside_those_of_a_robot_alone():

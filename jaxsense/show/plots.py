@@ -243,7 +243,7 @@ def _draw_references(ax: Axes, agent: Agent) -> None:
     optimal, naive, random = (mean(agent[key]) for key in ("optimal", "naive", "random"))
     ax.axhline(optimal, color="C2", linestyle="--", label=AGENTS["optimal"].label)
     ax.axhline(naive, color=policy_colour("naive"), linestyle=":", label=AGENTS["naive"].label)
-    bottom = naive - max(0.5, optimal - naive)
+    bottom = min(naive, mean(agent["return"])) - max(0.5, optimal - naive)
     ax.set_ylim(bottom=bottom)
     if random < bottom:
         ax.plot([], [], " ", label=f"random: {random:.2f}")

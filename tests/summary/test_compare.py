@@ -107,6 +107,8 @@ def test_the_verdict_names_naive_exploration_and_the_fastest_policy():
     found = compare.verdict({**NAIVE, "latent": latent, **others, **wrong})
     assert found == f"{faster} (and 20 % slower than `auction`)."
     assert compare.verdict(NAIVE) is None
+    quick = {**NAIVE, "naive_3": block(0.99, 6.0, 20.0), "latent": latent}
+    assert compare.verdict(quick) == f"{faster}."
     seeds = {"mean": 50.0, "low": 40.0, "high": 60.0}
     slow = {**latent, "time_s": seeds}
     assert "25 % slower than naive" in compare.verdict({**NAIVE, "latent": slow})
