@@ -1,77 +1,117 @@
-"""Minibatch training, on losses whose descent is known."""
+"""The supervised fit, on losses whose descent is known."""
 
+import dataclasses
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
+import pytest
 
 from jaxsense.core import supervised
 
-
-def fit(state, optimiser, batches):
-    """Fits p to batches with the loss (p - batch)^2 / 2."""
-    return supervised.fit(
-        state, lambda params, batch, step: 0.5 * (params - batch) ** 2, batches, optimiser
-    )
+KEY = jax.random.key(0)
 
 
-def test_steps_of_gradient_descent_as_worked_by_hand():
-    # p <- p - .5 (p - 3): 0, 1.5, and then towards 5: 1.5 + .5 x 3.5 = 3.25.
-    optimiser = optax.sgd(0.5)
-    start = supervised.start(jnp.float32(0), optimiser)
-    state, losses = fit(start, optimiser, jnp.array([3.0, 5.0]))
-    np.testing.assert_allclose(state.params, 3.25)
-    np.testing.assert_allclose(losses, [4.5, 6.125])  # 3^2 / 2; 3.5^2 / 2
+@dataclasses.dataclass(frozen=True)
+class Given:
+    """A problem whose batches are given, one for each step of a call."""
+
+    loss: Callable[..., jax.Array]
+    batches: Any
+    steps: int
+    learning_rate: float = 0.1
+
+    @property
+    def config(self):
+        return SimpleNamespace(steps=self.steps, learning_rate=self.learning_rate)
+
+    def draw(self, key, number):
+        del key
+        return jnp.array(self.batches)[:number]
+
+
+def fit(state, problem):
+    return supervised.fit(KEY, state, problem, len(problem.batches))
+
+
+def start(params, problem):
+    return supervised.start(params, problem.config)
+
+
+def square(params, batch, step):
+    del step
+    return 0.5 * (params - batch) ** 2
+
+
+def test_steps_of_adam_along_a_cosine_as_worked_by_hand():
+    # With slopes 3 and 5 the first step of Adam is as long as the learning rate, .1. In the second
+    # the mean slope is (.9 x .1 x 3 + .1 x 5) / .19 = 4.052632, the mean square
+    # (.999 x .001 x 9 + .001 x 25) / .001999 = 17.004002: .982792 of .1 (1 + cos(pi / 4)) / 2.
+    problem = Given(lambda params, slope, step: slope * params, [3.0, 5.0], 4)
+    state, losses = fit(start(jnp.float32(2), problem), problem)
+    np.testing.assert_allclose(losses, [6.0, 9.5], rtol=1e-6)  # 3 x 2; 5 x 1.9
+    np.testing.assert_allclose(state.params, 1.9 - 0.0853553 * 0.982792, rtol=1e-6)
+    np.testing.assert_allclose(state.loss, 7.75, rtol=1e-6)
     assert state.step == 2
 
 
 def test_chunks_go_on_where_the_last_one_stopped():
-    optimiser, batches = supervised.adam(0.1, 6), jnp.full(6, 3.0)
-    start = supervised.start(jnp.float32(0), optimiser)
-    whole, losses = fit(start, optimiser, batches)
-    half, first = fit(start, optimiser, batches[:3])
-    chunked, second = fit(half, optimiser, batches[3:])
-    assert (start.step, half.step, chunked.step, whole.step) == (0, 3, 6, 6)
-    np.testing.assert_allclose(chunked.params, whole.params, rtol=1e-6)
-    np.testing.assert_allclose(jnp.concatenate([first, second]), losses, rtol=1e-6)
+    whole, half = Given(square, [3.0] * 6, 6), Given(square, [3.0] * 3, 6)
+    first = start(jnp.float32(0), whole)
+    assert np.isinf(first.loss)
+    after, losses = fit(first, whole)
+    middle, early = fit(first, half)
+    chunked, late = fit(middle, half)
+    assert (first.step, middle.step, chunked.step, after.step) == (0, 3, 6, 6)
+    np.testing.assert_allclose(chunked.params, after.params, rtol=1e-6)
+    np.testing.assert_allclose(jnp.concatenate([early, late]), losses, rtol=1e-6)
+    np.testing.assert_allclose(chunked.loss, late.mean(), rtol=1e-6)
 
 
-def test_adam_comes_to_rest_at_the_last_step():
-    optimiser = supervised.adam(0.1, 6)
-    start = supervised.start(jnp.float32(0), optimiser)
-    state, _ = fit(start, optimiser, jnp.full(6, 3.0))
-    after, _ = fit(state, optimiser, jnp.full(3, 3.0))
-    assert after.params == state.params
-    # The first step of Adam is as long as the learning rate, whatever the gradient.
-    first, _ = fit(start, optimiser, jnp.full(1, 3.0))
-    np.testing.assert_allclose(first.params, 0.1, rtol=1e-4)
+def test_the_last_chunk_makes_no_step_too_many():
+    # Five steps in chunks of two: the sixth step is none, and its loss does not count.
+    problem = Given(lambda params, batch, step: params + step, [0.0] * 2, 5)
+    states = [start(jnp.float32(1), problem)]
+    for _ in range(3):
+        states.append(fit(states[-1], problem)[0])
+    assert [int(state.step) for state in states] == [0, 2, 4, 5]
+    one, losses = fit(states[2], Given(problem.loss, [0.0], 5))
+    assert one.params == states[3].params != states[2].params
+    np.testing.assert_allclose(states[3].loss, losses[0], rtol=1e-6)
 
 
-def test_the_loss_is_told_the_step_counted_from_the_start():
-    optimiser = optax.sgd(0.0)
-    state = supervised.start(jnp.float32(0), optimiser)
-    counted = []
+@pytest.mark.parametrize("steps", [6, 5])
+def test_adam_comes_to_rest_at_the_last_step(steps):
+    problem = Given(square, [3.0] * 3, steps)
+    state = start(jnp.float32(0), problem)
     for _ in range(2):
-        state, steps = supervised.fit(
-            state,
-            lambda params, drawn, step: step.astype(jnp.float32),
-            jnp.zeros(3),
-            optimiser,
-        )
+        state, _ = fit(state, problem)
+    after, _ = fit(state, problem)
+    assert after.params == state.params
+
+
+def test_the_loss_receives_the_step_counted_from_the_start():
+    problem = Given(lambda params, batch, step: step.astype(jnp.float32), [0.0] * 3, 6)
+    state, counted = start(jnp.float32(0), problem), []
+    for _ in range(2):
+        state, steps = fit(state, problem)
         counted.extend(steps.tolist())
     assert counted == [0, 1, 2, 3, 4, 5]
 
 
 def test_the_last_loss_tells_of_parameters_that_are_not_finite():
     # sqrt(p) at p = 0 is 0, and its slope infinite.
-    optimiser = optax.sgd(0.5)
-    start = supervised.start({"p": jnp.float32(0), "q": jnp.float32(0)}, optimiser)
-
-    def loss(params, drawn, step):
+    def loss(params, batch, step):
         return jnp.sqrt(params["p"]) + params["q"]
 
     for is_finite in ([False], [True, False]):
-        _, losses = supervised.fit(start, loss, jnp.zeros(len(is_finite)), optimiser)
+        problem = Given(loss, [0.0] * len(is_finite), 10)
+        state, losses = fit(start({"p": jnp.float32(0), "q": jnp.float32(0)}, problem), problem)
         np.testing.assert_array_equal(np.isfinite(losses), is_finite)
+        assert np.isnan(state.loss)
 
 
 def test_the_last_step_tells_of_it_also_where_a_chunk_has_more_steps_than_are_left():
@@ -79,11 +119,12 @@ def test_the_last_step_tells_of_it_also_where_a_chunk_has_more_steps_than_are_le
         # The value is finite, the slope of a root of zero is not.
         return batch + 0.0 * jnp.sqrt(jnp.where(step == 4, 0.0 * params, 1.0))
 
-    optimiser = optax.sgd(0.1)
-    state, told = supervised.start(jnp.float32(1), optimiser), []
+    problem = Given(loss, [1.0] * 3, 5)
+    state, told = start(jnp.float32(1), problem), []
     for _ in range(2):
-        state, losses = supervised.fit(state, loss, jnp.ones(3), optimiser, total=5)
+        state, losses = fit(state, problem)
         told.append(losses)
     assert state.step == 5
     assert np.isnan(state.params)
+    assert np.isnan(state.loss)
     np.testing.assert_array_equal(jnp.concatenate(told)[:5], [1, 1, 1, 1, np.nan])
