@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jaxsense.config import DetectorConfig
-from jaxsense.vae import detectors, metrics
+from jaxsense.core import supervised
+from jaxsense.vae import calibration, detectors
 
 CONFIG = DetectorConfig(hidden=(16,), steps=200, batch=64, learning_rate=1e-2)
 
@@ -32,19 +33,18 @@ def accuracy(detector, windows, labels):
     return np.mean(features.argmax(axis=-1) == labels)
 
 
+def fit(detector, windows, labels, config):
+    problem = detectors.Fitting(config, detector, windows, labels)
+    state = supervised.start(detector.params, config)
+    train = jax.jit(lambda key, state: supervised.fit(key, state, problem, config.steps))
+    return train(jax.random.key(2), state)
+
+
 @pytest.fixture(scope="module")
 def trained():
     windows, labels = synthetic_windows(jax.random.key(0), 1000)
     detector = detectors.init(jax.random.key(1), windows, 2, CONFIG)
-    state, losses = jax.jit(detectors.train, static_argnames=("config", "steps"))(
-        jax.random.key(2),
-        detectors.start(detector, CONFIG),
-        detector,
-        windows,
-        labels,
-        config=CONFIG,
-        steps=CONFIG.steps,
-    )
+    state, losses = fit(detector, windows, labels, CONFIG)
     return detector, replace(detector, params=state.params), losses
 
 
@@ -130,7 +130,7 @@ def test_calibration_changes_no_label_and_never_makes_the_looks_less_likely(trai
         calibrated = calibrate(detector, windows, given)
         before, after = (detect(d, windows) for d in (detector, calibrated))
         np.testing.assert_array_equal(before.argmax(axis=1), after.argmax(axis=1))
-        nll_before, nll_after = (metrics.negative_log_likelihood(p, given) for p in (before, after))
+        nll_before, nll_after = (calibration.negative_log_likelihood(p, given) for p in (before, after))
         assert nll_after <= nll_before + 1e-6
 
 
@@ -138,8 +138,7 @@ def test_a_training_starts_from_the_loss_of_the_detector_it_is_given():
     windows, labels = synthetic_windows(jax.random.key(0), 1000)
     detector = detectors.init(jax.random.key(1), windows, 2, CONFIG)
     config = replace(CONFIG, steps=20, batch=256, learning_rate=1e-12)
-    start = detectors.start(detector, config)
-    _, losses = detectors.train(jax.random.key(2), start, detector, windows, labels, config, 20)
+    _, losses = fit(detector, windows, labels, config)
     assert len(np.unique(losses)) == 20  # every step draws anew
     each = detect(detector, windows)
     expected = -np.log(np.asarray(each)[np.arange(1000), labels])

@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxsense.config import JmvaeConfig
 from jaxsense.core.types import Belief
-from jaxsense.vae import fusion, gaussian, jmvae, metrics
+from jaxsense.vae import fusion, gaussian, jmvae, latent
 from jaxsense.vae.jmvae import Jmvae
 
 TWO = Jmvae(("camera", "lidar"), (2, 2), latent_size=2, hidden=(8,))
@@ -214,10 +214,11 @@ def test_loss_is_that_of_encode_and_decode_with_the_keys_draw():
 
 def test_every_step_of_a_training_draws_anew():
     config = JmvaeConfig(hidden=(8,), steps=20, batch=4, learning_rate=1e-12)
-    state = jmvae.start(init(jax.random.key(0), TWO), config)
     bank = tuple(jax.random.uniform(k, (3, 50, 2)) for k in jax.random.split(jax.random.key(1)))
-    train = jax.jit(jmvae.train, static_argnums=(2, 5))
-    _, losses = train(jax.random.key(2), state, TWO, bank, config, 20)
+    params = init(jax.random.key(0), TWO)
+    _, losses = jax.jit(jmvae.train, static_argnums=2)(
+        jax.random.key(2), params, TWO, bank, config
+    )
     assert len(np.unique(losses)) == 20
 
 
@@ -284,12 +285,10 @@ def two_hot_bank(key, per_class):
 @pytest.fixture(scope="module")
 def trained():
     """Losses, and beliefs of new detections: joint and one per modality, `[C, S, D]`."""
-    state = jmvae.start(jmvae.init(jax.random.key(0), MODEL), CONFIG)
-    train = jax.jit(jmvae.train, static_argnames=("model", "config", "steps"))
-    bank = two_hot_bank(jax.random.key(1), 500)
-    key = jax.random.key(2)
-    state, losses = train(key, state, model=MODEL, bank=bank, config=CONFIG, steps=CONFIG.steps)
-    params, bank = state.params, two_hot_bank(jax.random.key(3), 50)
+    untrained, bank = jmvae.init(jax.random.key(0), MODEL), two_hot_bank(jax.random.key(1), 500)
+    train = jax.jit(jmvae.train, static_argnames=("model", "config"))
+    params, losses = train(jax.random.key(2), untrained, model=MODEL, bank=bank, config=CONFIG)
+    bank = two_hot_bank(jax.random.key(3), 50)
 
     @jax.jit
     def examine(camera, lidar):
@@ -315,7 +314,7 @@ def test_training_lowers_the_loss(trained):
 def test_trained_posteriors_reproduce_table_1(trained):
     beliefs = trained[3]
     class_means = beliefs["joint"].mean.mean(axis=1)
-    plausible = jax.vmap(jax.vmap(metrics.plausible_classes, (0, None)), (0, None))
+    plausible = jax.vmap(jax.vmap(latent.plausible_classes, (0, None)), (0, None))
     only_true = np.eye(3, dtype=bool)[:, None]
     shares = {
         name: np.all(plausible(b, class_means) == only_true, axis=-1).mean(axis=1)
@@ -327,7 +326,7 @@ def test_trained_posteriors_reproduce_table_1(trained):
 
 
 def test_trained_posteriors_are_wider_where_a_detection_is_ambiguous(trained):
-    sigma = {n: metrics.sigma_norm(b.std).mean(axis=1) for n, b in trained[3].items()}
+    sigma = {n: latent.sigma_norm(b.std).mean(axis=1) for n, b in trained[3].items()}
     assert np.min(sigma["camera"][1:]) > 1.5 * np.max([*sigma["joint"], sigma["camera"][0]])
     assert np.min(sigma["lidar"][:2]) > 1.5 * np.max([*sigma["joint"], sigma["lidar"][2]])
 
@@ -337,11 +336,11 @@ def test_trained_unimodal_posteriors_match_the_moments_of_the_joint_ones(trained
     for name, classes in (("camera", (1, 2)), ("lidar", (0, 1))):
         members = jax.tree.map(lambda x: x[np.array(classes)].reshape(-1, 2), beliefs["joint"])  # noqa: B023
         alone = jax.tree.map(lambda x: x[classes[0]], beliefs[name])  # noqa: B023
-        error = jax.vmap(metrics.moment_matching_error, in_axes=(0, None))(alone, members)
+        error = jax.vmap(latent.moment_matching_error, in_axes=(0, None))(alone, members)
         assert error.mean() < 0.3
     mean, std = gaussian.moment_match(members.mean, members.std)
     other = Belief(mean + std, std)  # the bound tells a shift by one deviation
-    assert metrics.moment_matching_error(other, members) > 0.3
+    assert latent.moment_matching_error(other, members) > 0.3
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -355,8 +354,9 @@ def test_a_trained_model_fuses_a_second_look_into_the_right_class(trained, first
     @jax.vmap
     @jax.vmap
     def fuse(old, features):
-        belief = fusion.write(params, MODEL, old, seen, features, 1 - first)
-        return metrics.nearest_class(belief, class_means)
+        both = (None, features) if first == 0 else (features, None)
+        belief = fusion.fuse(params, MODEL, old, seen, both)
+        return latent.nearest_class(belief, class_means)
 
     is_right = np.asarray(fuse(old, bank[1 - first])) == np.arange(3)[:, None]
     assert is_right.mean() > 0.95

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from jaxsense.config import JmvaeConfig
-from jaxsense.core import supervised
 from jaxsense.vae import jmvae
 
 MODEL = jmvae.Jmvae(("camera", "lidar"), (1, 2), 2, (3,))
@@ -18,9 +17,7 @@ LIDAR = np.tile(CLASSES + ROWS, (1, 1, 2))
 
 @pytest.fixture(scope="module")
 def drawn():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(supervised, "fit", lambda state, loss, drawn, optimiser, total: drawn)
-        return jmvae.train(jax.random.key(0), None, MODEL, (CAMERA, LIDAR), SETTINGS, 20)
+    return jmvae.Fitting(SETTINGS, (CAMERA, LIDAR), MODEL).draw(jax.random.key(0), 20)
 
 
 def test_every_class_and_every_row_of_a_bank_is_drawn(drawn):
@@ -45,13 +42,13 @@ def test_a_pair_is_of_one_class_and_otherwise_independent(drawn):
 def test_a_bank_of_the_wrong_shape_is_named():
     for bank in ((CAMERA, LIDAR[:3]), (CAMERA, LIDAR[..., :1]), (CAMERA[0], LIDAR)):
         with pytest.raises(AssertionError, match="bank"):
-            jmvae.train(jax.random.key(0), None, MODEL, bank, SETTINGS, 1)
+            jmvae.train(jax.random.key(0), None, MODEL, bank, SETTINGS)
 
 
-def test_three_modalities_are_drawn_independently(monkeypatch):
-    monkeypatch.setattr(supervised, "fit", lambda state, loss, drawn, optimiser, total: drawn)
+def test_three_modalities_are_drawn_independently():
     model = jmvae.Jmvae(("camera", "lidar", "thermal"), (1, 2, 2), 2, (3,))
-    _, features = jmvae.train(jax.random.key(0), None, model, (CAMERA, LIDAR, LIDAR), SETTINGS, 20)
+    problem = jmvae.Fitting(SETTINGS, (CAMERA, LIDAR, LIDAR), model)
+    _, features = problem.draw(jax.random.key(0), 20)
     _, lidar, thermal = (np.asarray(x[:, 0]) for x in features)
     np.testing.assert_array_equal(lidar // 10, thermal // 10)
     pairs = set(zip((lidar % 10).ravel().tolist(), (thermal % 10).ravel().tolist(), strict=True))

@@ -1,11 +1,11 @@
-"""The figures of a latent space, by hand."""
+"""Metrics of a latent space, by hand."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxsense.core.types import Belief
-from jaxsense.vae import gaussian, metrics
+from jaxsense.vae import gaussian, latent
 
 CLASS_MEANS = jnp.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]])
 
@@ -17,14 +17,14 @@ def belief(mean, std):
 def test_sigma_norm_is_the_euclidean_norm_over_the_last_axis():
     # sqrt(9 + 16) = 5, sqrt(.36 + .64) = 1.
     np.testing.assert_allclose(
-        metrics.sigma_norm(jnp.array([[3.0, 4.0], [0.6, 0.8]])), [5.0, 1.0], rtol=1e-6
+        latent.sigma_norm(jnp.array([[3.0, 4.0], [0.6, 0.8]])), [5.0, 1.0], rtol=1e-6
     )
 
 
 def test_active_units_counts_dimensions_whose_means_vary():
     # Variances of +-a: a^2 = 1, .0144, .0064 and 0, of which two exceed .01; an offset is no use.
     mean = jnp.array([[1.0, 0.12, 0.08, 7.0], [-1.0, -0.12, -0.08, 7.0]])
-    assert metrics.active_units(mean) == 2
+    assert latent.active_units(mean) == 2
 
 
 @pytest.mark.parametrize(
@@ -43,54 +43,32 @@ def test_active_units_counts_dimensions_whose_means_vary():
     ],
 )
 def test_plausible_classes_lie_within_two_standard_deviations(mean, std, expected):
-    assert tuple(metrics.plausible_classes(belief(mean, std), CLASS_MEANS)) == expected
+    assert tuple(latent.plausible_classes(belief(mean, std), CLASS_MEANS)) == expected
 
 
 def test_nearest_class_goes_by_the_mean_alone():
     # To (2, 1.9): sqrt(4 + 3.61) = 2.76, sqrt(1 + 3.61) = 2.15, sqrt(4 + 4.41) = 2.9.
-    assert metrics.nearest_class(belief((2.0, 1.9), (9.0, 0.1)), CLASS_MEANS) == 1
+    assert latent.nearest_class(belief((2.0, 1.9), (9.0, 0.1)), CLASS_MEANS) == 1
 
 
 def test_moment_matching_error_of_the_matched_gaussian_is_zero():
     components = belief(((0.0, 1.0), (4.0, 2.0)), ((1.0, 0.5), (3.0, 0.7)))
     matched = Belief(*gaussian.moment_match(components.mean, components.std))
-    np.testing.assert_allclose(metrics.moment_matching_error(matched, components), 0.0, atol=1e-6)
+    np.testing.assert_allclose(latent.moment_matching_error(matched, components), 0.0, atol=1e-6)
 
 
 def test_moment_matching_error_as_worked_by_hand():
     # The components match N(2, 3^2) and N(1, .5^2), see test_gaussian.
     # Dimension 1: |3.5 - 2| / 3 + |ln(6/3)| = .5 + .693147; dimension 2: |.9 - 1| / .5 + 0 = .2.
     components = belief(((0.0, 1.0), (4.0, 1.0)), ((1.0, 0.5), (3.0, 0.5)))
-    error = metrics.moment_matching_error(belief((3.5, 0.9), (6.0, 0.5)), components)
+    error = latent.moment_matching_error(belief((3.5, 0.9), (6.0, 0.5)), components)
     np.testing.assert_allclose(error, (0.5 + 0.693147 + 0.2) / 2, rtol=1e-5)
     # Too narrow counts as much as too wide.
-    narrow = metrics.moment_matching_error(belief((0.5, 1.1), (1.5, 0.5)), components)
+    narrow = latent.moment_matching_error(belief((0.5, 1.1), (1.5, 0.5)), components)
     np.testing.assert_allclose(narrow, error, rtol=1e-5)
 
 
 def test_consistent_classes_share_a_label():
     # Colours of green cylinder, red cylinder, red cube.
     expected = [[True, False, False], [False, True, True], [False, True, True]]
-    np.testing.assert_array_equal(metrics.consistent_classes((1, 0, 0)), expected)
-
-
-def test_calibration_by_hand():
-    # In the bin above 14/15: .95 and 1.0, of which one is right; in that above .6: .65, right.
-    probabilities = jnp.array([[0.95, 0.05], [0.0, 1.0], [0.65, 0.35]])
-    labels = jnp.array([0, 0, 0])
-    expected = (abs(0.95 + 1.0 - 1) + abs(0.65 - 1)) / 3
-    assert metrics.calibration_error(probabilities, labels) == pytest.approx(expected, abs=1e-6)
-    found = metrics.negative_log_likelihood(probabilities[::2], labels[::2])
-    assert found == pytest.approx(-(np.log(0.95) + np.log(0.65)) / 2, rel=1e-5)
-    # A label of probability zero costs no more than a finite number.
-    assert np.isfinite(metrics.negative_log_likelihood(probabilities, labels))
-
-
-def test_probabilities_that_are_true_are_calibrated():
-    rng = np.random.default_rng(0)
-    first = rng.uniform(size=40_000)
-    labels = jnp.array((rng.uniform(size=40_000) > first).astype(np.int32))
-    probabilities = jnp.array(np.stack([first, 1 - first], axis=1), jnp.float32)
-    assert metrics.calibration_error(probabilities, labels) < 0.01
-    bent = probabilities**3 / jnp.sum(probabilities**3, axis=1, keepdims=True)
-    assert metrics.calibration_error(bent, labels) > 0.1
+    np.testing.assert_array_equal(latent.consistent_classes((1, 0, 0)), expected)

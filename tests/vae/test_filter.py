@@ -1,0 +1,149 @@
+"""The filter: its algebra by hand, its learning against exact Bayes."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense.config import FilterConfig
+from jaxsense.core import supervised
+from jaxsense.core.types import Belief
+from jaxsense.vae import bayes, filter, fusion
+from jaxsense.vae.jmvae import Jmvae
+
+# Red or green, cylinder or cube: classes are green cylinder, red cylinder, red cube.
+MODEL = Jmvae(("camera", "lidar"), (2, 2), 2, (4,))
+LABELS = np.array([[1, 0, 0], [0, 0, 1]])
+CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
+PRIOR = fusion.prior(MODEL, 20.0)
+NOBODY = np.zeros(2, bool)
+
+
+def untrained(config=FilterConfig(hidden=(1,))):  # noqa: B008
+    return filter.init(jax.random.key(0), MODEL, CLASSES, PRIOR, config)
+
+
+def exact():
+    """A filter whose log-likelihoods are the logarithm of the label's feature."""
+    of_class = {
+        name: {"params": {"Dense_0": {"kernel": jnp.eye(2)[:, labels], "bias": jnp.zeros(3)}}}
+        for name, labels in zip(MODEL.modalities, LABELS, strict=True)
+    }
+    return dataclasses.replace(untrained(), networks=of_class, hidden=())
+
+
+def update(found, belief, features, modality):
+    return found.update(belief, NOBODY, jnp.array(features), modality)
+
+
+def bank(key, size):
+    """Calibrated detections whose logits are Gaussian: camera right in .98, LiDAR in .93."""
+    looks = []
+    for k, labels, separation in zip(jax.random.split(key), LABELS, (2.05, 1.48), strict=True):
+        sign = jnp.where(labels == 0, 1.0, -1.0)[:, None]
+        x = jax.random.normal(k, (3, size)) + separation * sign
+        prior = np.log(np.mean(labels == 0) / np.mean(labels == 1))
+        first = jax.nn.sigmoid(2 * separation * x + prior)
+        looks.append(jnp.stack([first, 1 - first], axis=-1))
+    return tuple(looks)
+
+
+def test_looks_by_hand():
+    found = exact()
+    read = found.class_probabilities
+    red = update(found, PRIOR, [0.8, 0.2], 0)
+    # .2 / 3 to .8 / 3 to .8 / 3.
+    np.testing.assert_allclose(read(red), [1 / 9, 4 / 9, 4 / 9], atol=1e-5)
+    cube = update(found, red, [0.25, 0.75], 1)
+    # 1 * .25 to 4 * .25 to 4 * .75.
+    expected = np.array([0.25, 1.0, 3.0]) / 4.25
+    np.testing.assert_allclose(read(cube), expected, atol=1e-5)
+    assert found.most_likely_class(cube) == 2
+    again = update(found, cube, [0.25, 0.75], 1)
+    expected = np.array([0.25, 1.0, 9.0]) / 10.25
+    np.testing.assert_allclose(read(again), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("variance", [20.0, 1.0, 0.01])
+def test_a_first_look_is_the_same_however_wide_the_prior_is(variance):
+    found = dataclasses.replace(exact(), prior=fusion.prior(MODEL, variance))
+    after = update(found, found.prior, [0.8, 0.2], 0)
+    np.testing.assert_allclose(found.class_probabilities(after), [1 / 9, 4 / 9, 4 / 9], atol=1e-5)
+
+
+def test_looks_come_to_the_same_in_any_order_and_together():
+    found = exact()
+    looks = [(0, [0.7, 0.3]), (1, [0.4, 0.6]), (1, [0.8, 0.2]), (0, [0.9, 0.1])]
+
+    def after(order):
+        belief = PRIOR
+        for modality, features in order:
+            belief = update(found, belief, features, modality)
+        return belief
+
+    first, *others = (after(order) for order in itertools.permutations(looks))
+    assert len(others) == 23
+    for other in others:
+        np.testing.assert_allclose(other.mean, first.mean, atol=1e-4)
+        np.testing.assert_allclose(other.std, first.std, atol=1e-4)
+    together = found.together({m: jnp.array(x) for m, x in looks[:2]})
+    jax.tree.map(np.testing.assert_array_equal, together, after(looks[:2]))
+
+
+TRAINED = FilterConfig(hidden=(16,), steps=600, batch=128)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """A filter after two chunks of half its training, and all losses."""
+    found = untrained(TRAINED)
+    problem = filter.Fitting(TRAINED, found, bank(jax.random.key(2), 4000))
+    train = jax.jit(lambda key, state: supervised.fit(key, state, problem, 300))
+    state, losses = supervised.start(found.networks, TRAINED), []
+    for i in range(2):
+        state, loss = train(jax.random.key(3 + i), state)
+        losses.append(loss)
+    return dataclasses.replace(found, networks=state.params), np.concatenate(losses)
+
+
+def test_a_trained_filter_is_nearly_exact_bayes(trained):
+    learned, losses = trained
+    assert losses[-50:].mean() < 0.7 * losses[:10].mean()
+    looks = bank(jax.random.key(9), 2000)
+    labels = jnp.array(LABELS)
+
+    def history(true_class, row):
+        belief, log_weights = PRIOR, jnp.full(3, -jnp.log(3.0))
+        for modality in (1, 0, 1, 1):
+            features = looks[modality][true_class, row]
+            belief = learned.update(belief, NOBODY, features, modality)
+            log_weights = bayes.bayes_update(log_weights, features, labels[modality])
+            row = row + 500
+        return jnp.log(learned.class_probabilities(belief)), log_weights
+
+    every = jnp.arange(3), jnp.arange(500)
+    found, expected = jax.jit(jax.vmap(jax.vmap(history, (None, 0)), (0, None)))(*every)
+    nll, of_bayes = (-np.mean([x[c, :, c] for c in range(3)]) for x in (found, expected))
+    assert nll == pytest.approx(of_bayes, rel=0.1)
+    assert np.mean(np.abs(np.exp(found) - np.exp(expected))) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"modality": 2}, "modality = 2: must be a whole number from 0 to 1"),
+        ({"features": jnp.array([0.5, 1.5])}, "features = 1.5: must be probabilities, within"),
+        ({"features": jnp.array([0.5, jnp.nan])}, "features = nan: must be probabilities"),
+        ({"features": jnp.array([0.5, 0.6])}, "sum of features = 1.1"),
+        ({"belief": Belief(jnp.array([jnp.nan, 0.0]), jnp.ones(2))}, "belief.mean = nan"),
+        ({"belief": Belief(jnp.zeros(2), jnp.array([1.0, 0.0]))}, "belief.std = 0.0: must be gr"),
+        ({"belief": Belief(jnp.zeros(2), jnp.array([1.0, jnp.inf]))}, "belief.std = inf"),
+    ],
+)
+def test_what_the_filter_refuses_is_named(change, expected):
+    given = {"belief": PRIOR, "seen": NOBODY, "features": jnp.array([0.5, 0.5]), "modality": 0, **change}
+    with pytest.raises(ValueError, match="^" + expected.replace(".", r"\.")):
+        exact().update(**given)
