@@ -1,5 +1,6 @@
-"""Writing into the map: which encoder is asked, and with what."""
+"""Fusion in place: which encoder is asked, and with what; and what every kind of fusion has."""
 
+import inspect
 import itertools
 from dataclasses import replace
 
@@ -8,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.core.types import Belief
-from jaxsense.vae import fusion, jmvae
+from jaxsense.config import FilterConfig
+from jaxsense.core.types import Belief, Fusion
+from jaxsense.vae import filter, fusion, jmvae, readout
 from jaxsense.vae.jmvae import Jmvae
 
 TWO = Jmvae(("camera", "lidar"), (2, 2), latent_size=2, hidden=(8,))
@@ -22,6 +24,14 @@ def model_and_params(request):
     return request.param, jmvae.init(jax.random.key(0), request.param)
 
 
+def in_place(model, params, classes=None):
+    """Fusion in place; classes do not matter to an update."""
+    shape = 3, model.latent_size
+    classes = Belief(jnp.zeros(shape), jnp.ones(shape)) if classes is None else classes
+    matrix = readout.readout_matrix(classes)
+    return fusion.InPlace(params, classes, fusion.prior(model, 20.0), matrix, model)
+
+
 def look(model, modality, seed=0):
     return jax.nn.softmax(jax.random.normal(jax.random.key(seed), (model.feature_sizes[modality],)))
 
@@ -32,27 +42,28 @@ def assert_same(belief, mean_and_log_var):
     np.testing.assert_allclose(belief.std, np.exp(log_var / 2), rtol=1e-5)
 
 
-def test_every_write_encodes_the_look_with_what_the_map_says_of_the_others(model_and_params):
+def test_every_update_encodes_the_look_with_what_the_map_says_of_the_others(model_and_params):
     model, params = model_and_params
-    write = jax.jit(fusion.write, static_argnames=("model", "modality"))
+    update = jax.jit(fusion.InPlace.update, static_argnames="modality")
     number = len(model.modalities)
     generated = jmvae.decode(params, model, OLD.mean)
     for modality in range(number):
         new = look(model, modality)
         for seen in itertools.product([False, True], repeat=number):
-            belief = write(params, model, OLD, jnp.array(seen), new, modality=modality)
+            found = in_place(model, params)
+            belief = update(found, OLD, jnp.array(seen), new, modality=modality)
             inputs = [g if s else None for g, s in zip(generated, seen, strict=True)]
             inputs[modality] = new  # never generated, whether it has been seen before or not
             assert_same(belief, jmvae.encode(params, model, tuple(inputs)))
 
 
 @pytest.mark.parametrize("modality", [0, 1])
-def test_a_first_look_gives_the_uni_modal_posterior_whatever_the_entry_was(modality):
+def test_a_first_look_gives_the_uni_modal_posterior_whatever_the_belief_was(modality):
     params, new = jmvae.init(jax.random.key(0), TWO), look(TWO, modality)
     alone = tuple(new if m == modality else None for m in range(2))
     for own in (False, True):  # a second look with the same sensor starts afresh
         seen = (jnp.arange(2) == modality) & own
-        belief = fusion.write(params, TWO, OLD, seen, new, modality)
+        belief = in_place(TWO, params).update(OLD, seen, new, modality)
         assert_same(belief, jmvae.encode(params, TWO, alone))
 
 
@@ -73,19 +84,19 @@ def test_several_sensors_may_look_at_once():
         fusion.fuse(params, THREE, OLD, jnp.zeros(3, bool), (camera, None))
 
 
-def test_fusion_decodes_the_mean_and_ignores_the_width_of_the_old_entry():
+def test_fusion_decodes_the_mean_and_ignores_the_width_of_the_old_belief():
     params, new = jmvae.init(jax.random.key(0), TWO), look(TWO, 1)
     seen = jnp.array([True, False])
-    belief = fusion.write(params, TWO, OLD, seen, new, 1)
+    belief = in_place(TWO, params).update(OLD, seen, new, 1)
     camera, _ = jmvae.decode(params, TWO, OLD.mean)
     assert_same(belief, jmvae.encode(params, TWO, (camera, new)))
-    wider = fusion.write(params, TWO, replace(OLD, std=5 * OLD.std), seen, new, 1)
+    wider = in_place(TWO, params).update(replace(OLD, std=5 * OLD.std), seen, new, 1)
     np.testing.assert_array_equal(wider.mean, belief.mean)
-    moved = fusion.write(params, TWO, replace(OLD, mean=OLD.mean + 1), seen, new, 1)
+    moved = in_place(TWO, params).update(replace(OLD, mean=OLD.mean + 1), seen, new, 1)
     assert np.all(moved.mean != belief.mean)
 
 
-def test_a_batch_of_writes_equals_a_loop_of_singles_in_any_order():
+def test_a_batch_of_updates_equals_a_loop_of_singles_in_any_order():
     params = jmvae.init(jax.random.key(0), TWO)
     mean, std = jax.random.normal(jax.random.key(1), (2, 6, 2))
     old = Belief(mean, jnp.abs(std))
@@ -94,21 +105,21 @@ def test_a_batch_of_writes_equals_a_loop_of_singles_in_any_order():
 
     @jax.jit
     @jax.vmap
-    def write(old, seen, new):
-        return fusion.write(params, TWO, old, seen, new, 0)
+    def update(old, seen, new):
+        return in_place(TWO, params).update(old, seen, new, 0)
 
-    batch = write(old, seen, new)
+    batch = update(old, seen, new)
     for i in range(6):
-        single = fusion.write(params, TWO, Belief(old.mean[i], old.std[i]), seen[i], new[i], 0)
+        single = in_place(TWO, params).update(Belief(old.mean[i], old.std[i]), seen[i], new[i], 0)
         np.testing.assert_allclose(batch.mean[i], single.mean, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(batch.std[i], single.std, rtol=1e-5)
     order = np.array([3, 5, 0, 1, 4, 2])
-    permuted = write(Belief(old.mean[order], old.std[order]), seen[order], new[order])
+    permuted = update(Belief(old.mean[order], old.std[order]), seen[order], new[order])
     np.testing.assert_allclose(permuted.mean, batch.mean[order], rtol=1e-5, atol=1e-6)
 
 
-def test_unseen_has_mean_zero_and_the_given_variance():
-    belief = fusion.unseen(TWO, 20.0)
+def test_a_prior_has_mean_zero_and_the_given_variance():
+    belief = fusion.prior(TWO, 20.0)
     np.testing.assert_array_equal(belief.mean, [0.0, 0.0])
     np.testing.assert_allclose(belief.std, [4.472136, 4.472136], rtol=1e-6)  # sqrt(20)
 
@@ -117,15 +128,74 @@ def test_wrong_shapes_raise_errors_that_name_the_argument():
     params, new = jmvae.init(jax.random.key(0), TWO), look(TWO, 0)
     seen = jnp.array([False, False])
     with pytest.raises(AssertionError, match="belief"):
-        fusion.write(params, TWO, Belief(jnp.zeros((1, 2)), jnp.ones((1, 2))), seen, new, 0)
+        in_place(TWO, params).update(Belief(jnp.zeros((1, 2)), jnp.ones((1, 2))), seen, new, 0)
     with pytest.raises(AssertionError, match="seen"):
-        fusion.write(params, TWO, OLD, jnp.array([False]), new, 0)
+        in_place(TWO, params).update(OLD, jnp.array([False]), new, 0)
     with pytest.raises(AssertionError, match="features of camera"):
-        fusion.write(params, TWO, OLD, seen, jnp.zeros(3), 0)
+        in_place(TWO, params).update(OLD, seen, jnp.zeros(3), 0)
 
 
 @pytest.mark.parametrize("modality", [-1, 2, 3])
 def test_a_modality_that_is_not_there_is_named(modality):
     params, seen = jmvae.init(jax.random.key(0), TWO), jnp.array([False, False])
     with pytest.raises(ValueError, match=rf"modality = {modality}: must be a whole number"):
-        fusion.write(params, TWO, OLD, seen, look(TWO, 0), modality)
+        in_place(TWO, params).update(OLD, seen, look(TWO, 0), modality)
+
+
+CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
+KINDS = {
+    "in_place": lambda: in_place(TWO, jmvae.init(jax.random.key(0), TWO), CLASSES),
+    "filter": lambda: filter.init(
+        jax.random.key(0), TWO, CLASSES, fusion.prior(TWO, 20.0), FilterConfig(hidden=(4,))
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_fusion_has_all_of_the_protocol(kind):
+    found = KINDS[kind]()
+    public = [name for name in vars(Fusion) if not name.startswith("_")]
+    assert set(public) == {
+        "classes", "prior", "update", "together", "class_probabilities", "most_likely_class"
+    }  # fmt: skip
+    for name in public:
+        declared, own = getattr(Fusion, name), getattr(found, name)
+        if inspect.isfunction(declared):
+            expected = list(inspect.signature(declared).parameters)[1:]
+            assert list(inspect.signature(own).parameters) == expected
+
+    # A value that is passed in: one program serves any parameters.
+    @jax.jit
+    def look(found, features):
+        seen = jnp.zeros(2, bool)
+        after = found.update(found.prior, seen, features, 1)
+        return after, found.class_probabilities(after), found.most_likely_class(after)
+
+    others = jax.tree.map(lambda x: 1.1 * x, found)
+    features = jnp.array([0.9, 0.1])
+    after, probabilities, shown = look(found, features)
+    assert not np.allclose(look(others, features)[0].mean, after.mean)
+    assert look._cache_size() == 1
+    np.testing.assert_allclose(after.mean, found.together({1: features}).mean, rtol=1e-5)
+    assert probabilities.shape == (3,)
+    np.testing.assert_allclose(probabilities.sum(), 1.0, rtol=1e-5)
+    assert (shown.shape, shown.dtype) == ((), jnp.int32)
+    np.testing.assert_allclose(found.class_probabilities(found.prior), 1 / 3, rtol=1e-6)
+    np.testing.assert_array_equal(found.classes.mean, CLASSES.mean)
+
+
+def test_looks_together_in_place_are_the_posterior_of_all_of_them():
+    params = jmvae.init(jax.random.key(0), THREE)
+    found, camera, sonar = in_place(THREE, params), look(THREE, 0), look(THREE, 2)
+    for looks, given in (
+        ({0: camera}, (camera, None, None)),
+        ({2: sonar, 0: camera}, (camera, None, sonar)),
+    ):
+        assert_same(found.together(looks), jmvae.encode(params, THREE, given))
+
+
+def test_in_place_the_class_shown_is_the_nearest():
+    # Far from all classes, in the first dimension: .9 from the first, 2.9 from the others.
+    found = KINDS["in_place"]()
+    assert found.most_likely_class(Belief(jnp.array([2.1, 0.9]), jnp.ones(2))) == 0
+    assert found.most_likely_class(Belief(jnp.array([-0.8, -0.3]), jnp.ones(2))) == 2
