@@ -10,7 +10,7 @@ import pytest
 import jaxsense
 from jaxsense import dqn, vae
 from jaxsense.core.types import Belief
-from jaxsense.vae import jmvae, metrics
+from jaxsense.vae import jmvae, latent
 
 CONFIG = jaxsense.PRESETS["smoke"]
 MODEL = jaxsense.make_jmvae(CONFIG)
@@ -26,16 +26,15 @@ def belief(*shape):
 
 
 def train_on(*bank):
-    params = jmvae.init(KEY, MODEL)
-    return jmvae.train(KEY, jmvae.start(params, CONFIG.jmvae), MODEL, bank, CONFIG.jmvae, 1)
+    return vae.train(KEY, jmvae.init(KEY, MODEL), MODEL, bank, CONFIG.jmvae)
 
 
 def encode(*features):
     return vae.encode(jmvae.init(KEY, MODEL), MODEL, features)
 
 
-def write(old, seen, features):
-    return vae.write(jmvae.init(KEY, MODEL), MODEL, old, seen, features, 0)
+def update(old, seen, features):
+    return jaxsense.init(KEY, CONFIG).fusion.update(old, seen, features, 0)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +48,7 @@ def write(old, seen, features):
         ("std", lambda: vae.moment_match(zeros(4, 2), zeros(4, 3))),
         ("belief.mean", lambda: vae.plausible_classes(belief(4, 2), zeros(3, 2))),
         ("belief.std", lambda: vae.plausible_classes(Belief(zeros(2), zeros(3)), zeros(3, 2))),
-        ("class_means", lambda: metrics.nearest_class(belief(2), zeros(3, 4))),
+        ("class_means", lambda: latent.nearest_class(belief(2), zeros(3, 4))),
         ("std", lambda: vae.sigma_norm(jnp.float32(1))),
         ("std", lambda: dqn.information(jnp.float32(1))),
         ("belief.mean", lambda: dqn.observation(belief(2))),
@@ -58,9 +57,9 @@ def write(old, seen, features):
         ("bank", lambda: train_on(zeros(3, 8, 2), zeros(2, 8, 2))),
         ("features of lidar", lambda: encode(zeros(2), zeros(3))),
         ("z", lambda: vae.decode(jmvae.init(KEY, MODEL), MODEL, zeros(3))),
-        ("seen", lambda: write(belief(2), zeros(3), zeros(2))),
-        ("belief.std", lambda: write(belief(3), zeros(2), zeros(2))),
-        ("features of camera", lambda: write(belief(2), zeros(2), zeros(5))),
+        ("seen", lambda: update(belief(2), zeros(3), zeros(2))),
+        ("belief.std", lambda: update(belief(3), zeros(2), zeros(2))),
+        ("features of camera", lambda: update(belief(2), zeros(2), zeros(5))),
     ],
 )
 def test_argument_is_named(name, call):
