@@ -76,9 +76,7 @@ def test_an_mdp_is_an_argument_of_jit(models):
     for number in range(2):
         other = jaxsense.init(jax.random.key(number), CONFIG)
         mdp = looks.make_mdp(CONFIG, other, Bank(features))
-        state = map_mdp.reset(
-            jax.random.key(0), mdp, jnp.array([0, 1, 2]), jnp.zeros((3, 2), bool)
-        )
+        state = map_mdp.reset(jax.random.key(0), mdp, jnp.array([0, 1, 2]), jnp.zeros((3, 2), bool))
         belief, _ = gain(mdp, state)
         expected = jmvae.posterior(other.jmvae, MODEL, (features[0][0, 0], None))
         np.testing.assert_allclose(belief.mean[0], expected.mean, rtol=1e-5)

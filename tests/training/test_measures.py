@@ -20,7 +20,7 @@ from jaxsense.config import (
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import map_mdp, optimum, policies
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.models import make_bayes, make_in_place, make_jmvae, make_prior
+from jaxsense.models import make_in_place, make_jmvae, make_prior
 from jaxsense.run.pipeline import policy_metrics
 from jaxsense.training import measures, perception
 from jaxsense.training.mdp import held_out_mdp, models_of
@@ -229,7 +229,9 @@ def constant(gain, total):
 
 def models_with(bias, values, fusion=None):
     """What policies read, with a Q-network of the same values for every map."""
-    return models_of(CONFIG, in_place() if fusion is None else fusion, values, (with_bias(bias),) * 2)
+    return models_of(
+        CONFIG, in_place() if fusion is None else fusion, values, (with_bias(bias),) * 2
+    )
 
 
 @jax.jit

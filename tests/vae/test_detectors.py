@@ -130,7 +130,9 @@ def test_calibration_changes_no_label_and_never_makes_the_looks_less_likely(trai
         calibrated = calibrate(detector, windows, given)
         before, after = (detect(d, windows) for d in (detector, calibrated))
         np.testing.assert_array_equal(before.argmax(axis=1), after.argmax(axis=1))
-        nll_before, nll_after = (calibration.negative_log_likelihood(p, given) for p in (before, after))
+        nll_before, nll_after = (
+            calibration.negative_log_likelihood(p, given) for p in (before, after)
+        )
         assert nll_after <= nll_before + 1e-6
 
 

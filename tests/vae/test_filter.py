@@ -144,6 +144,12 @@ def test_a_trained_filter_is_nearly_exact_bayes(trained):
     ],
 )
 def test_what_the_filter_refuses_is_named(change, expected):
-    given = {"belief": PRIOR, "seen": NOBODY, "features": jnp.array([0.5, 0.5]), "modality": 0, **change}
+    given = {
+        "belief": PRIOR,
+        "seen": NOBODY,
+        "features": jnp.array([0.5, 0.5]),
+        "modality": 0,
+        **change,
+    }
     with pytest.raises(ValueError, match="^" + expected.replace(".", r"\.")):
         exact().update(**given)

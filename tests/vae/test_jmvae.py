@@ -216,9 +216,7 @@ def test_every_step_of_a_training_draws_anew():
     config = JmvaeConfig(hidden=(8,), steps=20, batch=4, learning_rate=1e-12)
     bank = tuple(jax.random.uniform(k, (3, 50, 2)) for k in jax.random.split(jax.random.key(1)))
     params = init(jax.random.key(0), TWO)
-    _, losses = jax.jit(jmvae.train, static_argnums=2)(
-        jax.random.key(2), params, TWO, bank, config
-    )
+    _, losses = jax.jit(jmvae.train, static_argnums=2)(jax.random.key(2), params, TWO, bank, config)
     assert len(np.unique(losses)) == 20
 
 

@@ -1,0 +1,141 @@
+"""Stages of agents: the values of looks, Q-learning and tours."""
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny import KEY, TINY, stage_of
+
+from jaxsense import models
+from jaxsense.config import MdpConfig, TeamConfig, ToursConfig
+from jaxsense.core.types import Belief
+from jaxsense.dqn import optimum
+from jaxsense.dqn import training as dqn
+from jaxsense.training import measures
+from jaxsense.training.perception import Detections
+
+BANK = dataclasses.replace(TINY, dqn=dataclasses.replace(TINY.dqn, observe="bank"))
+
+
+def detections_of(bank, held_out: Any = (), starts: Any = ()) -> Detections:
+    """Detections of given features."""
+    nothing: Any = ()
+    return Detections(bank, held_out, starts, nothing)
+
+
+@pytest.mark.parametrize("reward", ["nats", "paper"])
+def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(reward):
+    mdp = MdpConfig(reward=reward, look_cost=0.125, min_increase=0.01)
+    fusion = dataclasses.replace(TINY.jmvae, fusion="filter", latent_size=1)
+    config = dataclasses.replace(TINY, jmvae=fusion, mdp=mdp)
+    # The camera is sure, red or green; the LiDAR knows nothing: two cylinders to one cube.
+    camera, lidar = jnp.array([[0, 1], [1, 0], [1, 0]]), jnp.full((3, 2), 1 / 3).at[:, 0].set(2 / 3)
+    bank = tuple(jnp.repeat(x[:, None].astype(jnp.float32), 4, axis=1) for x in (camera, lidar))
+    # Classes in one dimension of deviation 1, at 0, 3 and 3 + sqrt(12).
+    mean = jnp.array([[0.0], [3.0], [3.0 + 12**0.5]])
+    classes = Belief(mean, jnp.ones((3, 1)))
+    stage = stage_of("look_values", config)
+    camera, lidar = jax.jit(stage.begin)(
+        KEY, config, classes=classes, detections=detections_of(bank)
+    )
+    even = jnp.full(3, 1 / 3)
+    if reward == "nats":
+        # ln 3 before; nothing after a green one, and ln 2 after each of two red ones.
+        expected = first = [np.log(3) - np.log(2) * 2 / 3 - 0.125, -0.125]
+    else:
+        # Before, a variance of 1 + that of the three means. After a green one 1, and after a red
+        # one 1 + 12 / 4 = 4.
+        before = 1 / np.sqrt(1 + np.var(mean))
+        expected = [((1 - before) + 2 * (1 / 2 - before)) / 3, -1.0]
+        # An unseen PoI has a variance of 20, so that even the LiDAR's first look pays.
+        unseen = 1 / np.sqrt(20)
+        first = [((1 - unseen) + 2 * (1 / 2 - unseen)) / 3, before - unseen]
+    found = [optimum.interpolate(values.one_step, even) for values in (camera, lidar)]
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    np.testing.assert_allclose([camera.one_step_unseen, lidar.one_step_unseen], first, atol=1e-4)
+    # A second look of the camera adds nothing, and so costs more than it pays.
+    np.testing.assert_allclose(optimum.interpolate(camera.q, even), expected[0], atol=1e-4)
+    np.testing.assert_allclose(camera.q_unseen, first[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["dqn_camera", "dqn_lidar"])
+def test_an_agent_learns_on_the_bank_and_its_greedy_curve_is_on_held_out_looks(monkeypatch, name):
+    untrained = models.init(KEY, BANK)
+    bank, held_out = (tuple(jnp.full((3, 4, 2), x) for _ in range(2)) for x in (0.5, 0.25))
+    used = {}
+
+    def train_chunk(key, learning, config, state, starts, evaluate):
+        used["learning"], used["modality"] = learning.mdp.looks.features, learning.modality
+        evaluate(key, "network")
+        return state, SimpleNamespace(
+            episodes=jnp.array([2, 0]), episode_return=jnp.array([1.5, 9.0]),
+            is_finite=jnp.array([True, False]), loss=jnp.array([0.5, 0.25]),
+            greedy_return=jnp.array([jnp.nan, 3.0]), epsilon=jnp.ones(2),
+        )  # fmt: skip
+
+    def learned_return(key, modality, q_network, mdp, config):
+        used["greedy"], used["of"] = mdp.looks.features, (int(modality), q_network)
+
+    monkeypatch.setattr(dqn, "train_chunk", train_chunk)
+    monkeypatch.setattr(measures, "learned_return", learned_return)
+    stage, starts = stage_of(name, BANK), SimpleNamespace(classes=jnp.zeros((0, 3)))
+    found = {
+        "starts": None,
+        "fusion": untrained.fusion,
+        "detections": detections_of(bank, held_out, starts),
+        **dict(zip(("detector_camera", "detector_lidar"), untrained.detectors, strict=True)),
+    }
+    inputs = stage.select(found)
+    _, progress = stage.advance(KEY, BANK, "state", **inputs)
+    number = int(name == "dqn_lidar")
+    assert used["of"] == (number, "network")
+    assert used["modality"] == number
+    for each, expected in (("learning", bank), ("greedy", held_out)):
+        np.testing.assert_array_equal(used[each], expected)
+    # No episode ended in the second epoch, and its loss is not finite.
+    np.testing.assert_array_equal(progress.loss, [0.5, np.nan])
+    np.testing.assert_array_equal(progress.metrics["reward"], [1.5, np.nan])
+    np.testing.assert_array_equal(progress.metrics["greedy"], [np.nan, 3.0])
+
+
+@pytest.mark.slow  # compiles trials of the auction, with the map's readout
+def test_a_team_learns_its_tours_from_all_trials_so_far():
+    config = dataclasses.replace(
+        TINY,
+        dqn=dataclasses.replace(TINY.dqn, task="team", observe="bank"),
+        team=TeamConfig(
+            num_pois=(2, 3), tours=ToursConfig(states=20, tries=2, walk=1, steps=41, batch=8)
+        ),
+    )
+    untrained = models.init(KEY, config)
+    bank = tuple(jnp.ones((3, 4, n)) / n for n in models.make_jmvae(config).feature_sizes)
+    # The first look at a PoI pays, and no other.
+    values = tuple(
+        dataclasses.replace(v, one_step_unseen=jnp.ones(())) for v in untrained.look_values
+    )
+    inputs = {
+        "look_values": values, "fusion": untrained.fusion, "detections": detections_of(bank)
+    }  # fmt: skip
+    stage = stage_of("tours", config)
+    state = stage.begin(KEY, config, **inputs)
+    first = state[0].params
+    advance = jax.jit(lambda key, state: stage.advance(key, config, state, **inputs))
+    # 41 steps are 14 chunks of 3, the last of which has 2; 20 states are 2 in each chunk.
+    written = []
+    for key in stage.chunk_keys(KEY):
+        state, progress = advance(key, state)
+        assert np.isfinite(progress.loss).all()
+        written.append(np.asarray(state[1].observation))
+    assert len(written) == 14
+    for i, observed in enumerate(written):
+        assert np.any(observed[:, : 2 * i + 2], axis=0).all()
+        assert not np.any(observed[:, 2 * i + 2 :])
+        np.testing.assert_array_equal(observed[:, : 2 * i + 2], written[-1][:, : 2 * i + 2])
+    assert int(state[0].step) == 41
+    assert state[1].is_tried.sum(axis=0).max() == 2
+    learned = stage.finish(config, state, **inputs)
+    assert any(np.any(x != y) for x, y in zip(*map(jax.tree.leaves, (first, learned)), strict=True))

@@ -1,0 +1,177 @@
+"""Stages of perception: what detectors, the JMVAE and fusion are trained on."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny import KEY, SMOKE, TINY, stage_of
+
+from jaxsense import looks, models, training
+from jaxsense.config import DetectorConfig, JmvaeConfig
+from jaxsense.core import supervised
+from jaxsense.sim.world import make_world
+from jaxsense.training import perception
+from jaxsense.training.perception import Detections, Surveys
+from jaxsense.vae import detectors, jmvae
+
+
+def bank_of(bank) -> Detections:
+    """Detections for training, without any to measure on."""
+    nothing: Any = ()
+    return Detections(bank, nothing, nothing, nothing)
+
+
+@pytest.mark.parametrize(("share", "trained_on"), [(0.0, 10), (0.1, 9), (0.25, 7), (0.5, 5)])
+def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, monkeypatch):
+    config = dataclasses.replace(TINY.detector, calibration=share)
+    config = dataclasses.replace(TINY, detector=config)
+    # Of .25 of ten looks, three calibrate.
+    windows, labels = jnp.arange(20.0).reshape(10, 2), jnp.arange(10) % 2
+    examples, used = ((windows, labels),) * 2, {}
+
+    def fit(key, state, problem, number):
+        used["train"], used["labels"] = problem.windows, problem.labels
+        return state, jnp.zeros(number)
+
+    def calibrate(detector, windows, labels):
+        used["calibrate"] = windows
+        np.testing.assert_array_equal(labels, (windows[:, 0] / 2) % 2)
+        return "calibrated"
+
+    monkeypatch.setattr(supervised, "fit", fit)
+    monkeypatch.setattr(detectors, "calibrate", calibrate)
+    stage = stage_of("detector_lidar", config)
+    state = stage.begin(KEY, config, examples=examples)
+    state, _ = stage.advance(KEY, config, state, examples=examples)
+    found = stage.finish(config, state, examples=examples)
+    np.testing.assert_allclose(state[0].offset, windows[:trained_on].mean(axis=0))
+    np.testing.assert_array_equal(used["train"], windows[:trained_on])
+    np.testing.assert_array_equal(used["labels"], labels[:trained_on])
+    if share:
+        np.testing.assert_array_equal(used["calibrate"], windows[trained_on:])
+        assert found == "calibrated"
+    else:
+        assert "calibrate" not in used
+
+
+def test_without_calibration_a_detector_is_what_was_trained():
+    windows, labels = jax.random.normal(KEY, (48, 6)), jnp.arange(48) % 2
+    examples, config = ((windows, labels),) * 2, TINY.detector
+    assert config.calibration == 0
+    stage = stage_of("detector_camera")
+    state = stage.begin(KEY, TINY, examples=examples)
+    detector = detectors.init(KEY, windows, 2, config)
+    problem = detectors.Fitting(config, detector, windows, labels)
+    fit = supervised.start(detector.params, config)
+    for key in stage.chunk_keys(KEY)[:2]:
+        state, _ = stage.advance(key, TINY, state, examples=examples)
+        fit, _ = supervised.fit(key, fit, problem, 3)
+    found = stage.finish(TINY, state, examples=examples)
+    expected = dataclasses.replace(detector, params=fit.params)
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):
+    # 41 steps are 14 chunks of 3, the last of which has 2. The loss of a step is its number.
+    monkeypatch.setattr(jmvae.Fitting, "loss", lambda self, params, drawn, step: step + 1.0)
+    stage, detections = stage_of("jmvae_1"), bank_of((jnp.ones((3, 4, 2)),) * 2)
+    state, seen = stage.begin(KEY, TINY, detections=detections), []
+    for _ in range(stage.chunks):
+        state, progress = stage.advance(KEY, TINY, state, detections=detections)
+        seen.append(float(stage.finish(TINY, state, detections=detections)[1]))
+        assert len(progress.loss) == 3
+    assert seen[0] == 2.0  # of 1, 2, 3
+    assert seen[-1] == 40.5  # of 40 and 41
+
+
+def test_the_restart_with_the_lowest_loss_is_kept():
+    stage = stage_of("best_jmvae")
+
+    def best(*losses):
+        restarts = tuple((jnp.int32(i), x) for i, x in enumerate(losses))
+        return int(stage.begin(KEY, TINY, restarts=restarts))
+
+    assert best(jnp.float32(1), jnp.float32(0.5), jnp.float32(0.9)) == 1
+    assert best(jnp.float32(1), jnp.float32(jnp.nan), jnp.float32(0.9)) == 2
+    assert best(jnp.float32(jnp.nan), jnp.float32(jnp.inf)) == 0
+
+
+@pytest.fixture
+def surveys(monkeypatch) -> Surveys:
+    """Surveys whose windows, and scenes, hold the key that the scene was simulated with."""
+
+    def survey(keys, world, classes):
+        key = jax.random.key_data(keys)[:, -1].astype(jnp.uint32)
+        windows = jnp.broadcast_to(key[:, None, None], (*classes.shape, 1))
+        return key, (windows, windows)
+
+    monkeypatch.setattr(looks, "surveys", survey)
+    listed = {stage.name: stage for stage in training.stages(MEASURED)}
+    scenes = listed["scenes"].begin(KEY, MEASURED)
+    return listed["survey"].begin(KEY, MEASURED, scenes=scenes)
+
+
+MEASURED = dataclasses.replace(
+    SMOKE,
+    detector=DetectorConfig(num_scans=31, num_held_out=25, steps=1),
+    jmvae=JmvaeConfig(samples_per_class=10),
+    dqn=dataclasses.replace(SMOKE.dqn, observe="live", num_starts=2 * SMOKE.dqn.num_envs),
+)
+
+
+def used(arrays):
+    return set(np.concatenate([np.ravel(x) for x in jax.tree.leaves(arrays)]).tolist())
+
+
+def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeypatch):
+    assert len(used(surveys.scenes)) == sum(perception.num_scenes(MEASURED))  # no key twice
+    trained_on = []
+
+    def fit(key, state, problem, number):
+        trained_on.append(np.asarray(problem.windows))
+        return state, jnp.zeros(number)
+
+    listed = {stage.name: stage for stage in training.stages(MEASURED)}
+    monkeypatch.setattr(supervised, "fit", fit)
+    monkeypatch.setattr(detectors, "detect", lambda detector, window: window)
+    for name in ("detector_camera", "detector_lidar"):
+        examples = listed["examples"].begin(KEY, MEASURED, surveys=surveys)
+        state = listed[name].begin(KEY, MEASURED, examples=examples)
+        listed[name].advance(KEY, MEASURED, state, examples=examples)
+    detections = jax.jit(listed["detections"].begin)
+    found = detections(KEY, MEASURED, surveys=surveys, trained=(None, None))
+
+    seen, bank, held_out = used(trained_on), used(found.bank), used(found.held_out)
+    starts, shown = used(found.starts.scenes), used(found.windows)
+    assert seen.isdisjoint(bank)
+    assert held_out.isdisjoint(seen | bank | starts)
+    assert starts.isdisjoint(seen)
+    assert shown <= held_out
+    # All of them were looked at.
+    assert len(seen) >= 31 / 3
+    assert [x.shape[:2] for x in found.held_out] == [(3, 9), (3, 9)]
+
+
+def test_a_scene_is_the_same_whoever_works_it_out():
+    listed = {stage.name: stage for stage in training.stages(TINY, make_world(TINY).arena)}
+    keys, classes = listed["scenes"].begin(KEY, TINY)
+    survey = jax.jit(listed["survey"].begin)
+    first, second = (
+        survey(KEY, TINY, scenes=(keys[i : i + 4], classes[i : i + 4])) for i in (0, 2)
+    )
+    same = jax.tree.map(lambda x, y: np.abs(x[2:] - y[:2]).max(), first.scenes, second.scenes)
+    assert max(jax.tree.leaves(same)) < 1e-6
+    assert np.abs(first.scenes.poses[0] - first.scenes.poses[1]).max() > 0.01
+
+
+def test_beliefs_of_classes_are_of_detections_for_training():
+    # Nothing else can be encoded.
+    params = jmvae.init(KEY, models.make_jmvae(TINY))
+    bank = tuple(jnp.full((3, 4, 2), 0.5) for _ in range(2))
+    stage = stage_of("class_beliefs")
+    found = stage.begin(KEY, TINY, params=params, detections=bank_of(bank))
+    expected = jmvae.posterior(params, models.make_jmvae(TINY), tuple(x[0, 0] for x in bank))
+    np.testing.assert_allclose(found.mean, jnp.tile(expected.mean, (3, 1)), rtol=1e-5)

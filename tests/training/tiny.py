@@ -1,0 +1,25 @@
+"""The smallest training that has every stage."""
+
+import dataclasses
+
+import jax
+
+from jaxsense import training
+from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig, MissionConfig
+
+SMOKE, KEY = PRESETS["smoke"], jax.random.key(7)
+# Learning is chaotic, and two programs round differently: a few steps.
+TINY = dataclasses.replace(
+    SMOKE,
+    detector=DetectorConfig(hidden=(8,), num_scans=96, num_held_out=48, steps=41, batch=16),
+    jmvae=JmvaeConfig(hidden=(8,), restarts=2, samples_per_class=32, steps=41, batch=16),
+    dqn=dataclasses.replace(
+        SMOKE.dqn, hidden=(8,), num_envs=8, epochs=4, chunk=2, updates=2, batch=16,
+        replay_capacity=64, num_starts=8,
+    ),
+    mission=MissionConfig(episodes=1, time_limit=0.5),
+)  # fmt: skip
+
+
+def stage_of(name, config=TINY):
+    return next(stage for stage in training.stages(config) if stage.name == name)
