@@ -1,1 +1,1 @@
-"""What every floor builds on: types, argument checks, networks and the one supervised fit."""
+"""The ground floor: types, argument checks, networks and the supervised fit."""

@@ -5,14 +5,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
+from jaxtyping import Array, Float
 
 Params = Any
 """A pytree of network parameters."""
 
 
 class Dense(nn.Module):
-    """A layer for `[F]` features, or for `[F, B]`, with an example in each column.
+    """A dense layer for `[F]` features, or for `[F, B]`, with an example in each column.
 
     With the batch last, layers of this size and their gradients take half as long on a CPU.
     """
@@ -21,8 +23,8 @@ class Dense(nn.Module):
     kernel_init: nn.initializers.Initializer
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """`[F]` to `[size]`, or `[F, B]` to `[size, B]`."""
+    def __call__(self, x: Float[Array | np.ndarray, "F ..."]) -> Float[Array, "{self.size} ..."]:
+        """Maps `[F]` to `[size]`, or `[F, B]` to `[size, B]`."""
         kernel = self.param("kernel", self.kernel_init, (x.shape[0], self.size))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.size,))
         # In full precision, so that an accelerator agrees with a CPU.
@@ -42,8 +44,8 @@ class MLP(nn.Module):
     outputs: int
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """`[F]` to `[outputs]`, or `[F, B]` to `[outputs, B]`."""
+    def __call__(self, x: Float[Array | np.ndarray, "F ..."]) -> Float[Array, "{self.outputs} ..."]:
+        """Maps `[F]` to `[outputs]`, or `[F, B]` to `[outputs, B]`."""
         for i, size in enumerate(self.hidden):
             x = nn.relu(Dense(size, nn.initializers.he_normal(), name=f"Dense_{i}")(x))
         last = nn.initializers.lecun_normal()
@@ -52,10 +54,27 @@ class MLP(nn.Module):
 
 @functools.partial(jax.jit, static_argnames=("network", "inputs"))
 def init(key: jax.Array, network: nn.Module, inputs: int) -> Params:
-    """Random parameters of a network for `[inputs]`, compiled once per shape."""
+    """Random parameters of a network; compiled once for each shape.
+
+    Args:
+      key: random key.
+      network: the network; static.
+      inputs: size of its input; static.
+    """
     return network.init(key, jnp.zeros(inputs))
 
 
-def apply(network: nn.Module, params: Params, x: jax.Array) -> jax.Array:
-    """The forward pass of a network, see `MLP.__call__`."""
+def apply(
+    network: nn.Module, params: Params, x: Float[Array | np.ndarray, "F ..."]
+) -> Float[Array, "A ..."]:
+    """Applies a network.
+
+    Args:
+      network: for example an `MLP`.
+      params: its parameters.
+      x: `[F]`, or `[F, B]`.
+
+    Returns:
+      `[A]`, or `[A, B]`.
+    """
     return jnp.asarray(network.apply(params, x))

@@ -1,10 +1,11 @@
-"""The supervised fit that trains detectors, the JMVAE, the filter and tours: one `lax.scan`."""
+"""The supervised fit of detectors, the JMVAE, the filter and tours: one `lax.scan`."""
 
 from typing import Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Float, Int
 
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Key, pytree
@@ -13,30 +14,21 @@ D = TypeVar("D")
 
 
 class FitConfig(Protocol):
-    """Settings of a fit.
-
-    Attributes:
-      learning_rate: of Adam in the first step; it falls to zero along a cosine.
-      steps: gradient steps of the whole fit.
-    """
+    """Settings of a fit."""
 
     @property
     def learning_rate(self) -> float:
-        """Of Adam in the first step."""
+        """Adam's learning rate in the first step; it falls to zero along a cosine."""
         ...
 
     @property
     def steps(self) -> int:
-        """Of the whole fit."""
+        """Gradient steps of the whole fit."""
         ...
 
 
 class Problem(Protocol, Generic[D]):
-    """What a fit minimises.
-
-    Attributes:
-      config: settings of the fit.
-    """
+    """A loss to minimise, and what it is computed from."""
 
     @property
     def config(self) -> FitConfig:
@@ -44,14 +36,25 @@ class Problem(Protocol, Generic[D]):
         ...
 
     def draw(self, key: Key, number: int) -> D:
-        """Everything random in `number` steps, as `[number, ...]` arrays.
+        """Draws everything random in some steps, which is much cheaper than drawing in the loop.
 
-        Drawing all steps together is much cheaper than drawing in the loop.
+        Args:
+          key: random key.
+          number: of steps; static.
+
+        Returns:
+          `[number, ...]` arrays.
         """
         ...
 
-    def loss(self, params: Params, drawn: D, step: jax.Array) -> jax.Array:
-        """`[]` loss of what was drawn for one step, which counts from the start of the fit."""
+    def loss(self, params: Params, drawn: D, step: Int[Array, ""]) -> Float[Array, ""]:
+        """Loss of one step.
+
+        Args:
+          params: of the network.
+          drawn: for this step, a row of what `draw` returns.
+          step: `[]` int32, counted from the start of the fit.
+        """
         ...
 
 
@@ -62,7 +65,7 @@ class FitState:
     Attributes:
       params: of the network.
       optimiser: state of the optimiser.
-      step: `[]` int32 gradient steps so far.
+      step: `[]` int32 number of gradient steps so far.
       loss: `[]` mean loss of the last chunk; infinite before the first.
     """
 
@@ -81,7 +84,7 @@ def _adam(config: FitConfig) -> optax.GradientTransformation:
 
 
 def start(params: Params, config: FitConfig) -> FitState:
-    """The state before the first step.
+    """State before the first step.
 
     Args:
       params: initial parameters.
@@ -90,19 +93,21 @@ def start(params: Params, config: FitConfig) -> FitState:
     return FitState(params, _adam(config).init(params), jnp.int32(0), jnp.float32(jnp.inf))
 
 
-def fit(key: Key, state: FitState, problem: Problem[D], number: int) -> tuple[FitState, jax.Array]:
-    """Takes some gradient steps, at most up to the end of the whole fit.
+def fit(
+    key: Key, state: FitState, problem: Problem[D], number: int
+) -> tuple[FitState, Float[Array, "{number}"]]:
+    """Takes gradient steps, at most until the end of the whole fit.
 
     Args:
       key: random key of what the steps draw.
       state: from `start` or an earlier call.
       problem: what to minimise.
-      number: how many steps to take; static.
+      number: of steps; static.
 
     Returns:
-      The state after the last step and the `[number]` losses; those beyond the end of the fit mean
-      nothing. Non-finite values raise no error: the last meaningful loss is NaN if the parameters
-      after it are not finite.
+      The state after the last step and the `[number]` losses, of which those beyond the end of the
+      fit have no meaning. Non-finite values raise no error: the last loss of the fit is NaN if the
+      parameters after it are not finite.
     """
     optimiser, total = _adam(problem.config), problem.config.steps
     drawn = problem.draw(key, number)
@@ -124,6 +129,5 @@ def fit(key: Key, state: FitState, problem: Problem[D], number: int) -> tuple[Fi
     last = jnp.maximum(after.step - state.step - 1, 0)
     losses = losses.at[last].mul(jnp.where(is_finite, 1.0, jnp.nan))
     counts = state.step + jnp.arange(number) < total
-    return FitState(
-        after.params, after.optimiser, after.step, jnp.mean(losses, where=counts)
-    ), losses
+    mean = jnp.mean(losses, where=counts)
+    return FitState(after.params, after.optimiser, after.step, mean), losses

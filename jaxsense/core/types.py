@@ -1,4 +1,4 @@
-"""Types shared by `sim`, `vae`, `dqn` and the modules that join them."""
+"""Types that `sim`, `vae`, `dqn` and the modules above them share."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 T = TypeVar("T")
 
@@ -18,13 +18,13 @@ Key = jax.Array
 Index = int | jax.Array
 """A Python integer, or a `[]` int32 array."""
 
-Features = tuple[jax.Array | None, ...]
-"""`[D_m]` features of each modality, or None where it is missing."""
+Features = tuple[Float[Array | np.ndarray, "_"] | None, ...]
+"""`[D_m]` features of each modality, or None where it has not looked."""
 
 Scene = Any
-"""A pytree that looks see; MDPs only carry it."""
+"""A pytree that describes what looks see; MDPs only carry it."""
 
-Samples = tuple[jax.Array, ...]
+Samples = tuple[Float[Array | np.ndarray, "C _ _"], ...]
 """`[C, S, D_m]` features of each modality: S looks at every class."""
 
 
@@ -50,7 +50,7 @@ class Belief:
 
 
 class Fusion(Protocol):
-    """How the map takes in looks; a frozen pytree.
+    """How looks update beliefs; a frozen pytree.
 
     Attributes:
       classes: `[C, D]` mean joint posterior of each class.
@@ -71,10 +71,10 @@ class Fusion(Protocol):
         self,
         belief: Belief,
         seen: Bool[Array | np.ndarray, " M"],
-        features: Float[Array, " L"],
+        features: Float[Array | np.ndarray, " D_m"],
         modality: int,
     ) -> Belief:
-        """The belief after one more look.
+        """Belief after one more look.
 
         Args:
           belief: `[D]` before the look.
@@ -84,16 +84,16 @@ class Fusion(Protocol):
         """
         ...
 
-    def together(self, looks: Mapping[int, Float[Array, " L"]]) -> Belief:
-        """The belief after looks by several sensors together, `[D_m]` features by modality."""
+    def together(self, looks: Mapping[int, Float[Array | np.ndarray, "_"]]) -> Belief:
+        """Belief after looks by several sensors together, `[D_m]` features by modality."""
         ...
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
-        """The classes' probabilities that a `[D]` belief holds."""
+        """Probability of each class according to a `[D]` belief."""
         ...
 
     def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
-        """The class that a `[D]` belief shows, int32."""
+        """Most likely class according to a `[D]` belief, int32."""
         ...
 
 
@@ -117,7 +117,7 @@ class Transition:
 
 
 def is_static(index: Index) -> bool:
-    """Whether an index is fixed while tracing."""
+    """Whether an index is known while tracing."""
     return isinstance(index, int | np.integer)
 
 
@@ -126,7 +126,7 @@ def call(function: Callable[[int], T], index: Index, number: int) -> T:
 
     Args:
       function: returns the same shapes for every index.
-      index: if an array, the program switches between all indices.
+      index: of the call; the program switches between all indices if it is an array.
       number: of indices.
     """
     if is_static(index):
@@ -134,7 +134,15 @@ def call(function: Callable[[int], T], index: Index, number: int) -> T:
     return jax.lax.switch(index, [functools.partial(function, i) for i in range(number)])
 
 
-def others(rows: jax.Array, index: Index) -> jax.Array:
-    """`[R - 1, ...]` of `[R, ...]` rows: all but one, from the one after it on."""
+def others(rows: Shaped[Array, "R ..."], index: Index) -> Shaped[Array, "R-1 ..."]:
+    """All rows except one, starting with the row after it.
+
+    Args:
+      rows: `[R, ...]`.
+      index: of the row to leave out.
+
+    Returns:
+      `[R - 1, ...]`.
+    """
     number = len(rows)
     return rows[(index + 1 + jnp.arange(number - 1)) % number]

@@ -1,8 +1,10 @@
-"""Exact Bayes over the classes, and the product of experts: what fusion is compared with."""
+"""Exact Bayes over the classes, and the product of experts, to compare fusion with."""
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, pytree
@@ -10,11 +12,14 @@ from jaxsense.vae.calibration import MIN_PROBABILITY
 
 _MIN_PRECISION = 1e-6
 
+_Features = Float[Array | np.ndarray, " D_m"]
+_Labels = Int[Array | np.ndarray, " C"]
 
-def log_likelihoods(features: jax.Array, label_of_class: jax.Array) -> jax.Array:
-    """How likely each class makes a look, from a detector's probabilities.
 
-    Labels were as frequent in the detector's training as classes that have them, so
+def log_likelihoods(features: _Features, label_of_class: _Labels) -> Float[Array, " C"]:
+    """Log-likelihood of each class given one look, from a detector's probabilities.
+
+    In the detector's training each label was as frequent as the classes that have it, so
     `p(x | class) ~ p(label | x) / p(label)`.
 
     Args:
@@ -22,7 +27,7 @@ def log_likelihoods(features: jax.Array, label_of_class: jax.Array) -> jax.Array
       label_of_class: `[C]` int32, the label of each class in this modality.
 
     Returns:
-      `[C]` logarithms of the likelihoods, up to a constant.
+      `[C]`, up to a constant.
 
     Raises:
       ValueError: if a label does not exist or the features are not probabilities.
@@ -38,9 +43,9 @@ def log_likelihoods(features: jax.Array, label_of_class: jax.Array) -> jax.Array
 
 
 def bayes_update(
-    log_weights: jax.Array, features: jax.Array, label_of_class: jax.Array
-) -> jax.Array:
-    """Exact Bayes filter over classes, from a detector's probabilities.
+    log_weights: Float[Array | np.ndarray, " C"], features: _Features, label_of_class: _Labels
+) -> Float[Array, " C"]:
+    """Updates the exact posterior over the classes by one look.
 
     Args:
       log_weights: `[C]` logarithms of the classes' probabilities before the look.
@@ -51,7 +56,7 @@ def bayes_update(
       `[C]` logarithms after the look, normalised.
 
     Raises:
-      ValueError: if all classes are excluded, or a logarithm is NaN.
+      ValueError: if all classes are excluded or a logarithm is NaN; see also `log_likelihoods`.
     """
     chex.assert_rank(log_weights, 1, custom_message="log_weights")
     chex.assert_shape(label_of_class, log_weights.shape, custom_message="label_of_class")
@@ -68,50 +73,46 @@ class Bayes:
       labels: `[M, C]` int32, the label of each class in each modality.
     """
 
-    labels: jax.Array
+    labels: Int[Array, "M C"]
 
     @property
-    def prior(self) -> jax.Array:
-        """`[C]` logarithms of equal probabilities."""
+    def prior(self) -> Float[Array, " C"]:
+        """Logarithms of equal probabilities."""
         number = self.labels.shape[1]
         return jnp.full(number, -jnp.log(number))
 
-    def log_likelihoods(self, features: jax.Array, modality: int) -> jax.Array:
-        """How likely each class makes a look, see the function `log_likelihoods`.
+    def log_likelihoods(self, features: _Features, modality: int) -> Float[Array, " C"]:
+        """Log-likelihood of each class given one look, see the function `log_likelihoods`.
 
         Args:
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
-
-        Returns:
-          `[C]`.
         """
         return log_likelihoods(features, self.labels[modality])
 
-    def update(self, log_posterior: jax.Array, features: jax.Array, modality: int) -> jax.Array:
-        """The posterior after one more look, see `bayes_update`.
+    def update(
+        self, log_posterior: Float[Array, " C"], features: _Features, modality: int
+    ) -> Float[Array, " C"]:
+        """Posterior after one more look, see `bayes_update`.
 
         Args:
           log_posterior: `[C]` logarithms of the classes' probabilities before the look.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
-
-        Returns:
-          `[C]`.
         """
         return bayes_update(log_posterior, features, self.labels[modality])
 
 
 def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Belief:
-    """Multiplies a belief with the posterior of one more look, and divides by the prior.
+    """Multiplies a belief by the posterior of one more look and divides by their common prior.
 
     Args:
       belief: `[D]` before the look.
-      posterior: `[D]` `q(z | x)` of the look alone.
+      posterior: `[D]` posterior `q(z | x)` given this look alone.
       prior: `[D]`, contained in both.
 
     Returns:
-      `[D]` normalised product; dimensions without precision keep a little.
+      `[D]` normalised product, with a lower bound on its precision.
 
     Raises:
       ValueError: if a belief is not finite, or a standard deviation is not positive.

@@ -1,15 +1,17 @@
-"""Whether probabilities are right: likelihood, calibration error and reliability diagrams."""
+"""Quality of predicted probabilities: likelihood, calibration error, reliability diagram."""
 
 import chex
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 MIN_PROBABILITY = 1e-12
 _BINS = 15
 
 
-def negative_log_likelihood(probabilities: jax.Array, labels: jax.Array) -> jax.Array:
-    """Mean of `-log p(label)`, `[]` in nats.
+def negative_log_likelihood(
+    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
+) -> Float[Array, ""]:
+    """Mean of `-log p(label)` in nats.
 
     Args:
       probabilities: `[S, L]` of each label.
@@ -21,11 +23,13 @@ def negative_log_likelihood(probabilities: jax.Array, labels: jax.Array) -> jax.
     return -jnp.mean(jnp.log(jnp.maximum(right, MIN_PROBABILITY)))
 
 
-def calibration_error(probabilities: jax.Array, labels: jax.Array) -> jax.Array:
-    """Expected calibration error of the most likely labels, `[]` (Guo et al. 2017, Sec. 2).
+def calibration_error(
+    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
+) -> Float[Array, ""]:
+    """Expected calibration error of the most likely labels (Guo et al. 2017, Sec. 2).
 
-    The mean over all looks of the difference between the mean confidence of a bin of
-    `reliability` and its share of right labels.
+    It is the difference between mean confidence and accuracy in a bin of `reliability`, averaged
+    over all looks.
 
     Args:
       probabilities: `[S, L]` of each label.
@@ -36,17 +40,17 @@ def calibration_error(probabilities: jax.Array, labels: jax.Array) -> jax.Array:
 
 
 def reliability(
-    probabilities: jax.Array, labels: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The points of a reliability diagram: fifteen bins of equal width hold looks by confidence.
+    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
+) -> tuple[Float[Array, " B"], Float[Array, " B"], Float[Array, " B"]]:
+    """Points of a reliability diagram with fifteen bins of equal width.
 
     Args:
       probabilities: `[S, L]` of each label.
       labels: `[S]` int32 true labels.
 
     Returns:
-      For each bin its mean confidence and its share of right labels, NaN if it is empty, and its
-      share of all looks.
+      For each bin `[B]` mean confidence and `[B]` accuracy, NaN if it is empty, and `[B]` share of
+      all looks.
     """
     chex.assert_rank(probabilities, 2, custom_message="probabilities")
     chex.assert_shape(labels, (len(probabilities),), custom_message="labels")

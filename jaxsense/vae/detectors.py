@@ -1,4 +1,4 @@
-"""The scanline detectors f_x and f_w: what one sensor sees of a point of interest."""
+"""The scanline detectors f_x and f_w: from one sensor's window to features."""
 
 import dataclasses
 
@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jaxtyping import Array, Float, Int
 
 from jaxsense.config import DetectorConfig
 from jaxsense.core import networks
@@ -18,25 +19,34 @@ _MAX_TEMPERATURE = 4.0
 
 @pytree
 class Detector:
-    """A trained detector.
+    """A detector of one sensor.
 
     Attributes:
       params: of its network.
-      offset: `[F]` mean of the windows it was trained on.
-      scale: `[]` their overall standard deviation.
+      offset: `[F]` mean of the windows for training.
+      scale: `[]` overall standard deviation of these windows.
       hidden: sizes of the hidden layers.
-      num_labels: number of labels, D_m.
+      num_labels: D_m, the number of labels.
     """
 
     params: Params
-    offset: jax.Array
-    scale: jax.Array
+    offset: Float[Array, " F"]
+    scale: Float[Array, ""]
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
     num_labels: int = struct.field(pytree_node=False)
 
 
-def init(key: Key, windows: jax.Array, num_labels: int, config: DetectorConfig) -> Detector:
-    """Untrained detector, standardised to the `[S, F]` windows of its training."""
+def init(
+    key: Key, windows: Float[Array, "S F"], num_labels: int, config: DetectorConfig
+) -> Detector:
+    """Untrained detector.
+
+    Args:
+      key: random key.
+      windows: `[S, F]` windows for training, by which it standardises its input.
+      num_labels: D_m.
+      config: sizes of the network.
+    """
     chex.assert_rank(windows, 2, custom_message="windows")
     params = networks.init(key, MLP(config.hidden, num_labels), windows.shape[1])
     offset = jnp.mean(windows, axis=0)
@@ -44,19 +54,24 @@ def init(key: Key, windows: jax.Array, num_labels: int, config: DetectorConfig) 
     return Detector(params, offset, scale, config.hidden, num_labels)
 
 
-def logits(detector: Detector, window: jax.Array) -> jax.Array:
-    """Unnormalised log-probabilities of the labels, `[D_m]`, from one `[F]` window."""
+def logits(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
+    """Unnormalised log-probabilities of the labels.
+
+    Args:
+      detector: of the sensor.
+      window: `[F]`.
+    """
     chex.assert_shape(window, detector.offset.shape, custom_message="window")
     standard = (window - detector.offset) / detector.scale
     return networks.apply(_network(detector), detector.params, standard)
 
 
-def detect(detector: Detector, window: jax.Array) -> jax.Array:
+def detect(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
     """Features of one look.
 
     Args:
-      detector: a trained detector.
-      window: `[F]` readings around the PoI's bearing, see `sim.sensors.as_window`.
+      detector: of the sensor.
+      window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
 
     Returns:
       `[D_m]` probabilities of the labels, for example (red, green).
@@ -66,27 +81,40 @@ def detect(detector: Detector, window: jax.Array) -> jax.Array:
 
 @pytree
 class Fitting:
-    """The fit of a detector to labelled windows: the cross-entropy of its labels.
+    """Problem of fitting a detector to labelled windows, with the cross-entropy as loss.
 
     Attributes:
       config: batch, learning rate and steps.
       detector: from `init`.
       windows: `[S, F]` windows of simulated scans.
-      labels: `[S]` int32.
+      labels: `[S]` int32 true labels.
     """
 
     config: DetectorConfig
     detector: Detector
-    windows: jax.Array
-    labels: jax.Array
+    windows: Float[Array, "S F"]
+    labels: Int[Array, " S"]
 
-    def draw(self, key: Key, number: int) -> jax.Array:
-        """Rows of the windows for `number` steps, see `supervised.Problem.draw`."""
+    def draw(self, key: Key, number: int) -> Int[Array, "{number} B"]:
+        """Draws rows of the windows.
+
+        Args:
+          key: random key.
+          number: of steps; static.
+        """
         shape = number, self.config.batch
         return jax.random.randint(key, shape, 0, self.windows.shape[0])
 
-    def loss(self, params: Params, drawn: jax.Array, step: jax.Array) -> jax.Array:
-        """`[]` mean cross-entropy of a batch."""
+    def loss(
+        self, params: Params, drawn: Int[Array, " B"], step: Int[Array, ""]
+    ) -> Float[Array, ""]:
+        """Mean cross-entropy of a batch.
+
+        Args:
+          params: of the network.
+          drawn: `[B]` rows of the windows.
+          step: not used.
+        """
         del step
         detector = self.detector
         standard = (self.windows[drawn] - detector.offset[None]) / detector.scale
@@ -95,13 +123,15 @@ class Fitting:
         return cross_entropy(predicted, self.labels[drawn], 0).mean()
 
 
-def calibrate(detector: Detector, windows: jax.Array, labels: jax.Array) -> Detector:
-    """Divides logits by the temperature that suits other looks best (Guo et al. 2017, Sec. 4.2).
+def calibrate(
+    detector: Detector, windows: Float[Array, "S F"], labels: Int[Array, " S"]
+) -> Detector:
+    """Divides logits by the best temperature for other looks (Guo et al. 2017, Sec. 4.2).
 
     Args:
       detector: a trained detector.
-      windows: `[S, F]` looks that it was not trained on.
-      labels: `[S]` int32.
+      windows: `[S, F]` that the detector was not trained on.
+      labels: `[S]` int32 true labels.
 
     Returns:
       The detector whose probabilities make these labels most likely.
@@ -123,4 +153,5 @@ def calibrate(detector: Detector, windows: jax.Array, labels: jax.Array) -> Dete
 
 
 def _network(detector: Detector) -> MLP:
+    """The network of a detector."""
     return MLP(detector.hidden, detector.num_labels)

@@ -1,11 +1,12 @@
-"""Fusion by a filter: one update for each look, any number of looks in any order.
+"""Fusion by a filter: one update per look, for any number of looks in any order.
 
-The JMVAE's alpha term draws the posterior of each subset of the modalities to the joint one. Taken
-from subsets to whole histories of looks, it is `E[sum_t KL(q*_c || q_t)]`: q*_c is the joint
-posterior of the true class c, and q_t the belief after t looks. Among Gaussians this divergence is
-smallest where q_t has the moments of the mixture `sum_c w_c q*_c` whose weights are the classes'
-probabilities after the looks. So the mean shows which classes are open, and the width how uncertain
-the belief is. The weights follow from the moments again: a belief is a sufficient memory.
+The JMVAE's alpha term draws the posterior of each subset of the modalities to the joint one. For
+histories of looks instead of subsets, it is `E[sum_t KL(q*_c || q_t)]`: q*_c is the joint
+posterior of the true class c, and q_t the belief after t looks. Among Gaussians, q_t minimises this
+divergence if it has the moments of the mixture `sum_c w_c q*_c`, weighted by the probabilities of
+the classes after the looks. So the mean shows which classes are plausible, and the width how
+uncertain the belief is. The weights can be computed from the moments: a belief is a sufficient
+memory.
 """
 
 from collections.abc import Mapping
@@ -32,13 +33,14 @@ Drawn = tuple[jax.Array, jax.Array, tuple[jax.Array, ...]]
 
 @pytree
 class Filter:
-    """A filter.
+    """Fusion by a filter.
 
     Attributes:
-      networks: by modality, parameters that map features to the classes' log-likelihoods.
+      networks: by modality, parameters of the network that maps features to log-likelihoods of
+        the classes.
       classes: `[C, D]` mean joint posterior of each class.
       prior: `[D]` belief before any look.
-      readout: `[C, 2D + 1]` of `readout.readout_matrix`.
+      readout: `[C, 2D + 1]` from `readout.readout_matrix`.
       model: shape of the JMVAE.
       hidden: sizes of the networks' hidden layers.
     """
@@ -46,7 +48,7 @@ class Filter:
     networks: dict[str, Params]
     classes: Belief
     prior: Belief
-    readout: jax.Array
+    readout: Float[Array, "C K"]
     model: Jmvae = struct.field(pytree_node=False)
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
 
@@ -54,14 +56,20 @@ class Filter:
         self,
         belief: Belief,
         seen: Bool[Array | np.ndarray, " M"],
-        features: Float[Array, " L"],
+        features: Float[Array | np.ndarray, " D_m"],
         modality: int,
     ) -> Belief:
-        """The belief after one more look, see `Fusion.update`; `seen` does not matter.
+        """Belief after one more look.
+
+        Args:
+          belief: `[D]` before the look.
+          seen: not used.
+          features: `[D_m]` probabilities of the labels.
+          modality: index of the sensor; static.
 
         Raises:
-          ValueError: if there is no such modality, features are not probabilities, or a belief is
-            not finite or not positive.
+          ValueError: if there is no such modality, `features` are not probabilities, or the belief
+            is not finite or its width not positive.
         """
         del seen
         model = self.model
@@ -71,24 +79,24 @@ class Filter:
         checks.require_probabilities("features", features)
         chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
         chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
-        found = self.log_likelihood(self.networks, features, modality)
+        found = self.log_likelihood(self.networks, jnp.asarray(features), modality)
         before = jnp.log(self.class_probabilities(belief))
         return readout.mixture(self.classes, jax.nn.softmax(before + found))
 
-    def together(self, looks: Mapping[int, Float[Array, " L"]]) -> Belief:
-        """The belief after looks by several sensors, `[D_m]` features by modality."""
+    def together(self, looks: Mapping[int, Float[Array | np.ndarray, "_"]]) -> Belief:
+        """Belief after looks by several sensors, `[D_m]` features by modality."""
         belief, nobody = self.prior, jnp.zeros(len(self.model.modalities), bool)
         for modality, features in looks.items():
             belief = self.update(belief, nobody, features, modality)
         return belief
 
     def log_likelihood(
-        self, params: dict[str, Params], features: Float[Array, "L ..."], modality: int
-    ) -> Float[Array, "C ..."]:
+        self, params: dict[str, Params], features: Float[Array, "D_m *B"], modality: int
+    ) -> Float[Array, "C *B"]:
         """Log-likelihood of each class given one look, up to a constant.
 
         Args:
-          params: the networks, by modality.
+          params: of the networks, by modality.
           features: `[D_m]` probabilities of the labels, or `[D_m, B]`.
           modality: index of the sensor; static.
 
@@ -100,16 +108,16 @@ class Filter:
         return networks.apply(network, params[self.model.modalities[modality]], logarithm)
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
-        """The classes' probabilities that a `[D]` belief holds."""
+        """Probability of each class according to a `[D]` belief."""
         return readout.class_probabilities(self.readout, self.prior, belief)
 
     def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
-        """The class of the highest probability in a `[D]` belief, int32."""
+        """Most likely class according to a `[D]` belief, int32."""
         return jnp.argmax(self.class_probabilities(belief))
 
 
 def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterConfig) -> Filter:
-    """An untrained filter.
+    """Untrained filter.
 
     Args:
       key: random key.
@@ -137,12 +145,12 @@ def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterC
 
 @pytree
 class Fitting:
-    """The fit of a filter's networks to random histories of looks.
+    """Problem of fitting a filter's networks to random histories of looks.
 
     Attributes:
-      config: looks of a history, batch, learning rate and steps.
+      config: looks per history, batch, learning rate and steps.
       filter: from `init`.
-      bank: the detections to draw looks from.
+      bank: features to draw looks from.
     """
 
     config: FilterConfig
@@ -150,7 +158,12 @@ class Fitting:
     bank: Samples
 
     def draw(self, key: Key, number: int) -> Drawn:
-        """Histories of looks for `number` steps, see `supervised.Problem.draw`."""
+        """Draws histories of looks.
+
+        Args:
+          key: random key.
+          number: of steps; static.
+        """
         bank, shape = self.bank, (number, self.config.looks, self.config.batch)
         class_key, sensor_key, *row_keys = jax.random.split(key, 2 + len(bank))
         classes = jax.random.randint(class_key, (number, self.config.batch), 0, len(bank[0]))
@@ -161,8 +174,16 @@ class Fitting:
         )
         return classes, sensors, looks
 
-    def loss(self, params: dict[str, Params], drawn: Drawn, step: jax.Array) -> jax.Array:
-        """`[]` mean divergence from the true class's joint posterior to the beliefs."""
+    def loss(
+        self, params: dict[str, Params], drawn: Drawn, step: Int[Array, ""]
+    ) -> Float[Array, ""]:
+        """Mean divergence from the joint posterior of the true class to the beliefs.
+
+        Args:
+          params: of the networks, by modality.
+          drawn: one step of `draw`.
+          step: not used.
+        """
         del step
         true_class, sensor, looks = drawn
         number, classes = len(self.bank), self.filter.classes

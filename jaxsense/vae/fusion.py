@@ -1,7 +1,7 @@
-"""The paper's fusion of looks into a belief, in place.
+"""Fusion in place, the paper's.
 
-Korthals et al. 2018, Sec. III and Fig. 3. `vae.filter` holds the second kind of fusion. A third
-kind is a new class with the attributes and methods of `core.types.Fusion`.
+Korthals et al. 2018, Sec. III and Fig. 3. `vae.filter` holds another kind of fusion. A kind of your
+own is a class with the attributes and methods of `core.types.Fusion`.
 """
 
 import itertools
@@ -25,31 +25,37 @@ from jaxsense.vae.jmvae import Jmvae
 class InPlace:
     """The paper's fusion: a look replaces the belief.
 
-    The map does not keep the features of modalities that have looked before: they are decoded from
-    the belief's mean and encoded together with the new ones.
+    The map does not keep features of earlier looks. Those of the other modalities are decoded from
+    the mean of the belief, and encoded together with the new ones.
 
     Attributes:
       params: of the JMVAE.
       classes: `[C, D]` mean joint posterior of each class.
       prior: `[D]` belief before any look.
-      readout: `[C, 2D + 1]` of `readout.readout_matrix`.
+      readout: `[C, 2D + 1]` from `readout.readout_matrix`.
       model: shape of the JMVAE.
     """
 
     params: Params
     classes: Belief
     prior: Belief
-    readout: jax.Array
+    readout: Float[Array, "C K"]
     model: Jmvae = struct.field(pytree_node=False)
 
     def update(
         self,
         belief: Belief,
         seen: Bool[Array | np.ndarray, " M"],
-        features: Float[Array, " L"],
+        features: Float[Array | np.ndarray, " D_m"],
         modality: int,
     ) -> Belief:
-        """The belief after one more look, see `Fusion.update` and `fuse`.
+        """Belief after one more look, see `fuse`.
+
+        Args:
+          belief: `[D]` before the look.
+          seen: `[M]` bool, which modalities have looked before.
+          features: `[D_m]` probabilities of the labels.
+          modality: index of the sensor; static.
 
         Raises:
           ValueError: if there is no such modality; see also `fuse`.
@@ -59,17 +65,17 @@ class InPlace:
         of_all = tuple(features if m == modality else None for m in range(number))
         return fuse(self.params, self.model, belief, seen, of_all)
 
-    def together(self, looks: Mapping[int, Float[Array, " L"]]) -> Belief:
-        """The posterior `q(z|x)` of looks by several sensors, `[D_m]` features by modality."""
+    def together(self, looks: Mapping[int, Float[Array | np.ndarray, "_"]]) -> Belief:
+        """Posterior `q(z|x)` given looks by several sensors, `[D_m]` features by modality."""
         features = tuple(looks.get(m) for m in range(len(self.model.modalities)))
         return jmvae.posterior(self.params, self.model, features)
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
-        """The classes' probabilities that a `[D]` belief holds."""
+        """Probability of each class according to a `[D]` belief."""
         return readout.class_probabilities(self.readout, self.prior, belief)
 
     def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
-        """The class whose joint posterior is nearest to a `[D]` belief, int32."""
+        """Class whose joint posterior is nearest to a `[D]` belief, int32."""
         return latent.nearest_class(belief, self.classes.mean)
 
 
@@ -80,23 +86,20 @@ def fuse(
     seen: Bool[Array | np.ndarray, " M"],
     features: Features,
 ) -> Belief:
-    """Fuses looks by one sensor, or by several together, into a belief in place.
+    """Fuses looks by one sensor, or by several together, in place.
 
-    The first look yields `q(z|x)`.
+    The first look yields `q(z|x)`. The old belief enters the new one only through the decoder.
 
     Args:
       params: of the JMVAE.
-      model: its shape.
+      model: shape of the JMVAE.
       belief: `[D]` before the looks.
       seen: `[M]` bool, which modalities have looked before.
       features: for each modality `[D_m]` new features, or None where it has not looked.
 
-    Returns:
-      The new belief. The old one enters it only through the decoder.
-
     Raises:
-      ValueError: if `features` lacks an entry for a modality, all are None, or one holds no
-        probabilities; if the belief is not finite or not positive.
+      ValueError: if `features` has another length than `model.modalities`, all are None, or one
+        does not hold probabilities; if the belief is not finite or its width not positive.
     """
     chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
     chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
@@ -110,7 +113,7 @@ def fuse(
     generated = jmvae.decode(params, model, belief.mean)
     others = [m for m, new in enumerate(features) if new is None]
     fused = belief
-    # One encoder for each set of modalities that may have looked before; `seen` picks among them.
+    # One encoder for each set of modalities that may have looked before; `seen` selects one.
     for size in range(len(others) + 1):
         for subset in itertools.combinations(others, size):
             inputs = tuple(generated[m] if m in subset else new for m, new in enumerate(features))
@@ -122,7 +125,7 @@ def fuse(
 
 
 def prior(model: Jmvae, variance: float) -> Belief:
-    """Belief before any look: mean 0 and the given variance in each dimension.
+    """Belief before any look, with mean 0.
 
     Args:
       model: shape of the JMVAE.

@@ -1,16 +1,18 @@
 """Diagonal Gaussians: divergence, sampling and moment matching."""
 
 import chex
-import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
 from jaxsense.core import checks
 
+_Row = Float[Array | np.ndarray, " D"]
+_Columns = Float[Array | np.ndarray, "D ..."]
 
-def kl_divergence(
-    mean_p: jax.Array, log_var_p: jax.Array, mean_q: jax.Array, log_var_q: jax.Array
-) -> jax.Array:
-    """`KL(p || q)` of two diagonal Gaussians.
+
+def kl_divergence(mean_p: _Row, log_var_p: _Row, mean_q: _Row, log_var_q: _Row) -> Float[Array, ""]:
+    """Kullback-Leibler divergence `KL(p || q)` of two diagonal Gaussians.
 
     Args:
       mean_p: `[D]`.
@@ -30,16 +32,24 @@ def kl_divergence(
     return 0.5 * jnp.sum(ratio + distance - 1.0 - log_var_p + log_var_q)
 
 
-def kl_to_standard_normal(mean: jax.Array, log_var: jax.Array) -> jax.Array:
-    """`KL(N(mean, exp(log_var)) || N(0, I))`, `[]` in nats, of `[D]` inputs."""
+def kl_to_standard_normal(mean: _Row, log_var: _Row) -> Float[Array, ""]:
+    """Divergence `KL(N(mean, exp(log_var)) || N(0, I))`.
+
+    Args:
+      mean: `[D]`.
+      log_var: `[D]` logarithm of the variances.
+
+    Returns:
+      `[]` in nats.
+    """
     return kl_divergence(mean, log_var, jnp.zeros_like(mean), jnp.zeros_like(log_var))
 
 
-def sample(noise: jax.Array, mean: jax.Array, log_var: jax.Array) -> jax.Array:
+def sample(noise: _Columns, mean: _Columns, log_var: _Columns) -> Float[Array, "D ..."]:
     """Reparameterised draw, differentiable in `mean` and `log_var`.
 
     Args:
-      noise: `[D, ...]` standard normal numbers.
+      noise: `[D, ...]` standard normal draws.
       mean: `[D, ...]`.
       log_var: `[D, ...]` logarithm of the variances.
     """
@@ -48,11 +58,13 @@ def sample(noise: jax.Array, mean: jax.Array, log_var: jax.Array) -> jax.Array:
     return mean + jnp.exp(0.5 * log_var) * noise
 
 
-def moment_match(mean: jax.Array, std: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The Gaussian with the mean and variance of an equal mixture of diagonal Gaussians.
+def moment_match(
+    mean: Float[Array | np.ndarray, "K D"], std: Float[Array | np.ndarray, "K D"]
+) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
+    """Mean and standard deviation of an equal mixture of diagonal Gaussians.
 
-    It minimises `E KL(component || q)` over diagonal Gaussians q, the training goal of a JMVAE's
-    uni-modal encoders.
+    The Gaussian with these moments minimises `E KL(component || q)` over diagonal Gaussians q, the
+    training goal of a JMVAE's uni-modal encoders.
 
     Args:
       mean: `[K, D]` of the components.
@@ -60,6 +72,9 @@ def moment_match(mean: jax.Array, std: jax.Array) -> tuple[jax.Array, jax.Array]
 
     Returns:
       `[D]` mean and `[D]` standard deviation, with variance `E[std^2] + Var[mean]`.
+
+    Raises:
+      ValueError: if there is no component, or a standard deviation is not positive.
     """
     chex.assert_rank(mean, 2, custom_message="mean")
     chex.assert_shape(std, mean.shape, custom_message="std")

@@ -1,9 +1,9 @@
 """The joint multi-modal VAE (JMVAE) for any tuple of modalities.
 
 Suzuki, Nakayama and Matsuo 2017, as used in Korthals et al. 2018, Sec. II. Every non-empty subset
-of the modalities has an encoder: the full set's is the joint encoder, to which a Kullback-Leibler
-divergence draws each of the others. For two modalities these are the joint and the two uni-modal
-encoders of the paper.
+of the modalities has an encoder. The encoder of the full set is the joint encoder; a
+Kullback-Leibler divergence draws every other encoder to it. With two modalities these are the joint
+encoder and the two uni-modal encoders of the paper.
 """
 
 import dataclasses
@@ -12,7 +12,9 @@ import itertools
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
+from jaxtyping import Array, Float, Int
 
 from jaxsense.config import JmvaeConfig
 from jaxsense.core import checks, networks, supervised
@@ -26,7 +28,7 @@ Drawn = tuple[jax.Array, tuple[jax.Array, ...]]
 
 @dataclasses.dataclass(frozen=True)
 class Jmvae:
-    """The shape of a JMVAE; hashable, static under `jit`.
+    """Shape of a JMVAE; hashable, static under `jit`.
 
     Attributes:
       modalities: names, in the order of the features.
@@ -68,7 +70,12 @@ class Jmvae:
 
 
 def init(key: Key, model: Jmvae) -> Params:
-    """Random parameters: `{"encoders": {NAME: ...}, "decoders": {NAME: ...}}`."""
+    """Random parameters, `{"encoders": {NAME: ...}, "decoders": {NAME: ...}}`.
+
+    Args:
+      key: random key.
+      model: the shape.
+    """
     encoder_key, decoder_key = jax.random.split(key)
     encoder_keys = jax.random.split(encoder_key, len(model.subsets))
     decoder_keys = jax.random.split(decoder_key, len(model.modalities))
@@ -87,8 +94,10 @@ def init(key: Key, model: Jmvae) -> Params:
     return {"encoders": encoders, "decoders": decoders}
 
 
-def encode(params: Params, model: Jmvae, features: Features) -> tuple[jax.Array, jax.Array]:
-    """The posterior `q(z | present features)`.
+def encode(
+    params: Params, model: Jmvae, features: Features
+) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
+    """Mean and log-variance of the posterior `q(z | present features)`.
 
     Args:
       params: from `init` or `train`.
@@ -99,7 +108,8 @@ def encode(params: Params, model: Jmvae, features: Features) -> tuple[jax.Array,
       `[D]` mean and `[D]` log-variance.
 
     Raises:
-      ValueError: if `features` lacks an entry for a modality, all are None, or one is not finite.
+      ValueError: if `features` has another length than `model.modalities`, all are None, or one is
+        not finite.
     """
     check_features(model, features)
     subset = tuple(m for m, feature in enumerate(features) if feature is not None)
@@ -118,7 +128,16 @@ def _encode(
 
 
 def check_features(model: Jmvae, features: Features) -> None:
-    """Raises an error unless each modality has finite features or None, and one or more have."""
+    """Checks features of a look.
+
+    Args:
+      model: the shape.
+      features: for each modality `[D_m]`, or None where it is missing.
+
+    Raises:
+      ValueError: if `features` has another length than `model.modalities`, all are None, or one is
+        not finite.
+    """
     if len(features) != len(model.modalities):
         raise ValueError(
             f"features has {len(features)} entries: must be {len(model.modalities)}, one for each "
@@ -132,8 +151,19 @@ def check_features(model: Jmvae, features: Features) -> None:
             checks.require_finite(f"features of {name}", feature)
 
 
-def decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]:
-    """Mean of `p(features | z)` of every modality, `[D_m]` each, from `[D]` latents."""
+def decode(
+    params: Params, model: Jmvae, z: Float[Array | np.ndarray, " D"]
+) -> tuple[Float[Array, "_"], ...]:
+    """Mean of `p(features | z)` for every modality.
+
+    Args:
+      params: from `init` or `train`.
+      model: the shape.
+      z: `[D]` latents.
+
+    Returns:
+      For each modality `[D_m]`.
+    """
     chex.assert_shape(z, (model.latent_size,), custom_message="z")
     return _decode(params, model, z)
 
@@ -147,7 +177,13 @@ def _decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]
 
 
 def posterior(params: Params, model: Jmvae, features: Features) -> Belief:
-    """The posterior of `encode` as a belief."""
+    """Posterior `q(z | present features)` as a belief, see `encode`.
+
+    Args:
+      params: from `init` or `train`.
+      model: the shape.
+      features: for each modality `[D_m]`, or None where it is missing.
+    """
     mean, log_var = encode(params, model, features)
     return Belief(mean, jnp.exp(0.5 * log_var))
 
@@ -156,16 +192,16 @@ def loss(
     key: Key,
     params: Params,
     model: Jmvae,
-    features: tuple[jax.Array, ...],
+    features: tuple[Float[Array, "_"], ...],
     *,
     alpha: float | jax.Array,
     beta: float | jax.Array,
     reconstruction_weights: tuple[float, ...],
-) -> tuple[jax.Array, dict[str, jax.Array]]:
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """JMVAE-kl objective of one example (Suzuki et al. 2017, Sec. 3.3), to minimise.
 
     `-E[sum_m w_m log p(x_m|z)] + beta KL(q(z|all) || N(0, I)) + alpha sum_s KL(q(z|all) || q(z|s))`
-    with z one reparameterised draw from `q(z|all)`, Gaussian p of unit variance without its
+    where z is one reparameterised draw from `q(z|all)`, p a Gaussian of unit variance without its
     constant, and s every proper subset of the modalities.
 
     Args:
@@ -178,7 +214,7 @@ def loss(
       reconstruction_weights: w_m.
 
     Returns:
-      `[]` loss, and its parts before weighting: `reconstruction`, `prior` and `subsets`.
+      Loss, and its parts: `reconstruction`, which is weighted, `prior` and `subsets`.
 
     Raises:
       ValueError: if a modality's features or its weight is missing.
@@ -200,19 +236,19 @@ def loss(
 
 
 def losses(
-    noise: jax.Array,
+    noise: Float[Array, "D B"],
     params: Params,
     model: Jmvae,
-    features: tuple[jax.Array, ...],
+    features: tuple[Float[Array, "_ B"], ...],
     *,
     alpha: float | jax.Array,
     beta: float | jax.Array,
     reconstruction_weights: tuple[float, ...],
-) -> tuple[jax.Array, dict[str, jax.Array]]:
+) -> tuple[Float[Array, " B"], dict[str, Float[Array, " B"]]]:
     """Losses of a batch, which is the last axis of all arrays.
 
     Args:
-      noise: `[D, B]` standard normal numbers that draw z.
+      noise: `[D, B]` standard normal draws, for z.
       params: from `init`.
       model: the shape.
       features: `[D_m, B]` of every modality.
@@ -221,7 +257,7 @@ def losses(
       reconstruction_weights: see `loss`.
 
     Returns:
-      `[B]` losses, and their `[B]` parts before weighting.
+      `[B]` losses and their `[B]` parts, see `loss`.
 
     Raises:
       ValueError: if a modality's weight is missing.
@@ -252,13 +288,13 @@ def losses(
 
 @pytree
 class Fitting:
-    """The fit of a JMVAE to features.
+    """Problem of fitting a JMVAE to features.
 
-    A training example is one look by each modality, at the same class and otherwise independent.
+    A training example is one look by each modality at the same class, independent given the class.
 
     Attributes:
       config: weights, batch, learning rate and steps.
-      bank: the features to draw from.
+      bank: features to draw from.
       model: shape of the JMVAE.
     """
 
@@ -267,7 +303,12 @@ class Fitting:
     model: Jmvae = struct.field(pytree_node=False)
 
     def draw(self, key: Key, number: int) -> Drawn:
-        """Noise and features of `number` batches, see `supervised.Problem.draw`."""
+        """Draws noise, and features from the bank.
+
+        Args:
+          key: random key.
+          number: of steps; static.
+        """
         shape = number, self.config.batch
         columns = [jnp.moveaxis(x, -1, 0) for x in self.bank]
         class_key, noise_key, *row_keys = jax.random.split(key, 2 + len(columns))
@@ -279,8 +320,14 @@ class Fitting:
         noise = jax.random.normal(noise_key, (number, self.model.latent_size, shape[1]))
         return noise, tuple(features)
 
-    def loss(self, params: Params, drawn: Drawn, step: jax.Array) -> jax.Array:
-        """`[]` mean of the `losses` of a batch, with beta annealed."""
+    def loss(self, params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
+        """Mean of the `losses` of a batch.
+
+        Args:
+          params: of the JMVAE.
+          drawn: one step of `draw`.
+          step: `[]` int32, which determines beta.
+        """
         noise, features = drawn
         total, _ = losses(
             noise,
@@ -296,7 +343,7 @@ class Fitting:
 
 def train(
     key: Key, params: Params, model: Jmvae, bank: Samples, config: JmvaeConfig
-) -> tuple[Params, jax.Array]:
+) -> tuple[Params, Float[Array, "{config.steps}"]]:
     """Trains a JMVAE on features.
 
     Args:
@@ -310,7 +357,7 @@ def train(
       The parameters and the `[steps]` losses.
 
     Raises:
-      ValueError: unless each modality has features.
+      ValueError: if a modality has no features.
     """
     checks.require_one_each("bank", bank, model.modalities)
     for features, size in zip(bank, model.feature_sizes, strict=True):
@@ -320,12 +367,16 @@ def train(
     return state.params, losses
 
 
-def annealed_beta(step: jax.Array, config: JmvaeConfig) -> jax.Array:
-    """Beta at a gradient step, `[]`: from `initial_beta` to `beta` by equal factors, then constant.
+def annealed_beta(step: Int[Array, ""], config: JmvaeConfig) -> Float[Array, ""]:
+    """Beta at a gradient step: it falls from `initial_beta` to `beta` exponentially, then stays.
 
-    Falling from far above its last value, beta lets each latent dimension come into use once it
-    explains enough of the features. Started low, all classes may end up on one line, a local
-    optimum in which the other dimensions are empty.
+    A beta that falls from a high value lets each latent dimension come into use once it explains
+    enough of the features. With a low beta from the start, all classes may end up on one line, a
+    local optimum that leaves the other dimensions empty.
+
+    Args:
+      step: `[]` int32.
+      config: `beta`, `initial_beta`, `annealing` and `steps`.
     """
     # With `annealing` = 0, beta is constant.
     annealing_steps = jnp.maximum(config.annealing * config.steps, 1e-6)

@@ -1,9 +1,10 @@
-"""Metrics of a latent space, and the classes that a belief leaves open."""
+"""Metrics of a latent space, and the classes that are plausible given a belief."""
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core import checks
 from jaxsense.core.types import Belief
@@ -13,15 +14,19 @@ ACTIVE_VARIANCE = 0.01
 PLAUSIBLE_DISTANCE = 2.0
 
 
-def sigma_norm(std: jax.Array) -> jax.Array:
-    """`||sigma||_2` of `[..., D]` standard deviations, the colour in the paper's Fig. 4."""
+def sigma_norm(std: Float[Array, "*S D"]) -> Float[Array, "*S"]:
+    """Norm `||sigma||_2` of `[..., D]` standard deviations, the colour in the paper's Fig. 4.
+
+    Raises:
+      ValueError: if a standard deviation is not positive.
+    """
     chex.assert_shape(std, (..., None), custom_message="std")
     checks.require_positive("std", std)
     return jnp.linalg.norm(std, axis=-1)
 
 
-def active_units(mean: jax.Array) -> jax.Array:
-    """Number of latent dimensions in use, `[]` int32.
+def active_units(mean: Float[Array, "S D"]) -> Int[Array, ""]:
+    """Number of latent dimensions in use, int32.
 
     A dimension counts when the variance of its `[S, D]` posterior means over the data exceeds 0.01
     (Burda, Grosse and Salakhutdinov 2016, Sec. 5.2).
@@ -30,29 +35,41 @@ def active_units(mean: jax.Array) -> jax.Array:
     return jnp.sum(jnp.var(mean, axis=0) > ACTIVE_VARIANCE)
 
 
-def plausible_classes(belief: Belief, class_means: jax.Array) -> jax.Array:
-    """Classes that a belief leaves open.
+def plausible_classes(belief: Belief, class_means: Float[Array, "C D"]) -> Bool[Array, " C"]:
+    """Classes that are plausible given a belief.
 
     Args:
       belief: `[D]`.
       class_means: `[C, D]` mean of the joint posterior of each class.
 
     Returns:
-      `[C]` bool: the class's mean is at most two standard deviations away, or the nearest, so that
-      a belief far from all classes still names one.
+      `[C]` bool: classes whose mean is at most two standard deviations away, and the nearest one,
+      so that some class is always plausible.
+
+    Raises:
+      ValueError: if an argument is not finite, or a standard deviation is not positive.
     """
     _check_belief(belief, class_means)
     distance = jnp.linalg.norm((class_means - belief.mean[None]) / belief.std[None], axis=-1)
     return (distance <= PLAUSIBLE_DISTANCE) | (distance <= jnp.min(distance))
 
 
-def nearest_class(belief: Belief, class_means: jax.Array) -> jax.Array:
-    """Class whose joint mean is nearest to a belief's mean, `[]` int32."""
+def nearest_class(belief: Belief, class_means: Float[Array, "C D"]) -> Int[Array, ""]:
+    """Class whose mean is nearest to the mean of a belief, int32.
+
+    Args:
+      belief: `[D]`.
+      class_means: `[C, D]` mean of the joint posterior of each class.
+
+    Raises:
+      ValueError: if an argument is not finite, or a standard deviation is not positive.
+    """
     _check_belief(belief, class_means)
     return jnp.argmin(jnp.linalg.norm(class_means - belief.mean[None], axis=-1))
 
 
 def _check_belief(belief: Belief, class_means: jax.Array) -> None:
+    """Raises an error if shapes do not fit or values are not those of Gaussians."""
     chex.assert_rank(belief.mean, 1, custom_message="belief.mean")
     chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
     chex.assert_shape(class_means, (None, *belief.mean.shape), custom_message="class_means")
@@ -61,12 +78,12 @@ def _check_belief(belief: Belief, class_means: jax.Array) -> None:
     checks.require_positive("belief.std", belief.std)
 
 
-def moment_matching_error(belief: Belief, components: Belief) -> jax.Array:
-    """Distance of a uni-modal posterior from the best one.
+def moment_matching_error(belief: Belief, components: Belief) -> Float[Array, ""]:
+    """Distance of a uni-modal posterior from the best possible one.
 
     Args:
       belief: `[D]` posterior of one modality's detection.
-      components: `[K, D]` joint posteriors that are consistent with the detection.
+      components: `[K, D]` joint posteriors of the classes that are consistent with the detection.
 
     Returns:
       `[]` mean over the dimensions of `|mean difference|`, in matched standard deviations, plus
@@ -77,7 +94,7 @@ def moment_matching_error(belief: Belief, components: Belief) -> jax.Array:
     return jnp.mean(shift + jnp.abs(jnp.log(belief.std / std)))
 
 
-def consistent_classes(label_of_class: tuple[int, ...]) -> np.ndarray:
-    """Pairs of classes, `[C, C]` bool, that a modality with these labels cannot distinguish."""
+def consistent_classes(label_of_class: tuple[int, ...]) -> Bool[np.ndarray, "C C"]:
+    """Pairs of classes that a modality with these labels of the classes cannot distinguish."""
     labels = np.array(label_of_class)
     return labels[:, None] == labels[None, :]
