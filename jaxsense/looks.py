@@ -1,14 +1,14 @@
 """How robots look at points of interest, and the MDPs of these looks.
 
 `Live` casts a scan in the environment's own MJX arena and runs the detector on it; `Bank` draws
-from stored features of such scans. Features of single looks have the same distribution; live looks
-of one scene share its light.
+from stored features of such scans. Single looks have the same distribution in both; live looks at
+one scene share its light.
 """
 
 import chex
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Shaped
 
 from jaxsense.config import Config
 from jaxsense.core import checks
@@ -44,8 +44,8 @@ class Live:
         """M."""
         return len(self.detectors)
 
-    def scene(self, key: Key, classes: jax.Array) -> Scene:
-        """A random scene with PoIs of the given classes.
+    def scene(self, key: Key, classes: Int[Array, " N"]) -> Scene:
+        """Random scene with PoIs of the given classes.
 
         Args:
           key: random key.
@@ -54,8 +54,8 @@ class Live:
         return worlds.random_scene(key, self.world, classes)
 
     def observe(
-        self, key: Key, scene: Scene, poi: jax.Array, modality: int
-    ) -> tuple[jax.Array, Scene]:
+        self, key: Key, scene: Scene, poi: Int[Array, ""], modality: int
+    ) -> tuple[Float[Array, " D_m"], Scene]:
         """Puts a robot at a random viewpoint of a PoI and scans, see `Looks.observe`.
 
         Args:
@@ -70,7 +70,7 @@ class Live:
 
 @pytree
 class Bank:
-    """Looks that draw from stored features; a scene is the `[N]` array of the PoIs' classes.
+    """Looks that are drawn from stored features; a scene holds only the classes of the PoIs.
 
     Attributes:
       features: for each modality `[C, S, D_m]`, S looks at every class.
@@ -83,14 +83,14 @@ class Bank:
         """M."""
         return len(self.features)
 
-    def scene(self, key: Key, classes: jax.Array) -> jax.Array:
-        """The `classes` themselves; the `key` is not used."""
+    def scene(self, key: Key, classes: Int[Array, " N"]) -> Int[Array, " N"]:
+        """Returns the `[N]` int32 `classes`; the `key` is not used."""
         del key
         return classes
 
     def observe(
-        self, key: Key, scene: jax.Array, poi: jax.Array, modality: int
-    ) -> tuple[jax.Array, jax.Array]:
+        self, key: Key, scene: Int[Array, " N"], poi: Int[Array, ""], modality: int
+    ) -> tuple[Float[Array, " D_m"], Int[Array, " N"]]:
         """Draws a look at the PoI's class, see `Looks.observe`.
 
         Args:
@@ -107,39 +107,38 @@ class Bank:
 
 def features_of(
     detector: Detector, sensor: Sensor, readings: Float[Array, "W ..."]
-) -> Float[Array, " L"]:
-    """What a detector makes of the rays that it reads.
+) -> Float[Array, " D_m"]:
+    """Features of the rays that a detector reads.
 
     Args:
       detector: of the sensor.
       sensor: the sensor.
       readings: `[window, ...]` of the rays around the PoI's bearing.
-
-    Returns:
-      `[D_m]` probabilities of the labels.
     """
     return detectors.detect(detector, windowing.as_window(sensor, readings))
 
 
 def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapMdp | TeamMdp:
-    """The MDP of `config.dqn.task`: of one agent with the map, or of a team.
+    """Makes the MDP of `config.dqn.task`: the map MDP of one agent, or the MDP of a team.
 
     Args:
       config: all settings.
       models: from `jaxsense.load` or `jaxsense.init`.
-      looks: how it looks at PoIs, for example `Bank(jaxsense.detections(...))`; by default every
-        look casts a scan in the environment's own arena.
+      looks: how to look at PoIs, for example `Bank(jaxsense.detections(...))`; `Live` by default,
+        so that every look casts a scan in the environment's own arena.
 
     Raises:
-      ValueError: if models or looks have other shapes than the settings ask for.
+      ValueError: if the shapes of `models` or `looks` do not match `config`.
     """
     if not isinstance(models, Models):
         raise ValueError(f"models = {type(models).__name__}: must be Models, as from jaxsense.load")
     expected = len(config.arena.classes), config.jmvae.latent_size
     found = models.fusion.classes.mean.shape
     if found != expected:
-        reason = f"holds {found[0]} classes in {found[1]} dimensions; must be"
-        raise ValueError(f"models.fusion {reason} {expected}, as config's; take both from one run")
+        reason = f"{expected[0]} in {expected[1]}, as in config; take both from one run"
+        raise ValueError(
+            f"models.fusion holds {found[0]} classes in {found[1]} dimensions: must be {reason}"
+        )
     looks = Live(worlds.make_world(config), models.detectors) if looks is None else looks
     _require_fitting(config, looks)
     settings = config.team
@@ -158,7 +157,7 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapM
 
 
 def _require_fitting(config: Config, looks: Looks) -> None:
-    """Raises `ValueError` unless looks of this package have the shapes of the settings."""
+    """Raises `ValueError` if the shapes of looks of this package do not match the settings."""
     if isinstance(looks, Bank):
         checks.require_one_each("looks", looks.features, config.modalities)
         for name, features in zip(config.modalities, looks.features, strict=True):
@@ -175,8 +174,10 @@ def _require_fitting(config: Config, looks: Looks) -> None:
                 raise ValueError(f"models.detectors of {sensor.name}: {reason}")
 
 
-def surveys(keys: Key, world: World, classes: jax.Array) -> tuple[Scene, tuple[jax.Array, ...]]:
-    """Surveys of many scenes, see `sim.survey`.
+def surveys(
+    keys: Key, world: World, classes: Int[Array, "S N"]
+) -> tuple[Scene, tuple[Float[Array, "S N _"], ...]]:
+    """Surveys many scenes, see `sim.survey`.
 
     Args:
       keys: `[S]` random keys.
@@ -188,7 +189,7 @@ def surveys(keys: Key, world: World, classes: jax.Array) -> tuple[Scene, tuple[j
     """
     number = len(keys)
     chunk = min(_SCENES_AT_ONCE, number)
-    # A remainder would compile again.
+    # A remainder would be compiled separately.
     rows = jnp.arange(-(-number // chunk) * chunk) % number
     found = jax.lax.map(
         lambda scene: worlds.survey(scene[0], world, scene[1]),
@@ -198,8 +199,10 @@ def surveys(keys: Key, world: World, classes: jax.Array) -> tuple[Scene, tuple[j
     return jax.tree.map(lambda x: x[:number], found)
 
 
-def detect_all(trained: tuple[Detector, ...], windows: tuple[jax.Array, ...]) -> Samples:
-    """Features of surveyed scans.
+def detect_all(
+    trained: tuple[Detector, ...], windows: tuple[Float[Array, "S N _"], ...]
+) -> tuple[Float[Array, "S N _"], ...]:
+    """Features of surveyed scenes.
 
     Args:
       trained: one detector for each modality.
@@ -212,8 +215,8 @@ def detect_all(trained: tuple[Detector, ...], windows: tuple[jax.Array, ...]) ->
     return tuple(detect(d, w) for d, w in zip(trained, windows, strict=True))
 
 
-def balanced_classes(key: Key, config: Config, number: int) -> jax.Array:
-    """Classes of scenes in random order, equally frequent up to a remainder.
+def balanced_classes(key: Key, config: Config, number: int) -> Int[Array, "{number} N"]:
+    """Draws classes for scenes, in random order and equally frequent up to a remainder.
 
     Args:
       key: random key.
@@ -228,14 +231,16 @@ def balanced_classes(key: Key, config: Config, number: int) -> jax.Array:
     return jax.random.permutation(key, even).reshape(number, num_pois)
 
 
-def by_class(values: jax.Array, classes: jax.Array, num_classes: int, number: int) -> jax.Array:
+def by_class(
+    values: Shaped[Array, "S N *F"], classes: Int[Array, "S N"], num_classes: int, number: int
+) -> Shaped[Array, "{num_classes} {number} *F"]:
     """Sorts looks by class.
 
     Args:
-      values: `[S, N, ...]` with at least `number` of each class.
+      values: `[S, N, ...]` with at least `number` looks at each class.
       classes: `[S, N]` int32.
       num_classes: C; static.
-      number: looks to keep of each class; static.
+      number: looks to keep at each class; static.
 
     Returns:
       `[C, number, ...]`.
@@ -250,9 +255,9 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
 
     Args:
       key: random key.
-      config: the settings.
-      models: the models.
-      samples: looks at each class by each sensor, S.
+      config: all settings.
+      models: whose detectors to use.
+      samples: S, looks at each class by each sensor.
 
     Returns:
       For each modality `[C, S, D_m]`.

@@ -28,10 +28,10 @@ class Models:
       jmvae: parameters of the JMVAE.
       fusion: how looks update the map.
       bayes: the exact Bayes filter over classes, to compare with.
-      look_values: for each modality, the value of a look by dynamic programming.
+      look_values: for each modality, the values of looks by dynamic programming.
       agent: how the Q-networks are used.
-      q_networks: parameters of the Q-network of each modality; those of a team are the same.
-      tours: parameters of the network that orders a team's looks, see `dqn.tours`; else None.
+      q_networks: for each modality, parameters of the Q-network; the same for all in a team.
+      tours: parameters of the network that orders a team's looks, see `dqn.tours`, or None.
     """
 
     detectors: tuple[Detector, ...]
@@ -45,23 +45,23 @@ class Models:
 
 
 def make_jmvae(config: Config) -> Jmvae:
-    """The shape of the JMVAE for the modalities and classes of a configuration."""
+    """Shape of the JMVAE for the modalities and classes of a configuration."""
     sizes = tuple(len(config.labels(m)) for m in config.modalities)
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
 
 def make_prior(config: Config) -> Belief:
-    """`[D]` belief before any look."""
+    """Belief before any look, `[D]`."""
     return fusion.prior(make_jmvae(config), config.mdp.unseen_variance)
 
 
 def make_bayes(config: Config) -> Bayes:
-    """The exact Bayes filter over the classes of a configuration."""
+    """Exact Bayes filter over the classes of a configuration."""
     return Bayes(jnp.array([config.label_of_class(m) for m in config.modalities]))
 
 
 def make_agent(config: Config) -> Agent:
-    """How the Q-networks are used, see `config.dqn.task`."""
+    """Agent of `config.dqn.task`."""
     dqn, latent_size = config.dqn, config.jmvae.latent_size
     kinds: dict[str, Callable[[], Agent]] = {
         "map": lambda: MapAgent(dqn.discount, config.arena.num_pois, latent_size, dqn.hidden),
@@ -73,7 +73,7 @@ def make_agent(config: Config) -> Agent:
 
 
 def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InPlace:
-    """Fusion in place.
+    """Fusion in place, see `vae.InPlace`.
 
     Args:
       config: all settings.
@@ -85,7 +85,7 @@ def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InP
 
 
 def init(key: Key, config: Config) -> Models:
-    """Models with random parameters, to try the functions before training.
+    """Models with random parameters, to try functions before training.
 
     Args:
       key: random key.

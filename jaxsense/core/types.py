@@ -24,7 +24,7 @@ Features = tuple[Float[Array | np.ndarray, "_"] | None, ...]
 Scene = Any
 """A pytree that describes what looks see; MDPs only carry it."""
 
-Samples = tuple[Float[Array | np.ndarray, "C _ _"], ...]
+Samples = tuple[Float[Array, "C _ _"], ...]
 """`[C, S, D_m]` features of each modality: S looks at every class."""
 
 

@@ -1,4 +1,4 @@
-"""The whole training as pure functions: `learn`, and the list of stages that it composes."""
+"""The whole training as pure functions: `learn`, and the stages that it composes."""
 
 from jaxsense.training.stage import Learned as Learned
 from jaxsense.training.stage import Progress as Progress

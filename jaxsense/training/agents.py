@@ -1,10 +1,11 @@
-"""Stages of agents: the values of looks, Q-learning, and the order of a team's looks."""
+"""Stages of agents: values of looks, Q-learning, and tours of a team."""
 
 from collections.abc import Callable
 from typing import cast
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from jaxsense.config import Config
 from jaxsense.core import supervised
@@ -38,12 +39,12 @@ State = dqn.DqnState[Output]
 def look_values(
     key: Key, config: Config, *, classes: Belief, detections: Detections
 ) -> tuple[LookValues, ...]:
-    """The value of a look with each modality, from the features for training.
+    """Values of looks with each modality, from features for training.
 
     Args:
       key: not used.
       config: all settings.
-      classes: `[C, D]` joint posterior of each class.
+      classes: `[C, D]` mean joint posterior of each class.
       detections: of all sensors.
     """
     del key
@@ -65,7 +66,7 @@ def look_values(
 
 
 def agent_stages(arena: Arena, config: Config) -> list[Stage]:
-    """The first states of episodes, and the training of each learner's Q-network.
+    """Makes the stages that draw first states of episodes and train each learner's Q-network.
 
     Args:
       arena: of live looks.
@@ -74,7 +75,7 @@ def agent_stages(arena: Arena, config: Config) -> list[Stage]:
 
     def environment(
         config: Config,
-        modality: jax.Array,
+        modality: Int[Array, ""],
         detections: Detections,
         fusion: Fusion,
         detectors: tuple[Detector, ...],
@@ -87,14 +88,14 @@ def agent_stages(arena: Arena, config: Config) -> list[Stage]:
         return make_agent(config).environment(mdp, modality)
 
     def starts(key: Key, config: Config, *, detections: Detections, **inputs: Output) -> Output:
-        """`[num_starts]` first states of episodes."""
+        """First states of episodes, `[num_starts]`."""
         learning = environment(config, jnp.int32(0), detections, **inputs)
         if not detections.starts.classes.shape[0]:
             return dqn.starts(key, learning, config.dqn)
         return _surveyed_starts(key, learning.mdp.map, detections.starts, config.dqn.num_starts)
 
     def begin(
-        key: Key, config: Config, *, modality: jax.Array, starts: Output, **inputs: Output
+        key: Key, config: Config, *, modality: Int[Array, ""], starts: Output, **inputs: Output
     ) -> State:
         return dqn.init(key, environment(config, modality, **inputs), config.dqn, starts)
 
@@ -103,7 +104,7 @@ def agent_stages(arena: Arena, config: Config) -> list[Stage]:
         config: Config,
         state: State,
         *,
-        modality: jax.Array,
+        modality: Int[Array, ""],
         starts: Output,
         detections: Detections,
         fusion: Fusion,
@@ -111,7 +112,7 @@ def agent_stages(arena: Arena, config: Config) -> list[Stage]:
     ) -> tuple[State, Progress]:
         mdp = held_out_mdp(config, fusion, detections)
 
-        def evaluate(key: Key, q_network: Params) -> jax.Array:
+        def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
             return measures.learned_return(key, modality, q_network, mdp, config)
 
         learning = environment(config, modality, detections, fusion, detectors)
@@ -150,13 +151,13 @@ def learner(config: Config, modality: str) -> str:
 
     Args:
       config: all settings.
-      modality: its name.
+      modality: name of the sensor.
     """
     return f"dqn_{make_agent(config).learner(modality)}"
 
 
 def _surveyed_starts(key: Key, mdp: MapMdp, starts: Starts, number: int) -> MapState:
-    """`[number]` first states in surveyed scenes, with the looks of the surveys."""
+    """First states in surveyed scenes, `[number]`, with looks from the surveys."""
 
     def begin(key: Key, starts: Starts) -> MapState:
         seen_key, begin_key = jax.random.split(key)
@@ -167,13 +168,13 @@ def _surveyed_starts(key: Key, mdp: MapMdp, starts: Starts, number: int) -> MapS
 
 
 def tour_stages(config: Config) -> list[Stage]:
-    """The training of the network that orders a team's looks, see `tours`."""
+    """Makes the stage that trains the network of `tours`, if the agent has one."""
     agent, settings = make_agent(config), config.team.tours
     network = agent.tour_network
     if network is None:
         return []
     size, chunks = chunk_size(settings.steps), num_chunks(settings.steps)
-    number = -(-settings.states // chunks)  # of states in which each chunk tries choices
+    number = -(-settings.states // chunks)  # of states in each chunk, in which choices are tried
 
     def begin(key: Key, config: Config, **_: Output) -> tuple[FitState, Trials]:
         fit = supervised.start(agent.init_tours(key), config.team.tours)
@@ -189,7 +190,7 @@ def tour_stages(config: Config) -> list[Stage]:
         fusion: Fusion,
         detections: Detections,
     ) -> tuple[tuple[FitState, Trials], Progress]:
-        """Adds trials, and learns from all so far."""
+        """Adds trials and learns from all trials so far."""
         fit, trials = state
         settings = config.team.tours
         try_key, draw_key = jax.random.split(key)
@@ -210,9 +211,9 @@ def tour_stages(config: Config) -> list[Stage]:
 
 
 def _auction(config: Config, fusion: Fusion, look_values: tuple[LookValues, ...]) -> tours.Policy:
-    """The policy that robots follow in trials: the auction of gains minus the price of travel."""
+    """The policy that robots follow in trials: an auction of gains minus the price of travel."""
 
-    def policy(state: TeamState) -> jax.Array:
+    def policy(state: TeamState) -> Float[Array, " A"]:
         is_seen = jnp.any(state.map.seen, axis=-1)
         gains = expected_gains(fusion, look_values, state.map.belief, is_seen)
         times = team_mdp.travel_times(config.team.travel, state.team)

@@ -1,4 +1,4 @@
-"""The MDPs of a training, whose models are not complete."""
+"""The MDPs of a training, made from the models trained so far."""
 
 import dataclasses
 
@@ -19,13 +19,13 @@ def models_of(
     look_values: tuple[LookValues, ...] = (),
     q_networks: tuple[Params, ...] = (),
 ) -> Models:
-    """The models that a training has so far.
+    """Models trained so far; the others are empty.
 
     Args:
       config: all settings.
       fusion: how looks update the map.
-      look_values: for each modality, the value of a look.
-      q_networks: parameters of the Q-network of each modality.
+      look_values: for each modality, the values of looks.
+      q_networks: for each modality, parameters of the Q-network.
     """
     return Models(
         detectors=(),
@@ -40,7 +40,7 @@ def models_of(
 
 
 def mdp_of(config: Config, fusion: Fusion, looks: Looks) -> MapMdp | TeamMdp:
-    """The MDP in which agents learn.
+    """MDP in which agents learn.
 
     Args:
       config: all settings.
@@ -53,13 +53,13 @@ def mdp_of(config: Config, fusion: Fusion, looks: Looks) -> MapMdp | TeamMdp:
 def held_out_mdp(
     config: Config, fusion: Fusion, detections: Detections, num_pois: int | None = None
 ) -> MapMdp:
-    """The map MDP with held-out features, in which policies are measured.
+    """Map MDP with held-out features, in which policies are measured.
 
     Args:
       config: all settings.
       fusion: how looks update the map.
       detections: of all sensors.
-      num_pois: N; by default that of the arena.
+      num_pois: N; as in the arena by default.
     """
     mdp = mdp_of(config, fusion, Bank(detections.held_out)).map
     number = config.arena.num_pois if num_pois is None else num_pois

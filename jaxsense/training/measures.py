@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config
 from jaxsense.core.networks import Params
@@ -19,17 +20,18 @@ from jaxsense.dqn.policies import Known
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.training.mdp import held_out_mdp, models_of
 from jaxsense.training.perception import Detections
+from jaxsense.training.stage import Output
 from jaxsense.vae import calibration, latent
 
 COMPARED = ("latent", "optimal", "naive", "random")
-"""Policies that are compared in the map MDP, from `dqn.policies.POLICIES`."""
+"""Names of the policies to compare in the map MDP, from `dqn.policies.POLICIES`."""
 
-_LOOKS = 6  # of a random history at one PoI
+_LOOKS = 6  # in a random history
 
 
 def detector_metrics(
     key: Key, config: Config, *, detections: Detections
-) -> dict[str, dict[str, jax.Array]]:
+) -> dict[str, dict[str, Float[Array, ""]]]:
     """Measures the detectors on held-out scans.
 
     Args:
@@ -38,8 +40,8 @@ def detector_metrics(
       detections: of all sensors.
 
     Returns:
-      For each modality `accuracy`, `ece` and `nll`, `[]` each: the share of right labels, the
-      expected calibration error and the negative log-likelihood in nats.
+      For each modality `accuracy`, the expected calibration error `ece`, and the negative
+      log-likelihood `nll` in nats.
     """
     del key
 
@@ -60,24 +62,26 @@ def detector_metrics(
 
 @pytree
 class LatentSpace:
-    """Metrics of a latent space. C classes, S held-out looks at each.
+    """Metrics of a latent space, from held-out looks.
 
     Attributes:
-      active_units: `[]` int32 latent dimensions in use.
+      active_units: `[]` int32 number of latent dimensions in use.
       sigma_norm: for `joint` and each modality `[C]` mean `||sigma||_2`.
-      unambiguous: for `joint` and each modality `[C]` share of looks that leave one class open.
-      consistent: the same for the classes that the sensor cannot tell apart.
-      moment_matching_error: `[]` see `latent.moment_matching_error`.
-      fusion: quality of beliefs after one modality's look and then another's: `accuracy`,
-        `mean_error` and `std_error`, `[]` each; None with a single modality.
+      unambiguous: for `joint` and each modality `[C]` share of looks after which only the true
+        class is plausible.
+      consistent: for `joint` and each modality `[C]` share of looks after which exactly the classes
+        are plausible that the sensor cannot distinguish from the true one.
+      moment_matching_error: `[]` mean of `latent.moment_matching_error`.
+      fusion: `accuracy`, `mean_error` and `std_error` of beliefs after a look by one modality and
+        then by another, `[]` each; None with a single modality.
     """
 
-    active_units: jax.Array
-    sigma_norm: dict[str, jax.Array]
-    unambiguous: dict[str, jax.Array]
-    consistent: dict[str, jax.Array]
-    moment_matching_error: jax.Array
-    fusion: dict[str, jax.Array | None]
+    active_units: Int[Array, ""]
+    sigma_norm: dict[str, Float[Array, " C"]]
+    unambiguous: dict[str, Float[Array, " C"]]
+    consistent: dict[str, Float[Array, " C"]]
+    moment_matching_error: Float[Array, ""]
+    fusion: dict[str, Float[Array, ""] | None]
 
 
 def latent_space(
@@ -85,8 +89,8 @@ def latent_space(
 ) -> tuple[dict[str, Belief], LatentSpace]:
     """Fuses held-out looks, alone and together, and measures the latent space.
 
-    The s-th look at a class in one modality goes with the s-th in another. Parameters and features
-    that are not finite are not caught: check the beliefs.
+    The s-th look at a class by one modality is paired with the s-th by another. Non-finite
+    parameters and features raise no error: check the beliefs.
 
     Args:
       key: not used.
@@ -110,7 +114,9 @@ def latent_space(
     plausible = jax.vmap(jax.vmap(lambda b: latent.plausible_classes(b, class_means)))
     open_classes = {name: plausible(belief) for name, belief in found.items()}
 
-    def share(is_open: jax.Array, expected: np.ndarray) -> jax.Array:
+    def share(
+        is_open: Bool[Array, "C S K"], expected: Bool[np.ndarray, "C K"]
+    ) -> Float[Array, " C"]:
         return jnp.all(is_open == expected[:, None], axis=-1).mean(axis=1)
 
     return found, LatentSpace(
@@ -130,8 +136,8 @@ def _beliefs(fusion: Fusion, bank: Samples, members: Iterable[int]) -> Belief:
     return jax.vmap(jax.vmap(together))(bank)
 
 
-def _moment_matching_error(joint: Belief, alone: list[Belief], config: Config) -> jax.Array:
-    """`[]` mean distance of single modalities' posteriors from their moment-matched targets."""
+def _moment_matching_error(joint: Belief, alone: list[Belief], config: Config) -> Float[Array, ""]:
+    """Mean distance of uni-modal posteriors from their moment-matched targets."""
     errors = []
     for modality, belief in zip(config.modalities, alone, strict=True):
         labels = config.label_of_class(modality)
@@ -145,8 +151,8 @@ def _moment_matching_error(joint: Belief, alone: list[Belief], config: Config) -
 
 def _fusion_metrics(
     fusion: Fusion, bank: Samples, alone: list[Belief]
-) -> dict[str, jax.Array | None]:
-    """Quality of beliefs after one modality's look and then another's."""
+) -> dict[str, Float[Array, ""] | None]:
+    """Quality of beliefs after a look by one modality and then by another."""
     is_right, distances, widths = [], [], []
     shown = jax.vmap(jax.vmap(fusion.most_likely_class))
     for first, second in itertools.permutations(range(len(bank)), 2):
@@ -157,7 +163,7 @@ def _fusion_metrics(
         is_right.append(shown(fused) == jnp.arange(len(bank[0]))[:, None])
         distances.append(jnp.linalg.norm((fused.mean - both.mean) / both.std, axis=-1))
         widths.append(jnp.mean(jnp.abs(jnp.log(fused.std / both.std)), axis=-1))
-    # One modality fuses nothing.
+    # A single modality has nothing to fuse.
     return {
         "accuracy": jnp.mean(jnp.array(is_right)) if is_right else None,
         "mean_error": jnp.mean(jnp.array(distances)) if distances else None,
@@ -167,10 +173,10 @@ def _fusion_metrics(
 
 def beliefs(
     key: Key, config: Config, *, fusion: Fusion, detections: Detections
-) -> dict[str, jax.Array]:
-    """Reads the map after random histories of looks, and compares it with exact Bayes.
+) -> dict[str, Array]:
+    """Compares beliefs after random histories of looks with exact Bayes.
 
-    A history looks at one PoI, each time with a random modality.
+    All looks of a history are at one PoI, each by a random modality.
 
     Args:
       key: random key.
@@ -179,9 +185,10 @@ def beliefs(
       detections: of all sensors.
 
     Returns:
-      The block `belief` of the summary as arrays: `[K]` negative log-likelihood of the true class
-      and accuracy after 1 to K looks, of the map and of the exact Bayes filter on the same
-      detections; and Pearson's correlation of `||sigma||` with the entropy of the exact posterior.
+      The block `belief` of the summary as arrays. After 1 to K `looks`: `[K]` negative
+      log-likelihoods of the true class and accuracies, of the map (`nll`, `accuracy`) and of exact
+      Bayes on the same looks (`bayes_nll`, `bayes_accuracy`); and `doubt_correlation`, Pearson's
+      correlation of `||sigma||` with the entropy of the exact posterior.
     """
     bank, exact = detections.held_out, make_bayes(config)
     number, num_histories = len(fusion.classes.mean), config.evaluation.num_histories
@@ -230,14 +237,14 @@ def beliefs(
 
 
 def learned_return(
-    key: Key, modality: jax.Array, q_network: Params, mdp: MapMdp, config: Config
-) -> jax.Array:
-    """`[]` mean total reward of a Q-network's policy, in one episode from each of random starts.
+    key: Key, modality: Int[Array, ""], q_network: Params, mdp: MapMdp, config: Config
+) -> Float[Array, ""]:
+    """Mean total reward of a Q-network's policy, in one episode from each of random starts.
 
     Args:
       key: random key.
       modality: `[]` int32 index of the agent's own sensor.
-      q_network: parameters of its Q-network.
+      q_network: parameters of the Q-network.
       mdp: from `held_out_mdp`.
       config: all settings.
     """
@@ -258,35 +265,35 @@ def learned_return(
 
 
 def compare_policies(
-    key: Key, modality: jax.Array, models: Models, mdp: MapMdp, config: Config
-) -> tuple[jax.Array, jax.Array]:
-    """Plays episodes with each of `COMPARED`, on the same looks from the same starts.
+    key: Key, modality: Int[Array, ""], models: Models, mdp: MapMdp, config: Config
+) -> tuple[Float[Array, "P S"], Float[Array, "P S"]]:
+    """Plays episodes with each of `COMPARED`, with the same looks and starts.
 
     Args:
       key: random key.
       modality: `[]` int32 index of the agent's own sensor.
-      models: trained models, whose `q_networks` are all those of this modality.
+      models: trained models, in whose `q_networks` all are of this modality.
       mdp: from `held_out_mdp`.
       config: all settings.
 
     Returns:
-      `[P, S]` total reward and reward of the first action, means over the noise of looks; NaN where
-      a value or a reward was. The starts are every state of the map, then
-      `config.evaluation.num_starts` random ones.
+      `[P, S]` total reward and `[P, S]` reward of the first action, averaged over the noise of
+      looks; NaN where a value or a reward is NaN. The starts are the states of
+      `episodes.every_state`, then `config.evaluation.num_starts` random ones.
     """
     settings = config.evaluation
-    # The second key drew the looks of a table that is no longer needed.
+    # Three keys, although one is not used, so that figures stay as they were.
     start_key, _, play_key = jax.random.split(key, 3)
     starts = _every_start(start_key, mdp, config)
     compared = [policies.POLICIES[name] for name in COMPARED]
 
-    # One policy after the other, by a switch: the program is compiled once for all of them.
-    def with_policy(which: jax.Array) -> tuple[jax.Array, jax.Array]:
+    # By a switch, so that one program is compiled for all policies.
+    def with_policy(which: Int[Array, ""]) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
         def act(key: Key, known: Known) -> jax.Array:
             branches = [functools.partial(p.values, key, models, known) for p in compared]
             return policies.best(jax.lax.switch(which, branches))
 
-        # Only the first two are compared state by state.
+        # Only the first two policies are compared state by state.
         number = jnp.where(which < 2, settings.num_repeats, -(-settings.num_repeats // 8))
 
         def episode(key: Key, classes: jax.Array, seen: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -305,8 +312,10 @@ def compare_policies(
     return jax.lax.map(with_policy, jnp.arange(len(compared)))
 
 
-def _every_start(key: Key, mdp: MapMdp, config: Config) -> tuple[jax.Array, jax.Array]:
-    """`[S, N]` classes and `[S, N, M]` looks of every state of the map, then of random starts."""
+def _every_start(
+    key: Key, mdp: MapMdp, config: Config
+) -> tuple[Int[Array, "S N"], Bool[Array, "S N M"]]:
+    """Classes and looks of every state of the map, then of random starts."""
     keys = jax.random.split(key, config.evaluation.num_starts)
     random_classes, random_seen = jax.vmap(lambda key: random_start(key, mdp))(keys)
     classes, seen = episodes.every_state(
@@ -322,24 +331,24 @@ def play_policies(
     key: Key,
     config: Config,
     *,
-    modality: jax.Array,
+    modality: Int[Array, ""],
     q_network: Params,
     fusion: Fusion,
     look_values: tuple[LookValues, ...],
     detections: Detections,
     num_pois: int | None = None,
-) -> tuple[jax.Array, jax.Array]:
-    """See `compare_policies`.
+) -> tuple[Float[Array, "P S"], Float[Array, "P S"]]:
+    """Runs `compare_policies` for one modality.
 
     Args:
       key: random key.
       config: all settings.
       modality: `[]` int32 index of the agent's own sensor.
-      q_network: parameters of its Q-network.
+      q_network: parameters of the Q-network.
       fusion: how looks update the map.
-      look_values: of each modality.
+      look_values: for each modality, the values of looks.
       detections: of all sensors.
-      num_pois: N; by default that of the arena.
+      num_pois: N; as in the arena by default.
     """
     q_networks = (q_network,) * len(config.modalities)
     models = models_of(config, fusion, look_values, q_networks)
@@ -347,8 +356,10 @@ def play_policies(
     return compare_policies(key, modality, models, mdp, config)
 
 
-def play_numbers(key: Key, config: Config, **inputs: Params) -> list[tuple[jax.Array, jax.Array]]:
-    """The results of `compare_policies` for each of `evaluation.num_pois`.
+def play_numbers(
+    key: Key, config: Config, **inputs: Output
+) -> list[tuple[Float[Array, "P S"], Float[Array, "P S"]]]:
+    """Runs `compare_policies` with each number of PoIs in `evaluation.num_pois`.
 
     Args:
       key: random key.

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from jaxsense import looks
 from jaxsense.config import Config
@@ -21,28 +22,28 @@ from jaxsense.vae.detectors import Detector
 from jaxsense.vae.filter import Filter
 from jaxsense.vae.fusion import InPlace
 
-Examples = tuple[jax.Array, jax.Array]
-"""Windows of a detector, and their labels."""
+Examples = tuple[Float[Array, "L F"], Int[Array, " L"]]
+"""`[L, F]` windows of a detector, and their `[L]` int32 labels."""
 
 
 @pytree
 class Surveys:
-    """Every robot's look at every PoI of `[S]` scenes.
+    """Looks by every robot at every PoI of S scenes.
 
     Attributes:
       classes: `[S, N]` int32 true classes.
       scenes: `[S]` scenes.
-      windows: for each modality `[S, N, F]` the input of its detector.
+      windows: for each modality `[S, N, F]` inputs of its detector.
     """
 
-    classes: jax.Array
+    classes: Int[Array, "S N"]
     scenes: Scene
-    windows: tuple[jax.Array, ...]
+    windows: tuple[Float[Array, "S N F"], ...]
 
 
 @pytree
 class Starts:
-    """Looks with which episodes start.
+    """First scenes of episodes, and looks at their PoIs.
 
     Attributes:
       classes: `[S, N]` int32 true classes.
@@ -50,9 +51,9 @@ class Starts:
       features: for each modality `[S, N, D_m]`.
     """
 
-    classes: jax.Array
+    classes: Int[Array, "S N"]
     scenes: Scene
-    features: tuple[jax.Array, ...]
+    features: tuple[Float[Array, "S N D_m"], ...]
 
 
 @pytree
@@ -61,19 +62,19 @@ class Detections:
 
     Attributes:
       bank: for each modality `[C, S, D_m]` features for training.
-      held_out: the same from other scenes, to measure on.
-      starts: where episodes start; empty with a bank.
+      held_out: for each modality `[C, S', D_m]` features of other scenes, to measure on.
+      starts: where episodes start; empty unless looks are live.
       windows: for each modality `[C, 1, F]` one held-out look at each class.
     """
 
     bank: Samples
     held_out: Samples
     starts: Starts
-    windows: tuple[jax.Array, ...]
+    windows: tuple[Float[Array, "C 1 F"], ...]
 
 
 def num_scenes(config: Config) -> tuple[int, int, int]:
-    """Numbers of scenes to train the detectors, for the bank, and to measure."""
+    """Numbers of scenes to train detectors with, for the bank, and to measure on."""
     num_pois, num_classes = config.arena.num_pois, len(config.arena.classes)
     num_bank = -(-config.jmvae.samples_per_class * num_classes // num_pois)
     num_held_out = -(-_held_out_per_class(config) * num_classes // num_pois)
@@ -82,23 +83,24 @@ def num_scenes(config: Config) -> tuple[int, int, int]:
 
 
 def _held_out_per_class(config: Config) -> int:
+    """Number of held-out looks at each class."""
     return -(-config.detector.num_held_out // len(config.arena.classes))
 
 
 def _num_starts(config: Config) -> int:
-    """Surveyed scenes in which episodes start; none with a bank."""
+    """Number of surveyed scenes in which episodes start; 0 unless looks are live."""
     return config.dqn.num_starts if config.dqn.observe == "live" else 0
 
 
-def draw_scenes(key: Key, config: Config) -> tuple[Key, jax.Array]:
-    """Draws all scenes.
+def draw_scenes(key: Key, config: Config) -> tuple[Key, Int[Array, "S N"]]:
+    """Draws keys and classes of all scenes.
 
     Args:
       key: random key.
       config: all settings.
 
     Returns:
-      `[S]` keys of the scenes, and `[S, N]` classes of their PoIs.
+      `[S]` keys of the scenes, and `[S, N]` int32 classes of their PoIs.
     """
     class_key, scene_key = jax.random.split(key)
     numbers = num_scenes(config)
@@ -108,7 +110,7 @@ def draw_scenes(key: Key, config: Config) -> tuple[Key, jax.Array]:
 
 
 def survey_stage(arena: Arena) -> Stage:
-    """Surveys all scenes together, as compiling takes longer than running."""
+    """Makes the stage that surveys all scenes together: compiling takes longer than running."""
 
     def survey(key: Key, config: Config, *, scenes: tuple[Key, jax.Array]) -> Surveys:
         del key
@@ -120,15 +122,12 @@ def survey_stage(arena: Arena) -> Stage:
 
 
 def split_examples(key: Key, config: Config, *, surveys: Surveys) -> tuple[Examples, ...]:
-    """What each detector is trained on.
+    """Labelled windows to train each detector on.
 
     Args:
       key: not used.
       config: all settings.
       surveys: of all scenes.
-
-    Returns:
-      For each modality `[L, F]` windows and their `[L]` int32 labels.
     """
     del key
     num_train = num_scenes(config)[0]
@@ -143,16 +142,16 @@ def split_examples(key: Key, config: Config, *, surveys: Surveys) -> tuple[Examp
 
 
 def detector_stage(modality: int, name: str, config: Config) -> Stage:
-    """The training of one modality's detector.
+    """Makes the stage that trains the detector of one modality.
 
     Args:
-      modality: its index.
+      modality: index of the sensor.
       name: of the stage.
       config: all settings.
     """
 
     def split(examples: tuple[Examples, ...]) -> tuple[Examples, Examples]:
-        """The looks to train on, and those to calibrate with."""
+        """Examples to train on, and examples to calibrate with."""
         windows, labels = examples[modality]
         number = config.detector.num_training(len(labels))
         return (windows[:number], labels[:number]), (windows[number:], labels[number:])
@@ -191,13 +190,13 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
 def detect(
     key: Key, config: Config, *, surveys: Surveys, trained: tuple[Detector, ...]
 ) -> Detections:
-    """Applies the detectors to the surveys that none was trained on.
+    """Applies the detectors to the surveys that they were not trained on.
 
     Args:
       key: not used.
       config: all settings.
       surveys: of all scenes.
-      trained: a detector for each modality.
+      trained: one detector for each modality.
     """
     del key
     num_train, num_bank, _ = num_scenes(config)
@@ -221,7 +220,7 @@ def detect(
 
 
 def jmvae_stages(config: Config) -> list[Stage]:
-    """Trainings of the JMVAE from different random parameters, and the choice of the best."""
+    """Makes stages that train the JMVAE from different random parameters, and pick the best."""
 
     def untrained(key: Key, config: Config, *, detections: Detections) -> tuple[tuple[()], Params]:
         del detections
@@ -233,7 +232,7 @@ def jmvae_stages(config: Config) -> list[Stage]:
     def trained(
         config: Config, fitted: tuple[()], fit: FitState, *, detections: Detections
     ) -> tuple[Params, jax.Array]:
-        """The parameters, and their `[]` mean loss in the last chunk."""
+        """Parameters, and the `[]` mean loss of the last chunk."""
         return fit.params, fit.loss
 
     restart = fit_stage(
@@ -256,7 +255,7 @@ def jmvae_stages(config: Config) -> list[Stage]:
 def _best_jmvae(
     key: Key, config: Config, *, restarts: tuple[tuple[Params, jax.Array], ...]
 ) -> Params:
-    """The restart with the lowest final loss; one that is not finite only if none is."""
+    """Parameters of the restart with the lowest finite loss; of the first if none is finite."""
     del key, config
     losses = jnp.stack([loss for _, loss in restarts])
     best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
@@ -264,7 +263,7 @@ def _best_jmvae(
 
 
 def class_beliefs(key: Key, config: Config, *, params: Params, detections: Detections) -> Belief:
-    """`[C, D]` mean joint posterior of each class, from features for training.
+    """Mean joint posterior of each class, `[C, D]`, from features for training.
 
     Args:
       key: not used.
@@ -274,12 +273,12 @@ def class_beliefs(key: Key, config: Config, *, params: Params, detections: Detec
     """
     del key
     model = make_jmvae(config)
-    encode = jax.vmap(jax.vmap(lambda *features: jmvae.posterior(params, model, features)))
-    return jax.tree.map(lambda x: x.mean(axis=1), encode(*detections.bank))
+    encode = jax.vmap(jax.vmap(lambda features: jmvae.posterior(params, model, features)))
+    return jax.tree.map(lambda x: x.mean(axis=1), encode(detections.bank))
 
 
 def fusion_stages(config: Config) -> list[Stage]:
-    """The stages that make the fusion, the last of which is called `fusion`."""
+    """Makes the stages of `config.jmvae.fusion`, the last of which is called `fusion`."""
     kinds: dict[str, Callable[[Config], list[Stage]]] = {
         "in_place": _in_place_stages,
         "filter": _filter_stages,
@@ -288,6 +287,7 @@ def fusion_stages(config: Config) -> list[Stage]:
 
 
 def _in_place_stages(config: Config) -> list[Stage]:
+    """The stage that makes the fusion in place, which needs no training."""
     del config
 
     def begin(key: Key, config: Config, *, params: Params, classes: Belief) -> InPlace:
@@ -298,6 +298,8 @@ def _in_place_stages(config: Config) -> list[Stage]:
 
 
 def _filter_stages(config: Config) -> list[Stage]:
+    """The training of the filter, and the stage that returns it as the fusion."""
+
     def untrained(
         key: Key, config: Config, *, classes: Belief, detections: Detections
     ) -> tuple[Filter, Params]:
@@ -326,5 +328,6 @@ def _filter_stages(config: Config) -> list[Stage]:
 
 
 def _same(key: Key, config: Config, *, fusion: Filter) -> Filter:
+    """The filter as it was trained."""
     del key, config
     return fusion

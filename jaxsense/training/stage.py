@@ -1,4 +1,4 @@
-"""A stage of a training: a name and pure functions, which both `learn` and a run go through."""
+"""A stage of a training: a name and pure functions, which `learn` and a run both call."""
 
 import dataclasses
 import zlib
@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from jaxsense.config import Config
 from jaxsense.core.types import Key, pytree
@@ -29,15 +30,17 @@ class Progress:
       metrics: `[steps]` each; NaN where a step has none.
     """
 
-    loss: jax.Array
-    metrics: dict[str, jax.Array]
+    loss: Float[Array, "..."]
+    metrics: dict[str, Float[Array, "..."]]
 
 
 def _no_progress(*_: Output, **__: Output) -> tuple[Output, Progress]:
+    """`advance` of a stage without steps."""
     raise TypeError("a stage without steps does not advance")
 
 
-def _as_it_is(config: Config, state: Output, **_: Output) -> Output:
+def _state(config: Config, state: Output, **_: Output) -> Output:
+    """`finish` of a stage whose output is its state."""
     del config
     return state
 
@@ -49,41 +52,41 @@ class Stage:
     Attributes:
       name: determines the random keys of the stage.
       begin: `(key, config, **inputs) -> state`, the output of a stage without chunks.
-      inputs: for each argument the name of an earlier stage, whose output it is, the names of
-        several, or a number, which is passed as `[]` int32.
+      inputs: for each argument the name of the earlier stage that outputs it, the names of several,
+        or a number, which is passed as `[]` int32.
       advance: `(key, config, state, **inputs) -> (state, Progress)`, one chunk of steps.
       finish: `(config, state, **inputs) -> output`.
       steps: number of steps.
-      chunks: calls of `advance`; the last one may have fewer steps.
-      is_optional: the stage may diverge: a later one picks among several.
+      chunks: number of calls of `advance`; the last one may have fewer steps.
+      is_optional: whether the stage may diverge, because a later one picks a finite one of several.
     """
 
     name: str
     begin: Callable[..., Output]
     inputs: Mapping[str, str | tuple[str, ...] | int] = dataclasses.field(default_factory=dict)
     advance: Callable[..., tuple[Output, Progress]] = _no_progress
-    finish: Callable[..., Output] = _as_it_is
+    finish: Callable[..., Output] = _state
     steps: int = 0
     chunks: int = 0
     is_optional: bool = False
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the stages whose outputs it takes."""
+        """Names of the stages whose outputs are inputs."""
         named = [x for x in self.inputs.values() if not isinstance(x, int)]
         return tuple(n for x in named for n in ((x,) if isinstance(x, str) else x))
 
     def key(self, key: Key) -> Key:
-        """The key of `begin`, from the key of a training."""
+        """Key of `begin`, from the key of a training."""
         return jax.random.fold_in(key_of(key, self.name), 0)
 
     def chunk_keys(self, key: Key) -> Key:
-        """The `[chunks]` keys of `advance`, from the key of a training."""
+        """Keys of `advance`, `[chunks]`, from the key of a training."""
         own = key_of(key, self.name)
         return jax.vmap(lambda i: jax.random.fold_in(own, i))(1 + jnp.arange(self.chunks))
 
     def select(self, outputs: Mapping[str, Output]) -> dict[str, Output]:
-        """The inputs by argument, from the outputs of earlier stages."""
+        """Inputs by argument, from the outputs of earlier stages by name."""
 
         def of(source: str | tuple[str, ...] | int) -> Output:
             if isinstance(source, int):
@@ -100,21 +103,21 @@ class Learned:
     Attributes:
       outputs: of every stage, by its name.
       progress: `[steps]` of every stage that has steps, by its name.
-      is_finite: `[]` whether all losses and outputs are finite; optional stages are ignored.
+      is_finite: `[]` bool, whether all losses and outputs are finite; optional stages are ignored.
     """
 
     outputs: Outputs
     progress: dict[str, Progress]
-    is_finite: jax.Array
+    is_finite: Bool[Array, ""]
 
 
 def compose(key: Key, config: Config, stages: Sequence[Stage]) -> Learned:
-    """Goes through stages, with a `scan` over the chunks of each.
+    """Composes stages into one training, with a `scan` over the chunks of each.
 
     Args:
       key: of the training.
       config: all settings.
-      stages: each after its inputs.
+      stages: each after the stages whose outputs it takes.
     """
     outputs, progress = Outputs(), dict[str, Progress]()
     finite = [jnp.bool_(True)]
@@ -137,7 +140,7 @@ def compose(key: Key, config: Config, stages: Sequence[Stage]) -> Learned:
 
 
 def key_of(key: Key, name: str) -> Key:
-    """The key of a name, independent of all other names.
+    """Random key that depends on a name.
 
     Args:
       key: of a training.
@@ -147,16 +150,16 @@ def key_of(key: Key, name: str) -> Key:
 
 
 def chunk_size(steps: int) -> int:
-    """Steps of a chunk, for at most 20 chunks."""
+    """Number of steps in a chunk, for at most 20 chunks."""
     return -(-steps // _MAX_CHUNKS)
 
 
 def num_chunks(steps: int) -> int:
-    """Chunks of `chunk_size` steps."""
+    """Number of chunks of `chunk_size` steps."""
     return -(-steps // chunk_size(steps))
 
 
-def is_finite(values: Output) -> jax.Array:
-    """`[]` whether all real numbers in a pytree are finite."""
+def is_finite(values: Output) -> Bool[Array, ""]:
+    """Whether all floating-point numbers in a pytree are finite."""
     leaves = [x for x in jax.tree.leaves(values) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
     return jnp.stack([jnp.isfinite(x).all() for x in leaves] or [jnp.bool_(True)]).all()

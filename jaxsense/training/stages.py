@@ -1,8 +1,8 @@
-"""The whole training, written once: the list of stages, and their composition.
+"""The list of all stages of a training, and its composition.
 
 `learn` composes the list into one pure function, which you can `vmap` over seeds and settings.
-`jaxsense.run` walks the same list from the host, and reports, saves and stops between two chunks.
-Both use the same keys.
+`jaxsense.run` executes the same list from the host with the same keys; between two chunks it
+reports, saves, and stops if asked to.
 """
 
 from collections.abc import Mapping
@@ -17,11 +17,11 @@ from jaxsense.training.stage import Learned, Output, Stage, compose, key_of
 
 
 def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
-    """The stages of a training, each after its inputs.
+    """Stages of a training, each after the stages whose outputs it takes.
 
     Args:
       config: all settings; its static fields determine the stages and all sizes.
-      arena: of `sim.make_world(config)`, to reuse one.
+      arena: from `sim.make_world(config)`; compiled anew by default.
     """
     arena = make_world(config).arena if arena is None else arena
     detectors = tuple(f"detector_{name}" for name in config.modalities)
@@ -64,16 +64,16 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
 def learn(
     key: Key, config: Config, arena: Arena | None = None, *, until: str | None = None
 ) -> Learned:
-    """The whole training as one pure function.
+    """Trains everything, as one pure function.
 
     Args:
       key: the only source of randomness.
       config: all settings. Fields declared `Traced` may be traced, so that `jax.vmap` varies them.
-      arena: of `sim.make_world(config)`, to reuse one.
-      until: name of the last stage to compose; all by default.
+      arena: from `sim.make_world(config)`; compiled anew by default.
+      until: name of the last stage; all stages by default.
 
     Returns:
-      The outputs of the stages: the trained networks, see `models`, and all that a run measures
+      The outputs of the stages: the trained networks, see `models`, and all measurements of a run
       except its missions.
 
     Raises:
@@ -87,10 +87,10 @@ def learn(
 
 
 def models(outputs: Mapping[str, Output], config: Config) -> Models:
-    """The models among the outputs of all stages.
+    """Collects the models from the outputs of all stages.
 
     Args:
-      outputs: by the names of the stages.
+      outputs: by the name of the stage.
       config: all settings.
     """
     return Models(
@@ -106,5 +106,5 @@ def models(outputs: Mapping[str, Output], config: Config) -> Models:
 
 
 def mission_key(key: Key) -> Key:
-    """The key of the missions that follow a training with this key."""
+    """Key of the missions that follow a training with this key."""
     return key_of(key, "mission")

@@ -2,13 +2,12 @@
 
 import chex
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsense.core import checks
 
-_Row = Float[Array | np.ndarray, " D"]
-_Columns = Float[Array | np.ndarray, "D ..."]
+_Row = Float[Array, " D"]
+_Columns = Float[Array, "D ..."]
 
 
 def kl_divergence(mean_p: _Row, log_var_p: _Row, mean_q: _Row, log_var_q: _Row) -> Float[Array, ""]:
@@ -59,7 +58,7 @@ def sample(noise: _Columns, mean: _Columns, log_var: _Columns) -> Float[Array, "
 
 
 def moment_match(
-    mean: Float[Array | np.ndarray, "K D"], std: Float[Array | np.ndarray, "K D"]
+    mean: Float[Array, "K D"], std: Float[Array, "K D"]
 ) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
     """Mean and standard deviation of an equal mixture of diagonal Gaussians.
 

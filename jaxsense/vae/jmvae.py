@@ -12,7 +12,6 @@ import itertools
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
@@ -151,9 +150,7 @@ def check_features(model: Jmvae, features: Features) -> None:
             checks.require_finite(f"features of {name}", feature)
 
 
-def decode(
-    params: Params, model: Jmvae, z: Float[Array | np.ndarray, " D"]
-) -> tuple[Float[Array, "_"], ...]:
+def decode(params: Params, model: Jmvae, z: Float[Array, " D"]) -> tuple[Float[Array, "_"], ...]:
     """Mean of `p(features | z)` for every modality.
 
     Args:
