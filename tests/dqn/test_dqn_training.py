@@ -11,8 +11,8 @@ import pytest
 from toys import paying_once_mdp
 
 from jaxsense.config import DqnConfig
-from jaxsense.core import networks
-from jaxsense.dqn import belief_mdp, environments, policies, replay, training
+from jaxsense.dqn import map_mdp, replay, team_mdp, training
+from jaxsense.dqn.agents import MapAgent
 
 # Every episode is cut after one action: no value could be learnt beyond it, were a cut an end.
 MDP = paying_once_mdp(num_pois=2, max_steps=1)
@@ -31,6 +31,13 @@ PROBE = DqnConfig(
     target_period=20,
     num_starts=256,
 )
+
+
+def learning_in(mdp, config):
+    """What an agent with the only sensor learns in."""
+    return MapAgent(config.discount, mdp.num_pois, 2, config.hidden).environment(mdp, 0)
+
+
 SEEN = jnp.array([[[0], [0]], [[1], [0]], [[0], [1]], [[1], [1]]], bool)
 # A first look gains .8 and a second costs 1; with gamma = .5, for look 0, look 1 and NOP:
 Q = np.array(
@@ -56,17 +63,29 @@ SMALL = DqnConfig(
 )
 
 
+LEARNING = learning_in(MDP, SMALL)
+
+
 def states():
     classes = jnp.zeros(2, int)
-    reset = lambda seen: belief_mdp.reset(jax.random.key(0), MDP, classes, seen)  # noqa: E731
+    reset = lambda seen: map_mdp.reset(jax.random.key(0), MDP, classes, seen)  # noqa: E731
     return jax.jit(jax.vmap(reset))(SEEN)
+
+
+def values(params):
+    """`[4, 3]` values in the states above."""
+    agent = learning_in(MDP, PROBE).agent
+    alone = team_mdp.alone(2, 0)
+    observed = jax.vmap(lambda b: agent.observe(b, alone, jnp.int32(0)))(states().belief)
+    return agent.values(params, observed.T).T
 
 
 @pytest.fixture(scope="module")
 def probe():
     """Two seeds of the probe."""
     train = jax.jit(
-        jax.vmap(lambda key: training.train(key, MDP, 0, PROBE)), compiler_options=FAST_TO_COMPILE
+        jax.vmap(lambda key: training.train(key, learning_in(MDP, PROBE), PROBE)),
+        compiler_options=FAST_TO_COMPILE,
     )
     return train(jax.random.split(jax.random.key(0), 2))
 
@@ -74,16 +93,13 @@ def probe():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_values_are_those_worked_by_hand(probe, seed):
     params = jax.tree.map(lambda x: x[seed], probe[0].params)
-    inputs = jax.vmap(belief_mdp.observation)(states().belief)
-    values = networks.apply(policies.q_network(MDP.num_pois, PROBE.hidden), params, inputs.T)
-    np.testing.assert_allclose(values.T, Q, atol=0.05)
+    np.testing.assert_allclose(values(params), Q, atol=0.05)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_greedy_policy_is_optimal_after_training(probe, seed):
     params = jax.tree.map(lambda x: x[seed], probe[0].params)
-    act = policies.greedy(MDP, params, PROBE.hidden)
-    actions = jax.vmap(act, in_axes=(None, 0))(jax.random.key(0), states())
+    actions = np.argmax(values(params), axis=1)
     assert actions[0] in (0, 1)
     assert tuple(actions[1:]) == (1, 0, 2)
 
@@ -113,14 +129,14 @@ def chunks():
 
     @jax.jit
     def begin():
-        prepared = training.starts(start_key, MDP, config)
-        return prepared, training.init(init_key, MDP, config, prepared)
+        prepared = training.starts(start_key, LEARNING, config)
+        return prepared, training.init(init_key, LEARNING, config, prepared)
 
     prepared, first = begin()
 
     @chex.assert_max_traces(n=1)  # a second chunk must not be traced again
     def chunk(key, state):
-        return training.train_chunk(key, MDP, 0, config, state, prepared)
+        return training.train_chunk(key, LEARNING, config, state, prepared)
 
     chunk = jax.jit(chunk, compiler_options=FAST_TO_COMPILE)
     all_states, infos = [first], []
@@ -148,12 +164,14 @@ def test_target_is_a_copy_from_the_last_multiple_of_its_period(chunks):
 
 
 def train_small_once(key):
-    return training.train(key, MDP, 0, SMALL)
+    return training.train(key, LEARNING, SMALL)
 
 
 @pytest.fixture(scope="module")
 def train_small():
-    return jax.jit(lambda key: training.train(key, MDP, 0, SMALL), compiler_options=FAST_TO_COMPILE)
+    return jax.jit(
+        lambda key: training.train(key, LEARNING, SMALL), compiler_options=FAST_TO_COMPILE
+    )
 
 
 def test_training_in_one_call_equals_chunks_with_the_same_keys(chunks, train_small):
@@ -191,17 +209,19 @@ def test_an_episode_goes_on_until_nop_or_the_cut():
         num_starts=8,
     )
 
+    learning = learning_in(mdp, config)
+
     @jax.jit
     def begin():
-        prepared = training.starts(jax.random.key(2), mdp, config)
-        return prepared, training.init(jax.random.key(0), mdp, config, prepared)
+        prepared = training.starts(jax.random.key(2), learning, config)
+        return prepared, training.init(jax.random.key(0), learning, config, prepared)
 
     prepared, state = begin()
     layers = state.params["params"]
     layers = {**layers, "Dense_1": {**layers["Dense_1"], "bias": jnp.array([1e3, -1e3])}}
     state = replace(state, params={"params": layers})
     chunk = jax.jit(
-        lambda state: training.train_chunk(jax.random.key(1), mdp, 0, config, state, prepared),
+        lambda state: training.train_chunk(jax.random.key(1), learning, config, state, prepared),
         compiler_options=FAST_TO_COMPILE,
     )
     state, info = chunk(state)
@@ -211,7 +231,7 @@ def test_an_episode_goes_on_until_nop_or_the_cut():
     seen_before = np.round((-1.2 - ended) / 1.8 * 4)  # of 4 episodes
     np.testing.assert_allclose(ended, -1.2 - 1.8 * seen_before / 4, atol=1e-5)
     np.testing.assert_array_equal(np.asarray(info.episode_return)[[0, 1, 3, 4, 6]], 0.0)
-    np.testing.assert_array_equal(state.needs_start, False)
+    np.testing.assert_array_equal(state.done, False)
     np.testing.assert_array_equal(state.envs.steps, 1)
     # A cut is no end, so the discount is that of the settings and never 0 here.
     drawn = replay.sample(jax.random.uniform(jax.random.key(3), (64, 2)), state.replay)
@@ -234,11 +254,13 @@ def test_values_after_an_action_are_those_of_the_target_network():
     )  # fmt: skip
     seen = jnp.ones((1, 1), bool)
 
+    learning = learning_in(mdp, config)
+
     @jax.jit
     def begin():
-        one = belief_mdp.reset(jax.random.key(0), mdp, jnp.zeros(1, int), seen)
+        one = map_mdp.reset(jax.random.key(0), mdp, jnp.zeros(1, int), seen)
         prepared = jax.tree.map(lambda x: jnp.stack([x] * config.num_starts), one)
-        return prepared, training.init(jax.random.key(0), mdp, config, prepared)
+        return prepared, training.init(jax.random.key(0), learning, config, prepared)
 
     prepared, state = begin()
     state = replace(
@@ -247,7 +269,7 @@ def test_values_after_an_action_are_those_of_the_target_network():
         target=with_bias(state.params, [-2.0, 3.0]),
     )
     chunk = jax.jit(
-        lambda state: training.train_chunk(jax.random.key(1), mdp, 0, config, state, prepared),
+        lambda state: training.train_chunk(jax.random.key(1), learning, config, state, prepared),
         compiler_options=FAST_TO_COMPILE,
     )
     state, first = chunk(state)
@@ -260,8 +282,8 @@ def test_values_after_an_action_are_those_of_the_target_network():
 
 def test_the_replay_holds_as_many_transitions_as_the_settings_say():
     key = jax.random.key(0)
-    prepared = jax.eval_shape(lambda key: training.starts(key, MDP, SMALL), key)
-    state = jax.eval_shape(lambda key: training.init(key, MDP, SMALL, prepared), key)
+    prepared = jax.eval_shape(lambda key: training.starts(key, LEARNING, SMALL), key)
+    state = jax.eval_shape(lambda key: training.init(key, LEARNING, SMALL, prepared), key)
     rounds, blocks, _, width = state.replay.columns.shape
     assert rounds * blocks * width == SMALL.replay_capacity
     assert blocks * width == SMALL.num_envs
@@ -271,13 +293,12 @@ def test_every_start_of_a_share_and_every_action_is_drawn():
     config = replace(SMALL, epochs=200, chunk=200, num_starts=4 * SMALL.num_envs)
     draws = training._draw(jax.random.key(0), config)
     assert set(np.unique(draws.start)) == {0, 1, 2, 3}
-    place = environments.environment(MDP, 0, config)
 
     @jax.jit
     def explore(draws):
-        prepared = training.starts(jax.random.key(1), MDP, config)
+        prepared = training.starts(jax.random.key(1), LEARNING, config)
         envs = jax.tree.map(lambda x: x[: config.num_envs], prepared)
-        return jax.vmap(lambda draws: training._explored(place, envs, draws))(draws)
+        return jax.vmap(lambda draws: training._explored(LEARNING, envs, draws))(draws)
 
     action = explore(draws.action)
     shares = np.bincount(action.reshape(-1), minlength=MDP.num_pois + 1) / action.size
@@ -310,10 +331,10 @@ def length_of(key, params):
 
 @functools.partial(jax.jit, static_argnames="evaluate", compiler_options=FAST_TO_COMPILE)
 def train_from_epoch_5(config, evaluate):
-    prepared = training.starts(jax.random.key(2), MDP, config)
-    state = training.init(jax.random.key(0), MDP, config, prepared)
+    prepared = training.starts(jax.random.key(2), LEARNING, config)
+    state = training.init(jax.random.key(0), LEARNING, config, prepared)
     state = replace(state, epoch=jnp.int32(5))
-    return training.train_chunk(jax.random.key(1), MDP, 0, config, state, prepared, evaluate)
+    return training.train_chunk(jax.random.key(1), LEARNING, config, state, prepared, evaluate)
 
 
 def trained_for(chunk, evaluate, **settings):

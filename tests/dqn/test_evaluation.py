@@ -6,22 +6,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import classes_mdp, noisy_mdp
+from toys import Ignorant, classes_mdp, noisy_mdp, policy
 
-from jaxsense.dqn import belief_mdp, episodes, policies
+from jaxsense.core.types import pytree
+from jaxsense.dqn import episodes
 
 MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
 
 
 def scripted(*actions):
     """A policy that takes the given actions one after the other."""
-    table = jnp.array(actions)
-    return lambda key, state: table[state.steps]
+    return lambda seen: lambda key, known: jnp.array(actions)[jnp.sum(known.looks) - np.sum(seen)]
 
 
-def play(mdp, policy, seen, modality=0):
-    state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.array(seen, bool))
-    return episodes.run_episode(KEY, mdp, policy, state, modality)
+def always(act):
+    return lambda seen: act
+
+
+def start(mdp, seen):
+    return episodes.reset(KEY, mdp, Ignorant(), jnp.array([0, 1, 2]), jnp.array(seen, bool))
+
+
+def play(mdp, act, seen, modality=0):
+    begun = start(mdp, seen)
+    return episodes.run_episode(KEY, mdp, Ignorant(), act(seen), begun, modality)
 
 
 def test_every_state_of_the_map_is_there_once():
@@ -70,7 +78,7 @@ def test_of_very_many_states_an_even_sample_is_taken():
 
 def test_naive_play_has_the_total_worked_by_hand():
     # PoI 0 unseen: .2 - .158114; PoI 1 seen by the LiDAR: 1 - .2; PoI 2 seen by both: no look.
-    total, first = play(MDP, policies.naive(MDP, 0), [[0, 0], [0, 1], [1, 1]])
+    total, first = play(MDP, always(policy("naive")), [[0, 0], [0, 1], [1, 1]])
     np.testing.assert_allclose(total, 0.041886 + 0.8, rtol=1e-4)
     np.testing.assert_allclose(first, 0.041886, rtol=1e-3)
 
@@ -92,7 +100,7 @@ def test_first_reward_is_that_of_the_first_action_alone():
 
 def test_play_is_cut_after_max_steps():
     mdp = classes_mdp(max_steps=4)
-    total, _ = play(mdp, lambda key, state: jnp.int32(0), np.ones((3, 2)))
+    total, _ = play(mdp, always(lambda key, known: jnp.int32(0)), np.ones((3, 2)))
     np.testing.assert_allclose(total, -4.0)
 
 
@@ -109,13 +117,14 @@ def test_the_kth_look_at_a_poi_sees_the_same_in_any_order():
 
 
 def test_policies_draw_anew_at_every_step():
-    def coin(key, state):  # ends the episode with a chance of one half at every step
+    def coin(key, known):  # ends the episode with a chance of one half at every step
         return jnp.where(jax.random.bernoulli(key), NOP, 0)
 
     mdp = classes_mdp(max_steps=20)
-    state = belief_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.ones((3, 2), bool))
+    begun = start(mdp, np.ones((3, 2)))
     keys = jax.random.split(KEY, 400)
-    totals, _ = jax.vmap(lambda key: episodes.run_episode(key, mdp, coin, state, 0))(keys)
+    play = jax.vmap(lambda key: episodes.run_episode(key, mdp, Ignorant(), coin, begun, 0))
+    totals, _ = play(keys)
     # Looks in vain until the first NOP: geometric, mean 1, variance 2; +- 4 sqrt(2 / 400).
     np.testing.assert_allclose(-totals.mean(), 1.0, atol=0.29)
     assert len(np.unique(totals)) >= 5
@@ -162,3 +171,36 @@ def test_of_more_states_than_an_integer_holds_an_even_sample_is_taken(sizes):
     again = episodes.every_state(*sizes)
     np.testing.assert_array_equal(again[0], classes)
     np.testing.assert_array_equal(again[1], seen)
+
+
+@pytree
+class OfLooks:
+    """What a look by the camera, or 10 times that by the LiDAR, says for each of three classes."""
+
+    def log_likelihoods(self, features, modality):
+        return jnp.array([1.0, 2.0, 4.0]) * features[0] * (1, 10)[modality]
+
+
+@pytest.mark.parametrize("modality", [0, 1, jnp.int32(1)])
+def test_policies_know_looks_and_the_exact_posterior(modality):
+    # Features are the class, 0 to 2. Class 1 by both at first, class 2 by the LiDAR.
+    seen, told = np.array([[0, 0], [1, 1], [0, 1]]), []
+    first = seen.sum()
+
+    def act(key, known):
+        jax.debug.callback(
+            lambda *x: told.append(x), known.looks, known.log_posterior, ordered=True
+        )
+        return jnp.array([2, 1, 2, NOP])[jnp.sum(known.looks) - first]
+
+    begun = episodes.reset(KEY, MDP, OfLooks(), jnp.array([0, 1, 2]), jnp.array(seen, bool))
+    jax.block_until_ready(episodes.run_episode(KEY, MDP, OfLooks(), act, begun, modality))
+    factors = np.array([0.0, 11.0, 20.0])
+    for action, (looks, posterior) in zip((2, 1, 2, None), told, strict=True):
+        np.testing.assert_array_equal(looks, seen)
+        found = np.asarray(posterior) - np.asarray(posterior)[:, :1]
+        # Logarithms of ratios to the first class: 2 - 1 and 4 - 1 for each unit of a feature.
+        np.testing.assert_allclose(found, factors[:, None] * [0, 1, 3], rtol=1e-5)
+        if action is not None:
+            seen[action, int(modality)] += 1
+            factors[action] += action * (1, 10)[int(modality)]

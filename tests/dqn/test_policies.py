@@ -1,29 +1,43 @@
-"""The policies to compare with, on the toy map."""
+"""The table of policies, on values worked by hand."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import classes_mdp, noisy_mdp
+from toys import known_of, policy
 
-from jaxsense.dqn import belief_mdp, policies
+from jaxsense.core.types import Belief, pytree
+from jaxsense.dqn import agents, optimum, policies
+from jaxsense.dqn.optimum import LookValues
+from jaxsense.dqn.policies import Policy
 
-MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
-# The camera tells class 0 from the others, the LiDAR class 2.
-LABELS = jnp.array([[1, 0, 0], [0, 0, 1]])
-
-
-reset = jax.jit(lambda classes, seen: belief_mdp.reset(KEY, MDP, classes, seen))
-
-
-def start(seen):
-    return reset(jnp.array([0, 1, 2]), jnp.array(seen, bool))
+NOP, KEY, UNKNOWN = 3, jax.random.key(0), np.zeros((3, 3))
+# The logarithm of what is not so.
+NO = -np.inf
+ROUND, EDGY = [np.log(0.5), np.log(0.5), NO], [NO, NO, 0.0]
 
 
-@pytest.fixture(scope="module")
-def rewards():
-    """Of the LiDAR's looks."""
-    return jax.jit(lambda: policies.expected_rewards(KEY, MDP, 1, num_draws=2))()
+@pytree
+class OnMap:
+    """A fusion whose beliefs hold the classes' probabilities as their mean."""
+
+    def class_probabilities(self, belief):
+        return belief.mean
+
+
+def linear(of_classes, unseen):
+    """A table of `[P]` means of the rewards of three classes, and that of an unseen PoI."""
+    points = jnp.array(optimum.lattice(3, 66), jnp.float32)
+    return points @ jnp.array(of_classes, jnp.float32), jnp.float32(unseen)
+
+
+def worthless():
+    return linear([-1, -1, -1], -1)
+
+
+def look_values(q, one_step=None):
+    (one, one_unseen), (total, unseen) = one_step or worthless(), q
+    return LookValues(one, total, one_unseen, unseen)
 
 
 @pytest.mark.parametrize(
@@ -31,82 +45,102 @@ def rewards():
     [((0, 0, 0), 0), ((1, 0, 0), 1), ((0, 1, 1), 0), ((1, 1, 0), 2), ((1, 1, 1), NOP)],
 )
 def test_naive_looks_at_the_first_poi_the_own_sensor_has_not_seen(seen_by_camera, expected):
-    seen = np.array([seen_by_camera, (1, 0, 1)]).T  # what the LiDAR has seen does not matter
-    assert policies.naive(MDP, 0)(KEY, start(seen)) == expected
-    assert policies.naive(MDP, 1)(KEY, start(seen[:, ::-1])) == expected
+    looks = np.array([seen_by_camera, (1, 0, 1)]).T  # what the LiDAR has seen does not matter
+    assert policy("naive")(KEY, known_of(UNKNOWN, looks, 0)) == expected
+    assert policy("naive")(KEY, known_of(UNKNOWN, looks[:, ::-1], 1)) == expected
+
+
+def test_naive_play_of_more_looks_counts_its_own():
+    looks = np.array([(1, 3), (2, 0), (3, 0)])
+    found = [policy(f"naive{n}")(KEY, known_of(UNKNOWN, looks, 0)) for n in ("", "_2", "_3")]
+    assert [int(action) for action in found] == [NOP, 0, 0]
+    assert policy("naive_3")(KEY, known_of(UNKNOWN, looks[1:], 0)) == 0
 
 
 @pytest.mark.parametrize(
-    ("seen", "expected"),
-    [
-        (((1, 1), (1, 0), (1, 1)), 1),  # only PoI 1 is left for the LiDAR
-        (((1, 1), (0, 1), (0, 1)), NOP),  # the LiDAR has seen all
-        (((0, 0), (0, 1), (1, 0)), 2),  # 1 - .2 = .8 pays more than .2 - .158
-        (((0, 0), (0, 1), (0, 1)), 0),
-    ],
-)
-def test_optimal_takes_the_look_that_pays_most_or_else_nop(rewards, seen, expected):
-    assert policies.optimal(MDP, rewards, LABELS)(KEY, start(seen)) == expected
-
-
-def test_expected_rewards_of_each_look(rewards):
-    # Nobody, camera, LiDAR, both: .2 - 1 / sqrt(40) = .041886; 1 - .2 = .8; twice in vain.
-    table = np.repeat([[0.041886], [0.8], [-1.0], [-1.0]], 3, axis=1)
-    np.testing.assert_allclose(rewards, table, rtol=1e-4)
-
-
-def test_expected_rewards_average_over_the_draws():
-    mdp = noisy_mdp()  # every look gains a uniform number of its own
-    rewards = jax.jit(lambda: policies.expected_rewards(KEY, mdp, 0, num_draws=400))()
-    # 1/2 +- 4 sqrt(1/12 / 400) = +- .058, by different draws for each entry.
-    np.testing.assert_allclose(rewards, 0.5, atol=0.058)
-    assert len(np.unique(rewards)) == 12
-
-
-@pytest.mark.parametrize(
-    ("rewards_of_classes", "expected"),
+    ("of_classes", "unseen", "expected"),
     [
         # Unseen: (1 - 2 + 4) / 3 = 1. Seen round, class 0 or 1: (1 - 2) / 2. Seen edgy: 4.
-        ((1.0, -2.0, 4.0), 2),
+        ((1.0, -2.0, 4.0), 1.0, 2),
         # Unseen: (4 - 2 - 8) / 3 = -2. Seen round: (4 - 2) / 2 = 1. Seen edgy: -8.
-        ((4.0, -2.0, -8.0), 1),
+        ((4.0, -2.0, -8.0), -2.0, 1),
         # Nothing pays.
-        ((-1.0, 0.5, -3.0), NOP),
+        ((-1.0, 0.5, -3.0), -1.2, NOP),
+        # The first look at a PoI has a value of its own.
+        ((-1.0, 0.5, -3.0), 0.1, 0),
     ],
 )
-def test_optimal_averages_over_the_classes_that_the_looks_leave_open(rewards_of_classes, expected):
-    rewards = jnp.broadcast_to(jnp.array(rewards_of_classes), (4, 3))
-    seen = jnp.array([(0, 0), (0, 1), (0, 1)], bool)
-    state = reset(jnp.array([1, 1, 2]), seen)
-    assert policies.optimal(MDP, rewards, LABELS)(KEY, state) == expected
+@pytest.mark.parametrize("modality", [0, 1])
+def test_optimal_averages_over_the_classes_that_the_looks_leave_open(
+    of_classes, unseen, expected, modality
+):
+    known = known_of([[np.log(1 / 3)] * 3, ROUND, EDGY], [(0, 0), (0, 1), (0, 1)], modality)
+    own, other = look_values(linear(of_classes, unseen)), look_values(worthless())
+    models = (own, other) if modality == 0 else (other, own)
+    assert policy("optimal", look_values=models)(KEY, known) == expected
+    # `bayes` reads the reward of the next look alone.
+    short = look_values(worthless(), linear(of_classes, unseen))
+    models = (short, other) if modality == 0 else (other, short)
+    assert policy("bayes", look_values=models)(KEY, known) == expected
+    assert policy("optimal", look_values=models)(KEY, known) == NOP
 
 
-def test_uniform_takes_every_action_equally_often():
-    keys = jax.random.split(KEY, 4000)
-    actions = jax.vmap(policies.random(MDP), in_axes=(0, None))(keys, start(np.zeros((3, 2))))
+def test_greedy_reads_the_map_where_bayes_reads_the_exact_posterior():
+    values = look_values(worthless(), linear((1.0, -2.0, 4.0), -1.0))
+    models = {"look_values": (values, look_values(worthless())), "fusion": OnMap()}
+    on_map = Belief(jnp.array([[0.5, 0.5, 0], [0, 0, 1.0], [0, 1.0, 0]]), jnp.ones((3, 3)))
+    known = known_of([EDGY, ROUND, ROUND], np.ones((3, 2)), 0, on_map)
+    assert policy("greedy", **models)(KEY, known) == 1
+    assert policy("bayes", **models)(KEY, known) == 0
+    # The other sensor has other values.
+    known = known_of([EDGY, ROUND, ROUND], np.ones((3, 2)), 1, on_map)
+    assert policy("greedy", **models)(KEY, known) == NOP
+
+
+def test_expected_gains_are_of_each_sensor_and_poi():
+    camera = look_values(worthless(), linear((1.0, -2.0, 4.0), 7.0))
+    lidar = look_values(worthless(), linear((0.0, 3.0, 0.0), -5.0))
+    on_map = Belief(jnp.array([[0.5, 0.5, 0], [0, 0, 1.0], [0, 1.0, 0]]), jnp.ones((3, 3)))
+    is_seen = jnp.array([True, True, False])
+    found = policies.expected_gains(OnMap(), (camera, lidar), on_map, is_seen)
+    np.testing.assert_allclose(found, [[-0.5, 4, 7], [1.5, 0, -5]], atol=1e-5)
+
+
+def test_random_takes_every_action_equally_often():
+    keys, known = jax.random.split(KEY, 4000), known_of(UNKNOWN, np.zeros((3, 2)))
+    actions = jax.vmap(policy("random"), in_axes=(0, None))(keys, known)
     # 1000 each +- 4 sqrt(4000 x 3/16) = +- 110.
     np.testing.assert_allclose(np.bincount(actions, minlength=4), 1000, atol=110)
 
 
-def test_greedy_takes_the_action_of_highest_value():
-    network = policies.q_network(MDP.num_pois, (4,))
-    params = network.init(KEY, jnp.zeros(12))
-    state = start(np.zeros((3, 2)))
-    for best in range(4):
+def test_latent_takes_the_action_that_the_own_q_network_values_most():
+    agent = agents.MapAgent(0.5, 3, 2, (4,))
+    layers = agent.init(KEY)["params"]
+
+    def biased(best):
         bias = 100.0 * (jnp.arange(4) == best)
-        layers = {**params["params"], "Dense_1": {**params["params"]["Dense_1"], "bias": bias}}
-        assert policies.greedy(MDP, {"params": layers}, (4,))(KEY, state) == best
+        return {"params": {**layers, "Dense_1": {**layers["Dense_1"], "bias": bias}}}
+
+    class Classes:
+        classes = Belief(*jnp.ones((2, 5, 2)))
+
+    for best in range(4):
+        networks = biased(best), biased((best + 1) % 4)
+        models = {"agent": agent, "q_networks": networks, "tours": None, "fusion": Classes}
+        for modality in (0, 1):
+            known = known_of(UNKNOWN, np.zeros((3, 2)), modality)
+            assert policy("latent", **models)(KEY, known) == (best + modality) % 4
 
 
-def test_rewards_of_one_poi_and_three_modalities():
-    mdp = classes_mdp(num_pois=1, num_modalities=3)
-    rewards = jax.jit(lambda: policies.expected_rewards(KEY, mdp, 1, num_draws=2))()
-    # By who has looked, first modality in the lowest bit: nobody .2 - .158114, one other 1 - .2,
-    # both others 2 - 1, and in vain where the own bit is set.
-    of_codes = [0.041886, 0.8, -1.0, -1.0, 0.8, 1.0, -1.0, -1.0]
-    np.testing.assert_allclose(rewards, np.repeat(of_codes, 3).reshape(8, 3), rtol=1e-4)
-    act = policies.optimal(mdp, rewards, jnp.zeros((3, 3), int))
-    start = jax.jit(lambda seen: belief_mdp.reset(KEY, mdp, jnp.array([2]), seen))
-    for seen, expected in (((0, 0, 1), 0), ((0, 1, 1), 1)):
-        state = start(jnp.array([seen], bool))
-        assert act(KEY, state) == expected
+def test_a_policy_of_ones_own_is_one_more_entry():
+    def backwards(key, models, known):
+        return jnp.append(jnp.arange(len(known.looks)), -1)
+
+    timed = Policy(backwards, lambda agent: True)
+    table = policies.table({"backwards": backwards, "timed": timed, "greedy": backwards})
+    assert [*table] == [*policies.POLICIES, "backwards", "timed"]
+    known = known_of(UNKNOWN, np.zeros((3, 2)))
+    for name in ("backwards", "greedy"):
+        assert policies.best(table[name].values(KEY, None, known)) == 2
+        assert not table[name].counts_time(None)
+    assert table["timed"] is timed

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import classes_mdp, paying_once_mdp
+from toys import SENSORS, Fixed, classes_mdp, known_of, paying_once_mdp, policy
 
 from jaxsense.config import DqnConfig, TeamConfig, TravelConfig
-from jaxsense.core import networks
-from jaxsense.dqn import belief_mdp, environments, losses, policies, team_mdp, training
+from jaxsense.dqn import losses, map_mdp, team_mdp, training
+from jaxsense.dqn.agents import TeamAgent
 from jaxsense.dqn.team_mdp import TeamMdp
 
 TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
@@ -23,7 +23,12 @@ SMALL = DqnConfig(
 
 def team_of(mapped, poses, places, **config):
     given = {"travel": TRAVEL, "robots_each": 1, "alone": 0.0, "partly_seen": 0.0, **config}
-    return TeamMdp(TeamConfig(**given), mapped, lambda *given: (places, poses), ("camera", "lidar"))
+    return TeamMdp(TeamConfig(**given), mapped, Fixed(places, poses), SENSORS)
+
+
+def learning_in(mdp, config=SMALL):
+    agent = TeamAgent(mdp.config, config.discount, 2, mdp.map.num_modalities, config.hidden)
+    return agent.environment(mdp, 0)
 
 
 # From the origin 6, 11 and 16 s to look, less the turns, see `test_team_mdp.py`.
@@ -35,43 +40,47 @@ TWO = team_of(
 )
 
 
-def test_values_of_setting_out_as_worked_by_hand():
+def test_values_of_setting_out_as_worked_by_hand(monkeypatch):
     # D = 1 and M = 1: nine numbers of each PoI, the third of which is its time in tens of seconds.
     seen = jnp.zeros((9, 3)).at[2].set(jnp.array([0.2, 0.0, 0.4])).reshape(-1)
     after = jnp.array([8.0, 3.0, 16.0, 0.0])
-    config, dqn = TeamConfig(second_cost=0.1), replace(SMALL, discount=0.5)
+    monkeypatch.setattr(TeamAgent, "q", lambda agent, params, observed: params)
+    agent = TeamAgent(TeamConfig(second_cost=0.1), 0.5, 1, 1, (8,))
     # 2 s: 8/4 - .2; at once; 4 s: 16/16 - .4; NOP.
-    values = policies.of_ways(after, seen, 1, config, dqn)
-    np.testing.assert_allclose(values, [1.8, 3.0, 0.6, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(agent.values(after, seen), [1.8, 3.0, 0.6, 0.0], rtol=1e-6)
     # The same for a batch in the last axis.
-    both = policies.of_ways(
-        jnp.stack([after, -after], 1), jnp.stack([seen, seen], 1), 1, config, dqn
-    )
+    both = agent.values(jnp.stack([after, -after], 1), jnp.stack([seen, seen], 1))
     np.testing.assert_allclose(both.T, [[1.8, 3.0, 0.6, 0], [-2.2, -3.0, -1.4, 0]], rtol=1e-6)
 
 
-def team_params(mdp, config=SMALL):
-    network = policies.team_network(2, mdp.map.num_modalities, config)
-    params = networks.init(jax.random.key(1), network, network.features * mdp.map.num_pois)
+AGENT = learning_in(TWO).agent
+
+
+def team_params():
+    params = AGENT.init(jax.random.key(1))
     # So that some look is worth more than NOP.
     params["params"]["Value"]["bias"] += 9.0
     return params
 
 
+def latent(params):
+    """The policy of the trained network alone."""
+    models = {"agent": AGENT, "q_networks": (params,) * 2, "tours": None, "fusion": TWO.map.fusion}
+    return jax.jit(policy("latent", **models))
+
+
 @pytest.mark.parametrize("modality", [0, 1])
 def test_at_one_place_a_robot_values_what_one_that_is_alone_does(modality):
-    params = team_params(TWO)
-    greedy = jax.jit(policies.greedy_alone(TWO.map, params, modality, TWO.config, SMALL))
-    reset = jax.jit(lambda key: belief_mdp.reset(key, TWO.map))
+    params = team_params()
+    reset = jax.jit(lambda key: map_mdp.reset(key, TWO.map))
 
     @jax.jit
     def valued(belief, team):
         """Its values, and what comes after its looks."""
-        seen = team_mdp.observation(TRAVEL, belief, team, jnp.int32(0), 2).reshape(-1)
-        after = networks.apply(policies.team_network(2, 2, SMALL), params, seen)
-        return policies.of_ways(after, seen, 2, TWO.config, SMALL), after
+        seen = AGENT.observe(belief, team, jnp.int32(0))
+        return AGENT.values(params, seen), AGENT.q(params, seen)
 
-    taken = set()
+    taken, act = set(), latent(params)
     for seed in range(8):
         state = reset(jax.random.key(seed))
         # All at (1, 2), with a heading that is of no importance.
@@ -82,24 +91,24 @@ def test_at_one_place_a_robot_values_what_one_that_is_alone_does(modality):
         values, after = valued(state.belief, alone)
         np.testing.assert_allclose(values, valued(state.belief, there)[0], rtol=1e-5)
         taken.add(action := int(np.argmax(values)))
-        assert greedy(jax.random.key(0), state) == action
+        known = known_of(jnp.zeros((3, 3)), state.seen, modality, state.belief)
+        assert act(jax.random.key(0), known) == action
         # They look at once: half of what comes after, without a price of time.
         np.testing.assert_allclose(values, 0.5 * after, rtol=1e-5)
     assert len(taken) > 1
 
 
-def test_the_greedy_policy_tells_if_a_value_is_not_finite():
-    params = jax.tree.map(lambda x: x * jnp.nan, team_params(TWO))
-    act = policies.greedy_alone(TWO.map, params, 0, TWO.config, SMALL)
-    key = jax.random.key(0)
-    assert jax.jit(lambda: act(key, belief_mdp.reset(key, TWO.map)))() == -1
+def test_the_latent_policy_tells_if_a_value_is_not_finite():
+    params = jax.tree.map(lambda x: x * jnp.nan, team_params())
+    known = known_of(jnp.zeros((3, 3)), jnp.zeros((3, 2)))
+    assert latent(params)(jax.random.key(0), known) == -1
 
 
 @pytest.fixture(scope="module")
 def steps():
     """What is learned from each choice of two robots, with the observations before them."""
-    place = environments.environment(TWO, 0, SMALL)
-    observe, step = jax.jit(place.observation), jax.jit(place.step)
+    place = learning_in(TWO)
+    observe, step = jax.jit(place.observe), jax.jit(place.step)
     state, found = jax.jit(place.reset)(jax.random.key(0)), []
     # Robot 0 to PoI 0, 6 s away; robot 1 to PoI 1, 11 s; robot 0 ends; robot 1 looks, and ends.
     for action in (0, 1, 3, 3):
@@ -137,9 +146,8 @@ def test_without_a_look_nothing_is_lost(steps):
 def test_a_second_look_at_the_same_moment_is_learned_too():
     # Both are as near: the second look takes no more time.
     poses = jnp.zeros((2, 3))
-    mdp = replace(TWO, new_places=lambda *given: (TWO.new_places(*given)[0], poses))
-    place = environments.environment(mdp, 0, SMALL)
-    observe, step = jax.jit(place.observation), jax.jit(place.step)
+    place = learning_in(replace(TWO, places=replace(TWO.places, poses=poses)))
+    observe, step = jax.jit(place.observe), jax.jit(place.step)
     state, found = jax.jit(place.reset)(jax.random.key(0)), []
     for action in (0, 0, 1):
         state, transition, outcome = step(
@@ -150,7 +158,7 @@ def test_a_second_look_at_the_same_moment_is_learned_too():
 
 
 def test_exploring_takes_every_poi_that_is_present_and_no_other():
-    place = environments.environment(TWO, 0, SMALL)
+    place = learning_in(TWO)
     state = jax.jit(place.reset)(jax.random.key(0))
     present = jnp.array([[True, False, True], [False, False, True], [True, True, True]])
     states = jax.tree.map(lambda x: jnp.stack([x] * 3), state)
@@ -190,7 +198,8 @@ Q = np.array(
 
 def test_a_robot_alone_learns_the_values_worked_by_hand():
     train = jax.jit(
-        lambda key: training.train(key, ALONE, 0, PROBE), compiler_options=FAST_TO_COMPILE
+        lambda key: training.train(key, learning_in(ALONE, PROBE), PROBE),
+        compiler_options=FAST_TO_COMPILE,
     )
     state, info = train(jax.random.key(0))
     assert np.all(info.is_finite)
@@ -198,9 +207,9 @@ def test_a_robot_alone_learns_the_values_worked_by_hand():
     @jax.jit
     @jax.vmap
     def learned(seen):
-        known = belief_mdp.reset(jax.random.key(0), ALONE.map, jnp.zeros(2, int), seen).belief
-        team = team_mdp.alone(2, 0)
-        x = team_mdp.observation(TRAVEL, known, team, jnp.int32(0), 1).reshape(-1)
-        return networks.apply(policies.team_network(2, 1, PROBE), state.params, x)
+        known = map_mdp.reset(jax.random.key(0), ALONE.map, jnp.zeros(2, int), seen).belief
+        agent = learning_in(ALONE, PROBE).agent
+        x = agent.observe(known, team_mdp.alone(2, 0), jnp.int32(0))
+        return agent.q(state.params, x)
 
     np.testing.assert_allclose(learned(SEEN), Q, atol=0.1)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from toys import classes_mdp, noisy_mdp
+from toys import SENSORS, Fixed, classes_mdp, noisy_mdp
 
 from jaxsense.config import TeamConfig, TravelConfig
 from jaxsense.core.types import Belief
-from jaxsense.dqn import belief_mdp, team_mdp
+from jaxsense.dqn import map_mdp, team_mdp
 from jaxsense.dqn.team_mdp import Team, TeamMdp, TeamState
 
 TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
@@ -27,7 +27,7 @@ def make_mdp(mapped=None, places=PLACES, robots_each=1, **config):
     mapped = classes_mdp(partly_seen_starts=False) if mapped is None else mapped
     poses = jnp.arange(3.0 * robots_each * mapped.num_modalities).reshape(-1, 3)
     given = {"travel": TRAVEL, "num_pois": (1, 3), "robots_each": robots_each, **config}
-    return TeamMdp(TeamConfig(**given), mapped, lambda *given: (places, poses), ("camera", "lidar"))
+    return TeamMdp(TeamConfig(**given), mapped, Fixed(places, poses), SENSORS)
 
 
 MDP = make_mdp()
@@ -38,7 +38,7 @@ def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
     number = len(poses)
     works = jnp.ones(number, bool) if works is None else jnp.array(works)
     seen = jnp.zeros((3, 2), bool) if seen is None else jnp.array(seen, bool)
-    known = belief_mdp.reset(jax.random.key(0), mdp.map, jnp.array([0, 1, 2]), seen)
+    known = map_mdp.reset(jax.random.key(0), mdp.map, jnp.array([0, 1, 2]), seen)
     team = Team(
         positions=places,
         present=jnp.ones(3, bool),
@@ -285,13 +285,13 @@ def test_an_episode_is_cut_after_its_own_number_of_choices():
 def test_a_robot_alone_earns_what_the_map_mdp_gives(mapped, modality):
     mdp = make_mdp(mapped)
     alone = team_mdp.alone(3, modality)
-    known = belief_mdp.reset(jax.random.key(4), mapped)
+    known = map_mdp.reset(jax.random.key(4), mapped)
     one = jnp.ones(1, bool)
     team = TeamState(known, alone, one, jnp.int32(0), jnp.zeros(1), jnp.float32(0))
     both = jax.jit(
         lambda key, team, known, action: (
             team_mdp.step(key, mdp, team, action),
-            belief_mdp.step(key, mapped, known, action, modality),
+            map_mdp.step(key, mapped, known, action, modality),
         )
     )
     for i, action in enumerate([0, 2, 2, 1, NOP]):

@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import classes_mdp
+from toys import SENSORS, Fixed, classes_mdp
 
-from jaxsense.config import DqnConfig, TeamConfig, ToursConfig, TravelConfig
+from jaxsense.config import TeamConfig, ToursConfig, TravelConfig
 from jaxsense.core import networks, supervised
 from jaxsense.core.types import Belief
-from jaxsense.dqn import policies, team_mdp, tours
+from jaxsense.dqn import team_mdp, tours
+from jaxsense.dqn.agents import TeamAgent
 from jaxsense.dqn.team_mdp import Team, TeamMdp
 from jaxsense.dqn.tours import Trials
 
@@ -24,12 +25,11 @@ PLACES = jnp.array([[1.9, 0.0], [3.9, 0.0], [9.0, 9.0]])
 IN_ORDER = (5 + 1) + (10 + 1)
 # 3 m to the second, a half turn and .2 m back to the first.
 BACKWARDS = (15 + 1) + (math.pi + 1 + 1)
-DQN = DqnConfig(task="team", observe="bank", hidden=(8,))
-NETWORK = policies.team_network(2, 2, DQN)
-# Map, team, the robot that asks, and number of modalities.
-AT_ORIGIN = (
-    Belief(np.zeros((3, 2), np.float32), np.ones((3, 2), np.float32)),
-    Team(
+AGENT = TeamAgent(TeamConfig(travel=TRAVEL), 0.5, 2, 2, (8,))
+NETWORK = AGENT.network
+AT_ORIGIN = {
+    "belief": Belief(np.zeros((3, 2), np.float32), np.ones((3, 2), np.float32)),
+    "team": Team(
         positions=PLACES,
         present=np.ones(3, bool),
         poses=np.zeros((2, 3), np.float32),
@@ -37,18 +37,15 @@ AT_ORIGIN = (
         works=np.ones(2, bool),
         target=np.full(2, 3),
     ),
-    np.int32(0),
-    2,
-)
+    "robot": np.int32(0),
+}
 
 
 def make_mdp(present=2, max_steps=300):
     mapped = classes_mdp(partly_seen_starts=False)
     given = {"travel": TRAVEL, "num_pois": (present, present), "robots_each": 1, "alone": 1.0}
     settings = TeamConfig(**given, partly_seen=0.0, max_steps=max_steps)
-    return TeamMdp(
-        settings, mapped, lambda *given: (PLACES, jnp.zeros((2, 3))), ("camera", "lidar")
-    )
+    return TeamMdp(settings, mapped, Fixed(PLACES, jnp.zeros((2, 3))), SENSORS)
 
 
 def trials_of(present=2, max_steps=300, walk=0, bonus=0.0):
@@ -67,6 +64,10 @@ def _trials(present, max_steps, walk, bonus):
 
     config, mdp = ToursConfig(tries=2, walk=walk), make_mdp(present, max_steps)
     return tours.try_choices(jax.random.key(0), mdp, in_order, config, 64)
+
+
+def fitting(trials, **config):
+    return tours.Fitting(ToursConfig(**config), trials, NETWORK, 2)
 
 
 def own_seconds(trials):
@@ -117,7 +118,8 @@ def test_the_loss_is_of_differences_within_a_state():
     trials = Trials(
         known.reshape(-1, 2), tried, jnp.array([[26.0, 31.0], [36.0, 32.0], [5.0, 9.0]])
     )
-    loss = jax.jit(lambda trials: tours.loss(NETWORK, params, trials, 2))
+    both = jnp.arange(2)
+    loss = jax.jit(lambda trials: fitting(trials).loss(params, both, jnp.int32(0)))
     # 6 and 16 s, and 1 and 2 s: each 20 and 30 s too little, and that is no error.
     assert loss(trials) < 1e-6
     # 6 s off between the two: 3 s each from their mean, of 3 s.
@@ -132,19 +134,18 @@ def test_columns_are_written_and_only_those_with_a_trial_drawn():
     found = tours.write(room, one, jnp.int32(3))
     np.testing.assert_array_equal(found.seconds.sum(axis=0), [0, 0, 0, 3, 3])
     np.testing.assert_array_equal(found.observation.sum(axis=0), [0, 0, 0, 6, 6])
-    drawn = tours.sample(jax.random.key(0), found, (40,))
-    assert set(np.asarray(drawn).tolist()) == {3, 4}
+    drawn = fitting(found, batch=5).draw(jax.random.key(0), 8)
+    assert drawn.shape == (8, 5)
+    assert set(np.asarray(drawn).ravel().tolist()) == {3, 4}
 
 
 def test_training_finds_the_shorter_tour():
-    trials, optimiser = trials_of(), supervised.adam(1e-2, 100)
+    trials = trials_of()
+    problem = fitting(trials, learning_rate=1e-2, steps=100, batch=64)
     params = networks.init(jax.random.key(1), NETWORK, NETWORK.features * 3)
-    state = supervised.start(params, optimiser)
-
-    def loss(params, drawn, step):
-        return tours.loss(NETWORK, params, trials, 2)
-
-    state, losses = jax.jit(lambda s: supervised.fit(s, loss, jnp.zeros(100), optimiser))(state)
+    state = supervised.start(params, problem.config)
+    fit = jax.jit(lambda state: supervised.fit(jax.random.key(2), state, problem, 100))
+    state, losses = fit(state)
     assert losses[-1] < 1e-3 < losses[0]
     learned = jax.jit(lambda x: tours.seconds(NETWORK, state.params, x, 2))(trials.observation)
     expected = (BACKWARDS - IN_ORDER) / 2
@@ -161,18 +162,27 @@ def test_training_finds_the_shorter_tour():
     ],
 )
 def test_looks_that_pay_come_in_the_order_of_their_tours(monkeypatch, after, cost, order):
-    monkeypatch.setattr(networks, "apply", lambda network, params, seen: jnp.array([*after, 0.0]))
-    monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
-    team = TeamConfig(travel=TRAVEL, second_cost=cost)
-    known = *AT_ORIGIN, team, DQN
-    values = jax.jit(lambda: policies.tour_values(None, None, *known))()
+    values = decided(monkeypatch, after, cost)
     assert np.argsort(-values)[: len(order)].tolist() == order
 
 
 def test_nan_of_the_q_network_stays_visible(monkeypatch):
-    monkeypatch.setattr(networks, "apply", lambda *given: jnp.array([jnp.nan, 1.0, 1.0, 0.0]))
+    values = decided(monkeypatch, [jnp.nan, 1.0, 1.0], 0.0)
+    np.testing.assert_array_equal(np.isnan(values), [True, False, False, False])
+
+
+def decided(monkeypatch, after, cost):
+    """Values in a mission, where the networks say what follows looks, and 20, 30 and 10 s."""
+    monkeypatch.setattr(TeamAgent, "q", lambda *given: jnp.array([*after, 0.0]))
     monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
-    known = *AT_ORIGIN, TeamConfig(travel=TRAVEL), DQN
-    np.testing.assert_array_equal(
-        np.isnan(policies.tour_values(None, None, *known)), [True, False, False, False]
-    )
+    agent = replace(AGENT, config=TeamConfig(travel=TRAVEL, second_cost=cost))
+    return jax.jit(lambda: agent.decide({}, {}, classes=None, **AT_ORIGIN))()
+
+
+def test_without_tours_the_values_are_those_of_setting_out(monkeypatch):
+    monkeypatch.setattr(TeamAgent, "q", lambda *given: jnp.array([8.0, 3.0, 16.0, 0.0]))
+    values = AGENT.decide({}, None, classes=None, **AT_ORIGIN)
+    # 6, 16 and, an eighth of a turn and 12.73 - .9 m away, 60.9 s, each of which halves a value.
+    seconds = np.array([6, 16, math.pi / 4 + (9 * math.sqrt(2) - 0.9) / 0.2 + 1])
+    expected = [*np.array([8.0, 3.0, 16.0]) * 0.5**seconds, 0.0]
+    np.testing.assert_allclose(values, expected, rtol=1e-4)

@@ -1,76 +1,142 @@
-"""Map MDPs without networks, whose rewards are known."""
+"""Map MDPs without networks, whose rewards are known: toy looks and toy fusions."""
+
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
-from jaxsense.dqn.belief_mdp import MapMdp
+from flax import struct
 
 from jaxsense.config import MdpConfig
-from jaxsense.core.types import Belief
+from jaxsense.core.types import Belief, pytree
+from jaxsense.dqn import policies, rewards, team_mdp
+from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn.policies import Known
+
+SENSORS = ("camera", "lidar")
+
+
+@pytree
+class Certain:
+    """A look shows the true class and which sensor has looked; a scene is the PoIs' classes."""
+
+    num_modalities: int = struct.field(pytree_node=False, default=2)
+
+    def scene(self, key, classes):
+        return classes
+
+    def observe(self, key, scene, poi, modality):
+        return jnp.stack([scene[poi], modality]).astype(jnp.float32), scene
+
+
+@pytree
+class Uniform(Certain):
+    """A look shows a random number that only its key decides."""
+
+    def observe(self, key, scene, poi, modality):
+        return jax.random.uniform(key, (1,)), scene
+
+
+@pytree
+class Toy:
+    """A fusion of no classes in particular: what fusions of these tests share."""
+
+    prior: Belief
+    num_classes: int = struct.field(pytree_node=False)
+
+    @property
+    def classes(self):
+        return Belief(*jnp.ones((2, self.num_classes, *self.prior.mean.shape)))
+
+    def class_probabilities(self, belief):
+        return jnp.full(self.num_classes, 1 / self.num_classes)
+
+
+@pytree
+class Counting(Toy):
+    """The more modalities have looked, the better a PoI is known."""
+
+    def update(self, belief, seen, features, modality):
+        number = jnp.sum(jnp.asarray(seen).at[modality].set(True))
+        return Belief(features, jnp.array([[3.0, 4.0], [0.6, 0.8], [0.3, 0.4]])[number - 1])
+
+
+@pytree
+class Adding(Toy):
+    """A look adds to the information what it shows."""
+
+    def update(self, belief, seen, features, modality):
+        return Belief(features, 1.0 / (1.0 / belief.std + features))
+
+
+@pytree
+class Once(Toy):
+    """Every look writes the same."""
+
+    def update(self, belief, seen, features, modality):
+        return Belief(jnp.array([1.0, 0.0]), jnp.array([0.6, 0.8]))
+
+
+@pytree
+class Fixed:
+    """PoIs and robots that are always at the same positions."""
+
+    positions: jax.Array
+    poses: jax.Array
+
+    def draw(self, key, num_robots):
+        return self.positions, self.poses
+
+
+@pytree
+class Ignorant:
+    """An exact Bayes filter that learns nothing."""
+
+    def log_likelihoods(self, features, modality):
+        return jnp.zeros(3)
+
+
+def known_of(log_posterior, looks, modality=0, belief=None):
+    """What a robot alone knows of PoIs, by `[N, C]` logarithms of posteriors and `[N, M]` looks."""
+    log_posterior, looks = jnp.asarray(log_posterior), jnp.asarray(looks, jnp.int32)
+    number = len(looks)
+    team = team_mdp.alone(number, modality)
+    belief = Belief(*jnp.ones((2, number, 2))) if belief is None else belief
+    return Known(belief, looks, log_posterior, team, jnp.ones((1, number)), jnp.int32(0))
+
+
+def policy(name, **models):
+    """`(key, known) -> action` of a policy in the table, by what it reads of models."""
+    values = policies.POLICIES[name].values
+    return lambda key, known: policies.best(values(key, SimpleNamespace(**models), known))
+
+
+def make_mdp(looks, fusion, num_pois, **config):
+    settings = MdpConfig(**config)
+    return MapMdp(looks, fusion, rewards.make(settings), settings, num_pois)
 
 
 def classes_mdp(num_pois=3, num_modalities=2, **config):
     """A look sees the true class, and a PoI that more modalities have seen is known better.
 
-    An entry's mean is (class, last modality to look). Its std is (3, 4) after looks of one
+    A belief's mean is (class, last modality to look). Its std is (3, 4) after looks of one
     modality, information 1/5; (.6, .8) after looks of two, information 1; (.3, .4) after three,
-    information 2. Unseen, the variance is 20 each: information 1 / sqrt(40) = .158114.
+    information 2. Before any, the variance is 20 each: information 1 / sqrt(40) = .158114.
     """
-
-    def observe(key, classes, poi, modality):
-        return jnp.stack([classes[poi], modality]).astype(jnp.float32), classes
-
-    def write(belief, seen, features, modality):
-        number = jnp.sum(seen.at[modality].set(True))
-        table = jnp.array([[3.0, 4.0], [0.6, 0.8], [0.3, 0.4]])
-        return Belief(features, table[number - 1])
-
-    return MapMdp(
-        config=MdpConfig(**{"min_increase": 0.01, "partly_seen_starts": True, **config}),
-        num_pois=num_pois,
-        num_classes=3,
-        num_modalities=num_modalities,
-        unseen=Belief(jnp.zeros(2), jnp.full(2, jnp.sqrt(20.0))),
-        new_scene=lambda key, classes: classes,
-        observe=observe,
-        write=write,
-    )
+    given = {"min_increase": 0.01, "partly_seen_starts": True, **config}
+    prior = Belief(jnp.zeros(2), jnp.full(2, jnp.sqrt(20.0)))
+    return make_mdp(Certain(num_modalities), Counting(prior, 3), num_pois, **given)
 
 
 def noisy_mdp(num_pois=3, max_steps=20):
     """Each look adds to a PoI's information a random number that only the look's key decides."""
-
-    def observe(key, classes, poi, modality):
-        return jax.random.uniform(key, (1,)), classes
-
-    def write(belief, seen, features, modality):
-        return Belief(features, 1.0 / (1.0 / belief.std + features))
-
-    return MapMdp(
-        config=MdpConfig(min_increase=0.0, max_steps=max_steps),
-        num_pois=num_pois,
-        num_classes=3,
-        num_modalities=2,
-        unseen=Belief(jnp.zeros(1), jnp.ones(1)),
-        new_scene=lambda key, classes: classes,
-        observe=observe,
-        write=write,
-    )
+    fusion = Adding(Belief(jnp.zeros(1), jnp.ones(1)), 3)
+    return make_mdp(Uniform(), fusion, num_pois, min_increase=0.0, max_steps=max_steps)
 
 
 def paying_once_mdp(num_pois=2, max_steps=20):
     """One modality; the first look at a PoI raises its information from .2 to 1, later ones fail.
 
-    The entry is N((0, 0), (3, 4)^2) before and N((1, 0), (.6, .8)^2) after, whatever the class.
+    The belief is N((0, 0), (3, 4)^2) before and N((1, 0), (.6, .8)^2) after, whatever the class.
     """
-    return MapMdp(
-        config=MdpConfig(max_steps=max_steps, partly_seen_starts=False),
-        num_pois=num_pois,
-        num_classes=1,
-        num_modalities=1,
-        unseen=Belief(jnp.zeros(2), jnp.array([3.0, 4.0])),
-        new_scene=lambda key, classes: classes,
-        observe=lambda key, classes, poi, modality: (jnp.ones(1), classes),
-        write=lambda belief, seen, features, modality: Belief(
-            jnp.array([1.0, 0.0]), jnp.array([0.6, 0.8])
-        ),
-    )
+    fusion = Once(Belief(jnp.zeros(2), jnp.array([3.0, 4.0])), 1)
+    return make_mdp(Certain(1), fusion, num_pois, max_steps=max_steps, partly_seen_starts=False)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from toys import classes_mdp, noisy_mdp
 
-from jaxsense.config import MdpConfig
-from jaxsense.core.types import Belief
-from jaxsense.dqn import belief_mdp
+from jaxsense.core.types import Belief, pytree
+from jaxsense.dqn import agents, map_mdp, rewards
+from jaxsense.dqn.rewards import Nats, Paper
 
 NOP = 3
 MDP = classes_mdp()
@@ -23,17 +23,17 @@ SEEN = jnp.array([[False, False], [True, False], [True, True]])
 
 @jax.jit
 def reset(key, classes, seen):
-    return belief_mdp.reset(key, MDP, classes, seen)
+    return map_mdp.reset(key, MDP, classes, seen)
 
 
 @jax.jit
 def camera_step(state, action):
-    return belief_mdp.step(jax.random.key(0), MDP, state, action, 0)
+    return map_mdp.step(jax.random.key(0), MDP, state, action, 0)
 
 
 @jax.jit
 def lidar_step(state, action):
-    return belief_mdp.step(jax.random.key(0), MDP, state, action, 1)
+    return map_mdp.step(jax.random.key(0), MDP, state, action, 1)
 
 
 def start(seen=SEEN):
@@ -43,15 +43,15 @@ def start(seen=SEEN):
 def test_information_is_the_inverse_norm_of_the_deviations():
     # 1 / sqrt(9 + 16) = .2 and 1 / sqrt(.36 + .64) = 1.
     np.testing.assert_allclose(
-        belief_mdp.information(jnp.array([[3.0, 4.0], [0.6, 0.8]])), [0.2, 1.0], rtol=1e-6
+        rewards.information(jnp.array([[3.0, 4.0], [0.6, 0.8]])), [0.2, 1.0], rtol=1e-6
     )
 
 
 def test_state_is_mean_and_deviation_of_one_poi_after_the_other():
     belief = Belief(jnp.array([[1.0, 2.0], [5.0, 6.0]]), jnp.array([[3.0, 4.0], [7.0, 8.0]]))
-    np.testing.assert_array_equal(belief_mdp.observation(belief), [1, 2, 3, 4, 5, 6, 7, 8])
+    np.testing.assert_array_equal(agents.observation(belief), [1, 2, 3, 4, 5, 6, 7, 8])
     with pytest.raises(AssertionError, match="belief"):
-        belief_mdp.observation(Belief(jnp.zeros(2), jnp.ones(2)))
+        agents.observation(Belief(jnp.zeros(2), jnp.ones(2)))
 
 
 def test_reset_writes_what_has_been_seen_and_nothing_else():
@@ -68,8 +68,8 @@ def test_reset_writes_what_has_been_seen_and_nothing_else():
 
 
 def test_reset_draws_no_start_that_is_given(monkeypatch):
-    monkeypatch.setattr(belief_mdp, "random_start", None)
-    state = belief_mdp.reset(jax.random.key(0), MDP, CLASSES, SEEN)
+    monkeypatch.setattr(map_mdp, "random_start", None)
+    state = map_mdp.reset(jax.random.key(0), MDP, CLASSES, SEEN)
     np.testing.assert_array_equal(state.seen, SEEN)
 
 
@@ -111,44 +111,52 @@ def test_a_second_look_with_the_same_sensor_costs_one(step):
 @pytest.mark.parametrize(("min_increase", "pays"), [(0.75, True), (0.85, False)])
 def test_a_gain_below_the_threshold_costs_one(min_increase, pays):
     mdp = classes_mdp(min_increase=min_increase)  # against a gain of 1 - .2 = .8
-    _, outcome = belief_mdp.step(jax.random.key(0), mdp, start(), jnp.int32(1), 1)
+    _, outcome = map_mdp.step(jax.random.key(0), mdp, start(), jnp.int32(1), 1)
     np.testing.assert_allclose(outcome.reward, 0.8 if pays else -1.0, rtol=1e-5)
 
 
 def test_no_gain_costs_one_even_without_a_threshold():
     mdp = classes_mdp(min_increase=0.0)
-    _, outcome = belief_mdp.step(jax.random.key(0), mdp, start(), jnp.int32(2), 1)
+    _, outcome = map_mdp.step(jax.random.key(0), mdp, start(), jnp.int32(2), 1)
     assert outcome.reward == -1.0
 
 
 def test_the_reward_of_the_paper_is_a_gain_above_the_threshold_or_minus_one():
-    config = MdpConfig(min_increase=0.25, look_cost=0.1)
     gains = jnp.array([[0.5, 0.26, 0.25], [0.1, 0.0, -2.0]])
     expected = [[0.5, 0.26, -1.0], [-1.0, -1.0, -1.0]]
-    np.testing.assert_allclose(belief_mdp.reward(gains, config), expected)
-    assert np.isnan(belief_mdp.reward(jnp.float32(jnp.nan), config))
+    np.testing.assert_allclose(Paper(0.25).of_gain(gains), expected)
+    assert np.isnan(Paper(0.25).of_gain(jnp.float32(jnp.nan)))
 
 
 def test_the_reward_in_nats_is_every_gain_less_the_cost_of_a_look():
-    config = MdpConfig(reward="nats", min_increase=0.25, look_cost=0.125)
     gains = jnp.array([0.5, 0.25, 0.0, -2.0])
-    np.testing.assert_array_equal(belief_mdp.reward(gains, config), [0.375, 0.125, -0.125, -2.125])
+    np.testing.assert_array_equal(Nats(0.125).of_gain(gains), [0.375, 0.125, -0.125, -2.125])
 
 
-def test_a_step_is_rewarded_by_the_information_of_its_mdp():
-    # An entry's mean is (class, last modality), and (0, 0) before; the LiDAR is modality 1.
-    base = classes_mdp(reward="nats", look_cost=0.5)
-    mdp = replace(base, information=lambda belief: 10 * belief.mean[0] + 2 * belief.mean[1])
+@pytree
+class OfMean:
+    """A user's own reward: 10 and 2 for the numbers of a belief's mean, and -.5 for a look."""
+
+    def information(self, belief, probabilities):
+        return 10 * belief.mean[0] + 2 * belief.mean[1]
+
+    def of_gain(self, gain):
+        return gain - 0.5
+
+
+def test_a_step_is_rewarded_by_the_reward_of_its_mdp():
+    # A belief's mean is (class, last modality), and (0, 0) before; the LiDAR is modality 1.
+    mdp = replace(classes_mdp(), reward=OfMean())
     # PoI 0 unseen, of class 0: 2 - 0. PoI 1 of class 1, seen by the camera: 12 - 10. Of PoI 2 in
     # class 2, seen by the LiDAR, no more is left.
     seen = jnp.array([[0, 0], [1, 0], [0, 1]], bool)
-    state = belief_mdp.reset(jax.random.key(0), mdp, CLASSES, seen)
+    state = map_mdp.reset(jax.random.key(0), mdp, CLASSES, seen)
     for action, expected in ((0, 1.5), (1, 1.5), (2, -0.5), (NOP, 0.0)):
-        _, outcome = belief_mdp.step(jax.random.key(0), mdp, state, jnp.int32(action), 1)
+        _, outcome = map_mdp.step(jax.random.key(0), mdp, state, jnp.int32(action), 1)
         assert outcome.reward == expected
 
 
-def test_a_look_changes_the_entry_and_the_seen_bit_of_its_poi_alone():
+def test_a_look_changes_the_belief_and_the_seen_bit_of_its_poi_alone():
     before = start(seen=jnp.zeros((3, 2), bool))
     for poi in range(3):
         after, _ = lidar_step(before, jnp.int32(poi))
@@ -174,13 +182,13 @@ def test_nop_gives_nothing_ends_the_episode_and_leaves_the_map():
 def test_an_episode_is_cut_after_max_steps():
     mdp, state, cut = classes_mdp(max_steps=3), start(), []
     for _ in range(3):
-        state, outcome = belief_mdp.step(jax.random.key(0), mdp, state, jnp.int32(0), 0)
+        state, outcome = map_mdp.step(jax.random.key(0), mdp, state, jnp.int32(0), 0)
         cut.append(bool(outcome.truncated))
         assert not outcome.terminated
     assert cut == [False, False, True]
     # An episode that NOP ends is not cut as well.
     late = replace(state, steps=jnp.int32(2))
-    _, outcome = belief_mdp.step(jax.random.key(0), mdp, late, jnp.int32(NOP), 0)
+    _, outcome = map_mdp.step(jax.random.key(0), mdp, late, jnp.int32(NOP), 0)
     assert outcome.terminated
     assert not outcome.truncated
 
@@ -201,14 +209,14 @@ ORDERS = jnp.array(list(itertools.permutations(range(3))))
 @pytest.mark.parametrize("mdp", [MDP, noisy_mdp()], ids=["classes", "noisy"])
 @pytest.mark.parametrize("modality", [0, 1])
 def test_permuting_pois_permutes_what_a_step_does(mdp, modality):
-    state = belief_mdp.reset(jax.random.key(0), mdp, jnp.array([2, 0, 1]), SEEN)
+    state = map_mdp.reset(jax.random.key(0), mdp, jnp.array([2, 0, 1]), SEEN)
 
     def both_ways(order, action):
         # PoI n of the permuted state is PoI order[n] of the other.
         action_there = jnp.append(order, NOP)[action]
         key = jax.random.key(1)
-        here, outcome = belief_mdp.step(key, mdp, permute(state, order), action, modality)
-        there, outcome_there = belief_mdp.step(key, mdp, state, action_there, modality)
+        here, outcome = map_mdp.step(key, mdp, permute(state, order), action, modality)
+        there, outcome_there = map_mdp.step(key, mdp, state, action_there, modality)
         return (here, outcome), (permute(there, order), outcome_there)
 
     pairs = jax.vmap(jax.vmap(both_ways, in_axes=(None, 0)), in_axes=(0, None))
@@ -231,7 +239,7 @@ def test_permuting_pois_permutes_what_a_reset_does():
 @pytest.fixture(scope="module")
 def many_starts():
     keys = jax.random.split(jax.random.key(0), 12_400)
-    classes, seen = jax.jit(jax.vmap(lambda key: belief_mdp.random_start(key, MDP)))(keys)
+    classes, seen = jax.jit(jax.vmap(lambda key: map_mdp.random_start(key, MDP)))(keys)
     return np.asarray(classes), np.asarray(seen)
 
 
@@ -259,7 +267,7 @@ def test_partly_seen_starts_are_uniform_over_all_but_all_and_nothing(many_starts
 def test_starts_may_hold_all_and_nothing_if_not_partly_seen():
     mdp = classes_mdp(num_pois=1, partly_seen_starts=False)
     keys = jax.random.split(jax.random.key(0), 1000)
-    _, seen = jax.vmap(lambda key: belief_mdp.random_start(key, mdp))(keys)
+    _, seen = jax.vmap(lambda key: map_mdp.random_start(key, mdp))(keys)
     counts = np.bincount(np.asarray(seen).reshape(-1, 2) @ [1, 2], minlength=4)
     # Two fair coins: 250 of each +- 4 sqrt(1000 x 3/16) = +- 55.
     np.testing.assert_allclose(counts, 250, atol=55)
@@ -275,15 +283,15 @@ def test_classes_and_looks_of_a_start_are_unrelated(many_starts):
 def test_three_modalities_need_nothing_new():
     mdp = classes_mdp(num_modalities=3)
     seen = jnp.array([[True, True, False], [False, False, True], [False, False, False]])
-    state = belief_mdp.reset(jax.random.key(0), mdp, CLASSES, seen)
-    _, outcome = belief_mdp.step(jax.random.key(0), mdp, state, jnp.int32(0), 2)
+    state = map_mdp.reset(jax.random.key(0), mdp, CLASSES, seen)
+    _, outcome = map_mdp.step(jax.random.key(0), mdp, state, jnp.int32(0), 2)
     np.testing.assert_allclose(outcome.reward, 2.0 - 1.0, rtol=1e-5)  # (.6, .8) to (.3, .4)
 
 
 def test_wrong_shapes_raise_errors_that_name_the_argument():
     with pytest.raises(AssertionError, match="classes"):
-        belief_mdp.reset(jax.random.key(0), MDP, classes=jnp.zeros(2, int))
+        map_mdp.reset(jax.random.key(0), MDP, classes=jnp.zeros(2, int))
     with pytest.raises(AssertionError, match="seen"):
-        belief_mdp.reset(jax.random.key(0), MDP, seen=jnp.zeros((2, 3), bool))
+        map_mdp.reset(jax.random.key(0), MDP, seen=jnp.zeros((2, 3), bool))
     with pytest.raises(AssertionError, match="action"):
-        belief_mdp.step(jax.random.key(0), MDP, start(), jnp.zeros(3, int), 0)
+        map_mdp.step(jax.random.key(0), MDP, start(), jnp.zeros(3, int), 0)
