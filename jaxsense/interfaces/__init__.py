@@ -1,7 +1,7 @@
-"""The map MDP and that of a team behind the interfaces of other libraries, one extra each.
+"""The map MDP and the team MDP behind the interfaces of other libraries, one extra each.
 
 Import `jaxsense.interfaces.gymnax`, `.rejax`, `.gymnasium`, `.stable_baselines3`, `.jaxmarl` or
-`.pettingzoo` by name; only that library needs to be installed.
+`.pettingzoo` by name; only that library must be installed.
 """
 
 from jaxsense.interfaces.common import prepared_starts as prepared_starts

@@ -1,6 +1,9 @@
-"""The part that all interfaces share: the map MDP of one agent."""
+"""What interfaces share: spaces, and the map MDP of one agent."""
+
+from typing import Any
 
 import jax
+import numpy as np
 
 from jaxsense.core import checks
 from jaxsense.core.types import Key
@@ -9,18 +12,37 @@ from jaxsense.dqn.map_mdp import MapMdp, MapState
 
 
 def check_modality(mdp: MapMdp, modality: int) -> None:
-    """Raises `ValueError` unless the MDP has a sensor of that index."""
+    """Checks that the MDP has a sensor.
+
+    Args:
+      mdp: the MDP.
+      modality: index of the sensor.
+
+    Raises:
+      ValueError: if there is no such sensor.
+    """
     checks.require_index("modality", modality, mdp.num_modalities)
 
 
-def num_actions(mdp: MapMdp) -> int:
-    """Number of actions: a look at each PoI, and NOP."""
-    return mdp.num_pois + 1
+def spaces_of(spaces: Any, size: int, num_pois: int) -> tuple[Any, Any]:
+    """Spaces of observations and of actions.
+
+    Args:
+      spaces: another library's module, with `Box` and `Discrete`.
+      size: numbers in an observation.
+      num_pois: N; there is an action for each PoI, and NOP.
+    """
+    return spaces.Box(-np.inf, np.inf, (size,), np.float32), spaces.Discrete(num_pois + 1)
 
 
-def observation_size(mdp: MapMdp) -> int:
-    """Numbers in an observation, `N * 2D`."""
-    return 2 * mdp.num_pois * mdp.fusion.prior.mean.size
+def map_spaces(spaces: Any, mdp: MapMdp) -> tuple[Any, Any]:
+    """Spaces of the map, `[N * 2D]`, and of the actions, see `spaces_of`.
+
+    Args:
+      spaces: another library's module, with `Box` and `Discrete`.
+      mdp: the MDP.
+    """
+    return spaces_of(spaces, 2 * mdp.num_pois * mdp.fusion.prior.mean.size, mdp.num_pois)
 
 
 def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
@@ -28,13 +50,18 @@ def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
 
     A start looks at everything it has seen, which costs several steps; a draw from a few thousand
     prepared ones costs nothing.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      number: of states.
+
+    Raises:
+      ValueError: if `number` is not positive.
     """
     checks.require_number("number", number)
-
-    def reset(key: Key) -> MapState:
-        return map_mdp.reset(key, mdp)
-
-    return jax.jit(lambda key: jax.vmap(reset)(jax.random.split(key, number)))(key)
+    reset = jax.vmap(map_mdp.reset, (0, None))
+    return jax.jit(lambda key, mdp: reset(jax.random.split(key, number), mdp))(key, mdp)
 
 
 def start(key: Key, mdp: MapMdp, starts: MapState | None) -> MapState:

@@ -28,7 +28,7 @@ class MapVectorEnv(VectorEnv):
     """Many environments of one agent, stepped side by side by one compiled program.
 
     An observation is the `[N * 2D]` map, see `dqn.observation`. Action n < N looks at PoI n; action
-    N is NOP and terminates the episode. All methods are those of Gymnasium.
+    N is NOP and terminates the episode. The methods are Gymnasium's.
     """
 
     def __init__(
@@ -37,12 +37,13 @@ class MapVectorEnv(VectorEnv):
         modality: int,
         num_envs: int,
         starts: MapState | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        # Quoted: where the site is built without Gymnasium, a stand-in has no `|`.
+        autoreset_mode: "AutoresetMode | str" = AutoresetMode.NEXT_STEP,
     ):
-        """Makes the environments; call `reset` before the first step.
+        """Makes the environments; `reset` must be called before the first step.
 
         Args:
-          mdp: the MDP, see `interfaces.map_mdp`.
+          mdp: the MDP, of one agent, see `jaxsense.make_mdp`.
           modality: index of the agent's own sensor.
           num_envs: how many environments, E.
           starts: `[S]` from `interfaces.prepared_starts`, to start each episode from a random one;
@@ -56,9 +57,7 @@ class MapVectorEnv(VectorEnv):
         checks.require_number("num_envs", num_envs)
         self.num_envs = num_envs
         self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
-        size = (common.observation_size(mdp),)
-        self.single_observation_space = spaces.Box(-np.inf, np.inf, size, np.float32)
-        self.single_action_space = spaces.Discrete(common.num_actions(mdp))
+        self.single_observation_space, self.single_action_space = common.map_spaces(spaces, mdp)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._states: MapState | None = None
@@ -78,15 +77,19 @@ class MapVectorEnv(VectorEnv):
 
         Returns:
           `[E, N * 2D]` float32 observations and an empty dictionary.
+
+        Raises:
+          ValueError: if `reset_mask` does not hold a boolean for each environment.
         """
         super().reset(seed=seed)
         if seed is not None or self._states is None:
             self._key = jax.random.key(int(self.np_random.integers(2**32)))
-        mask = (options or {}).get("reset_mask")
-        if mask is None:
-            self._states, mask = None, np.ones(self.num_envs, bool)
-        elif np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != bool:
-            raise ValueError(f"reset_mask = {mask!r}: must be an array of {self.num_envs} booleans")
+        given = (options or {}).get("reset_mask")
+        mask = np.ones(self.num_envs, bool) if given is None else np.asarray(given)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(f"reset_mask = {given!r}: must hold {self.num_envs} booleans")
+        if given is None:
+            self._states = None
         return self._restarted(mask), {}
 
     def step(

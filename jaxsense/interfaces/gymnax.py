@@ -49,14 +49,14 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     """The map MDP of one agent.
 
     An observation is the `[N * 2D]` map, see `dqn.observation`. Action n < N looks at PoI n; action
-    N is NOP and terminates the episode. All methods are those of gymnax.
+    N is NOP and terminates the episode. The methods are gymnax's.
     """
 
     def __init__(self, mdp: MapMdp, modality: int):
         """Makes the environment.
 
         Args:
-          mdp: the MDP, see `interfaces.map_mdp`.
+          mdp: the MDP, of one agent, see `jaxsense.make_mdp`.
           modality: index of the agent's own sensor.
 
         Raises:
@@ -72,12 +72,22 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         return MapEnvParams(max_steps_in_episode=self.mdp.config.max_steps)
 
     def prepared_params(self, key: Key, number: int) -> MapEnvParams:
-        """Default parameters with `number` prepared starts, which make training far faster."""
+        """Default parameters with prepared starts, which make training far faster.
+
+        Args:
+          key: random key.
+          number: of starts.
+        """
         starts = common.prepared_starts(key, self.mdp, number)
         return self.default_params.replace(starts=starts)  # pyright: ignore
 
     def reset_env(self, key: Key, params: MapEnvParams) -> tuple[jax.Array, MapEnvState]:
-        """Starts an episode."""
+        """Starts an episode.
+
+        Args:
+          key: random key.
+          params: of the environment.
+        """
         start = common.start(key, self.mdp, params.starts)
         state = MapEnvState(time=start.steps, map=start, terminated=jnp.bool_(False))  # pyright: ignore
         return self.observe(key, state, None, params), state
@@ -85,26 +95,55 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     def step_env(
         self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams
     ) -> tuple[jax.Array, MapEnvState, jax.Array, jax.Array, dict[Any, Any]]:
-        """Takes one action, without a reset."""
-        action = jnp.asarray(action, jnp.int32)
-        after, outcome = map_mdp.step(key, self.mdp, state.map, action, self.modality)
+        """Takes one action, without a reset.
+
+        Args:
+          key: random key.
+          state: the current state.
+          action: `[]` integer, a PoI or N for NOP.
+          params: of the environment.
+
+        Returns:
+          Observation, state, reward, whether NOP has ended the episode, and info.
+
+        Raises:
+          ValueError: if the action is no integer, or does not exist and is not traced.
+        """
+        after, outcome = map_mdp.step(key, self.mdp, state.map, jnp.asarray(action), self.modality)
         state = MapEnvState(time=after.steps, map=after, terminated=outcome.terminated)  # pyright: ignore
         info = {"discount": self.discount(state, params)}
         observation = self.observe(key, state, action, params)
         return observation, state, outcome.reward, outcome.terminated, info
 
     def observe(self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams) -> jax.Array:
-        """The map, `[N * 2D]`."""
+        """The map, `[N * 2D]`.
+
+        Args:
+          key: not used.
+          state: the current state.
+          action: not used.
+          params: not used.
+        """
         del key, action, params
         return observation(state.map.belief)
 
     def is_terminated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
-        """Whether the last action was NOP, `[]` bool."""
+        """Whether the last action was NOP, `[]` bool.
+
+        Args:
+          state: the current state.
+          params: not used.
+        """
         del params
         return state.terminated
 
     def is_truncated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
-        """Whether the episode reached its limit without NOP, `[]` bool."""
+        """Whether the episode reached its limit without NOP, `[]` bool.
+
+        Args:
+          state: the current state.
+          params: of the environment.
+        """
         return ~state.terminated & (state.time >= params.max_steps_in_episode)
 
     @property
@@ -115,14 +154,14 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     @property
     def num_actions(self) -> int:
         """Number of actions: a look at each PoI, and NOP."""
-        return common.num_actions(self.mdp)
+        return self.mdp.num_pois + 1
 
     def action_space(self, params: MapEnvParams | None = None) -> spaces.Discrete:
         """Space of the actions: a look at each PoI, and NOP."""
         del params
-        return spaces.Discrete(self.num_actions)
+        return common.map_spaces(spaces, self.mdp)[1]
 
     def observation_space(self, params: MapEnvParams | None = None) -> spaces.Box:
         """Space of the map."""
         del params
-        return spaces.Box(-jnp.inf, jnp.inf, (common.observation_size(self.mdp),), jnp.float32)
+        return common.map_spaces(spaces, self.mdp)[0]

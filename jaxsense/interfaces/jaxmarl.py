@@ -1,4 +1,4 @@
-"""The MDP of a team as an environment of jaxmarl 0.2: `pip install 'jaxsense[jaxmarl]'`."""
+"""The team MDP as an environment of jaxmarl 0.2: `pip install 'jaxsense[jaxmarl]'`."""
 
 import functools
 from typing import Any
@@ -31,16 +31,16 @@ class TeamEnvState(multi_agent_env.State):
 
 
 class TeamEnv(multi_agent_env.MultiAgentEnv):
-    """The MDP of a team: each robot of `Config.robots` is an agent of its name.
+    """The team MDP: each robot of `Config.robots` is an agent of its name.
 
-    Robots take turns, see `jaxsense.interfaces.team`. All methods are those of jaxmarl.
+    Robots take turns, see `jaxsense.interfaces.team`. The methods are jaxmarl's.
     """
 
     def __init__(self, mdp: TeamMdp, config: Config):
         """Makes the environment.
 
         Args:
-          mdp: the MDP, see `interfaces.team_mdp`.
+          mdp: the MDP, of a team, see `jaxsense.make_mdp`.
           config: the settings, which name the robots.
 
         Raises:
@@ -51,11 +51,9 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         self.mdp = mdp
         self.config = config
         self.agents = list(config.robot_names)
-        size = (team.observation_size(mdp),)
-        self.observation_spaces = {
-            agent: spaces.Box(-jnp.inf, jnp.inf, size, jnp.float32) for agent in self.agents
-        }
-        self.action_spaces = {agent: spaces.Discrete(mdp.map.num_pois + 1) for agent in self.agents}
+        observation, action = team.team_spaces(spaces, mdp)
+        self.observation_spaces = dict.fromkeys(self.agents, observation)
+        self.action_spaces = dict.fromkeys(self.agents, action)
 
     @functools.partial(jax.jit, static_argnums=0)
     def reset(self, key: Key) -> tuple[dict[str, jax.Array], TeamEnvState]:
@@ -75,10 +73,18 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
     ]:
         """Takes one step, without a reset.
 
+        Args:
+          key: random key.
+          state: the current state.
+          actions: of all robots; only that of the robot whose turn it is counts.
+
         Returns:
-          Observations, state, rewards, dones and infos. A robot is done when its part is over;
-          `__all__` is whether the episode is over. `seconds`, `[R]` and the same for all, are those
-          that passed.
+          Observations, state, rewards, dones and infos. A robot is done after NOP, and all are at
+          the limit; `__all__` is whether the episode is over. `seconds`, `[R]` and the same for
+          all, are those that passed.
+
+        Raises:
+          ValueError: if an action is no integer, or does not exist and is not traced.
         """
         chosen = jnp.stack([jnp.asarray(actions[agent]) for agent in self.agents])
         after, outcome = team.step(key, self.mdp, state.team, chosen)

@@ -1,4 +1,4 @@
-"""The MDP of a team as a `ParallelEnv` of PettingZoo: `pip install 'jaxsense[pettingzoo]'`."""
+"""The team MDP as environments of PettingZoo: `pip install 'jaxsense[pettingzoo]'`."""
 
 import functools
 from typing import Any
@@ -15,20 +15,19 @@ from jaxsense.interfaces.team import TeamOutcome
 
 with extra("pettingzoo"):
     from gymnasium import error, spaces  # pyright: ignore[reportMissingImports]
-    from pettingzoo import ParallelEnv  # pyright: ignore[reportMissingImports]
+    from pettingzoo import AECEnv, ParallelEnv  # pyright: ignore[reportMissingImports]
+
+Infos = dict[str, dict[str, Any]]
 
 
-class TeamParallelEnv(ParallelEnv):
-    """The MDP of a team: each robot of `Config.robots` is an agent of its name.
-
-    Robots take turns, see `jaxsense.interfaces.team`. All methods are those of PettingZoo.
-    """
+class _Team:
+    """An episode of a team, one robot at a time, with what both environments share."""
 
     def __init__(self, mdp: TeamMdp, config: Config):
-        """Makes the environment; call `reset` before the first step.
+        """Makes the environment; `reset` must be called before the first step.
 
         Args:
-          mdp: the MDP, see `interfaces.team_mdp`.
+          mdp: the MDP of a team, see `jaxsense.make_mdp`.
           config: the settings, which name the robots.
 
         Raises:
@@ -39,30 +38,131 @@ class TeamParallelEnv(ParallelEnv):
         self.render_mode = None
         self.possible_agents = list(config.robot_names)
         self.agents: list[str] = []
-        size = (team.observation_size(mdp),)
-        self.observation_spaces = {
-            agent: spaces.Box(-np.inf, np.inf, size, np.float32) for agent in self.possible_agents
-        }
-        self.action_spaces = {
-            agent: spaces.Discrete(mdp.map.num_pois + 1) for agent in self.possible_agents
-        }
-        self._nop = mdp.map.num_pois
+        observation, action = team.team_spaces(spaces, mdp)
+        self.observation_spaces = dict.fromkeys(self.possible_agents, observation)
+        self.action_spaces = dict.fromkeys(self.possible_agents, action)
         self._state: TeamState | None = None
         self._key: Key | None = None
         self._start = jax.jit(functools.partial(_start, mdp, config))
         self._step = jax.jit(functools.partial(_step, mdp))
 
-    def observation_space(self, agent: str) -> spaces.Box:
+    def observation_space(self, agent: str) -> Any:
         """Space of what a robot knows, `[F * N]`."""
-        return self.observation_spaces[agent]  # pyright: ignore
+        return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> spaces.Discrete:
+    def action_space(self, agent: str) -> Any:
         """Space of a robot's actions: each PoI, and NOP."""
-        return self.action_spaces[agent]  # pyright: ignore
+        return self.action_spaces[agent]
+
+    def _begin(self, seed: int | None) -> tuple[dict[str, np.ndarray], Infos]:
+        """Starts an episode; observations and infos of all robots."""
+        if seed is not None or self._key is None:
+            (word,) = np.random.SeedSequence(seed).generate_state(1)
+            self._key = jax.random.key(int(word))
+        self._key, self._state, observations, available = self._start(self._key)
+        self.agents = list(self.possible_agents)
+        return self._named(observations), self._infos(0.0, available)
+
+    def _advance(
+        self, action: int
+    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+        """Takes the action of the robot whose turn it is; results by the names of `agents`."""
+        chosen = np.full(len(self.possible_agents), action, np.int32)
+        self._key, self._state, observations, outcome, available = self._step(
+            self._key, self._state, chosen
+        )
+        return (
+            self._named(observations),
+            self._named(outcome.rewards, float),
+            self._named(outcome.terminated, bool),
+            self._named(outcome.truncated, bool),
+            self._infos(float(outcome.seconds), available),
+        )
+
+    def _turn(self) -> str:
+        """The robot that chooses; raises `ResetNeeded` if there is none."""
+        if self._state is None or not self.agents:
+            raise error.ResetNeeded("step before reset, or after the end of an episode")
+        return self.possible_agents[int(self._state.agent)]
+
+    def _checked(self, agent: str, name: str, action: Any) -> int:
+        """An integer of any library; raises `ValueError` if it is no action of the robot."""
+        if not self.action_space(agent).contains(np.asarray(action)):
+            raise ValueError(f"{name} = {action!r}: must be in {self.action_space(agent)}")
+        return int(action)
+
+    def _named(self, of_robots: jax.Array, kind: Any = np.array) -> dict[str, Any]:
+        """`[R, ...]` by the names of the robots that work."""
+        of_each = dict(zip(self.possible_agents, np.asarray(of_robots), strict=True))
+        return {agent: kind(of_each[agent]) for agent in self.agents}
+
+    def _infos(self, seconds: float, available: jax.Array) -> Infos:
+        return {
+            agent: {"seconds": seconds, "action_mask": mask.astype(np.int8)}
+            for agent, mask in self._named(available).items()
+        }
+
+
+class TeamAECEnv(_Team, AECEnv):
+    """The team MDP, in which agents take turns: each robot of `Config.robots` is an agent.
+
+    `agent_selection` is the robot that chooses; it earns the reward of its look before its next
+    turn. The methods are PettingZoo's. `seconds` in the infos are those that the last action took,
+    and `action_mask`, `[N + 1]` int8, is 1 for the actions that the robot has.
+    """
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Starts an episode.
+
+        Args:
+          seed: of all random numbers from here on; by default they continue.
+          options: ignored.
+        """
+        del options
+        self._observations, self.infos = self._begin(seed)
+        self.rewards = dict.fromkeys(self.agents, 0.0)
+        self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
+        self.terminations = dict.fromkeys(self.agents, False)
+        self.truncations = dict.fromkeys(self.agents, False)
+        self._skip_agent_selection = None
+        self.agent_selection = self._turn()
+
+    def observe(self, agent: str) -> np.ndarray:
+        """What a robot knows, `[F * N]` float32."""
+        return self._observations[agent].copy()
+
+    def step(self, action: Any) -> None:
+        """Takes the action of `agent_selection`.
+
+        Args:
+          action: an integer; None for a robot that is done, which then leaves `agents`.
+
+        Raises:
+          ResetNeeded: before the first reset, or if the episode has ended.
+          ValueError: if there is no such action.
+        """
+        self._turn()
+        agent = self.agent_selection
+        if self.terminations[agent] or self.truncations[agent]:
+            self._was_dead_step(action)
+            return
+        result = self._advance(self._checked(agent, "action", action))
+        self._observations, self.rewards, self.terminations, self.truncations, self.infos = result
+        self._cumulative_rewards[agent] = 0.0
+        self._accumulate_rewards()
+        self.agent_selection = self._turn()
+        self._deads_step_first()
+
+
+class TeamParallelEnv(_Team, ParallelEnv):
+    """The team MDP for libraries that step all agents together: see `TeamAECEnv`.
+
+    In each step only the action of the robot whose turn it is counts. The methods are PettingZoo's.
+    """
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+    ) -> tuple[dict[str, np.ndarray], Infos]:
         """Starts an episode.
 
         Args:
@@ -73,22 +173,11 @@ class TeamParallelEnv(ParallelEnv):
           For each robot `[F * N]` float32, and infos as in `step`.
         """
         del options
-        if seed is not None or self._key is None:
-            (word,) = np.random.SeedSequence(seed).generate_state(1)
-            self._key = jax.random.key(int(word))
-        self._key, self._state, observations, available = self._start(self._key)
-        self.agents = list(self.possible_agents)
-        return self._named(observations), self._infos(0.0, available)
+        return self._begin(seed)
 
     def step(
         self, actions: dict[str, Any]
-    ) -> tuple[
-        dict[str, np.ndarray],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, Any]],
-    ]:
+    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
         """Takes one step.
 
         Args:
@@ -96,55 +185,25 @@ class TeamParallelEnv(ParallelEnv):
 
         Returns:
           Observations, rewards, terminations, truncations and infos of all robots that worked
-          before. `seconds` in the infos are those that passed, and `action_mask`, `[N + 1]` int8,
-          is 1 for the actions that the robot has: only NOP if it is not its turn.
+          before. The infos are those of `TeamAECEnv`, whose masks allow only NOP to a robot that
+          does not choose.
 
         Raises:
           ResetNeeded: before the first reset, or if the episode has ended.
           ValueError: if there is no such action, or that of the robot whose turn it is is missing.
         """
-        if self._state is None or not self.agents:
-            raise error.ResetNeeded("step before reset, or after the end of an episode")
-        self._key, self._state, observations, outcome, available = self._step(
-            self._key, self._state, self._chosen(actions)
-        )
-        terminations = self._named(outcome.terminated, bool)
-        truncations = self._named(outcome.truncated, bool)
-        result = (
-            self._named(observations),
-            self._named(outcome.rewards, float),
-            terminations,
-            truncations,
-            self._infos(float(outcome.seconds), available),
-        )
-        self.agents = [a for a in self.agents if not (terminations[a] or truncations[a])]
-        return result
-
-    def _chosen(self, actions: dict[str, Any]) -> np.ndarray:
-        """`[R]` int32 actions; raises what `step` raises about them."""
-        turn = self.possible_agents[int(self._state.agent)]  # pyright: ignore
+        turn = self._turn()
         if turn not in actions:
             raise ValueError(f"actions of {sorted(actions)}: must have one of {turn!r}")
-        chosen = np.full(len(self.possible_agents), self._nop, np.int32)
-        for i, agent in enumerate(self.possible_agents):
-            if agent in actions and agent in self.agents:
-                space = self.action_space(agent)
-                if not space.contains(actions[agent]):
-                    raise ValueError(f"actions[{agent!r}] = {actions[agent]!r}: must be in {space}")
-                chosen[i] = actions[agent]
-        return chosen
-
-    def _named(self, of_robots: jax.Array, kind: Any = np.array) -> dict[str, Any]:
-        """`[R, ...]` by the names of the robots that work."""
-        of_each = dict(zip(self.possible_agents, np.asarray(of_robots), strict=True))
-        return {agent: kind(of_each[agent]) for agent in self.agents}
-
-    def _infos(self, seconds: float, available: jax.Array) -> dict[str, dict[str, Any]]:
-        masks = self._named(available)
-        return {
-            agent: {"seconds": seconds, "action_mask": mask.astype(np.int8)}
-            for agent, mask in masks.items()
+        chosen = {
+            agent: self._checked(agent, f"actions[{agent!r}]", action)
+            for agent, action in actions.items()
+            if agent in self.agents
         }
+        result = self._advance(chosen[turn])
+        _, _, terminations, truncations, _ = result
+        self.agents = [a for a in self.agents if not (terminations[a] or truncations[a])]
+        return result
 
 
 def _start(mdp: TeamMdp, config: Config, key: Key) -> tuple[Key, TeamState, jax.Array, jax.Array]:

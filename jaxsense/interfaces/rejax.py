@@ -24,7 +24,17 @@ class MapEnv(gymnax.MapEnv):
         action: Any,
         params: gymnax.MapEnvParams | None = None,
     ) -> tuple[jax.Array, gymnax.MapEnvState, jax.Array, jax.Array, dict[Any, Any]]:
-        """Returns observation, state, reward, whether the episode has ended, and info."""
+        """Takes one action, and restarts an episode that has ended.
+
+        Args:
+          key: random key.
+          state: the current state.
+          action: `[]` integer, a PoI or N for NOP.
+          params: of the environment; the default ones by default.
+
+        Returns:
+          Observation, state, reward, whether the episode has ended, and info.
+        """
         result = super().step(key, state, action, params)
         observation, state, reward, terminated, truncated, info = result
         return observation, state, reward, terminated | truncated, info

@@ -17,9 +17,9 @@ with extra("sb3"):
 class MapVecEnv(VecEnv):
     """A vector environment of Gymnasium in the form that Stable-Baselines3 takes.
 
-    `MapVecEnv(MapVectorEnv(mdp, modality, num_envs, autoreset_mode="SameStep"))`. All methods are
-    those of Stable-Baselines3. The environments are one program: attributes and methods apply to
-    all, whatever the indices.
+    `MapVecEnv(MapVectorEnv(mdp, modality, num_envs, autoreset_mode="SameStep"))`. The methods are
+    Stable-Baselines3's. The environments are one program: attributes and methods apply to all,
+    whatever the indices.
     """
 
     def __init__(self, env: VectorEnv):
@@ -63,18 +63,41 @@ class MapVecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Returns the shared attribute once for each index."""
+        """Returns the shared attribute once for each index.
+
+        Args:
+          attr_name: its name.
+          indices: of environments; all by default.
+        """
         return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Sets the shared attribute."""
+        """Sets the shared attribute.
+
+        Args:
+          attr_name: its name.
+          value: its value.
+          indices: not used.
+        """
         setattr(self.env, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **more: Any) -> list:
-        """Calls the shared method and returns its result once for each index."""
+        """Calls the shared method and returns its result once for each index.
+
+        Args:
+          method_name: its name.
+          *args: its arguments.
+          indices: of environments; all by default.
+          **more: its arguments by name.
+        """
         result = getattr(self.env, method_name)(*args, **more)
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """Returns False for each index: no environment has its own wrapper."""
+        """Returns False for each index: no environment has its own wrapper.
+
+        Args:
+          wrapper_class: not used.
+          indices: of environments; all by default.
+        """
         return [False for _ in self._get_indices(indices)]

@@ -83,10 +83,9 @@ def values(params):
 @pytest.fixture(scope="module")
 def probe():
     """Two seeds of the probe."""
-    train = jax.jit(
-        jax.vmap(lambda key: training.train(key, learning_in(MDP, PROBE), PROBE)),
-        compiler_options=FAST_TO_COMPILE,
-    )
+    learning = learning_in(MDP, PROBE)
+    train = jax.vmap(lambda key: training.train(key, learning, PROBE))
+    train = jax.jit(train, compiler_options=FAST_TO_COMPILE)
     return train(jax.random.split(jax.random.key(0), 2))
 
 
@@ -169,9 +168,7 @@ def train_small_once(key):
 
 @pytest.fixture(scope="module")
 def train_small():
-    return jax.jit(
-        lambda key: training.train(key, LEARNING, SMALL), compiler_options=FAST_TO_COMPILE
-    )
+    return jax.jit(train_small_once, compiler_options=FAST_TO_COMPILE)
 
 
 def test_training_in_one_call_equals_chunks_with_the_same_keys(chunks, train_small):

@@ -16,7 +16,9 @@ MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
 
 def scripted(*actions):
     """A policy that takes the given actions one after the other."""
-    return lambda seen: lambda key, known: jnp.array(actions)[jnp.sum(known.looks) - np.sum(seen)]
+    return lambda seen: (
+        lambda key, known: jnp.array(actions)[jnp.sum(known.looks) - int(np.sum(seen))]
+    )
 
 
 def always(act):

@@ -1,24 +1,59 @@
 """The values of looks by dynamic programming, against enumeration and against play."""
 
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxsense.dqn.belief_mdp import MapMdp
+from flax import struct
+from toys import known_of, policy
 
 from jaxsense.config import MdpConfig
-from jaxsense.core.types import Belief
-from jaxsense.dqn import belief_mdp, episodes, optimum, policies
-from jaxsense.vae import filtering
+from jaxsense.core.types import Belief, pytree
+from jaxsense.dqn import episodes, optimum, rewards
+from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn.optimum import LookValues
+from jaxsense.dqn.rewards import Reward
 
 KEY = jax.random.key(0)
 HORIZON = 3
 NUM_CLASSES = (1, 2, 3, 4, 6, 15)
 interpolate = jax.jit(jax.vmap(optimum.interpolate, in_axes=(None, 0)))
-solve = jax.jit(optimum.solve, static_argnames=("information", "horizon"))
+PRIOR = Belief(jnp.zeros(3), jnp.full(3, 2.0))
+
+
+@pytree
+class Of:
+    """The reward of settings, for another information of class probabilities.
+
+    The prior, whose standard deviation is 2, may have information of its own.
+    """
+
+    information_of: Callable = struct.field(pytree_node=False)
+    rule: Reward
+    of_prior: jax.Array | None = None
+
+    def information(self, belief, probabilities):
+        known = self.information_of(probabilities)
+        if self.of_prior is None:
+            return known
+        return jnp.where(belief.std[0] == 2, self.of_prior, known)
+
+    def of_gain(self, gain):
+        return self.rule.of_gain(gain)
+
+
+def certain(probabilities):
+    return Belief(jnp.log(probabilities), jnp.ones(len(probabilities)))
+
+
+@functools.partial(jax.jit, static_argnames="horizon")
+def solve(likelihoods, reward, config, horizon):
+    return optimum.value_iteration(likelihoods, reward, certain, PRIOR, config, horizon)
 
 
 @pytest.mark.parametrize("number", NUM_CLASSES)
@@ -71,7 +106,7 @@ def entropy(weights):
 REWARDS = {
     "nats": (
         lambda weights: -entropy(weights),
-        lambda weights: -filtering.entropy(weights),
+        lambda weights: -rewards.entropy(weights),
         MdpConfig(reward="nats", look_cost=0.02),
     ),
     "paper": (
@@ -116,20 +151,21 @@ def enumerated(name, weights, horizon):
 @pytest.mark.parametrize("name", REWARDS)
 def test_values_are_those_of_all_histories(name, number):
     _, information, config = REWARDS[name]
+    reward = Of(information, rewards.make(config))
     likelihoods = jnp.log(jnp.array(LOOKS[number]))
     starts = jnp.array(STARTS[number], jnp.float32)
     by_horizon = []
     for horizon in (1, 2, HORIZON):
-        found = solve(likelihoods, information, config, horizon)
+        found = solve(likelihoods, reward, config, horizon)
         gain = [enumerated(name, weights, 1) for weights in STARTS[number]]
         total = [enumerated(name, weights, horizon) for weights in STARTS[number]]
-        np.testing.assert_allclose(interpolate(found.gain, starts), gain, atol=1e-5)
+        np.testing.assert_allclose(interpolate(found.one_step, starts), gain, atol=1e-5)
         # A step of the lattice apart, a slope that changes by 1 where looks begin to pay is read
         # wrongly by a quarter of the step.
         error = 0.25 / optimum.steps_of_lattice(number) if horizon > 1 else 1e-5
-        np.testing.assert_allclose(interpolate(found.total, starts), total, atol=error)
+        np.testing.assert_allclose(interpolate(found.q, starts), total, atol=error)
         # The first start is that of equal probabilities.
-        first = [found.first_gain, found.first_total]
+        first = [found.one_step_unseen, found.q_unseen]
         np.testing.assert_allclose(first, [gain[0], total[0]], atol=error)
         by_horizon.append(total[0])
     # Later looks pay.
@@ -138,22 +174,23 @@ def test_values_are_those_of_all_histories(name, number):
 
 def test_an_episode_of_few_steps_has_as_few_looks():
     _, information, config = REWARDS["nats"]
+    reward = Of(information, rewards.make(config))
     likelihoods = jnp.log(jnp.array(LOOKS[3]))
     shorter = replace(config, max_steps=2)
-    found = solve(likelihoods, information, shorter, HORIZON)
+    found = solve(likelihoods, reward, shorter, HORIZON)
     for horizon, is_same in ((2, True), (HORIZON, False)):
-        other = solve(likelihoods, information, config, horizon)
-        assert np.allclose(found.total, other.total, atol=1e-6) == is_same
-        assert np.allclose(found.first_total, other.first_total, atol=1e-6) == is_same
+        other = solve(likelihoods, reward, config, horizon)
+        assert np.allclose(found.q, other.q, atol=1e-6) == is_same
+        assert np.allclose(found.q_unseen, other.q_unseen, atol=1e-6) == is_same
 
 
 def test_a_look_that_is_certain_pays_once():
     # It shows the class: ln 2 from one half each, and then no more than it costs.
     likelihoods = jnp.array([[[0.0, -200.0]], [[-200.0, 0.0]]])
     config = MdpConfig(reward="nats", look_cost=0.1)
-    found = solve(likelihoods, lambda w: -filtering.entropy(w), config, 5)
+    found = solve(likelihoods, rewards.make(config), config, 5)
     weights = jnp.array([[0.5, 0.5], [1.0, 0.0], [0.0, 1.0]])
-    for table in (found.gain, found.total):
+    for table in (found.one_step, found.q):
         # In none of the last two can the look of the other class happen.
         np.testing.assert_allclose(
             interpolate(table, weights), [math.log(2) - 0.1, -0.1, -0.1], atol=1e-6
@@ -173,40 +210,49 @@ CALIBRATED = jnp.log(
 )
 
 
-def weights_of(belief):
-    """Class probabilities of an entry whose mean holds their logarithms."""
-    return jax.nn.softmax(belief.mean)
+@pytree
+class Calibrated:
+    """A look shows how likely each class makes one of four that its class is equally likely to be.
 
-
-def exact_mdp(information, config, unseen):
-    """Two PoIs, whose entries are their classes' logarithmic probabilities by exact Bayes.
-
-    An entry that was written has a standard deviation of 1. One that was not has 2, and the
-    information `unseen`.
+    A scene is the PoIs' classes.
     """
 
-    def information_of(belief):
-        return jnp.where(belief.std[0] == 2, unseen, information(weights_of(belief)))
+    num_modalities = 1
 
-    def observe(key, classes, poi, modality):
-        return CALIBRATED[classes[poi], jax.random.randint(key, (), 0, 4)], classes
+    def scene(self, key, classes):
+        return classes
 
-    return MapMdp(
-        config=config,
-        num_pois=2,
-        num_classes=3,
-        num_modalities=1,
-        unseen=Belief(jnp.zeros(3), jnp.full(3, 2.0)),
-        new_scene=lambda key, classes: classes,
-        observe=observe,
-        write=lambda belief, seen, features, modality: Belief(belief.mean + features, jnp.ones(3)),
-        information=information_of,
-    )
+    def observe(self, key, scene, poi, modality):
+        return CALIBRATED[scene[poi], jax.random.randint(key, (), 0, 4)], scene
+
+
+@pytree
+class Exact:
+    """Beliefs whose means are the classes' logarithmic probabilities by exact Bayes.
+
+    A belief after a look has a standard deviation of 1.
+    """
+
+    prior = PRIOR
+    classes = Belief(jnp.zeros((3, 3)), jnp.ones((3, 3)))
+
+    def update(self, belief, seen, features, modality):
+        return Belief(belief.mean + features, jnp.ones(3))
+
+    def class_probabilities(self, belief):
+        return jax.nn.softmax(belief.mean)
+
+
+class Told:
+    """Exact Bayes."""
+
+    def log_likelihoods(self, features, modality):
+        return features
 
 
 @pytest.fixture(scope="module")
 def played():
-    """Values of two unseen PoIs by the tables, and returns by both policies that read them.
+    """Values of two unseen PoIs by the tables, and returns of the policies that read them.
 
     The information is the negative entropy, or a convex function of the likeliest class.
     """
@@ -214,22 +260,23 @@ def played():
     @jax.jit
     def play(keys, is_convex, cost, unseen):
         def information(weights):
-            return jnp.where(is_convex, jnp.max(weights) ** 8, -filtering.entropy(weights))
+            return jnp.where(is_convex, jnp.max(weights) ** 8, -rewards.entropy(weights))
 
         config = MdpConfig(reward="nats", look_cost=cost, max_steps=200, partly_seen_starts=False)
-        mdp = exact_mdp(information, config, unseen)
-        found = optimum.solve(CALIBRATED, information, config, 100, unseen=unseen)
+        reward = Of(information, rewards.make(config), unseen)
+        mdp = MapMdp(Calibrated(), Exact(), reward, config, 2)
+        found = optimum.value_iteration(CALIBRATED, reward, certain, PRIOR, config, 100)
+        models = {"look_values": (found,), "fusion": Exact()}
 
         def returns(key):
             start_key, play_key = jax.random.split(key)
-            start = belief_mdp.reset(start_key, mdp, seen=jnp.zeros((2, 1), bool))
-            compared = (
-                policies.by_posterior(found.total, found.first_total, weights_of),
-                policies.by_posterior(found.gain, found.first_gain, weights_of),
-            )
-            return [episodes.run_episode(play_key, mdp, each, start, 0)[0] for each in compared]
+            start = episodes.reset(start_key, mdp, Told(), seen=jnp.zeros((2, 1), bool))
+            return [
+                episodes.run_episode(play_key, mdp, Told(), policy(name, **models), start, 0)[0]
+                for name in ("optimal", "bayes", "greedy")
+            ]
 
-        return (found.first_total, found.first_gain), jax.vmap(returns)(keys)
+        return (found.q_unseen, found.one_step_unseen), jax.vmap(returns)(keys)
 
     return play
 
@@ -248,9 +295,11 @@ def played():
 )
 def test_the_policy_by_the_table_returns_the_tables_value(played, is_convex, cost, unseen):
     number = 4000
-    (total, gain), (optimal, short_sighted) = played(
+    (total, gain), (optimal, short_sighted, on_map) = played(
         jax.random.split(KEY, number), is_convex, cost, unseen
     )
+    # This map holds the exact posterior.
+    np.testing.assert_allclose(on_map, short_sighted, atol=1e-4)
     # Four standard errors of the mean; each of the two PoIs is worth the table's value.
     error = 4 * optimal.std() / np.sqrt(number)
     np.testing.assert_allclose(optimal.mean(), 2 * total, atol=error)
@@ -263,24 +312,26 @@ def test_the_policy_by_the_table_returns_the_tables_value(played, is_convex, cos
 
 
 def test_the_policy_takes_the_look_of_the_highest_value_or_else_nop():
-    mdp = exact_mdp(jnp.max, MdpConfig(partly_seen_starts=False), unseen=0.0)
     table = jnp.array(optimum.lattice(3)[:, 0]) - 0.5
-    act = jax.jit(policies.by_posterior(table, jnp.float32(0.15), weights_of))
-    seen = jnp.ones((2, 1), bool)
-    state = jax.jit(lambda: belief_mdp.reset(KEY, mdp, jnp.array([0, 1]), seen))()
+    values = LookValues(table, table, jnp.float32(0.15), jnp.float32(0.15))
+    act = jax.jit(policy("optimal", look_values=(values,)))
     for first_classes, action in (((0.6, 0.7), 1), ((0.8, 0.7), 0), ((0.4, 0.49), 2)):
-        means = jnp.log(jnp.array([[p, (1 - p) / 2, (1 - p) / 2] for p in first_classes]))
-        belief = replace(state.belief, mean=means)
-        assert act(KEY, replace(state, belief=belief)) == action
+        posterior = np.log([[p, (1 - p) / 2, (1 - p) / 2] for p in first_classes])
+        assert act(KEY, known_of(posterior, np.ones((2, 1)))) == action
     # The first look at PoI 1 has a value of .15, and one at PoI 0 of .1 or .2.
-    seen = jnp.array([[True], [False]])
     for known, action in (((0.6, 0.2, 0.2), 1), ((0.7, 0.15, 0.15), 0)):
-        belief = replace(state.belief, mean=jnp.log(jnp.array([known, (1.0, 0.0, 0.0)])))
-        assert act(KEY, replace(state, belief=belief, seen=seen)) == action
+        posterior = np.log([known, (1 / 3, 1 / 3, 1 / 3)])
+        assert act(KEY, known_of(posterior, [[1], [0]])) == action
 
 
 LIKELIHOODS = np.zeros((3, 2, 3), np.float32)
 ONE_NAN = np.where(np.arange(18).reshape(3, 2, 3) == 8, np.float32(np.nan), LIKELIHOODS)
+
+
+def solve_now(likelihoods, horizon):
+    config = MdpConfig()
+    reward = rewards.make(config)
+    return optimum.value_iteration(likelihoods, reward, certain, PRIOR, config, horizon)
 
 
 @pytest.mark.parametrize(
@@ -295,7 +346,7 @@ ONE_NAN = np.where(np.arange(18).reshape(3, 2, 3) == 8, np.float32(np.nan), LIKE
 )
 def test_what_has_no_values_is_named(likelihoods, horizon, error, expected):
     with pytest.raises(error, match=expected):
-        optimum.solve(likelihoods, jnp.max, MdpConfig(), horizon)
+        solve_now(likelihoods, horizon)
 
 
 def test_sizes_that_no_lattice_has_are_named():

@@ -6,32 +6,42 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import classes_mdp, paying_once_mdp
+from toys import Certain, Ignorant, Toy, classes_mdp, known_of, paying_once_mdp, policy
 
 from jaxsense.config import DqnConfig
-from jaxsense.core.types import Belief
-from jaxsense.dqn import belief_mdp, episodes, policies, training
+from jaxsense.core.types import Belief, pytree
+from jaxsense.dqn import episodes, map_mdp, training
+from jaxsense.dqn.agents import MapAgent
+from jaxsense.dqn.optimum import LookValues
 
 MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
 FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
 
 
 def start(mdp=MDP):
-    return belief_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.zeros((3, 2), bool))
+    return map_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.zeros((3, 2), bool))
 
 
 @pytest.mark.parametrize("action", [-1, NOP + 1])
 def test_an_action_that_is_none_pays_nan(action):
     # Traced, it cannot be refused; known before, it is.
-    step = jax.jit(lambda action: belief_mdp.step(KEY, MDP, start(), action, 0)[1])
+    step = jax.jit(lambda action: map_mdp.step(KEY, MDP, start(), action, 0)[1])
     outcome = step(jnp.int32(action))
     assert np.isnan(outcome.reward)
     assert not outcome.terminated
 
 
+@pytree
+class Lost(Toy):
+    """A fusion that fails."""
+
+    def update(self, belief, seen, features, modality):
+        return Belief(jnp.zeros(2), jnp.full(2, jnp.nan))
+
+
 def test_a_belief_that_is_not_a_number_pays_nan_and_not_a_look_in_vain():
-    mdp = replace(MDP, write=lambda *look: Belief(jnp.zeros(2), jnp.full(2, jnp.nan)))
-    step = jax.jit(lambda state, action: belief_mdp.step(KEY, mdp, state, action, 0))
+    mdp = replace(MDP, fusion=Lost(MDP.fusion.prior, 3))
+    step = jax.jit(lambda state, action: map_mdp.step(KEY, mdp, state, action, 0))
     after, outcome = step(start(), jnp.int32(0))
     assert np.isnan(outcome.reward)
     # Nothing is looked at: nothing is wrong.
@@ -40,23 +50,34 @@ def test_a_belief_that_is_not_a_number_pays_nan_and_not_a_look_in_vain():
 
 @pytest.mark.parametrize("worst", [0, 2, 3])
 def test_values_that_are_not_numbers_choose_no_action_and_total_nan(worst):
-    params = policies.q_network(MDP.num_pois, (4,)).init(KEY, jnp.zeros(12))["params"]
+    agent = MapAgent(0.5, 3, 2, (4,))
+    params = agent.init(KEY)["params"]
     bias = jnp.array([0.0, 1.0, 2.0, 9.0]).at[worst].set(jnp.nan)
-    greedy = policies.greedy(
-        MDP, {"params": {**params, "Dense_1": {**params["Dense_1"], "bias": bias}}}, (4,)
-    )
-    assert greedy(KEY, start()) == -1
-    total, first = episodes.run_episode(KEY, MDP, greedy, start(), 0)
+    layers = {"params": {**params, "Dense_1": {**params["Dense_1"], "bias": bias}}}
+    latent = policy("latent", agent=agent, q_networks=(layers,) * 2, tours=None, fusion=MDP.fusion)
+    told = []
+
+    def act(key, known):
+        action = latent(key, known)
+        jax.debug.callback(told.append, action)
+        return action
+
+    begun = episodes.reset(KEY, MDP, Ignorant())
+    total, first = episodes.run_episode(KEY, MDP, Ignorant(), act, begun, 0)
     assert np.isnan(total)
     assert np.isnan(first)
+    jax.effects_barrier()
+    assert set(map(int, told)) == {-1}
 
 
 def test_rewards_that_are_not_numbers_choose_no_action():
-    labels = jnp.array([[1, 0, 0], [0, 0, 1]])
-    rewards = jnp.ones((4, 3)).at[2, 1].set(jnp.nan)  # of class 1, after the LiDAR
-    state = replace(start(), seen=jnp.zeros((3, 2), bool).at[1, 1].set(True))
-    act = jax.jit(lambda rewards: policies.optimal(MDP, rewards, labels)(KEY, state))
-    assert act(rewards) == -1
+    nothing = jnp.zeros(3)
+    values = LookValues(nothing, jnp.array([1.0, jnp.nan, 1.0]), jnp.float32(1), jnp.float32(1))
+    act = policy("optimal", look_values=(values,))
+    certain = jnp.log(jnp.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]))
+    assert act(KEY, known_of(certain, jnp.ones((3, 1)))) == -1
+    # The value of a first look is another one, and finite.
+    assert act(KEY, known_of(certain, jnp.zeros((3, 1)))) == 0
 
 
 CONFIG = DqnConfig(
@@ -71,23 +92,39 @@ CONFIG = DqnConfig(
     epsilon_min=1.0,
 )
 
-# A look gains what the scene holds.
-SCENE_MDP = replace(
-    paying_once_mdp(),
-    new_scene=lambda key, classes: jnp.float32(1.0),
-    observe=lambda key, scene, poi, modality: (scene[None], scene),
-    write=lambda belief, seen, features, modality: Belief(belief.mean, jnp.full(2, 1.0) * features),
-)
+
+@pytree
+class Shown(Certain):
+    """A look shows the number that is the scene."""
+
+    def scene(self, key, classes):
+        return jnp.float32(1.0)
+
+    def observe(self, key, scene, poi, modality):
+        return scene[None], scene
+
+
+@pytree
+class Wide(Toy):
+    """A look leaves as much doubt as it shows."""
+
+    def update(self, belief, seen, features, modality):
+        return Belief(belief.mean, jnp.full(2, 1.0) * features)
+
+
+PAYING = paying_once_mdp()
+SCENE_MDP = replace(PAYING, looks=Shown(1), fusion=Wide(PAYING.fusion.prior, 1))
+SCENE = MapAgent(CONFIG.discount, 2, 2, CONFIG.hidden).environment(SCENE_MDP, 0)
 
 
 @pytest.fixture(scope="module")
 def chunk():
     """Two epochs of exploration, and where they start."""
-    prepared = training.starts(KEY, SCENE_MDP, CONFIG)
-    state = training.init(KEY, SCENE_MDP, CONFIG, prepared)
+    prepared = training.starts(KEY, SCENE, CONFIG)
+    state = training.init(KEY, SCENE, CONFIG, prepared)
 
     def run(state, prepared):
-        return training.train_chunk(KEY, SCENE_MDP, 0, CONFIG, state, prepared)
+        return training.train_chunk(KEY, SCENE, CONFIG, state, prepared)
 
     return jax.jit(run, compiler_options=FAST_TO_COMPILE), state, prepared
 

@@ -8,7 +8,7 @@ import pytest
 from jaxsense.dqn import rules
 from jaxsense.dqn.team_mdp import Team
 
-RULES = (rules.nearest, rules.auction, rules.rollout)
+RULES = (rules.nearest, rules.auction, rules.gain_rate)
 
 
 def team(num_robots, num_pois=3, target=None, works=None, present=None):
@@ -62,8 +62,8 @@ def test_nearest(times, gains, target, expected):
         ([4, 2, 8], [-0.8, 0.0, -0.8], 3, 3),
     ],
 )
-def test_rollout(times, gains, target, expected):
-    found = choice(rules.rollout, [gains, ALIKE[1]], [times, [1, 1, 1]], target=[3, target])
+def test_gain_rate(times, gains, target, expected):
+    found = choice(rules.gain_rate, [gains, ALIKE[1]], [times, [1, 1, 1]], target=[3, target])
     assert found == expected
 
 
@@ -72,7 +72,7 @@ def test_values_of_rules_as_worked_by_hand():
     one = team(1)
     found = rules.nearest(gains, times, one, jnp.int32(0))
     np.testing.assert_allclose(found, [996, 998, -1, 0])
-    found = rules.rollout(gains, times, one, jnp.int32(0))
+    found = rules.gain_rate(gains, times, one, jnp.int32(0))
     np.testing.assert_allclose(found, [0.2, 0.15, -1, 0], rtol=1e-6)
     # The auction's PoI is worth 1000 more than in `nearest`.
     found = rules.auction(gains, times, one, jnp.int32(0))
@@ -109,7 +109,7 @@ def test_who_has_nothing_to_learn_or_has_ended_does_not_bid():
 
 
 def test_what_a_robot_that_has_ended_headed_for_is_free():
-    for rule in (rules.nearest, rules.rollout):
+    for rule in (rules.nearest, rules.gain_rate):
         times = [[2, 4, 9], [1, 1, 1]]
         assert choice(rule, ALIKE, times, target=[3, 0]) == 1
         assert choice(rule, ALIKE, times, target=[3, 0], works=[True, False]) == 0

@@ -197,10 +197,9 @@ Q = np.array(
 
 
 def test_a_robot_alone_learns_the_values_worked_by_hand():
-    train = jax.jit(
-        lambda key: training.train(key, learning_in(ALONE, PROBE), PROBE),
-        compiler_options=FAST_TO_COMPILE,
-    )
+    learning = learning_in(ALONE, PROBE)
+    train = lambda key: training.train(key, learning, PROBE)  # noqa: E731
+    train = jax.jit(train, compiler_options=FAST_TO_COMPILE)
     state, info = train(jax.random.key(0))
     assert np.all(info.is_finite)
 
