@@ -1,18 +1,20 @@
-"""Recorded scans through a trained run: detect, encode, fuse, and read the map.
+"""Recorded scans through a trained run: detect, fuse, and read the map.
 
     python -m jaxsense.train --preset smoke --out runs/smoke
+    python examples/recorded_scans.py runs/smoke recorded.npz --simulate
     python examples/recorded_scans.py runs/smoke recorded.npz
 
-A run with sensors of your own needs `--trust` at the end, for their functions are imported.
+The second line writes a recording of simulated looks at a PoI of each class, the third reads it.
+Yours can come from anywhere. It holds for C PoIs
 
-Where there is no such file yet, looks at a PoI of each class are simulated and written to it. Yours
-can come from anywhere. It holds for C PoIs
-
-    places      [C, 2]       where they stand, in metres
+    places      [C, 2]       their positions, in metres
     NAME_poses  [C, 3]       from where the sensor NAME looked: x, y in metres and yaw in radians
     NAME_scans  [C, B, ...]  what all its B rays read
+
+A run with sensors of your own needs `--trust`, for their functions are imported.
 """
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -24,41 +26,32 @@ import jaxsense
 from jaxsense import sim, vae
 
 
-def main(run: Path, recording: Path, trust: bool = False) -> None:
-    """Reads the run and the recording, and tells what the map makes of it."""
-    config, models = jaxsense.load(run, trust)
-    if not recording.exists():
-        np.savez(recording, **simulate(config))
-    recorded = np.load(recording)
-
-    sensors, model = sim.sensors.make(config), jaxsense.make_jmvae(config)
+def read(config: jaxsense.Config, models: jaxsense.Models, recorded: dict[str, np.ndarray]) -> None:
+    """Prints what the map makes of a recording."""
+    fusion, sensors = models.fusion, sim.sensors.make(config)
     for n, place in enumerate(recorded["places"]):
         print(f"PoI {n + 1}")
-        entry = vae.unseen(model, config.mdp.unseen_variance)
-        seen = np.zeros(len(sensors), bool)
+        belief, seen = fusion.prior, np.zeros(len(sensors), bool)
         for m, sensor in enumerate(sensors):
             # The part of the scan around the PoI, and what the detector makes of it.
             bearing = sim.bearing(recorded[f"{sensor.name}_poses"][n], place)
             window = sim.cut_out(sensor, recorded[f"{sensor.name}_scans"][n], bearing)
             features = vae.detect(models.detectors[m], window)
 
-            # What it tells alone, and together with what the others have written before.
-            look = tuple(features if i == m else None for i in range(len(sensors)))
-            mean, log_var = vae.encode(models.jmvae, model, look)
-            std = jnp.exp(0.5 * log_var)
-            entry = vae.fuse(models.jmvae, model, entry, seen, look)
+            # What it says alone, and with the looks of other sensors before it.
+            alone = fusion.together({m: features})
+            belief = fusion.update(belief, seen, features, m)
             seen[m] = True
 
             told = zip(config.labels(sensor.name), features, strict=True)
             print(f"  {sensor.name}:", ", ".join(f"{label} {share:.2f}" for label, share in told))
-            print(f"    alone:   mean {np.asarray(mean)}, sigma {np.asarray(std)}")
-            print(f"    in map:  mean {np.asarray(entry.mean)}, sigma {np.asarray(entry.std)}")
-        nearest = vae.nearest_class(entry, models.class_beliefs.mean)
-        print(f"  The map says: {config.arena.classes[nearest]}")
+            print(f"    alone:   mean {np.asarray(alone.mean)}, sigma {np.asarray(alone.std)}")
+            print(f"    in map:  mean {np.asarray(belief.mean)}, sigma {np.asarray(belief.std)}")
+        print(f"  The map says: {config.arena.classes[fusion.most_likely_class(belief)]}")
 
 
 def simulate(config: jaxsense.Config) -> dict[str, np.ndarray]:
-    """What a recording of one PoI of each class would hold."""
+    """Simulates a recording of one PoI of each class."""
     world = sim.make_world(config)
 
     @jax.jit
@@ -72,9 +65,16 @@ def simulate(config: jaxsense.Config) -> dict[str, np.ndarray]:
             look_key, noise_key = jax.random.split(keys[robot])
             _, scene = sim.look(look_key, world, scene, robot, jnp.int32(0))  # goes there
             data = sim.place(world.arena, scene.layout, scene.poses)
-            at = world.arena, data, scene.layout, scene.light, robot
-            rays = jnp.array(sensor.directions)
-            found[f"{sensor.name}_scans"] = sim.scan(noise_key, sensor, *at, rays)
+            found[f"{sensor.name}_scans"] = sim.scan(
+                noise_key,
+                sensor,
+                world.arena,
+                data,
+                scene.layout,
+                scene.light,
+                robot,
+                directions=jnp.array(sensor.directions),
+            )
             found[f"{sensor.name}_poses"] = scene.poses[robot]
         return found
 
@@ -83,6 +83,28 @@ def simulate(config: jaxsense.Config) -> dict[str, np.ndarray]:
     return {name: np.asarray(values) for name, values in found.items()}
 
 
-if __name__ == "__main__":
+def main(argv: list[str] | None = None) -> None:
+    """Runs the program."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, help="directory of a run")
+    parser.add_argument("recording", type=Path, help="file of NumPy's format .npz")
+    parser.add_argument("--simulate", action="store_true", help="write a new recording, and stop")
+    parser.add_argument("--trust", action="store_true", help="import the run's own sensors")
+    arguments = parser.parse_args(argv)
     np.set_printoptions(precision=2, suppress=True)
-    main(Path(sys.argv[1]), Path(sys.argv[2]), trust="--trust" in sys.argv[3:])
+    try:
+        config, models = jaxsense.load(arguments.run, arguments.trust)
+        if arguments.simulate:
+            found = simulate(config)
+            # Opened here, so that NumPy appends no ending; "x": never over another file.
+            with arguments.recording.open("xb") as file:
+                np.savez(file, **found)
+            return
+        with np.load(arguments.recording, allow_pickle=False) as recorded:
+            read(config, models, dict(recorded))
+    except (OSError, ValueError, KeyError) as error:
+        sys.exit(f"recorded_scans: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,19 +1,25 @@
 """The examples, as a user runs them; small, for most of their time is spent compiling."""
 
+import dataclasses
 import importlib.util
 import json
+import re
+import runpy
 import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxsense.stages import learn
 
 import jaxsense
-from jaxsense import evaluate, sim, stages, train
+from jaxsense import Belief, evaluate, sim, train
 from jaxsense.config import PRESETS
+from jaxsense.core.types import pytree
 from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.training import learn, stages
+from jaxsense.vae import InPlace
 
 SMALL = ("--preset", "smoke", "--mission.episodes", "1")
 THERMAL = (
@@ -90,19 +96,125 @@ def test_the_thermal_camera_tells_what_is_hot(learned):
     assert thermal[3] < 0.7 * min(thermal[:3])
 
 
-def test_recorded_scans(example, runs, tmp_path, capsys):
-    main, recording = example("recorded_scans").main, tmp_path / "recorded.npz"
-    main(runs / "thermal", recording, trust=True)
+@pytest.fixture
+def recorded_scans(example, runs):
+    """Runs the example on the run, as from the command line."""
+    main = example("recorded_scans").main
+    return lambda *argv: main([str(runs / "thermal"), *map(str, argv), "--trust"])
+
+
+def test_recorded_scans(recorded_scans, tmp_path, capsys):
+    recording = tmp_path / "recorded"  # without an ending
+    recorded_scans(recording, "--simulate")
+    assert capsys.readouterr().out == ""
+    assert [*tmp_path.iterdir()] == [recording]
+    recorded_scans(recording)
     told = capsys.readouterr().out
     recorded = np.load(recording)
     assert recorded["lidar_scans"].shape == (4, 683)
     assert recorded["thermal_scans"].shape == (4, 64)
     assert told.count("The map says:") == 4
     assert told.rstrip().endswith("The map says: red cube hot")
-    # Now the file is there, and is read.
-    np.savez(recording, **{**recorded, "thermal_scans": np.full((4, 64), 60.0)})
-    main(runs / "thermal", recording, trust=True)
+    # Another recording says something else.
+    changed = {**recorded, "thermal_scans": np.full((4, 64), 60.0)}
+    np.savez(tmp_path / "hot.npz", **changed)
+    recorded_scans(tmp_path / "hot.npz")
     assert capsys.readouterr().out.count("thermal: cold 0.00, hot 1.00") == 4
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_recorded_scans_neither_invents_nor_replaces_a_recording(
+    recorded_scans, tmp_path, is_there, capsys
+):
+    recording = tmp_path / "recorded.npz"
+    if is_there:
+        recording.write_bytes(b"precious")
+    with pytest.raises(SystemExit, match=r"^recorded_scans: .*recorded\.npz") as stop:
+        recorded_scans(recording, *["--simulate"] * is_there)
+    assert "\n" not in str(stop.value)
+    assert capsys.readouterr().out == ""
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"precious"] * is_there
+
+
+def test_recorded_scans_names_missing_arguments(example, capsys):
+    with pytest.raises(SystemExit) as stop:
+        example("recorded_scans").main(["runs/smoke"])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.splitlines()[-1].endswith("arguments are required: recording")
+
+
+@pytree
+class Latest(InPlace):
+    """Remembers only the modality of the last look."""
+
+    def update(self, belief, seen, features, modality):
+        return Belief(jnp.full_like(belief.mean, modality + 5.5), belief.std)
+
+
+def test_recorded_scans_uses_the_fusion_of_the_run(recorded_scans, tmp_path, monkeypatch, capsys):
+    recorded_scans(tmp_path / "recorded.npz", "--simulate")
+    load = jaxsense.load
+
+    def with_another(run, trust):
+        config, models = load(run, trust)
+        parts = {p.name: getattr(models.fusion, p.name) for p in dataclasses.fields(InPlace)}
+        return config, dataclasses.replace(models, fusion=Latest(**parts))
+
+    monkeypatch.setattr(jaxsense, "load", with_another)
+    recorded_scans(tmp_path / "recorded.npz")
+    told = re.findall(r"in map: +mean \[(\S+)", capsys.readouterr().out)
+    assert told == ["5.5", "6.5"] * 4
+
+
+def test_own_values_take_at_most_forty_lines():
+    for name in ("new_fusion", "new_policy", "new_reward"):
+        assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= 40
+
+
+def printed(name, capsys):
+    """What an example prints."""
+    runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+    return capsys.readouterr().out
+
+
+def test_new_fusion(capsys):
+    told = printed("new_fusion", capsys)
+    norms = [
+        np.linalg.norm(np.fromstring(sigma, sep=" "))
+        for sigma in re.findall(r"sigma \[(.*?)\] after", told)
+    ]
+    # Each look makes the product narrower.
+    assert len(norms) == 3
+    assert norms[0] > norms[1] > norms[2]
+    assert "looks in a mission" in told
+
+
+def test_a_product_of_experts_is_the_fusion_of_the_mdp(example):
+    config = PRESETS["smoke"]
+    models = example("new_fusion").multiplying(jaxsense.init(jax.random.key(0), config))
+    mdp = jaxsense.make_mdp(config, models)
+    prior, features = mdp.fusion.prior, jnp.array([0.25, 0.75])
+    once = mdp.fusion.update(prior, np.zeros(2, bool), features, 0)
+    alone = mdp.fusion.together({0: features})
+    # The first look is what it says alone: 1/prior + 1/alone - 1/prior.
+    np.testing.assert_allclose(once.std, alone.std, rtol=1e-4)
+    np.testing.assert_allclose(once.mean, alone.mean, rtol=1e-3, atol=1e-5)
+    twice = mdp.fusion.update(once, np.ones(2, bool), features, 0)
+    np.testing.assert_allclose(twice.std**-2, 2 * alone.std**-2 - prior.std**-2, rtol=1e-4)
+
+
+def test_new_policy(capsys):
+    told = printed("new_policy", capsys)
+    assert re.search(r"map MDP: total reward -?\d+\.\d\d, of the first look -?\d+\.\d\d", told)
+    # Untrained detectors say nothing: both look at PoIs that nobody knows yet.
+    assert re.search(r"mission: the robots head for PoIs \[[0-3] [0-3]\]", told)
+
+
+def test_new_reward(capsys):
+    told = printed("new_reward", capsys)
+    first, last, epochs = re.findall(r"-?\d+\.\d{3}|\d+ epochs", told)
+    assert float(last) > float(first)
+    assert epochs == f"{PRESETS['smoke'].dqn.epochs} epochs"
 
 
 def test_a_run_whose_sensor_cannot_be_imported_is_named(runs, capsys, monkeypatch):

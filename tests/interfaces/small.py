@@ -5,14 +5,16 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxsense.observe import Bank
 
 from jaxsense.config import MODALITIES, PRESETS, Config, JmvaeConfig, TeamConfig
-from jaxsense.dqn import belief_mdp, episodes, policies
+from jaxsense.core.types import Samples
+from jaxsense.dqn import episodes, map_mdp, policies, rewards
+from jaxsense.dqn.map_mdp import MapMdp, MapState
+from jaxsense.dqn.optimum import value_iteration
 from jaxsense.dqn.team_mdp import TeamMdp
-from jaxsense.interfaces import map_mdp, team_mdp
-from jaxsense.models import Models, init, make_jmvae
-from jaxsense.vae import jmvae
+from jaxsense.looks import Bank, make_mdp
+from jaxsense.models import Models, init, make_in_place, make_jmvae
+from jaxsense.vae import jmvae, readout
 
 CONFIG = dataclasses.replace(
     PRESETS["smoke"], jmvae=JmvaeConfig(hidden=(32, 32), restarts=1, steps=3000, batch=64)
@@ -20,6 +22,7 @@ CONFIG = dataclasses.replace(
 # A price of time that is a sum of powers of 2, and the lonely episodes that no interface may have.
 TEAM = dataclasses.replace(
     CONFIG,
+    dqn=dataclasses.replace(CONFIG.dqn, task="team", observe="bank"),
     robots=("camera", "camera", "lidar"),
     team=TeamConfig(num_pois=(1, 4), robots_each=1, alone=1.0, second_cost=0.125, max_steps=12),
 )
@@ -31,7 +34,7 @@ ONLY_CAMERAS = dataclasses.replace(
 )
 
 
-def noisy_bank(key: jax.Array, config: Config, samples: int = 256) -> Bank:
+def noisy_bank(key: jax.Array, config: Config, samples: int = 256) -> Samples:
     """Detections that give the true label a probability of .98 to 1."""
     features = []
     for k, name in zip(
@@ -45,55 +48,67 @@ def noisy_bank(key: jax.Array, config: Config, samples: int = 256) -> Bank:
 
 
 @functools.cache
-def trained() -> tuple[Models, Bank]:
-    """Models of which the JMVAE is trained, and its bank."""
+def trained() -> tuple[Models, Samples]:
+    """Models of which the JMVAE is trained, and their detections."""
     models = init(jax.random.key(0), CONFIG)
     bank, model, settings = noisy_bank(jax.random.key(1), CONFIG), make_jmvae(CONFIG), CONFIG.jmvae
-    state = jmvae.start(models.jmvae, settings)
-    train = jax.jit(lambda key, state: jmvae.train(key, state, model, bank, settings, 3000)[0])
-    state = train(jax.random.key(2), state)
-    return dataclasses.replace(models, jmvae=state.params), bank
+    train = jax.jit(lambda key, params: jmvae.train(key, params, model, bank, settings)[0])
+    params = train(jax.random.key(2), models.jmvae)
+    joint = jax.vmap(jax.vmap(lambda *x: jmvae.posterior(params, model, x)))
+    classes = jax.tree.map(lambda x: x.mean(axis=1), joint(*bank))
+    fusion = make_in_place(CONFIG, params, classes)
+    return dataclasses.replace(models, jmvae=params, fusion=fusion), bank
 
 
 @functools.cache
-def small_mdp() -> belief_mdp.MapMdp:
+def small_mdp() -> MapMdp:
     """The MDP."""
     models, bank = trained()
-    return map_mdp(CONFIG, models, bank)
+    return make_mdp(CONFIG, models, Bank(bank)).map
 
 
 @functools.cache
 def team() -> TeamMdp:
     """The MDP of a team, with an untrained JMVAE."""
-    models = init(jax.random.key(0), TEAM)
-    return team_mdp(TEAM, models, noisy_bank(jax.random.key(1), TEAM))
+    mdp = make_mdp(TEAM, init(jax.random.key(0), TEAM), Bank(noisy_bank(jax.random.key(1), TEAM)))
+    assert isinstance(mdp, TeamMdp)
+    return mdp
 
 
 @functools.cache
-def noiseless() -> tuple[belief_mdp.MapMdp, belief_mdp.MapState]:
+def noiseless() -> tuple[MapMdp, MapState]:
     """The MDP where every look at a class sees the same, and `[1]` start of all episodes."""
     models, bank = trained()
-    mdp = map_mdp(CONFIG, models, tuple(features[:, :1] for features in bank))
+    mdp = make_mdp(CONFIG, models, Bank(tuple(features[:, :1] for features in bank))).map
     classes, seen = jnp.array([2, 0, 1]), jnp.array([[0, 0], [0, 1], [1, 0]], bool)
-    start = jax.jit(lambda key: belief_mdp.reset(key, mdp, classes, seen))(jax.random.key(5))
+    start = jax.jit(lambda key: map_mdp.reset(key, mdp, classes, seen))(jax.random.key(5))
     return mdp, jax.tree.map(lambda x: x[None], start)
 
 
-def returns(policy: policies.Policy, number: int = 256) -> jax.Array:
+def returns(act, number: int = 256) -> jax.Array:
     """`[number]` total rewards of the camera's agent, from random starts."""
-    mdp = small_mdp()
+    mdp, exact = small_mdp(), trained()[0].bayes
 
     def play(key):
         start_key, play_key = jax.random.split(key)
-        start = belief_mdp.reset(start_key, mdp)
-        return episodes.run_episode(play_key, mdp, policy, start, 0)[0]
+        start = episodes.reset(start_key, mdp, exact)
+        return episodes.run_episode(play_key, mdp, exact, act, start, 0)[0]
 
     return jax.jit(jax.vmap(play))(jax.random.split(jax.random.key(3), number))
 
 
 def optimal_return() -> float:
-    """The mean of the optimal policy's."""
-    mdp = small_mdp()
-    labels = [CONFIG.arena.label_of_class(MODALITIES[m]) for m in CONFIG.modalities]
-    table = jax.jit(lambda key: policies.expected_rewards(key, mdp, 0, 256))(jax.random.key(4))
-    return float(returns(policies.optimal(mdp, table, jnp.array(labels))).mean())
+    """The mean of the optimal policy's, by dynamic programming on the exact posterior."""
+    mdp, (models, bank) = small_mdp(), trained()
+    likelihoods = jax.vmap(jax.vmap(lambda x: models.bayes.log_likelihoods(x, 0)))(bank[0])
+    values = value_iteration(
+        likelihoods,
+        rewards.make(CONFIG.mdp),
+        lambda weights: readout.mixture(mdp.fusion.classes, weights),
+        mdp.fusion.prior,
+        CONFIG.mdp,
+        horizon=4,
+    )
+    knowing = dataclasses.replace(models, look_values=(values,))
+    optimal = policies.POLICIES["optimal"].values
+    return float(returns(lambda key, known: policies.best(optimal(key, knowing, known))).mean())

@@ -12,7 +12,7 @@ import gymnasium
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import map_mdp, observation
 from jaxsense.interfaces import prepared_starts
 from jaxsense.interfaces.gymnasium import MapVectorEnv
 
@@ -33,7 +33,7 @@ class OneEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Discrete(4)
 
     def observation(self):
-        return np.asarray(belief_mdp.observation(self.state.belief))
+        return np.asarray(observation(self.state.belief))
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -55,9 +55,9 @@ def test_every_step_equals_the_mdps(starts):
     key, start_key = jax.random.split(jax.random.key(int(seed)))
     rows = [int(jax.random.randint(k, (), 0, 16)) for k in jax.random.split(start_key, 4)]
     states = jax.tree.map(lambda x: x[np.array(rows)], starts)
-    step = jax.jit(jax.vmap(lambda k, s, a: belief_mdp.step(k, mdp, s, a, LIDAR)))
+    step = jax.jit(jax.vmap(lambda k, s, a: map_mdp.step(k, mdp, s, a, LIDAR)))
     for actions in ([0, 1, 2, 0], [1, 1, 0, 2], [2, 0, NOP, NOP]):
-        expected = jax.vmap(belief_mdp.observation)(states.belief)
+        expected = jax.vmap(observation)(states.belief)
         np.testing.assert_allclose(observations, expected, rtol=1e-6)
         observations, rewards, terminations, truncations, _ = env.step(np.array(actions))
         key, step_key = jax.random.split(key)
@@ -88,7 +88,7 @@ def assert_same(ours, theirs):
 def test_ends_are_followed_by_starts_as_in_gymnasiums_own(mode):
     mdp, start = small.noiseless()
     one = jax.tree.map(lambda x: x[0], start)
-    step = jax.jit(lambda k, s, a: belief_mdp.step(k, mdp, s, a, LIDAR))
+    step = jax.jit(lambda k, s, a: map_mdp.step(k, mdp, s, a, LIDAR))
     theirs = SyncVectorEnv([lambda: OneEnv(mdp, one, step)] * 3, autoreset_mode=mode)
     ours = MapVectorEnv(mdp, LIDAR, 3, start, mode)
     assert ours.metadata["autoreset_mode"] is theirs.metadata["autoreset_mode"]
@@ -120,8 +120,19 @@ def test_without_autoreset_only_the_masked_environments_start_again(starts):
     assert (after[1] == observations[1]).all()
     assert (after[[0, 2]] != observations[[0, 2]]).any(axis=1).all()
     assert not env.step(np.zeros(3, int))[2].any()
-    with pytest.raises(ValueError, match=r"reset_mask = .*must be an array of 3 booleans"):
+    with pytest.raises(ValueError, match=r"reset_mask = .*must hold 3 booleans"):
         env.reset(options={"reset_mask": np.ones(2, bool)})
+    with pytest.raises(ValueError, match=r"reset_mask = \[1, 0, 1\]: must hold 3 booleans"):
+        env.reset(options={"reset_mask": [1, 0, 1]})
+
+
+def test_a_mask_may_be_a_list(starts):
+    env = MapVectorEnv(small.small_mdp(), LIDAR, 3, starts, "Disabled")
+    env.reset(seed=0)
+    before = env.step(np.array([NOP, 0, NOP]))[0]
+    after, _ = env.reset(options={"reset_mask": [True, False, True]})
+    assert list((after != before).any(axis=1)) == [True, False, True]
+    assert not env.step(np.zeros(3, int))[2].any()
 
 
 def test_seeds_repeat_and_differ(starts):

@@ -11,9 +11,9 @@ pytest.importorskip("gymnax", reason="needs the extra jaxsense[gymnax]")
 from gymnax.wrappers import purerl
 from gymnax.wrappers.gym import GymnaxToGymWrapper
 
-from jaxsense.dqn import belief_mdp
-from jaxsense.interfaces import map_mdp
+from jaxsense.dqn import map_mdp, observation
 from jaxsense.interfaces.gymnax import MapEnv
+from jaxsense.looks import make_mdp
 from jaxsense.models import init
 
 LIDAR = 1
@@ -31,17 +31,17 @@ def assert_trees_equal(actual, expected):
 def test_every_step_equals_the_mdps(env):
     params = env.default_params
     obs, state = env.reset(jax.random.key(0), params)
-    expected = jax.jit(lambda key: belief_mdp.reset(key, env.mdp))(jax.random.key(0))
-    mdp_step = jax.jit(lambda k, s, a: belief_mdp.step(k, env.mdp, s, a, LIDAR))
+    expected = jax.jit(lambda key: map_mdp.reset(key, env.mdp))(jax.random.key(0))
+    mdp_step = jax.jit(lambda k, s, a: map_mdp.step(k, env.mdp, s, a, LIDAR))
     for i, action in enumerate([0, 1, 0, 2, 3]):
-        np.testing.assert_allclose(obs, belief_mdp.observation(expected.belief), rtol=1e-6)
+        np.testing.assert_allclose(obs, observation(expected.belief), rtol=1e-6)
         assert_trees_equal(state.map.seen, expected.seen)
         key = jax.random.key(10 + i)
         obs, state, reward, terminated, truncated, info = env.step(key, state, action, params)
         expected, outcome = mdp_step(jax.random.split(key)[0], expected, jnp.int32(action))
         np.testing.assert_allclose(reward, outcome.reward, rtol=1e-5)
         assert (terminated, truncated) == (outcome.terminated, outcome.truncated)
-        final = belief_mdp.observation(expected.belief)
+        final = observation(expected.belief)
         np.testing.assert_allclose(info["final_observation"], final, rtol=1e-6)
         assert info["discount"] == 1.0 - outcome.terminated
     assert terminated
@@ -67,7 +67,7 @@ def test_prepared_starts_are_drawn_and_no_others(env):
     params = env.prepared_params(jax.random.key(2), 5)
     keys = jax.random.split(jax.random.key(3), 100)
     drawn, _ = jax.vmap(env.reset, (0, None))(keys, params)
-    starts = jax.vmap(belief_mdp.observation)(params.starts.belief)
+    starts = jax.vmap(observation)(params.starts.belief)
     distances = np.abs(np.asarray(drawn)[:, None] - np.asarray(starts)[None]).max(axis=2)
     assert (distances.min(axis=1) == 0).all()
     assert (distances.min(axis=0) == 0).all()
@@ -112,7 +112,7 @@ def test_wrappers_of_gymnax_take_it(env):
 
 def test_live_observations_trace():
     models = init(jax.random.key(0), small.CONFIG)
-    env = MapEnv(map_mdp(small.CONFIG, models), 0)
+    env = MapEnv(make_mdp(small.CONFIG, models).map, 0)
 
     def play(key):
         _, state = env.reset(key, env.default_params)
@@ -126,3 +126,17 @@ def test_live_observations_trace():
 def test_a_sensor_that_is_not_there_is_named(modality):
     with pytest.raises(ValueError, match=f"modality = {modality}: must be a whole number"):
         MapEnv(small.small_mdp(), modality)
+
+
+@pytest.mark.parametrize("action", [1.7, jnp.float32(1), np.array([0, 1])])
+def test_an_action_that_is_no_integer_is_refused(env, action):
+    _, state = env.reset(jax.random.key(0))
+    with pytest.raises((ValueError, AssertionError), match="action"):
+        env.step(jax.random.key(1), state, action)
+
+
+@pytest.mark.parametrize("action", [2, np.int64(2), np.uint8(2), jnp.int32(2)])
+def test_integers_of_all_libraries_are_the_same_action(env, action):
+    _, state = env.reset(jax.random.key(0))
+    after = env.step_env(jax.random.key(1), state, action, env.default_params)[1]
+    assert after.map.seen[2, LIDAR]

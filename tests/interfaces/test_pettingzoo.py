@@ -11,10 +11,10 @@ import small
 pytest.importorskip("pettingzoo", reason="needs the extra jaxsense[pettingzoo]")
 
 from gymnasium.error import ResetNeeded
-from pettingzoo.test import parallel_api_test, parallel_seed_test
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
 from jaxsense.dqn import team_mdp
-from jaxsense.interfaces.pettingzoo import TeamParallelEnv
+from jaxsense.interfaces.pettingzoo import TeamAECEnv, TeamParallelEnv
 
 AGENTS = ["camera_1", "camera_2", "lidar"]
 NOP = 4
@@ -30,6 +30,77 @@ def test_pettingzoos_own_tests_pass(env):
         warnings.simplefilter("error", UserWarning)
         parallel_api_test(env, num_cycles=40)
         parallel_seed_test(lambda: TeamParallelEnv(small.team(), small.TEAM), num_cycles=40)
+
+
+def test_pettingzoos_own_tests_of_turns_pass():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        # A mean has no bounds.
+        warnings.filterwarnings("ignore", "Agent's m.* observation space value is -?infinity")
+        api_test(TeamAECEnv(small.team(), small.TEAM), num_cycles=40)
+        seed_test(lambda: TeamAECEnv(small.team(), small.TEAM), num_cycles=40)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_turns_are_the_steps_of_the_parallel_environment(env, seed):
+    turns = TeamAECEnv(small.team(), small.TEAM)
+    turns.reset(seed=seed)
+    observations, infos = env.reset(seed=seed)
+    assert turns.agents == AGENTS
+    totals, earned, moves = dict.fromkeys(AGENTS, 0.0), dict.fromkeys(AGENTS, 0.0), 0
+    rng = np.random.default_rng(seed)
+    for agent in turns.agent_iter():
+        seen, reward, terminated, truncated, info = turns.last()
+        earned[agent] += reward
+        if terminated or truncated:
+            turns.step(None)
+            assert agent not in turns.agents
+            continue
+        assert agent == env.possible_agents[int(env._state.agent)]
+        np.testing.assert_array_equal(seen, observations[agent])
+        assert info["seconds"] == infos[agent]["seconds"]
+        np.testing.assert_array_equal(info["action_mask"], infos[agent]["action_mask"])
+        action = int(rng.choice(np.flatnonzero(info["action_mask"])))
+        turns.step(action)
+        observations, rewards, terminations, truncations, infos = env.step({agent: action})
+        moves += 1
+        assert (turns.rewards, turns.terminations, turns.truncations) == (
+            rewards, terminations, truncations
+        )  # fmt: skip
+        totals = {name: total + rewards.get(name, 0.0) for name, total in totals.items()}
+    assert turns.agents == env.agents == []
+    assert moves > 3
+    # Whoever is asked gets all that it has earned since its last turn.
+    assert earned == pytest.approx(totals)
+
+
+def test_a_turn_takes_actions_of_its_robot_only():
+    turns = TeamAECEnv(small.team(), small.TEAM)
+    with pytest.raises(ResetNeeded):
+        turns.step(0)
+    turns.reset(seed=0)
+    for action in (5, -1, 0.5, None):
+        with pytest.raises(ValueError, match=rf"action = {action}: must be in Discrete"):
+            turns.step(action)
+    for agent in AGENTS:
+        assert turns.agent_selection == agent
+        turns.step(jnp.int32(NOP))
+        assert turns.terminations[agent]
+        # First it leaves.
+        turns.step(None)
+    with pytest.raises(ResetNeeded, match="after the end"):
+        turns.step(0)
+
+
+@pytest.mark.parametrize("kind", [int, np.int64, np.uint8, jnp.int32])
+def test_integers_of_all_libraries_are_actions(env, kind):
+    env.reset(seed=1)
+    found = env.step({"camera_1": kind(0)})[0]
+    env.reset(seed=1)
+    expected = env.step({"camera_1": 0})[0]
+    np.testing.assert_array_equal(found["camera_1"], expected["camera_1"])
+    assert not env.step({"camera_2": kind(NOP)})[2]["camera_1"]
+    assert "camera_2" not in env.agents
 
 
 def test_every_step_equals_the_mdps(env):

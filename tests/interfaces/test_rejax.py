@@ -7,7 +7,7 @@ import small
 
 pytest.importorskip("gymnax", reason="needs the extra jaxsense[gymnax]")
 
-from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import observation
 from jaxsense.interfaces import gymnax
 from jaxsense.interfaces.rejax import MapEnv
 
@@ -51,5 +51,5 @@ def test_its_dqn_reaches_95_percent_of_the_optimal_return():
     state, (lengths, _) = jax.jit(algorithm.train)(jax.random.key(6))
     assert lengths.max() <= small.CONFIG.mdp.max_steps
     act = algorithm.make_act(state)
-    reached = small.returns(lambda key, s: act(belief_mdp.observation(s.belief), key)).mean()
+    reached = small.returns(lambda key, known: act(observation(known.belief), key)).mean()
     assert reached >= 0.95 * small.optimal_return()

@@ -1,0 +1,38 @@
+"""Another fusion, a product of experts: `python examples/new_fusion.py`."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+import jaxsense
+from jaxsense import dqn, mission, vae
+from jaxsense.core.types import pytree
+
+
+@pytree
+class Product(vae.InPlace):
+    """A look multiplies the belief with what it says alone, and the prior counts once."""
+
+    def update(self, belief, seen, features, modality):
+        """The belief after one more look, whichever sensors have `seen` the PoI."""
+        return vae.product_of_experts(belief, self.together({modality: features}), self.prior)
+
+
+def multiplying(models: jaxsense.Models) -> jaxsense.Models:
+    """The same networks with another fusion."""
+    parts = {part.name: getattr(models.fusion, part.name) for part in dataclasses.fields(Product)}
+    return dataclasses.replace(models, fusion=Product(**parts))
+
+
+if __name__ == "__main__":
+    config, key = jaxsense.PRESETS["smoke"], jax.random.key(0)
+    models = multiplying(jaxsense.init(key, config))  # or those of `jaxsense.load("runs/...")`
+    mdp, step = jaxsense.make_mdp(config, models), jax.jit(dqn.step)
+    state = dqn.reset(key, mdp, seen=jnp.zeros((mdp.num_pois, 2), bool))
+    for look in range(3):
+        state, outcome = step(jax.random.key(look), mdp, state, jnp.int32(0), jnp.int32(look % 2))
+        print(f"sigma {state.belief.std[0]} after look {look + 1}, reward {outcome.reward:.2f}")
+    played = mission.make_mission(config)
+    play = jax.jit(lambda key: mission.rollout(key, played, models, mission.reset(key, played), 50))
+    print(f"looks in a mission:\n{play(key)[0].times_seen}")

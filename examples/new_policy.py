@@ -1,0 +1,32 @@
+"""Another policy, in the map MDP and in missions: `python examples/new_policy.py`."""
+
+import jax
+import jax.numpy as jnp
+
+import jaxsense
+from jaxsense import dqn, mission
+from jaxsense.dqn import episodes, policies
+
+
+def widest(key: jax.Array, models: dqn.policies.Trained, known: dqn.Known) -> jax.Array:
+    """Values of actions, `[N + 1]`: looks at the PoI with the widest belief, twice at most."""
+    width = jnp.linalg.norm(known.belief.std, axis=-1)
+    is_left = known.looks[:, known.modality] < 2
+    return jnp.append(jnp.where(is_left, width, -1.0), 0.0)  # NOP, the last, has a value of 0
+
+
+if __name__ == "__main__":
+    config, key = jaxsense.PRESETS["smoke"], jax.random.key(0)
+    models = jaxsense.init(key, config)  # or those of `jaxsense.load("runs/...")`
+    mdp = jaxsense.make_mdp(config, models)
+
+    def act(key, known):
+        return policies.best(widest(key, models, known))
+
+    start = episodes.reset(key, mdp, models.bayes)
+    total, first = jax.jit(lambda: episodes.run_episode(key, mdp, models.bayes, act, start, 0))()
+    print(f"map MDP: total reward {total:.2f}, of the first look {first:.2f}")
+    played = mission.make_mission(config, policies={"widest": widest})
+    state = mission.reset(key, played, played.policy("widest"))
+    state, _ = jax.jit(lambda: mission.rollout(key, played, models, state, 50))()
+    print(f"mission: the robots head for PoIs {state.robots.target}")

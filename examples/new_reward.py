@@ -1,0 +1,36 @@
+"""Another reward, and a Q-network that learns from it: `python examples/new_reward.py`."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+import jaxsense
+from jaxsense import dqn
+from jaxsense.core.types import Belief, pytree
+
+
+@pytree
+class Confident:
+    """Rewards a look for the probability of the most likely class that it adds, minus a cost."""
+
+    look_cost: float = 0.05
+
+    def information(self, belief: Belief, probabilities: jax.Array) -> jax.Array:
+        """Probability of the most likely class, `[]`."""
+        return jnp.max(probabilities)
+
+    def of_gain(self, gain: jax.Array) -> jax.Array:
+        """The reward of a look, `[...]`, by what it has added."""
+        return gain - self.look_cost
+
+
+if __name__ == "__main__":
+    config, key = jaxsense.PRESETS["smoke"], jax.random.key(0)
+    models = jaxsense.init(key, config)  # or those of `jaxsense.load("runs/...")`
+    looks = jaxsense.Bank(jaxsense.detections(key, config, models, samples=64))
+    mdp = dataclasses.replace(jaxsense.make_mdp(config, models, looks), reward=Confident())
+    learning = models.agent.environment(mdp, modality=0)
+    state, info = jax.jit(lambda key: dqn.train(key, learning, config.dqn))(key)
+    print(f"episode return: {info.episode_return[:5].mean():.3f} at first,", end=" ")
+    print(f"{info.episode_return[-5:].mean():.3f} after {state.epoch} epochs")
