@@ -11,11 +11,11 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import mission, observe
+from jaxsense import looks, mission
 from jaxsense.config import PRESETS
 from jaxsense.models import init, make_jmvae
 from jaxsense.run import devices
-from jaxsense.vae import detectors, jmvae
+from jaxsense.vae import jmvae
 
 _SCENES = 256
 _SECONDS = 1.0
@@ -52,14 +52,11 @@ def _results() -> dict[str, np.ndarray]:
 
     @jax.jit
     def run(keys: jax.Array):
-        classes = observe.balanced_classes(jax.random.key(2), config, _SCENES)
-        _, windows = observe.surveys(keys, team.world, classes)
-        features = [
-            jax.vmap(jax.vmap(detectors.detect, (None, 0)), (None, 0))(detector, window)
-            for detector, window in zip(models.detectors, windows, strict=True)
-        ]
+        classes = looks.balanced_classes(jax.random.key(2), config, _SCENES)
+        _, windows = looks.surveys(keys, team.world, classes)
+        features = looks.detect_all(models.detectors, windows)
         encode = jax.vmap(jax.vmap(lambda *f: jmvae.posterior(models.jmvae, model, f)))
-        states = jax.vmap(lambda key: mission.reset(key, team, 1))(keys)
+        states = jax.vmap(lambda key: mission.reset(key, team, team.policy("naive")))(keys)
         periods = round(_SECONDS / config.mission.control_period)
         states, _ = mission.rollout_batch(keys, team, models, states, periods, every=_SCENES)
         found = dict(zip(config.modalities, windows, strict=True))

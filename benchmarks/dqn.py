@@ -1,33 +1,31 @@
 """Q-learning on the map MDP: environment steps per second, with a gradient step per vector step."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxsense.dqn.belief_mdp import MapMdp
 
 from benchmarks import measure, peers
 from benchmarks.maps import MODALITY, Task, untrained_task
 from benchmarks.measure import Options, Row, Side
-from jaxsense import models, observe
 from jaxsense.config import PRESETS, DqnConfig
 from jaxsense.dqn import training
-from jaxsense.sim import world as worlds
+from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.looks import make_mdp
+from jaxsense.models import make_agent
 
 _UNIT = "env-steps/s"
 
 
 def dqn_rejax(options: Options) -> Row:
     """Against rejax, with as many environments and the same batch, network and replay."""
-    task, _ = untrained_task(_settings(options))
+    task = untrained_task(_settings(options))
     peer = peers.load("rejax", options)
     theirs = [peer.throughput(task, options)] if peer else []
     return measure.compare(
         "dqn_rejax",
         _UNIT,
-        [_our_side(task)],
+        [_our_side(task, task.mdp)],
         theirs,
         options,
         peer="rejax DQN",
@@ -37,13 +35,13 @@ def dqn_rejax(options: Options) -> Row:
 
 def dqn_sb3(options: Options) -> Row:
     """Against Stable-Baselines3, which steps one environment in NumPy."""
-    task, _ = untrained_task(_settings(options))
+    task = untrained_task(_settings(options))
     peer = peers.load("sb3", options)
     theirs = peer.throughputs(task, options) if peer else []
     return measure.compare(
         "dqn_sb3",
         _UNIT,
-        [_our_side(task)],
+        [_our_side(task, task.mdp)],
         theirs,
         options,
         peer="Stable-Baselines3 DQN",
@@ -53,21 +51,14 @@ def dqn_sb3(options: Options) -> Row:
 
 def dqn_live(options: Options) -> Row:
     """With a scan cast in each environment's own arena at every step."""
-    task, networks = untrained_task(_settings(options, epochs=100))
-    world = worlds.make_world(task.config)
-    shape = models.make_jmvae(task.config)
-
-    def make_mdp(detectors: Any, params: Any) -> MapMdp:
-        return observe.live_mdp(task.config, world, detectors, params, shape)
-
-    inputs = make_mdp, networks.detectors, task.params
-    ours = _train_side(task, *inputs)
-    return measure.compare("dqn_live", _UNIT, [ours], [], options)
+    task = untrained_task(_settings(options, epochs=100))
+    mdp = make_mdp(task.config, task.models).map
+    return measure.compare("dqn_live", _UNIT, [_our_side(task, mdp)], [], options)
 
 
 def dqn_seeds(options: Options) -> Row:
     """Many seeds of the agents of both modalities in one program, with the paper's settings."""
-    task, _ = untrained_task(_settings(options))
+    task = untrained_task(_settings(options))
     is_accelerated = jax.default_backend() != "cpu"
     num_seeds = 64 if is_accelerated and not options.quick else 2
     if not options.quick:
@@ -77,18 +68,20 @@ def dqn_seeds(options: Options) -> Row:
         settings = dataclasses.replace(paper, epochs=epochs)
         task = dataclasses.replace(task, config=dataclasses.replace(task.config, dqn=settings))
     settings, modalities = task.config.dqn, jnp.arange(len(task.config.modalities))
+    agent = make_agent(task.config)
 
-    def train(keys: jax.Array, params: Any, bank: Any):
-        mdp = task.mdp_of(params, bank)
-        of_seeds = jax.vmap(lambda key, m: training.train(key, mdp, m, settings), (0, None))
+    def train(keys: jax.Array, mdp: MapMdp):
+        def of_one(key: jax.Array, modality: jax.Array):
+            return training.train(key, agent.environment(mdp, modality), settings)
+
+        of_seeds = jax.vmap(of_one, (0, None))
         state, infos = jax.vmap(of_seeds, (None, 0))(keys, modalities)
         return state.params, infos
 
     agents = num_seeds * len(modalities)
     work = agents * settings.epochs * settings.num_envs
     keys = jax.random.split(jax.random.key(3), num_seeds)
-    inputs = keys, task.params, task.bank
-    side = measure.compiled(train, *inputs, work=work, batch=agents)
+    side = measure.compiled(train, keys, task.mdp, work=work, batch=agents)
     return measure.compare("dqn_seeds", _UNIT, [side], [], options, repeats=1)
 
 
@@ -116,19 +109,11 @@ def _settings(options: Options, epochs: int = 400) -> DqnConfig:
     )
 
 
-def _our_side(task: Task) -> Side:
-    def make_mdp(params: Any, bank: Any) -> MapMdp:
-        return task.mdp_of(params, bank)
-
-    return _train_side(task, make_mdp, task.params, task.bank)
-
-
-def _train_side(task: Task, make_mdp: Callable[..., MapMdp], *networks: Any) -> Side:
+def _our_side(task: Task, mdp: MapMdp) -> Side:
     settings = task.config.dqn
 
-    def train(key: jax.Array, *networks: Any):
-        return training.train(key, make_mdp(*networks), MODALITY, settings)
+    def train(key: jax.Array, mdp: MapMdp):
+        return training.train(key, task.models.agent.environment(mdp, MODALITY), settings)
 
     work = settings.epochs * settings.num_envs
-    inputs, batch = (jax.random.key(2), *networks), settings.num_envs
-    return measure.compiled(train, *inputs, work=work, batch=batch)
+    return measure.compiled(train, jax.random.key(2), mdp, work=work, batch=settings.num_envs)

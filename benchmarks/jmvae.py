@@ -9,6 +9,7 @@ from jaxsense.observe import Bank
 from benchmarks import measure, peers
 from benchmarks.measure import Options, Row
 from jaxsense.config import PRESETS
+from jaxsense.core.types import Samples
 from jaxsense.models import make_jmvae
 from jaxsense.vae import jmvae as our_jmvae
 
@@ -24,14 +25,13 @@ def jmvae(options: Options) -> Row:
     num_classes = len(PRESETS["default"].arena.classes)
     bank = random_bank(jax.random.key(0), model.feature_sizes, num_classes, _SAMPLES_PER_CLASS)
 
-    def train(key: jax.Array, bank: Bank):
+    def train(key: jax.Array, bank: Samples):
         init_key, train_key = jax.random.split(key)
-        state = our_jmvae.start(our_jmvae.init(init_key, model), config)
-        return our_jmvae.train(train_key, state, model, bank, config, steps)
+        params = our_jmvae.init(init_key, model)
+        return our_jmvae.train(train_key, params, model, bank, config)
 
     work, batch = steps * config.batch, config.batch
-    inputs = jax.random.key(1), bank
-    ours = [measure.compiled(train, *inputs, work=work, batch=batch)]
+    ours = [measure.compiled(train, jax.random.key(1), bank, work=work, batch=batch)]
     peer = peers.load("multivae", options)
     theirs = peer.sides(model, config, [np.asarray(x) for x in bank], options) if peer else []
     return measure.compare(
@@ -47,7 +47,7 @@ def jmvae(options: Options) -> Row:
 
 def random_bank(
     key: jax.Array, feature_sizes: tuple[int, ...], num_classes: int, samples: int
-) -> Bank:
+) -> Samples:
     """For each modality `[C, S, D_m]` probabilities: what they are does not change the speed."""
     keys = jax.random.split(key, len(feature_sizes))
     return tuple(

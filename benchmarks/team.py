@@ -1,6 +1,4 @@
-"""The MDP of a team: choices per second of random teams, without learning."""
-
-import dataclasses
+"""The team MDP: choices per second of random teams, without learning."""
 
 import jax
 import jax.numpy as jnp
@@ -8,25 +6,26 @@ import jax.numpy as jnp
 from benchmarks import measure
 from benchmarks.maps import untrained_task
 from benchmarks.measure import Options, Row
-from jaxsense import models, observe
 from jaxsense.config import PRESETS
 from jaxsense.dqn import team_mdp as teams
+from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.looks import Bank, make_mdp
+from jaxsense.models import init
 
 
 def team_mdp(options: Options) -> Row:
     """Random choices in 512 environments with the settings of `team`; ended episodes restart."""
     number, steps = (16, 4) if options.quick else (512, 200)
-    task, _ = untrained_task(PRESETS["team"].dqn)
-    config = dataclasses.replace(task.config, team=PRESETS["team"].team)
-    shape = models.make_jmvae(config)
+    config = PRESETS["team"]
+    task = untrained_task(PRESETS["default"].dqn)
+    mdp = make_mdp(config, init(jax.random.key(0), config), Bank(task.bank))
+    assert isinstance(mdp, TeamMdp)
 
     @jax.jit
-    def begin(keys: jax.Array, params, bank) -> teams.TeamState:
-        mdp = observe.team_mdp(config, bank, params, shape)
+    def begin(keys: jax.Array, mdp: TeamMdp) -> teams.TeamState:
         return jax.vmap(lambda key: teams.reset(key, mdp))(keys)
 
-    def play(key: jax.Array, starts: teams.TeamState, params, bank) -> jax.Array:
-        mdp = observe.team_mdp(config, bank, params, shape)
+    def play(key: jax.Array, starts: teams.TeamState, mdp: TeamMdp) -> jax.Array:
         choice_key, look_key = jax.random.split(key)
         draws = jax.random.uniform(choice_key, (steps, number))
         keys = jax.random.split(look_key, (steps, number))
@@ -49,9 +48,8 @@ def team_mdp(options: Options) -> Row:
 
         return jax.lax.scan(step, starts, (draws, keys))[1]
 
-    networks = task.params, task.bank
     # A start looks at everything it has seen; a training prepares them once.
-    starts = begin(jax.random.split(jax.random.key(1), number), *networks)
-    inputs = jax.random.key(0), starts, *networks
+    starts = begin(jax.random.split(jax.random.key(1), number), mdp)
+    inputs = jax.random.key(0), starts, mdp
     side = measure.compiled(play, *inputs, work=number * steps, batch=number)
     return measure.compare("team_mdp", "env-steps/s", [side], [], options)

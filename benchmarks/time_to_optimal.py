@@ -77,17 +77,18 @@ def _row(
 
 def _learner(task: Task) -> Learner:
     """Our own training, compiled as in a run: side by side."""
-    settings, mdp = task.config.dqn, task.mdp
+    settings = task.config.dqn
+    learning = task.models.agent.environment(task.mdp, MODALITY)
 
     def start(key: jax.Array):
         init_key, start_key, key = jax.random.split(key, 3)
-        prepared = training.starts(start_key, mdp, settings)
-        return key, training.init(init_key, mdp, settings, prepared), prepared
+        prepared = training.starts(start_key, learning, settings)
+        return key, training.init(init_key, learning, settings, prepared), prepared
 
     def go_on(carry):
         key, state, prepared = carry
         key, chunk_key = jax.random.split(key)
-        state, _ = training.train_chunk(chunk_key, mdp, MODALITY, settings, state, prepared)
+        state, _ = training.train_chunk(chunk_key, learning, settings, state, prepared)
         return key, state, prepared
 
     key = jax.random.key(7)

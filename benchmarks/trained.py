@@ -4,11 +4,11 @@ import dataclasses
 import functools
 
 import jax
-from jaxsense.stages import learn
 
 from benchmarks.maps import Examiner, Task
+from jaxsense import models
 from jaxsense.config import PRESETS, DetectorConfig, DqnConfig, JmvaeConfig
-from jaxsense.sim import world as worlds
+from jaxsense.training import learn
 
 _CONFIG = dataclasses.replace(
     PRESETS["default"],
@@ -39,9 +39,14 @@ def trained_task(quick: bool) -> tuple[Task, Examiner]:
     The examination has detections of its own.
     """
     config = _QUICK if quick else _CONFIG
-    world = worlds.make_world(config)
-    train = jax.jit(lambda key: learn(key, config, world, until="jmvae").outputs)
+    train = jax.jit(lambda key: learn(key, config, until="look_values").outputs)
     outputs = train(jax.random.key(6))
-    params, detections = outputs["jmvae"], outputs["detections"]
-    examined = Task(config, params, detections.held_out)
-    return Task(config, params, detections.bank), Examiner(examined, 32 if quick else 4096)
+    trained = dataclasses.replace(
+        models.init(jax.random.key(6), config),
+        fusion=outputs["fusion"],
+        jmvae=outputs["best_jmvae"],
+        look_values=outputs["look_values"],
+    )
+    bank, held_out = outputs["detections"].bank, outputs["detections"].held_out
+    examiner = Examiner(Task(config, trained, held_out), 32 if quick else 4096)
+    return Task(config, trained, bank), examiner

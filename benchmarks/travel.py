@@ -15,7 +15,7 @@ import rich.console
 import rich.table
 
 from jaxsense import mission
-from jaxsense.config import POLICIES, Config, TravelConfig
+from jaxsense.config import Config, TravelConfig
 from jaxsense.dqn import team_mdp
 from jaxsense.models import Models
 from jaxsense.run import rundir
@@ -50,7 +50,7 @@ def ways(config: Config, models: Models) -> tuple[np.ndarray, np.ndarray, np.nda
     team = mission.make_mission(config)
     period = config.mission.control_period
     steps = int(config.mission.time_limit / period)
-    naive = POLICIES.index("naive")
+    naive = team.policy("naive")
 
     @jax.jit
     def play(keys: jax.Array):

@@ -20,7 +20,8 @@ if __name__ == "__main__":
     models = jaxsense.init(key, config)  # or those of `jaxsense.load("runs/...")`
     mdp = jaxsense.make_mdp(config, models)
 
-    def act(key, known):
+    def act(key: jax.Array, known: dqn.Known) -> jax.Array:
+        """The action in the map MDP."""
         return policies.best(widest(key, models, known))
 
     start = episodes.reset(key, mdp, models.bayes)

@@ -29,7 +29,7 @@ class NumpyMap:
 
 
 class NumpyMdp:
-    """`dqn.belief_mdp` on a bank of detections, with the same rewards and the same maps."""
+    """`dqn.map_mdp` on a bank of detections, with the same rewards and the same maps."""
 
     def __init__(self, config: Config, params: Any, bank: Any, modality: int):
         """Takes a JMVAE's parameters, a bank `[C, S, D_m]` per modality, and the own sensor."""

@@ -22,7 +22,7 @@ class MapEnv(gymnasium.Env):
     """The NumPy MDP behind gymnasium's interface."""
 
     def __init__(self, task: Task):
-        self._mdp = NumpyMdp(task.config, task.params, task.bank, MODALITY)
+        self._mdp = NumpyMdp(task.config, task.models.jmvae, task.bank, MODALITY)
         self._state: Any = None
         size = (self._mdp.observation_size,)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float32)

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.maps import untrained_task
 from benchmarks.peers.numpy_mdp import NumpyMdp
 from jaxsense.config import DqnConfig
-from jaxsense.dqn import belief_mdp
+from jaxsense.dqn import map_mdp, observation
 
 TOLERANCE = 1e-5  # latent units, over a few float32 layers
 
@@ -16,16 +16,16 @@ TOLERANCE = 1e-5  # latent units, over a few float32 layers
 @pytest.fixture(scope="module")
 def task():
     # One detection of each class, so that there is nothing to draw.
-    return untrained_task(DqnConfig(observe="bank"), samples=1)[0]
+    return untrained_task(DqnConfig(observe="bank"), samples=1)
 
 
 @pytest.mark.parametrize("modality", [0, 1])
 def test_every_step_equals_ours(task, modality):
     mdp = task.mdp
-    step = jax.jit(lambda key, state, a: belief_mdp.step(key, mdp, state, a, modality))
-    reset = jax.jit(lambda key, classes, seen: belief_mdp.reset(key, mdp, classes, seen))
-    observation = jax.jit(belief_mdp.observation)
-    theirs = NumpyMdp(task.config, task.params, task.bank, modality)
+    step = jax.jit(lambda key, state, a: map_mdp.step(key, mdp, state, a, modality))
+    reset = jax.jit(lambda key, classes, seen: map_mdp.reset(key, mdp, classes, seen))
+    observed = jax.jit(observation)
+    theirs = NumpyMdp(task.config, task.models.jmvae, task.bank, modality)
     rng = np.random.default_rng(0)
     for episode in range(10):
         classes = rng.integers(3, size=3)
@@ -35,7 +35,7 @@ def test_every_step_equals_ours(task, modality):
         for action in [*rng.integers(3, size=7), 3]:
             np.testing.assert_allclose(
                 theirs.observation(their_state),
-                observation(state.belief),
+                observed(state.belief),
                 atol=TOLERANCE,
             )
             state, outcome = step(jax.random.key(1), state, jnp.int32(action))
@@ -46,7 +46,7 @@ def test_every_step_equals_ours(task, modality):
 
 
 def test_episodes_are_cut_as_ours(task):
-    theirs = NumpyMdp(task.config, task.params, task.bank, 0)
+    theirs = NumpyMdp(task.config, task.models.jmvae, task.bank, 0)
     rng = np.random.default_rng(0)
     state = theirs.reset(rng)
     cuts = [theirs.step(rng, state, 0)[2] for _ in range(task.config.mdp.max_steps)]
@@ -55,24 +55,24 @@ def test_episodes_are_cut_as_ours(task):
 
 @pytest.mark.parametrize("first", [0, 1])
 def test_starts_write_looks_in_rotated_order(task, first):
-    """A PoI that both have seen: the second writes over the first, as `write` does."""
+    """A PoI that both have seen: the second writes over the first, as `update` does."""
     mdp = task.mdp
-    theirs = NumpyMdp(task.config, task.params, task.bank, 0)
+    theirs = NumpyMdp(task.config, task.models.jmvae, task.bank, 0)
     classes = np.array([0, 1, 2])
     state = theirs.reset(
         np.random.default_rng(0), classes, np.ones((3, 2), bool), np.full(3, first)
     )
     for poi, poi_class in enumerate(classes):
-        entry, seen = mdp.unseen, jnp.zeros(2, bool)
+        belief, seen = mdp.fusion.prior, jnp.zeros(2, bool)
         for modality in (first, 1 - first):
-            entry = mdp.write(entry, seen, task.bank[modality][poi_class, 0], modality)
+            belief = mdp.fusion.update(belief, seen, task.bank[modality][poi_class, 0], modality)
             seen = seen.at[modality].set(True)
-        np.testing.assert_allclose(state.mean[poi], entry.mean, atol=TOLERANCE)
-        np.testing.assert_allclose(state.std[poi], entry.std, atol=TOLERANCE)
+        np.testing.assert_allclose(state.mean[poi], belief.mean, atol=TOLERANCE)
+        np.testing.assert_allclose(state.std[poi], belief.std, atol=TOLERANCE)
 
 
 def test_starts_have_fair_coins(task):
-    theirs = NumpyMdp(task.config, task.params, task.bank, 0)
+    theirs = NumpyMdp(task.config, task.models.jmvae, task.bank, 0)
     rng = np.random.default_rng(0)
     seen = np.array([theirs.reset(rng).seen for _ in range(400)])
     # 2,400 fair coins: three standard deviations are 0.031.

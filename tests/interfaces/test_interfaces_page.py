@@ -25,6 +25,7 @@ PACKAGES = (
     "pettingzoo",
     "flatbuffers",
 )
+TEAM = OTHERS.pop(4)
 EXAMPLES = dict(zip(PACKAGES, OTHERS, strict=True))
 
 
@@ -47,7 +48,8 @@ def names():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jaxsense, "init", with_colours)
-        exec(compile(FIRST, PAGE.name, "exec"), found)
+        for example in (FIRST, TEAM):
+            exec(compile(example, PAGE.name, "exec"), found)
     return found
 
 
@@ -68,7 +70,7 @@ def test_examples_run(names, package, tmp_path, monkeypatch, capsys):
 
 
 def test_detections_are_of_the_classes_that_they_are_stored_under(names):
-    bank = names["bank"]
+    bank = names["bank"].features
     assert [x.shape for x in bank] == [(3, 64, 2)] * 2
     labels = np.array(names["config"].arena.label_of_class("colour"))
     np.testing.assert_array_equal(np.argmax(bank[0], axis=-1), np.tile(labels[:, None], 64))
