@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import numpy as np
-from jaxsense.observe import Bank
 
 from benchmarks import measure, peers
 from benchmarks.measure import Options, Row
