@@ -55,7 +55,14 @@ class Fusion(Protocol):
     Attributes:
       classes: `[C, D]` mean joint posterior of each class.
       prior: `[D]` belief before any look.
+      accumulates: whether repeated looks by the same sensor add up; otherwise, a look replaces the
+        sensor's look before.
     """
+
+    @property
+    def accumulates(self) -> bool:
+        """Whether repeated looks by the same sensor add up."""
+        ...
 
     @property
     def classes(self) -> Belief:

@@ -17,6 +17,7 @@ from jaxsense.dqn import episodes, policies
 from jaxsense.dqn.map_mdp import MapMdp, random_start
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Known
+from jaxsense.dqn.reference import reference
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.training.mdp import held_out_mdp, models_of
 from jaxsense.training.perception import Detections
@@ -282,23 +283,27 @@ def compare_policies(
       `episodes.every_state`, then `config.evaluation.num_starts` random ones.
     """
     settings = config.evaluation
-    # Three keys, although one is not used, so that figures stay as they were.
-    start_key, _, play_key = jax.random.split(key, 3)
+    start_key, table_key, play_key = jax.random.split(key, 3)
     starts = _every_start(start_key, mdp, config)
-    compared = [policies.POLICIES[name] for name in COMPARED]
+    optimal = reference(table_key, mdp, modality, models, models.bayes.labels)
 
     # By a switch, so that one program is compiled for all policies.
     def with_policy(which: Int[Array, ""]) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
-        def act(key: Key, known: Known) -> jax.Array:
-            branches = [functools.partial(p.values, key, models, known) for p in compared]
-            return policies.best(jax.lax.switch(which, branches))
-
         # Only the first two policies are compared state by state.
         number = jnp.where(which < 2, settings.num_repeats, -(-settings.num_repeats // 8))
 
         def episode(key: Key, classes: jax.Array, seen: jax.Array) -> tuple[jax.Array, jax.Array]:
             reset_key, episode_key = jax.random.split(key)
             start = episodes.reset(reset_key, mdp, models.bayes, classes, seen)
+
+            def act(key: Key, known: Known) -> jax.Array:
+                of_table = {
+                    name: functools.partial(policies.POLICIES[name].values, key, models, known)
+                    for name in ("latent", "naive", "random")
+                }
+                by_name = {**of_table, "optimal": lambda: optimal(known, classes)}
+                return policies.best(jax.lax.switch(which, [by_name[name] for name in COMPARED]))
+
             return episodes.run_episode(episode_key, mdp, models.bayes, act, start, modality)
 
         def repeat(i: jax.Array, sums: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -309,7 +314,7 @@ def compare_policies(
         total, first = jax.lax.fori_loop(0, number, repeat, (zero, zero))
         return total / number, first / number
 
-    return jax.lax.map(with_policy, jnp.arange(len(compared)))
+    return jax.lax.map(with_policy, jnp.arange(len(COMPARED)))
 
 
 def _every_start(

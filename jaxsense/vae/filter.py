@@ -52,6 +52,11 @@ class Filter:
     model: Jmvae = struct.field(pytree_node=False)
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
 
+    @property
+    def accumulates(self) -> bool:
+        """True: looks add up."""
+        return True
+
     def update(
         self,
         belief: Belief,

@@ -42,6 +42,11 @@ class InPlace:
     readout: Float[Array, "C K"]
     model: Jmvae = struct.field(pytree_node=False)
 
+    @property
+    def accumulates(self) -> bool:
+        """False: a look replaces the sensor's look before."""
+        return False
+
     def update(
         self,
         belief: Belief,
