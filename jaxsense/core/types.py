@@ -18,7 +18,7 @@ Key = jax.Array
 Index = int | jax.Array
 """A Python integer, or a `[]` int32 array."""
 
-Features = tuple[Float[Array | np.ndarray, "_"] | None, ...]
+Features = tuple[Float[Array, "_"] | None, ...]
 """`[D_m]` features of each modality, or None where it has not looked."""
 
 Scene = Any

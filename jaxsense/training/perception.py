@@ -22,7 +22,7 @@ from jaxsense.vae.detectors import Detector
 from jaxsense.vae.filter import Filter
 from jaxsense.vae.fusion import InPlace
 
-Examples = tuple[Float[Array, "L F"], Int[Array, " L"]]
+Examples = tuple[Float[Array, "_ _"], Int[Array, "_"]]
 """`[L, F]` windows of a detector, and their `[L]` int32 labels."""
 
 

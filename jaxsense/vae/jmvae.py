@@ -116,8 +116,8 @@ def encode(
 
 
 def _encode(
-    params: Params, model: Jmvae, subset: tuple[int, ...], features: Features
-) -> tuple[jax.Array, jax.Array]:
+    params: Params, model: Jmvae, subset: tuple[int, ...], features: tuple[Array | None, ...]
+) -> tuple[Array, Array]:
     """`[D]` mean and log-variance from `[D_m]` features, or `[D, B]` from `[D_m, B]`."""
     joined = jnp.concatenate([x for m, x in enumerate(features) if m in subset and x is not None])
     network = MLP(model.hidden, 2 * model.latent_size)

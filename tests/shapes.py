@@ -1,0 +1,82 @@
+"""A checker of array shapes for jaxtyping's import hook, and a program that calls what it checks.
+
+It checks annotations that name a shape, and leaves all other types to pyright.
+"""
+
+import dataclasses
+import inspect
+import json
+from typing import get_args
+
+import beartype
+import jaxtyping
+
+_CONFIG = beartype.BeartypeConf(is_pep484_tower=True)  # an int is a float
+CHECKED = set[str]()
+"""Names of the functions whose arrays are checked."""
+
+
+def checked(function):
+    """Checks the shapes of a function's arrays, one item of each tuple, at every call."""
+    hints = {name: hint for name, hint in function.__annotations__.items() if _has_shape(hint)}
+    # JAX rebuilds pytrees with batches and placeholders in their fields.
+    if not hints or function.__name__ == "__init__":
+        return function
+    CHECKED.add(f"{function.__module__}.{function.__qualname__}")
+    function.__annotations__ = hints
+    return beartype.beartype(conf=_CONFIG)(function)
+
+
+def _has_shape(hint) -> bool:
+    is_shape = inspect.isclass(hint) and issubclass(hint, jaxtyping.AbstractArray)
+    return is_shape or any(map(_has_shape, get_args(hint)))
+
+
+def main() -> None:
+    """Traces trainings and a mission, and prints what was checked and refused, as JSON."""
+    import shapes
+
+    with jaxtyping.install_import_hook("jaxsense", "shapes.checked"):
+        import jaxsense
+    import jax
+    import jax.numpy as jnp
+    from training.tiny import KEY, TINY
+
+    from jaxsense import mission, vae
+
+    team = dataclasses.replace(
+        TINY,
+        jmvae=dataclasses.replace(TINY.jmvae, fusion="filter"),
+        dqn=dataclasses.replace(TINY.dqn, task="team", observe="bank"),
+    )
+    for config in (TINY, team):
+        jax.eval_shape(lambda key: jaxsense.learn(key, config), KEY)  # noqa: B023
+    there, models = mission.make_mission(TINY), jaxsense.init(KEY, TINY)
+
+    def play(key):
+        return mission.rollout(key, there, models, mission.reset(key, there), 3)
+
+    jax.eval_shape(play, KEY)
+
+    mdp = jaxsense.make_mdp(TINY, models, jaxsense.Bank((jnp.full((3, 4, 2), 0.5),) * 2))
+    look, seen, two = jnp.full(2, 0.5), jnp.zeros(2, bool), jnp.zeros(2)
+    vae.bayes_update(two, look, jnp.arange(2))
+    models.fusion.update(models.fusion.prior, seen, look, 1)
+    wrong = {
+        "kl_divergence": lambda: vae.kl_divergence(two, two, jnp.zeros(3), two),
+        "bayes_update": lambda: vae.bayes_update(two, look, jnp.zeros(2)),
+        "observe": lambda: mdp.looks.observe(KEY, jnp.arange(3), jnp.arange(1), 0),
+        "detect": lambda: vae.detect(models.detectors[0], jnp.zeros((1, 240))),
+        "update": lambda: models.fusion.update(models.fusion.prior, two, look, 1),
+    }
+    refused = {}
+    for name, call in wrong.items():
+        try:
+            call()
+        except jaxtyping.TypeCheckError as error:
+            refused[name] = str(error).splitlines()[0]
+    print(json.dumps({"checked": sorted(shapes.CHECKED), "refused": refused}))
+
+
+if __name__ == "__main__":
+    main()
