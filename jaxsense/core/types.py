@@ -78,7 +78,7 @@ class Fusion(Protocol):
         self,
         belief: Belief,
         seen: Bool[Array | np.ndarray, " M"],
-        features: Float[Array | np.ndarray, " D_m"],
+        features: Float[Array, " D_m"],
         modality: int,
     ) -> Belief:
         """Belief after one more look.
@@ -91,7 +91,7 @@ class Fusion(Protocol):
         """
         ...
 
-    def together(self, looks: Mapping[int, Float[Array | np.ndarray, "_"]]) -> Belief:
+    def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """Belief after looks by several sensors together, `[D_m]` features by modality."""
         ...
 

@@ -12,7 +12,7 @@ from jaxsense.vae.calibration import MIN_PROBABILITY
 
 _MIN_PRECISION = 1e-6
 
-_Features = Float[Array | np.ndarray, " D_m"]
+_Features = Float[Array, " D_m"]
 _Labels = Int[Array | np.ndarray, " C"]
 
 
@@ -43,7 +43,7 @@ def log_likelihoods(features: _Features, label_of_class: _Labels) -> Float[Array
 
 
 def bayes_update(
-    log_weights: Float[Array | np.ndarray, " C"], features: _Features, label_of_class: _Labels
+    log_weights: Float[Array, " C"], features: _Features, label_of_class: _Labels
 ) -> Float[Array, " C"]:
     """Updates the exact posterior over the classes by one look.
 

@@ -61,7 +61,7 @@ class Filter:
         self,
         belief: Belief,
         seen: Bool[Array | np.ndarray, " M"],
-        features: Float[Array | np.ndarray, " D_m"],
+        features: Float[Array, " D_m"],
         modality: int,
     ) -> Belief:
         """Belief after one more look.
@@ -84,11 +84,11 @@ class Filter:
         checks.require_probabilities("features", features)
         chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
         chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
-        found = self.log_likelihood(self.networks, jnp.asarray(features), modality)
+        found = self.log_likelihood(self.networks, features, modality)
         before = jnp.log(self.class_probabilities(belief))
         return readout.mixture(self.classes, jax.nn.softmax(before + found))
 
-    def together(self, looks: Mapping[int, Float[Array | np.ndarray, "_"]]) -> Belief:
+    def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """Belief after looks by several sensors, `[D_m]` features by modality."""
         belief, nobody = self.prior, jnp.zeros(len(self.model.modalities), bool)
         for modality, features in looks.items():

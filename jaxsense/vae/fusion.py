@@ -51,7 +51,7 @@ class InPlace:
         self,
         belief: Belief,
         seen: Bool[Array | np.ndarray, " M"],
-        features: Float[Array | np.ndarray, " D_m"],
+        features: Float[Array, " D_m"],
         modality: int,
     ) -> Belief:
         """Belief after one more look, see `fuse`.
@@ -70,7 +70,7 @@ class InPlace:
         of_all = tuple(features if m == modality else None for m in range(number))
         return fuse(self.params, self.model, belief, seen, of_all)
 
-    def together(self, looks: Mapping[int, Float[Array | np.ndarray, "_"]]) -> Belief:
+    def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """Posterior `q(z|x)` given looks by several sensors, `[D_m]` features by modality."""
         features = tuple(looks.get(m) for m in range(len(self.model.modalities)))
         return jmvae.posterior(self.params, self.model, features)
