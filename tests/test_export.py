@@ -226,6 +226,15 @@ def test_contents_describe_what_is_there(results, file):
     assert contents["versions"]["jax"] == jax.__version__
 
 
+@pytest.mark.parametrize("variance", [20.0, 5.0])
+def test_contents_hold_the_belief_before_any_look(variance):
+    config = dataclasses.replace(
+        CONFIG, mdp=dataclasses.replace(CONFIG.mdp, unseen_variance=variance)
+    )
+    contents = export._description(config, init(jax.random.key(0), config))
+    assert contents["unseen"] == {"mean": [0.0, 0.0], "std": pytest.approx([variance**0.5] * 2)}
+
+
 def test_programs_are_lowered_for_accelerators_too(models):
     program = export.exported(functions(CONFIG, models)["classify"])
     assert program.platforms == ("cpu", "cuda", "tpu")
