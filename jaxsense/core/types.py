@@ -50,28 +50,21 @@ class Belief:
 
 
 class Fusion(Protocol):
-    """How looks update beliefs; a frozen pytree.
-
-    Attributes:
-      classes: `[C, D]` mean joint posterior of each class.
-      prior: `[D]` belief before any look.
-      accumulates: whether repeated looks by the same sensor add up; otherwise, a look replaces the
-        sensor's look before.
-    """
+    """How looks update beliefs; a frozen pytree."""
 
     @property
     def accumulates(self) -> bool:
-        """Whether repeated looks by the same sensor add up."""
+        """Whether repeated looks by a sensor add up; otherwise, each replaces the one before."""
         ...
 
     @property
     def classes(self) -> Belief:
-        """Mean joint posterior of each class."""
+        """Mean joint posterior of each class, `[C, D]`."""
         ...
 
     @property
     def prior(self) -> Belief:
-        """Belief before any look."""
+        """Belief before any look, `[D]`."""
         ...
 
     def update(

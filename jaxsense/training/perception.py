@@ -324,10 +324,5 @@ def _filter_stages(config: Config) -> list[Stage]:
         problem=problem,
         trained=trained,
     )
-    return [training, Stage("fusion", _same, {"fusion": "filter"})]
-
-
-def _same(key: Key, config: Config, *, fusion: Filter) -> Filter:
-    """The filter as it was trained."""
-    del key, config
-    return fusion
+    # The key of a training depends on the name of its stage.
+    return [training, Stage("fusion", lambda key, config, *, fusion: fusion, {"fusion": "filter"})]

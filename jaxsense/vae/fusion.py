@@ -111,10 +111,6 @@ def fuse(
     chex.assert_shape(seen, (len(model.modalities),), custom_message="seen")
     checks.require_finite("belief.mean", belief.mean)
     checks.require_positive("belief.std", belief.std)
-    jmvae.check_features(model, features)
-    for name, new in zip(model.modalities, features, strict=True):
-        if new is not None:
-            checks.require_probabilities(f"features of {name}", new)
     generated = jmvae.decode(params, model, belief.mean)
     others = [m for m, new in enumerate(features) if new is None]
     fused = belief
@@ -126,6 +122,9 @@ def fuse(
             is_subset = jnp.array([m in subset for m in others], bool)
             applies = jnp.all(jnp.asarray(seen)[jnp.array(others, int)] == is_subset)
             fused = jax.tree.map(lambda new, old: jnp.where(applies, new, old), candidate, fused)  # noqa: B023
+    for name, new in zip(model.modalities, features, strict=True):
+        if new is not None:
+            checks.require_probabilities(f"features of {name}", new)
     return fused
 
 

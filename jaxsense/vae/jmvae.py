@@ -110,7 +110,7 @@ def encode(
       ValueError: if `features` has another length than `model.modalities`, all are None, or one is
         not finite.
     """
-    check_features(model, features)
+    _check_features(model, features)
     subset = tuple(m for m, feature in enumerate(features) if feature is not None)
     return _encode(params, model, subset, features)
 
@@ -126,17 +126,8 @@ def _encode(
     return mean, log_var
 
 
-def check_features(model: Jmvae, features: Features) -> None:
-    """Checks features of a look.
-
-    Args:
-      model: the shape.
-      features: for each modality `[D_m]`, or None where it is missing.
-
-    Raises:
-      ValueError: if `features` has another length than `model.modalities`, all are None, or one is
-        not finite.
-    """
+def _check_features(model: Jmvae, features: Features) -> None:
+    """Raises an error unless each modality has finite features or None, and one or more have."""
     if len(features) != len(model.modalities):
         raise ValueError(
             f"features has {len(features)} entries: must be {len(model.modalities)}, one for each "

@@ -61,8 +61,8 @@ def test_every_stage_of_learn_is_that_of_a_run(trained):
             of_run = jax.tree.map(lambda x: x[:2], found.outputs[stage.name])
         elif stage.chunks:
             chunk_keys = jax.vmap(stage.chunk_keys)(keys)[:, 0]
-            state = compiled.begin(begin_keys[0], config, *inputs)
-            of_run = compiled.advance(chunk_keys[0], config, state, *inputs)
+            state = compiled.begin(begin_keys[0], config, inputs)
+            of_run = compiled.advance(chunk_keys[0], config, state, inputs)
             of_run = of_run[0], jax.tree.map(lambda x: np.asarray(x)[None], of_run[1])
         else:
             of_run = found.outputs[stage.name]
