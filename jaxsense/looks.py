@@ -15,7 +15,8 @@ from jaxsense.core import checks
 from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.dqn import rewards
 from jaxsense.dqn.map_mdp import Looks, MapMdp
-from jaxsense.dqn.team_mdp import Places, TeamMdp
+from jaxsense.dqn.places import Places
+from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.models import Models
 from jaxsense.sim import windows as windowing
 from jaxsense.sim import world as worlds

@@ -1,6 +1,6 @@
-"""Agents: what a Q-network reads and predicts, alone with the map or in a team.
+"""Agents: how a Q-network is used, for the map MDP and for a team.
 
-Another kind of agent is a new class with the attributes and methods of `environments.Agent`.
+Another kind is a new class with the attributes and methods of `environments.Agent`.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,9 @@ from jaxsense.core.types import Belief, Index, Key, pytree
 from jaxsense.dqn import team_mdp, tours
 from jaxsense.dqn.environments import MapEnvironment, TeamEnvironment
 from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn.places import Places
 from jaxsense.dqn.pooling import PoolingNetwork
-from jaxsense.dqn.team_mdp import Names, Places, Team, TeamMdp
+from jaxsense.dqn.team_mdp import Names, Team, TeamMdp
 
 _NOT_WORTH_IT = -1e6  # s, below minus any tour
 
@@ -58,7 +59,13 @@ class MapAgent:
         return num_pois == self.num_pois
 
     def mdp(self, of_number: Callable[[int], MapMdp], places: Places, names: Names) -> MapMdp:
-        """The map MDP of `of_number(num_pois)`; `places` and `names` do not matter."""
+        """The map MDP.
+
+        Args:
+          of_number: number of PoIs to the map MDP.
+          places: not used.
+          names: not used.
+        """
         del places, names
         return of_number(self.num_pois)
 
@@ -79,16 +86,32 @@ class MapAgent:
         """None: without travel time there is no order to learn."""
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
-        """The map, see `observation`; `team` and `robot` do not matter."""
+        """The map, see `observation`.
+
+        Args:
+          belief: `[N, D]` the map.
+          team: not used.
+          robot: not used.
+        """
         del team, robot
         return observation(belief)
 
     def q(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
-        """See `Agent.q`; the `observed` maps have `params` applied to them."""
+        """The network's output, see `Agent.q`.
+
+        Args:
+          params: of the Q-network.
+          observed: `[N * 2D]`, or `[N * 2D, B]`.
+        """
         return networks.apply(self._network, params, observed)
 
     def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
-        """The same as `q` of `params` and what is `observed`."""
+        """The same as `q`: looks take no time.
+
+        Args:
+          params: of the Q-network.
+          observed: `[N * 2D]`, or `[N * 2D, B]`.
+        """
         return self.q(params, observed)
 
     def decide(
@@ -102,9 +125,16 @@ class MapAgent:
     ) -> Float[Array, " A"]:
         """Values of a robot's actions in a mission, see `Agent.decide`.
 
-        The network would count on learning more about a PoI that the robot has given up. Nothing is
-        left to learn about a PoI of a known class; since its class is unknown, the values are
-        means over all classes.
+        A PoI that is not present is shown to the network as one of a known class, about which
+        nothing is left to learn. As its class is unknown, the values are means over all classes.
+
+        Args:
+          params: of the Q-network.
+          tour_params: not used.
+          classes: `[C, D]` joint posterior of each class.
+          belief: `[N, D]` the map.
+          team: which PoIs are present.
+          robot: not used.
         """
         del tour_params
 
@@ -168,17 +198,22 @@ class TeamAgent:
         return True
 
     def mdp(self, of_number: Callable[[int], MapMdp], places: Places, names: Names) -> TeamMdp:
-        """The MDP of a team.
+        """The team MDP.
 
         Args:
           of_number: number of PoIs to the map MDP.
-          places: where PoIs and robots are.
+          places: draws positions of PoIs and robots.
           names: of the sensors.
         """
         return TeamMdp(self.config, of_number(self.config.num_pois[1]), places, names)
 
     def environment(self, mdp: TeamMdp, modality: Index) -> TeamEnvironment:
-        """What the agent learns in; `mdp` is from `mdp`, and the `modality` does not matter."""
+        """What the agent learns in.
+
+        Args:
+          mdp: from `mdp`.
+          modality: not used.
+        """
         del modality
         return TeamEnvironment(self, mdp)
 
@@ -213,8 +248,7 @@ class TeamAgent:
     def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
         """Discounts values on arrival to the time of departure.
 
-        Until then time passes: `discount^t q - second_cost t`, with `t` the seconds of travel. NOP
-        takes none.
+        `discount^t q - second_cost t`, with `t` the seconds until the look. NOP takes none.
 
         Args:
           params: of the Q-network.
@@ -236,10 +270,17 @@ class TeamAgent:
     ) -> Float[Array, " A"]:
         """Values of a robot's actions that rank PoIs by predicted completion time.
 
-        A look is worth it if its reward and what follows, as the Q-network predicts them, exceed
-        the price of the travel time. The value is then minus the predicted seconds of `tours`; that
-        of NOP lies below these, and those of other looks lowest. Without `tour_params`, the values
-        of `values`. See `Agent.decide` for the arguments; `classes` does not matter.
+        A look is worthwhile if its Q-value exceeds the price of the travel time. Its value is then
+        minus the predicted seconds of `tours`; that of NOP is lower, and those of other looks are
+        lowest. Without `tour_params`, the values are those of `values`.
+
+        Args:
+          params: of the Q-network.
+          tour_params: of the network of `tours`, or None.
+          classes: not used.
+          belief: `[N, D]` the map.
+          team: where everybody is.
+          robot: `[]` int32, the robot that chooses.
         """
         del classes
         seen = self.observe(belief, team, robot)
@@ -259,7 +300,7 @@ class TeamAgent:
 
 
 def observation(belief: Belief) -> Float[Array, " S"]:
-    """Mean and standard deviation of each PoI's belief, `[N * 2D]`, as a Q-network reads them.
+    """Mean and standard deviation of each PoI's belief, `[N * 2D]`, PoI by PoI.
 
     Raises:
       ValueError: if a standard deviation is not positive.

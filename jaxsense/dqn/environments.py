@@ -1,18 +1,19 @@
-"""The interface of agents, and of the environments in which they learn."""
+"""Adapts the map MDP and the team MDP to one interface for Q-learning, and defines agents'."""
 
 from collections.abc import Callable
 from typing import Any, Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Index, Key, Transition, pytree
 from jaxsense.dqn import map_mdp, team_mdp
 from jaxsense.dqn.map_mdp import MapMdp, MapState, Outcome
+from jaxsense.dqn.places import Places
 from jaxsense.dqn.pooling import PoolingNetwork
-from jaxsense.dqn.team_mdp import Names, Places, Team, TeamMdp, TeamState
+from jaxsense.dqn.team_mdp import Names, Team, TeamMdp, TeamState
 
 S = TypeVar("S")
 
@@ -50,7 +51,7 @@ class Agent(Protocol):
 
         Args:
           of_number: number of PoIs to the map MDP.
-          places: where PoIs and robots are in the MDP of a team.
+          places: draws positions of PoIs and robots, for the team MDP.
           names: of the sensors.
         """
         ...
@@ -95,7 +96,15 @@ class Agent(Protocol):
         ...
 
     def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
-        """Values of choosing actions now, the highest of which is best; see `q`."""
+        """Values of choosing actions now, the highest of which is best.
+
+        Args:
+          params: of the Q-network.
+          observed: `[S]`, or `[S, B]`.
+
+        Returns:
+          `[A]`, or `[A, B]`; NOP's last.
+        """
         ...
 
     def decide(
@@ -148,16 +157,16 @@ class Environment(Protocol, Generic[S]):
         """A random first state."""
         ...
 
-    def action_mask(self, state: S) -> jax.Array:
+    def action_mask(self, state: S) -> Bool[Array, " A"]:
         """`[A]` bool, the actions that exist."""
         ...
 
-    def observe(self, state: S) -> jax.Array:
+    def observe(self, state: S) -> Float[Array, " S"]:
         """`[S]` what the agent's network reads."""
         ...
 
     def step(
-        self, key: Key, state: S, s_tm1: jax.Array, action: jax.Array
+        self, key: Key, state: S, s_tm1: Float[Array, " S"], action: Int[Array, ""]
     ) -> tuple[S, Transition, Outcome]:
         """Takes an action.
 
@@ -198,18 +207,18 @@ class MapEnvironment:
         """A random first state."""
         return map_mdp.reset(key, self.mdp)
 
-    def action_mask(self, state: MapState) -> jax.Array:
+    def action_mask(self, state: MapState) -> Bool[Array, " A"]:
         """`[A]` bool: all actions exist."""
         del state
         return jnp.ones(self.num_actions, bool)
 
-    def observe(self, state: MapState) -> jax.Array:
+    def observe(self, state: MapState) -> Float[Array, " S"]:
         """`[N * 2D]` the map."""
         team = team_mdp.alone(self.mdp.num_pois, self.modality)
         return self.agent.observe(state.belief, team, jnp.int32(0))
 
     def step(
-        self, key: Key, state: MapState, s_tm1: jax.Array, action: jax.Array
+        self, key: Key, state: MapState, s_tm1: Float[Array, " S"], action: Int[Array, ""]
     ) -> tuple[MapState, Transition, Outcome]:
         """Takes an action, see `Environment.step`.
 
@@ -227,7 +236,7 @@ class MapEnvironment:
 
 @pytree
 class SmdpState:
-    """A team, and what each robot observed and chose when it last set out.
+    """The state of a team, and what each robot observed and chose when it last set out.
 
     Attributes:
       now: the state.
@@ -242,7 +251,7 @@ class SmdpState:
 
 @pytree
 class TeamEnvironment:
-    """The MDP of a team, whose robots share one agent.
+    """The team MDP, whose robots share one agent.
 
     Attributes:
       agent: what learns.
@@ -265,17 +274,17 @@ class TeamEnvironment:
         nothing = jnp.zeros((num_robots, len(observed)))
         return SmdpState(now, nothing, jnp.full(num_robots, num_pois))
 
-    def action_mask(self, state: SmdpState) -> jax.Array:
+    def action_mask(self, state: SmdpState) -> Bool[Array, " A"]:
         """`[A]` bool, PoIs that are present, and NOP."""
         return jnp.append(state.now.team.present, True)
 
-    def observe(self, state: SmdpState) -> jax.Array:
+    def observe(self, state: SmdpState) -> Float[Array, " S"]:
         """`[F * N]` what the robot that chooses knows."""
         now = state.now
         return self.agent.observe(now.map.belief, now.team, now.agent)
 
     def step(
-        self, key: Key, state: SmdpState, s_tm1: jax.Array, action: jax.Array
+        self, key: Key, state: SmdpState, s_tm1: Float[Array, " S"], action: Int[Array, ""]
     ) -> tuple[SmdpState, Transition, Outcome]:
         """Lets one robot choose, see `Environment.step`.
 

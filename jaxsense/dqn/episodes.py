@@ -8,6 +8,7 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Index, Key, call, pytree
 from jaxsense.dqn import map_mdp
@@ -19,16 +20,21 @@ MAX_STATES = 4096
 
 
 class LogLikelihoods(Protocol):
-    """What the exact Bayes filter learns from a look; see `vae.bayes.Bayes`."""
+    """How the exact Bayes filter reads a look; see `vae.bayes.Bayes`."""
 
-    def log_likelihoods(self, features: jax.Array, modality: int) -> jax.Array:
-        """`[C]` log-likelihoods of the classes, from `[D_m]` features of a static modality."""
+    def log_likelihoods(self, features: Float[Array, " L"], modality: int) -> Float[Array, " C"]:
+        """Log-likelihood of each class given one look.
+
+        Args:
+          features: `[D_m]` probabilities of the labels.
+          modality: index of the sensor; static.
+        """
         ...
 
 
 @pytree
 class Start:
-    """A first state of an episode, with what policies know beyond it.
+    """The first state of an episode, and what policies know besides.
 
     Attributes:
       state: the state.
@@ -43,8 +49,8 @@ def reset(
     key: Key,
     mdp: MapMdp,
     exact: LogLikelihoods,
-    classes: jax.Array | None = None,
-    seen: jax.Array | None = None,
+    classes: Int[Array, " N"] | None = None,
+    seen: Bool[Array, "N M"] | None = None,
 ) -> Start:
     """Starts an episode, see `map_mdp.reset`.
 
@@ -70,16 +76,16 @@ def run_episode(
     act: Callable[[Key, Known], jax.Array],
     start: Start,
     modality: Index,
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Plays one episode with a policy.
 
-    With the same key, the k-th look at a PoI sees the same whatever came before, so that policies
-    are compared on the same detections. Under `vmap` it runs until the longest episode has ended.
+    With the same key, the k-th look at a PoI shows the same whatever came before, so that policies
+    are compared on the same looks. Under `vmap` it runs until the longest episode has ended.
 
     Args:
       key: random key.
       mdp: the MDP.
-      exact: the exact Bayes filter, for policies that read its posterior.
+      exact: the exact Bayes filter, whose posterior some policies read.
       act: `(key, known) -> []` int32 action, see `policies.best`.
       start: from `reset`.
       modality: index of the agent's own sensor, see `map_mdp.step`.
@@ -163,10 +169,10 @@ class _Carry:
 
 def every_state(
     num_pois: int, num_classes: int, num_modalities: int, limit: int = MAX_STATES
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Int[np.ndarray, "S N"], Bool[np.ndarray, "S N M"]]:
     """Lists the `C^N 2^(N M)` states of the map: every combination of classes, every set of looks.
 
-    Of more than `limit` states, a stratified sample, which is always the same.
+    If there are more than `limit`, it takes a fixed stratified sample.
 
     Args:
       num_pois: N.
@@ -184,7 +190,8 @@ def every_state(
     edges = [i * number // parts for i in range(parts + 1)]
     draw = random.Random(0)
     # Python's integers: the states of 25 PoIs overflow an int64.
-    states = np.array([draw.randrange(*part) for part in itertools.pairwise(edges)], object)
+    drawn = [draw.randrange(first, end) for first, end in itertools.pairwise(edges)]
+    states = np.array(drawn, object)
     bits = states[:, None] >> np.arange(num_bits, dtype=object) & 1
     states >>= num_bits
     places = np.array([num_classes**n for n in reversed(range(num_pois))], object)
@@ -192,6 +199,6 @@ def every_state(
     return classes, bits.astype(bool).reshape(-1, num_pois, num_modalities)
 
 
-def are_different(classes: np.ndarray) -> np.ndarray:
+def are_different(classes: Int[np.ndarray, "S N"]) -> Bool[np.ndarray, " S"]:
     """`[S]` bool, whether all of `[S, N]` classes differ, as in the paper's `N! 2^(N M)` states."""
     return np.all(np.diff(np.sort(classes, axis=1), axis=1) > 0, axis=1)

@@ -3,16 +3,17 @@
 import chex
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 
 def td_error(
-    q_tm1: jax.Array,
-    a_tm1: jax.Array,
-    r_t: jax.Array,
-    discount_t: jax.Array,
-    q_t: jax.Array,
-) -> jax.Array:
-    """One-step Q-learning error (Mnih et al. 2015, Eq. 2), of one transition or of many.
+    q_tm1: Float[Array, "A ..."],
+    a_tm1: Int[Array, "..."],
+    r_t: Float[Array, "..."],
+    discount_t: Float[Array, "..."],
+    q_t: Float[Array, "A ..."],
+) -> Float[Array, "..."]:
+    """One-step Q-learning error (Mnih et al. 2015, Eq. 2) of one or many transitions.
 
     Args:
       q_tm1: `[A, ...]` values before the action.
@@ -33,6 +34,6 @@ def td_error(
     return jax.lax.stop_gradient(target) - value
 
 
-def pseudo_huber(error: jax.Array) -> jax.Array:
+def pseudo_huber(error: Float[Array, "..."]) -> Float[Array, "..."]:
     """`sqrt(1 + e^2) - 1`: quadratic near zero, linear far away, smooth everywhere."""
     return jnp.sqrt(1.0 + error**2) - 1.0

@@ -6,19 +6,18 @@ is no operation (NOP) and ends the episode.
 """
 
 import dataclasses
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import MdpConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Fusion, Index, Key, Scene, call, pytree
 from jaxsense.dqn.rewards import Reward
-
-S = TypeVar("S")
 
 
 class Looks(Protocol):
@@ -33,7 +32,7 @@ class Looks(Protocol):
         """M."""
         ...
 
-    def scene(self, key: Key, classes: jax.Array) -> Scene:
+    def scene(self, key: Key, classes: Int[Array, " N"]) -> Scene:
         """A random scene with PoIs of the given classes.
 
         Args:
@@ -43,8 +42,8 @@ class Looks(Protocol):
         ...
 
     def observe(
-        self, key: Key, scene: Scene, poi: jax.Array, modality: int
-    ) -> tuple[jax.Array, Scene]:
+        self, key: Key, scene: Scene, poi: Int[Array, ""], modality: int
+    ) -> tuple[Float[Array, " L"], Scene]:
         """Looks at a PoI.
 
         Args:
@@ -92,7 +91,7 @@ class MapMdp:
         """C, the number of classes that a PoI can have."""
         return len(self.fusion.classes.mean)
 
-    def information(self, belief: Belief) -> jax.Array:
+    def information(self, belief: Belief) -> Float[Array, ""]:
         """`[]` information of a `[D]` belief, in units of the reward."""
         return self.reward.information(belief, self.fusion.class_probabilities(belief))
 
@@ -124,7 +123,7 @@ class Outcome:
       reward: `[]` float32.
       terminated: `[]` bool, NOP has ended the episode.
       truncated: `[]` bool, the episode has reached its limit of steps.
-      seconds: `[]` that the action took, or None if actions take no time: each then counts as one.
+      seconds: `[]` that the action took; None in the map MDP, whose actions take no time.
     """
 
     reward: jax.Array
@@ -133,7 +132,7 @@ class Outcome:
     seconds: jax.Array | None = None
 
 
-def random_start(key: Key, mdp: MapMdp) -> tuple[jax.Array, jax.Array]:
+def random_start(key: Key, mdp: MapMdp) -> tuple[Int[Array, " N"], Bool[Array, "N M"]]:
     """Random classes and earlier looks.
 
     Args:
@@ -150,7 +149,10 @@ def random_start(key: Key, mdp: MapMdp) -> tuple[jax.Array, jax.Array]:
 
 
 def reset(
-    key: Key, mdp: MapMdp, classes: jax.Array | None = None, seen: jax.Array | None = None
+    key: Key,
+    mdp: MapMdp,
+    classes: Int[Array, " N"] | None = None,
+    seen: Bool[Array, "N M"] | None = None,
 ) -> MapState:
     """Starts an episode in which some modalities have looked at some of the PoIs.
 
@@ -171,7 +173,10 @@ def reset(
 
 
 def reset_with_looks(
-    key: Key, mdp: MapMdp, classes: jax.Array | None = None, seen: jax.Array | None = None
+    key: Key,
+    mdp: MapMdp,
+    classes: Int[Array, " N"] | None = None,
+    seen: Bool[Array, "N M"] | None = None,
 ) -> tuple[MapState, tuple[jax.Array, ...]]:
     """Starts an episode, see `reset`, and returns what it drew.
 
@@ -208,8 +213,8 @@ def begin(
     key: Key,
     mdp: MapMdp,
     scene: Scene,
-    classes: jax.Array,
-    seen: jax.Array,
+    classes: Int[Array, " N"],
+    seen: Bool[Array, "N M"],
     looks: tuple[jax.Array, ...],
 ) -> MapState:
     """Starts an episode in a given scene, see `reset`.
@@ -237,7 +242,7 @@ def begin(
 
 
 def step(
-    key: Key, mdp: MapMdp, state: MapState, action: jax.Array, modality: Index
+    key: Key, mdp: MapMdp, state: MapState, action: Int[Array, ""], modality: Index
 ) -> tuple[MapState, Outcome]:
     """Looks at a PoI with one modality's sensor, or ends the episode.
 
@@ -251,10 +256,10 @@ def step(
 
     Returns:
       The next state and the outcome. The reward is that of the look, see `Reward`; 0 for NOP; NaN
-      if the gain is NaN or the action does not exist.
+      if the gain is NaN or a traced action does not exist.
 
     Raises:
-      ValueError: if there is no such modality.
+      ValueError: if there is no such modality or action.
     """
     _check_step(mdp, state, action, modality)
     is_nop = action == mdp.num_pois
@@ -286,7 +291,7 @@ def step(
 
 
 def _check_step(mdp: MapMdp, state: MapState, action: jax.Array, modality: Index) -> None:
-    """Raises an error that names an argument of `step` that does not fit the MDP."""
+    """Checks the arguments of `step` against the MDP."""
     checks.require_index("modality", modality, mdp.num_modalities)
     chex.assert_rank(action, 0, custom_message="action")
     checks.require_index("action", action, mdp.num_pois + 1)

@@ -1,10 +1,10 @@
 """The value of looks at a PoI, by dynamic programming on the posterior over its classes.
 
-Points of interest are independent, and looks cost no time in the map MDP: so an agent may decide
-for each of them alone whether another look pays. What it knows of one is the posterior over the
-classes, a point of a simplex. The values stand on a lattice in that simplex; between its points
-they are interpolated linearly over the simplices of Freudenthal's triangulation (Lovejoy 1991,
-Operations Research 39(1), Sec. 3).
+Points of interest are independent, and looks take no time in the map MDP, so whether another look
+pays can be decided for each PoI on its own. What an agent knows of a PoI is the posterior over its
+classes, a point of a simplex. The values are tabulated on a lattice in that simplex and
+interpolated linearly over the simplices of Freudenthal's triangulation (Lovejoy 1991, Operations
+Research 39(1), Sec. 3).
 """
 
 import itertools
@@ -15,14 +15,15 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxsense.config import MdpConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn.rewards import Reward
 
-MOST_POINTS = 2**13
-_MOST_STEPS = 512
+MAX_POINTS = 2**13
+_MAX_STEPS = 512
 _POINTS_AT_ONCE = 256
 
 
@@ -32,9 +33,9 @@ class LookValues:
 
     Attributes:
       one_step: `[P]` of the next look alone, at the points of the lattice.
-      q: `[P]` of the next look and of all worthwhile looks after it.
-      one_step_unseen: `[]` of the next look alone, at a PoI that nobody has looked at.
-      q_unseen: `[]` of that look and of all worthwhile looks after it.
+      q: `[P]` of the next look and all worthwhile looks after it.
+      one_step_unseen: `[]` of the first look at a PoI alone.
+      q_unseen: `[]` of the first look and all worthwhile looks after it.
     """
 
     one_step: jax.Array
@@ -43,11 +44,19 @@ class LookValues:
     q_unseen: jax.Array
 
 
-def steps_of_lattice(num_classes: int, most_points: int = MOST_POINTS) -> int:
-    """Steps of the lattice along each edge of the simplex; the more classes, the fewer."""
+def steps_of_lattice(num_classes: int, max_points: int = MAX_POINTS) -> int:
+    """Steps of the lattice along each edge of the simplex; the more classes, the fewer.
+
+    Args:
+      num_classes: C.
+      max_points: of the lattice.
+
+    Raises:
+      ValueError: if a number is not a positive integer.
+    """
     checks.require_number("num_classes", num_classes)
-    checks.require_number("most_points", most_points)
-    fits = [n for n in range(1, _MOST_STEPS + 1) if _num_points(n, num_classes) <= most_points]
+    checks.require_number("max_points", max_points)
+    fits = [n for n in range(1, _MAX_STEPS + 1) if _num_points(n, num_classes) <= max_points]
     return max(fits, default=1)
 
 
@@ -55,11 +64,19 @@ def _num_points(steps: int, num_classes: int) -> int:
     return math.comb(steps + num_classes - 1, num_classes - 1)
 
 
-def lattice(num_classes: int, most_points: int = MOST_POINTS) -> np.ndarray:
-    """`[P, C]` class probabilities at the points of the lattice, in the order of their rows."""
-    steps = steps_of_lattice(num_classes, most_points)
+def lattice(num_classes: int, max_points: int = MAX_POINTS) -> Float[np.ndarray, "P C"]:
+    """Class probabilities at the points of the lattice, in the order of a table's rows.
+
+    Args:
+      num_classes: C.
+      max_points: of the lattice.
+
+    Returns:
+      `[P, C]`.
+    """
+    steps = steps_of_lattice(num_classes, max_points)
     each = itertools.combinations(range(steps + num_classes - 1), num_classes - 1)
-    # Between the ends, C - 1 bars divide the steps among the classes.
+    # C - 1 bars divide the steps among the classes.
     bars = np.array(list(each), int).reshape(_num_points(steps, num_classes), num_classes - 1)[
         :, ::-1
     ]
@@ -86,12 +103,12 @@ def _rows(sums, steps: int):
     return choose[sums + ranks - 1, ranks].sum(axis=-1)
 
 
-def interpolate(table: jax.Array, weights: jax.Array) -> jax.Array:
+def interpolate(table: Float[Array, " P"], probabilities: Float[Array, " C"]) -> Float[Array, ""]:
     """Reads a table between the points of the lattice.
 
     Args:
       table: `[P]` values at the points of `lattice`.
-      weights: `[C]` class probabilities.
+      probabilities: `[C]` of the classes.
 
     Returns:
       `[]` the value.
@@ -99,14 +116,14 @@ def interpolate(table: jax.Array, weights: jax.Array) -> jax.Array:
     Raises:
       ValueError: if no lattice of these classes has P points.
     """
-    chex.assert_rank(weights, 1, custom_message="weights")
+    chex.assert_rank(probabilities, 1, custom_message="probabilities")
     chex.assert_rank(table, 1, custom_message="table")
-    steps = steps_of_lattice(len(weights), len(table))
-    number = _num_points(steps, len(weights))
+    steps = steps_of_lattice(len(probabilities), len(table))
+    number = _num_points(steps, len(probabilities))
     if len(table) != number:
         reason = f"must be {number} or another number of points of a lattice"
         raise ValueError(f"length of table = {len(table)}: {reason}")
-    rows, shares = _corners(weights, steps)
+    rows, shares = _corners(probabilities, steps)
     return jnp.sum(shares * table[rows])
 
 
@@ -123,13 +140,13 @@ def _corners(weights: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
 
 
 def value_iteration(
-    likelihoods: jax.Array,
+    likelihoods: Float[Array, "C K C"],
     reward: Reward,
     mixture: Callable[[jax.Array], Belief],
     prior: Belief,
     config: MdpConfig,
     horizon: int,
-    most_points: int = MOST_POINTS,
+    max_points: int = MAX_POINTS,
 ) -> LookValues:
     """The values of one modality's looks.
 
@@ -141,7 +158,7 @@ def value_iteration(
       prior: `[D]` belief of an unseen PoI, whose classes are equally likely.
       config: `max_steps`, which also limits the looks at one PoI.
       horizon: maximum number of looks at one PoI; static.
-      most_points: of the lattice; static.
+      max_points: of the lattice; static.
 
     Returns:
       The values at the points of the lattice. The optimal policy takes every look whose `q` is
@@ -155,7 +172,7 @@ def value_iteration(
     chex.assert_shape(likelihoods, (number, num_looks, number), custom_message="likelihoods")
     checks.require_finite("likelihoods", likelihoods)
     checks.require_number("horizon", horizon)
-    points = jnp.asarray(lattice(number, most_points), jnp.float32)
+    points = jnp.asarray(lattice(number, max_points), jnp.float32)
     steps = steps_of_lattice(number, len(points))
     # The unseen PoI is the last row, to which no look leads.
     points = jnp.concatenate([points, jnp.full((1, number), 1 / number)])

@@ -1,8 +1,7 @@
 """The table of policies, for the map MDP and for missions.
 
-A policy is a function of the trained models and of what a robot knows, and returns `[N + 1]` values
-of actions, the highest of which is taken; NOP's is the last. A policy of your own is one more entry
-of a table.
+A policy is a function from trained models and what a robot knows to `[N + 1]` values of actions, the
+highest of which is taken; the last is NOP's. A policy of your own is one more entry of a table.
 """
 
 import dataclasses
@@ -11,6 +10,7 @@ from typing import Protocol
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
@@ -99,7 +99,7 @@ class Policy:
 
 
 def table(own: Mapping[str, Values | Policy] | None = None) -> dict[str, Policy]:
-    """All policies by name: `POLICIES`, and then those of your own."""
+    """All policies by name: `POLICIES`, then your own."""
     wrapped = {
         name: each if isinstance(each, Policy) else Policy(each)
         for name, each in (own or {}).items()
@@ -107,15 +107,18 @@ def table(own: Mapping[str, Values | Policy] | None = None) -> dict[str, Policy]
     return {**POLICIES, **wrapped}
 
 
-def best(values: jax.Array) -> jax.Array:
-    """Action, `[]` int32, of the highest of `[N + 1]` values; -1, which is none, if one is NaN."""
+def best(values: Float[Array, " A"]) -> Int[Array, ""]:
+    """Action of the highest value, `[]` int32, or -1 if any value is NaN."""
     return jnp.where(jnp.any(jnp.isnan(values)), -1, jnp.argmax(values)).astype(jnp.int32)
 
 
 def expected_gains(
-    fusion: Fusion, look_values: tuple[LookValues, ...], belief: Belief, is_seen: jax.Array
-) -> jax.Array:
-    """Expected reward of each modality's next look at each PoI, by what the map shows.
+    fusion: Fusion,
+    look_values: tuple[LookValues, ...],
+    belief: Belief,
+    is_seen: Bool[Array, " N"],
+) -> Float[Array, "M N"]:
+    """Expected reward of each modality's next look at each PoI, given the map.
 
     Args:
       fusion: reads the map.
@@ -135,12 +138,12 @@ def expected_gains(
 def _expected(
     values: jax.Array, of_unseen: jax.Array, probabilities: jax.Array, is_seen: jax.Array
 ) -> jax.Array:
-    """`[N]` values of looks, from a table `[P]`, that of an unseen PoI, and `[N, C]` posteriors."""
+    """`[N]` values of looks from a `[P]` table, the value of a first look and `[N, C]` posteriors."""
     known = jax.vmap(lambda p: optimum.interpolate(values, p))(probabilities)
     return jnp.where(is_seen, known, of_unseen)
 
 
-def latent(key: Key, models: Trained, known: Known) -> jax.Array:
+def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     """Asks the trained Q-network.
 
     Args:
@@ -156,7 +159,7 @@ def latent(key: Key, models: Trained, known: Known) -> jax.Array:
     )
 
 
-def greedy(key: Key, models: Trained, known: Known) -> jax.Array:
+def greedy(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     """Takes the look with the highest expected gain on the map.
 
     Args:
@@ -168,7 +171,7 @@ def greedy(key: Key, models: Trained, known: Known) -> jax.Array:
     return jnp.append(_gains(models, known)[known.robot], 0.0)
 
 
-def bayes(key: Key, models: Trained, known: Known) -> jax.Array:
+def bayes(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     """Takes the look with the highest expected gain on the exact posterior over the classes.
 
     Args:
@@ -182,7 +185,7 @@ def bayes(key: Key, models: Trained, known: Known) -> jax.Array:
     return jnp.append(gains, 0.0)
 
 
-def optimal(key: Key, models: Trained, known: Known) -> jax.Array:
+def optimal(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     """Takes the look with the highest total gain by dynamic programming on the exact posterior.
 
     Args:
@@ -217,7 +220,7 @@ def naive(number: int) -> Values:
     return values
 
 
-def random(key: Key, models: Trained, known: Known) -> jax.Array:
+def random(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     """Takes every action with equal chance.
 
     Args:

@@ -1,13 +1,14 @@
-"""A network that treats all points of interest alike, for any number of them.
+"""A network for any number of points of interest, which treats them all alike.
 
-One small network reads each PoI, with what lies around it and a pool over all of them (Zaheer et
-al. 2017, Deep Sets). PoIs that are not present count nowhere.
+One small network reads each PoI, its surroundings and a pool over all PoIs (Zaheer et al. 2017,
+Deep Sets). PoIs that are not present are masked out.
 """
 
 import chex
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from jaxtyping import Array, Float
 
 from jaxsense.core.networks import Dense
 
@@ -22,14 +23,14 @@ class PoolingNetwork(nn.Module):
 
     Attributes:
       hidden: sizes of the hidden layers, the same for each PoI.
-      features: numbers known of each PoI; the last three are its presence and its place.
+      features: numbers known of each PoI; the last three are its presence and its position.
     """
 
     hidden: tuple[int, ...]
     features: int
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
         """`[F * N]` to `[N + 1]` values, NOP's last; or `[F * N, B]` to `[N + 1, B]`."""
         batch = x.shape[1:]
         chex.assert_is_divisible(x.shape[0], self.features)
@@ -51,37 +52,35 @@ class PoolingNetwork(nn.Module):
         of_poi = nn.relu(of_poi.reshape(size, *known.shape[1:]) + context[:, None])
         value = Dense(1, last, name="Value")(of_poi.reshape(size, -1))
         value = value.reshape(*known.shape[1:])
-        # A robot's part ends with NOP.
+        # Nothing follows NOP.
         nop = jnp.zeros((1, *batch))
         return jnp.concatenate([jnp.where(present[0] > 0, value, _NOTHING), nop])
 
     def _messages(self, flat: jax.Array, present: jax.Array, place: jax.Array) -> jax.Array:
-        """What lies near each PoI: messages of all PoIs, loudest from where a robot is soonest."""
+        """Sums the messages of all PoIs, weighted by travel time."""
         sent = Dense(_MESSAGES, nn.initializers.lecun_normal(), name="Message")(flat)
         sent = nn.relu(sent).reshape(_MESSAGES, *present.shape[1:]) * present
         seconds = _seconds_between(place)
         near, far = (jnp.exp(-seconds / reach) for reach in _REACHES)
         of_near = jnp.sum(near[None] * sent[:, None], axis=2)
-        # A mean, so that many PoIs that are far away do not count like a near one.
+        # A mean, so that many distant PoIs do not count like a near one.
         of_far = jnp.sum(far[None] * sent[:, None], axis=2)
         of_far /= 1.0 + jnp.sum(far * present, axis=1)[None]
         return jnp.concatenate([of_near, of_far])
 
 
 def _seconds_between(place: jax.Array) -> jax.Array:
-    """About how long a robot takes from one PoI to the next, `[N, N, ...]` seconds.
-
-    It is only a measure of nearness, and so a rough model of travel is enough.
+    """Rough travel time from one PoI to the next, `[N, N, ...]` seconds: a measure of nearness.
 
     Args:
-      place: `[2, N, ...]` of the PoIs in metres from where the robot sets out.
+      place: `[2, N, ...]` positions of the PoIs in metres from where the robot sets out.
     """
     apart = jnp.sqrt(jnp.sum(place**2, axis=0) + 1e-6)
     course = place / apart[None]
     stop = course * jnp.maximum(apart - _VIEW, 0.0)[None]
-    way = place[:, None] - stop[:, :, None]
-    length = jnp.sqrt(jnp.sum(way**2, axis=0) + 1e-6)
-    ahead = jnp.sum(way * course[:, :, None], axis=0) / length
+    path = place[:, None] - stop[:, :, None]
+    length = jnp.sqrt(jnp.sum(path**2, axis=0) + 1e-6)
+    ahead = jnp.sum(path * course[:, :, None], axis=0) / length
     # From 0 for straight on to a half turn, without the cost of an arc cosine.
     turn = jnp.pi / 2 * (1.0 - ahead)
     return turn / _TURN_RATE + jnp.maximum(length - _VIEW, 0.0) / _SPEED

@@ -1,4 +1,4 @@
-"""A replay memory as pure functions: a ring of rounds, with one transition of each environment.
+"""A replay memory as pure functions: a ring of rounds, each with one transition per environment.
 
 Transitions are columns, drawn in blocks of neighbouring environments: copying a few pieces of
 memory is many times faster than picking single numbers.
@@ -7,6 +7,7 @@ memory is many times faster than picking single numbers.
 import chex
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxsense.core.types import Transition, pytree
 
@@ -38,7 +39,12 @@ def init(state_size: int, rounds: int, blocks: int, width: int) -> Replay:
 
 
 def add(replay: Replay, transitions: Transition) -> Replay:
-    """Adds a round in place of the oldest: `[S, E]` states, `[E]` of all else."""
+    """Adds a round in place of the oldest.
+
+    Args:
+      replay: the memory.
+      transitions: `[S, E]` states, `[E]` other fields.
+    """
     rounds, blocks, rows, width = replay.columns.shape
     chex.assert_shape(
         [transitions.s_tm1, transitions.s_t],
@@ -53,7 +59,7 @@ def add(replay: Replay, transitions: Transition) -> Replay:
     return Replay(ring, replay.count + 1)
 
 
-def sample(draws: jax.Array, replay: Replay) -> Transition:
+def sample(draws: Float[Array, "B 2"], replay: Replay) -> Transition:
     """Draws blocks of transitions from a memory that is not empty.
 
     All transitions are equally likely: rounds are uniform, with replacement; each draw takes one of
@@ -64,7 +70,7 @@ def sample(draws: jax.Array, replay: Replay) -> Transition:
       replay: the memory.
 
     Returns:
-      `[S, B * W]` states, and `[B * W]` of all else.
+      `[S, B * W]` states, and `[B * W]` other fields.
     """
     chex.assert_shape(draws, (None, 2), custom_message="draws")
     rounds, blocks, rows, width = replay.columns.shape

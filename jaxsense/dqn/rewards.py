@@ -1,4 +1,4 @@
-"""What a look is rewarded for: the paper's information, or nats. Another kind is a new class."""
+"""Rewards of looks: the paper's, or nats. Another kind is a new class with the methods of `Reward`."""
 
 from typing import Protocol
 
@@ -40,7 +40,12 @@ class Paper:
     min_increase: jax.Array | float
 
     def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
-        """Information of a belief, see `information`; the `probabilities` do not matter."""
+        """Information of a belief, see the function `information`.
+
+        Args:
+          belief: `[D]`.
+          probabilities: not used.
+        """
         del probabilities
         return information(belief.std)
 
@@ -60,7 +65,12 @@ class Nats:
     look_cost: jax.Array | float
 
     def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
-        """Negative entropy of the class `probabilities`, in nats."""
+        """Negative entropy of the classes, in nats.
+
+        Args:
+          belief: not used.
+          probabilities: `[C]` class probabilities.
+        """
         del belief
         return -entropy(probabilities)
 
@@ -75,7 +85,7 @@ def make(config: MdpConfig) -> Reward:
     return rewards[config.reward]
 
 
-def information(std: jax.Array) -> jax.Array:
+def information(std: Float[Array, "... D"]) -> Float[Array, "..."]:
     """Information of a belief, `I = 1 / ||std||_2` (Korthals et al. 2018, Sec. IV).
 
     Args:

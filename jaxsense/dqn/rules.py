@@ -1,13 +1,14 @@
-"""Hand-written rules for choosing the next PoI of a team's robot, to compare learned policies with.
+"""Hand-written rules by which a team's robot chooses its next PoI, to compare policies with.
 
-All read expected gains of information and travel times, and return `[N + 1]` values of actions, the
-highest of which is taken; NOP's, the last, is 0.
+They read expected gains of information and travel times, and return `[N + 1]` values of actions,
+the highest of which is taken. The last, NOP's, is 0.
 """
 
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from jaxsense.dqn.team_mdp import Team
 
@@ -18,7 +19,9 @@ Rule = Callable[[jax.Array, jax.Array, Team, jax.Array], jax.Array]
 """`(gains [R, N], times [R, N], team, agent []) -> [N + 1]` values; see `nearest`."""
 
 
-def nearest(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) -> jax.Array:
+def nearest(
+    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
+) -> Float[Array, " A"]:
     """Prefers the nearest PoI with a positive expected gain.
 
     Args:
@@ -31,7 +34,9 @@ def nearest(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) ->
     return _with_nop(_USEFUL - cost, _is_useful(gains, team)[agent])
 
 
-def auction(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) -> jax.Array:
+def auction(
+    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
+) -> Float[Array, " A"]:
     """Ranks the PoI won in a sequential auction first, the rest as `nearest` does.
 
     Each robot at work bids its travel time for each PoI with a positive expected gain. The lowest
@@ -60,7 +65,9 @@ def auction(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) ->
     return nearest(gains, times, team, agent).at[won].add(jnp.where(won < num_pois, _USEFUL, 0.0))
 
 
-def gain_rate(gains: jax.Array, times: jax.Array, team: Team, agent: jax.Array) -> jax.Array:
+def gain_rate(
+    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
+) -> Float[Array, " A"]:
     """Prefers the PoI with the highest expected gain for each second.
 
     Args:

@@ -1,12 +1,12 @@
-"""The shared map with places: a team of robots chooses, drives and looks, and time counts.
+"""The team MDP: robots choose, drive and look, and time counts.
 
-One step is one robot's choice: the PoI that it will look at, or NOP, which ends its part. Then time
-passes until a robot arrives and looks; the look is written into the map, and that robot chooses
-next. For each robot this is a semi-Markov decision process (Sutton, Precup and Singh 1999,
-Artificial Intelligence 112, Sec. 3), whose actions take as long as its way: it earns the rewards of
-its own looks in the map MDP, less a price of each second, discounted by the time that passes.
+In each step one robot chooses the PoI that it will look at, or NOP, after which it is done. If all
+have chosen, time passes until a robot arrives and looks; the look updates the map, and that robot
+chooses next. For each robot this is a semi-Markov decision process (Sutton, Precup and Singh 1999,
+Artificial Intelligence 112, Sec. 3): an action takes the time until its look. The robot earns the
+rewards of its own looks in the map MDP minus a price of each second, discounted by time.
 
-Times come from a model of travel, which `TravelConfig` holds: a robot turns, drives straight until
+Travel times follow a model with the settings `TravelConfig`: a robot turns, drives straight until
 it is near enough, and looks.
 """
 
@@ -16,27 +16,29 @@ import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float, Int
 
 from jaxsense.config import TeamConfig, TravelConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, Key, pytree
 from jaxsense.dqn import map_mdp
 from jaxsense.dqn.map_mdp import MapMdp, MapState, Outcome
+from jaxsense.dqn.places import Places
 
 TIME_SCALE = 10.0
-"""Seconds in which observations count travel."""
+"""Unit of travel times in observations, in seconds."""
 
 
 @pytree
 class Team:
-    """Robots and PoIs at one moment, as far as each robot knows them.
+    """Robots and PoIs at one moment.
 
     Attributes:
-      positions: `[N, 2]` places of the PoIs, in metres.
-      present: `[N]` bool, PoIs that exist, or that the robot that chooses has not given up.
+      positions: `[N, 2]` of the PoIs, in metres.
+      present: `[N]` bool, PoIs that exist and that the robot that chooses has not given up.
       poses: `[R, 3]` x [m], y [m] and yaw [rad] of the robots.
       modality: `[R]` int32 index of each robot's sensor.
-      works: `[R]` bool, robots that have neither ended nor failed.
+      works: `[R]` bool, robots that are neither done nor failed.
       target: `[R]` int32 PoI that each robot heads for, or N.
     """
 
@@ -55,9 +57,9 @@ class TeamState:
     Attributes:
       map: the map, and the scene that it describes.
       team: where everybody is.
-      asks: `[R]` bool, robots that have yet to choose at this moment, as all do at first.
+      asks: `[R]` bool, robots that have yet to choose at this moment; at first all.
       agent: `[]` int32, the robot that chooses.
-      looked: `[R]` seconds that each robot's look has lasted already.
+      looked: `[R]` seconds that each robot has been looking.
       seconds: `[]` since the start.
     """
 
@@ -74,56 +76,13 @@ Names = tuple[str, ...]
 
 
 @pytree
-class Places:
-    """Random places: each PoI in a cell of its own, robots anywhere.
-
-    Attributes:
-      sides: `[2]` shortest and longest side of an arena, in metres.
-      robot_radius: `[]` metres that a robot keeps from a wall.
-      poi_pitch: smallest distance of two PoIs' centres, in metres.
-      num_pois: N.
-      cells_per_side: cells along a side of an arena.
-    """
-
-    sides: tuple[jax.Array | float, jax.Array | float]
-    robot_radius: jax.Array | float
-    poi_pitch: float = struct.field(pytree_node=False)
-    num_pois: int = struct.field(pytree_node=False)
-    cells_per_side: int = struct.field(pytree_node=False)
-
-    def draw(self, key: Key, num_robots: int) -> tuple[jax.Array, jax.Array]:
-        """Draws an arena.
-
-        Args:
-          key: random key.
-          num_robots: R; static.
-
-        Returns:
-          `[N, 2]` positions of the PoIs, in metres, and `[R, 3]` poses of the robots.
-        """
-        num_pois, per_side = self.num_pois, self.cells_per_side
-        draws = jax.random.uniform(key, (1 + per_side**2 + 2 * num_pois + 3 * num_robots,))
-        side = self.sides[0] + (self.sides[1] - self.sides[0]) * draws[0]
-        order, draws = draws[1 : 1 + per_side**2], draws[1 + per_side**2 :]
-        cell = jnp.argsort(order)[:num_pois]
-        corner = jnp.stack([cell // per_side, cell % per_side], axis=-1)
-        play = jnp.maximum(side / per_side - self.poi_pitch, 0.0)
-        jitter = play * (draws[: 2 * num_pois].reshape(num_pois, 2) - 0.5)
-        positions = (corner + 0.5) * side / per_side - side / 2 + jitter
-        places = 2 * draws[2 * num_pois :].reshape(num_robots, 3) - 1
-        reach = side / 2 - self.robot_radius
-        poses = jnp.concatenate([reach * places[:, :2], jnp.pi * places[:, 2:]], axis=-1)
-        return positions, poses
-
-
-@pytree
 class TeamMdp:
-    """The MDP of a team whose members share one map.
+    """The MDP of a team that shares one map.
 
     Attributes:
-      config: the teams, and the price of time.
+      config: size of teams, travel, and the price of time.
       map: the map MDP, with the largest number of PoIs.
-      places: where PoIs and robots are.
+      places: draws positions of PoIs and robots.
       modalities: names of the sensors, in the order of their indices.
     """
 
@@ -133,24 +92,26 @@ class TeamMdp:
     modalities: Names = struct.field(pytree_node=False)
 
 
-def travel_seconds(config: TravelConfig, pose: jax.Array, places: jax.Array) -> jax.Array:
-    """Time until a robot has looked at PoIs, by the model of travel.
+def travel_seconds(
+    config: TravelConfig, pose: Float[Array, "3"], places: Float[Array, "N 2"]
+) -> Float[Array, " N"]:
+    """Time until a robot has looked at PoIs, by the travel model.
 
     Args:
-      config: the model.
+      config: the travel model.
       pose: `[3]` x [m], y [m] and yaw [rad] of the robot.
-      places: `[N, 2]` of the PoIs, in metres.
+      places: `[N, 2]` positions of the PoIs, in metres.
 
     Returns:
       `[N]` seconds.
     """
     chex.assert_shape(pose, (3,), custom_message="pose")
     chex.assert_shape(places, (None, 2), custom_message="places")
-    turn, way = jax.vmap(lambda place: _way(config, pose, place))(places)
-    return config.look_seconds + jnp.abs(turn) / config.turn_rate + way / config.speed
+    turn, path = jax.vmap(lambda place: _path(config, pose, place))(places)
+    return config.look_seconds + jnp.abs(turn) / config.turn_rate + path / config.speed
 
 
-def travel_times(config: TravelConfig, team: Team) -> jax.Array:
+def travel_times(config: TravelConfig, team: Team) -> Float[Array, "R N"]:
     """Time until each robot has looked at each PoI, see `travel_seconds`.
 
     Args:
@@ -163,45 +124,67 @@ def travel_times(config: TravelConfig, team: Team) -> jax.Array:
     return jax.vmap(lambda pose: travel_seconds(config, pose, team.positions))(team.poses)
 
 
-def _way(config: TravelConfig, pose: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _path(config: TravelConfig, pose: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array]:
     """`[]` radians to turn and `[]` metres to drive until a robot is near enough to look."""
     to_place = place - pose[:2]
     turn = jnp.arctan2(to_place[1], to_place[0]) - pose[2]
     turn = (turn + jnp.pi) % (2 * jnp.pi) - jnp.pi
-    # All at one place, nobody turns.
+    # At zero distance the bearing is undefined: do not turn.
     distance = jnp.linalg.norm(to_place)
     turn = jnp.where(distance > 0, turn, 0.0)
     return turn, jnp.maximum(distance - config.view_distance, 0.0)
 
 
-def move(config: TravelConfig, pose: jax.Array, place: jax.Array, seconds: jax.Array) -> jax.Array:
-    """Pose, `[3]`, of a robot some seconds after it set out for a place, by the model of travel."""
-    turn, way = _way(config, pose, place)
+def move(
+    config: TravelConfig,
+    pose: Float[Array, "3"],
+    place: Float[Array, "2"],
+    seconds: Float[Array, ""],
+) -> Float[Array, "3"]:
+    """Pose of a robot some time after it set out for a PoI, by the travel model.
+
+    Args:
+      config: the travel model.
+      pose: `[3]` x [m], y [m] and yaw [rad] of the robot as it set out.
+      place: `[2]` position of the PoI, in metres.
+      seconds: `[]` since then.
+    """
+    turn, path = _path(config, pose, place)
     turning = jnp.minimum(jnp.abs(turn) / config.turn_rate, seconds)
     yaw = pose[2] + jnp.sign(turn) * turning * config.turn_rate
-    driven = jnp.minimum((seconds - turning) * config.speed, way)
+    driven = jnp.minimum((seconds - turning) * config.speed, path)
     to_place = place - pose[:2]
     along = to_place / jnp.maximum(jnp.linalg.norm(to_place), 1e-6)
     return jnp.append(pose[:2] + driven * along, yaw)
 
 
-def own_seconds(observed: jax.Array, latent_size: int) -> jax.Array:
-    """`[N, ...]` the robot's own time to look at each PoI, from `[F, N, ...]` of `observation`."""
+def own_seconds(observed: Float[Array, "F N ..."], latent_size: int) -> Float[Array, "N ..."]:
+    """The robot's own time to look at each PoI, in seconds.
+
+    Args:
+      observed: `[F, N, ...]` from `observation`.
+      latent_size: D.
+    """
     return TIME_SCALE * observed[2 * latent_size]
 
 
 def num_features(latent_size: int, num_modalities: int) -> int:
-    """Numbers that a robot knows of each PoI, see `observation`."""
+    """Numbers that a robot knows of each PoI, F, see `observation`.
+
+    Args:
+      latent_size: D.
+      num_modalities: M.
+    """
     return 2 * latent_size + 3 * num_modalities + 4
 
 
 def observation(
-    config: TravelConfig, belief: Belief, team: Team, agent: jax.Array, num_modalities: int
-) -> jax.Array:
+    config: TravelConfig, belief: Belief, team: Team, agent: Int[Array, ""], num_modalities: int
+) -> Float[Array, "F N"]:
     """What a robot knows when it chooses.
 
     Args:
-      config: the model of travel.
+      config: the travel model.
       belief: `[N, D]` the map.
       team: where everybody is.
       agent: `[]` int32, the robot that chooses.
@@ -211,7 +194,10 @@ def observation(
       `[F, N]`, for each PoI: mean and standard deviation of its belief; the robot's own time to
       look at it; for each modality, how soon another robot that heads for it arrives, and how soon
       the nearest other robot could, as `exp(-time / 10 s)`, 0 for none; the robot's own modality,
-      one number for each; whether the PoI is present; and its place relative to the robot.
+      one number for each; whether the PoI is present; and its position relative to the robot.
+
+    Raises:
+      ValueError: if a standard deviation is not positive.
     """
     chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
     checks.require_positive("belief.std", belief.std)
@@ -256,15 +242,18 @@ def alone(num_pois: int, modality: Index) -> Team:
     )
 
 
-def reset(key: Key, mdp: TeamMdp, modality: jax.Array | None = None) -> TeamState:
+def reset(key: Key, mdp: TeamMdp, modality: Int[Array, " R"] | None = None) -> TeamState:
     """Starts an episode with a random number of PoIs and earlier looks.
 
     Args:
       key: random key.
       mdp: the MDP.
-      modality: `[R]` int32 sensors of the robots, who all work; by default the team is random. In a
-        share of its episodes, `TeamConfig.alone`, one robot is alone, and all is at one place: the
-        map MDP of the paper, where only looks take time.
+      modality: `[R]` int32 sensors of the robots, which all work; by default the team is random. In
+        a share of these episodes, `TeamConfig.alone`, one robot is alone and shares its position
+        with all PoIs: the map MDP of the paper, where only looks take time.
+
+    Raises:
+      ValueError: if a modality does not exist.
     """
     map_key, place_key, number_key, team_key, alone_key, seen_key = jax.random.split(key, 6)
     config, num_pois = mdp.config, mdp.map.num_pois
@@ -284,7 +273,7 @@ def reset(key: Key, mdp: TeamMdp, modality: jax.Array | None = None) -> TeamStat
 
     some_key, share_key, looks_key = jax.random.split(seen_key, 3)
     starts_late = alone | jax.random.bernoulli(some_key, config.partly_seen)
-    # Of any share, so that the end of a mission is seen as often as its middle.
+    # Uniform share, so that late states are as frequent as early ones.
     share = jnp.where(starts_late, jax.random.uniform(share_key), 0.0)
     seen = jax.random.bernoulli(looks_key, share, (num_pois, mdp.map.num_modalities))
     state = map_mdp.reset(map_key, mdp.map, seen=seen)
@@ -309,7 +298,7 @@ def _look(
         after, outcome = map_mdp.step(key, mdp, state, action, m)
         return after, outcome.reward
 
-    # Every sensor looks, and one look counts: under `vmap` a switch takes many times as long.
+    # Every sensor looks and one look is kept: under `vmap` a switch takes many times as long.
     found = look(0)
     for m in range(1, mdp.num_modalities):
         found = jax.tree.map(lambda x, y: jnp.where(modality == m, x, y), look(m), found)  # noqa: B023
@@ -329,8 +318,10 @@ def _random_team(key: Key, mdp: TeamMdp, alone: jax.Array) -> tuple[jax.Array, j
     return modality, works
 
 
-def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[TeamState, Outcome]:
-    """Lets one robot choose; if no other has to, time passes until the next look.
+def step(
+    key: Key, mdp: TeamMdp, state: TeamState, action: Int[Array, ""]
+) -> tuple[TeamState, Outcome]:
+    """Lets one robot choose; if all have chosen, time passes until the next look.
 
     Args:
       key: random key.
@@ -339,8 +330,11 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
       action: `[]` int32 choice of robot `state.agent`: a PoI, or N for NOP.
 
     Returns:
-      The next state and the outcome. The reward is that of the look, if there was one, of the robot
-      that chooses next; `seconds` have passed.
+      The next state and the outcome: the reward of the look, if there was one, by the robot that
+      chooses next, and the seconds that passed.
+
+    Raises:
+      ValueError: if there is no such action.
     """
     chex.assert_rank(action, 0, custom_message="action")
     checks.require_index("action", action, mdp.map.num_pois + 1)
@@ -360,7 +354,7 @@ def step(key: Key, mdp: TeamMdp, state: TeamState, action: jax.Array) -> tuple[T
     left = times - state.looked
     looker = jnp.argmin(jnp.where(works, left, jnp.inf)).astype(jnp.int32)
     seconds = jnp.where(passes, left[looker], 0.0)
-    # A look that has begun goes on while another robot looks.
+    # A look under way continues while another robot looks.
     looked = jnp.maximum(state.looked + seconds - (times - travel.look_seconds), 0.0)
     looked = jnp.minimum(looked, travel.look_seconds)
     moved = jax.vmap(lambda pose, goal: move(travel, pose, goal, seconds))(team.poses, goals)

@@ -1,10 +1,10 @@
-"""How soon the robots of a team end after each choice, learned from trials in the travel model.
+"""Time until the robots of a team are done after each choice, learned from simulated trials.
 
-A discounted Q-network, see `team_mdp`, knows what a look is worth, but not the end of a mission:
-it puts off PoIs that lie apart, and the way back to them is long. So some choices of a robot are
-tried from the same state and with the same random numbers. After each, everybody follows a given
-policy until all have ended, and a second network learns which choice ends soonest: one step of
-policy improvement by rollouts (Tesauro and Galperin 1996, On-line policy improvement using
+A discounted Q-network, see `team_mdp`, predicts what a look is worth but barely reflects the end of
+a mission: it puts off remote PoIs, and returning to them takes long. Therefore several choices of a
+robot are tried from the same state and with the same random numbers. After each, all robots follow
+a given policy until they are done, and a second network learns which choice ends soonest: one step
+of policy improvement by rollouts (Tesauro and Galperin 1996, On-line policy improvement using
 Monte-Carlo search; Bertsekas, Tsitsiklis and Wu 1997, J. Heuristics 3, 245-262).
 """
 
@@ -14,6 +14,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float, Int
 
 from jaxsense.config import ToursConfig
 from jaxsense.core import networks
@@ -37,9 +38,9 @@ class Trials:
 
     Attributes:
       observation: `[F * N, ...]` what the robot knew.
-      is_tried: `[N, ...]` bool, PoIs that it set out for; none where it had fewer than two to
-        choose from.
-      seconds: `[N, ...]` mean over the robots at work of the time until each ends; counts where
+      is_tried: `[N, ...]` bool, PoIs that it set out for; none if it had fewer than two to choose
+        from.
+      seconds: `[N, ...]` mean over the working robots of the time until each is done; valid where
         tried.
     """
 
@@ -54,8 +55,8 @@ def try_choices(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, num
     Args:
       key: random key.
       mdp: the MDP.
-      policy: what everybody follows after the choice, and before it.
-      config: how many choices, and how far from a start.
+      policy: what all robots follow before and after the choice.
+      config: how many choices are tried, and how far from a start.
       number: B, of states.
 
     Returns:
@@ -107,7 +108,7 @@ def _some_way_on(
 def _seconds_to_end(
     key: Key, mdp: TeamMdp, policy: Policy, state: TeamState, poi: jax.Array
 ) -> jax.Array:
-    """`[]` seconds until a robot has ended if one sets out for a PoI, the mean of all at work."""
+    """`[]` mean seconds until a working robot is done if one sets out for a PoI."""
     begin_key, step_key = jax.random.split(key)
     after, _ = team_mdp.step(begin_key, mdp, state, poi)
     ends = jnp.full(state.team.works.shape, state.seconds)
@@ -149,7 +150,7 @@ def no_trials(num_features: int, num_pois: int, number: int) -> Trials:
     )
 
 
-def write(trials: Trials, found: Trials, column: jax.Array) -> Trials:
+def write(trials: Trials, found: Trials, column: Int[Array, ""]) -> Trials:
     """Writes trials into a buffer.
 
     Args:
@@ -165,9 +166,9 @@ def write(trials: Trials, found: Trials, column: jax.Array) -> Trials:
 
 
 def seconds(
-    network: PoolingNetwork, params: Params, observation: jax.Array, latent_size: int
-) -> jax.Array:
-    """Seconds until robots end, on average, if this one sets out for each PoI; up to a constant.
+    network: PoolingNetwork, params: Params, observation: Float[Array, "S ..."], latent_size: int
+) -> Float[Array, "N ..."]:
+    """Mean seconds until robots are done if this one sets out for each PoI, up to a constant.
 
     Args:
       network: of a team.
@@ -176,10 +177,10 @@ def seconds(
       latent_size: D.
 
     Returns:
-      `[N, ...]`; only differences mean anything, and those to absent PoIs nothing.
+      `[N, ...]`; only differences between PoIs that are present have a meaning.
     """
     learned = networks.apply(network, params, observation)[:-1]
-    observed = observation.reshape(network.features, *learned.shape)
+    observed = observation.reshape((network.features, *learned.shape))
     return team_mdp.own_seconds(observed, latent_size) + TIME_SCALE * learned
 
 
@@ -199,15 +200,31 @@ class Fitting:
     network: PoolingNetwork = struct.field(pytree_node=False)
     latent_size: int = struct.field(pytree_node=False)
 
-    def draw(self, key: Key, number: int) -> jax.Array:
-        """Columns of states in which something was tried, see `supervised.Problem.draw`."""
+    def draw(self, key: Key, number: int) -> Int[Array, "T B"]:
+        """Draws states in which something was tried, see `supervised.Problem.draw`.
+
+        Args:
+          key: random key.
+          number: of steps.
+
+        Returns:
+          `[number, B]` int32 columns of the trials.
+        """
         counts = jnp.any(self.trials.is_tried, axis=0)
         first = jnp.argsort(~counts)
         drawn = jax.random.uniform(key, (number, self.config.batch)) * jnp.sum(counts)
         return first[jnp.floor(drawn).astype(jnp.int32)]
 
-    def loss(self, params: Params, drawn: jax.Array, step: jax.Array) -> jax.Array:
-        """`[]` mean error of a batch."""
+    def loss(
+        self, params: Params, drawn: Int[Array, " B"], step: Int[Array, ""]
+    ) -> Float[Array, ""]:
+        """Mean error of a batch.
+
+        Args:
+          params: of the network.
+          drawn: `[B]` columns of the trials.
+          step: not used.
+        """
         del step
         trials = jax.tree.map(lambda x: x[:, drawn], self.trials)
         predicted = seconds(self.network, params, trials.observation, self.latent_size)

@@ -1,7 +1,6 @@
-"""Deep Q-learning over many environments at once (Mnih et al. 2015), as pure functions.
+"""Deep Q-learning in many environments side by side (Mnih et al. 2015), as pure functions.
 
-Random numbers are drawn for a whole chunk of epochs at once: in the loop they would dominate its
-cost.
+Random numbers are drawn once for a whole chunk of epochs: in the loop they would dominate its cost.
 """
 
 import dataclasses
@@ -91,7 +90,7 @@ class _Draws:
 
 
 def init(key: Key, environment: Environment[S], config: DqnConfig, prepared: S) -> DqnState[S]:
-    """Fresh network, empty replay, and environments before their first start.
+    """The state before the first chunk: a new network, an empty replay, no episode started.
 
     Args:
       key: random key of the network.
@@ -118,8 +117,8 @@ def init(key: Key, environment: Environment[S], config: DqnConfig, prepared: S) 
 def starts(key: Key, environment: Environment[S], config: DqnConfig) -> S:
     """Random states, `[num_starts]`, for episodes to start from.
 
-    A training prepares them once: a start looks at everything that has been seen, which costs far
-    more than a step.
+    A training prepares them once: a start simulates every look already taken, which costs far more
+    than a step.
 
     Args:
       key: random key.
@@ -281,12 +280,13 @@ def _explore(
 
     steps = jax.vmap(step, in_axes=(0, 0, -1, 0), out_axes=(0, -1, 0, 0))
     envs, (s_tm1, s_t), numbers, outcome = steps(draws.step, started, s_tm1, a_tm1)
-    transitions = Transition(s_tm1, *numbers, s_t)
+    a_tm1, r_t, discount_t = numbers
+    transitions = Transition(s_tm1, a_tm1, r_t, discount_t, s_t)
     return envs, outcome.terminated | outcome.truncated, transitions, values
 
 
 def _explored(environment: Environment[S], states: S, draws: jax.Array) -> jax.Array:
-    """Random `[E]` int32 actions among those that exist in `[E]` states, by `[E]` in [0, 1)."""
+    """Random `[E]` int32 actions that exist in `[E]` states, from `[E]` draws in [0, 1)."""
     exist = jax.vmap(environment.action_mask)(states)
     number = jnp.floor(draws * jnp.sum(exist, axis=1)).astype(jnp.int32)
     return jnp.argmax(jnp.cumsum(exist, axis=1) > number[:, None], axis=1).astype(jnp.int32)

@@ -59,7 +59,7 @@ def look_values(
             prior=make_prior(config),
             config=config.mdp,
             horizon=_MAX_LOOKS,
-            most_points=settings.value_points,
+            max_points=settings.value_points,
         )
 
     return tuple(map(of_modality, range(len(config.modalities))))
