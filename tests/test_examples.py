@@ -43,10 +43,9 @@ def learned():
         patch.syspath_prepend(EXAMPLES)
         change = importlib.import_module("new_modality").change
         config = train.parse([*SMALL, *THERMAL], change).config
-        world = sim.make_world(config)
-
-    perceive = jax.jit(lambda key: learn(key, config, world, until="look_values").outputs)
-    return config, perceive(jax.random.key(0))
+        arena = sim.make_world(config).arena
+        perceive = jax.jit(lambda key: learn(key, config, arena, until="look_values").outputs)
+        return config, perceive(jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
@@ -89,10 +88,10 @@ def test_new_modality(example, tmp_path):
 
 def test_the_thermal_camera_tells_what_is_hot(learned):
     _, outputs = learned
-    assert outputs["detections"].metrics["thermal"]["accuracy"] >= 0.95
+    assert outputs["detector_metrics"]["thermal"]["accuracy"] >= 0.95
     _, latent = outputs["latent_space"]
     # Only what is hot is told by the thermal camera alone.
-    thermal = np.asarray(latent["sigma_norm"]["thermal"])
+    thermal = np.asarray(latent.sigma_norm["thermal"])
     assert thermal[3] < 0.7 * min(thermal[:3])
 
 

@@ -21,14 +21,14 @@ from jaxsense import export
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
-from jaxsense.dqn import observation, policies
+from jaxsense.dqn import observation
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.interfaces.onboard import functions
-from jaxsense.models import init, make_jmvae
+from jaxsense.models import init, make_in_place, make_jmvae
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
-from jaxsense.vae import detectors, fusion, jmvae, metrics
+from jaxsense.vae import detectors, jmvae, latent
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "run_exported.py"
 CONFIG = dataclasses.replace(
@@ -66,9 +66,14 @@ def run_alone(code, *arguments):
 
 @pytest.fixture(scope="module")
 def models():
-    models = init(jax.random.key(0), CONFIG)
-    means = jax.random.normal(jax.random.key(1), models.class_beliefs.mean.shape)
-    return dataclasses.replace(models, class_beliefs=Belief(means, jnp.ones_like(means)))
+    return with_classes(init(jax.random.key(0), CONFIG), CONFIG)
+
+
+def with_classes(models, config):
+    """The models, with classes at random places in the latent space."""
+    means = jax.random.normal(jax.random.key(1), models.fusion.classes.mean.shape)
+    classes = Belief(means, jnp.ones_like(means))
+    return dataclasses.replace(models, fusion=make_in_place(config, models.jmvae, classes))
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +122,7 @@ def check(results, name, expected, *keys):
 
 @pytest.mark.parametrize("m", [0, 1])
 def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
-    name, model = CONFIG.modalities[m], make_jmvae(CONFIG)
+    name = CONFIG.modalities[m]
     sensor = sensors.make(CONFIG)[m]
 
     def window(readings, bearing):
@@ -128,8 +133,8 @@ def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
         return [np.minimum(readings[rays], sensor.window_limit).reshape(-1)]
 
     def write(mean, std, seen, features):
-        entry = fusion.write(models.jmvae, model, Belief(mean, std), seen, features, m)
-        return entry.mean, entry.std
+        belief = models.fusion.update(Belief(mean, std), seen, features, m)
+        return belief.mean, belief.std
 
     def decide(mean, std):
         network = MLP(CONFIG.dqn.hidden, CONFIG.arena.num_pois + 1)
@@ -158,11 +163,11 @@ def test_encoders_give_what_jaxsense_gives(models, results, name, given):
 
 
 def test_the_map_is_read_as_jaxsense_reads_it(models, results):
-    means = models.class_beliefs.mean
+    means = models.fusion.classes.mean
 
     def classify(mean, std):
         belief = Belief(mean, std)
-        return metrics.nearest_class(belief, means), metrics.plausible_classes(belief, means)
+        return latent.nearest_class(belief, means), latent.plausible_classes(belief, means)
 
     check(results, "classify", classify, "nearest", "plausible")
 
@@ -170,16 +175,14 @@ def test_the_map_is_read_as_jaxsense_reads_it(models, results):
 def test_the_policy_of_a_team_serves_any_number_of_points_and_robots():
     dqn = dataclasses.replace(PRESETS["team"].dqn, hidden=(8,))
     config = dataclasses.replace(CONFIG, dqn=dqn, robots=("camera", "lidar", "lidar"))
-    trained = init(jax.random.key(0), config)
-    means = jax.random.normal(jax.random.key(1), trained.class_beliefs.mean.shape)
-    trained = dataclasses.replace(trained, class_beliefs=Belief(means, jnp.ones_like(means)))
+    trained = with_classes(init(jax.random.key(0), config), config)
     of_run = functions(config, trained)
     decide = export.exported(of_run["decide_lidar"])
 
     @jax.jit
-    def values(*known):
-        sizes = 2, config.team, config.dqn
-        return policies.tour_values(trained.q_networks[1], trained.tours, *known, *sizes)
+    def values(belief, team, robot):
+        q_network, classes = trained.q_networks[1], trained.fusion.classes
+        return trained.agent.decide(q_network, trained.tours, classes, belief, team, robot)
 
     assert [str(n) for n in decide.out_avals[1].shape] == ["batch", "points + 1"]
     for num_pois, num_robots in ((5, 3), (2, 1)):

@@ -1,12 +1,12 @@
 """The table of policies, for the map MDP and for missions.
 
-A policy is a function from trained models and what a robot knows to `[N + 1]` values of actions, the
-highest of which is taken; the last is NOP's. A policy of your own is one more entry of a table.
+A policy maps trained models and what a robot knows to `[N + 1]` values of actions, the highest of
+which is taken; the last is NOP's. A policy of your own is one more entry of a table.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,8 @@ from jaxsense.dqn import optimum, rules
 from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team_mdp import Team
+
+T = TypeVar("T")
 
 
 @pytree
@@ -130,7 +132,7 @@ def expected_gains(
       `[M, N]`.
     """
     on_map = jax.vmap(fusion.class_probabilities)(belief)
-    of_each = jax.tree.map(lambda *x: jnp.stack(x), *look_values)
+    of_each = _stacked(look_values)
     by_map = jax.vmap(_expected, in_axes=(0, 0, None, None))
     return by_map(of_each.one_step, of_each.one_step_unseen, on_map, is_seen)
 
@@ -138,7 +140,7 @@ def expected_gains(
 def _expected(
     values: jax.Array, of_unseen: jax.Array, probabilities: jax.Array, is_seen: jax.Array
 ) -> jax.Array:
-    """`[N]` values of looks from a `[P]` table, the value of a first look and `[N, C]` posteriors."""
+    """`[N]` values of looks from a `[P]` table, that of a first look and `[N, C]` posteriors."""
     known = jax.vmap(lambda p: optimum.interpolate(values, p))(probabilities)
     return jnp.where(is_seen, known, of_unseen)
 
@@ -152,7 +154,7 @@ def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
       known: what the robot knows.
     """
     del key
-    q_network = jax.tree.map(lambda *x: jnp.stack(x)[known.modality], *models.q_networks)
+    q_network = jax.tree.map(lambda x: x[known.modality], _stacked(models.q_networks))
     classes = models.fusion.classes
     return models.agent.decide(
         q_network, models.tours, classes, known.belief, known.team, known.robot
@@ -252,8 +254,12 @@ def _gains(models: Trained, known: Known) -> jax.Array:
 
 def _own(models: Trained, known: Known) -> LookValues:
     """The values of looks with the robot's own sensor."""
-    of_each = jax.tree.map(lambda *x: jnp.stack(x), *models.look_values)
-    return jax.tree.map(lambda x: x[known.modality], of_each)
+    return jax.tree.map(lambda x: x[known.modality], _stacked(models.look_values))
+
+
+def _stacked(of_modalities: tuple[T, ...]) -> T:
+    """One tree with the leaves of all, `[M, ...]`."""
+    return jax.tree.map(lambda *x: jnp.stack(x), *of_modalities)
 
 
 def _always(agent: Agent) -> bool:

@@ -1,4 +1,4 @@
-"""Rewards of looks: the paper's, or nats. Another kind is a new class with the methods of `Reward`."""
+"""Rewards of looks: the paper's, or nats. Another kind is a new class like `Reward`."""
 
 from typing import Protocol
 

@@ -1,4 +1,4 @@
-"""Packages that are not installed with jaxsense itself."""
+"""Imports of packages that jaxsense does not require."""
 
 import contextlib
 import sys
@@ -7,7 +7,11 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def extra(name: str) -> Iterator[None]:
-    """Names the extra of jaxsense that installs a package whose import fails."""
+    """Names the extra of jaxsense that installs a package whose import fails.
+
+    Raises:
+      ModuleNotFoundError: if a package is not installed.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
@@ -18,7 +22,7 @@ def extra(name: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Sends what an import prints to the standard error, and keeps the streams that it replaces.
+    """Sends what an import prints to standard error, and restores the streams that it replaces.
 
     jaxmarl sets `sys.stdout` to `sys.__stdout__`, which is not where a notebook prints.
     """

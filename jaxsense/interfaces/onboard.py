@@ -1,4 +1,4 @@
-"""Functions of one example that a robot needs of a run, independent of the run."""
+"""The functions of a run that a robot needs, for export; each takes one example."""
 
 import dataclasses
 from collections.abc import Callable
@@ -24,7 +24,7 @@ class Function:
       about: its result, in one line.
       inputs: shape and dtype of each input, by its name.
       apply: `(*inputs) -> {name: output}`.
-      any_size: names of the axes that may have any size, by input, as in `"points, ..."`.
+      any_size: names of the axes of any size, by input, for example `"points, ..."`.
     """
 
     about: str
@@ -38,6 +38,10 @@ def functions(config: Config, models: Models) -> dict[str, Function]:
 
     For each modality M `window_M`, `detect_M`, `write_M` and `decide_M`; for each encoder of the
     JMVAE an `encode_M`, for example `encode_camera+lidar`; and `classify`.
+
+    Args:
+      config: all settings.
+      models: trained models.
     """
     model = make_jmvae(config)
     found = {}
@@ -97,48 +101,38 @@ def _encode(models: Models, model: jmvae.Jmvae, subset: tuple[int, ...]) -> Func
         return _named(jmvae.posterior(models.jmvae, model, of_each))
 
     inputs = {model.modalities[m]: _floats(model.feature_sizes[m]) for m in subset}
-    return Function("the belief after a detection by each of these", inputs, apply)
+    return Function("the belief after a look by each of these", inputs, apply)
 
 
 def _decide(config: Config, models: Models, m: int) -> Function:
     if models.agent.counts_time:
         return _decide_in_team(config, models, m)
-    num_pois = config.arena.num_pois
 
     def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
         values = models.agent.values(models.q_networks[m], observation(Belief(mean, std)))
-        return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
+        return _decision(values)
 
-    shape = num_pois, config.jmvae.latent_size
-    inputs = {"mean": _floats(*shape), "std": _floats(*shape)}
-    return Function("the PoI to look at next, N for NOP, and the value of each", inputs, apply)
+    about = "the PoI to look at next, N for NOP, and the value of each"
+    return Function(about, _map_inputs(config), apply)
 
 
 def _decide_in_team(config: Config, models: Models, m: int) -> Function:
     num_pois, num_robots = config.arena.num_pois, len(config.carried)
 
-    def apply(
-        mean: jax.Array,
-        std: jax.Array,
-        positions: jax.Array,
-        present: jax.Array,
-        poses: jax.Array,
-        modality: jax.Array,
-        works: jax.Array,
-        target: jax.Array,
-        robot: jax.Array,
-    ) -> dict[str, jax.Array]:
-        team = Team(positions, present, poses, modality, works, target)
-        classes, belief = models.fusion.classes, Belief(mean, std)
+    def apply(mean: jax.Array, std: jax.Array, *known: jax.Array) -> dict[str, jax.Array]:
+        of_team = dict(zip(team, known, strict=True))
+        robot = of_team.pop("robot")
         values = models.agent.decide(
-            models.q_networks[m], models.tours, classes, belief, team, robot
+            models.q_networks[m],
+            models.tours,
+            models.fusion.classes,
+            Belief(mean, std),
+            Team(**of_team),
+            robot,
         )
-        return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
+        return _decision(values)
 
-    shape = num_pois, config.jmvae.latent_size
-    inputs = {
-        "mean": _floats(*shape),
-        "std": _floats(*shape),
+    team = {
         "positions": _floats(num_pois, 2),
         "present": jax.ShapeDtypeStruct((num_pois,), bool),
         "poses": _floats(num_robots, 3),
@@ -147,20 +141,29 @@ def _decide_in_team(config: Config, models: Models, m: int) -> Function:
         "target": jax.ShapeDtypeStruct((num_robots,), jnp.int32),
         "robot": jax.ShapeDtypeStruct((), jnp.int32),
     }
-    about = "the PoI to look at next, N for NOP, and the value of each; targets likewise"
+    about = "the PoI to look at next, N for NOP, and the value of each; the same for targets"
     of_pois = dict.fromkeys(("mean", "std", "positions", "present"), "points, ...")
     of_robots = dict.fromkeys(("poses", "modality", "works", "target"), "robots, ...")
-    return Function(about, inputs, apply, {**of_pois, **of_robots})
+    return Function(about, {**_map_inputs(config), **team}, apply, {**of_pois, **of_robots})
+
+
+def _map_inputs(config: Config) -> dict[str, jax.ShapeDtypeStruct]:
+    of_map = _floats(config.arena.num_pois, config.jmvae.latent_size)
+    return {"mean": of_map, "std": of_map}
+
+
+def _decision(values: jax.Array) -> dict[str, jax.Array]:
+    return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
 
 
 def _classify(models: Models) -> Function:
     means = models.fusion.classes.mean
 
     def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
-        entry = Belief(mean, std)
+        belief = Belief(mean, std)
         return {
-            "nearest": models.fusion.most_likely_class(entry).astype(jnp.int32),
-            "plausible": latent.plausible_classes(entry, means),
+            "nearest": models.fusion.most_likely_class(belief).astype(jnp.int32),
+            "plausible": latent.plausible_classes(belief, means),
         }
 
     inputs = {"mean": _floats(means.shape[1]), "std": _floats(means.shape[1])}
