@@ -8,7 +8,7 @@ from jaxsense import dqn, mission
 from jaxsense.dqn import episodes, policies
 
 
-def widest(key: jax.Array, models: dqn.policies.Trained, known: dqn.Known) -> jax.Array:
+def widest(key: jax.Array, models: policies.Trained, known: dqn.Known) -> jax.Array:
     """Values of actions, `[N + 1]`: looks at the PoI with the widest belief, twice at most."""
     width = jnp.linalg.norm(known.belief.std, axis=-1)
     is_left = known.looks[:, known.modality] < 2

@@ -2,9 +2,9 @@
 
     python examples/run_exported.py runs/.../exported.zip
 
-plays the looks of a run's robots at the points of interest of one map: each asks its own policy
-where to look, and writes into the map what its sensor detects there. Real robots detect in their
-scans with `detect`; here the detections are made up.
+lets a run's robots explore the points of interest (PoIs) of one map: each asks its own policy where
+to look, and updates the map with what its sensor detects there. Real robots run `detect` on their
+scans; here the features are made up.
 """
 
 import argparse
@@ -60,7 +60,7 @@ def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) ->
     known = {
         "mean": mean,
         "std": std,
-        # What policies of a team also read: places in metres, on a circle around the robots.
+        # What policies of a team also read: positions in metres, on a circle around the robots.
         "positions": 2 * np.stack([np.cos(angles), np.sin(angles)], axis=1),
         "present": np.ones(num_pois, bool),
         "poses": np.zeros((len(robots), 3), np.float32),
@@ -83,10 +83,10 @@ def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) ->
             labels = contents["labels"][name]
             features = np.eye(len(labels), dtype=np.float32)[label]
             poi = slice(action, action + 1)
-            entry = programs[f"write_{name}"](mean[poi], std[poi], seen[poi], features[None])
-            mean[poi], std[poi] = entry["mean"], entry["std"]
+            belief = programs[f"write_{name}"](mean[poi], std[poi], seen[poi], features[None])
+            mean[poi], std[poi] = belief["mean"], belief["std"]
             seen[action, modalities.index(name)] = True
-            # It drives there in no time; 0.9 m on this side of the PoI it looks at it.
+            # It arrives at once, and looks at the PoI from 0.9 m.
             known["poses"][robot, :2] = 0.55 * known["positions"][action]
             told = ", ".join(np.array(contents["classes"])[plausible(programs, mean, std)[action]])
             lines.append(f"{name} looks at PoI {action}: {labels[label]}; it may be: {told}")
@@ -102,7 +102,7 @@ def plausible(programs: Programs, mean: np.ndarray, std: np.ndarray) -> np.ndarr
 
 
 def main() -> None:
-    """The program."""
+    """Runs the program."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("file", type=Path, help="from `python -m jaxsense.export`")
     path = parser.parse_args().file
