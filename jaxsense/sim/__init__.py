@@ -1,10 +1,10 @@
-"""Simulated AMiRos, arenas and scanline sensors in MuJoCo-MJX."""
+"""Simulation in MuJoCo-MJX: arenas, AMiRo robots and their scanline sensors."""
 
 import contextlib
 import io
 
 with contextlib.redirect_stdout(io.StringIO()):
-    # On import, MJX prints that NVIDIA Warp, which nothing here uses, is not installed.
+    # On import, MJX prints that NVIDIA Warp is not installed; nothing here uses it.
     import mujoco.mjx as _  # noqa: F401
 
 from jaxsense.sim import sensors as sensors
@@ -23,10 +23,10 @@ from jaxsense.sim.raycast import cast as cast
 from jaxsense.sim.raycast import cast_along as cast_along
 from jaxsense.sim.raycast import choose as choose
 from jaxsense.sim.raycast import cross_section as cross_section
-from jaxsense.sim.sensors import Fan as Fan
+from jaxsense.sim.rays import Fan as Fan
+from jaxsense.sim.rays import Pinhole as Pinhole
+from jaxsense.sim.rays import Rays as Rays
 from jaxsense.sim.sensors import Light as Light
-from jaxsense.sim.sensors import Pinhole as Pinhole
-from jaxsense.sim.sensors import Rays as Rays
 from jaxsense.sim.sensors import Sensor as Sensor
 from jaxsense.sim.sensors import Surfaces as Surfaces
 from jaxsense.sim.sensors import random_light as random_light

@@ -1,10 +1,9 @@
-"""The AMiRo mini robot: its sizes and its MJCF.
+"""The AMiRo mini robot: its dimensions and its MJCF.
 
-Numbers come from the robot's published URDF (`amiro_description`). The robot moves in the plane on
-two slides and a hinge, so its `qpos` and `qvel` are x [m], y [m] and yaw [rad]. Its wheels are
-velocity servos that push the body where the wheels stand; a third, passive actuator keeps it from
-sliding sideways. Nothing else couples them: a wheel that cannot reach its speed slips, within the
-servo's force.
+The numbers come from the robot's published URDF (`amiro_description`). Two slides and a hinge let
+the robot move in the plane, so its `qpos` and `qvel` are x [m], y [m] and yaw [rad]. Its wheels are
+velocity servos that push the body at the wheels' positions; a third, passive actuator prevents it
+from sliding sideways. A wheel that cannot reach its speed with the servo's force slips.
 """
 
 from jaxsense.config import ROBOT_RADIUS
@@ -29,8 +28,8 @@ MAX_ACCELERATION = 2.5  # m/s^2
 MAX_TURN_ACCELERATION = 3.2  # rad/s^2
 
 _MASS = BODY_MASS + 2 * WHEEL_MASS
-# Of the servo on its way to a commanded wheel speed; two physics steps or more keep the integration
-# stable and well damped.
+# Time constant of the wheel servos; two physics steps or more keep the integration stable and well
+# damped.
 _TIME_CONSTANT = 0.02  # s
 _WHEEL_GAIN = _MASS * WHEEL_RADIUS**2 / (2 * _TIME_CONSTANT)  # N m s / rad
 _WHEEL_TORQUE = _MASS * MAX_ACCELERATION * WHEEL_RADIUS / 2  # N m
@@ -41,24 +40,24 @@ _WHEEL_INERTIA = WHEEL_MASS * (WHEEL_RADIUS**2 / 4 + WHEEL_WIDTH**2 / 12)  # abo
 _YAW_INERTIA = BODY_MASS * BODY_RADIUS**2 / 2 + 2 * (
     _WHEEL_INERTIA + WHEEL_MASS * (WHEEL_SEPARATION / 2) ** 2
 )  # kg m^2
-# Both accelerations come from the same motors: each rad/s^2 of turning takes this much from the
-# forward acceleration.
+# The same motors accelerate and turn the robot: each rad/s^2 of turning costs this much forward
+# acceleration.
 FORWARD_PER_TURN = 2 * _YAW_INERTIA / (_MASS * WHEEL_SEPARATION)  # m/rad
 
 MAX_WHEEL_SPEED = (MAX_SPEED + MAX_TURN_RATE * WHEEL_SEPARATION / 2) / WHEEL_RADIUS  # rad/s
 
 
 def body(name: str, has_lidar: bool, reach: float) -> str:
-    """MJCF of one robot's body.
+    """Writes the MJCF of one robot's body.
 
     Args:
       name: prefix of the names of its parts.
-      has_lidar: whether it carries a laser scanner on top besides the camera in its body.
-      reach: largest distance of the robot's centre from the origin along x and along y, in metres.
+      has_lidar: whether a laser scanner is mounted on top; the camera is inside the body.
+      reach: maximum distance of the robot's centre from the origin along x and y, in metres.
 
     Returns:
-      An MJCF `<body>` element. Only the sphere in its middle collides: it meets upright cylinders,
-      boxes and other robots where the robot's disc does.
+      An MJCF `<body>` element. Only the sphere in its middle collides: with upright cylinders,
+      boxes and other robots, it collides exactly where the robot's disc would.
     """
     middle = GROUND_CLEARANCE + BODY_HEIGHT / 2
     tower = (LIDAR_TOP - GROUND_CLEARANCE - BODY_HEIGHT) / 2
@@ -93,7 +92,7 @@ def body(name: str, has_lidar: bool, reach: float) -> str:
 
 
 def actuators(name: str) -> str:
-    """MJCF of one robot's three actuators: left wheel, right wheel, and sideways grip."""
+    """Writes the MJCF of one robot's actuators: left wheel, right wheel and sideways grip."""
     wheels = "".join(
         f'<velocity name="{name}_{side}" site="{name}_{side}" gear="{1 / WHEEL_RADIUS} 0 0 0 0 0" '
         f'kv="{_WHEEL_GAIN}" ctrlrange="{-MAX_WHEEL_SPEED} {MAX_WHEEL_SPEED}" '

@@ -1,8 +1,8 @@
-"""The arena in MuJoCo-MJX: walls, robots, and points of interest whose kind is data.
+"""The arena in MuJoCo-MJX: walls, robots, and PoIs whose classes are data.
 
-A PoI slot owns one upright solid for each shape, each a mocap body; all but the one it shows wait
-below the floor. Pose and shape are therefore entries of the MJX state, colour is an entry of the
-layout, and a new layout or class never recompiles anything.
+Each PoI has one upright solid for every shape, each of them a mocap body; all but the one that it
+shows are stored below the floor. Position and shape are thus part of the MJX state and colour is
+part of the layout, so a new layout or class never recompiles anything.
 """
 
 import dataclasses
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
+from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
 from jaxsense.config import TIMESTEP, ArenaConfig, Shape, require_32_bits
@@ -29,14 +30,14 @@ _WALL_COLOUR = (0.6, 0.6, 0.6)
 
 @pytree
 class Layout:
-    """PoIs of one arena, all as data, so that nothing recompiles.
+    """The PoIs of one arena, all of it data.
 
     Attributes:
       position: `[N, 2]` float32 centres of the PoIs, in metres from the arena's centre.
       yaw: `[N]` float32, in radians.
-      shape: `[N]` int32 index into `config.shapes`, in their order.
+      shape: `[N]` int32 index into the shapes of the settings.
       colour: `[N, 3]` float32 albedo, linear RGB in [0, 1].
-      values: for each of `config.attributes` its `[N]` float32 number.
+      values: `[N]` float32 value of each attribute in the settings.
     """
 
     position: jax.Array
@@ -48,14 +49,14 @@ class Layout:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Arena:
-    """A compiled arena, shared by all its layouts. Static under `jit`.
+    """A compiled arena, shared by all its layouts. Static under `jit`, compared by identity.
 
     Attributes:
       config: the settings it was built from.
-      mj_model: the model for C MuJoCo.
-      model: the same for MJX.
-      data: an MJX state, which `place` fills.
-      num_robots: robots, named robot0, robot1 and so on.
+      mj_model: the model in C MuJoCo.
+      model: the model in MJX.
+      data: an MJX state for `place` to fill in.
+      num_robots: number of robots, which are named robot0, robot1 and so on.
     """
 
     config: ArenaConfig
@@ -65,16 +66,16 @@ class Arena:
     num_robots: int
 
     @functools.cached_property
-    def robot_of_geom(self) -> np.ndarray:
-        """Robot that owns each geom, `[G]` int32, or -1."""
+    def robot_of_geom(self) -> Int[np.ndarray, "G"]:
+        """Index of the robot that each geom belongs to, or -1."""
         bodies = [self.mj_model.body(f"robot{r}").id for r in range(self.num_robots)]
         return np.array(
             [bodies.index(b) if b in bodies else -1 for b in self.mj_model.geom_bodyid], np.int32
         )
 
     @functools.cached_property
-    def poi_of_geom(self) -> np.ndarray:
-        """PoI slot that owns each geom, `[G]` int32, or -1."""
+    def poi_of_geom(self) -> Int[np.ndarray, "G"]:
+        """Index of the PoI that each geom belongs to, or -1."""
         names = [self.mj_model.geom(g).name for g in range(self.mj_model.ngeom)]
         return np.array(
             [int(n.split("_")[0][3:]) if n.startswith("poi") else -1 for n in names], np.int32
@@ -94,10 +95,10 @@ def build(
       config: sizes and number of PoIs.
       lidar_robots: for each robot, whether it carries a laser scanner.
       contacts: whether robots collide with PoIs, with each other and with the walls.
-      obstacles: whether there are PoIs and walls; without them robots move freely and see nothing.
+      obstacles: whether there are PoIs and walls.
 
     Returns:
-      The arena; its `data` holds every robot and PoI at the origin.
+      The arena; in its `data` every robot and PoI is at the origin.
 
     Raises:
       ConfigError: if JAX computes in 64 bits.
@@ -105,7 +106,7 @@ def build(
     require_32_bits()
     mjcf = _mjcf(config, lidar_robots, contacts, obstacles)
     mj_model = mujoco.MjModel.from_xml_string(mjcf)  # pyright: ignore[reportAttributeAccessIssue]
-    # By itself MJX takes the first device of all processes.
+    # The default of MJX is the first device of all processes, not of this one.
     device = jax.local_devices()[0]
     model = mjx.put_model(mj_model, device=device, impl="jax")
     model, data = _as_float32((model, mjx.make_data(model, device=device)))
@@ -113,14 +114,14 @@ def build(
 
 
 def _as_float32(tree):
-    """The simulation runs in float32 even where JAX has 64 bits."""
+    """Keeps the simulation in float32 when JAX runs with 64 bits."""
     return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, tree)
 
 
 def _mjcf(
     config: ArenaConfig, lidar_robots: tuple[bool, ...], contacts: bool, obstacles: bool
 ) -> str:
-    """MJCF of the whole arena."""
+    """Writes the MJCF of the whole arena."""
     reach = config.side / 2 - amiro.BODY_RADIUS
     robots = [f"robot{r}" for r in range(len(lidar_robots))]
     pois = "".join(
@@ -129,8 +130,8 @@ def _mjcf(
         for name, shape in config.shapes.items()
     )
     bits = (1, 2) if contacts else (0, 0)
-    # Euler, because MJX's implicitfast ignores the limit of a servo's force, and accelerates a
-    # third less than C MuJoCo. The servos' time constant of two steps keeps it stable.
+    # MJX's implicitfast ignores the force limit of a servo and accelerates a third less than
+    # C MuJoCo. Euler is stable because the servos' time constant is two steps.
     return f"""
     <mujoco model="jaxsense">
       <compiler angle="degree" autolimits="true"/>
@@ -155,7 +156,7 @@ def _mjcf(
 
 
 def _walls(config: ArenaConfig) -> str:
-    """MJCF of the four walls."""
+    """Writes the MJCF of the four walls."""
     offset = (config.side + WALL_THICKNESS) / 2
     half = (WALL_THICKNESS / 2, config.side / 2 + WALL_THICKNESS)
     return "".join(
@@ -167,7 +168,7 @@ def _walls(config: ArenaConfig) -> str:
 
 
 def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
-    """MJCF of one solid of one PoI."""
+    """Writes the MJCF of one solid of one PoI."""
     u, v = (share * config.poi_radius for share in shape.half_sides)
     half_height = config.poi_height / 2
     is_box = shape.primitive == "box"
@@ -176,16 +177,29 @@ def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
     collides = 'class="obstacle"/>'
     if is_box or not contacts:
         return f'<body name="{name}" mocap="true">{solid} {collides}</body>'
-    # MJX finds contacts of cylinders by descent, of capsules in closed form. At the height of a
-    # robot's collider both shapes are the same.
+    # MJX finds contacts with cylinders iteratively, with capsules in closed form. At the height of
+    # a robot's collider, both have the same cross-section.
     capsule = f'<geom name="{name}_collider" type="capsule" size="{size}" group="3" {collides}'
     return f'<body name="{name}" mocap="true">{solid}/>{capsule}</body>'
 
 
 def make_layout(
-    config: ArenaConfig, position: jax.Array, yaw: jax.Array, classes: jax.Array
+    config: ArenaConfig,
+    position: Float[Array, "N 2"],
+    yaw: Float[Array, "N"],
+    classes: Int[Array, "N"],
 ) -> Layout:
-    """Builds the layout of PoIs of `[N]` int32 `classes`, an index into `config.classes`."""
+    """Builds the layout of PoIs of given classes.
+
+    Args:
+      config: the arena.
+      position: centres of the PoIs, in metres from the arena's centre.
+      yaw: orientations of the PoIs, in radians.
+      classes: index of each PoI's class in `config.classes`.
+
+    Raises:
+      ValueError: if a position or a yaw is not finite, or there is no such class.
+    """
     chex.assert_shape(position, (config.num_pois, 2), custom_message="position")
     chex.assert_shape([yaw, classes], (config.num_pois,), custom_message="yaw, classes")
     checks.require_finite("position", position)
@@ -198,16 +212,16 @@ def make_layout(
     return Layout(position, yaw, shapes[classes], colours[classes], of_pois)
 
 
-def random_layout(key: Key, config: ArenaConfig, classes: jax.Array) -> Layout:
-    """Puts PoIs of the given classes at random places that keep `poi_gap` between them.
+def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> Layout:
+    """Draws a layout of PoIs of given classes with gaps of `poi_gap` or more.
 
-    Square cells, about twice as many as PoIs, divide the arena; each PoI gets its own cell and a
-    place in it with half the gap free on every side.
+    The arena is divided into square cells, about twice as many as PoIs. Each PoI gets a cell of its
+    own and a position that leaves half the gap free on every side.
 
     Args:
       key: random key.
       config: the arena.
-      classes: `[N]` int32 index into `config.classes`.
+      classes: index of each PoI's class in `config.classes`.
 
     Returns:
       The layout, with random yaws.
@@ -222,28 +236,34 @@ def random_layout(key: Key, config: ArenaConfig, classes: jax.Array) -> Layout:
     x, y, turn = draws[per_side**2 :].reshape(3, config.num_pois)
     corner = jnp.stack([cell // per_side, cell % per_side], axis=-1) * cell_side - config.side / 2
     play = (cell_side - config.poi_pitch) / 2
-    place = play * (2 * jnp.stack([x, y], axis=-1) - 1)
+    offset = play * (2 * jnp.stack([x, y], axis=-1) - 1)
     yaw = jnp.pi * (2 * turn - 1)
-    return make_layout(config, corner + cell_side / 2 + place, yaw, classes)
+    return make_layout(config, corner + cell_side / 2 + offset, yaw, classes)
 
 
-@functools.partial(jax.jit, static_argnums=0)  # traced once for all who look
-def place(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
-    """Puts PoIs and robots, at rest, into the MJX state.
+@functools.partial(jax.jit, static_argnums=0)  # traced once for all callers
+def place(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
+    """Places PoIs and robots, which are at rest, and computes MJX's kinematics.
 
     Args:
       arena: the arena.
-      layout: where the PoIs stand.
-      poses: `[R, 3]` x [m], y [m] and yaw [rad] of each robot.
+      layout: the PoIs.
+      poses: x [m], y [m] and yaw [rad] of each robot.
 
     Returns:
-      The state after MJX's kinematics, with `geom_xpos` and `geom_xmat`.
+      The MJX state with up-to-date `geom_xpos` and `geom_xmat`.
     """
     return _as_float32(mjx.kinematics(arena.model, put(arena, layout, poses)))
 
 
-def put(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
-    """Does what `place` does, without the kinematics: a physics step computes them itself."""
+def put(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
+    """Places PoIs and robots without the kinematics, which a physics step computes anyway.
+
+    Args:
+      arena: the arena.
+      layout: the PoIs.
+      poses: x [m], y [m] and yaw [rad] of each robot.
+    """
     chex.assert_shape(poses, (arena.num_robots, 3), custom_message="poses")
     check_layout(arena.config, layout)
     shown = layout.shape[:, None] == jnp.arange(len(arena.config.shapes))[None]
@@ -261,7 +281,15 @@ def put(arena: Arena, layout: Layout, poses: jax.Array) -> mjx.Data:
 
 
 def check_layout(config: ArenaConfig, layout: Layout) -> None:
-    """Raises an `AssertionError` naming the part of a layout that does not fit the arena."""
+    """Checks that a layout fits an arena.
+
+    Args:
+      config: the arena.
+      layout: the layout.
+
+    Raises:
+      AssertionError: if an array of the layout has another shape; the message names it.
+    """
     shapes = {"position": (2,), "yaw": (), "shape": (), "colour": (3,)}
     for name, shape in shapes.items():
         chex.assert_shape(
@@ -269,28 +297,28 @@ def check_layout(config: ArenaConfig, layout: Layout) -> None:
         )
 
 
-def robot_poses(data: mjx.Data) -> jax.Array:
-    """`[R, 3]` x [m], y [m] and yaw [rad] of each robot."""
+def robot_poses(data: mjx.Data) -> Float[Array, "R 3"]:
+    """Reads x [m], y [m] and yaw [rad] of each robot from the MJX state."""
     return data.qpos.reshape(-1, 3)
 
 
-def drive(arena: Arena, data: mjx.Data, wheel_speeds: jax.Array) -> mjx.Data:
-    """Makes one physics step of `TIMESTEP` seconds under commanded wheel speeds.
+def drive(arena: Arena, data: mjx.Data, wheel_speeds: Float[Array, "R 2"]) -> mjx.Data:
+    """Makes one physics step of `TIMESTEP` seconds with commanded wheel speeds.
 
     Args:
       arena: the arena.
       data: the MJX state.
-      wheel_speeds: `[R, 2]` left and right wheel speed of each robot, in rad/s.
+      wheel_speeds: left and right wheel speed of each robot, in rad/s.
 
     Returns:
       The next MJX state.
     """
     chex.assert_shape(wheel_speeds, (arena.num_robots, 2), custom_message="wheel_speeds")
-    # MJX promotes ranks, which the caller may have forbidden.
+    # MJX relies on rank promotion, which the caller may have forbidden.
     with jax.numpy_rank_promotion("allow"):
         return _as_float32(mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds))))
 
 
-def as_control(wheel_speeds: jax.Array) -> jax.Array:
-    """MuJoCo's control vector for `[R, 2]` wheel speeds; the sideways grips take no command."""
+def as_control(wheel_speeds: Float[Array, "R 2"]) -> Float[Array, "U"]:
+    """Makes MuJoCo's control vector of wheel speeds; the third actuator of a robot is passive."""
     return jnp.pad(wheel_speeds, ((0, 0), (0, 1))).reshape(-1)

@@ -1,27 +1,30 @@
-"""What makes sensors unsure, beside the noise of single readings: light, edges, lost beams.
+"""Noise of the sensors: ranges, edges and lost beams of the LiDAR, light of the camera.
 
-All of it is off by default. A disturbance that is off is no part of the program: it takes no time,
-and changes no bit of a reading.
+All of it but the noise of single readings is off by default. What is off is not compiled: it takes
+no time and changes no bit of a reading.
 """
 
 import chex
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxsense.config import CameraConfig, LidarConfig
 from jaxsense.core.types import Key
 
 
-def measured_ranges(key: Key, distance: jax.Array, config: LidarConfig) -> jax.Array:
-    """What a laser scanner measures.
+def measured_ranges(
+    key: Key, distance: Float[Array, "B"], config: LidarConfig
+) -> Float[Array, "B"]:
+    """Simulates the ranges that a laser scanner measures.
 
     Args:
       key: random key.
-      distance: `[B]` true distances of neighbouring beams, in metres; infinite without a hit.
-      config: `range_noise` and `range_noise_growth`, `mixed_pixels`, `dropout`, and the range.
+      distance: true distances along neighbouring beams, in metres; infinite without a hit.
+      config: settings of the scanner.
 
     Returns:
-      `[B]` measured distances, in metres; `max_range` without a return.
+      Measured ranges, in metres; `max_range` without a return.
     """
     chex.assert_rank(distance, 1, custom_message="distance")
     is_disturbed = config.mixed_pixels > 0 or config.dropout > 0
@@ -34,11 +37,11 @@ def measured_ranges(key: Key, distance: jax.Array, config: LidarConfig) -> jax.A
     return jnp.where(met <= config.max_range, measured, config.max_range)
 
 
-def _disturbed(key: Key, distance: jax.Array, config: LidarConfig) -> jax.Array:
-    """`[B]` distances with mixed pixels and without the beams that drop out."""
-    # The key itself draws the noise, as it does without disturbances.
+def _disturbed(key: Key, distance: Float[Array, "B"], config: LidarConfig) -> Float[Array, "B"]:
+    """Distances with mixed pixels, infinite where a beam drops out."""
+    # Folded in: `key` draws the noise, which must not depend on what is switched on.
     uniform = jax.random.uniform(jax.random.fold_in(key, 1), (3, *distance.shape), jnp.float32)
-    # The last beam has no next one. Beyond its range, the scanner meets nothing.
+    # The last beam has no neighbour. The scanner detects nothing beyond its range.
     within = jnp.minimum(distance, config.max_range)
     following = jnp.append(within[1:], within[-1:])
     between = within + uniform[0] * (following - within)
@@ -47,24 +50,26 @@ def _disturbed(key: Key, distance: jax.Array, config: LidarConfig) -> jax.Array:
 
 
 def changes_light(config: CameraConfig) -> bool:
-    """Whether any disturbance of the camera is on."""
+    """Whether exposure, colour cast, low light or shadows are switched on."""
     amounts = config.exposure_error, config.colour_cast, config.low_light, config.shadow
     return any(amount > 0 for amount in amounts)
 
 
-def lighting(key: Key, num_pixels: int, config: CameraConfig) -> tuple[jax.Array, jax.Array]:
-    """How an image is lit and exposed.
+def lighting(
+    key: Key, num_pixels: int, config: CameraConfig
+) -> tuple[Float[Array, "3"], Float[Array, "B"]]:
+    """Draws how an image is lit and exposed.
 
     Args:
       key: random key.
-      num_pixels: B.
-      config: `exposure_error`, `colour_cast`, `low_light` and `shadow`.
+      num_pixels: number of pixels, B.
+      config: settings of the camera.
 
     Returns:
-      `[3]` factors on the brightness of red, green and blue, and `[B]` which pixels the distant
-      light reaches, 0 or 1.
+      Factors on the brightness of red, green and blue, and for each pixel 1 where the distant light
+      reaches the surface, 0 in shadow.
     """
-    # The key itself draws the noise, as it does without disturbances.
+    # Folded in: `key` draws the noise, which must not depend on what is switched on.
     normal_key, uniform_key = jax.random.split(jax.random.fold_in(key, 1))
     brightness, *casts = jax.random.normal(normal_key, (4,), jnp.float32)
     missing, falls, edge, side = jax.random.uniform(uniform_key, (4,), jnp.float32)

@@ -1,8 +1,7 @@
-"""An exact ray-caster for horizontal rays over the MJX state.
+"""An exact ray-caster for horizontal rays in an MJX state.
 
-Everything that a sensor can see is upright: cylinders, and boxes turned about the vertical. At a
-sensor's height the scene is therefore a set of circles and rectangles, which a ray meets in closed
-form.
+Everything that a sensor can see is an upright cylinder or box. At the height of a sensor the scene
+is thus a set of circles and rectangles, whose intersections with a ray have a closed form.
 """
 
 import functools
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax.core import Tracer
+from jaxtyping import Array, Float, Shaped
 from mujoco import mjx
 
 from jaxsense.core import checks
@@ -21,20 +21,23 @@ from jaxsense.sim.arena import Arena
 
 _VISIBLE_GROUP = 0
 
-Direction = tuple[jax.Array, jax.Array]
-"""x and y part, `[...]` each, of unit vectors."""
+Direction = tuple[Float[Array | np.ndarray, "..."], Float[Array | np.ndarray, "..."]]
+"""x and y of unit vectors, two arrays of the same shape."""
+
+Origin = Float[Array | np.ndarray, "2"]
+"""Start of rays, in metres."""
 
 
 @pytree
 class CrossSection:
-    """The scene cut at one height: O outlines, first all circles, then all rectangles.
+    """The scene cut at one height: O outlines, all circles followed by all rectangles.
 
     Attributes:
       centre: `[O, 2]` in metres.
       axis: `[O, 2]` unit vector along the first side.
-      half: `[O, 2]` half the sides, for a circle its radius twice, in metres; 0 where the plane
-        does not cut the geom.
-      geom: for each outline, the MuJoCo geom id.
+      half: `[O, 2]` half the sides, in metres; a circle's radius twice; 0 if the plane does not cut
+        the geom.
+      geom: MuJoCo geom id of each outline.
       num_circles: number of circles.
     """
 
@@ -52,8 +55,7 @@ class Hit:
     Attributes:
       distance: `[...]` float32, in metres; infinite without a hit.
       geom: `[...]` int32 MuJoCo geom id; -1 without a hit.
-      normal: x and y part, `[...]` float32 each, of the surface's outward unit normal; 0 without a
-        hit.
+      normal: x and y, `[...]` float32 each, of the surface's outward unit normal; 0 without a hit.
     """
 
     distance: jax.Array
@@ -61,21 +63,23 @@ class Hit:
     normal: tuple[jax.Array, jax.Array]
 
 
-def cross_section(arena: Arena, data: mjx.Data, height: float, robot: int) -> CrossSection:
-    """Cuts the scene at `height` [m] above the floor, without the robot that is looking.
+def cross_section(
+    arena: Arena, data: mjx.Data, height: Float[Array, ""] | float, robot: int
+) -> CrossSection:
+    """Cuts the scene at a height above the floor.
 
     Args:
       arena: the arena.
-      data: its MJX state, with current `geom_xpos` and `geom_xmat`.
-      height: of the plane, in metres.
-      robot: index of the robot whose own geoms to omit, or -1 for none.
+      data: the arena's MJX state, with up-to-date `geom_xpos` and `geom_xmat`.
+      height: height of the cut, in metres.
+      robot: index of the robot whose geoms to omit, because it is looking; -1 for none.
 
     Returns:
-      The cross-section, without wheels and casters: at the height of sensors they do not reach
-      beyond the body's cylinder.
+      The cross-section, without wheels and casters: at the height of a sensor they are inside the
+      robot's cylinder.
 
     Raises:
-      ValueError: if there is no such robot.
+      ValueError: if there is no such robot, or the height is not finite.
     """
     if not -1 <= robot < arena.num_robots:
         raise ValueError(f"robot = {robot}: must be -1 or one of the {arena.num_robots} robots")
@@ -105,68 +109,100 @@ def cross_section(arena: Arena, data: mjx.Data, height: float, robot: int) -> Cr
     )
 
 
-def cast(section: CrossSection, origin: jax.Array, angle: jax.Array) -> Hit:
-    """Casts rays from one place.
+def cast(
+    section: CrossSection,
+    origin: Origin,
+    angle: Float[Array | np.ndarray, "..."],
+) -> Hit:
+    """Casts rays from one position.
 
-    A ray that starts inside a geom meets it where it leaves, as in MuJoCo's `mj_ray`.
+    A ray that starts inside a geom hits it from inside, as in MuJoCo's `mj_ray`.
 
     Distance and normal are differentiable in origin, angle and section, forwards and backwards. The
-    derivatives are finite for every ray, 0 without a hit, and exact wherever they exist: not at
-    edges, on tangents and where two outlines are equally far.
+    derivatives are finite for every ray and 0 without a hit. They are exact wherever they exist,
+    which is not at edges, on tangents and where two outlines are equally far away.
 
     Args:
       section: the scene.
-      origin: `[2]` start, in metres.
-      angle: `[...]` directions in the world, in radians.
+      origin: start of the rays, in metres.
+      angle: directions in the world, in radians.
 
     Returns:
-      The nearest hits.
+      The first hit of each ray.
+
+    Raises:
+      ValueError: if the origin or an angle is not finite.
     """
     return cast_along(section, origin, (jnp.cos(angle), jnp.sin(angle)))
 
 
-def cast_along(section: CrossSection, origin: jax.Array, direction: Direction) -> Hit:
-    """Casts rays along unit vectors: twice as fast as `cast` if these are shared by many calls."""
+def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> Hit:
+    """Casts rays along unit vectors: twice as fast as `cast` if many calls share them.
+
+    Args:
+      section: the scene.
+      origin: start of the rays, in metres.
+      direction: unit vectors in the world.
+
+    Returns:
+      The first hit of each ray.
+
+    Raises:
+      ValueError: if the origin is not finite, or a direction is no unit vector.
+    """
     chex.assert_shape(origin, (2,), custom_message="origin")
     chex.assert_equal_shape(direction, custom_message="direction")
     checks.require_finite("origin", origin)
     for part in direction:
         checks.require_finite("direction", part)
     if not any(isinstance(part, Tracer) for part in direction):
-        lengths = np.hypot(*map(np.asarray, direction))
+        lengths = np.hypot(np.asarray(direction[0]), np.asarray(direction[1]))
         checks.require("length of direction", lengths, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
-    # Chosen here and not by `platform_dependent`, which is traced and batched twice as long.
+    # Not by `platform_dependent`, which takes twice as long to trace and batch.
     on_cpu = jax.default_backend() == "cpu"
     nearest = _nearest_by_two_loops if on_cpu else _nearest_by_one_loop
     distance, outline = nearest(section, origin, direction)
     is_hit = outline < len(section.geom)
     geom = jnp.where(is_hit, choose(jnp.array(section.geom), outline), -1)
-    # Without a hit, infinity times a direction would have no derivative.
+    # Infinity times a direction would have no derivative.
     finite = jnp.where(jnp.isfinite(distance), distance, 0.0)
     normal_x, normal_y = _normal(section, outline, origin, direction, finite)
     normal = jnp.where(is_hit, normal_x, 0.0), jnp.where(is_hit, normal_y, 0.0)
     return Hit(distance, geom, normal)
 
 
-def turned(direction: Direction, yaw: jax.Array) -> Direction:
-    """Turns unit vectors to the left by `[]` yaw, in radians."""
+def turned(direction: Direction, yaw: Float[Array, ""]) -> Direction:
+    """Turns vectors to the left.
+
+    Args:
+      direction: the vectors.
+      yaw: angle to turn by, in radians.
+    """
     x, y = direction
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     return cos * x - sin * y, cos * y + sin * x
 
 
-def choose(table: jax.Array, index: jax.Array) -> jax.Array:
-    """Returns `table[index]` along the first axis by a chain of selects.
+def choose(
+    table: Shaped[Array | np.ndarray, "rows"], index: Shaped[Array, "*rays"]
+) -> Shaped[Array, "*rays"]:
+    """Returns `table[index]`, computed by a chain of selects.
 
-    For a few rows and many indices under `vmap` this is ten times faster on CPU than a gather. An
-    index outside the table selects the first row.
+    On CPUs this is ten times faster than a gather for a short table and many indices under `vmap`.
+
+    Args:
+      table: values to choose from.
+      index: rows of the table, as integers or whole floats; any other number chooses the first row.
+
+    Returns:
+      The chosen value for each index.
     """
     return functools.reduce(
         lambda chosen, i: jnp.where(index == i, table[i], chosen), range(len(table)), table[0]
     )
 
 
-def _distances(section: CrossSection, origin: jax.Array, direction: Direction) -> list[jax.Array]:
+def _distances(section: CrossSection, origin: Origin, direction: Direction) -> list[jax.Array]:
     """Distance to each outline, infinite without a hit."""
     return [
         (_to_circle if i < section.num_circles else _to_rectangle)(section, i, origin, direction)
@@ -179,11 +215,11 @@ def _to_circle(section: CrossSection, i: int, origin, direction) -> jax.Array:
     to_x = section.centre[i, 0] - origin[0]
     to_y = section.centre[i, 1] - origin[1]
     along = to_x * direction[0] + to_y * direction[1]
-    # From the distance of the centre to the ray: the textbook discriminant loses digits far away.
+    # Uses the distance of the ray from the centre: the textbook discriminant cancels far away.
     across = to_x * direction[1] - to_y * direction[0]
     half_chord_squared = radius**2 - across**2
     is_cut = half_chord_squared > 0
-    # The slope of a square root is infinite at 0, and no number once it is multiplied by 0.
+    # The derivative of a square root is infinite at 0, and NaN once multiplied by 0.
     half_chord = jnp.sqrt(jnp.where(is_cut, half_chord_squared, 1.0))
     distance = jnp.where(along >= half_chord, along - half_chord, along + half_chord)
     return jnp.where(is_cut & (distance >= 0), distance, jnp.inf)
@@ -195,7 +231,7 @@ def _to_rectangle(section: CrossSection, i: int, origin, direction) -> jax.Array
     from_y = origin[1] - section.centre[i, 1]
 
     def slab(position, speed, half):
-        # One division for both sides: it costs as much as everything else.
+        # A single division for both sides: it costs as much as all other operations.
         pace = 1.0 / jnp.where(jnp.abs(speed) < 1e-12, 1e-12, speed)
         middle, reach = -position * pace, jnp.abs(half * pace)
         return middle - reach, middle + reach
@@ -210,9 +246,9 @@ def _to_rectangle(section: CrossSection, i: int, origin, direction) -> jax.Array
 
 
 def _nearest_by_one_loop(
-    section: CrossSection, origin: jax.Array, direction: Direction
+    section: CrossSection, origin: Origin, direction: Direction
 ) -> tuple[jax.Array, jax.Array]:
-    """Distance to a ray's first hit, and the index of its outline."""
+    """Distance to a ray's first hit and index of the outline, in one loop."""
     distance, outline = jnp.float32(jnp.inf), jnp.float32(len(section.geom))
     for i, each in enumerate(_distances(section, origin, direction)):
         is_nearer = (each <= distance) & (each < jnp.inf)
@@ -222,18 +258,20 @@ def _nearest_by_one_loop(
 
 
 def _nearest_by_two_loops(
-    section: CrossSection, origin: jax.Array, direction: Direction
+    section: CrossSection, origin: Origin, direction: Direction
 ) -> tuple[jax.Array, jax.Array]:
     """Distance and index where XLA does not vectorise one loop with two results.
 
-    A second loop finds the outline, from inputs that the compiler does not recognise as the same.
+    The barrier keeps the compiler from merging the second loop, which finds the outline, with the
+    first.
     """
     distance = functools.reduce(jnp.minimum, _distances(section, origin, direction))
-    return distance, _nearest_outline(*jax.lax.optimization_barrier((section, origin, direction)))
+    section, origin, direction = jax.lax.optimization_barrier((section, origin, direction))
+    return distance, _nearest_outline(section, origin, direction)
 
 
-def _nearest_outline(section: CrossSection, origin: jax.Array, direction: Direction) -> jax.Array:
-    """Index of the outline that a ray hits first, `[...]` float32; their number for none."""
+def _nearest_outline(section: CrossSection, origin: Origin, direction: Direction) -> jax.Array:
+    """Index of the outline that a ray hits first, `[...]` float32; O without a hit."""
     distances = _distances(section, origin, direction)
     nearest = functools.reduce(jnp.minimum, distances)
     squared_index = functools.reduce(
@@ -241,15 +279,15 @@ def _nearest_outline(section: CrossSection, origin: jax.Array, direction: Direct
         range(len(distances)),
         jnp.float32(len(distances) ** 2),
     )
-    # XLA computes a square root once and keeps it. Without one it repeats the whole chain at every
-    # use of the index, hundreds of times slower.
+    # XLA computes a square root once. Without it, the whole chain would be recomputed at every use
+    # of the index, which is hundreds of times slower.
     return jnp.round(jnp.sqrt(squared_index))
 
 
 def _normal(
-    section: CrossSection, outline: jax.Array, origin: jax.Array, direction: Direction, distance
+    section: CrossSection, outline: jax.Array, origin: Origin, direction: Direction, distance
 ) -> tuple[jax.Array, jax.Array]:
-    """Both parts of the outward unit normal where a ray meets an outline."""
+    """X and y of the outward unit normal where a ray hits an outline."""
     centre_x, centre_y, half_u, half_v, cos, sin = (
         choose(table[:, i], outline)
         for table in (section.centre, section.half, section.axis)

@@ -1,20 +1,20 @@
-"""Sensors: rays at one height of a robot, and what they read where they hit something.
+"""Sensors: rays at one height above the floor, and the readings that they make of hits.
 
-A sensor is a value with methods. `Lidar` and `Camera` are built in; a sensor of your own is another
-subclass of `Sensor`, made by a function that `Config.sensors` names. Nothing else in the package
-asks which sensor it has.
+A sensor is a value with methods. `Lidar` and `Camera` are built in. Your own sensor is another
+subclass of `Sensor`, made by a function that `Config.sensors` names; the rest of the package treats
+all sensors alike.
 """
 
 import abc
 import dataclasses
 import importlib
-from typing import Protocol
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
 from jaxsense.config import LIDAR_HEIGHT, CameraConfig, Config, ConfigError, LidarConfig
@@ -22,16 +22,17 @@ from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, is_static, pytree
 from jaxsense.sim import amiro, disturbances, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
+from jaxsense.sim.rays import Fan, Pinhole, Rays
 
-_LEAST_CHROMA = 0.1  # difference of a pixel's channels, 0 on walls, robots and in the dark
+_MIN_CHROMA = 0.1  # difference of a pixel's channels; 0 on walls, on robots and in the dark
 _RANGE_TOLERANCE = 5.0  # standard deviations of the LiDAR's noise
-_LEAST_RANGE_TOLERANCE = 0.001  # m, above the rounding of a distance
-_BACKGROUND = (0.5, 0.6, 0.7)  # colour where a ray leaves the arena
+_MIN_RANGE_TOLERANCE = 0.001  # m, above the rounding error of a distance
+_BACKGROUND = (0.5, 0.6, 0.7)  # colour outside the arena
 
 
 @pytree
 class Light:
-    """A distant light and ambient light.
+    """A distant light source and ambient light.
 
     Attributes:
       direction: `[3]` unit vector towards the light.
@@ -45,109 +46,30 @@ class Light:
 
 
 Surfaces = dict[str, jax.Array]
-"""Surfaces of G geoms: `colour`, their `[G, 3]` albedo, and `[G]` numbers for each of
+"""Surfaces of G geoms: `colour`, the `[G, 3]` albedo, and the `[G]` values of each of
 `arena.attributes`."""
 
 
-class Rays(Protocol):
-    """Directions of a sensor's rays; static, and so hashable."""
-
-    @property
-    def angles(self) -> np.ndarray:
-        """`[B]` float32 angles in the robot's frame, in radians, in the order of the readings."""
-        ...
-
-    def centre(self, bearing: jax.Array) -> jax.Array:
-        """Real index `[]` of the ray along a `[]` bearing, in radians."""
-        ...
-
-
-@dataclasses.dataclass(frozen=True)
-class Fan:
-    """Rays at equal angles, from right to left.
-
-    Attributes:
-      num_rays: number of rays, B.
-      field_of_view: angle between the first and the last ray, in degrees.
-    """
-
-    num_rays: int
-    field_of_view: float
-
-    def __post_init__(self):
-        checks.require_number("num_rays", self.num_rays)
-        is_angle = "must be above 0 and at most 360 degrees"
-        checks.require(
-            "field_of_view", self.field_of_view, lambda x: (x > 0) & (x <= 360), is_angle
-        )
-
-    @property
-    def _half(self) -> float:
-        return float(np.radians(self.field_of_view)) / 2
-
-    @property
-    def angles(self) -> np.ndarray:
-        """`[B]` float32 angles in the robot's frame, in radians."""
-        return np.linspace(-self._half, self._half, self.num_rays, dtype=np.float32)
-
-    def centre(self, bearing: jax.Array) -> jax.Array:
-        """Real index `[]` of the ray along a `[]` bearing, in radians."""
-        return (bearing + self._half) / (2 * self._half / max(self.num_rays - 1, 1))
-
-
-@dataclasses.dataclass(frozen=True)
-class Pinhole:
-    """Rays through the pixels of a pinhole camera's scanline, from left to right.
-
-    Attributes:
-      num_pixels: number of pixels, B.
-      field_of_view: angle between the outer edges of the first and the last pixel, in degrees.
-    """
-
-    num_pixels: int
-    field_of_view: float
-
-    def __post_init__(self):
-        checks.require_number("num_pixels", self.num_pixels)
-        is_angle = "must be above 0 and below 180 degrees"
-        checks.require("field_of_view", self.field_of_view, lambda x: (x > 0) & (x < 180), is_angle)
-
-    @property
-    def _middle(self) -> float:
-        return (self.num_pixels - 1) / 2
-
-    @property
-    def _focal_length(self) -> float:
-        return (self.num_pixels / 2) / float(np.tan(np.radians(self.field_of_view) / 2))
-
-    @property
-    def angles(self) -> np.ndarray:
-        """`[B]` float32 angles in the robot's frame, in radians."""
-        columns = np.arange(self.num_pixels)
-        return np.arctan((self._middle - columns) / self._focal_length).astype(np.float32)
-
-    def centre(self, bearing: jax.Array) -> jax.Array:
-        """Real index `[]` of the pixel along a `[]` bearing, in radians."""
-        return self._middle - self._focal_length * jnp.tan(bearing)
-
-
 class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
-    """A scanline sensor on a robot: a pytree with methods.
+    """A scanline sensor on a robot, a frozen pytree.
 
-    Subclasses define `read`, and `shows` if they can. They are dataclasses too, without a
-    decorator; their own fields are leaves unless declared `flax.struct.field(pytree_node=False)`.
+    A subclass defines `read`, and may define `shows`. It becomes a dataclass and a pytree without a
+    decorator; its own fields are leaves unless declared `flax.struct.field(pytree_node=False)`.
 
     Attributes:
-      name: of the modality; `make` sets it from the settings.
+      name: name of the modality, which `make` takes from the settings; static.
       height: height of the rays above the floor, in metres; static.
       rays: directions of the rays; static.
       window: number of rays that the detector reads; static.
       channels: numbers in the reading of one ray; static.
       stride: step between the rays that the detector reads; static.
-      ray_bytes: size of one ray's reading in a ROS message; static.
+      ray_bytes: size of one ray's reading in a ROS message, in bytes; static.
       window_limit: highest reading in the detector's input.
       lost: mean share of rays with a wrong reading.
-      blind: reading of every ray when the sensor has failed.
+      blind: reading of every ray after the sensor has failed.
+
+    Raises:
+      ValueError: if a size is not a whole number above 0, or the height is not above 0.
     """
 
     name: str = struct.field(pytree_node=False, default="")
@@ -167,56 +89,60 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
         checks.require_positive("height", self.height)
 
     @abc.abstractmethod
-    def read(self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light) -> jax.Array:
-        """Turns the hits of one scan into readings, in pure JAX.
+    def read(
+        self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light
+    ) -> Float[Array, "B *channels"]:
+        """Turns the hits of one scan into readings.
 
         Args:
           key: random key of the noise.
           hits: `[B]` first hits of the rays.
-          surfaces: colour and attributes of each geom.
+          surfaces: colour and attributes of all geoms, for `raycast.choose`.
           light: the light.
 
         Returns:
           `[B]` readings, or `[B, channels]` if there are several channels.
         """
 
-    def shows(self, readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
-        """Which rays may have hit a PoI; by default all.
+    def shows(
+        self, readings: Float[Array, "B *channels"], distance: Float[Array, ""], extent: float
+    ) -> Bool[Array, "B"]:
+        """Tells which rays may have hit a PoI; by default all.
 
         Args:
-          readings: `[B, ...]` readings.
-          distance: `[]` expected distance of the PoI's centre, in metres.
+          readings: readings of some rays.
+          distance: expected distance of the PoI's centre, in metres.
           extent: greatest distance from the PoI's centre to its surface, in metres.
 
         Returns:
-          `[B]` bool.
+          For each ray whether its reading is possible for such a PoI.
         """
         del distance, extent
         return jnp.ones(len(readings), bool)
 
-    def centre(self, bearing: jax.Array) -> jax.Array:
-        """Real index `[]` of the ray along a `[]` bearing, in radians."""
+    def centre(self, bearing: Float[Array, ""]) -> Float[Array, ""]:
+        """Real-valued index of the ray along a bearing, in radians."""
         return self.rays.centre(bearing)
 
     @property
-    def angles(self) -> np.ndarray:
-        """`[B]` float32 angles of the rays in the robot's frame, in radians."""
+    def angles(self) -> Float[np.ndarray, "B"]:
+        """Angles of the rays in the robot's frame, in radians, in the order of the readings."""
         return self.rays.angles
 
     @property
-    def directions(self) -> np.ndarray:
-        """`[2, B]` float32 unit vectors along the rays in the robot's frame."""
+    def directions(self) -> Float[np.ndarray, "2 B"]:
+        """Unit vectors along the rays in the robot's frame."""
         angles = self.angles.astype(np.float64)
         return np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
 
     @property
     def scan_bytes(self) -> int:
-        """Size of a whole scan in a ROS message."""
+        """Size of a whole scan in a ROS message, in bytes."""
         return self.ray_bytes * len(self.angles)
 
 
 class Lidar(Sensor):
-    """The laser scanner: one distance in metres per beam, from right to left.
+    """A laser scanner: one distance in metres per beam, from right to left.
 
     Attributes:
       config: its settings.
@@ -224,20 +150,24 @@ class Lidar(Sensor):
 
     config: LidarConfig
 
-    def read(self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light) -> jax.Array:
+    def read(
+        self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light
+    ) -> Float[Array, "B *channels"]:
         """See `Sensor.read`."""
         del surfaces, light
         return disturbances.measured_ranges(key, hits.distance, self.config)
 
-    def shows(self, readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
-        """Which beams read the distance of a PoI, within noise; see `Sensor.shows`."""
+    def shows(
+        self, readings: Float[Array, "B *channels"], distance: Float[Array, ""], extent: float
+    ) -> Bool[Array, "B"]:
+        """See `Sensor.shows`: whether the range, up to noise, is that of the PoI."""
         noise = self.config.range_noise + self.config.range_noise_growth * distance
-        tolerance = jnp.maximum(_RANGE_TOLERANCE * noise, _LEAST_RANGE_TOLERANCE)
+        tolerance = jnp.maximum(_RANGE_TOLERANCE * noise, _MIN_RANGE_TOLERANCE)
         return jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + tolerance
 
 
 class Camera(Sensor):
-    """The camera's scanline: linear RGB in [0, 1] per pixel, from left to right.
+    """One line of a camera's pixels: linear RGB in [0, 1], from left to right.
 
     Attributes:
       config: its settings.
@@ -245,7 +175,9 @@ class Camera(Sensor):
 
     config: CameraConfig
 
-    def read(self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light) -> jax.Array:
+    def read(
+        self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light
+    ) -> Float[Array, "B *channels"]:
         """See `Sensor.read`."""
         normal_x, normal_y = hits.normal
         facing = normal_x * light.direction[0] + normal_y * light.direction[1]
@@ -262,19 +194,21 @@ class Camera(Sensor):
             seen = jnp.where(hits.geom >= 0, lit, of_background)
             return jnp.clip((seen if gain is None else seen * gain) + noise, 0.0, 1.0)
 
-        # A loop over the channels makes the compiler finish hits and noise before it shades them;
-        # fused with the ray-caster, each channel would cast the rays many times over.
+        # The loop over channels makes the compiler finish hits and noise first; fused with the
+        # ray-caster, each channel would cast the rays many times over.
         background = jnp.array(_BACKGROUND, jnp.float32)
         return jax.lax.map(channel, (surfaces["colour"].T, background, noise, gain)).T
 
-    def shows(self, readings: jax.Array, distance: jax.Array, extent: float) -> jax.Array:
-        """Which pixels have a colour, unlike walls, robots and darkness; see `Sensor.shows`."""
+    def shows(
+        self, readings: Float[Array, "B *channels"], distance: Float[Array, ""], extent: float
+    ) -> Bool[Array, "B"]:
+        """See `Sensor.shows`: whether the pixel is coloured, unlike walls, robots and darkness."""
         del distance, extent
-        return readings.max(axis=-1) - readings.min(axis=-1) >= _LEAST_CHROMA
+        return readings.max(axis=-1) - readings.min(axis=-1) >= _MIN_CHROMA
 
 
 def random_light(key: Key) -> Light:
-    """Draws a light of random strength from any side, 20 to 70 degrees high."""
+    """Draws a light of random strength from any side, 20 to 70 degrees above the floor."""
     side, height, diffuse, ambient = jax.random.uniform(key, (4,), jnp.float32)
     side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)
     flat = jnp.cos(height)
@@ -315,7 +249,14 @@ def camera(config: CameraConfig) -> Camera:
 
 
 def make(config: Config) -> tuple[Sensor, ...]:
-    """Makes the sensor of each modality, in the order of `config.modalities`."""
+    """Makes the sensor of each modality, in the order of `config.modalities`.
+
+    Args:
+      config: all settings; numbers that are declared `Traced` may be traced.
+
+    Raises:
+      ConfigError: if a custom sensor cannot be imported, is no `Sensor`, or does not fit the arena.
+    """
     known = {"camera": lambda: camera(config.camera), "lidar": lambda: lidar(config.lidar)}
     return tuple(
         _own(name, config) if name in config.sensors else known[name]()
@@ -324,18 +265,18 @@ def make(config: Config) -> tuple[Sensor, ...]:
 
 
 def _own(name: str, config: Config) -> Sensor:
-    """Makes a custom sensor; raises `ConfigError` if it cannot be made or does not fit."""
-    entry, field = config.sensors[name].make, f"sensors.{name}"
-    module, _, function = entry.partition(":")
+    """Makes a custom sensor and checks it."""
+    path, field = config.sensors[name].make, f"sensors.{name}"
+    module, _, function = path.partition(":")
     try:
         make = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
         reason = f"must be a function that can be imported ({error})"
-        raise ConfigError(f"{field}.make", entry, reason) from None
+        raise ConfigError(f"{field}.make", path, reason) from None
     sensor = make(config)
     if not isinstance(sensor, Sensor):
         kind = type(sensor).__name__
-        raise ConfigError(f"{field}.make", entry, f"must return a jaxsense.sim.Sensor, not {kind}")
+        raise ConfigError(f"{field}.make", path, f"must return a jaxsense.sim.Sensor, not {kind}")
     if not 0 < sensor.height < config.arena.poi_height:
         reason = f"must be above 0 and below arena.poi_height = {config.arena.poi_height} m"
         raise ConfigError(f"{field}: height", sensor.height, reason)
@@ -347,7 +288,15 @@ def _own(name: str, config: Config) -> Sensor:
 
 
 def surfaces(arena: Arena, layout: Layout) -> Surfaces:
-    """Surfaces of all geoms: of PoIs from the layout, of others from model and settings."""
+    """Looks up the surfaces of all geoms.
+
+    Args:
+      arena: the arena, for the surfaces of walls and robots.
+      layout: the PoIs, for theirs.
+
+    Returns:
+      Colour and attributes of all geoms.
+    """
     poi = jnp.array(arena.poi_of_geom)
     albedo = jnp.where((poi >= 0)[:, None], layout.colour[poi], arena.model.geom_rgba[:, :3])
     own = {
@@ -365,22 +314,23 @@ def scan(
     layout: Layout,
     light: Light,
     robot: Index,
-    directions: jax.Array,
-) -> jax.Array:
+    directions: Float[Array | np.ndarray, "2 B"],
+) -> Float[Array, "B *channels"]:
     """Scans along some rays of one robot's sensor.
 
     Args:
       key: random key of the noise.
       sensor: the sensor.
       arena: the arena.
-      data: its MJX state, after kinematics.
+      data: the arena's MJX state, after kinematics.
       layout: the PoIs, for their surfaces.
       light: the light.
-      robot: index of the robot that carries the sensor, which does not see its own parts.
-      directions: `[2, B]` unit vectors in the robot's frame; `sensor.directions` for a full scan.
+      robot: index of the robot that carries the sensor and does not see its own body. May be
+        traced; a static index saves casting rays at that body.
+      directions: unit vectors in the robot's frame; `sensor.directions` for a whole scan.
 
     Returns:
-      `[B, ...]` readings.
+      The readings of these rays.
     """
     chex.assert_shape(directions, (2, None), custom_message="directions")
     chex.assert_shape(light.direction, (3,), custom_message="light.direction")
@@ -393,10 +343,10 @@ def scan(
 
 
 def _section(arena: Arena, data: mjx.Data, height: float, robot: Index) -> raycast.CrossSection:
-    """The scene at a height, without the robot that looks."""
+    """Cuts the scene at a height, without the robot that is looking."""
     if is_static(robot):
         return raycast.cross_section(arena, data, height, int(robot))
-    # Rays pass through outlines of no size.
+    # Rays never hit an outline of size 0.
     section = raycast.cross_section(arena, data, height, -1)
     is_own = jnp.array(arena.robot_of_geom[list(section.geom)]) == robot
     return dataclasses.replace(section, half=jnp.where(is_own[:, None], 0.0, section.half))

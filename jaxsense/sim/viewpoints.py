@@ -1,9 +1,10 @@
-"""Places from which a sensor faces a point of interest, in range and free of collision."""
+"""Poses from which a sensor faces a PoI, in range and free of collisions."""
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from jaxsense.config import ArenaConfig, ViewpointConfig
 from jaxsense.core.types import Key
@@ -18,36 +19,36 @@ def random_viewpoint(
     config: ViewpointConfig,
     arena: ArenaConfig,
     layout: Layout,
-    others: jax.Array,
-    poi: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
+    others: Float[Array, "K 2"],
+    poi: Int[Array, ""],
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """Draws a pose from which a robot looks at a PoI.
 
-    Candidates are uniform in distance and direction. The first one wins that is free and sees the
-    PoI past the other PoIs and robots; if there is none, the one with the most room.
+    Candidates are uniform in distance and direction. Returns the first one that is free and has an
+    unobstructed view of the PoI, or the one with the most room if there is none.
 
     Args:
       key: random key.
-      config: distances, bearings and clearance.
-      arena: sizes of arena and PoIs.
-      layout: where the PoIs stand.
-      others: `[K, 2]` positions of the other robots, in metres.
-      poi: `[]` int32 index of the PoI to look at.
+      config: settings of viewpoints.
+      arena: the sizes of arena and PoIs.
+      layout: the PoIs.
+      others: positions of the other robots, in metres.
+      poi: index of the PoI to look at.
 
     Returns:
-      `[3]` pose x [m], y [m], yaw [rad], and `[]` the PoI's believed bearing in the robot's frame,
-      in radians.
+      The pose, x [m], y [m] and yaw [rad], and the bearing of the PoI in the robot's frame as the
+      robot believes it, in radians.
     """
     chex.assert_shape(others, (None, 2), custom_message="others")
     chex.assert_rank(poi, 0, custom_message="poi")
-    # One draw for everything: each use of the random generator takes long to compile.
+    # A single draw, because each use of the random generator takes long to compile.
     draws = jax.random.uniform(key, (2 * NUM_CANDIDATES + 2,), jnp.float32)
     near, far = config.min_distance, config.max_distance
     distance = near + (far - near) * draws[:NUM_CANDIDATES]
     side = jnp.pi * (2 * draws[NUM_CANDIDATES:-2] - 1)
     target = layout.position[poi]
     position = target[0] + distance * jnp.cos(side), target[1] + distance * jnp.sin(side)
-    room = free_room(*position, config.clearance, arena, layout, others, poi)
+    room = free_room(position[0], position[1], config.clearance, arena, layout, others, poi)
     first_free = jnp.argmax(room > 0)
     chosen = jnp.where(jnp.any(room > 0), first_free, jnp.argmax(room))
 
@@ -57,46 +58,48 @@ def random_viewpoint(
     return jnp.stack([position[0][chosen], position[1][chosen], yaw]), believed
 
 
-def bearing(pose: jax.Array | np.ndarray, place: jax.Array | np.ndarray) -> jax.Array:
-    """Angle at which a robot sees a place.
+def bearing(
+    pose: Float[Array | np.ndarray, "3"], position: Float[Array | np.ndarray, "2"]
+) -> Float[Array, ""]:
+    """Bearing of a position in a robot's frame.
 
     Args:
-      pose: `[3]` x [m], y [m] and yaw [rad] of the robot.
-      place: `[2]` in metres.
+      pose: x [m], y [m] and yaw [rad] of the robot.
+      position: x and y of the position, in metres.
 
     Returns:
-      `[]` angle from its heading, positive to the left, in radians within -pi and pi.
+      The angle from the robot's heading, positive to the left, in radians within -pi and pi.
     """
     chex.assert_shape(pose, (3,), custom_message="pose")
-    chex.assert_shape(place, (2,), custom_message="place")
-    to_place = place - pose[:2]
-    angle = jnp.arctan2(to_place[1], to_place[0]) - pose[2]
+    chex.assert_shape(position, (2,), custom_message="position")
+    offset = position - pose[:2]
+    angle = jnp.arctan2(offset[1], offset[0]) - pose[2]
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
 
 
 def free_room(
-    x: jax.Array,
-    y: jax.Array,
-    clearance: float,
+    x: Float[Array, "V"],
+    y: Float[Array, "V"],
+    clearance: Float[Array, ""] | float,
     arena: ArenaConfig,
     layout: Layout,
-    others: jax.Array,
-    poi: jax.Array,
-) -> jax.Array:
-    """Free room around viewpoints and in the view from them.
+    others: Float[Array, "K 2"],
+    poi: Int[Array, ""],
+) -> Float[Array, "V"]:
+    """Free room around V viewpoints and in the view from them.
 
     Args:
-      x: `[C]` of the candidates, in metres.
-      y: `[C]` of the candidates, in metres.
+      x: x of the viewpoints, in metres.
+      y: y of the viewpoints, in metres.
       clearance: free space that a robot needs around it, in metres.
-      arena: sizes of arena and PoIs.
-      layout: where the PoIs stand.
-      others: `[K, 2]` positions of the other robots, in metres.
-      poi: `[]` int32 index of the PoI to look at.
+      arena: the sizes of arena and PoIs.
+      layout: the PoIs.
+      others: positions of the other robots, in metres.
+      poi: index of the PoI to look at.
 
     Returns:
-      `[C]` metres, the smallest over walls, robots and PoIs; 0 or less where a robot would be too
-      close to something, or something covers part of the PoI.
+      The smallest margin to walls, robots and PoIs, in metres; 0 or less where a robot would be too
+      close to something, or something hides part of the PoI.
     """
     chex.assert_equal_shape([x, y], custom_message="x, y")
     reach = amiro.BODY_RADIUS + clearance
@@ -109,7 +112,7 @@ def free_room(
         centre, radius = obstacle
         to_x, to_y = centre[0] - x, centre[1] - y
         standing = jnp.sqrt(to_x**2 + to_y**2) - radius - reach
-        # The view is the cone from the sensor to the outline of the PoI.
+        # The view is a cone from the sensor to the PoI's outline.
         along = jnp.clip((to_x * view_x + to_y * view_y) / view_length, 0.0, view_length)
         share = along / view_length
         beside_x, beside_y = to_x - share * view_x, to_y - share * view_y
@@ -117,8 +120,8 @@ def free_room(
         in_view = across - share * arena.poi_extent - radius
         return jnp.minimum(room, jnp.minimum(standing, in_view)), None
 
-    # The target itself is never in the way. A loop makes the compiler finish the candidates first;
-    # fused with the work for each obstacle, they would be recomputed every time.
+    # The target never obstructs the view. The loop makes the compiler finish the viewpoints first;
+    # fused into the loop's body, they would be recomputed for each obstacle.
     is_target = jnp.arange(arena.num_pois) == poi
     of_pois = jnp.where(is_target, -jnp.inf, arena.poi_extent)
     of_robots = jnp.full(len(others), amiro.BODY_RADIUS, jnp.float32)

@@ -4,56 +4,67 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsense.config import ArenaConfig
 from jaxsense.core import checks
 from jaxsense.sim.sensors import Sensor
 
-_SHARE_OF_WIDTH = 0.7  # of a PoI, that a ray must meet
+_SHARE_OF_WIDTH = 0.7  # of a PoI; rays within must hit it
 
 
-def window_of(sensor: Sensor, values: np.ndarray, bearing: jax.Array) -> jax.Array:
-    """Values of those rays of a scan that the detector reads.
+def window_of(
+    sensor: Sensor, values: Shaped[np.ndarray, "*axes B"], bearing: Float[Array, ""]
+) -> Shaped[Array, "*axes window"]:
+    """Selects from the values of all rays those of the rays that the detector reads.
 
     Args:
       sensor: the sensor.
-      values: `[..., B]` of all rays, for example `sensor.angles`.
-      bearing: `[]` at the centre of these rays, in radians in the robot's frame; near the edge of
-        the field of view they stop at its last ray.
+      values: one value per ray, for example `sensor.angles`.
+      bearing: bearing of the window's centre in the robot's frame, in radians. Near the edge of the
+        field of view, the window ends at the last ray.
 
     Returns:
-      `[..., window]` values.
+      The values of the window's rays.
     """
     chex.assert_rank(bearing, 0, custom_message="bearing")
-    *shape, number = values.shape
+    *shape, num_rays = values.shape
     start = _first_ray(sensor, bearing)
-    # One slice of all rays a stride apart: XLA would recompute a list of indices for each ray, from
-    # the bearing on.
-    padded = np.pad(values, [(0, 0)] * len(shape) + [(0, -number % sensor.stride)])
+    # One slice of all rays a stride apart: XLA would recompute an array of indices, starting from
+    # the bearing, for each ray.
+    padded = np.pad(values, [(0, 0)] * len(shape) + [(0, -num_rays % sensor.stride)])
     strided = jnp.array(padded.reshape(*shape, -1, sensor.stride))
-    zero = jnp.int32(0)  # of the same type as the other indices also with 64 bits
-    place = [zero] * len(shape) + [start // sensor.stride, start % sensor.stride]
-    return jax.lax.dynamic_slice(strided, place, (*shape, sensor.window, 1))[..., 0]
+    zero = jnp.int32(0)  # in 64-bit mode a plain 0 would be another type than the other indices
+    first = [zero] * len(shape) + [start // sensor.stride, start % sensor.stride]
+    return jax.lax.dynamic_slice(strided, first, (*shape, sensor.window, 1))[..., 0]
 
 
-def _first_ray(sensor: Sensor, bearing: jax.Array) -> jax.Array:
-    """Index of the first ray that the detector reads around a bearing, `[]` int32."""
+def _first_ray(sensor: Sensor, bearing: Float[Array, ""]) -> Int[Array, ""]:
+    """Index of the first ray that the detector reads around a bearing."""
     span = (sensor.window - 1) * sensor.stride
     start = jnp.round(sensor.centre(bearing) - span / 2).astype(jnp.int32)
     return jnp.clip(start, 0, len(sensor.angles) - 1 - span)
 
 
-def cut_out(sensor: Sensor, readings: jax.Array | np.ndarray, bearing: jax.Array | float):
+def cut_out(
+    sensor: Sensor,
+    readings: Float[Array | np.ndarray, "B *channels"],
+    bearing: Float[Array | np.ndarray, ""] | float,
+) -> Float[Array, "F"]:
     """Cuts the detector's input out of a whole scan, recorded or simulated.
 
     Args:
       sensor: the sensor.
-      readings: `[B, ...]` of all its rays in their order: a LiDAR's in metres from right to left, a
+      readings: readings of all rays, in their order: a LiDAR's in metres from right to left, a
         camera's as linear RGB in [0, 1] from left to right.
-      bearing: `[]` of the PoI in the robot's frame, in radians, positive to the left.
+      bearing: bearing of the PoI in the robot's frame, in radians, positive to the left.
 
     Returns:
-      `[F]` input of `vae.detect`.
+      The input of `vae.detect`.
+
+    Raises:
+      ValueError: if a reading is negative, not a number or not real, or the bearing is not within
+        -pi and pi.
     """
     channels = () if sensor.channels == 1 else (sensor.channels,)
     shape = (len(sensor.angles), *channels)
@@ -73,29 +84,32 @@ def cut_out(sensor: Sensor, readings: jax.Array | np.ndarray, bearing: jax.Array
 
 def shows_poi(
     sensor: Sensor,
-    readings: jax.Array,
-    bearing: jax.Array,
-    distance: jax.Array,
+    readings: Float[Array, "window *channels"],
+    bearing: Float[Array, ""],
+    distance: Float[Array, ""],
     arena: ArenaConfig,
-    bearing_error: jax.Array | float = 0.0,
-) -> jax.Array:
-    """Whether readings may show a PoI where it is expected.
+    bearing_error: Float[Array, ""] | float = 0.0,
+) -> Bool[Array, ""]:
+    """Tells whether the readings of a window may show a PoI at its expected position.
 
-    The LiDAR judges by distance. The camera distinguishes a PoI from walls, robots and darkness by
-    its colour, but not from another PoI before or behind it: good viewpoints have none there.
+    Rays near the PoI's centre must hit it, rays near its edge may: at least one that may hit it has
+    to show it, and so has every ray that must, except for twice the share that the sensor loses on
+    average.
+
+    The LiDAR decides by distance. The camera tells a PoI from walls, robots and darkness by its
+    colour, but not from another PoI in front of it or behind it; good viewpoints have none there.
 
     Args:
       sensor: the sensor.
-      readings: `[window, ...]` of the rays around the bearing.
-      bearing: `[]` at which the PoI is expected, in radians in the robot's frame.
-      distance: `[]` at which its centre is expected, in metres.
-      arena: sizes of PoIs.
-      bearing_error: `[]` largest error of the bearing, in radians.
+      readings: readings of the window around the bearing.
+      bearing: expected bearing of the PoI in the robot's frame, in radians.
+      distance: expected distance of the PoI's centre, in metres.
+      arena: the sizes of PoIs.
+      bearing_error: largest error of the bearing, in radians.
 
     Returns:
-      `[]` bool: a ray that may meet a PoI of this size can have met one, and so can all that must,
-      except for twice the share that the sensor loses on average. False for a covered or absent
-      PoI, or a failed sensor; of a camera whose light changes, for a failed one only.
+      False if the PoI is hidden or absent, or the sensor has failed. A camera whose light changes
+      can only recognise its own failure.
     """
     angles = jnp.abs(window_of(sensor, sensor.angles, bearing) - bearing)
     half_width = jnp.arcsin(jnp.minimum(arena.poi_half_width / distance, 1.0))
@@ -105,7 +119,15 @@ def shows_poi(
     return jnp.any(may & shows) & (jnp.sum(must & ~shows) <= 2 * sensor.lost * jnp.sum(must))
 
 
-def as_window(sensor: Sensor, readings: jax.Array) -> jax.Array:
-    """Input of the detector, `[F]`, from the `[window, ...]` readings of its rays."""
+def as_window(sensor: Sensor, readings: Float[Array, "window *channels"]) -> Float[Array, "F"]:
+    """Turns the readings of a window into the detector's input.
+
+    Args:
+      sensor: the sensor.
+      readings: readings of the rays that the detector reads.
+
+    Returns:
+      The readings as one vector, limited to `sensor.window_limit`.
+    """
     chex.assert_axis_dimension(readings, 0, sensor.window, custom_message="readings")
     return jnp.minimum(readings, sensor.window_limit).reshape(-1)

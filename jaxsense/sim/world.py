@@ -1,4 +1,4 @@
-"""Looks at points of interest in simulated arenas: the simulator's interface for training."""
+"""Scenes in simulated arenas, and looks at their PoIs."""
 
 import dataclasses
 
@@ -6,6 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
 from jaxsense.config import Config, ViewpointConfig
@@ -17,7 +18,7 @@ from jaxsense.sim import sensors, viewpoints, windows
 
 @struct.dataclass
 class World:
-    """A simulation: what all its scenes share.
+    """What all scenes of a simulation share.
 
     Attributes:
       arena: the compiled arena; static.
@@ -32,7 +33,7 @@ class World:
 
 @pytree
 class Scene:
-    """One arena at one moment, the source of its MJX state.
+    """One arena at one moment; determines the MJX state.
 
     Attributes:
       layout: the PoIs.
@@ -56,35 +57,34 @@ def make_world(
 
     Args:
       config: all settings; numbers that are declared `Traced` may be traced.
-      robots: the modality of each robot; by default one robot for each of `config.modalities`, as
-        training needs.
-      arena: a compiled arena to reuse; by default it is compiled, which cannot be traced.
-      contacts: see `arena.build`.
-
-    Returns:
-      The simulation.
+      robots: modality of each robot; by default one robot per modality, in the order of
+        `config.modalities`, as training needs.
+      arena: a compiled arena to reuse, with which this function can be traced; `robots` and
+        `contacts` are ignored. By default, the arena is compiled.
+      contacts: whether robots collide, see `arena.build`.
 
     Raises:
       ValueError: if `arena` was compiled from other settings than `config.arena`.
+      ConfigError: if a custom sensor is wrong, see `sensors.make`.
     """
     if arena is None:
         carries_lidar = tuple(name == "lidar" for name in robots or config.modalities)
         arena = arenas.build(config.arena, carries_lidar, contacts=contacts)
     elif arena.config != config.arena:
-        raise ValueError("arena: must be compiled from config.arena; it has other settings")
+        raise ValueError("arena: must be compiled from config.arena; its settings differ")
     return World(arena, sensors.make(config), config.viewpoint)
 
 
-def random_scene(key: Key, world: World, classes: jax.Array) -> Scene:
-    """Draws a scene with PoIs of the given classes at random places under random light.
+def random_scene(key: Key, world: World, classes: Int[Array, "N"]) -> Scene:
+    """Draws a scene with PoIs of given classes at random positions under random light.
 
     Args:
       key: random key.
       world: the simulation.
-      classes: `[N]` int32 index into `config.arena.classes`.
+      classes: index of each PoI's class in the settings of the arena.
 
     Returns:
-      The scene. Every robot stands at a random viewpoint of a random PoI.
+      The scene. Each robot stands at a random viewpoint of a random PoI.
     """
     layout_key, light_key, poi_key, *robot_keys = jax.random.split(key, 3 + len(world.sensors))
     layout = arenas.random_layout(layout_key, world.arena.config, classes)
@@ -97,21 +97,24 @@ def random_scene(key: Key, world: World, classes: jax.Array) -> Scene:
 
 
 def look(
-    key: Key, world: World, scene: Scene, robot: int, poi: jax.Array
-) -> tuple[jax.Array, Scene]:
-    """Puts a robot at a random viewpoint of a PoI, updates MJX's kinematics and scans.
+    key: Key, world: World, scene: Scene, robot: int, poi: Int[Array, ""]
+) -> tuple[Float[Array, "F"], Scene]:
+    """Places a robot at a random viewpoint of a PoI and scans.
 
-    Casts only the rays that the detector reads; their readings are those of a full scan.
+    Casts only the rays that the detector reads; their readings are those of a whole scan.
 
     Args:
       key: random key.
       world: the simulation.
       scene: the current scene.
       robot: index of the robot and of its modality; static.
-      poi: `[]` int32 index of the PoI.
+      poi: index of the PoI.
 
     Returns:
-      `[F]` the detector's input, and the scene with the robot at its viewpoint.
+      The detector's input, and the scene with the robot at its viewpoint.
+
+    Raises:
+      ValueError: if there is no such robot or PoI, or a pose is not finite.
     """
     if not 0 <= robot < len(world.sensors):
         raise ValueError(f"robot = {robot}: must be one of the {len(world.sensors)} robots")
@@ -133,39 +136,40 @@ def scan_around(
     scene: Scene,
     data: mjx.Data,
     robot: Index,
-    bearing: jax.Array,
+    bearing: Float[Array, ""],
     modality: int,
-) -> jax.Array:
-    """Scans around a bearing from where a robot stands.
+) -> Float[Array, "window *channels"]:
+    """Scans around a bearing from a robot's current pose.
 
     Args:
       key: random key of the noise.
       world: the simulation.
       scene: the scene.
-      data: the MJX state of the scene, from `place`.
-      robot: index of the robot, which may be traced; a static one is a little faster, as it leaves
-        the robot's own parts out of the program.
-      bearing: `[]` in the robot's frame, in radians.
-      modality: index of the robot's sensor; static, as sensors have different shapes.
+      data: the scene's MJX state, from `place`.
+      robot: index of the robot, which may be traced.
+      bearing: bearing of the window's centre in the robot's frame, in radians.
+      modality: index of the robot's sensor; static, because sensors differ in shape.
 
     Returns:
-      `[window, ...]` readings of the rays that the detector reads.
+      The readings of the rays that the detector reads.
     """
     sensor = world.sensors[modality]
     rays = windows.window_of(sensor, sensor.directions, bearing)
     return sensors.scan(key, sensor, world.arena, data, scene.layout, scene.light, robot, rays)
 
 
-def survey(key: Key, world: World, classes: jax.Array) -> tuple[Scene, tuple[jax.Array, ...]]:
-    """Draws a scene, and scans each PoI in it by each robot.
+def survey(
+    key: Key, world: World, classes: Int[Array, "N"]
+) -> tuple[Scene, tuple[Float[Array, "N _"], ...]]:
+    """Draws a scene in which each robot looks at each PoI, every time from a new viewpoint.
 
     Args:
       key: random key.
       world: the simulation.
-      classes: `[N]` int32 index into `config.arena.classes`.
+      classes: index of each PoI's class in the settings of the arena.
 
     Returns:
-      The scene, and for each robot the `[N, F]` inputs of its detector.
+      The scene, and for each robot the inputs of its detector, one per PoI.
     """
     scene_key, viewpoint_key, noise_key = jax.random.split(key, 3)
     scene = random_scene(scene_key, world, classes)

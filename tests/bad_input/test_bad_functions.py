@@ -161,7 +161,7 @@ FUNCTIONS = {
     "cut_out degrees": (lambda w: sim.cut_out(w.lidar, np.zeros(683), 90.0), "bearing = 90.0"),
     "cut_out bearing": (lambda w: sim.cut_out(w.lidar, np.zeros(683), NAN), "bearing = nan"),
     "bearing pose": (lambda w: sim.bearing(w.x, w.x), "pose"),
-    "bearing place": (lambda w: sim.bearing(jnp.zeros(3), jnp.zeros(3)), "place"),
+    "bearing position": (lambda w: sim.bearing(jnp.zeros(3), jnp.zeros(3)), "position"),
     "Sensor stride": (lambda w: dataclasses.replace(w.lidar, stride=0), "stride = 0"),
     "Sensor window": (lambda w: dataclasses.replace(w.lidar, window=1.5), "window = 1.5"),
     "Sensor channels": (lambda w: dataclasses.replace(w.lidar, channels=-1), "channels = -1"),
