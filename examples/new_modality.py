@@ -2,34 +2,33 @@
 
     python examples/new_modality.py --preset smoke --out runs/thermal
 
-takes every option of `python -m jaxsense.train`. Other programs that read the run must be able to
-import this file, and be told that they may:
+takes every option of `python -m jaxsense.train`. To load the run, other programs must be able to
+import this file and be allowed to:
 
     PYTHONPATH=examples python -m jaxsense.evaluate runs/thermal --trust
 """
 
-import dataclasses
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 
 from jaxsense import Attribute, Config, SensorConfig, sim, train
 
-ROOM = 20.0  # degrees Celsius
-NOISE = 1.0  # degrees Celsius
+ROOM, NOISE = 20.0, 1.0  # degrees Celsius
 
 
 class Thermal(sim.Sensor):
-    """A thermal camera: one temperature per ray."""
+    """A thermal camera: one temperature per ray, in degrees Celsius."""
 
     def read(self, key, hits, surfaces, light):
-        """Temperatures in degrees Celsius."""
+        """Measures the surfaces that the rays hit, or the room."""
         temperature = sim.choose(surfaces["temperature"], hits.geom)
         temperature = jnp.where(hits.geom >= 0, temperature, ROOM)
         return temperature + NOISE * jax.random.normal(key, temperature.shape)
 
     def shows(self, readings, distance, extent):
-        """Which rays may have hit a PoI: even a cold one is warmer than the walls."""
+        """Tells which rays may have hit a PoI: even a cold one is warmer than the walls."""
         return readings > ROOM + 4 * NOISE
 
 
@@ -39,24 +38,16 @@ def thermal(config: Config) -> sim.Sensor:
 
 
 def change(config: Config) -> Config:
-    """The settings of a preset, with temperatures and a third robot that sees them."""
+    """Adds temperatures, and a third robot that measures them, to the settings of a preset."""
     temperature = Attribute({"cold": 30.0, "hot": 60.0}, elsewhere=ROOM)
-    return dataclasses.replace(
+    # A class now has a third word. No sensor can tell all of these classes apart.
+    classes = ("green cylinder cold", "red cylinder cold", "red cube cold", "red cube hot")
+    return replace(
         config,
-        arena=dataclasses.replace(
-            config.arena,
-            attributes={"temperature": temperature},
-            # A class has one more word now. No sensor alone tells all of these apart.
-            classes=(
-                "green cylinder cold",
-                "red cylinder cold",
-                "red cube cold",
-                "red cube hot",
-            ),
-        ),
+        arena=replace(config.arena, attributes={"temperature": temperature}, classes=classes),
         sensors={"thermal": SensorConfig("new_modality:thermal", attribute="temperature")},
         modalities=("camera", "lidar", "thermal"),
-        jmvae=dataclasses.replace(config.jmvae, reconstruction_weights=(10.0, 10.0, 10.0)),
+        jmvae=replace(config.jmvae, reconstruction_weights=(10.0, 10.0, 10.0)),
     )
 
 

@@ -1,5 +1,8 @@
 """Colours, shapes and attributes that a user has declared, in arena and sensors."""
 
+import dataclasses
+
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -109,3 +112,42 @@ def test_bearings_are_counted_from_the_heading_to_the_left():
     pose, place = np.array([1.0, 0.0, np.pi / 2]), np.array([0.0, 0.0])
     assert sim.bearing(pose, place) == pytest.approx(np.pi / 2, abs=1e-6)
     assert sim.bearing(pose, np.array([2.0, 1.0])) == pytest.approx(-np.pi / 4, abs=1e-6)
+
+
+@dataclasses.dataclass(frozen=True)
+class ThreeRays:
+    """Ahead and 0.5 rad to either side, from left to right."""
+
+    angles = np.float32([0.5, 0.0, -0.5])
+
+    def centre(self, bearing):
+        return 1.0 - 2.0 * bearing
+
+
+class Sonar(sim.Sensor):
+    """One range for all rays, in a unit of its own."""
+
+    scale: float
+
+    def read(self, key, hits, surfaces, light):
+        nearest = jnp.min(hits.distance)
+        return self.scale * jnp.full(hits.distance.shape, nearest)
+
+
+def test_a_sensor_of_ones_own_is_a_subclass_whose_fields_are_inputs_of_a_program(view):
+    arena, data = view
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def scan(sonar):
+        light, key = LIGHT, jax.random.key(0)
+        return sim.scan(key, sonar, arena, data, LAYOUT, light, 0, jnp.array(sonar.directions))
+
+    for scale in (1.0, 100.0):
+        sonar = Sonar(scale, height=0.1, rays=ThreeRays(), window=3)
+        # The slab is 0.5 m ahead of robot 0, less half of its 0.2 m.
+        np.testing.assert_allclose(scan(sonar), 3 * [0.4 * scale], rtol=1e-5)
+        assert sonar.shows(scan(sonar), jnp.float32(1.0), 0.1).tolist() == [True, True, True]
+    assert windows.cut_out(sonar, np.ones(3, np.float32), 0.0).tolist() == [1.0, 1.0, 1.0]
+    with pytest.raises(TypeError, match="abstract"):
+        sim.Sensor(height=0.1, rays=ThreeRays(), window=3)
