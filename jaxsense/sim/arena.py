@@ -109,13 +109,7 @@ def build(
     # The default of MJX is the first device of all processes, not of this one.
     device = jax.local_devices()[0]
     model = mjx.put_model(mj_model, device=device, impl="jax")
-    model, data = _as_float32((model, mjx.make_data(model, device=device)))
-    return Arena(config, mj_model, model, data, len(lidar_robots))
-
-
-def _as_float32(tree):
-    """Keeps the simulation in float32 when JAX runs with 64 bits."""
-    return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, tree)
+    return Arena(config, mj_model, model, mjx.make_data(model, device=device), len(lidar_robots))
 
 
 def _mjcf(
@@ -206,8 +200,8 @@ def make_layout(
     checks.require_finite("yaw", yaw)
     checks.require_index("classes", classes, len(config.classes))
     shapes = jnp.array([list(config.shapes).index(w) for w in config.words("shape")], jnp.int32)
-    colours = jnp.array(config.values("colour"), jnp.float32)
-    values = {name: jnp.array(config.values(name), jnp.float32) for name in config.attributes}
+    colours = jnp.array(config.values("colour"))
+    values = {name: jnp.array(config.values(name)) for name in config.attributes}
     of_pois = {name: numbers[classes] for name, numbers in values.items()}
     return Layout(position, yaw, shapes[classes], colours[classes], of_pois)
 
@@ -231,7 +225,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
         int(np.ceil(np.sqrt(2 * config.num_pois))), int(np.floor(config.side / config.poi_pitch))
     )
     cell_side = config.side / per_side
-    draws = jax.random.uniform(key, (per_side**2 + 3 * config.num_pois,), jnp.float32)
+    draws = jax.random.uniform(key, (per_side**2 + 3 * config.num_pois,))
     cell = jnp.argsort(draws[: per_side**2])[: config.num_pois]
     x, y, turn = draws[per_side**2 :].reshape(3, config.num_pois)
     corner = jnp.stack([cell // per_side, cell % per_side], axis=-1) * cell_side - config.side / 2
@@ -253,7 +247,7 @@ def place(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
     Returns:
       The MJX state with up-to-date `geom_xpos` and `geom_xmat`.
     """
-    return _as_float32(mjx.kinematics(arena.model, put(arena, layout, poses)))
+    return mjx.kinematics(arena.model, put(arena, layout, poses))
 
 
 def put(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
@@ -316,7 +310,7 @@ def drive(arena: Arena, data: mjx.Data, wheel_speeds: Float[Array, "R 2"]) -> mj
     chex.assert_shape(wheel_speeds, (arena.num_robots, 2), custom_message="wheel_speeds")
     # MJX relies on rank promotion, which the caller may have forbidden.
     with jax.numpy_rank_promotion("allow"):
-        return _as_float32(mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds))))
+        return mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds)))
 
 
 def as_control(wheel_speeds: Float[Array, "R 2"]) -> Float[Array, "U"]:

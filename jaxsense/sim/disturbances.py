@@ -32,7 +32,7 @@ def measured_ranges(
     spread = config.range_noise
     if config.range_noise_growth > 0:
         spread += config.range_noise_growth * jnp.minimum(met, config.max_range)
-    noise = spread * jax.random.normal(key, met.shape, jnp.float32)
+    noise = spread * jax.random.normal(key, met.shape)
     measured = jnp.clip(met + noise, config.min_range, config.max_range)
     return jnp.where(met <= config.max_range, measured, config.max_range)
 
@@ -40,7 +40,7 @@ def measured_ranges(
 def _disturbed(key: Key, distance: Float[Array, "B"], config: LidarConfig) -> Float[Array, "B"]:
     """Distances with mixed pixels, infinite where a beam drops out."""
     # Folded in: `key` draws the noise, which must not depend on what is switched on.
-    uniform = jax.random.uniform(jax.random.fold_in(key, 1), (3, *distance.shape), jnp.float32)
+    uniform = jax.random.uniform(jax.random.fold_in(key, 1), (3, *distance.shape))
     # The last beam has no neighbour. The scanner detects nothing beyond its range.
     within = jnp.minimum(distance, config.max_range)
     following = jnp.append(within[1:], within[-1:])
@@ -71,8 +71,8 @@ def lighting(
     """
     # Folded in: `key` draws the noise, which must not depend on what is switched on.
     normal_key, uniform_key = jax.random.split(jax.random.fold_in(key, 1))
-    brightness, *casts = jax.random.normal(normal_key, (4,), jnp.float32)
-    missing, falls, edge, side = jax.random.uniform(uniform_key, (4,), jnp.float32)
+    brightness, *casts = jax.random.normal(normal_key, (4,))
+    missing, falls, edge, side = jax.random.uniform(uniform_key, (4,))
     logarithm = config.exposure_error * brightness + config.colour_cast * jnp.stack(casts)
     gain = (1 - config.low_light * missing) * jnp.exp(logarithm)
     is_beyond = jnp.arange(num_pixels) >= edge * num_pixels

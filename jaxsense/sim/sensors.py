@@ -186,7 +186,7 @@ class Camera(Sensor):
             gain, is_lit = disturbances.lighting(key, len(facing), self.config)
             direct = direct * is_lit
         shade = light.ambient + direct
-        noise = self.config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape), jnp.float32)
+        noise = self.config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape))
 
         def channel(given):
             of_geom, of_background, noise, gain = given
@@ -196,8 +196,8 @@ class Camera(Sensor):
 
         # The loop over channels makes the compiler finish hits and noise first; fused with the
         # ray-caster, each channel would cast the rays many times over.
-        background = jnp.array(_BACKGROUND, jnp.float32)
-        return jax.lax.map(channel, (surfaces["colour"].T, background, noise, gain)).T
+        inputs = surfaces["colour"].T, jnp.array(_BACKGROUND), noise, gain
+        return jax.lax.map(channel, inputs).T
 
     def shows(
         self, readings: Float[Array, "B *channels"], distance: Float[Array, ""], extent: float
@@ -209,7 +209,7 @@ class Camera(Sensor):
 
 def random_light(key: Key) -> Light:
     """Draws a light of random strength from any side, 20 to 70 degrees above the floor."""
-    side, height, diffuse, ambient = jax.random.uniform(key, (4,), jnp.float32)
+    side, height, diffuse, ambient = jax.random.uniform(key, (4,))
     side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)
     flat = jnp.cos(height)
     direction = jnp.stack([flat * jnp.cos(side), flat * jnp.sin(side), jnp.sin(height)])

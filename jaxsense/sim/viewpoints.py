@@ -42,7 +42,7 @@ def random_viewpoint(
     chex.assert_shape(others, (None, 2), custom_message="others")
     chex.assert_rank(poi, 0, custom_message="poi")
     # A single draw, because each use of the random generator takes long to compile.
-    draws = jax.random.uniform(key, (2 * NUM_CANDIDATES + 2,), jnp.float32)
+    draws = jax.random.uniform(key, (2 * NUM_CANDIDATES + 2,))
     near, far = config.min_distance, config.max_distance
     distance = near + (far - near) * draws[:NUM_CANDIDATES]
     side = jnp.pi * (2 * draws[NUM_CANDIDATES:-2] - 1)
@@ -124,6 +124,6 @@ def free_room(
     # fused into the loop's body, they would be recomputed for each obstacle.
     is_target = jnp.arange(arena.num_pois) == poi
     of_pois = jnp.where(is_target, -jnp.inf, arena.poi_extent)
-    of_robots = jnp.full(len(others), amiro.BODY_RADIUS, jnp.float32)
+    of_robots = jnp.full(len(others), amiro.BODY_RADIUS)
     obstacles = jnp.concatenate([layout.position, others]), jnp.append(of_pois, of_robots)
     return jax.lax.scan(around, to_wall, obstacles)[0]

@@ -34,8 +34,7 @@ def window_of(
     # the bearing, for each ray.
     padded = np.pad(values, [(0, 0)] * len(shape) + [(0, -num_rays % sensor.stride)])
     strided = jnp.array(padded.reshape(*shape, -1, sensor.stride))
-    zero = jnp.int32(0)  # in 64-bit mode a plain 0 would be another type than the other indices
-    first = [zero] * len(shape) + [start // sensor.stride, start % sensor.stride]
+    first = [0] * len(shape) + [start // sensor.stride, start % sensor.stride]
     return jax.lax.dynamic_slice(strided, first, (*shape, sensor.window, 1))[..., 0]
 
 

@@ -89,7 +89,7 @@ def random_scene(key: Key, world: World, classes: Int[Array, "N"]) -> Scene:
     layout_key, light_key, poi_key, *robot_keys = jax.random.split(key, 3 + len(world.sensors))
     layout = arenas.random_layout(layout_key, world.arena.config, classes)
     pois = jax.random.randint(poi_key, (len(robot_keys),), 0, world.arena.config.num_pois)
-    poses = jnp.zeros((0, 3), jnp.float32)
+    poses = jnp.zeros((0, 3))
     for robot_key, poi in zip(robot_keys, pois, strict=True):
         pose, _ = _viewpoint(robot_key, world, layout, poses, poi)
         poses = jnp.concatenate([poses, pose[None]])
