@@ -21,7 +21,6 @@ from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import map_mdp, optimum, policies
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.models import make_in_place, make_jmvae, make_prior
-from jaxsense.run.pipeline import policy_metrics
 from jaxsense.training import measures, perception
 from jaxsense.training.mdp import held_out_mdp, models_of
 from jaxsense.training.perception import Detections
@@ -406,24 +405,3 @@ SMALL = Config(
     jmvae=JmvaeConfig(reconstruction_weights=(1.0,)),
     evaluation=EvaluationConfig(num_starts=3),
 )
-
-
-def test_figures_of_policies_as_worked_by_hand():
-    # Sixteen states and three random starts, of which the figures are means.
-    of_states = np.zeros((4, 16))
-    # .02 and .009 below the optimum, of which .01 is let pass; more than the optimum is too. The
-    # classes of the first and last four states are equal, of the others different.
-    of_states[1, [0, 1, 4, 5, 10]] = 0.02, 0.009, 0.02, 0.009, 0.5
-    of_states[0, 15] = 1.0
-    of_starts = np.array([[0.9, 1.0, 1.1], [1.0, 1.1, 1.2], [0.5, 0.5, 0.8], [-1.0, 0.0, -0.5]])
-    total = np.concatenate([of_states, of_starts], axis=1)
-    figures = policy_metrics(total, total / 2, SMALL)
-    expected = {"return": 1.0, "optimal": 1.1, "naive": 0.6, "random": -0.5}
-    assert {name: figures[name] for name in expected} == pytest.approx(expected)
-    assert figures["fraction_of_optimal"] == pytest.approx(1 / 1.1)
-    one_step = {"policy": 0.5, "optimal": 0.55, "random": -0.25}
-    assert figures["one_step"] == pytest.approx(one_step)
-    assert (figures["optimal_states"], figures["num_states"]) == (13, 16)
-    assert (figures["optimal_permutations"], figures["num_permutations"]) == (6, 8)
-    nothing = policy_metrics(np.zeros((4, 19)), np.zeros((4, 19)), SMALL)
-    assert nothing["fraction_of_optimal"] is None
