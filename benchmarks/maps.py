@@ -1,4 +1,4 @@
-"""What the rows about Q-learning have in common: a task, and a short way to say it."""
+"""What the rows about Q-learning share: a task, a learner and an examination."""
 
 import dataclasses
 from collections.abc import Callable

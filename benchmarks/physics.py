@@ -32,7 +32,7 @@ _PERIODS_BEFORE = 40  # 4 s of missions that last 14 s
 _MOST_PLAYED = 384  # missions; more are copies of these
 _UNTRAINED = dataclasses.replace(
     PRESETS["default"],
-    # Untrained detectors are never sure; what they say is of no importance here.
+    # Untrained detectors are never confident; what they detect does not matter here.
     mission=dataclasses.replace(PRESETS["default"].mission, least_confidence=0.0),
 )
 

@@ -1,8 +1,7 @@
-"""How well the model of travel predicts missions in MJX: `python -m benchmarks.travel RUN`.
+"""How well the travel model predicts missions in MJX: `python -m benchmarks.travel RUN`.
 
-Plays missions of naive exploration with the models of a run, takes each way from a decision to the
-look that it leads to, and prints how long it took, how long the model predicts, and the numbers of
-the model that fit best.
+Plays missions of naive exploration with the models of a run, takes each trip from a decision to its
+look, and prints how long it took, how long the model predicts, and the best-fitting parameters.
 """
 
 import dataclasses
@@ -26,7 +25,7 @@ _MISSIONS = 64
 def main(argv: list[str]) -> None:
     """Prints the errors of the model."""
     config, models = rundir.load(argv[0], trust=False)
-    poses, places, taken = ways(config, models)
+    poses, places, taken = trips(config, models)
     table = rich.table.Table("model", "mean", "median error", "root mean square error")
     for name, travel in {
         "settings": config.team.travel,
@@ -42,11 +41,11 @@ def main(argv: list[str]) -> None:
         )
     console = rich.console.Console()
     console.print(table)
-    console.print(f"{len(taken)} ways, on average {taken.mean():.2f} s long")
+    console.print(f"{len(taken)} trips of {taken.mean():.2f} s on average")
 
 
-def ways(config: Config, models: Models) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ways from a decision to a look: `[W, 3]` first poses, `[W, 2]` PoIs and `[W]` seconds."""
+def trips(config: Config, models: Models) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Trips from a decision to a look: `[W, 3]` first poses, `[W, 2]` PoIs and `[W]` seconds."""
     team = mission.make_mission(config)
     period = config.mission.control_period
     steps = int(config.mission.time_limit / period)
@@ -69,7 +68,7 @@ def ways(config: Config, models: Models) -> tuple[np.ndarray, np.ndarray, np.nda
             begin = 0
             target = record.target[b, :, r]
             for i in np.flatnonzero(record.scanned[b, :, r]):
-                # After a look the target is none; a robot that changed its mind went a longer way.
+                # After a look there is no target; a robot that changed its mind drove farther.
                 aims = target[begin:i]
                 if (
                     record.detected[b, i, r]
