@@ -211,9 +211,10 @@ def test_new_policy(capsys):
 
 def test_new_reward(capsys):
     told = printed("new_reward", capsys)
-    first, last, epochs = re.findall(r"-?\d+\.\d{3}|\d+ epochs", told)
-    assert float(last) > float(first)
-    assert epochs == f"{PRESETS['smoke'].dqn.epochs} epochs"
+    first, last = map(float, re.findall(r"-?\d+\.\d{3}", told))
+    # At random each look costs .05; NOP costs nothing.
+    assert first < -0.05
+    assert last > 0.5 * first
 
 
 def test_a_run_whose_sensor_cannot_be_imported_is_named(runs, capsys, monkeypatch):
