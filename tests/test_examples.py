@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import Belief, evaluate, sim, train, training
+from jaxsense import Belief, evaluate, sim, train
 from jaxsense.config import PRESETS
 from jaxsense.core.types import pytree
 from jaxsense.run.rundir import RunDirectory, Settings
-from jaxsense.training import learn
+from jaxsense.training import learn, stages
 from jaxsense.vae import InPlace
 
 SMALL = ("--preset", "smoke", "--mission.episodes", "1")
@@ -54,7 +54,7 @@ def runs(learned, tmp_path_factory):
     config, outputs = learned
     untrained = jaxsense.init(jax.random.key(0), config)
     q_networks = zip(config.modalities, untrained.q_networks, strict=True)
-    models = training.models(outputs | {f"dqn_{name}": q for name, q in q_networks}, config)
+    models = stages.models(outputs | {f"dqn_{name}": q for name, q in q_networks}, config)
     path = tmp_path_factory.mktemp("runs")
     with RunDirectory.create(path / "thermal", Settings("smoke", 0, config)) as created:
         created.save_models(models)

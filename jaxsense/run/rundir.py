@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import jax
 
-from jaxsense import models, training
+from jaxsense import models
 from jaxsense.config import (
     PRESETS,
     Config,
@@ -26,6 +26,7 @@ from jaxsense.models import Models
 from jaxsense.run import files
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.version import __version__, commit, versions
+from jaxsense.training import stages
 from jaxsense.training.agents import learner
 
 Json: TypeAlias = dict[str, Any]
@@ -329,7 +330,7 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
         return jax.device_put(found)
 
     found = {name: restore(name, shape) for name, shape in _named(shapes, config).items()}
-    return config, training.models(found, config)
+    return config, stages.models(found, config)
 
 
 def _named(models: Models, config: Config) -> dict[str, Any]:

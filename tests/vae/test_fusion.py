@@ -156,7 +156,8 @@ def test_every_kind_of_fusion_has_all_of_the_protocol(kind):
     found = KINDS[kind]()
     public = [name for name in vars(Fusion) if not name.startswith("_")]
     assert set(public) == {
-        "classes", "prior", "update", "together", "class_probabilities", "most_likely_class"
+        "accumulates", "classes", "prior", "update", "together", "class_probabilities",
+        "most_likely_class",
     }  # fmt: skip
     for name in public:
         declared, own = getattr(Fusion, name), getattr(found, name)
