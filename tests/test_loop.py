@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxsense.stages import Progress, Stage, Steps
 
 from jaxsense.config import PRESETS
 from jaxsense.run import loop, pipeline, programs
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.training.stage import Progress, Stage
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
 
@@ -25,7 +25,7 @@ def toy(monkeypatch, tmp_path):
     monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
 
     def train(*stages, saved=False):
-        monkeypatch.setattr(programs, "stages", lambda config, world: list(stages))
+        monkeypatch.setattr(programs, "stages", lambda config, arena: list(stages))
         heard, warned = [], []
         monitor = Monitor(lambda *report: heard.append(report), warned.append)
         checkpoints = Checkpoints(tmp_path if saved else None, warned.append)
@@ -36,21 +36,19 @@ def toy(monkeypatch, tmp_path):
     return train
 
 
-def begin(key, config, *inputs):
-    return jnp.zeros(2)
-
-
 def counting(name, bad_from=jnp.inf, **settings):
     """A stage of 5 steps in 3 chunks whose state counts them, with a loss of 10 less that."""
 
-    def advance(key, config, state, *inputs):
+    def begin(key, config):
+        return jnp.zeros(2)
+
+    def advance(key, config, state):
         steps = state[0] + 1 + jnp.arange(2)
         loss = jnp.where(steps >= bad_from, jnp.nan, 10 - steps)
         metrics = {"double": jnp.where(steps == 2, jnp.nan, 2 * steps)}
         return state + 2, Progress(loss, metrics)
 
-    settings = {"finish": lambda config, state, *inputs: state, "is_saved": False} | settings
-    return Steps(name, begin, advance=advance, steps=5, chunks=3, program=name, **settings)
+    return Stage(name, begin, advance=advance, steps=5, chunks=3, **settings)
 
 
 def test_a_stage_reports_its_steps_and_none_beyond_the_last(toy):
@@ -67,24 +65,31 @@ def test_a_stage_reports_its_steps_and_none_beyond_the_last(toy):
 
 
 def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(toy):
-    def broken(key, config, *inputs):
+    def broken(key, config, x):
         raise ArithmeticError("no such policy")
 
     with pytest.raises(ArithmeticError, match="no such policy"):
-        toy(counting("count"), Stage("broken", broken, ("count",)))
+        toy(counting("count"), Stage("broken", broken, {"x": "count"}))
 
 
 def test_stages_are_given_what_those_before_return(toy):
-    double = Stage("double", lambda key, config, x: 2 * x, ("count",))
-    row = Stage("row", lambda key, config, x: {"x": x + 1}, ("double",), has_rows=True)
-    found, _, _ = toy(counting("count"), double, row)
-    np.testing.assert_array_equal(found.outputs["row"]["x"], [13, 13])
+    double = Stage("double", lambda key, config, x: 2 * x, {"x": "count"})
+    survey = Stage("survey", lambda key, config, x: {"y": x + 1}, {"x": "double"})
+    both = Stage(
+        "both",
+        lambda key, config, xs, n: n * xs[0] + xs[1]["y"],
+        {"xs": ("double", "survey"), "n": 3},
+    )
+    found, _, _ = toy(counting("count"), double, survey, both)
+    np.testing.assert_array_equal(found.outputs["survey"]["y"], [13, 13])
+    # 3 * 12 + 13
+    np.testing.assert_array_equal(found.outputs["both"], [49, 49])
 
 
 def test_what_was_saved_is_not_trained_again(toy):
-    first, heard, _ = toy(counting("count", is_saved=True), saved=True)
+    first, heard, _ = toy(counting("count"), saved=True)
     assert heard
-    again, heard, _ = toy(counting("count", is_saved=True), saved=True)
+    again, heard, _ = toy(counting("count"), saved=True)
     assert not heard
     np.testing.assert_array_equal(first.outputs["count"], again.outputs["count"])
     np.testing.assert_array_equal(first.curves["count"]["double"], again.curves["count"]["double"])
@@ -92,14 +97,15 @@ def test_what_was_saved_is_not_trained_again(toy):
 
 @pytest.mark.parametrize("bad", [(), (0,), (1,)])
 def test_an_optional_training_that_is_not_finite_is_left_out_and_named(toy, bad):
-    def finish(config, state, *inputs):
+    def finish(config, state):
         return state[0]
 
     trials = [
         counting(f"trial_{i}", 4 if i in bad else jnp.inf, is_optional=True, finish=finish)
         for i in range(2)
     ]
-    best = Stage("best", lambda key, config, *x: jnp.nanmin(jnp.stack(x)), ("trial_0", "trial_1"))
+    inputs = {"x": ("trial_0", "trial_1")}
+    best = Stage("best", lambda key, config, x: jnp.nanmin(jnp.stack(x)), inputs)
     found, _, warned = toy(*trials, best, saved=True)
     assert warned == [f"trial_{i}: loss = nan at step 4 of 5: left out" for i in bad]
     assert found.outputs["best"] == 6
@@ -111,11 +117,11 @@ def test_an_optional_training_that_is_not_finite_is_left_out_and_named(toy, bad)
 def test_a_training_ends_if_what_comes_of_optional_ones_is_not_finite(toy):
     trial = counting("trial", 4, is_optional=True)
     with pytest.raises(StageError, match="best: results are not finite"):
-        toy(trial, Stage("best", lambda key, config, x: x, ("trial",)))
+        toy(trial, Stage("best", lambda key, config, x: x, {"x": "trial"}))
 
 
 def test_a_training_that_is_not_finite_ends_what_follows_from_it(toy):
-    follows = Stage("follows", lambda key, config, x: x, ("count",))
+    follows = Stage("follows", lambda key, config, x: x, {"x": "count"})
     with pytest.raises(StageError, match="count: loss = nan at step 4 of 5"):
         toy(counting("count", 4), follows, counting("beside"))
 

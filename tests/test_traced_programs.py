@@ -9,12 +9,13 @@ import jax
 import pytest
 from smoke import SMOKE
 
-from jaxsense import stages, train
+from jaxsense import train
 from jaxsense.config import PRESETS
 from jaxsense.run import programs
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.monitor import Monitor
 from jaxsense.sim.world import make_world
+from jaxsense.training.stages import stages
 
 NUMBERS = {
     "detector.learning-rate": "0.001",
@@ -95,11 +96,11 @@ def lowered(config, names=None):
         patch.setattr(Program, "compile", compile_one)
         if names is not None:
             patch.setattr(programs, "_trace_missions", lambda *_: None)
-            listed = stages.stages(config)
+            listed = stages(config)
             some = [stage for stage in listed if stage.name in {*names, "survey", "detections"}]
             patch.setattr(programs, "stages", lambda *_: some)
         with Compiler(Monitor()) as compiler:
-            made = programs.compile_programs(config, make_world(config), compiler)
+            made = programs.compile_programs(config, make_world(config).arena, compiler)
             for each in made.of_stages.values():
                 each.shapes.result()
             if names is None:

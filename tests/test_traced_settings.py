@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import observe
+from jaxsense import dqn
 from jaxsense.config import Config, DetectorConfig, DqnConfig, JmvaeConfig, MdpConfig
+from jaxsense.core import supervised
 from jaxsense.core.types import Belief
-from jaxsense.dqn import belief_mdp
-from jaxsense.dqn import training as dqn
-from jaxsense.models import make_jmvae
-from jaxsense.vae import detectors, filtering, fusion, jmvae
+from jaxsense.looks import Bank, make_mdp
+from jaxsense.models import init, make_in_place, make_jmvae
+from jaxsense.vae import detectors, filter, jmvae, prior
 
 CONFIG = Config(
     detector=DetectorConfig(hidden=(2,), steps=3, batch=4),
@@ -51,19 +51,22 @@ def learn(config):
     keys = jax.random.split(jax.random.key(0), 8)
     windows = jax.random.normal(keys[0], (12, 3))
     detector = detectors.init(keys[1], windows, 2, config.detector)
-    fit = detectors.start(detector, config.detector)
-    inputs = windows, jnp.arange(12) % 2, config.detector, config.detector.steps
-    fit, _ = detectors.train(keys[2], fit, detector, *inputs)
+    problem = detectors.Fitting(config.detector, detector, windows, jnp.arange(12) % 2)
+    state = supervised.start(detector.params, config.detector)
+    fit, _ = supervised.fit(keys[2], state, problem, config.detector.steps)
 
     model = make_jmvae(config)
     bank = tuple(jax.random.uniform(k, (3, 5, 2)) for k in keys[3:5])
-    latent = jmvae.start(jmvae.init(keys[5], model), config.jmvae)
-    latent, _ = jmvae.train(keys[6], latent, model, bank, config.jmvae, config.jmvae.steps)
+    params = jmvae.init(keys[5], model)
+    latent, _ = jmvae.train(keys[6], params, model, bank, config.jmvae)
 
     # Apart from the JMVAE that was trained: what its settings change must not stand for those here.
-    mdp = observe.bank_mdp(config, bank, jmvae.init(keys[5], model), model)
-    state, info = dqn.train(keys[7], mdp, 0, config.dqn)
-    return {"detector": fit.params, "jmvae": latent.params, "dqn": (state.params, info)}
+    models = init(keys[5], config)
+    classes = Belief(jnp.eye(3, 2), jnp.full((3, 2), 0.2))
+    models = dataclasses.replace(models, fusion=make_in_place(config, params, classes))
+    mdp = make_mdp(config, models, Bank(bank))
+    state, info = dqn.train(keys[7], models.agent.environment(mdp, 0), config.dqn)
+    return {"detector": fit.params, "jmvae": latent, "dqn": (state.params, info)}
 
 
 def with_values(values):
@@ -123,17 +126,16 @@ def test_the_cost_of_a_look_may_be_traced():
     with_filter = dataclasses.replace(CONFIG.jmvae, fusion="filter")
     model, keys = make_jmvae(CONFIG), jax.random.split(jax.random.key(0), 4)
     classes = Belief(jax.random.normal(keys[0], (3, 2)), jnp.full((3, 2), 0.2))
-    unseen = fusion.unseen(model, 20.0)
-    begin = jax.jit(lambda key: filtering.init(key, model, classes, unseen, CONFIG.filter))
-    params = {"filter": begin(keys[1])}
+    begin = jax.jit(lambda key: filter.init(key, model, classes, prior(model, 20.0), CONFIG.filter))
+    models = dataclasses.replace(init(keys[1], CONFIG), fusion=begin(keys[1]))
     bank = (jnp.full((3, 1, 2), 0.5),) * 2
 
     def rewarded(cost):
         settings = MdpConfig(reward="nats", look_cost=cost)
         config = dataclasses.replace(CONFIG, jmvae=with_filter, mdp=settings)
-        mdp = observe.bank_mdp(config, bank, params, model)
-        start = belief_mdp.reset(keys[2], mdp)
-        return belief_mdp.step(keys[3], mdp, start, jnp.int32(0), 0)[1].reward
+        mdp = make_mdp(config, models, Bank(bank))
+        start = dqn.reset(keys[2], mdp)
+        return dqn.step(keys[3], mdp, start, jnp.int32(0), 0)[1].reward
 
     free, dear = jax.jit(jax.vmap(rewarded))(jnp.array([0.0, 0.25]))
     assert free - dear == pytest.approx(0.25, abs=1e-6)

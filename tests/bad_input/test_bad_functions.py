@@ -10,13 +10,14 @@ import pytest
 from refusals import INF, NAN, SMOKE
 
 import jaxsense
-from jaxsense import Belief, dqn, interfaces, mission, sim, vae
+from jaxsense import Belief, dqn, mission, sim, vae
 from jaxsense.config import FilterConfig
+from jaxsense.interfaces import common
 from jaxsense.run import missions
-from jaxsense.vae import filtering, fusion
+from jaxsense.vae import filter
 
 # Settings whose models have other shapes.
-OTHERS = dataclasses.replace(SMOKE, jmvae=dataclasses.replace(SMOKE.jmvae, fusion="filter"))
+OTHERS = dataclasses.replace(SMOKE, jmvae=dataclasses.replace(SMOKE.jmvae, latent_size=3))
 WINDOWS = dataclasses.replace(SMOKE, camera=dataclasses.replace(SMOKE.camera, stride=2, window=40))
 
 
@@ -34,10 +35,12 @@ class World:
         light = sim.random_light(self.key)
         self.scene = sim.Scene(layout, light, jnp.zeros((2, 3)))
         classes = Belief(jnp.eye(3)[:, :2], jnp.ones((3, 2)))
-        inputs = self.model, classes, vae.unseen(self.model, 20.0), FilterConfig(hidden=(1,))
-        self.filter = filtering.init(self.key, *inputs)
+        prior = vae.prior(self.model, 20.0)
+        self.filter = filter.init(self.key, self.model, classes, prior, FilterConfig(hidden=(1,)))
+        self.in_place = self.models.fusion
         self.bank = tuple(jnp.full((3, 4, 2), 0.5) for _ in range(2))
-        self.mdp = jaxsense.bank_mdp(SMOKE, self.bank, self.params, self.model)
+        self.mdp = jaxsense.make_mdp(SMOKE, self.models, jaxsense.Bank(self.bank))
+        self.environment = self.models.agent.environment(self.mdp, 0)
         beliefs = Belief(jnp.zeros((3, 2)), jnp.ones((3, 2)))
         seen = jnp.zeros((3, 2), bool)
         self.state = dqn.MapState(beliefs, seen, self.classes, self.classes, jnp.int32(0))
@@ -58,25 +61,27 @@ BAD = jnp.array([0, 1, 7])
 FUNCTIONS = {
     "load": (lambda w: jaxsense.load(""), "run = '.': must hold"),
     "load nul": (lambda w: jaxsense.load("\0"), "run = "),
-    "bank_mdp few": (
-        lambda w: jaxsense.bank_mdp(SMOKE, w.bank[:1], w.params, w.model),
-        "bank has 1 entries: must be 2",
+    "make_mdp few": (
+        lambda w: jaxsense.make_mdp(SMOKE, w.models, jaxsense.Bank(w.bank[:1])),
+        "looks has 1 entries: must be 2",
     ),
-    "bank_mdp rank": (
-        lambda w: jaxsense.bank_mdp(SMOKE, (w.bank[0][0],) * 2, w.params, w.model),
-        "bank",
+    "make_mdp rank": (
+        lambda w: jaxsense.make_mdp(SMOKE, w.models, jaxsense.Bank((w.bank[0][0],) * 2)),
+        "looks of camera",
     ),
-    "bank_mdp empty": (
-        lambda w: jaxsense.bank_mdp(SMOKE, (w.bank[0][:, :0],) * 2, w.params, w.model),
-        "bank = 0: must be",
+    "make_mdp empty": (
+        lambda w: jaxsense.make_mdp(SMOKE, w.models, jaxsense.Bank((w.bank[0][:, :0],) * 2)),
+        "looks at each class = 0: must be",
     ),
-    "bank_mdp nan": (
-        lambda w: jaxsense.bank_mdp(SMOKE, (w.bank[0] * NAN,) * 2, w.params, w.model),
-        "bank = nan: must be finite",
+    "make_mdp nan": (
+        lambda w: jaxsense.make_mdp(SMOKE, w.models, jaxsense.Bank((w.bank[0] * NAN,) * 2)),
+        "looks = nan: must be finite",
     ),
-    "live_mdp few": (
-        lambda w: jaxsense.live_mdp(SMOKE, w.world, w.models.detectors[:1], w.params, w.model),
-        "trained has 1 entries",
+    "make_mdp live few": (
+        lambda w: jaxsense.make_mdp(
+            SMOKE, w.models, jaxsense.Live(w.world, w.models.detectors[:1])
+        ),
+        "detectors has 1 entries",
     ),
     "make_layout classes": (
         lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD),
@@ -199,52 +204,56 @@ FUNCTIONS = {
         lambda w: vae.posterior(w.params, w.model, (None, w.x * NAN)),
         "features of lidar = nan: must be finite",
     ),
-    "write mean": (
-        lambda w: vae.write(
-            w.params, w.model, w.belief_of(mean=jnp.array([0.0, INF])), w.seen, w.look, 0
-        ),
+    "in place mean": (
+        lambda w: w.in_place.update(w.belief_of(mean=jnp.array([0.0, INF])), w.seen, w.look, 0),
         "belief.mean = inf: must be finite",
     ),
-    "write real": (
-        lambda w: vae.write(w.params, w.model, w.belief, w.seen, w.look, 0.0),
+    "in place real": (
+        lambda w: w.in_place.update(w.belief, w.seen, w.look, 0.0),
         "modality of dtype float32: must be a whole number from 0 to 1",
     ),
-    "update real": (
-        lambda w: vae.update(w.filter, w.model, w.belief, w.look, 0.0),
+    "in place modality": (
+        lambda w: w.in_place.update(w.belief, w.seen, w.x, 2),
+        "modality = 2: must be a whole number from 0 to 1",
+    ),
+    "filter real": (
+        lambda w: w.filter.update(w.belief, w.seen, w.look, 0.0),
         "modality of dtype float32: must be a whole number from 0 to 1",
     ),
-    "update bool": (
-        lambda w: vae.update(w.filter, w.model, w.belief, w.look, True),
+    "filter bool": (
+        lambda w: w.filter.update(w.belief, w.seen, w.look, True),
         "modality of dtype bool: must be a whole number from 0 to 1",
     ),
-    "update negative": (
-        lambda w: vae.update(w.filter, w.model, w.belief, w.look, -1),
+    "filter negative": (
+        lambda w: w.filter.update(w.belief, w.seen, w.look, -1),
         "modality = -1: must be a whole number from 0 to 1",
     ),
-    "evidence": (
-        lambda w: filtering.evidence(w.filter, w.model, w.look, -1),
-        "modality = -1: must be a whole number from 0 to 1",
+    "filter features": (
+        lambda w: w.filter.update(w.belief, w.seen, jnp.array([2.0, -1.0]), 0),
+        "features = 2.0: must be probabilities, within 0 and 1",
     ),
     "mixture": (
-        lambda w: filtering.mixture(w.filter["classes"], jnp.array([2.0, -1.0, 0.0])),
-        "weights = 2.0: must be probabilities, within 0 and 1",
+        lambda w: vae.mixture(w.filter.classes, jnp.array([2.0, -1.0, 0.0])),
+        "probabilities = 2.0: must be probabilities, within 0 and 1",
     ),
     "mixture sum": (
-        lambda w: filtering.mixture(w.filter["classes"], jnp.full(3, 0.5)),
-        "sum of weights = 1.5: must be 1",
+        lambda w: vae.mixture(w.filter.classes, jnp.full(3, 0.5)),
+        "sum of probabilities = 1.5: must be 1",
     ),
-    "weights mean": (
-        lambda w: filtering.weights(w.filter, w.belief_of(mean=w.x * NAN)),
+    "class_probabilities mean": (
+        lambda w: w.filter.class_probabilities(w.belief_of(mean=w.x * NAN)),
         "belief.mean = nan: must be finite",
     ),
-    "weights std": (
-        lambda w: filtering.weights(w.filter, w.belief_of(std=-w.belief.std)),
+    "class_probabilities std": (
+        lambda w: w.filter.class_probabilities(w.belief_of(std=-w.belief.std)),
         "belief.std = -1.0: must be greater than 0",
     ),
-    "most_likely_class": (
-        lambda w: fusion.most_likely_class(
-            {"filter": w.filter}, w.means, w.belief_of(mean=w.x * NAN)
-        ),
+    "most_likely_class filter": (
+        lambda w: w.filter.most_likely_class(w.belief_of(mean=w.x * NAN)),
+        "belief.mean = nan: must be finite",
+    ),
+    "most_likely_class in place": (
+        lambda w: w.in_place.most_likely_class(w.belief_of(mean=w.x * NAN)),
         "belief.mean = nan: must be finite",
     ),
     "product_of_experts": (
@@ -267,13 +276,9 @@ FUNCTIONS = {
         lambda w: vae.fuse(w.params, w.model, w.belief, jnp.zeros(3, bool), (w.x, None)),
         "seen",
     ),
-    "write": (
-        lambda w: vae.write(w.params, w.model, w.belief, w.seen, w.x, 2),
-        "modality = 2: must be a whole number from 0 to 1",
-    ),
-    "unseen": (lambda w: vae.unseen(w.model, -1.0), "variance = -1.0: must be greater than 0"),
-    "unseen nan": (lambda w: vae.unseen(w.model, NAN), "variance = nan"),
-    "unseen text": (lambda w: vae.unseen(w.model, "x"), "variance = 'x'"),
+    "prior": (lambda w: vae.prior(w.model, -1.0), "variance = -1.0: must be greater than 0"),
+    "prior nan": (lambda w: vae.prior(w.model, NAN), "variance = nan"),
+    "prior text": (lambda w: vae.prior(w.model, "x"), "variance = 'x'"),
     "kl": (lambda w: vae.kl_divergence(w.x[None], w.x, w.x, w.x), "mean_p"),
     "moment_match": (lambda w: vae.moment_match(w.means, w.means - 1), "std = -1.0"),
     "moment_match none": (
@@ -305,12 +310,8 @@ FUNCTIONS = {
         ),
         "reconstruction_weights = (1,)",
     ),
-    "train steps": (
-        lambda w: vae.train(w.key, None, w.model, w.bank, SMOKE.jmvae, 0),
-        "steps = 0",
-    ),
     "train bank": (
-        lambda w: vae.train(w.key, None, w.model, w.bank[:1], SMOKE.jmvae, 1),
+        lambda w: vae.train(w.key, w.params, w.model, w.bank[:1], SMOKE.jmvae),
         "bank has 1 entries",
     ),
     "information": (lambda w: dqn.information(-w.belief.std), "std = -1.0: must be greater"),
@@ -340,41 +341,29 @@ FUNCTIONS = {
         lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(0), 2),
         "modality = 2: must be a whole number from 0 to 1",
     ),
-    "naive": (lambda w: dqn.naive(w.mdp, -1), "modality = -1"),
-    "optimal": (
-        lambda w: dqn.optimal(w.mdp, jnp.full((4, 3), NAN), jnp.zeros((2, 3), int)),
-        "rewards = nan",
-    ),
-    "optimal shape": (
-        lambda w: dqn.optimal(w.mdp, jnp.zeros((4, 3)), jnp.zeros((3, 3), int)),
-        "label_of_class",
-    ),
-    "dqn.train": (
-        lambda w: jax.eval_shape(lambda: dqn.train(w.key, w.mdp, 5, SMOKE.dqn)),
+    "environment modality": (
+        lambda w: jax.eval_shape(
+            lambda: dqn.train(w.key, w.models.agent.environment(w.mdp, 5), SMOKE.dqn)
+        ),
         "modality = 5",
     ),
     "missions.batch_of": (lambda w: missions.batch_of(0), "total = 0"),
     "mission.rollout": (lambda w: mission.rollout(w.key, None, None, None, 0), "steps = 0"),
-    "map_mdp": (lambda w: interfaces.map_mdp(SMOKE, w.models, w.bank[:1]), "bank has 1 entries"),
-    "map_mdp without models": (
-        lambda w: interfaces.map_mdp(SMOKE, None),
-        "models = NoneType: must",
+    "make_mdp without models": (
+        lambda w: jaxsense.make_mdp(SMOKE, None),
+        "models = NoneType: must be Models",
     ),
-    "map_mdp of others": (
-        lambda w: interfaces.map_mdp(OTHERS, w.models),
-        "models.jmvae: must have the shapes of config",
+    "make_mdp of others": (
+        lambda w: jaxsense.make_mdp(OTHERS, w.models),
+        "models.fusion holds 3 classes in 2 dimensions: must be 3 in 3, as in config",
     ),
-    "team_mdp of others": (
-        lambda w: interfaces.team_mdp(OTHERS, w.models, w.bank),
-        "models.jmvae: must have the shapes of config",
-    ),
-    "map_mdp of other windows": (
-        lambda w: interfaces.map_mdp(WINDOWS, w.models),
+    "make_mdp of other windows": (
+        lambda w: jaxsense.make_mdp(WINDOWS, w.models),
         "models.detectors of camera: reads windows of 240 numbers; must be of 120, as config's are",
     ),
-    "prepared_starts": (lambda w: interfaces.prepared_starts(w.key, w.mdp, 0), "number = 0"),
-    "prepared_starts real": (lambda w: interfaces.prepared_starts(w.key, w.mdp, 1.5), "number ="),
-    "detections": (lambda w: interfaces.detections(w.key, SMOKE, w.models, 0), "samples = 0"),
+    "prepared_starts": (lambda w: common.prepared_starts(w.key, w.mdp, 0), "number = 0"),
+    "prepared_starts real": (lambda w: common.prepared_starts(w.key, w.mdp, 1.5), "number ="),
+    "detections": (lambda w: jaxsense.detections(w.key, SMOKE, w.models, 0), "samples = 0"),
 }
 
 
