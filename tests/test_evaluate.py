@@ -20,7 +20,7 @@ from recordings import recording
 from smoke import MISSION_KEYS, error_line
 
 import jaxsense
-from jaxsense import cli, evaluate, export, mission
+from jaxsense import cli, dqn, evaluate, export
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import devices, files, missions
 from jaxsense.run.compilation import Compiler
@@ -53,8 +53,8 @@ def test_evaluate_writes_a_file_of_its_own_and_leaves_the_runs_figures(evaluated
     found = read(path)
     blocks = found.pop("mission")
     assert found == {"num_pois": 3, "side": 3.0, "robots": ["camera", "lidar"]}
-    assert set(blocks) == {*mission.POLICIES, "bytes_per_detection"}
-    for policy in mission.POLICIES:
+    assert set(blocks) == {*dqn.POLICIES, "bytes_per_detection"}
+    for policy in dqn.POLICIES:
         # The policies of an untrained team may be less accurate than naive exploration.
         compared = {"of_naive"} | ({"intervals"} if policy != "latent" else set())
         assert set(blocks[policy]) | compared == MISSION_KEYS | {"seed"} | compared

@@ -292,7 +292,7 @@ def test_a_checkpoint_of_other_shapes_is_named(tmp_path, shapes, expected):
 
 def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_path):
     checkpoints = Checkpoints(tmp_path, pytest.fail)
-    state = [FitState({"w": np.ones(2, np.float32)}, (np.int32(3),), np.int32(7))]
+    state = [FitState({"w": np.ones(2, np.float32)}, (np.int32(3),), np.int32(7), np.float32(0.5))]
     saved = Unfinished(2, state, {"loss": [1.5, float("nan")], "none": []})
     checkpoints.save_unfinished("jmvae", saved)
     checkpoints.save("tree", TREE)

@@ -97,7 +97,7 @@ def test_the_film_is_named_after_the_policy_that_it_shows(tmp_path, monkeypatch)
     monkeypatch.setattr(train.page, "render", lambda *inputs: "")
     names = ("posteriors", "windows", "detections", "rewards")
     recorded = SimpleNamespace(records=None, end=None)
-    models = SimpleNamespace(class_beliefs=None)
+    models = SimpleNamespace(fusion=SimpleNamespace(classes=None))
     result = SimpleNamespace(models=models, recording=recorded, results={}, **dict.fromkeys(names))
     with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as run:
         train._write(run, result, {}, Monitor())  # pyright: ignore

@@ -159,7 +159,8 @@ class _Option:
         elif dataclasses.is_dataclass(default):
             section = default if isinstance(default, type) else type(default)
             kinds, marked = get_type_hints(section), get_type_hints(section, include_extras=True)
-            for field, kind in kinds.items():
+            for field in (each.name for each in dataclasses.fields(section)):
+                kind = kinds[field]
                 names = [mark for mark in get_args(marked[field]) if isinstance(mark, Name)]
                 name = names[0] if names else prefix + field.replace("_", "-")
                 value = getattr(default, field, dataclasses.MISSING)

@@ -359,7 +359,7 @@ def _read_config(file: Path, field: str, path: Path) -> Json:
     except OSError as error:
         reason = f"{file.name} cannot be read ({error.strerror})"
         if path != file and isinstance(error, FileNotFoundError | NotADirectoryError):
-            reason = f"is not a run directory: it has no {file.name}"
+            raise NotARunError(path) from None
         raise ConfigError(field, str(path), reason) from None
     except ValueError as error:
         raise ConfigError(field, str(path), f"{file.name} is not JSON: {error}") from None

@@ -30,6 +30,7 @@ class World:
         self.params, self.model = self.models.jmvae, jaxsense.make_jmvae(SMOKE)
         self.world = sim.make_world(SMOKE)
         self.camera, self.lidar = self.world.sensors
+        self.mission = mission.make_mission(SMOKE, arenas=(self.world.arena,) * 2)
         self.classes = jnp.array([0, 1, 2])
         layout = sim.random_layout(self.key, SMOKE.arena, self.classes)
         light = sim.random_light(self.key)
@@ -59,7 +60,7 @@ def given_world():
 
 BAD = jnp.array([0, 1, 7])
 FUNCTIONS = {
-    "load": (lambda w: jaxsense.load(""), "run = '.': must hold"),
+    "load": (lambda w: jaxsense.load(""), ". is not a run directory: it has no config.json"),
     "load nul": (lambda w: jaxsense.load("\0"), "run = "),
     "make_mdp few": (
         lambda w: jaxsense.make_mdp(SMOKE, w.models, jaxsense.Bank(w.bank[:1])),
@@ -386,7 +387,7 @@ def test_functions_refuse(given_world, name):
     ],
 )
 def test_a_mission_refuses(given_world, inputs, expected):
-    team = mission.Mission(given_world.world, given_world.world.arena, SMOKE)
+    team = given_world.mission
     base = {"classes": given_world.classes, "policy": 0, "faults": mission.no_faults(SMOKE)}
     with pytest.raises(ValueError, match=re.escape(expected)):
         mission.start(team, given_world.scene, **{**base, **inputs})
@@ -408,7 +409,7 @@ def test_environments_refuse(given_world):
         gymnasium.MapVectorEnv(mdp, 0, 2, autoreset_mode="Later")
     env = gymnasium.MapVectorEnv(mdp, 0, 2)
     for mask in ([True], [1, 0], "x", np.ones(3, bool)):
-        with pytest.raises(ValueError, match=r"reset_mask = .*: must be an array of 2 booleans"):
+        with pytest.raises(ValueError, match=r"reset_mask = .*: must hold 2 booleans"):
             env.reset(options={"reset_mask": mask})
     env._states = given_world.state  # as after a reset, which takes long to compile
     for actions in ([0, 4], [-1, 0], [0.5, 1.0], [0], [[0, 1]], "x"):
