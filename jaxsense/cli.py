@@ -139,16 +139,19 @@ def find_run(path: Path) -> Path:
     return finished[max(finished)]
 
 
-def keep_programs(program: str, directory: Path | None, config: Config) -> Kept | None:
+def keep_programs(
+    program: str, directory: Path | None, config: Config, *, has_own_code: bool = False
+) -> Kept | None:
     """Opens the directory of compiled programs.
 
     Args:
       program: module that runs.
       directory: where to keep them, if anywhere.
       config: all settings.
+      has_own_code: whether missions play policies of the user's own.
 
     Returns:
-      The programs with these settings; None if the settings name custom sensors, whose code may
+      The programs with these settings; None with custom sensors or policies, whose code may
       change, and, with a warning, if the directory cannot be used.
     """
     # Several processes can load a program only together.
@@ -156,7 +159,7 @@ def keep_programs(program: str, directory: Path | None, config: Config) -> Kept 
         return None
     try:
         directory = directory.expanduser()
-        if config.sensors:
+        if config.sensors or has_own_code:
             compilation.use_cache(directory)
             return None
         return Kept(directory, jax.tree.structure(config))

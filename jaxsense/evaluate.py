@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,7 @@ from jaxsense.config.checks import check_fields, require
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Name
 from jaxsense.core.types import Belief
+from jaxsense.dqn.policies import Policy, Values
 from jaxsense.run import devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.missions import Recording
@@ -82,15 +84,22 @@ class Arguments:
         cli.require_directory("cache", self.cache)
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Runs the program."""
+def main(
+    argv: list[str] | None = None, policies: Mapping[str, Values | Policy] | None = None
+) -> None:
+    """Runs the program.
+
+    Args:
+      argv: the command line without the program; by default the process's own.
+      policies: of your own, by name, to play besides `dqn.POLICIES`.
+    """
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
         arguments = dataclasses.replace(arguments, run=cli.find_run(arguments.run))
         workers = devices.start(arguments.devices)
         trained, models = rundir.load(arguments.run, arguments.trust)
         config = _elsewhere(arguments, trained)
-        team = mission.make_mission(config)
+        team = mission.make_mission(config, policies)
         played = _cases(arguments, team)
         # If these files cannot be written, fail now rather than after minutes of work.
         with files.locked(arguments.run, on_wait=say):
@@ -100,7 +109,7 @@ def main(argv: list[str] | None = None) -> None:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be used ({cli.reason(error)})")
-    kept = cli.keep_programs(PROGRAM, arguments.cache, config)
+    kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
     console = rich.console.Console()
     key = jax.random.key(arguments.seed)
     with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:

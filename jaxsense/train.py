@@ -18,10 +18,11 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import cli, summary
+from jaxsense import cli, mission, summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, read_some
+from jaxsense.dqn.policies import Policy, Values
 from jaxsense.run import devices, files, pipeline, rundir, seeds
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
@@ -99,16 +100,19 @@ class Arguments:
 
 
 def main(
-    argv: list[str] | None = None, change: Callable[[Config], Config] = lambda config: config
+    argv: list[str] | None = None,
+    change: Callable[[Config], Config] = lambda config: config,
+    policies: Mapping[str, Values | Policy] | None = None,
 ) -> None:
     """Runs the program.
 
     Args:
       argv: the command line without the program; by default the process's own.
       change: changes a preset in your own program, before the other options do.
+      policies: of your own, by name; missions play those that `config.mission.policies` names.
     """
     begin = time.perf_counter()
-    arguments = parse(sys.argv[1:] if argv is None else argv, change)
+    arguments = parse(sys.argv[1:] if argv is None else argv, change, policies)
     is_quiet, is_first = arguments.quiet, not arguments.process_index
     if not is_first:
         arguments = dataclasses.replace(arguments, quiet=True, tensorboard=False)
@@ -123,7 +127,8 @@ def main(
                 arguments.process_index,
                 begins=lambda: None if is_quiet else _say_waits(arguments),
             )
-            _train(begin, arguments, run, devices.start(arguments.devices), console)
+            workers = devices.start(arguments.devices)
+            _train(begin, arguments, run, workers, console, policies)
         devices.leave()
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
@@ -144,12 +149,17 @@ def main(
     say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
 
 
-def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: config) -> Arguments:
+def parse(
+    argv: list[str],
+    change: Callable[[Config], Config] = lambda config: config,
+    policies: Mapping[str, Values | Policy] | None = None,
+) -> Arguments:
     """Reads the command line; ends the program with status 2 and one line if it is wrong.
 
     Args:
       argv: the command line without the program.
       change: changes a preset before the other options do.
+      policies: of your own, by name.
 
     Returns:
       The options.
@@ -167,6 +177,7 @@ def parse(argv: list[str], change: Callable[[Config], Config] = lambda config: c
         )
         arguments = cli.parse(PROGRAM, Arguments, argv, default, _COMMON)
         sensors.make(arguments.config)
+        mission.require_policies(arguments.config, policies)
         if arguments.tensorboard:
             tensorboard.require()
         if not 0 <= arguments.seed < 2**32:
@@ -236,10 +247,11 @@ def _train(
     run: RunDirectory,
     workers: Workers,
     console: rich.console.Console,
+    policies: Mapping[str, Values | Policy] | None,
 ) -> None:
     """Trains all seeds with the same programs, and writes their results."""
     settings, failed = run.settings, dict[int, str]()
-    kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config)
+    kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config, has_own_code=bool(policies))
     monitor = Monitor(warn=_warn)
 
     def stop() -> None:
@@ -255,7 +267,7 @@ def _train(
     try:
         with (
             on_interrupt(stop),
-            pipeline.compiled(settings.config, monitor, workers, kept, size) as programs,
+            pipeline.compiled(settings.config, monitor, workers, kept, size, policies) as programs,
         ):
             for first in range(0, len(left), size):
                 with contextlib.ExitStack() as opened:

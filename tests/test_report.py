@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxsense.config import POLICIES, PRESETS, SHAPES, ArenaConfig, Attribute, Shape
+from jaxsense.config import PRESETS, SHAPES, ArenaConfig, Attribute, Shape
 from jaxsense.core.types import Belief
+from jaxsense.dqn import POLICIES
 from jaxsense.show import colours, mission_plots, plots
 from jaxsense.sim import sensors
 

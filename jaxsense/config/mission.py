@@ -40,7 +40,8 @@ class MissionConfig(Section, place="mission"):
     """The closed loop of all robots in one arena."""
 
     policies: tuple[str, ...] = limited(("latent", "naive", "random"), min_items=1)
-    """Policies to play missions with at the end of a run; `jaxsense.evaluate` plays all."""
+    """Policies to play missions with at the end of a run; `jaxsense.evaluate` plays all. See
+    `dqn.POLICIES`."""
     episodes: int = limited(128, at_least=1, at_most=MAX_EPISODES)
     """Missions per policy at the end of a run."""
     time_limit: Traced[float] = limited(120.0, above=0, at_most=3600)
@@ -63,8 +64,7 @@ class MissionConfig(Section, place="mission"):
     once more before it ends."""
 
     def check(self) -> None:
-        """Checks the policies and the control period; raises `ConfigError`."""
-        require_policies(self)
+        """Checks the control period, and that no policy repeats; raises `ConfigError`."""
         is_once = len(set(self.policies)) == len(self.policies)
         require(is_once, self, "policies", "must name no policy twice")
         steps = self.control_period / TIMESTEP
@@ -78,27 +78,3 @@ class MissionConfig(Section, place="mission"):
     def arrays(self, sizes: Sizes) -> dict[str, int]:
         """How many numbers each large array holds."""
         return {"episodes": self.episodes * sizes.views * sizes.pois * NODES_PER_POI}
-
-
-# The policies that are known.
-
-POLICIES = (
-    *("latent", "greedy", "bayes", "optimal", "naive", "naive_2", "naive_3", "random"),
-    *("nearest", "auction", "rollout"),
-)
-"""Policies of robots in missions; the index is the policy's code. `latent` asks the Q-networks.
-`greedy` takes the look with the highest expected gain on the map, `bayes` on the exact posterior
-over the classes, and `optimal` the look with the highest total gain by dynamic programming. With
-`naive` every robot looks at every PoI once, with `naive_2` twice, with `naive_3` three times.
-`random` takes any PoI, or ends. The last three use travel times as well as gains on the map, see
-`dqn.rules`: `nearest` takes the nearest PoI with a positive expected gain, `auction` shares these
-out among the robots by travel time, and `rollout` takes the highest gain per second."""
-
-KNOW_WAYS = ("nearest", "auction", "rollout")
-"""Policies whose values include travel time, so that no coordination rule breaks ties."""
-
-
-def require_policies(mission: MissionConfig) -> None:
-    """Raises `ConfigError` unless all policies of missions are known."""
-    is_known = set(mission.policies) <= set(POLICIES)
-    require(is_known, mission, "policies", f"must name some of {', '.join(POLICIES)}")

@@ -8,6 +8,8 @@ way. Everything is a pure function of one episode: `vmap` over episodes.
 
 from jaxsense.mission.cases import Case as Case
 from jaxsense.mission.cases import cases as cases
+from jaxsense.mission.cases import is_fault as is_fault
+from jaxsense.mission.cases import require_policies as require_policies
 from jaxsense.mission.outcome import REASONS as REASONS
 from jaxsense.mission.outcome import measure as measure
 from jaxsense.mission.outcome import reason as reason

@@ -1,15 +1,16 @@
 """Cases to play missions with: policies, and robots that fail."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import jax.numpy as jnp
 
-from jaxsense.config import Config
-from jaxsense.dqn.policies import POLICIES
+from jaxsense.config import Config, ConfigError
+from jaxsense.dqn.policies import POLICIES, Policy, Values, table
 from jaxsense.mission.state import Faults, no_faults
 
 FAULT_TIME = 6.0  # s
+_FAULTS = ("alone", "stops", "blind")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +26,35 @@ class Case:
     faults: Faults
 
 
+def require_policies(config: Config, policies: Mapping[str, Values | Policy] | None = None) -> None:
+    """Checks that the policies of a run exist, before anything is trained.
+
+    Args:
+      config: all settings.
+      policies: of your own, by name, besides `dqn.POLICIES`.
+
+    Raises:
+      ConfigError: if `config.mission.policies` names an unknown policy, or a policy of your own has
+        the name of a fault.
+    """
+    known = table(policies)
+    _require_names(known)
+    if not set(config.mission.policies) <= set(known):
+        reason = f"must name some of {', '.join(known)}"
+        raise ConfigError("mission.policies", config.mission.policies, reason)
+
+
+def _require_names(policies: Iterable[str]) -> None:
+    """Raises `ConfigError` if a policy has a name like a case with a fault."""
+    for name in filter(is_fault, policies):
+        raise ConfigError("policies", name, f"must not end in _{', _'.join(_FAULTS)}")
+
+
+def is_fault(case: str) -> bool:
+    """Whether a case is one of the latent policy with a robot that fails, by its name."""
+    return case.endswith(tuple(f"_{fault}" for fault in _FAULTS))
+
+
 def cases(config: Config, policies: Iterable[str] = POLICIES) -> dict[str, Case]:
     """Lists the policies, each robot alone, and each robot failing in mid-mission.
 
@@ -36,8 +66,12 @@ def cases(config: Config, policies: Iterable[str] = POLICIES) -> dict[str, Case]
     Args:
       config: all settings.
       policies: names in the order of `Mission.policies`.
+
+    Raises:
+      ConfigError: if a policy has a name like a case with a fault.
     """
     healthy, names = no_faults(config), tuple(policies)
+    _require_names(names)
     found = {name: Case(policy, healthy) for policy, name in enumerate(names)}
     latent = names.index("latent")
     for r, name in enumerate(config.robot_names if len(config.carried) > 1 else ()):

@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import jax
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from jaxsense import mission, summary
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Key
+from jaxsense.dqn.policies import Policy, Values
 from jaxsense.models import Models
 from jaxsense.run import missions
 from jaxsense.run.checkpoints import Checkpoints
@@ -55,6 +56,7 @@ def compiled(
     workers: Workers = ALONE,
     kept: Kept | None = None,
     num_seeds: int = 1,
+    policies: Mapping[str, Values | Policy] | None = None,
 ) -> Iterator[Programs]:
     """The programs of runs with the same settings, compiled in the background.
 
@@ -64,9 +66,15 @@ def compiled(
       workers: what shares scenes, missions and seeds.
       kept: where to keep compiled programs for later runs, if anywhere.
       num_seeds: runs side by side, see `compile_programs`.
+      policies: of your own, by name; keep no programs with these, whose code may change.
+
+    Raises:
+      ConfigError: if `config.mission.policies` names an unknown policy.
     """
+    mission.require_policies(config, policies)
+    arena = make_world(config).arena
     with Compiler(monitor, kept) as compiler:
-        yield compile_programs(config, make_world(config).arena, compiler, workers, num_seeds)
+        yield compile_programs(config, arena, compiler, workers, num_seeds, policies)
 
 
 def run(

@@ -5,6 +5,7 @@ compiled programs already run. Shapes come from tracing: a stage's outputs are l
 """
 
 import dataclasses
+from collections.abc import Mapping
 from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
@@ -14,6 +15,7 @@ import jax
 from jaxsense import mission
 from jaxsense.config import Config
 from jaxsense.core.types import Key
+from jaxsense.dqn.policies import Policy, Values
 from jaxsense.run import missions
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
@@ -98,6 +100,7 @@ class Programs:
       player: of the missions.
       workers: what shares rows and missions.
       trainings: those side by side.
+      policies: of missions, by name, besides `dqn.POLICIES`.
     """
 
     config: Config
@@ -106,6 +109,7 @@ class Programs:
     player: Future[missions.Player]
     workers: Workers
     trainings: Trainings
+    policies: Mapping[str, Values | Policy] | None = None
 
     def of(self, stage: Stage) -> StagePrograms:
         """The programs of a stage."""
@@ -127,6 +131,7 @@ def compile_programs(
     compiler: Compiler,
     workers: Workers = ALONE,
     num_seeds: int = 1,
+    policies: Mapping[str, Values | Policy] | None = None,
 ) -> Programs:
     """Starts to trace and compile the programs of a run in the background.
 
@@ -136,6 +141,7 @@ def compile_programs(
       compiler: compiles them.
       workers: what shares rows, missions and seeds.
       num_seeds: trainings side by side; each calls the programs from its own threads.
+      policies: of missions, by name, besides `dqn.POLICIES`.
     """
     found, trainings = stages(config, arena), Trainings(num_seeds)
 
@@ -159,6 +165,7 @@ def compile_programs(
         player=Future(),
         workers=workers,
         trainings=trainings,
+        policies=policies,
     )
 
     thread = ThreadPoolExecutor(1)
@@ -195,7 +202,7 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
 def _trace_missions(programs: Programs, compiler: Compiler) -> None:
     config = programs.config
     batch = missions.batch_of(len(config.mission.policies) * config.mission.episodes)
-    team = mission.make_mission(config)
+    team = mission.make_mission(config, programs.policies)
     programs.player.set_result(missions.Player(team, compiler, batch, programs.workers))
 
 

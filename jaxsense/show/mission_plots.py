@@ -7,9 +7,10 @@ from typing import cast
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxsense.config import POLICIES
+from jaxsense.dqn import POLICIES
 from jaxsense.show.colours import MARKERS, policy_colour
 from jaxsense.summary.blocks import MISSIONS, Evaluation, Missions, cases
+from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.metrics import Number, mean
 
 
@@ -22,7 +23,7 @@ def policies(block: Missions) -> Figure:
     Args:
       block: `mission` of the summary.
     """
-    played = {name: case for name, case in cases(block).items() if name in POLICIES}
+    played = policies_of(block)
     names = sorted(played, key=lambda name: -mean(played[name]["mean_time_s"]))
     figure = Figure(figsize=(10, 1.2 + 0.35 * len(names)), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
@@ -118,7 +119,8 @@ def _draw_times(ax: Axes, places: list[Evaluation], key: str) -> None:
 
     # Places of one number differ in something else, and no line leads from one to the other.
     line = "-" if len(set(map(number, places))) == len(places) else ""
-    for i, name in enumerate(POLICIES):
+    found = dict.fromkeys(name for place in places for name in policies_of(place["mission"]))
+    for i, name in enumerate({**POLICIES, **found}):
         played = [
             (number(place), mean(case["time_s"]))
             for place in places

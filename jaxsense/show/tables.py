@@ -3,9 +3,9 @@
 import dataclasses
 from collections.abc import Iterable, Mapping
 
-from jaxsense.config import POLICIES
+from jaxsense.mission import is_fault
 from jaxsense.summary import Case, Metric, Missions, Results, Timing, cases
-from jaxsense.summary.blocks import AGENTS, BELIEF, DETECTORS, JMVAE, MISSIONS, STAGES
+from jaxsense.summary.blocks import AGENTS, BELIEF, DETECTORS, JMVAE, MISSIONS, STAGES, policies
 from jaxsense.summary.metrics import Number, mean, text
 
 # Table I of Korthals et al. 2018: the classes that a sensor alone identifies.
@@ -126,13 +126,12 @@ def missions(block: Missions, caption: str) -> Table:
       block: `mission` of a summary or of an evaluation.
       caption: of the table.
     """
-    played = {name: case for name, case in cases(block).items() if name in POLICIES}
-    return _missions(played, caption)
+    return _missions(policies(block), caption)
 
 
 def failures(block: Missions) -> Table:
     """The missions of a block `mission` in which a robot fails."""
-    failing = {name: case for name, case in cases(block).items() if name not in POLICIES}
+    failing = {name: case for name, case in cases(block).items() if is_fault(name)}
     return _missions(failing, "The latent policy, with a robot that is alone, stops or goes blind")
 
 

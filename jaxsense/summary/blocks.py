@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Annotated, NotRequired, TypedDict, cast, get_args, get_origin, get_type_hints
 from typing import is_typeddict as is_block
 
+from jaxsense.mission import is_fault
 from jaxsense.summary.metrics import Interval, Metric
 
 PerClass = dict[str, list[float]]
@@ -208,6 +209,11 @@ class Summary(Header, Results):
 def cases(missions: Missions) -> dict[str, Case]:
     """The cases of a block `mission`, by their names."""
     return {name: cast(Case, case) for name, case in missions.items() if name != _TRAFFIC}
+
+
+def policies(missions: Missions) -> dict[str, Case]:
+    """The cases of a block `mission` in which no robot fails, by their policies."""
+    return {name: case for name, case in cases(missions).items() if not is_fault(name)}
 
 
 def traffic(missions: Missions) -> Traffic:

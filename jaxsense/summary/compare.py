@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 import scipy.special
 
-from jaxsense.config import POLICIES
+from jaxsense.mission import is_fault
 from jaxsense.summary.blocks import Case, Differences, Missions, OfNaive, cases
 from jaxsense.summary.metrics import Interval, mean
 
@@ -122,7 +122,7 @@ def verdict(played: dict[str, Case]) -> str | None:
     faster = {
         name: mean(case["time_s"])
         for name, case in played.items()
-        if name in POLICIES
+        if not is_fault(name)
         and not name.startswith("naive")
         and mean(case["time_s"]) < mean(own["time_s"])
         and mean(case["accuracy"]) > mean(own["accuracy"]) - _AS_ACCURATE

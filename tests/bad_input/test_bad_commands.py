@@ -188,6 +188,7 @@ TRAIN = [
     (["--num_seed=3"], "unknown option --num-seed. Did you mean --num-seeds?"),
     (["--dqn.epoch", "3"], "unknown option --dqn.epoch. Did you mean --dqn.epochs?"),
     (["--" + "x" * 5000], "unknown option --xxx"),
+    (["--mission.policies", "naive", "best"], "('naive', 'best'): must name some of latent, gr"),
     (["smoke"], "unexpected argument 'smoke'"),
     (["--jmvae.hidden", "10000000", "10000000"], "jmvae.hidden = (10000000, 10000000): takes"),
 ]

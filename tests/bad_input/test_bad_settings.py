@@ -378,7 +378,6 @@ CHANGES = [
     ),
     ({"navigation.view_distances": (0.6, NAN)}, "must be a list of finite numbers"),
     ({"mission.policies": ("naive", "latent", "naive")}, "must name no policy twice"),
-    ({"mission.policies": ("naive", "best")}, "('naive', 'best'): must name some of latent, gr"),
     ({"mission.policies": "naive"}, "mission.policies = 'naive': must be a list of texts"),
     ({"mission.control_period": 0.033}, "must be a multiple of 0.01 s"),
     ({"mission.time_limit": 0.05}, "mission.time_limit = 0.05: must be at least control_period"),
