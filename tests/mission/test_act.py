@@ -249,9 +249,10 @@ def test_a_viewpoint_on_which_a_robot_has_come_to_stand_is_left_without_blame(
     assert state.robots.goals[CAMERA] == 0
     assert state.robots.attempts[CAMERA] == 0
     assert state.robots.excluded[CAMERA, view]
-    # One that only drives past will be gone.
-    passing = set_robot(driving(taken, set_robot, view, 1.0, 0.9), LIDAR, phase=DRIVING)
-    assert approach(passing, CAMERA).robots.phase[CAMERA] == DRIVING
+    # One that drives past or backs off will be gone.
+    for phase in (DRIVING, BACKING):
+        passing = set_robot(driving(taken, set_robot, view, 1.0, 0.9), LIDAR, phase=phase)
+        assert approach(passing, CAMERA).robots.phase[CAMERA] == DRIVING
 
 
 def test_a_robot_that_has_ended_makes_room_for_one_that_is_stuck(approach, facing, set_robot):

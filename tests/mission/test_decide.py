@@ -66,6 +66,13 @@ def test_of_values_within_the_tolerance_the_nearest_is_taken(chosen, values, tar
     assert state.robots.goals[0] == (target == 2)
 
 
+def test_progress_counts_from_the_moment_of_setting_out(chosen):
+    later = lambda state: replace(state, steps=jnp.int32(70))  # noqa: E731
+    # 70 control periods of 0.1 s, after which a robot that had set out at 0 would count as stuck.
+    assert chosen([1.0, 0.0, 0.0, 0.0], change=later).robots.progress_at[0] == pytest.approx(7.0)
+    assert chosen([0.0] * 4, change=later).robots.progress_at[0] == 0.0  # it ends
+
+
 def test_when_nothing_beats_nop_the_robot_ends(chosen):
     state = chosen([0.1, 0.2, 0.3, 0.3])
     assert state.robots.phase[0] == ENDED

@@ -11,8 +11,9 @@ from teams import CONFIG, LATENT, NAIVE, POLICIES, alone, with_class_beliefs, wi
 import jaxsense
 from jaxsense import mission
 from jaxsense.core.types import Belief
-from jaxsense.mission import act, decide, outcome
+from jaxsense.mission import act, decide
 from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
+from jaxsense.summary import make
 
 TEAM = replace(CONFIG, robots=("camera", "camera", "lidar"))
 FIRST, SECOND, LIDAR = 0, 1, 2
@@ -211,8 +212,8 @@ def test_what_is_measured_of_three_robots(many, models, start_of):
     assert found["observations_per_poi"] == 2
     assert set(found["told"]) == {"camera", "lidar"}
     # Four scans of 640 pixels of 3 bytes, and none of 683 beams of 4; then one more of these.
-    assert outcome.bytes_per_detection(many, np.array([3, 1, 0]))["raw"] == 1920
-    raw = outcome.bytes_per_detection(many, np.array([3, 0, 1]))["raw"]
+    assert make.traffic(many, np.array([3, 1, 0]))["raw"] == 1920
+    raw = make.traffic(many, np.array([3, 0, 1]))["raw"]
     assert raw == pytest.approx((3 * 1920 + 2732) / 4)
 
 
@@ -227,10 +228,10 @@ def test_a_robot_alone_is_measured_by_the_labels_of_its_sensor():
             "reason",
         )},
     }  # fmt: skip
-    block = outcome.summarise(TEAM, "camera_2_alone", found)
+    block = make.case(TEAM, "camera_2_alone", found)
     # The camera cannot tell the red ones apart, classes 1 and 2.
     assert (block["told"], block["ambiguous_reported"]) == (0.25, 0.5)
-    block = outcome.summarise(TEAM, "lidar_alone", found)
+    block = make.case(TEAM, "lidar_alone", found)
     assert (block["told"], block["ambiguous_reported"]) == (0.75, 0.5)
 
 

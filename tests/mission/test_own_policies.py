@@ -1,0 +1,180 @@
+"""Policies of missions: those of the table, and one of the user's own."""
+
+import contextlib
+from concurrent.futures import Future
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from teams import CONFIG, POLICIES
+
+from jaxsense import cli, dqn, evaluate, mission, train
+from jaxsense.config import ConfigError
+from jaxsense.dqn.policies import Policy
+from jaxsense.mission import decide
+from jaxsense.mission.state import DRIVING
+from jaxsense.run import programs
+from jaxsense.run.monitor import StageError, Stopped
+from jaxsense.sim import arena as arenas
+
+# The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
+POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
+POSES = [[0.0, 0.0, 0.0], [1.2, 1.2, 0.0]]
+
+
+def last_first(key, models, known):
+    """A policy of one's own, which visits the last PoI first and looks once at each."""
+    del key, models
+    number = len(known.looks)
+    return jnp.append(jnp.where(known.is_seen, -1.0, jnp.arange(1.0, number + 1)), 0.0)
+
+
+def close(key, models, known):
+    """Values within `equal_values` = 0.1 of the highest, which is that of a farther PoI."""
+    del key, models, known
+    return jnp.array([1.0, 0.95, 0.0, 0.0])
+
+
+OWN = {"mine": last_first, "close": close, "timed": Policy(close, lambda agent: True)}
+
+
+@pytest.fixture(scope="module")
+def own(team):
+    return mission.make_mission(CONFIG, OWN, arenas=(team.world.arena, team.free_arena))
+
+
+@pytest.fixture(scope="module")
+def decides(own, models):
+    return jax.jit(lambda state: decide.decide(jax.random.key(0), own, models, state, 0))
+
+
+def test_a_policy_of_ones_own_chooses_pois(own, decides, arena_of):
+    state = arena_of(POSITIONS, POSES)
+    state = replace(state, policy=jnp.int32(own.policy("mine")))
+    assert decides(state).robots.target[0] == 2
+    state = replace(state, times_seen=jnp.array([[0, 0], [0, 0], [0, 1]], jnp.int32))
+    after = decides(state)
+    assert (after.robots.target[0], after.robots.phase[0]) == (1, DRIVING)
+    state = replace(state, times_seen=jnp.ones((3, 2), jnp.int32))
+    assert decides(state).robots.target[0] == 3  # NOP
+
+
+def test_values_that_count_time_are_taken_in_their_own_order(own, decides, arena_of):
+    state = arena_of(POSITIONS, POSES)
+    # PoI 1 is nearer and within 0.1: so near in value only where values do not know the way.
+    for name, target in (("close", 1), ("timed", 0)):
+        state = replace(state, policy=jnp.int32(own.policy(name)))
+        assert decides(state).robots.target[0] == target
+
+
+def test_every_policy_of_the_table_is_played(own, models, arena_of):
+    state = arena_of(POSITIONS, POSES)
+    state = replace(state, times_seen=jnp.array([[1, 0], [0, 1], [0, 0]], jnp.int32))
+    key, given_up = jax.random.key(1), jnp.zeros(3, bool)
+    known = decide.known_to(own, state, 0, given_up)
+    values_of = jax.jit(lambda policy: decide._values(key, own, models, known, policy))
+    assert [*own.policies] == [*POLICIES, *OWN]
+    for name in POLICIES:
+        expected = dqn.POLICIES[name].values(key, models, known)
+        np.testing.assert_allclose(values_of(own.policy(name)), expected, atol=1e-6)
+
+
+def test_an_unknown_policy_is_refused(own):
+    with pytest.raises(
+        ConfigError, match=r"^policy = 'best': must be one of latent, gre.*, timed$"
+    ):
+        own.policy("best")
+
+
+def test_arenas_of_another_mission_are_reused(team, monkeypatch):
+    def build(*_args, **_settings):
+        raise AssertionError("compiles an arena")
+
+    monkeypatch.setattr(arenas, "build", build)
+    given = team.world.arena, team.free_arena
+    made = mission.make_mission(CONFIG, OWN, arenas=given)
+    assert (made.world.arena, made.free_arena) == given
+    with pytest.raises(AssertionError, match="compiles an arena"):
+        mission.make_mission(CONFIG)
+
+
+def playing(*names):
+    return replace(CONFIG, mission=replace(CONFIG.mission, policies=names))
+
+
+def test_a_run_with_an_unknown_policy_is_refused():
+    mission.require_policies(playing("naive", "mine"), OWN)
+    expected = r"^mission.policies = \('naive', 'mine'\): must name some of latent, "
+    with pytest.raises(ConfigError, match=expected):
+        mission.require_policies(playing("naive", "mine"))
+
+
+def test_a_policy_may_not_be_named_like_a_fault():
+    expected = "^policies = 'wall_stops': must not end in _alone, _stops, _blind$"
+    with pytest.raises(ConfigError, match=expected):
+        mission.require_policies(CONFIG, {"wall_stops": close})
+    with pytest.raises(ConfigError, match=expected):
+        mission.cases(CONFIG, (*POLICIES, "wall_stops"))
+
+
+RUN = ["--preset", "smoke", "--quiet", "--mission.policies", "latent", "mine"]
+
+
+def test_train_passes_own_policies_on_and_keeps_no_programs(tmp_path, monkeypatch):
+    given = []
+
+    @contextlib.contextmanager
+    def compiled(config, monitor, workers, kept, size, policies):
+        given.append((config.mission.policies, kept, policies))
+        raise Stopped
+        yield
+
+    monkeypatch.setattr(train.pipeline, "compiled", compiled)
+    argv = [*RUN, "--out", str(tmp_path / "run"), "--cache", str(tmp_path / "cache")]
+    with pytest.raises(SystemExit) as stop:
+        train.main(argv, policies=OWN)
+    assert stop.value.code == cli.INTERRUPTED
+    assert given == [(("latent", "mine"), None, OWN)]
+
+
+def test_train_refuses_a_policy_that_it_is_not_given(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        train.main([*RUN, "--out", str(tmp_path / "run"), "--cache", "None"])
+    line = "jaxsense.train: mission.policies = ('latent', 'mine'): must name some of latent, greedy"
+    assert capsys.readouterr().err.startswith(line)
+    assert not (tmp_path / "run").exists()
+
+
+def test_own_policies_reach_the_missions_of_a_run(team, monkeypatch):
+    played = lambda mission, compiler, batch, workers: mission  # noqa: E731
+    monkeypatch.setattr(programs.missions, "Player", played)
+    run = SimpleNamespace(config=CONFIG, policies=OWN, workers=None, player=Future())
+    programs._trace_missions(run, None)  # pyright: ignore[reportArgumentType]
+    assert [*run.player.result().policies] == [*POLICIES, *OWN]
+
+
+def test_evaluate_plays_own_policies_and_keeps_no_programs(tmp_path, monkeypatch, models, capsys):
+    found = []
+
+    class Player:
+        def __init__(self, team, compiler, batch, workers):
+            found.append(([*team.policies], compiler.kept))
+
+        def wait(self):
+            pass
+
+        def play(self, key, models, played, episodes):
+            found.append([*played])
+            raise StageError("mission", "made up")
+
+    monkeypatch.setattr(evaluate.rundir, "load", lambda run, trust: (CONFIG, models))
+    monkeypatch.setattr(evaluate, "_report", lambda run, config: None)
+    monkeypatch.setattr(evaluate.missions, "Player", Player)
+    options = ["--policy", "mine", "--cache", str(tmp_path / "cache")]
+    with pytest.raises(SystemExit):
+        evaluate.main([str(tmp_path), *options], OWN)
+    assert "made up" in capsys.readouterr().err
+    assert found == [([*POLICIES, *OWN], None), ["mine"]]
