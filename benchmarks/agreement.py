@@ -11,9 +11,7 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import looks, mission
-from jaxsense.config import PRESETS
-from jaxsense.models import init, make_jmvae
+from jaxsense import PRESETS, init, looks, make_jmvae, mission
 from jaxsense.run import devices
 from jaxsense.vae import jmvae
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from benchmarks import measure, peers
 from benchmarks.maps import MODALITY, Task, untrained_task
 from benchmarks.measure import Options, Row, Side
-from jaxsense.config import PRESETS, DqnConfig
+from jaxsense import PRESETS, make_mdp
+from jaxsense.config import DqnConfig
 from jaxsense.dqn import training
 from jaxsense.dqn.map_mdp import MapMdp
-from jaxsense.looks import make_mdp
 from jaxsense.models import make_agent
 
 _UNIT = "env-steps/s"

@@ -7,9 +7,8 @@ import numpy as np
 
 from benchmarks import measure, peers
 from benchmarks.measure import Options, Row
-from jaxsense.config import PRESETS
+from jaxsense import PRESETS, make_jmvae
 from jaxsense.core.types import Samples
-from jaxsense.models import make_jmvae
 from jaxsense.vae import jmvae as our_jmvae
 
 _STEPS, _STEPS_QUICK = 2000, 5

@@ -8,16 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks.jmvae import random_bank
-from jaxsense import models
-from jaxsense.config import PRESETS, Config, DqnConfig
+from jaxsense import PRESETS, Bank, Config, Models, init, make_jmvae, make_mdp
+from jaxsense.config import DqnConfig
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Key, Samples
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn.episodes import Start
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.policies import Known
-from jaxsense.looks import Bank, make_mdp
-from jaxsense.models import Models
 
 MODALITY = 0
 """The agent looks with the camera."""
@@ -53,8 +51,8 @@ def untrained_task(dqn: DqnConfig, samples: int = 10000) -> Task:
       samples: detections of each class by each sensor.
     """
     config = dataclasses.replace(PRESETS["default"], dqn=dqn)
-    networks = models.init(jax.random.key(0), config)
-    sizes = models.make_jmvae(config).feature_sizes
+    networks = init(jax.random.key(0), config)
+    sizes = make_jmvae(config).feature_sizes
     bank = random_bank(jax.random.key(1), sizes, len(config.arena.classes), samples)
     return Task(config, networks, bank)
 

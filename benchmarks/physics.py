@@ -14,8 +14,7 @@ from mujoco import mjx
 from benchmarks import measure
 from benchmarks.measure import Options, Row, Side
 from benchmarks.peers import native
-from jaxsense import mission, models
-from jaxsense.config import PRESETS, Config
+from jaxsense import PRESETS, Config, init, mission
 from jaxsense.mission import Mission, MissionState, navigation
 from jaxsense.mission.motion import move
 from jaxsense.mission.rollout import step as mission_step
@@ -127,7 +126,7 @@ def _random_drives(key: jax.Array, config: Config, batch: int, steps: int) -> Dr
 def _mid_mission(batch: int, periods: int) -> tuple[Mission, MissionState]:
     """`[B, P]` states that the physics was given in P successive periods of naive missions."""
     team = mission.make_mission(_UNTRAINED)
-    networks = models.init(jax.random.key(0), team.config)
+    networks = init(jax.random.key(0), team.config)
 
     def play(keys: jax.Array) -> MissionState:
         reset_keys, play_keys = jax.vmap(jax.random.split, out_axes=1)(keys)

@@ -11,7 +11,7 @@ from mujoco import mjx
 from benchmarks import measure
 from benchmarks.measure import Options, Row, Side
 from benchmarks.peers import native
-from jaxsense.config import PRESETS
+from jaxsense import PRESETS
 from jaxsense.run import devices
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import raycast

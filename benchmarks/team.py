@@ -6,11 +6,9 @@ import jax.numpy as jnp
 from benchmarks import measure
 from benchmarks.maps import untrained_task
 from benchmarks.measure import Options, Row
-from jaxsense.config import PRESETS
+from jaxsense import PRESETS, Bank, init, make_mdp
 from jaxsense.dqn import team_mdp as teams
 from jaxsense.dqn.team_mdp import TeamMdp
-from jaxsense.looks import Bank, make_mdp
-from jaxsense.models import init
 
 
 def team_mdp(options: Options) -> Row:

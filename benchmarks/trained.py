@@ -6,9 +6,8 @@ import functools
 import jax
 
 from benchmarks.maps import Examiner, Task
-from jaxsense import models
-from jaxsense.config import PRESETS, DetectorConfig, DqnConfig, JmvaeConfig
-from jaxsense.training import learn
+from jaxsense import PRESETS, init, learn
+from jaxsense.config import DetectorConfig, DqnConfig, JmvaeConfig
 
 _CONFIG = dataclasses.replace(
     PRESETS["default"],
@@ -42,7 +41,7 @@ def trained_task(quick: bool) -> tuple[Task, Examiner]:
     train = jax.jit(lambda key: learn(key, config, until="look_values").outputs)
     outputs = train(jax.random.key(6))
     trained = dataclasses.replace(
-        models.init(jax.random.key(6), config),
+        init(jax.random.key(6), config),
         fusion=outputs["fusion"],
         jmvae=outputs["best_jmvae"],
         look_values=outputs["look_values"],

@@ -13,10 +13,9 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import mission
-from jaxsense.config import Config, TravelConfig
+from jaxsense import Config, Models, mission
+from jaxsense.config import TravelConfig
 from jaxsense.dqn import team_mdp
-from jaxsense.models import Models
 from jaxsense.run import rundir
 
 _MISSIONS = 64

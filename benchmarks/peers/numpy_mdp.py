@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsense.config import Config
-from jaxsense.models import make_jmvae
+from jaxsense import Config, make_jmvae
 
 
 @dataclasses.dataclass
