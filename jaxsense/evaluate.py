@@ -224,7 +224,7 @@ def _elsewhere(arguments: Arguments, config: Config) -> Config:
     changed = {name: value for name, value in sizes.items() if value is not None}
     arena = dataclasses.replace(config.arena, **changed)
     # The Q-network of one agent has an input for each PoI.
-    if config.dqn.task == "map" and arena.num_pois != config.arena.num_pois:
+    if not config.dqn.is_team and arena.num_pois != config.arena.num_pois:
         number = config.arena.num_pois
         reason = (
             f"the policies of this run are for {number} points; must be {number}, or a run with"

@@ -112,9 +112,6 @@ class Config(Section):
         is_large = self.jmvae.fusion != "filter" or number <= 2 * self.jmvae.latent_size + 1
         expected = f"must be at least {number // 2}, so that a filter can hold {number} classes"
         require(is_large, self.jmvae, "latent_size", expected)
-        has_filter = self.mdp.reward != "nats" or self.jmvae.fusion == "filter"
-        expected = f"needs jmvae.fusion = 'filter', not {self.jmvae.fusion!r}"
-        require(has_filter, self.mdp, "reward", expected)
         # Scans come in whole scenes.
         scans = -(-self.detector.num_scans // self.arena.num_pois) * self.arena.num_pois
         leaves_some = self.detector.num_training(scans) > 0
@@ -123,7 +120,7 @@ class Config(Section):
 
     def _check_task(self) -> None:
         """A team learns from stored detections; a dense network is for one number of PoIs."""
-        is_team, team = self.dqn.task == "team", self.team
+        is_team, team = self.dqn.is_team, self.team
         observes_bank = not is_team or self.dqn.observe == "bank"
         expected = "must be 'bank' with dqn.task = 'team', whose MDP has no scans"
         require(observes_bank, self.dqn, "observe", expected)
@@ -188,7 +185,7 @@ class Config(Section):
         num_pois, windows = self.arena.num_pois, {"camera": 3 * self.camera.window}
         windows["lidar"] = self.lidar.window
         state = 2 * self.jmvae.latent_size * num_pois
-        if self.dqn.task == "team":
+        if self.dqn.is_team:
             of_poi = 2 * self.jmvae.latent_size + 3 * len(self.modalities) + 4
             state = max(self.team.num_pois[1], num_pois) * of_poi
         return Sizes(

@@ -320,7 +320,6 @@ CHANGES = [
     ({"jmvae.reconstruction_weights": (1.0,) * 9}, "must have one value for each of modalities ="),
     ({"jmvae.reconstruction_weights": (NAN, 1.0)}, "must be a list of finite numbers"),
     ({"mdp.reward": "bits"}, "mdp.reward = 'bits': must be one of paper, nats"),
-    ({"mdp.reward": "nats"}, "mdp.reward = 'nats': needs jmvae.fusion = 'filter', not 'in_place'"),
     (
         {
             "dqn.task": "team",
