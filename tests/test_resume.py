@@ -186,7 +186,10 @@ def test_a_config_reproduces_its_run(resumed, smoke_run, capsys):
             '{"preset": "best"}',
             "preset = 'best': must be one of default, paper, noisy, team, smoke",
         ),
-        ('{"config": {"dqn": {"epoch": 3}}}', "epoch = 3: unknown setting; did you mean dqn.epochs?"),
+        (
+            '{"config": {"dqn": {"epoch": 3}}}',
+            "epoch = 3: unknown setting; did you mean dqn.epochs?",
+        ),
         ('{"config": {"dqn": {"epochs": "many"}}}', "dqn.epochs = 'many': must be a whole number"),
         ('{"config": {"jmvae": {"beta": -1}}}', "jmvae.beta = -1.0: must be greater than 0"),
         ('{"config": {"arena": 3}}', "arena = 3: must be an object with names and values"),
