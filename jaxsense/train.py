@@ -121,6 +121,7 @@ def main(
         # Before joining, so that no process waits for a first one that refuses its options.
         with _open(arguments) as run:
             seeds.check(run)
+            devices.check(arguments.devices)
             devices.join(
                 arguments.coordinator,
                 arguments.num_processes,

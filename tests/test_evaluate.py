@@ -20,7 +20,7 @@ from recordings import recording
 from smoke import MISSION_KEYS, error_line
 
 import jaxsense
-from jaxsense import cli, dqn, evaluate, export
+from jaxsense import cli, dqn, evaluate, export, mission
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import devices, files, missions
 from jaxsense.run.compilation import Compiler

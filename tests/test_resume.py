@@ -92,7 +92,10 @@ def test_a_stopped_run_says_how_to_go_on(stops):
     [
         (shutil.rmtree, "is not a run directory: it has no config.json"),
         (lambda path: (path / "summary.json").write_text("{}"), "is finished"),
-        (lambda path: edit(path, "versions", {"jaxsense": "0.0.1"}), "was written by jaxsense 0.0"),
+        (
+            lambda path: edit(path, "versions", {"jaxsense": "0.2.0"}),
+            "was written by jaxsense 0.2.0; this is 0.3.",
+        ),
         (lambda path: edit(path, "versions", None), "was written by an older jaxsense"),
         (lambda path: edit(path, "seed", 7), "config.json has changed since the run began"),
     ],
