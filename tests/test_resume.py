@@ -111,14 +111,14 @@ def test_a_run_that_cannot_go_on_is_named(stopped, cache, tmp_path, capsys, chan
 def test_a_run_goes_on_from_what_is_sound(stopped, smoke_run, cache, tmp_path, capsys):
     path = tmp_path / "run"
     shutil.copytree(stopped, path)
-    for name in ("jmvae", "unfinished/dqn_camera"):
+    for name in ("best_jmvae", "unfinished/dqn_camera"):
         file = path / "checkpoints" / f"{name}.msgpack"
         file.write_bytes(file.read_bytes()[:-1])
     with (path / "metrics.jsonl").open("a", encoding="utf-8") as metrics:
         metrics.write('{"stage": "jm')  # as a process that was killed leaves it
     train.main(["--resume", str(path), "--quiet", *cache])
     said = capsys.readouterr().err
-    assert "jmvae.msgpack': is damaged" in said
+    assert "best_jmvae.msgpack': is damaged" in said
     assert "dqn_camera.msgpack': is damaged" in said
     assert without_times(path) == without_times(smoke_run)
     assert steps(path, "jmvae_1")[-1] == 300  # every line can be read

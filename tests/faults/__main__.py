@@ -34,7 +34,7 @@ POISONED = {
     "detector_camera-advance": "parameters of a detector",
     "jmvae-advance": "parameters of the JMVAE",
     "dqn-advance": "parameters of a Q-network, and so Q-values",
-    "latent_space": "class beliefs",
+    "class_beliefs": "class beliefs",
 }
 SMOKE = ["--preset", "smoke", "--quiet"]
 IN_ONE_SECOND = ["20250101-000000-smoke", "20250101-000000-smoke-2"]

@@ -21,22 +21,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxsense.stages import Progress, Surveys
 
 from jaxsense import cli, evaluate, export, train
+from jaxsense.config import DetectorConfig, DqnConfig, JmvaeConfig
+from jaxsense.core import supervised
 from jaxsense.core.supervised import FitState
 from jaxsense.dqn import training as dqn_training
 from jaxsense.dqn.training import DqnState
 from jaxsense.run.compilation import Program
 from jaxsense.show import plots
-from jaxsense.vae import detectors, jmvae
+from jaxsense.training.perception import Surveys
+from jaxsense.training.stage import Progress
 
 NAN_STEP = 17
-TRAININGS = {
-    "detector_camera": detectors,
-    "jmvae": jmvae,
-    "dqn": dqn_training,
+TRAININGS: dict[str, tuple[Any, str, type]] = {
+    "detector_camera": (supervised, "_adam", DetectorConfig),
+    "jmvae": (supervised, "_adam", JmvaeConfig),
+    "dqn": (dqn_training, "_optimiser", DqnConfig),
 }
+"""Where the optimiser of a training is made, and from which settings."""
 OTHERS = {"evaluate": evaluate, "export": export}
 
 SIGNALS = {
@@ -91,11 +94,13 @@ def with_bad_params(state: Any, number: int) -> Any:
 
 def poison_gradients(stage: str, number: int) -> None:
     """Lets one array of the gradients of a training be NaN in step `NAN_STEP`."""
-    module: Any = TRAININGS[stage]
-    make = module._optimiser
+    module, name, settings = TRAININGS[stage]
+    make = getattr(module, name)
 
-    def make_poisoned(*args: Any) -> optax.GradientTransformation:
-        optimiser = make(*args)
+    def make_poisoned(config: Any) -> optax.GradientTransformation:
+        optimiser = make(config)
+        if not isinstance(config, settings):
+            return optimiser
 
         def update(updates: Any, state: Any, params: Any = None) -> Any:
             # Adam and its schedule count alike, from zero.
@@ -108,7 +113,7 @@ def poison_gradients(stage: str, number: int) -> None:
 
         return optax.GradientTransformation(optimiser.init, update)
 
-    module._optimiser = make_poisoned
+    setattr(module, name, make_poisoned)
 
 
 class StoppedClock(datetime.datetime):
