@@ -6,7 +6,7 @@ Korthals, Leitner and Rueckert, "Coordinated Heterogeneous Distributed Perceptio
 Space Representation", 2018.
 
 The parts are `jaxsense.sim` (arena, ray-caster, sensors), `jaxsense.vae` (detectors, JMVAE, fusion)
-and `jaxsense.dqn` (map MDP, Q-learning). `jaxsense.observe` joins them, `jaxsense.stages` trains
+and `jaxsense.dqn` (map MDP, Q-learning). `jaxsense.looks` joins them, `jaxsense.training` trains
 them, `jaxsense.mission` drives all robots in closed loop, and `jaxsense.interfaces` offers the MDPs
 to other libraries. Every function is pure, takes its random key first and works on one example: add
 `vmap` and `jit` yourself.

@@ -106,7 +106,7 @@ def build(
     require_32_bits()
     mjcf = _mjcf(config, lidar_robots, contacts, obstacles)
     mj_model = mujoco.MjModel.from_xml_string(mjcf)  # pyright: ignore[reportAttributeAccessIssue]
-    # The default of MJX is the first device of all processes, not of this one.
+    # By default MJX takes the first device of all processes.
     device = jax.local_devices()[0]
     model = mjx.put_model(mj_model, device=device, impl="jax")
     return Arena(config, mj_model, model, mjx.make_data(model, device=device), len(lidar_robots))
