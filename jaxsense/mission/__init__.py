@@ -1,11 +1,13 @@
-"""The mission: all robots at once in one MJX arena, in closed loop over one shared map.
+"""Missions: all robots at once in one MJX arena, in closed loop over one shared map.
 
 Each robot asks its policy which PoI to look at, drives to a viewpoint, turns to the PoI, scans it,
-writes the detection into the shared map, and asks again, until the policy chooses NOP. Each robot
-decides at its own time; one whose policy reads the map decides again when the map changes under
-way. Everything is a pure function of one episode: `vmap` over episodes.
+updates the shared map with the detection and asks again, until the policy chooses NOP. Robots
+decide independently of each other, and again when the map changes under way. Most functions take
+one mission, for `vmap`; those that are faster for many take B missions.
 """
 
+from jaxsense.mission.begin import reset as reset
+from jaxsense.mission.begin import start as start
 from jaxsense.mission.cases import Case as Case
 from jaxsense.mission.cases import cases as cases
 from jaxsense.mission.cases import is_fault as is_fault
@@ -22,5 +24,3 @@ from jaxsense.mission.state import MissionState as MissionState
 from jaxsense.mission.state import Record as Record
 from jaxsense.mission.state import make_mission as make_mission
 from jaxsense.mission.state import no_faults as no_faults
-from jaxsense.mission.state import reset as reset
-from jaxsense.mission.state import start as start

@@ -1,4 +1,4 @@
-"""Cases to play missions with: policies, and robots that fail."""
+"""Cases to play missions with: healthy robots with each policy, and robots that fail."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -34,8 +34,8 @@ def require_policies(config: Config, policies: Mapping[str, Values | Policy] | N
       policies: of your own, by name, besides `dqn.POLICIES`.
 
     Raises:
-      ConfigError: if `config.mission.policies` names an unknown policy, or a policy of your own has
-        the name of a fault.
+      ConfigError: if `config.mission.policies` names an unknown policy, or a policy of your own is
+        named like a case with a fault.
     """
     known = table(policies)
     _require_names(known)
@@ -45,30 +45,29 @@ def require_policies(config: Config, policies: Mapping[str, Values | Policy] | N
 
 
 def _require_names(policies: Iterable[str]) -> None:
-    """Raises `ConfigError` if a policy has a name like a case with a fault."""
+    """Raises `ConfigError` if a policy is named like a case with a fault."""
     for name in filter(is_fault, policies):
         raise ConfigError("policies", name, f"must not end in _{', _'.join(_FAULTS)}")
 
 
 def is_fault(case: str) -> bool:
-    """Whether a case is one of the latent policy with a robot that fails, by its name."""
+    """Whether a case, given by its name, has a robot that is alone, stops or goes blind."""
     return case.endswith(tuple(f"_{fault}" for fault in _FAULTS))
 
 
 def cases(config: Config, policies: Iterable[str] = POLICIES) -> dict[str, Case]:
-    """Lists the policies, each robot alone, and each robot failing in mid-mission.
+    """Cases of every policy, of each robot alone, and of each robot failing during the mission.
 
-    Each policy is a case; in `ROBOT_alone` all other robots stand still from the start; in
-    `ROBOT_stops` and `ROBOT_blind` the robot stops or its sensor goes blind after 6 s. A robot has
-    the name of its modality, with a number if several share it, see `Config.robot_names`. Cases
-    with faults use the latent policy.
+    Each policy is a case. In `ROBOT_alone` all other robots stand still from the start; in
+    `ROBOT_stops` and `ROBOT_blind` the robot stops or its sensor goes blind after 6 s. Robots are
+    named as in `Config.robot_names`. Cases with faults use the latent policy.
 
     Args:
       config: all settings.
       policies: names in the order of `Mission.policies`.
 
     Raises:
-      ConfigError: if a policy has a name like a case with a fault.
+      ConfigError: if a policy is named like a case with a fault.
     """
     healthy, names = no_faults(config), tuple(policies)
     _require_names(names)

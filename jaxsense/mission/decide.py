@@ -1,9 +1,7 @@
-"""Choosing the PoI that a robot looks at next, and the viewpoint."""
+"""The choice of the PoI that a robot looks at next, and of the viewpoint."""
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Index, Key, others
 from jaxsense.dqn import team_mdp
@@ -19,9 +17,6 @@ from jaxsense.mission.state import (
     IDLE,
     Mission,
     MissionState,
-    now,
-    robot_of,
-    with_robot,
 )
 from jaxsense.models import Models
 from jaxsense.sim import viewpoints
@@ -30,9 +25,15 @@ _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
 
 
-def is_due(mission: Mission, state: MissionState, robot: Index) -> jax.Array:
-    """Whether a robot has to decide, `[]` bool: it has nothing to do, or the map has changed."""
-    own = robot_of(state, robot)
+def is_due(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, ""]:
+    """Whether a robot has to decide: it has nothing to do, or the map has changed.
+
+    Args:
+      mission: the mission.
+      state: the current state.
+      robot: index of the robot.
+    """
+    own = state.robot(robot)
     is_under_way = (own.phase == DRIVING) | (own.phase == FACING)
     has_news = (state.version != own.decided_on) & mission.config.mission.redecides
     return (own.phase == IDLE) | (is_under_way & has_news)
@@ -41,8 +42,16 @@ def is_due(mission: Mission, state: MissionState, robot: Index) -> jax.Array:
 def decide(
     key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> MissionState:
-    """Asks the policy if a decision is due, and sets out for a viewpoint of the PoI."""
-    own, config = robot_of(state, robot), mission.config
+    """Asks a robot's policy if a decision is due, and sets out for a viewpoint of the PoI.
+
+    Args:
+      key: random key.
+      mission: the mission.
+      models: trained models.
+      state: the current state.
+      robot: index of the robot.
+    """
+    own, config = state.robot(robot), mission.config
     is_idle, decides = own.phase == IDLE, is_due(mission, state, robot)
     action = jnp.where(decides, _choose(key, mission, models, state, robot), own.target)
     is_new = action != own.target
@@ -51,22 +60,22 @@ def decide(
     # Failures belong to one target.
     excluded = jnp.where(is_new, False, own.excluded)
     view, length, excluded = _best_view(mission, state, robot, action, excluded)
-    has_way = jnp.isfinite(length)
-    sets_out_now, gives_up = sets_out & has_way, sets_out & ~has_way
+    has_path = jnp.isfinite(length)
+    sets_out_now, gives_up = sets_out & has_path, sets_out & ~has_path
     poi = jnp.minimum(action, config.arena.num_pois - 1)
     nothing_left = decides & (action == config.arena.num_pois)
-    # What was in the way may have gone: before it ends, a robot tries once more to reach PoIs where
-    # it was stuck.
-    place = state.scene.poses[robot, :2]
-    stuck_at = own.unreachable & roadmap.reaches(config, state.scene.layout, state.roadmap, place)
+    # Obstacles may have moved: before it ends, a robot retries the PoIs where it was stuck.
+    position = state.scene.poses[robot, :2]
+    reachable = roadmap.reachable(config, state.scene.layout, state.roadmap, position)
+    stuck_at = own.unreachable & reachable
     tries_again = nothing_left & jnp.any(stuck_at) & ~own.tried_again
     ends, given_up = nothing_left & ~tries_again, own.unreachable & ~(stuck_at & tries_again)
-    # A look from the current place is no goal; a PoI without a way to it is a missed one.
+    # Looks from the current position are not goals; an unreachable PoI is a missed goal.
     num_views = state.roadmap.viewpoints.shape[1]
     is_goal = (sets_out_now & (view < num_views)) | gives_up
     was_needless = decides & is_new & (own.phase == DRIVING) & (own.view < num_views)
-    after = dataclasses.replace(
-        own,
+    return state.with_robot(
+        robot,
         phase=jnp.select(
             [ends, sets_out_now, gives_up | tries_again], [ENDED, DRIVING, IDLE], own.phase
         ),
@@ -77,21 +86,20 @@ def decide(
         attempts=jnp.where(is_new, 0, own.attempts),
         unreachable=jnp.where(gives_up, given_up.at[poi].set(True), given_up),
         tried_again=own.tried_again | tries_again,
-        way_left=jnp.where(sets_out_now, length, own.way_left),
-        progress_at=jnp.where(sets_out_now, now(mission, state), own.progress_at),
+        path_left=jnp.where(sets_out_now, length, own.path_left),
+        progress_at=jnp.where(sets_out_now, mission.time(state), own.progress_at),
         goals=own.goals + is_goal - was_needless,
     )
-    return with_robot(state, robot, own, after)
 
 
 def _choose(
     key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
-) -> jax.Array:
-    """PoI that a robot's policy chooses, `[]` int32, or N for NOP."""
+) -> Int[Array, ""]:
+    """PoI that a robot's policy chooses, or N for NOP."""
     config, robots = mission.config, state.robots
     settings, num_pois = config.mission, config.arena.num_pois
     given_up = robots.unreachable[robot] | robots.undetected[robot]
-    known = known_to(mission, state, robot, given_up)
+    known = _known_to(mission, state, robot, given_up)
     values = _values(key, mission, models, known, state.policy)
     counts_time = [policy.counts_time(models.agent) for policy in mission.policies.values()]
     # Values that include travel time need no tie-breaking.
@@ -99,12 +107,12 @@ def _choose(
     of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
     is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > values[num_pois])
 
-    place = state.scene.poses[robot, :2]
-    distance = jnp.linalg.norm(state.scene.layout.position - place[None], axis=-1)
+    position = state.scene.poses[robot, :2]
+    distance = jnp.linalg.norm(state.scene.layout.position - position[None], axis=-1)
     is_kept = jnp.arange(num_pois) == robots.target[robot]
     targets = others(robots.target, robot)
     is_others = jnp.any(jnp.arange(num_pois)[:, None] == targets[None], axis=-1)
-    # First the PoI that the robot heads for already, then those no other heads for, then distance.
+    # Prefer the robot's present target, then PoIs that no other robot heads for, then near ones.
     rank = jnp.where(settings.nearest_first, distance, jnp.arange(num_pois))
     rank += _KEPT * is_kept + _HEADED_FOR * (is_others & settings.avoids_targets)
     poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
@@ -112,22 +120,17 @@ def _choose(
 
 
 def _values(
-    key: Key, mission: Mission, models: Models, known: Known, policy: jax.Array
-) -> jax.Array:
-    """`[N + 1]` values of a policy's actions, NOP's last."""
+    key: Key, mission: Mission, models: Models, known: Known, policy: Int[Array, ""]
+) -> Float[Array, " N+1"]:
+    """Values of a policy's actions, NOP's last."""
     of_each = [each.values(key, models, known) for each in mission.policies.values()]
     return jnp.stack(of_each)[policy]
 
 
-def known_to(mission: Mission, state: MissionState, robot: Index, given_up: jax.Array) -> Known:
-    """What a robot knows when it chooses.
-
-    Args:
-      mission: the mission.
-      state: the current state.
-      robot: index of the robot.
-      given_up: `[N]` bool, PoIs that the robot has given up.
-    """
+def _known_to(
+    mission: Mission, state: MissionState, robot: Index, given_up: Bool[Array, " N"]
+) -> Known:
+    """What a robot that has given up some PoIs knows when it chooses."""
     phase = state.robots.phase
     team = Team(
         positions=state.scene.layout.position,
@@ -148,23 +151,23 @@ def known_to(mission: Mission, state: MissionState, robot: Index, given_up: jax.
 
 
 def _best_view(
-    mission: Mission, state: MissionState, robot: Index, target: jax.Array, excluded: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Viewpoint of a PoI with the shortest way, V for the robot's current place.
+    mission: Mission,
+    state: MissionState,
+    robot: Index,
+    target: Int[Array, ""],
+    excluded: Bool[Array, " V+1"],
+) -> tuple[Int[Array, ""], Float[Array, ""], Bool[Array, " V+1"]]:
+    """Nearest viewpoint of a PoI, V for the robot's current position.
 
     Returns:
-      The viewpoint, the length of the way, and the `[V + 1]` viewpoints that stay excluded: none if
-      all that can be reached have been.
+      The viewpoint, the length of the path in metres, and the viewpoints that stay excluded: none
+      if all that can be reached have been.
     """
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
-    standing = standing_robots(state, robot)
     length = roadmap.lengths(config, scene.layout, state.roadmap, scene.poses[robot, :2], poi)
-    places, margin = state.roadmap.viewpoints[poi], config.navigation.margin
-    room = viewpoints.free_room(
-        places[:, 0], places[:, 1], margin, config.arena, scene.layout, standing, poi
-    )
-    length += jnp.where(room > 0, 0.0, _DETOUR)
+    positions, margin = state.roadmap.viewpoints[poi], config.navigation.margin
+    length += jnp.where(_room(mission, state, robot, poi, positions, margin) > 0, 0.0, _DETOUR)
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
     cost = jnp.append(length, here)
     excluded &= jnp.any(jnp.isfinite(cost) & ~excluded)
@@ -173,19 +176,59 @@ def _best_view(
     return view, cost[view], excluded
 
 
-def sees(mission: Mission, state: MissionState, robot: Index, poi: jax.Array) -> jax.Array:
-    """Whether a PoI is in range of a robot and nothing standing covers it, `[]` bool."""
-    config, place = mission.config, state.scene.poses[robot, :2]
-    layout, standing = state.scene.layout, standing_robots(state, robot)
-    distance = jnp.linalg.norm(layout.position[poi] - place)
+def is_taken(
+    mission: Mission, state: MissionState, robot: Index, poi: Index, view: Index
+) -> Bool[Array, ""]:
+    """Whether another robot stands at a viewpoint or in the view from it.
+
+    Args:
+      mission: the mission.
+      state: the current state.
+      robot: index of the robot that wants to go there.
+      poi: index of the PoI.
+      view: index of the viewpoint.
+    """
+    position = state.roadmap.viewpoints[poi, view][None]
+    return _room(mission, state, robot, poi, position, mission.config.navigation.margin)[0] <= 0
+
+
+def sees(mission: Mission, state: MissionState, robot: Index, poi: Index) -> Bool[Array, ""]:
+    """Whether a PoI is in range of a robot, and nothing that stands still covers it.
+
+    Args:
+      mission: the mission.
+      state: the current state.
+      robot: index of the robot.
+      poi: index of the PoI.
+    """
+    config, position = mission.config, state.scene.poses[robot, :2]
+    distance = jnp.linalg.norm(state.scene.layout.position[poi] - position)
     in_range = distance >= config.viewpoint.min_distance
     in_range &= distance <= config.navigation.view_range
-    room = viewpoints.free_room(place[:1], place[1:], 0.0, config.arena, layout, standing, poi)
-    return in_range & (room[0] > 0)
+    return in_range & (_room(mission, state, robot, poi, position[None], 0.0)[0] > 0)
 
 
-def standing_robots(state: MissionState, robot: Index) -> jax.Array:
-    """Places of the other robots, `[R - 1, 2]`; far away for moving ones, which will be gone."""
+def _room(
+    mission: Mission,
+    state: MissionState,
+    robot: Index,
+    poi: Index,
+    positions: Float[Array, "C 2"],
+    margin: float,
+) -> Float[Array, " C"]:
+    """Free room around positions to look at a PoI from, see `viewpoints.free_room`."""
+    standing, layout = standing_robots(state, robot), state.scene.layout
+    x, y = positions[:, 0], positions[:, 1]
+    return viewpoints.free_room(x, y, margin, mission.config.arena, layout, standing, poi)
+
+
+def standing_robots(state: MissionState, robot: Index) -> Float[Array, "R-1 2"]:
+    """Positions of the other robots; moving ones, which will be gone, count as far away.
+
+    Args:
+      state: the current state.
+      robot: index of the robot.
+    """
     phase = others(state.robots.phase, robot)
     drives = (phase == DRIVING) | (phase == BACKING)
     return jnp.where(drives[:, None], 1e3, others(state.scene.poses[:, :2], robot))

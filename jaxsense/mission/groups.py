@@ -1,28 +1,34 @@
 """Runs a function only for the missions of a batch that need it."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
-T = TypeVar("T")
+Row = TypeVar("Row")
+Result = TypeVar("Result")
 
-_FEWEST = 8  # rows of a group; on a CPU, fewer take as long
+_MIN_ROWS = 8  # of a group; on a CPU, fewer take as long
 
 
 def where_due(
-    due: jax.Array, function: Callable[..., T], before: T, *inputs: Any, parts: int = 1
-) -> T:
+    due: Bool[Array, " B"],
+    function: Callable[[Row], Result],
+    before: Result,
+    inputs: Row,
+    parts: int = 1,
+) -> Result:
     """Applies a function to the rows of a batch that are due, one group of rows after another.
 
     Under a `vmap`, all batches take as many groups as the one with the most rows.
 
     Args:
       due: `[B]` bool.
-      function: takes a single row of each input, and returns a single row.
+      function: takes one row of `inputs`, and returns one row.
       before: `[B, ...]` rows to keep where nothing is due.
-      *inputs: `[B, ...]` each.
+      inputs: `[B, ...]` arrays.
       parts: how many equal parts of the batch form groups of their own; with one part on each
         device, no row moves to another.
 
@@ -30,24 +36,28 @@ def where_due(
       `[B, ...]` rows.
     """
     if parts == 1:
-        return _where_due(due, function, before, *inputs)
-    split = jax.tree.map(lambda x: x.reshape(parts, -1, *x.shape[1:]), (due, before, inputs))
-    of_part = jax.vmap(lambda due, before, inputs: _where_due(due, function, before, *inputs))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), of_part(*split))
+        return _where_due(due, function, before, inputs)
+    due, before, inputs = jax.tree.map(
+        lambda x: x.reshape(parts, -1, *x.shape[1:]), (due, before, inputs)
+    )
+    of_part = jax.vmap(lambda due, before, inputs: _where_due(due, function, before, inputs))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), of_part(due, before, inputs))
 
 
-def _where_due(due: jax.Array, function: Callable[..., T], before: T, *inputs: Any) -> T:
+def _where_due(
+    due: Bool[Array, " B"], function: Callable[[Row], Result], before: Result, inputs: Row
+) -> Result:
     """See `where_due`, for a batch of one part."""
     total, number = len(due), jnp.sum(due)
-    size = min(total, max(_FEWEST, total // 16))
+    size = min(total, max(_MIN_ROWS, total // 16))
     order = jnp.argsort(~due)
 
-    def advance(carry: tuple[jax.Array, T]) -> tuple[jax.Array, T]:
+    def advance(carry: tuple[jax.Array, Result]) -> tuple[jax.Array, Result]:
         first, after = carry
-        place = first + jnp.arange(size)
-        row = order[jnp.minimum(place, total - 1)]
-        new = jax.vmap(function)(*jax.tree.map(lambda x: x[row], inputs))
-        kept = jnp.where(place < number, row, total)  # past the last that is due, none is written
+        index = first + jnp.arange(size)
+        row = order[jnp.minimum(index, total - 1)]
+        new = jax.vmap(function)(jax.tree.map(lambda x: x[row], inputs))
+        kept = jnp.where(index < number, row, total)  # drops rows beyond the last that is due
         put = lambda rows, new: rows.at[kept].set(new, mode="drop")  # noqa: E731
         return first + size, jax.tree.map(put, after, new)
 

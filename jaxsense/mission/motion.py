@@ -1,4 +1,4 @@
-"""The robots' motion in one control period, in MJX."""
+"""Physics of one control period, in MJX."""
 
 import dataclasses
 import functools
@@ -6,6 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from mujoco import mjx
 
 from jaxsense.config import ArenaConfig
@@ -26,18 +27,18 @@ class _Motion:
       velocity: `[B, R, 3]`.
       warmstart: `[B, V]`.
       command: `[B, R, 2]`.
-      clearance: `[B]` the smallest so far.
+      clearance: `[B]` the smallest so far, in metres.
     """
 
-    poses: jax.Array
-    velocity: jax.Array
-    warmstart: jax.Array
-    command: jax.Array
-    clearance: jax.Array
+    poses: Float[Array, "B R 3"]
+    velocity: Float[Array, "B R 3"]
+    warmstart: Float[Array, "B V"]
+    command: Float[Array, "B R 2"]
+    clearance: Float[Array, " B"]
 
 
-def move(mission: Mission, states: MissionState) -> tuple[MissionState, jax.Array]:
-    """Simulates one control period of missions side by side.
+def move(mission: Mission, states: MissionState) -> tuple[MissionState, Float[Array, " B"]]:
+    """Simulates one control period of B missions side by side.
 
     Contacts cost several times as much as everything else, and the planner avoids them. While no
     robot of any mission can touch anything within the period, the robots move in an empty arena,
@@ -63,7 +64,9 @@ def move(mission: Mission, states: MissionState) -> tuple[MissionState, jax.Arra
         is_near,
         functools.partial(_integrate, mission, mission.world.arena),
         functools.partial(_integrate, mission, mission.free_arena),
-        *(motion, robots.wanted, layout),
+        motion,
+        robots.wanted,
+        layout,
     )
     states = dataclasses.replace(
         states,
@@ -72,21 +75,27 @@ def move(mission: Mission, states: MissionState) -> tuple[MissionState, jax.Arra
         warmstart=motion.warmstart,
         robots=dataclasses.replace(robots, command=motion.command),
         contacts=states.contacts + (motion.clearance < 0),
-        least_clearance=jnp.minimum(states.least_clearance, motion.clearance),
+        min_clearance=jnp.minimum(states.min_clearance, motion.clearance),
     )
     return states, motion.clearance
 
 
-def _clearance(config: ArenaConfig, layout: Layout, poses: jax.Array) -> jax.Array:
-    """Smallest free distance around any robot, `[B]` metres."""
+def _clearance(
+    config: ArenaConfig, layout: Layout, poses: Float[Array, "B R 3"]
+) -> Float[Array, " B"]:
+    """Smallest free distance around any robot, in metres."""
     around = jax.vmap(lambda layout, poses: navigation.clearance(config, layout, poses))
     return jnp.min(around(layout, poses), axis=-1)
 
 
 def _integrate(
-    mission: Mission, arena: Arena, motion: _Motion, wanted: jax.Array, layout: Layout
+    mission: Mission,
+    arena: Arena,
+    motion: _Motion,
+    wanted: Float[Array, "B R 2"],
+    layout: Layout,
 ) -> _Motion:
-    """Makes the physics steps, in each of which commands approach the wanted ones."""
+    """Makes the physics steps, in each of which the commands approach the wanted ones."""
     is_empty = not np.any(arena.poi_of_geom >= 0)
 
     def place_pois(layout: Layout, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -96,7 +105,7 @@ def _integrate(
     placed = jax.vmap(place_pois)(layout, motion.poses)
 
     def step(motion: _Motion, wanted: jax.Array, placed: tuple[jax.Array, jax.Array]) -> _Motion:
-        """Makes one step of one mission."""
+        """Makes one physics step of one mission."""
         command = navigation.ramp(motion.command, wanted, arenas.TIMESTEP)
         data: mjx.Data = arena.data.replace(
             mocap_pos=placed[0],

@@ -1,9 +1,8 @@
 """Ends and results of missions."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Int, PyTree
 
 from jaxsense.dqn import rewards
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
@@ -19,13 +18,13 @@ REASONS = (
     "robot failed",
     "no robot left",
 )
-"""Ends of a mission. `unreachable`: a robot gave up a PoI without getting there, and did not take
-it back before it ended; `undetected`: it gave up one after looks that showed nothing; `robot
-failed`: the others finished. The index is the reason's code."""
+"""Ends of a mission, by their codes. `unreachable`: a robot gave up a PoI that it could not get to,
+also when it retried; `undetected`: it gave one up after looks that showed nothing; `robot failed`:
+the others finished."""
 
 
-def reason(state: MissionState) -> jax.Array:
-    """Reason of a mission's end, `[]` int32 index into `REASONS`."""
+def reason(state: MissionState) -> Int[Array, ""]:
+    """Reason of a mission's end, as an index into `REASONS`."""
     robots = state.robots
     working = robots.phase != FAILED
     ends = [
@@ -42,16 +41,27 @@ def reason(state: MissionState) -> jax.Array:
     return code
 
 
-def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, Any]:
+def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, PyTree[Array]]:
     """Measures the results of a mission.
 
+    Args:
+      mission: the mission.
+      models: trained models.
+      state: the last state.
+
     Returns:
-      `[N]` each, `classes`, the true ones, `seen`, whether the PoI is in the map, `is_right`,
-      whether the map's most likely class is true, and `ambiguous`, whether the map leaves more than
-      one open (unseen PoIs are neither); `told`, for each modality `[]` the share of PoIs whose
-      label the map has right; `observations_per_poi`; `time_s`; `collisions`, control periods with
-      contact; `goals` and `goals_reached`; `information`, the sum over the map; `detections` `[R]`;
-      and `reason`.
+      `classes`: `[N]` int32 true classes.
+      `seen`: `[N]` bool, PoIs that were detected; others are neither right nor ambiguous.
+      `is_right`: `[N]` bool, whether the map's most likely class is the true one.
+      `ambiguous`: `[N]` bool, whether several classes are plausible.
+      `told`: for each modality, `[]` share of PoIs whose label the map has right.
+      `observations_per_poi`: `[]` looks per PoI.
+      `time_s`: `[]` duration, in seconds.
+      `collisions`: `[]` int32 control periods with contact.
+      `goals`, `goals_reached`: `[]` int32, of all robots.
+      `information`: `[]` sum over the map.
+      `detections`: `[R]` int32.
+      `reason`: `[]` int32, see `reason`.
     """
     config = mission.config
     means = models.fusion.classes.mean

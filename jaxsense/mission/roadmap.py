@@ -84,7 +84,7 @@ def lengths(
     return jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
 
 
-def reaches(config: Config, layout: Layout, roadmap: Roadmap, place: jax.Array) -> jax.Array:
+def reachable(config: Config, layout: Layout, roadmap: Roadmap, place: jax.Array) -> jax.Array:
     """Whether there is a way from a place to a viewpoint of each PoI, `[N]` bool; see `lengths`."""
     chex.assert_shape(place, (2,), custom_message="place")
     goals = roadmap.viewpoints.reshape(-1, 2)
@@ -97,7 +97,7 @@ def reaches(config: Config, layout: Layout, roadmap: Roadmap, place: jax.Array) 
     return jnp.any(direct, axis=-1) | jnp.any(around, axis=-1)
 
 
-def next_place(
+def next_waypoint(
     config: Config,
     layout: Layout,
     roadmap: Roadmap,

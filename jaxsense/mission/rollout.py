@@ -4,9 +4,10 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Int
 
 from jaxsense.core import checks
-from jaxsense.core.types import Key
+from jaxsense.core.types import Index, Key
 from jaxsense.mission import act, decide
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.motion import move
@@ -17,9 +18,6 @@ from jaxsense.mission.state import (
     MissionState,
     Record,
     Robots,
-    now,
-    robot_of,
-    with_robot,
 )
 from jaxsense.models import Models
 
@@ -27,18 +25,21 @@ from jaxsense.models import Models
 def rollout(
     key: Key, mission: Mission, models: Models, state: MissionState, steps: int
 ) -> tuple[MissionState, Record]:
-    """Runs some control periods of a mission as one `lax.scan`.
+    """Runs a mission for some control periods as one `lax.scan`.
 
     Args:
       key: random key.
       mission: the mission.
-      models: trained networks.
+      models: trained models.
       state: the first state.
-      steps: how many control periods; static. A mission that is over no longer changes.
+      steps: number of control periods; static. A mission that is done no longer changes.
 
     Returns:
-      The state after the last one, and the `[steps]` records. For many missions, `rollout_batch`
-      is faster than a `vmap` of this.
+      The last state, and the `[steps]` records. For many missions, `rollout_batch` is faster than a
+      `vmap` of this.
+
+    Raises:
+      ValueError: if `steps` is not positive.
     """
     checks.require_number("steps", steps)
 
@@ -60,20 +61,20 @@ def rollout_batch(
     every: int,
     parts: int = 1,
 ) -> tuple[MissionState, Record]:
-    """Runs missions side by side and records some of them.
+    """Runs B missions side by side, and records some of them.
 
     Args:
       keys: `[B]` random keys; each mission runs as in `rollout` with its key.
       mission: the mission.
-      models: trained networks.
+      models: trained models.
       states: `[B]` first states.
-      steps: how many control periods; static.
+      steps: number of control periods; static.
       every: records the first of each group of this size; divides B. With one group per device,
         no device waits for another's record.
-      parts: of how many devices each has its part of the batch; see `groups.where_due`.
+      parts: number of devices that share the batch, see `groups.where_due`.
 
     Returns:
-      The `[B]` states after the last one, and `[B / every, steps]` records.
+      The `[B]` last states, and `[B / every, steps]` records.
     """
 
     def go_on(states: MissionState, keys: Key):
@@ -88,13 +89,22 @@ def rollout_batch(
 def step(
     keys: Key, mission: Mission, models: Models, states: MissionState, parts: int = 1
 ) -> tuple[MissionState, Record]:
-    """Runs one control period of `[B]` missions side by side.
+    """Runs one control period of B missions side by side.
 
     In each, all robots decide, set their speeds and look, then all move. Policies and sensors run
-    only in the missions that need them: see `groups.where_due`, also for `parts`.
+    only in the missions that need them.
+
+    Args:
+      keys: `[B]` random keys.
+      mission: the mission.
+      models: trained models.
+      states: `[B]` current states.
+      parts: number of devices that share the batch, see `groups.where_due`.
+
+    Returns:
+      The `[B]` next states and records.
     """
     before = states
-    looks = states.robots.looks, states.robots.detections
     num_robots = mission.world.arena.num_robots
     robot_keys = jax.vmap(lambda key: jax.random.split(key, num_robots), out_axes=1)(keys)
     # One after the other, so that no robot scans what another has just made certain.
@@ -112,14 +122,14 @@ def step(
     keep = jax.vmap(jnp.where)
     states = jax.tree.map(lambda x, y: keep(before.done, x, y), before, after)
     records = Record(
-        time=states.steps * settings.control_period,
+        time=mission.time(states),
         poses=states.scene.poses,
         command=states.robots.command,
         wanted=states.robots.wanted,
         phase=states.robots.phase,
         target=states.robots.target,
-        scanned=states.robots.looks > looks[0],
-        detected=states.robots.detections > looks[1],
+        scanned=states.robots.looks > before.robots.looks,
+        detected=states.robots.detections > before.robots.detections,
         belief=states.belief,
         seen=states.seen,
         clearance=clearance,
@@ -132,30 +142,31 @@ def _act(
     mission: Mission,
     models: Models,
     states: MissionState,
-    robot: jax.Array,
+    robot: Int[Array, ""],
     parts: int,
 ) -> MissionState:
-    """Decides, sets speeds and scans for one robot of each of `[B]` missions."""
+    """Decides, sets speeds and scans for one robot of each of B missions."""
 
-    def fail(state: MissionState) -> MissionState:
-        stops = now(mission, state) >= state.faults.stops_at[robot]
-        own = robot_of(state, robot)
-        fails = stops & (own.phase != ENDED)
-        failed = dataclasses.replace(
-            own,
-            phase=jnp.where(fails, FAILED, own.phase),
-            target=jnp.where(fails, mission.config.arena.num_pois, own.target),
-        )
-        return with_robot(state, robot, own, failed)
-
-    def choose(key: Key, state: MissionState) -> Robots:
+    def choose(row: tuple[Key, MissionState]) -> Robots:
+        key, state = row
         return decide.decide(key, mission, models, state, robot).robots
 
     choice_keys, scan_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-    states = jax.vmap(fail)(states)
+    states = jax.vmap(lambda state: _fail(mission, state, robot))(states)
     due = jax.vmap(lambda state: decide.is_due(mission, state, robot))(states)
-    inputs = states.robots, choice_keys, states
-    robots = where_due(due & ~states.done, choose, *inputs, parts=parts)
+    inputs = choice_keys, states
+    robots = where_due(due & ~states.done, choose, states.robots, inputs, parts)
     states = dataclasses.replace(states, robots=robots)
     states = jax.vmap(lambda state: act.approach(mission, state, robot))(states)
     return act.scan(scan_keys, mission, models, states, robot, parts)
+
+
+def _fail(mission: Mission, state: MissionState, robot: Index) -> MissionState:
+    """Stops a robot when its time to fail has come."""
+    own = state.robot(robot)
+    fails = (mission.time(state) >= state.faults.stops_at[robot]) & (own.phase != ENDED)
+    return state.with_robot(
+        robot,
+        phase=jnp.where(fails, FAILED, own.phase),
+        target=jnp.where(fails, mission.config.arena.num_pois, own.target),
+    )

@@ -13,17 +13,17 @@ from jaxtyping import PyTree
 from jaxsense.config import MISSIONS_AT_ONCE, Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.mission.cases import Case
-from jaxsense.mission.outcome import measure
-from jaxsense.mission.rollout import rollout_batch
-from jaxsense.mission.state import (
+from jaxsense.mission import (
+    Case,
     Faults,
     Mission,
     MissionState,
     Record,
     make_mission,
+    measure,
     no_faults,
     reset,
+    rollout_batch,
 )
 from jaxsense.models import Models, init
 from jaxsense.run.compilation import Compiler, Program

@@ -207,11 +207,11 @@ def approach(team):
     return jax.jit(lambda state, robot: act.approach(team, state, robot))
 
 
-def driving(state, set_robot, view, seconds, progress_at, way_left=0.1):
+def driving(state, set_robot, view, seconds, progress_at, path_left=0.1):
     steps = round(seconds / CONFIG.mission.control_period)
     state = replace(state, steps=jnp.int32(steps))
     values = {"phase": DRIVING, "target": 0, "view": view, "goals": 1}
-    return set_robot(state, CAMERA, **values, progress_at=progress_at, way_left=way_left)
+    return set_robot(state, CAMERA, **values, progress_at=progress_at, path_left=path_left)
 
 
 def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
@@ -228,9 +228,9 @@ def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
     np.testing.assert_array_equal(np.flatnonzero(stuck.robots.excluded[CAMERA]), [0])
     assert (stuck.robots.goals[CAMERA], stuck.robots.reached[CAMERA]) == (1, 0)
     # A way that has become shorter is progress.
-    goes_on = approach(driving(start, set_robot, 0, patience + 0.2, 0.0, way_left=9.0), CAMERA)
+    goes_on = approach(driving(start, set_robot, 0, patience + 0.2, 0.0, path_left=9.0), CAMERA)
     assert goes_on.robots.phase[CAMERA] == DRIVING
-    assert goes_on.robots.way_left[CAMERA] < 9.0
+    assert goes_on.robots.path_left[CAMERA] < 9.0
     # And after the time of recovery it asks again.
     later = patience + 0.2 + act.RECOVERY_TIME + 0.1
     steps = jnp.int32(round(later / CONFIG.mission.control_period))

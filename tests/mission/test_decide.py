@@ -307,7 +307,7 @@ def test_a_robot_that_sees_the_poi_looks_from_where_it_stands(chosen):
     # PoI 1 is 0.8 m away and in full view; V is the place where the robot stands.
     state = chosen([0.0, 1.0, 0.0, 0.0])
     assert state.robots.view[0] == state.roadmap.viewpoints.shape[1]
-    assert state.robots.way_left[0] == 0
+    assert state.robots.path_left[0] == 0
     # PoI 2 is 1.6 m away.
     assert chosen([0.0, 0.0, 1.0, 0.0]).robots.view[0] < state.roadmap.viewpoints.shape[1]
 

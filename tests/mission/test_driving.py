@@ -63,7 +63,7 @@ def driven():
             if by_map:
                 far = jnp.full((1, 2), 1e3)
                 args = poses[0, :2], far, poi, view
-                _, waypoint = roadmap.next_place(CONFIG, layout, ways, *args)
+                _, waypoint = roadmap.next_waypoint(CONFIG, layout, ways, *args)
             args = poses, commands, 0, waypoint, PERIOD, jnp.bool_(False)
             wanted = navigation.drive_to(SETTINGS, ARENA, layout, *args)
             poses, commands, clearance = move(layout, poses, commands, wanted[None])

@@ -10,7 +10,8 @@ from jaxsense.mission.groups import where_due
 CALLS = []
 
 
-def draw(key, row):
+def draw(given):
+    key, row = given
     jax.debug.callback(lambda _: CALLS.append(1), row["x"])
     return {"drawn": row["x"] + jax.random.uniform(key)}
 
@@ -24,7 +25,7 @@ def test_rows_that_are_due_are_worked_out_and_the_others_stay(total, parts, shar
     keys = jax.random.split(jax.random.key(total), total)
     find = jax.jit(
         lambda due, before, keys, x: where_due(
-            due, draw, {"drawn": before}, keys, {"x": x}, parts=parts
+            due, draw, {"drawn": before}, (keys, {"x": x}), parts=parts
         )
     )
     CALLS.clear()

@@ -74,7 +74,7 @@ def test_contacts_hold_a_robot_back_where_there_are_any(move, pushing):
             state, _ = each(state)
         ends[name] = way(pushing(0.0, 0.0, 0.0), state)
         assert np.all(state.contacts > 0)
-        assert np.all(state.least_clearance < 0)
+        assert np.all(state.min_clearance < 0)
     # In half a second it drives 10 cm, but for the time it takes to start.
     assert np.all(ends["free"] > 0.08)
     assert np.all(ends["contacts"] < 0.01)

@@ -28,8 +28,8 @@ RING = np.concatenate([np.zeros((1, 2)), 0.6 * np.stack([np.cos(ANGLES), np.sin(
 
 build = jax.jit(roadmap.build, static_argnums=0)
 lengths = jax.jit(roadmap.lengths, static_argnums=0)
-reaches = jax.jit(roadmap.reaches, static_argnums=0)
-next_place = jax.jit(roadmap.next_place, static_argnums=0)
+reaches = jax.jit(roadmap.reachable, static_argnums=0)
+next_place = jax.jit(roadmap.next_waypoint, static_argnums=0)
 
 
 def planned(config, positions):
@@ -218,7 +218,7 @@ def followed():
         view = jnp.argmax(jnp.where(jnp.isfinite(length), draws, -1.0))
 
         def step(place, _):
-            left, waypoint = roadmap.next_place(CONFIG, layout, ways, place, FAR_AWAY, poi, view)
+            left, waypoint = roadmap.next_waypoint(CONFIG, layout, ways, place, FAR_AWAY, poi, view)
             away = waypoint - place
             share = jnp.minimum(0.02 / jnp.maximum(jnp.linalg.norm(away), 1e-9), 1.0)
             return place + share * away, (place, left)
@@ -414,8 +414,8 @@ def test_a_robot_that_is_alone_has_a_next_place():
     "call",
     [
         lambda plan, place: roadmap.lengths(*plan, place, 0),
-        lambda plan, place: roadmap.reaches(*plan, place),
-        lambda plan, place: roadmap.next_place(*plan, place, FAR_AWAY, 0, 0),
+        lambda plan, place: roadmap.reachable(*plan, place),
+        lambda plan, place: roadmap.next_waypoint(*plan, place, FAR_AWAY, 0, 0),
     ],
     ids=["lengths", "reaches", "next_place"],
 )

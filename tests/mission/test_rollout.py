@@ -103,10 +103,10 @@ def test_every_robot_visits_every_poi_once_and_ends(healthy):
 def test_nobody_touches_anything(healthy):
     _, end, record = healthy
     assert np.all(end.contacts == 0)
-    assert np.min(end.least_clearance) > 0.03
+    assert np.min(end.min_clearance) > 0.03
     moving = record.time > 0
     np.testing.assert_allclose(
-        np.where(moving, record.clearance, np.inf).min(axis=1), end.least_clearance, rtol=1e-6
+        np.where(moving, record.clearance, np.inf).min(axis=1), end.min_clearance, rtol=1e-6
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig, Config
-from jaxsense.mission import roadmap, state
+from jaxsense.mission import begin, roadmap
 
 # So narrow that from some places there is no way out.
 CONFIG = Config(arena=ArenaConfig(num_pois=16, poi_gap=0.1))
@@ -34,7 +34,7 @@ def started():
             return jnp.min(to_pois) - KEEP, jnp.all(jax.vmap(reached)(jnp.arange(16)))
 
         room, has_ways = jax.vmap(jax.vmap(look))(candidates)
-        return candidates, room, has_ways, state._random_poses(pose_key, CONFIG, layout, ways)
+        return candidates, room, has_ways, begin._random_poses(pose_key, CONFIG, layout, ways)
 
     return jax.tree.map(np.array, jax.jit(jax.vmap(start))(jax.random.split(jax.random.key(0), 64)))
 

@@ -1,0 +1,169 @@
+"""The start of missions."""
+
+import chex
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxsense.config import Config
+from jaxsense.core import checks
+from jaxsense.core.types import Key
+from jaxsense.mission import roadmap
+from jaxsense.mission.roadmap import Roadmap
+from jaxsense.mission.state import IDLE, Faults, Mission, MissionState, Robots, no_faults
+from jaxsense.models import make_bayes, make_prior
+from jaxsense.sim import arena as arenas
+from jaxsense.sim import sensors
+from jaxsense.sim.world import Scene
+
+_NUM_CANDIDATES = 32  # positions drawn for each robot
+
+
+def reset(
+    key: Key,
+    mission: Mission,
+    policy: Int[Array, ""] | int = 0,
+    faults: Faults | None = None,
+    classes: Int[Array, " N"] | None = None,
+) -> MissionState:
+    """Starts a mission in a random arena with an empty map.
+
+    Args:
+      key: random key, which alone determines the arena.
+      mission: the mission.
+      policy: `[]` int32 index into `Mission.policies`; by default `latent`, the trained one.
+      faults: which robots will fail; none by default.
+      classes: `[N]` int32 classes of the PoIs; independent by default.
+
+    Returns:
+      The state. Robots stand at random positions with room around them.
+
+    Raises:
+      ValueError: if a class, the policy or a time is out of range.
+    """
+    config = mission.config
+    class_key, layout_key, light_key, pose_key = jax.random.split(key, 4)
+    num_pois = config.arena.num_pois
+    if classes is None:
+        classes = jax.random.randint(class_key, (num_pois,), 0, len(config.arena.classes))
+    layout = arenas.random_layout(layout_key, config.arena, classes)
+    paths = roadmap.build(config, layout)
+    poses = _random_poses(pose_key, config, layout, paths)
+    scene = Scene(layout, sensors.random_light(light_key), poses)
+    faults = no_faults(config) if faults is None else faults
+    return start(mission, scene, classes, jnp.asarray(policy, jnp.int32), faults, paths)
+
+
+def start(
+    mission: Mission,
+    scene: Scene,
+    classes: Int[Array, " N"],
+    policy: Int[Array, ""],
+    faults: Faults,
+    paths: Roadmap | None = None,
+) -> MissionState:
+    """Starts a mission in a given arena with an empty map.
+
+    Args:
+      mission: the mission.
+      scene: PoIs, light and the robots' poses.
+      classes: `[N]` int32 classes of the PoIs.
+      policy: `[]` int32 index into `Mission.policies`.
+      faults: which robots will fail.
+      paths: roadmap of the layout; computed by default.
+
+    Raises:
+      ValueError: if a class, the policy or a time is out of range.
+    """
+    config = mission.config
+    num_robots, num_pois = len(config.carried), config.arena.num_pois
+    num_classes = len(config.arena.classes)
+    chex.assert_shape(classes, (num_pois,), custom_message="classes")
+    checks.require_index("classes", classes, num_classes)
+    checks.require_index("policy", policy, len(mission.policies))
+    chex.assert_shape(scene.poses, (num_robots, 3), custom_message="scene.poses")
+    _check_faults(faults, num_robots)
+    prior, exact = make_prior(config), make_bayes(config)
+    paths = roadmap.build(config, scene.layout) if paths is None else paths
+    return MissionState(
+        scene=scene,
+        classes=classes,
+        roadmap=paths,
+        faults=faults,
+        policy=policy,
+        velocity=jnp.zeros((num_robots, 3)),
+        warmstart=jnp.zeros(3 * num_robots),
+        belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), prior),
+        log_posterior=jnp.tile(exact.prior, (num_pois, 1)),
+        times_seen=jnp.zeros((num_pois, len(config.modalities)), jnp.int32),
+        version=jnp.int32(0),
+        robots=_idle_robots(num_robots, num_pois, paths.is_free.shape[1]),
+        steps=jnp.int32(0),
+        contacts=jnp.int32(0),
+        min_clearance=jnp.float32(jnp.inf),
+        done=jnp.bool_(False),
+    )
+
+
+def _check_faults(faults: Faults, num_robots: int) -> None:
+    """Raises `ValueError` if a time is negative; there must be one for each robot."""
+    for name in ("stops_at", "blind_at"):
+        times = getattr(faults, name)
+        chex.assert_shape(times, (num_robots,), custom_message=f"faults.{name}")
+        expected = "must be seconds, infinite for never"
+        checks.require(f"faults.{name}", times, lambda x: x >= 0, expected)
+
+
+def _idle_robots(num_robots: int, num_pois: int, num_views: int) -> Robots:
+    """Robots before their first decision."""
+    number = jnp.zeros(num_robots, jnp.int32)
+    seconds = jnp.zeros(num_robots)
+    return Robots(
+        phase=number + IDLE,
+        target=number + num_pois,
+        view=number,
+        command=jnp.zeros((num_robots, 2)),
+        wanted=jnp.zeros((num_robots, 2)),
+        decided_on=number,
+        excluded=jnp.zeros((num_robots, num_views + 1), bool),
+        attempts=number,
+        path_left=seconds,
+        progress_at=seconds,
+        backs_off_until=seconds,
+        unreachable=jnp.zeros((num_robots, num_pois), bool),
+        undetected=jnp.zeros((num_robots, num_pois), bool),
+        tried_again=jnp.zeros(num_robots, bool),
+        goals=number,
+        reached=number,
+        looks=number,
+        detections=number,
+    )
+
+
+def _random_poses(
+    key: Key, config: Config, layout: arenas.Layout, paths: Roadmap
+) -> Float[Array, "R 3"]:
+    """Random poses with room around the robots and, where possible, paths to all PoIs."""
+    num_robots, settings = len(config.carried), config.navigation
+    draws = jax.random.uniform(key, (num_robots, 3, _NUM_CANDIDATES), minval=-1.0)
+    reach = config.arena.side / 2 - settings.robot_radius
+    candidates = reach * jnp.swapaxes(draws[:, :2], 1, 2)
+
+    def room_at(position: jax.Array) -> jax.Array:
+        to_pois = jnp.linalg.norm(layout.position - position[None], axis=-1)
+        room = jnp.min(to_pois) - config.arena.poi_extent - settings.robot_radius
+        # A corner behind a PoI may have no way out.
+        has_paths = jnp.all(roadmap.reachable(config, layout, paths, position))
+        return jnp.where(has_paths, room, room - config.arena.side)
+
+    def place_robot(taken: jax.Array, robot: jax.Array) -> tuple[jax.Array, jax.Array]:
+        apart = jnp.linalg.norm(candidates[robot][:, None] - taken[None], axis=-1)
+        beside = jnp.min(apart, axis=-1) - 3 * settings.robot_radius
+        free = jnp.minimum(room[robot], beside)
+        chosen = jnp.where(jnp.any(free > 0), jnp.argmax(free > 0), jnp.argmax(free))
+        position, yaw = candidates[robot, chosen], jnp.pi * draws[robot, 2, chosen]
+        return taken.at[robot].set(position), jnp.append(position, yaw)
+
+    room = jax.vmap(jax.vmap(room_at))(candidates)
+    nowhere = jnp.full((num_robots, 2), jnp.inf)
+    return jax.lax.scan(place_robot, nowhere, jnp.arange(num_robots))[1]
