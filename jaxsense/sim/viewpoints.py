@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsense.config import ArenaConfig, ViewpointConfig
-from jaxsense.core.types import Key
+from jaxsense.core.types import Index, Key
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
 
@@ -84,7 +84,7 @@ def free_room(
     arena: ArenaConfig,
     layout: Layout,
     others: Float[Array, "K 2"],
-    poi: Int[Array, ""],
+    poi: Index,
 ) -> Float[Array, "V"]:
     """Free room around V viewpoints and in the view from them.
 
