@@ -30,7 +30,7 @@ def pattern(phrase):
 
 
 def prose_of_source(text):
-    """Docstrings, messages, help and comments, each with its line. A lone word is a name."""
+    """Docstrings, messages, help and comments, with their lines; a string of one word is a name."""
     for node in ast.walk(ast.parse(text)):
         parts = node.values if isinstance(node, ast.JoinedStr) else [node]
         found = [x.value if isinstance(x, ast.Constant) else "{}" for x in parts]

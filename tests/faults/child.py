@@ -1,7 +1,7 @@
 """`python -m tests.faults.child FAULT STAGE ARGUMENTS...`: a training that meets a fault.
 
 The fault strikes in this process, at the first program of a stage that has run; in the stage
-`write` when the first plot is about to be written. `gradient` makes one array of a training's
+`write` when the plots are about to be drawn. `gradient` makes one array of a training's
 gradients NaN, within its compiled program, in step `NAN_STEP`.
 
 `clock` lets all runs begin in the same second. `evaluate` and `export` as STAGE begin that program
@@ -127,7 +127,7 @@ class StoppedClock(datetime.datetime):
 
 def strike_at(stage: str, fault: str) -> None:
     """Lets a fault happen once."""
-    run, write_plots, struck = Program.__call__, plots.write_plots, []
+    run, draw_plots, struck = Program.__call__, plots.of_run, []
 
     def strike() -> None:
         if not struck:
@@ -144,12 +144,12 @@ def strike_at(stage: str, fault: str) -> None:
         strike()
         return output
 
-    def write(*args: Any) -> None:
+    def draw(*args: Any) -> dict[str, bytes]:
         strike()
-        write_plots(*args)
+        return draw_plots(*args)
 
     if stage == "write":
-        plots.write_plots = write
+        plots.of_run = draw
     else:
         Program.__call__ = call
 
