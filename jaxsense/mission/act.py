@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.core.types import Belief, Index, Key, call, others, pytree
 from jaxsense.looks import features_of
 from jaxsense.mission import navigation, roadmap
-from jaxsense.mission.decide import is_taken, sees, standing_robots
+from jaxsense.mission.decide import is_taken, sees
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.state import (
     BACKING,
@@ -47,7 +47,7 @@ def approach(mission: Mission, state: MissionState, robot: Index) -> MissionStat
     config, own = mission.config, state.robot(robot)
     num_views = state.roadmap.viewpoints.shape[1]
     poi, view = _target(mission, own), jnp.minimum(own.view, num_views - 1)
-    position, standing = state.scene.poses[robot, :2], standing_robots(state, robot)
+    position, standing = state.scene.poses[robot, :2], state.standing_robots(robot)
     length, waypoint = roadmap.next_waypoint(
         config, state.scene.layout, state.roadmap, position, standing, poi, view
     )
@@ -133,13 +133,7 @@ def _is_in_the_way(mission: Mission, state: MissionState, robot: Index) -> Bool[
 
 @pytree
 class _Failure:
-    """A robot's failures at its target.
-
-    Attributes:
-      attempts: `[]` int32, as in `Robots`.
-      excluded: `[V + 1]` bool, as in `Robots`.
-      gives_up: `[N]` bool, the target if the robot gives it up now.
-    """
+    """New `attempts` and `excluded` of a robot, and its target if the robot gives it up."""
 
     attempts: Int[Array, ""]
     excluded: Bool[Array, " V+1"]
@@ -159,15 +153,7 @@ def _fail(own: Robots, applies: Bool[Array, ""], attempts: int) -> _Failure:
 
 @pytree
 class _Aim:
-    """The next scan of a robot.
-
-    Attributes:
-      scans: `[]` bool, whether it scans at all.
-      poi: `[]` int32 PoI that it faces.
-      bearing: `[]` believed bearing of the PoI, in radians.
-      distance: `[]` of the PoI, in metres.
-      noise_key: random key of the sensor's noise.
-    """
+    """Whether a robot scans, and which PoI, at which believed bearing [rad] and distance [m]."""
 
     scans: Bool[Array, ""]
     poi: Int[Array, ""]
@@ -178,13 +164,7 @@ class _Aim:
 
 @pytree
 class _Look:
-    """The result of a scan.
-
-    Attributes:
-      detects: `[]` bool, whether it updates the map.
-      belief: `[D]` of the PoI after an update.
-      log_posterior: `[C]` of the PoI after an update.
-    """
+    """Whether a scan detects its PoI, and the belief and exact posterior if it does."""
 
     detects: Bool[Array, ""]
     belief: Belief

@@ -9,7 +9,6 @@ from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission import roadmap
 from jaxsense.mission.state import (
-    BACKING,
     DRIVING,
     ENDED,
     FACING,
@@ -177,7 +176,7 @@ def _best_view(
 
 
 def is_taken(
-    mission: Mission, state: MissionState, robot: Index, poi: Index, view: Index
+    mission: Mission, state: MissionState, robot: Index, poi: Int[Array, ""], view: Int[Array, ""]
 ) -> Bool[Array, ""]:
     """Whether another robot stands at a viewpoint or in the view from it.
 
@@ -192,7 +191,9 @@ def is_taken(
     return _room(mission, state, robot, poi, position, mission.config.navigation.margin)[0] <= 0
 
 
-def sees(mission: Mission, state: MissionState, robot: Index, poi: Index) -> Bool[Array, ""]:
+def sees(
+    mission: Mission, state: MissionState, robot: Index, poi: Int[Array, ""]
+) -> Bool[Array, ""]:
     """Whether a PoI is in range of a robot, and nothing that stands still covers it.
 
     Args:
@@ -212,23 +213,11 @@ def _room(
     mission: Mission,
     state: MissionState,
     robot: Index,
-    poi: Index,
+    poi: Int[Array, ""],
     positions: Float[Array, "C 2"],
     margin: float,
 ) -> Float[Array, " C"]:
     """Free room around positions to look at a PoI from, see `viewpoints.free_room`."""
-    standing, layout = standing_robots(state, robot), state.scene.layout
+    standing, layout = state.standing_robots(robot), state.scene.layout
     x, y = positions[:, 0], positions[:, 1]
     return viewpoints.free_room(x, y, margin, mission.config.arena, layout, standing, poi)
-
-
-def standing_robots(state: MissionState, robot: Index) -> Float[Array, "R-1 2"]:
-    """Positions of the other robots; moving ones, which will be gone, count as far away.
-
-    Args:
-      state: the current state.
-      robot: index of the robot.
-    """
-    phase = others(state.robots.phase, robot)
-    drives = (phase == DRIVING) | (phase == BACKING)
-    return jnp.where(drives[:, None], 1e3, others(state.scene.poses[:, :2], robot))

@@ -20,15 +20,7 @@ from jaxsense.sim.arena import Arena, Layout
 
 @pytree
 class _Motion:
-    """State of the physics of B missions.
-
-    Attributes:
-      poses: `[B, R, 3]`.
-      velocity: `[B, R, 3]`.
-      warmstart: `[B, V]`.
-      command: `[B, R, 2]`.
-      clearance: `[B]` the smallest so far, in metres.
-    """
+    """Physics of B missions, and the smallest free distance [m] so far."""
 
     poses: Float[Array, "B R 3"]
     velocity: Float[Array, "B R 3"]

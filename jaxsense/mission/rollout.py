@@ -42,14 +42,9 @@ def rollout(
       ValueError: if `steps` is not positive.
     """
     checks.require_number("steps", steps)
-
-    def go_on(states: MissionState, key: Key):
-        states, records = step(key[None], mission, models, states)
-        return states, jax.tree.map(lambda x: x[0], records)
-
     alone = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
-    states, records = jax.lax.scan(go_on, alone, jax.random.split(key, steps))
-    return jax.tree.map(lambda x: x[0], states), records
+    batch = rollout_batch(key[None], mission, models, alone, steps, every=1)
+    return jax.tree.map(lambda x: x[0], batch)
 
 
 def rollout_batch(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config, ConfigError
-from jaxsense.core.types import Belief, Index, pytree
+from jaxsense.core.types import Belief, Index, others, pytree
 from jaxsense.dqn.policies import Policy, Values, table
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.sim import arena as arenas_of
@@ -130,6 +130,12 @@ class MissionState:
     def robot(self, robot: Index) -> Robots:
         """State of one robot: the fields of `Robots` without their first axis."""
         return jax.tree.map(lambda x: x[robot], self.robots)
+
+    def standing_robots(self, robot: Index) -> Float[Array, "R-1 2"]:
+        """Positions of the other robots; moving ones, which will be gone, count as far away."""
+        phase = others(self.robots.phase, robot)
+        moves = (phase == DRIVING) | (phase == BACKING)
+        return jnp.where(moves[:, None], 1e3, others(self.scene.poses[:, :2], robot))
 
     def with_robot(self, robot: Index, **changes: jax.Array) -> "MissionState":
         """Changes one robot.

@@ -28,12 +28,12 @@ RING = np.concatenate([np.zeros((1, 2)), 0.6 * np.stack([np.cos(ANGLES), np.sin(
 
 build = jax.jit(roadmap.build, static_argnums=0)
 lengths = jax.jit(roadmap.lengths, static_argnums=0)
-reaches = jax.jit(roadmap.reachable, static_argnums=0)
-next_place = jax.jit(roadmap.next_waypoint, static_argnums=0)
+reachable = jax.jit(roadmap.reachable, static_argnums=0)
+next_waypoint = jax.jit(roadmap.next_waypoint, static_argnums=0)
 
 
 def planned(config, positions):
-    """The first arguments of `lengths` and `next_place`."""
+    """The first arguments of `lengths` and `next_waypoint`."""
     number = len(positions)
     position, classes = jnp.array(positions, jnp.float32), jnp.zeros(number, jnp.int32)
     layout = sim.make_layout(config.arena, position, jnp.zeros(number), classes)
@@ -80,7 +80,7 @@ def test_viewpoints_lie_all_around_at_the_configured_distances(poi):
 def test_a_way_with_nothing_between_is_straight(view, goal, length):
     args = *planned(CONFIG, [[0.0, 0.0], [1.2, 1.2], [-1.2, 1.2]]), jnp.array([-0.8, -0.4])
     assert lengths(*args, 0)[view] == pytest.approx(length, abs=1e-5)
-    way, place = next_place(*args, FAR_AWAY, 0, view)
+    way, place = next_waypoint(*args, FAR_AWAY, 0, view)
     assert way == pytest.approx(length, abs=1e-5)
     np.testing.assert_allclose(place, goal, atol=1e-6)
 
@@ -91,7 +91,7 @@ def test_a_way_is_straight_if_it_keeps_the_planning_radius(passes_at, is_straigh
     # the planning radius is 0.241421.
     sine = passes_at / 0.9
     start = jnp.array([0.9 - 1.8 * np.sqrt(1 - sine**2), 1.8 * sine])
-    length, place = next_place(*planned(ALONE, [[0.0, 0.0]]), start, FAR_AWAY, 0, OUTER + EAST)
+    length, place = next_waypoint(*planned(ALONE, [[0.0, 0.0]]), start, FAR_AWAY, 0, OUTER + EAST)
     assert np.allclose(place, [0.9, 0.0], atol=1e-6) == is_straight
     assert length == pytest.approx(1.8, abs=1e-5) if is_straight else 1.8 < length < 1.81
 
@@ -136,7 +136,7 @@ def test_the_way_to_the_far_side_of_a_poi_is_longer_than_straight():
     # Tangents of sqrt(1 - 0.2414^2) = 0.9704 and sqrt(0.9^2 - 0.2414^2) = 0.8670, and an arc of
     # pi - acos(0.2414 / 1) - acos(0.2414 / 0.9) = 0.5154 rad at 0.2414: 0.1244. Straight is 1.9.
     assert 0.9704 + 0.8670 + 0.1244 - 1e-4 < length < 1.06 * 1.9618
-    way, place = next_place(*args, FAR_AWAY, 0, OUTER + EAST)
+    way, place = next_waypoint(*args, FAR_AWAY, 0, OUTER + EAST)
     assert way == pytest.approx(float(length), rel=1.1e-3)
     assert np.linalg.norm(place) > KEEP
 
@@ -155,7 +155,7 @@ def test_no_way_leads_between_a_poi_and_a_wall_that_is_near(start, shortest):
     # To (1.18, 0.5) around a PoI at (1.18, 0). A robot's middle can go to 1.5 - 0.1 = 1.4 only,
     # which is 0.22 from the middle of the PoI.
     plan = planned(ALONE, [[1.18, 0.0]])
-    way, place = next_place(*plan, jnp.array(start), FAR_AWAY, 0, NORTH)
+    way, place = next_waypoint(*plan, jnp.array(start), FAR_AWAY, 0, NORTH)
     assert place[0] < 1.18
     assert shortest - 1e-3 < way < 1.05 * shortest
 
@@ -182,7 +182,7 @@ def test_a_robot_near_a_node_is_led_on_to_the_next(offset):
     nodes = plan[2].nodes[:, None]
     places = nodes + offset * jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)[None]
     assert np.linalg.norm(places, axis=-1).min() > KEEP
-    lead = functools.partial(next_place, *plan)
+    lead = functools.partial(next_waypoint, *plan)
     by_view = jax.vmap(lead, in_axes=(None, None, None, 0))
     by_place = jax.vmap(by_view, in_axes=(0, None, None, None))
     length, place = by_place(places.reshape(-1, 2), FAR_AWAY, 0, jnp.arange(2 * OUTER))
@@ -202,7 +202,7 @@ def test_a_viewpoint_close_to_another_poi_is_reached():
 
 @pytest.fixture(scope="module")
 def followed():
-    """Robots that go 2 cm at a time to what `next_place` says, in 100 random arenas."""
+    """Robots that go 2 cm at a time to what `next_waypoint` says, in 100 random arenas."""
 
     def follow(key):
         layout_key, class_key, place_key, poi_key, view_key = jax.random.split(key, 5)
@@ -230,13 +230,13 @@ def followed():
     return jax.tree.map(np.array, followed)
 
 
-def test_following_the_next_place_reaches_the_viewpoint_by_the_promised_way(followed):
+def test_following_the_next_waypoint_reaches_the_viewpoint_by_the_promised_way(followed):
     _, goal, length, path, left = followed
     assert np.isfinite(length).all()
     assert length.max() > 2.5
     away = np.linalg.norm(path - goal[:, None], axis=-1)
     assert away[:, -1].max() < 1e-5
-    # One thousandth is what `next_place` adds to prefer the farther of two nodes on a way; the last
+    # One thousandth is what `next_waypoint` adds to prefer the farther of two nodes on a way; the last
     # step is short.
     walked = 0.02 * (away > 1e-5).sum(axis=-1)
     assert np.all(walked <= 1.001 * length + 0.02 + 1e-4)
@@ -245,7 +245,7 @@ def test_following_the_next_place_reaches_the_viewpoint_by_the_promised_way(foll
     assert np.diff(left, axis=-1).max() < 1e-5
 
 
-def test_following_the_next_place_keeps_off_pois_and_walls(followed):
+def test_following_the_next_waypoint_keeps_off_pois_and_walls(followed):
     position, _, _, path, _ = followed
     apart = np.linalg.norm(path[:, :, None] - position[:, None], axis=-1)
     assert apart.min() > KEEP - 2e-3
@@ -260,7 +260,7 @@ def test_a_poi_in_a_ring_of_others_cannot_be_reached_from_outside(start):
     closed = planned(WALLED_IN, RING)
     assert np.all(closed[2].is_free[0])
     np.testing.assert_array_equal(lengths(*closed, start, 0), np.inf)
-    length, _ = next_place(*closed, start, FAR_AWAY, 0, 0)
+    length, _ = next_waypoint(*closed, start, FAR_AWAY, 0, 0)
     assert length == np.inf
     # One of the ring itself can be reached.
     assert np.isfinite(lengths(*closed, start, 1).min())
@@ -331,7 +331,7 @@ def test_a_place_reaches_the_pois_with_a_way_of_finite_length():
         each = jax.vmap(lambda place, poi, plan=plan: lengths(*plan, place, poi), in_axes=(None, 0))
         length = jax.vmap(each, in_axes=(0, None))(places, jnp.arange(9))
         expected = np.isfinite(length).any(axis=-1)
-        found = jax.vmap(lambda place, plan=plan: reaches(*plan, place))(places)
+        found = jax.vmap(lambda place, plan=plan: reachable(*plan, place))(places)
         np.testing.assert_array_equal(found, expected)
         shares.append(expected[:, 0].mean())
     # Within the ring, and from nearly everywhere.
@@ -345,7 +345,7 @@ def test_a_place_with_no_node_in_sight_reaches_the_pois_around_it():
     # The viewpoint at 0.35 m and 22.5 degrees is 0.246 from two of them, which is enough.
     plan = planned(WALLED_IN, RING * 0.53 / 0.6)
     place = 0.3 * jnp.array([np.cos(np.pi / 8), np.sin(np.pi / 8)])
-    reached = reaches(*plan, place)
+    reached = reachable(*plan, place)
     by_poi = jax.vmap(lambda poi: lengths(*plan, place, poi))(jnp.arange(9))
     np.testing.assert_array_equal(reached, np.isfinite(by_poi).any(axis=-1))
     # Those of the ring on its side have viewpoints beside it, those beyond the middle none.
@@ -377,7 +377,7 @@ def test_only_free_viewpoints_have_a_way(beside_wall_and_poi, view, is_free):
     assert np.isinf(ways.to_viewpoint[0, view]).all() != is_free
     # Even from where it is.
     assert lengths(*beside_wall_and_poi, here, 0)[view] == expected
-    length, place = next_place(*beside_wall_and_poi, here, FAR_AWAY, 0, view)
+    length, place = next_waypoint(*beside_wall_and_poi, here, FAR_AWAY, 0, view)
     assert length == expected
     if is_free:
         np.testing.assert_array_equal(place, here)
@@ -385,15 +385,15 @@ def test_only_free_viewpoints_have_a_way(beside_wall_and_poi, view, is_free):
 
 @pytest.mark.parametrize(("offset", "is_taken"), [(0.0, True), (0.19, True), (0.21, False)])
 @pytest.mark.parametrize("start", [(-1.0, 0.0), (-0.4, -0.9), (0.95, -0.9)])
-def test_the_next_place_is_not_where_another_robot_stands(start, offset, is_taken):
+def test_the_next_waypoint_is_not_where_another_robot_stands(start, offset, is_taken):
     # From the first two a node is the next place to (0.9, 0), from the last one that itself.
     # Two robots with 0.1 each stand there if their middles are less than 0.2 apart.
     args = *planned(ALONE, [[0.0, 0.0]]), jnp.array(start)
-    length, place = next_place(*args, FAR_AWAY, 0, OUTER + EAST)
+    length, place = next_waypoint(*args, FAR_AWAY, 0, OUTER + EAST)
     # Beyond it, where no other place of the way is near.
     other = place + offset * (place - args[3]) / jnp.linalg.norm(place - args[3])
     others = jnp.stack([FAR_AWAY[0], other])
-    detour, aside = next_place(*args, others, 0, OUTER + EAST)
+    detour, aside = next_waypoint(*args, others, 0, OUTER + EAST)
     assert detour >= length
     if is_taken:
         assert np.linalg.norm(aside - other) >= 0.2 - 1e-6
@@ -402,10 +402,10 @@ def test_the_next_place_is_not_where_another_robot_stands(start, offset, is_take
         np.testing.assert_array_equal(aside, place)
 
 
-def test_a_robot_that_is_alone_has_a_next_place():
+def test_a_robot_that_is_alone_has_a_next_waypoint():
     args = *planned(ALONE, [[0.0, 0.0]]), jnp.array([-1.0, 0.0])
-    expected = next_place(*args, FAR_AWAY, 0, OUTER + EAST)
-    ours = next_place(*args, jnp.zeros((0, 2)), 0, OUTER + EAST)
+    expected = next_waypoint(*args, FAR_AWAY, 0, OUTER + EAST)
+    ours = next_waypoint(*args, jnp.zeros((0, 2)), 0, OUTER + EAST)
     np.testing.assert_array_equal(ours[0], expected[0])
     np.testing.assert_array_equal(ours[1], expected[1])
 
@@ -417,10 +417,10 @@ def test_a_robot_that_is_alone_has_a_next_place():
         lambda plan, place: roadmap.reachable(*plan, place),
         lambda plan, place: roadmap.next_waypoint(*plan, place, FAR_AWAY, 0, 0),
     ],
-    ids=["lengths", "reaches", "next_place"],
+    ids=["lengths", "reachable", "next_waypoint"],
 )
-def test_a_wrong_shape_of_the_place_is_named_while_tracing(call):
+def test_a_wrong_shape_of_the_position_is_named_while_tracing(call):
     plan = planned(ALONE, [[0.0, 0.0]])
     jax.eval_shape(lambda place: call(plan, place), jnp.zeros(2))
-    with pytest.raises(AssertionError, match="place"):
+    with pytest.raises(AssertionError, match="position"):
         jax.eval_shape(lambda place: call(plan, place), jnp.zeros(3))
