@@ -18,7 +18,7 @@ POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
 @pytest.mark.slow  # a minute, mostly compiling; before a release
 def test_missions_with_contacts_always_and_never_computed_take_the_same_decisions(team, models):
     never = mission.make_mission(CONFIG, contacts=False)
-    always = mission.Mission(team.world, team.world.arena, team.config)
+    always = mission.Mission(team.world, team.world.arena, team.config, team.policies)
     keys = jax.random.split(jax.random.key(2), 6)
     records = []
     for each in (never, always):

@@ -16,8 +16,8 @@ from jaxsense.config import ConfigError
 from jaxsense.dqn.policies import Policy
 from jaxsense.mission import decide
 from jaxsense.mission.state import DRIVING
-from jaxsense.run import programs
-from jaxsense.run.monitor import StageError, Stopped
+from jaxsense.run import pipeline, programs
+from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.sim import arena as arenas
 
 # The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
@@ -146,6 +146,17 @@ def test_train_refuses_a_policy_that_it_is_not_given(tmp_path, capsys):
     line = "jaxsense.train: mission.policies = ('latent', 'mine'): must name some of latent, greedy"
     assert capsys.readouterr().err.startswith(line)
     assert not (tmp_path / "run").exists()
+
+
+def test_own_policies_reach_the_programs_of_a_run(monkeypatch):
+    monkeypatch.setattr(programs, "_trace", lambda run, compiler: None)
+    with pipeline.compiled(playing("mine"), Monitor(), policies=OWN) as made:
+        assert made.policies == OWN
+    with (
+        pytest.raises(ConfigError, match=r"mission\.policies = \('mine',\): must name some of"),
+        pipeline.compiled(playing("mine"), Monitor()),
+    ):
+        pass
 
 
 def test_own_policies_reach_the_missions_of_a_run(team, monkeypatch):

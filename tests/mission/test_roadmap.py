@@ -236,7 +236,7 @@ def test_following_the_next_waypoint_reaches_the_viewpoint_by_the_promised_way(f
     assert length.max() > 2.5
     away = np.linalg.norm(path - goal[:, None], axis=-1)
     assert away[:, -1].max() < 1e-5
-    # One thousandth is what `next_waypoint` adds to prefer the farther of two nodes on a way; the last
+    # One thousandth is what `next_waypoint` adds to prefer the farther of two nodes; the last
     # step is short.
     walked = 0.02 * (away > 1e-5).sum(axis=-1)
     assert np.all(walked <= 1.001 * length + 0.02 + 1e-4)
