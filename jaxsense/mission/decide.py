@@ -120,8 +120,8 @@ def _choose(
 
 def _values(
     key: Key, mission: Mission, models: Models, known: Known, policy: Int[Array, ""]
-) -> Float[Array, " N+1"]:
-    """Values of a policy's actions, NOP's last."""
+) -> Float[Array, " A"]:
+    """Values of the A = N + 1 actions of a policy, NOP's last."""
     of_each = [each.values(key, models, known) for each in mission.policies.values()]
     return jnp.stack(of_each)[policy]
 
@@ -154,12 +154,12 @@ def _best_view(
     state: MissionState,
     robot: Index,
     target: Int[Array, ""],
-    excluded: Bool[Array, " V+1"],
-) -> tuple[Int[Array, ""], Float[Array, ""], Bool[Array, " V+1"]]:
+    excluded: Bool[Array, " W"],
+) -> tuple[Int[Array, ""], Float[Array, ""], Bool[Array, " W"]]:
     """Nearest viewpoint of a PoI, V for the robot's current position.
 
     Returns:
-      The viewpoint, the length of the path in metres, and the viewpoints that stay excluded: none
+      The viewpoint, the length of the path in metres, and the excluded ones of W = V + 1: none
       if all that can be reached have been.
     """
     config, scene = mission.config, state.scene

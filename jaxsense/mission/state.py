@@ -131,7 +131,7 @@ class MissionState:
         """State of one robot: the fields of `Robots` without their first axis."""
         return jax.tree.map(lambda x: x[robot], self.robots)
 
-    def standing_robots(self, robot: Index) -> Float[Array, "R-1 2"]:
+    def standing_robots(self, robot: Index) -> Float[Array, "_ 2"]:
         """Positions of the other robots; moving ones, which will be gone, count as far away."""
         phase = others(self.robots.phase, robot)
         moves = (phase == DRIVING) | (phase == BACKING)
