@@ -14,9 +14,9 @@ import rich.table
 
 from benchmarks import ROWS
 from benchmarks.measure import Options, Row
-from jaxsense import cli
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
+from jaxsense.run import cli
 
 PROGRAM = "benchmarks"
 _WIDTH_OF_FILES = 160

@@ -2,9 +2,10 @@
 
 import contextlib
 import dataclasses
+import functools
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -12,20 +13,17 @@ import jax
 import rich.console
 import rich.table
 
-from jaxsense import cli, mission, summary
-from jaxsense.config import Config, ConfigError
+from jaxsense import mission, summary
+from jaxsense.config import TIMESTEP, Config, ConfigError
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Name
-from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import Policy, Values
-from jaxsense.run import devices, files, missions, rundir
+from jaxsense.run import cli, devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
-from jaxsense.run.missions import Recording
 from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.show import animation, mission_plots, page, plots, tables
 from jaxsense.show.terminal import Display, print_table, say
-from jaxsense.sim.arena import TIMESTEP
 from jaxsense.summary import compare
 from jaxsense.summary.read import EVALUATIONS
 
@@ -124,9 +122,15 @@ def main(
         seconds = time.perf_counter() - begin
         compiling = compiler.monitor.seconds["mission"]["compile_s"]
     block = summary.missions(team, found.metrics)
+    draw = functools.partial(
+        animation.draw,
+        config,
+        found.recording.records,
+        found.recording.end,
+        models.fusion.classes,
+    )
     try:
-        beliefs = models.fusion.classes
-        written = _write(arguments, trained, config, beliefs, block, found.recording)
+        written = _write(arguments, trained, config, block, draw)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
@@ -147,9 +151,8 @@ def _write(
     arguments: Arguments,
     trained: Config,
     config: Config,
-    class_beliefs: Belief,
     missions: summary.Missions,
-    recording: Recording,
+    draw: Callable[[str], str],
 ) -> list[str]:
     """Writes an evaluation, the page that shows it and, if requested, the film.
 
@@ -157,9 +160,8 @@ def _write(
       arguments: of the program.
       trained: the settings of the run.
       config: the settings of these missions.
-      class_beliefs: `[C, D]` beliefs of the classes.
       missions: what was measured.
-      recording: the first mission.
+      draw: draws the film of the first mission with a title.
 
     Returns:
       Lines about where they are.
@@ -173,8 +175,7 @@ def _write(
             suffix = f"-{place}"
             title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
         film = run / f"mission-{name}-{arguments.seed}{suffix}.svg"
-        content = animation.draw(config, recording.records, recording.end, class_beliefs, title)
-        files.write(film, content)
+        files.write(film, draw(title))
         written.append(f"The first mission of {name} is in {film}.")
     for case in summary.cases(missions).values():
         case["seed"] = arguments.seed

@@ -18,14 +18,11 @@ import jax
 import numpy as np
 from jax import export
 
-from jaxsense import cli
-from jaxsense.config import Config, ConfigError
+from jaxsense import Config, ConfigError, Models, __version__
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
 from jaxsense.interfaces.onboard import Function, functions
-from jaxsense.models import Models
-from jaxsense.run import files, rundir
-from jaxsense.run.version import __version__
+from jaxsense.run import cli, files, rundir
 
 PROGRAM = "jaxsense.export"
 PLATFORMS = ("cpu", "cuda", "tpu")
@@ -123,8 +120,7 @@ def main(argv: list[str] | None = None) -> None:
         path = path or run / "exported.zip"
         config, models = rundir.load(run, arguments.trust)
         with files.new(path) as file:
-            content = archive(config, models)
-            file.write(content)
+            file.write(content := archive(config, models))
     except FileExistsError:
         cli.fail(PROGRAM, str(ConfigError("out", str(path), "exists already; must be a new file")))
     except ConfigError as error:

@@ -18,12 +18,12 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import cli, mission, summary
+from jaxsense import mission, summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, read_some
 from jaxsense.dqn.policies import Policy, Values
-from jaxsense.run import devices, files, pipeline, rundir, seeds
+from jaxsense.run import cli, devices, files, pipeline, rundir, seeds
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -345,7 +345,7 @@ def _display(
     records = [run.append_metrics]
     if arguments.tensorboard:
         records.append(tensorboard.make_writer(run.path / "tensorboard"))
-    return Display(console, *records, quiet=arguments.quiet or not is_shown)
+    return Display(console, records, quiet=arguments.quiet or not is_shown)
 
 
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:

@@ -17,10 +17,9 @@ import pytest
 from flax import struct
 
 import jaxsense
-from jaxsense import cli
 from jaxsense.config import PRESETS, SensorConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.run import compilation, files
+from jaxsense.run import cli, compilation, files
 from jaxsense.run.compilation import Compiler, Kept, Program
 from jaxsense.run.monitor import Monitor
 

@@ -30,7 +30,7 @@ def test_a_terminal_shows_count_rate_and_time_left_at_any_width(width):
 def test_without_a_terminal_there_are_plain_lines_now_and_then(capsys):
     records = []
     display = Display(
-        rich.console.Console(file=io.StringIO()), lambda **figures: records.append(figures)
+        rich.console.Console(file=io.StringIO()), [lambda **figures: records.append(figures)]
     )
     show(display)
     lines = capsys.readouterr().out.splitlines()
@@ -44,6 +44,6 @@ def test_without_a_terminal_there_are_plain_lines_now_and_then(capsys):
 def test_a_quiet_display_records_and_shows_nothing(capsys):
     records = []
     console = rich.console.Console(file=io.StringIO(), quiet=True)
-    show(Display(console, lambda **figures: records.append(figures), quiet=True))
+    show(Display(console, [lambda **figures: records.append(figures)], quiet=True))
     assert capsys.readouterr().out == ""
     assert records[1] == {"stage": "dqn_camera", "step": 200, "loss": 0.25, "reward": 1.0}

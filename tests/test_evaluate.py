@@ -20,9 +20,9 @@ from recordings import recording
 from smoke import MISSION_KEYS, error_line
 
 import jaxsense
-from jaxsense import cli, dqn, evaluate, export, mission
+from jaxsense import dqn, evaluate, export, mission
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.run import devices, files, missions
+from jaxsense.run import cli, devices, files, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
 
@@ -127,7 +127,8 @@ def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):
     (path / "summary.json").unlink()
     program = """
 import sys
-from jaxsense import cli, train
+from jaxsense import train
+from jaxsense.run import cli
 train._train = lambda begin, arguments, run, *more: (run.path / "summary.json").write_text(
     open(sys.argv[1], encoding="utf-8").read(), encoding="utf-8")
 cli.run(lambda: train.main(["--resume", sys.argv[2]]))

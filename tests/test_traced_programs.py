@@ -14,7 +14,6 @@ from jaxsense.config import PRESETS
 from jaxsense.run import programs
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.monitor import Monitor
-from jaxsense.sim.world import make_world
 from jaxsense.training.stages import stages
 
 NUMBERS = {
@@ -100,7 +99,7 @@ def lowered(config, names=None):
             some = [stage for stage in listed if stage.name in {*names, "survey", "detections"}]
             patch.setattr(programs, "stages", lambda *_: some)
         with Compiler(Monitor()) as compiler:
-            made = programs.compile_programs(config, make_world(config).arena, compiler)
+            made = programs.compile_programs(config, compiler)
             for each in made.of_stages.values():
                 each.shapes.result()
             if names is None:

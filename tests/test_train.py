@@ -284,7 +284,7 @@ def test_tensorboard_is_refused_before_anything_is_written(tmp_path, capsys, mon
 
 
 def test_whoever_reads_the_help_may_stop_reading():
-    code = "from jaxsense import cli, train; cli.run(lambda: train.main(['--help']))"
+    code = "from jaxsense import train; train.cli.run(lambda: train.main(['--help']))"
     with subprocess.Popen([sys.executable, "-c", code], **PIPES) as process:
         process.stdout.close()
         assert process.stderr.read() == b""

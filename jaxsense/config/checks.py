@@ -10,7 +10,7 @@ import functools
 import types
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import jax
 
@@ -157,7 +157,7 @@ def _place(section: object, field: str) -> str:
 
 
 @functools.cache
-def _fields(cls: Any) -> list[tuple[str, object, Limits | None]]:
+def _fields(cls: type) -> list[tuple[str, object, Limits | None]]:
     """Name, type and limits of each field of a dataclass."""
     hints = get_type_hints(cls)
     return [(f.name, hints[f.name], f.metadata.get("limits")) for f in dataclasses.fields(cls)]

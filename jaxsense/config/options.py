@@ -14,7 +14,7 @@ import textwrap
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeVar, get_args, get_origin, get_type_hints
+from typing import Literal, NoReturn, TypeVar, cast, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
 _Values = Mapping[tuple[str, ...], object]
@@ -55,7 +55,7 @@ def read(base: T | type[T], argv: list[str]) -> T:
         if option.default is dataclasses.MISSING and option.path not in values:
             what = option.help[:1].lower() + option.help[1:].rstrip(".")
             raise OptionError(f"missing argument {option.name}: {what}")
-    return _changed(base, values)
+    return cast(T, _changed(base, values))
 
 
 def read_some(arguments: type, argv: list[str], fields: Sequence[str]) -> dict[str, object]:
@@ -117,8 +117,8 @@ class _Option:
 
     path: tuple[str, ...]
     name: str
-    kind: Any
-    default: Any
+    kind: object
+    default: object
     section: type
     place: str = ""
 
@@ -128,7 +128,7 @@ class _Option:
         return types.NoneType in get_args(self.kind)
 
     @property
-    def words(self) -> tuple[Any, str | int | None]:
+    def words(self) -> tuple[object, str | int | None]:
         """Type of the words of the value, and their number in the form of `argparse`."""
         kind = get_args(self.kind)[0] if self.is_optional else self.kind
         if get_origin(kind) is not tuple:
@@ -224,7 +224,7 @@ def _docs(section: type) -> dict[str, str]:
     return found
 
 
-def _changed(section: Any, values: _Values) -> Any:
+def _changed(section: object, values: _Values) -> object:
     """A section with other values at some paths; of a class, a new instance."""
     if () in values:
         return values[()]
@@ -234,7 +234,10 @@ def _changed(section: Any, values: _Values) -> Any:
     if isinstance(section, Mapping):
         return {**section, **{key: _changed(section[key], part) for key, part in parts.items()}}
     new = {name: _changed(getattr(section, name, None), part) for name, part in parts.items()}
-    return section(**new) if isinstance(section, type) else dataclasses.replace(section, **new)
+    if dataclasses.is_dataclass(section) and not isinstance(section, type):
+        return dataclasses.replace(section, **new)
+    assert isinstance(section, type)
+    return section(**new)
 
 
 class _Parser(argparse.ArgumentParser):

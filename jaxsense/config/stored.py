@@ -4,13 +4,13 @@ import dataclasses
 import difflib
 import json
 from collections.abc import Iterator
-from typing import Any, get_args, get_type_hints
+from typing import cast, get_args, get_type_hints
 
 from jaxsense.config.checks import ConfigError
 from jaxsense.config.whole import Config
 
 
-def as_plain(config: Config) -> dict[str, Any]:
+def as_plain(config: Config) -> dict[str, object]:
     """Converts settings to dictionaries, lists, numbers and strings, for JSON."""
     return dataclasses.asdict(config)
 
@@ -25,10 +25,10 @@ def from_plain(stored: object, base: Config | None = None) -> Config:
     Raises:
       ConfigError: names a field that is unknown, of the wrong type, or invalid.
     """
-    return _made(Config, stored, Config() if base is None else base, "")
+    return cast(Config, _made(Config, stored, base or Config(), ""))
 
 
-def parse_json(text: str) -> Any:
+def parse_json(text: str) -> object:
     """Parses JSON.
 
     Raises:
@@ -57,15 +57,8 @@ def require_trust(config: Config) -> None:
         raise ConfigError(f"sensors.{name}.make", sensor.make, reason)
 
 
-def _made(kind: object, stored: object, base: Any, place: str) -> Any:
-    """A value of a declared type; the dataclasses among them check their fields.
-
-    Args:
-      kind: the type.
-      stored: its plain form.
-      base: source of missing fields, if it is a dataclass.
-      place: name of the setting, empty for all settings.
-    """
+def _made(kind: object, stored: object, base: object, place: str) -> object:
+    """A value of type `kind`, with the missing fields of `base`; dataclasses check their fields."""
     if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
         if isinstance(stored, dict) and len(get_args(kind)) == 2:
             inner = get_args(kind)[1]
@@ -79,7 +72,7 @@ def _made(kind: object, stored: object, base: Any, place: str) -> Any:
         if name not in kinds:
             raise ConfigError(path, value, f"unknown setting{_suggestion(path)}")
         given[name] = _made(kinds[name], value, getattr(base, name, None), path)
-    if base is not None:
+    if dataclasses.is_dataclass(base) and not isinstance(base, type):
         return dataclasses.replace(base, **given)
     for field in dataclasses.fields(kind):
         if field.name not in given and field.default is dataclasses.MISSING:
@@ -99,9 +92,9 @@ def _suggestion(path: str) -> str:
     return ""
 
 
-def _names(section: Any, prefix: str = "") -> Iterator[str]:
+def _names(section: type, prefix: str = "") -> Iterator[str]:
     """Names of all settings with their sections."""
     for field in dataclasses.fields(section):
         yield prefix + field.name
-        if dataclasses.is_dataclass(field.type):
+        if isinstance(field.type, type) and dataclasses.is_dataclass(field.type):
             yield from _names(field.type, f"{prefix}{field.name}.")

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from jaxsense.config import ConfigError
 T = TypeVar("T")
 Row = TypeVar("Row", jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 
+Options: TypeAlias = dict[str, Any]  # JAX declares fewer types than it takes
 AXIS = "devices"
 NUM_THREADS = min(os.cpu_count() or 1, 8)
 _MAX_DEVICES = 256
@@ -29,7 +30,7 @@ _JOIN_TIMEOUT = 300.0  # s
 LEAVE_TIMEOUT = 10.0  # s
 
 
-def compiler_options(*, runs_long: bool = False) -> dict[str, Any]:
+def compiler_options(*, runs_long: bool = False) -> Options:
     """Compiler options that minimise the total time of compiling and running a program.
 
     On a CPU, level 1 compiles a third faster than level 3, with equally fast programs. The older
@@ -44,7 +45,7 @@ def compiler_options(*, runs_long: bool = False) -> dict[str, Any]:
     """
     if jax.config.values["jax_disable_most_optimizations"]:
         return {}
-    wanted: dict[str, int | bool] = {}
+    wanted: dict[str, bool | int] = {}
     if jax.default_backend() == "cpu":
         wanted = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": runs_long}
     elif jax.default_backend() == "gpu" and not runs_long:
@@ -55,7 +56,7 @@ def compiler_options(*, runs_long: bool = False) -> dict[str, Any]:
 @functools.cache
 def _is_known(option: str, value: int | bool) -> bool:
     """Whether the installed compiler supports an option, which depends on its version."""
-    options: dict[str, Any] = {option: value}
+    options: Options = {option: value}
     try:
         jax.jit(lambda: 0).lower().compile(compiler_options=options)
     except jax.errors.JaxRuntimeError:
@@ -197,9 +198,9 @@ def join(
         raise ConfigError("num_processes", number, "must be greater than 0")
     if not 0 <= index < number:
         raise ConfigError("process_index", index, f"must be within 0 and {number - 1}")
-    address = host.strip("[]"), int(port)
+    host, port = host.strip("[]"), int(port)
     try:
-        socket.getaddrinfo(*address)
+        socket.getaddrinfo(host, port)
     except OSError as error:
         raise ConfigError("coordinator", coordinator, f"cannot be found ({error})") from None
     begins()
@@ -221,7 +222,7 @@ def join(
 
     end = time.monotonic() + _JOIN_TIMEOUT
     if index > 0:
-        _wait_for_listener(address, end)
+        _wait_for_listener(host, port, end)
     # A signal is not noticed in the thread that waits within JAX.
     threading.Thread(target=initialise, daemon=True).start()
     while not joined.done() and time.monotonic() < end:
@@ -236,17 +237,16 @@ def join(
         raise ConfigError("coordinator", coordinator, reason) from None
 
 
-def _wait_for_listener(address: tuple[str, int], end: float) -> None:
+def _wait_for_listener(host: str, port: int, end: float) -> None:
     """Waits until the first process listens, or raises `ConfigError` at `end`, in monotonic s."""
     while True:
         try:
-            socket.create_connection(address, timeout=1.0).close()
+            socket.create_connection((host, port), timeout=1.0).close()
             return
         except OSError as error:
             if time.monotonic() > end:
-                where, reason = ":".join(map(str, address)), error.strerror or str(error)
-                expected = f"the first process does not listen ({reason})"
-                raise ConfigError("coordinator", where, expected) from None
+                expected = f"the first process does not listen ({error.strerror or error})"
+                raise ConfigError("coordinator", f"{host}:{port}", expected) from None
             time.sleep(0.2)
 
 

@@ -4,10 +4,10 @@ import dataclasses
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxsense.config import Config
 from jaxsense.core.types import Key
@@ -28,7 +28,7 @@ class Trained:
       curves: of every stage with steps: `[steps]` of each metric, and `seconds` of each chunk.
     """
 
-    outputs: dict[str, Any]
+    outputs: dict[str, Output]
     curves: dict[str, Curves]
 
 
@@ -85,7 +85,7 @@ class _Loop:
 
     def run(self) -> Trained:
         """Runs all stages."""
-        stages, done = self._programs.stages, dict[str, Future[Any]]()
+        stages, done = self._programs.stages, dict[str, Future[Output]]()
         with ThreadPoolExecutor(len(stages)) as threads:
             for stage in stages:
                 before = {name: done[name] for name in stage.sources}
@@ -103,7 +103,7 @@ class _Loop:
         for each in self._saving:
             each.result()
 
-    def _run_stage(self, stage: Stage, before: dict[str, Future[Any]]) -> Any:
+    def _run_stage(self, stage: Stage, before: dict[str, Future[Output]]) -> Output:
         """The output of a stage, loaded if it was saved."""
         try:
             found = self._load(stage) if is_saved(stage) else None
@@ -141,7 +141,7 @@ class _Loop:
         # The rate must not include compilation.
         programs.advance.wait()
 
-        def advance(chunk: int, state: Any) -> tuple[Any, Curves]:
+        def advance(chunk: int, state: Output) -> tuple[Output, Curves]:
             begin = time.perf_counter()
             state, progress = programs.advance(keys[chunk], config, state, inputs)
             seconds = time.perf_counter() - begin
@@ -161,7 +161,7 @@ class _Loop:
         self._curves[stage.name] = curves
         return programs.finish(config, state, inputs)
 
-    def _report(self, stage: Stage, chunk: int, progress: Progress, output: Any) -> Curves:
+    def _report(self, stage: Stage, chunk: int, progress: Progress, output: Output) -> Curves:
         """Reports a chunk, checks the output so far, and returns the steps' metrics."""
         size = len(progress.loss)
         done = min((chunk + 1) * size, stage.steps)
@@ -176,7 +176,7 @@ class _Loop:
         self._monitor.report(stage.name, done, stage.steps, losses, output, **means)
         return {name: values.tolist() for name, values in metrics.items()}
 
-    def _load(self, stage: Stage) -> Any:
+    def _load(self, stage: Stage) -> Output:
         """The saved output of a finished stage; None if there is none."""
         if stage.chunks:
             shapes = _as_arrays(self._no_curves(stage))
@@ -189,10 +189,10 @@ class _Loop:
 
     def _no_curves(self, stage: Stage) -> Curves:
         """The curves of a failed training."""
-        metrics = self._programs.of(stage).shapes.result().progress.metrics
+        metrics = self._programs.of(stage).shapes.result().metrics
         return {**dict.fromkeys(metrics, [np.nan] * stage.steps), "seconds": [0.0] * stage.chunks}
 
-    def _save(self, stage: Stage, output: Any) -> None:
+    def _save(self, stage: Stage, output: Output) -> None:
         """Saves a finished stage while others run; raises if an earlier save failed."""
         for each in self._saving:
             if each.done():
@@ -213,10 +213,10 @@ def _as_arrays(curves: Curves) -> dict[str, np.ndarray]:
     return {name: np.array(values, np.float32) for name, values in curves.items()}
 
 
-def _failed(state: Any) -> Any:
+def _failed(state: Output) -> Output:
     """The state of a failed training: every float is NaN."""
 
-    def fail(x: Any) -> np.ndarray:
+    def fail(x: ArrayLike) -> np.ndarray:
         x = np.asarray(x)
         return np.full_like(x, np.nan) if np.issubdtype(x.dtype, np.floating) else x
 
@@ -225,12 +225,12 @@ def _failed(state: Any) -> Any:
 
 def run_chunks(
     stage: str,
-    state: Any,
+    state: Output,
     number: int,
-    run: Callable[[int, Any], tuple[Any, Curves]],
+    run: Callable[[int, Output], tuple[Output, Curves]],
     monitor: Monitor,
     checkpoints: Checkpoints,
-) -> tuple[Any, Curves]:
+) -> tuple[Output, Curves]:
     """Runs a training from where it was last saved.
 
     Args:

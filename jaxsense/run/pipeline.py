@@ -19,7 +19,6 @@ from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs, compile_programs
-from jaxsense.sim.world import make_world
 from jaxsense.training.agents import learner
 from jaxsense.training.stages import mission_key, models
 
@@ -72,9 +71,8 @@ def compiled(
       ConfigError: if `config.mission.policies` names an unknown policy.
     """
     mission.require_policies(config, policies)
-    arena = make_world(config).arena
     with Compiler(monitor, kept) as compiler:
-        yield compile_programs(config, arena, compiler, workers, num_seeds, policies)
+        yield compile_programs(config, compiler, workers, num_seeds, policies)
 
 
 def run(

@@ -8,9 +8,9 @@ import dataclasses
 from collections.abc import Mapping
 from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import suppress
-from typing import Any
 
 import jax
+from jaxtyping import PyTree
 
 from jaxsense import mission
 from jaxsense.config import Config
@@ -20,7 +20,6 @@ from jaxsense.run import missions
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.together import SharedProgram, Trainings
-from jaxsense.sim.arena import Arena
 from jaxsense.training.stage import Output, Stage
 from jaxsense.training.stages import stages
 
@@ -65,11 +64,11 @@ class Shapes:
 
     Attributes:
       output: of the stage.
-      progress: of one chunk; None for a stage without steps.
+      metrics: names of what a chunk reports.
     """
 
-    output: Any
-    progress: Any = None
+    output: Output
+    metrics: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,7 +126,6 @@ class Programs:
 
 def compile_programs(
     config: Config,
-    arena: Arena,
     compiler: Compiler,
     workers: Workers = ALONE,
     num_seeds: int = 1,
@@ -137,13 +135,12 @@ def compile_programs(
 
     Args:
       config: all settings.
-      arena: without contacts.
       compiler: compiles them.
       workers: what shares rows, missions and seeds.
       num_seeds: trainings side by side; each calls the programs from its own threads.
       policies: of missions, by name, besides `dqn.POLICIES`.
     """
-    found, trainings = stages(config, arena), Trainings(num_seeds)
+    found, trainings = stages(config), Trainings(num_seeds)
 
     def program(stage: Stage, part: str) -> Program | SharedProgram:
         alone = Program(compiler, _program_name(stage), part)
@@ -245,13 +242,18 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
         advance, key, config, state, inputs, runs_long=runs_long, whole=(1,)
     )
     output = compiled.finish.compile(finish, config, state, inputs, whole=(0,))
-    compiled.shapes.set_result(Shapes(output, progress))
+    compiled.shapes.set_result(Shapes(output, tuple(progress.metrics)))
 
 
-def padded(inputs: Any, number: int) -> Any:
-    """Repeats the first rows of inputs until `number` divides their count."""
+def padded(inputs: PyTree, number: int) -> PyTree:
+    """Repeats the first rows of inputs until `number` divides their count.
 
-    def pad(x: Any) -> Any:
+    Args:
+      inputs: arrays or their shapes.
+      number: of parts.
+    """
+
+    def pad(x: jax.Array | jax.ShapeDtypeStruct) -> jax.Array | jax.ShapeDtypeStruct:
         rows = -(-x.shape[0] // number) * number
         if isinstance(x, jax.ShapeDtypeStruct):
             return x.update(shape=(rows, *x.shape[1:]))

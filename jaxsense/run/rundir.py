@@ -8,9 +8,10 @@ import itertools
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
+from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import (
@@ -29,7 +30,7 @@ from jaxsense.run.version import __version__, commit, versions
 from jaxsense.training import stages
 from jaxsense.training.agents import learner
 
-Json: TypeAlias = dict[str, Any]
+Json: TypeAlias = dict[str, object]
 _METRICS = "metrics.jsonl"
 
 
@@ -55,14 +56,6 @@ class Settings:
         return range(self.seed, self.seed + self.num_seeds)
 
 
-class NotARunError(ConfigError):
-    """A directory that holds no run."""
-
-    def __init__(self, path: Path):
-        self.expected = "is not a run directory: it has no config.json"
-        ValueError.__init__(self, f"{path} {self.expected}")
-
-
 class RunDirectory:
     """Writes the files of one run, and never overwrites files of another.
 
@@ -73,12 +66,6 @@ class RunDirectory:
     """
 
     def __init__(self, path: Path, settings: Settings):
-        """Use `create` or `resume` instead.
-
-        Args:
-          path: an existing directory.
-          settings: of the run.
-        """
         self.path, self.settings = path, settings
         self.checkpoints = Checkpoints(path / "checkpoints")
         self._reported: dict[str, int] = {}
@@ -322,7 +309,7 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     if not checkpoints.exists() and content.get("num_seeds", 1) != 1:
         raise ConfigError("run", str(path), f"holds several seeds; choose one, {path}/seed-...")
 
-    def restore(name: str, shape: Any) -> Any:
+    def restore(name: str, shape: PyTree) -> PyTree:
         found = checkpoints.load(name, shape)
         if found is None:
             reason = f"must be a finished run (there is no checkpoint {name!r})"
@@ -333,7 +320,7 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     return config, stages.models(found, config)
 
 
-def _named(models: Models, config: Config) -> dict[str, Any]:
+def _named(models: Models, config: Config) -> dict[str, PyTree]:
     """The parts of the models, by the names of their stages and checkpoints."""
     detectors = zip(config.modalities, models.detectors, strict=True)
     q_networks = zip(config.modalities, models.q_networks, strict=True)
@@ -377,14 +364,18 @@ def _settings_of(content: Json, trust: bool) -> Settings:
     preset = content.get("preset", "default")
     if not isinstance(preset, str) or preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
-    numbers = {"seed": content.get("seed", 0), "num_seeds": content.get("num_seeds", 1)}
-    for name, number in numbers.items():
+
+    def whole(name: str, default: int) -> int:
+        number = content.get(name, default)
         if not isinstance(number, int) or isinstance(number, bool):
             raise ConfigError(name, number, "must be a whole number")
+        return number
+
+    seed, num_seeds = whole("seed", 0), whole("num_seeds", 1)
     config = from_plain(content.get("config", {}), PRESETS[preset])
     if not trust:
         require_trust(config)
-    return Settings(preset, config=config, **numbers)
+    return Settings(preset, seed, config, num_seeds)
 
 
 def _digest(content: Json) -> str:

@@ -128,7 +128,8 @@ def _draw_times(ax: Axes, places: list[Evaluation], key: str) -> None:
         ]
         if played:
             style = MARKERS[i % 4] + line
-            ax.plot(*zip(*played, strict=True), style, color=policy_colour(name), label=name)
+            numbers, times = zip(*played, strict=True)
+            ax.plot(numbers, times, style, color=policy_colour(name), label=name)
     label = "PoIs" if key == "num_pois" else "robots"
     ax.set(xlabel=label, ylabel="median time [s]", ylim=(0, None))
     ax.set_xticks(sorted(set(map(number, places))))

@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import rich.box
 import rich.console
@@ -23,14 +23,14 @@ class Display:
     def __init__(
         self,
         console: rich.console.Console,
-        *records: Callable[..., None],
+        records: Sequence[Callable[..., None]] = (),
         quiet: bool = False,
     ):
         """Shows progress on a console.
 
         Args:
           console: to show it on.
-          *records: receive the metrics of every report.
+          records: receive the metrics of every report.
           quiet: record, but show nothing.
         """
         self._console, self._records, self._quiet = console, records, quiet

@@ -1,7 +1,7 @@
 """Compares policies that played in the same arenas."""
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import scipy.special
@@ -13,7 +13,7 @@ from jaxsense.summary.metrics import Interval, mean
 REFERENCE = "latent"
 """The policy that the others are compared with."""
 
-Measured = Mapping[str, Any]
+Measured = Mapping[str, np.ndarray]
 """`[E, ...]` metrics of the missions of a case, see `mission.measure`."""
 
 _CONFIDENCE = 0.95

@@ -48,8 +48,9 @@ def _read(run: Path, file: Path, kind: type) -> object:
         content = parse_json(file.read_text(encoding="utf-8"))
         json.dumps(content, allow_nan=False)
         # Of several seeds, only what each of them wrote is of this type.
-        has_seeds = isinstance(content, dict) and "seeds" in content
-        values, kind = (content["seeds"], dict[str, Results]) if has_seeds else (content, kind)
+        values = content
+        if isinstance(content, dict) and "seeds" in content:
+            values, kind = content["seeds"], dict[str, Results]
         if wrong := _wrong(values, kind, file.stem):
             raise ValueError(wrong)
         return content

@@ -22,12 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxsense import cli, evaluate, export, train
+from jaxsense import evaluate, export, train
 from jaxsense.config import DetectorConfig, DqnConfig, JmvaeConfig
 from jaxsense.core import supervised
 from jaxsense.core.supervised import FitState
 from jaxsense.dqn import training as dqn_training
 from jaxsense.dqn.training import DqnState
+from jaxsense.run import cli
 from jaxsense.run.compilation import Program
 from jaxsense.show import plots
 from jaxsense.training.perception import Surveys

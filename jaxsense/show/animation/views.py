@@ -5,8 +5,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxsense import Belief
 from jaxsense.config import ROBOT_RADIUS, Config
-from jaxsense.core.types import Belief
 from jaxsense.mission import MissionState, Record
 from jaxsense.mission.state import ENDED, FACING
 from jaxsense.show.animation.svg import Timeline, add
@@ -148,9 +148,8 @@ class MapView:
 
     def __init__(self, config: Config, end: MissionState, class_beliefs: Belief):
         self._config, self._end = config, end
-        self._classes = in_plane(class_beliefs.mean), in_plane(class_beliefs.std)
-        self._reach = 1.0 + float(np.max(np.abs(self._classes[0]) + self._classes[1]))
-        self._scale = SIZE / 2 / self._reach
+        self._means, self._stds = in_plane(class_beliefs.mean), in_plane(class_beliefs.std)
+        self._scale = SIZE / 2 / (1.0 + float(np.max(np.abs(self._means) + self._stds)))
 
     def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
         """Adds the view.
@@ -162,7 +161,7 @@ class MapView:
         """
         arena = self._config.arena
         colours = [as_hex(class_colour(arena, label)) for label in arena.classes]
-        for colour, mean in zip(colours, self._classes[0], strict=True):
+        for colour, mean in zip(colours, self._means, strict=True):
             x, y = self._place(mean)
             add(parent, "circle", cx=x, cy=y, r=3, fill=colour)
         numbers = add(parent, "g")
@@ -193,7 +192,7 @@ class MapView:
     def _draw_labels(self, parent: Element, colours: list[str]) -> None:
         """The names of the classes, beyond the ellipses that are as small as they get."""
         for label, colour, mean, std in zip(
-            self._config.arena.classes, colours, *self._classes, strict=True
+            self._config.arena.classes, colours, self._means, self._stds, strict=True
         ):
             x, y = self._place(mean)
             side = -1 if mean[1] >= 0 else 1
