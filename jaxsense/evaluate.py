@@ -154,18 +154,7 @@ def _write(
     missions: summary.Missions,
     draw: Callable[[str], str],
 ) -> list[str]:
-    """Writes an evaluation, the page that shows it and, if requested, the film.
-
-    Args:
-      arguments: of the program.
-      trained: the settings of the run.
-      config: the settings of these missions.
-      missions: what was measured.
-      draw: draws the film of the first mission with a title.
-
-    Returns:
-      Lines about where they are.
-    """
+    """Writes an evaluation, its page and, if requested, the film; returns lines about them."""
     run, written, place = arguments.run, [], _place(config)
     if arguments.animate:
         name = next(iter(summary.cases(missions)))

@@ -40,7 +40,6 @@ PROGRAM = "jaxsense.train"
 _MOST_SEEDS = 10_000
 _MOST_TOGETHER = 16  # seeds in one program on an accelerator
 
-
 _COMMON = (
     *("--preset", "--seed", "--num-seeds", "--out", "--config", "--resume", "--devices"),
     *("--cache", "--quiet", "--tensorboard", "--trust", "--modalities", "--robots"),
@@ -117,6 +116,7 @@ def main(
     if not is_first:
         arguments = dataclasses.replace(arguments, quiet=True, tensorboard=False)
     console = rich.console.Console(quiet=arguments.quiet)
+    waits = f"Waiting for the other processes at {arguments.coordinator}."
     try:
         # Before joining, so that no process waits for a first one that refuses its options.
         with _open(arguments) as run:
@@ -126,7 +126,7 @@ def main(
                 arguments.coordinator,
                 arguments.num_processes,
                 arguments.process_index,
-                begins=lambda: None if is_quiet else _say_waits(arguments),
+                begins=lambda: None if is_quiet else say(waits),
             )
             workers = devices.start(arguments.devices)
             _train(begin, arguments, run, workers, console, policies)
@@ -216,11 +216,6 @@ def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     return Settings(preset, 0, change(PRESETS[preset]))
 
 
-def _say_waits(arguments: Arguments) -> None:
-    """Announces that this process waits for the others of its run."""
-    say(f"Waiting for the other processes at {arguments.coordinator}.")
-
-
 def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:
     """The run directory: a new one, the one to resume, or that of a process that only helps."""
     if arguments.process_index:
@@ -302,12 +297,15 @@ def _train_together(
     monitor: Monitor,
     console: rich.console.Console,
 ) -> dict[int, str]:
-    """Trains some seeds side by side and writes their run directories.
+    """Trains some seeds side by side and writes their runs; returns why which seeds failed."""
 
-    Returns:
-      The failed seeds, and why.
-    """
-    displays = [_display(arguments, run, console, is_shown=run is runs[0]) for run in runs]
+    def display(run: RunDirectory) -> Display:
+        records = [run.append_metrics]
+        if arguments.tensorboard:
+            records.append(tensorboard.make_writer(run.path / "tensorboard"))
+        return Display(console, records, quiet=arguments.quiet or run is not runs[0])
+
+    displays = [display(run) for run in runs]
     programs.trainings.begin(len(runs))
 
     def train(i: int) -> RunResult | StageError:
@@ -338,16 +336,6 @@ def _train_together(
     return failed
 
 
-def _display(
-    arguments: Arguments, run: RunDirectory, console: rich.console.Console, *, is_shown: bool
-) -> Display:
-    """Records the progress of a run, and shows it if `is_shown`."""
-    records = [run.append_metrics]
-    if arguments.tensorboard:
-        records.append(tensorboard.make_writer(run.path / "tensorboard"))
-    return Display(console, records, quiet=arguments.quiet or not is_shown)
-
-
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
     paths = [path for seed, path in seeds.paths(run).items() if seed not in failed]
@@ -357,7 +345,7 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
     curves = seeds.rewards(paths, run.settings.config, _warn)
     _write_page(run, plots.of_seeds(curves, means), found)
-    run.write_json("summary.json", found)
+    rundir.write_json(run.path / "summary.json", found)
 
 
 def _warn(text: str) -> None:
@@ -374,12 +362,12 @@ def _write(run: RunDirectory, result: RunResult, timing: summary.Timing, monitor
     )
     pictures |= plots.of_seeds(result.rewards, result.results)
     title = f"{config.mission.policies[0]} policy".replace("_", " ")
-    beliefs = result.models.fusion.classes
-    film = animation.draw(config, recording.records, recording.end, beliefs, title)
+    classes = result.models.fusion.classes
+    film = animation.draw(config, recording.records, recording.end, classes, title)
     found: summary.Summary = {**_header(run), "timing": timing, **result.results}
     _write_page(run, {**pictures, "mission.svg": film}, found)
     monitor.check_stop()
-    run.write_json("summary.json", found)
+    rundir.write_json(run.path / "summary.json", found)
 
 
 def _write_page(

@@ -198,18 +198,14 @@ class Checkpoints:
 
     def _sound(self) -> set[str]:
         """Names of all intact checkpoints on disk, except the list; other files are the user's."""
-
-        def is_sound(file: Path) -> bool:
-            try:
-                _read(file)
-            except (OSError, ValueError):
-                return False
-            return True
-
         assert self.path is not None
-        there = [file for place in self.directories() for file in place.glob(f"*{_SUFFIX}")]
-        names = {file.relative_to(self.path).as_posix() for file in there if is_sound(file)}
-        return {name.removesuffix(_SUFFIX) for name in names} - {_LIST}
+        found = set[str]()
+        for place in self.directories():
+            for file in place.glob(f"*{_SUFFIX}"):
+                with contextlib.suppress(OSError, ValueError):
+                    _read(file)
+                    found.add(file.relative_to(self.path).as_posix().removesuffix(_SUFFIX))
+        return found - {_LIST}
 
     def _listed(self) -> set[str]:
         """Names of all checkpoints that were saved; of all intact ones if the list is damaged."""

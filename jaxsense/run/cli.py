@@ -166,4 +166,3 @@ def keep_programs(
     except (OSError, RuntimeError) as error:
         complain(f"{program}: programs cannot be kept in {directory} ({error})")
         return None
-    return kept

@@ -22,10 +22,6 @@ def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
         if (handler := signal.getsignal(number)) is not signal.SIG_IGN
     }
 
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
     def end(number: int, frame: FrameType | None) -> None:
         # Any other exit would wait for threads that compile or save.
         with contextlib.suppress(OSError):
@@ -42,4 +38,5 @@ def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
     try:
         yield
     finally:
-        restore()
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -88,7 +88,7 @@ class Monitor:
         """
         if self._failure is not None:
             raise self._failure
-        if self.is_stopping:
+        if self._stop.is_set():
             raise Stopped
 
     def announce(self, stage: str) -> None:

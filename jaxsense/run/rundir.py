@@ -134,15 +134,6 @@ class RunDirectory:
             run._read_metrics()
             yield run
 
-    def write_json(self, name: str, content: Mapping[str, object]) -> None:
-        """Writes a JSON file of the run; see the function `write_json`.
-
-        Args:
-          name: of the file.
-          content: of the file.
-        """
-        write_json(self.path / name, content)
-
     def save_models(self, models: Models) -> None:
         """Saves trained models for `load`; see `Checkpoints.save`."""
         for name, tree in _named(models, self.settings.config).items():

@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 import scipy.special
+from jaxtyping import PyTree
 
 from jaxsense.mission import is_fault
 from jaxsense.summary.blocks import Case, Differences, Missions, OfNaive, cases
@@ -13,7 +14,7 @@ from jaxsense.summary.metrics import Interval, mean
 REFERENCE = "latent"
 """The policy that the others are compared with."""
 
-Measured = Mapping[str, np.ndarray]
+Measured = Mapping[str, PyTree[np.ndarray]]
 """`[E, ...]` metrics of the missions of a case, see `mission.measure`."""
 
 _CONFIDENCE = 0.95
