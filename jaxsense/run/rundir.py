@@ -56,6 +56,14 @@ class Settings:
         return range(self.seed, self.seed + self.num_seeds)
 
 
+class NotARunError(ConfigError):
+    """A directory that holds no run."""
+
+    def __init__(self, path: Path):
+        self.expected = "is not a run directory: it has no config.json"
+        ValueError.__init__(self, f"{path} {self.expected}")
+
+
 class RunDirectory:
     """Writes the files of one run, and never overwrites files of another.
 
