@@ -18,12 +18,10 @@ def run_example(path: Path) -> dict:
 
 def test_example_of_the_readme_runs(capsys):
     names = run_example(ROOT / "README.md")
-    assert capsys.readouterr().out == "(64,) (64, 2) (64, 2) (64,)\n"
-    assert (np.asarray(names["distance"]) > 0).all()
-    assert np.isfinite(names["distance"]).all()
-    assert (np.asarray(names["std"]) > 0).all()
-    assert np.isfinite(names["mean"]).all()
-    assert np.isfinite(names["reward"]).all()
+    assert capsys.readouterr().out == "(64, 3, 2) (64,)\n"
+    assert np.isfinite(names["states"].belief.mean).all()
+    assert (np.asarray(names["states"].belief.std) > 0).all()
+    assert np.isfinite(names["outcomes"].reward).all()
 
 
 def test_example_of_the_first_steps_runs(capsys):
