@@ -1,13 +1,59 @@
-"""The directions of imports, as `pyproject.toml` states them."""
+"""The directions of imports, as `pyproject.toml` states them, and what the page on them names."""
 
+import re
 from pathlib import Path
 
+import pytest
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
+import jaxsense
+from jaxsense.training.stages import stages
+
 ROOT = Path(__file__).parent.parent
+PAGE = ROOT / "docs" / "architecture.md"
 
 
 def test_imports_keep_to_their_directions():
     # What is broken, and where, is in the captured output.
     status = lint_imports(str(ROOT / "pyproject.toml"), no_cache=True)
     assert status == EXIT_STATUS_SUCCESS
+
+
+def rows_of(heading: str) -> list[tuple[str, str]]:
+    """File and call of each row of a section's table."""
+    _, rest = PAGE.read_text().split(f"## {heading}\n")
+    lines = [line for line in rest.split("\n## ")[0].splitlines() if re.match(r"\| \d", line)]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return [(file.strip("`"), call) for _, file, call in cells]
+
+
+@pytest.mark.parametrize(
+    ("heading", "most"),
+    [("From a LiDAR scan to the action", 14), ("From --jmvae.alpha to the loss", 9)],
+)
+def test_files_and_calls_of_the_page_exist(heading, most):
+    rows = rows_of(heading)
+    assert 0 < len(rows) <= most
+    for file, call in rows:
+        source = (ROOT / "jaxsense" / file).read_text()
+        names = [name.split(".")[-1] for name in re.findall(r"`([\w.]+)`", call)]
+        assert names
+        missing = [name for name in names if not re.search(rf"\b{name}\b", source)]
+        assert not missing, file
+
+
+def test_paths_of_the_page_exist():
+    paths = re.findall(r"`((?:jaxsense|tests|examples)/[\w./]*)`", PAGE.read_text())
+    assert len(paths) > 30
+    assert not [path for path in paths if not (ROOT / path).exists()]
+
+
+def test_stages_of_the_page_are_those_of_the_list():
+    table = PAGE.read_text().split("| stage | inputs | output |")[1].split("\n\n")[0]
+    named = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (.+?) \|", table, re.MULTILINE))))
+    found = set()
+    for preset in ("noisy", "team"):
+        config = jaxsense.PRESETS[preset]
+        endings = r"_(camera|lidar|team)$"
+        found |= {re.sub(endings, "_MODALITY", stage.name) for stage in stages(config)}
+    assert {name for name in named if name != "jmvae_2"} == found - {"jmvae_3"} - {"jmvae_2"}
