@@ -33,7 +33,11 @@ exclude_patterns = ["_build"]
 templates_path = ["_templates"]
 # A reference within jaxsense that leads nowhere is a warning.
 nitpicky = True
-nitpick_ignore_regex = [("py:.*", r"(?!jaxsense).*"), ("py:(class|obj)", r".*\.T")]
+# Type variables have no page.
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!jaxsense).*"),
+    ("py:(class|obj)", r".*\.([DST]|Row|Result|Annotated)"),
+]
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
 myst_heading_anchors = 3
