@@ -18,11 +18,13 @@ import jax
 import numpy as np
 from jax import export
 
-from jaxsense import Config, ConfigError, Models, __version__
+from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
 from jaxsense.interfaces.onboard import Function, functions
+from jaxsense.models import Models
 from jaxsense.run import cli, files, rundir
+from jaxsense.run.version import __version__
 
 PROGRAM = "jaxsense.export"
 PLATFORMS = ("cpu", "cuda", "tpu")

@@ -116,7 +116,7 @@ class MdpConfig(Section, place="mdp"):
     """Variance of each latent dimension of the prior, the belief before any look."""
     reward: Literal["paper", "nats"] = "paper"
     """What a look is rewarded for. `paper`: the gain of 1 / ||sigma||, or -1, see `min_increase`.
-    `nats`: the information gained about the class, minus `look_cost`; needs the filter."""
+    `nats`: the information gained about the class, minus `look_cost`."""
     look_cost: Traced[float] = limited(0.05, at_least=0, at_most=_MAX_WEIGHT)
     """Cost of a look with the reward `nats`."""
     min_increase: Traced[float] = limited(0.05, at_least=0)

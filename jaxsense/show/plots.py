@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
-from jaxsense import Belief
 from jaxsense.config import Config
+from jaxsense.core.types import Belief
 from jaxsense.show import mission_plots
 from jaxsense.show.colours import MARKERS, RGB, as_srgb, class_colour, in_plane, policy_colour
 from jaxsense.sim import sensors

@@ -109,7 +109,7 @@ def surveys(monkeypatch) -> Surveys:
         return key, (windows, windows)
 
     monkeypatch.setattr(looks, "surveys", survey)
-    listed = {stage.name: stage for stage in training.stages(MEASURED)}
+    listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
     scenes = listed["scenes"].begin(KEY, MEASURED)
     return listed["survey"].begin(KEY, MEASURED, scenes=scenes)
 
@@ -134,7 +134,7 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
         trained_on.append(np.asarray(problem.windows))
         return state, jnp.zeros(number)
 
-    listed = {stage.name: stage for stage in training.stages(MEASURED)}
+    listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
     monkeypatch.setattr(supervised, "fit", fit)
     monkeypatch.setattr(detectors, "detect", lambda detector, window: window)
     for name in ("detector_camera", "detector_lidar"):
@@ -156,7 +156,7 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
 
 
 def test_a_scene_is_the_same_whoever_works_it_out():
-    listed = {stage.name: stage for stage in training.stages(TINY, make_world(TINY).arena)}
+    listed = {stage.name: stage for stage in training.stages.stages(TINY, make_world(TINY).arena)}
     keys, classes = listed["scenes"].begin(KEY, TINY)
     survey = jax.jit(listed["survey"].begin)
     first, second = (

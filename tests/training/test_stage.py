@@ -43,7 +43,9 @@ def data(keys):
 
 def test_keys_follow_from_the_names_of_stages_alone():
     more = dataclasses.replace(TINY, jmvae=dataclasses.replace(TINY.jmvae, restarts=5))
-    few, many = ({s.name: data(keys_of(s)) for s in training.stages(c)} for c in (TINY, more))
+    few, many = (
+        {s.name: data(keys_of(s)) for s in training.stages.stages(c)} for c in (TINY, more)
+    )
     assert all(many[name] == keys for name, keys in few.items())
     used = [key for keys in few.values() for key in keys] + data([mission_key(KEY)])
     assert len(set(used)) == len(used)
@@ -129,7 +131,7 @@ def test_a_stage_without_steps_does_not_advance():
 
 
 def test_every_stage_is_called_as_it_is_in_the_list():
-    stages = training.stages(TINY)
+    stages = training.stages.stages(TINY)
     names = [stage.name for stage in stages]
     assert len(set(names)) == len(names)
     for i, stage in enumerate(stages):
@@ -149,8 +151,8 @@ def test_a_filter_and_a_team_have_stages_of_their_own():
     filtered = dataclasses.replace(TINY.jmvae, fusion="filter")
     dqn = dataclasses.replace(TINY.dqn, task="team", observe="bank")
     config = dataclasses.replace(TINY, jmvae=filtered, dqn=dqn)
-    names = [stage.name for stage in training.stages(config)]
-    plain = [stage.name for stage in training.stages(TINY)]
+    names = [stage.name for stage in training.stages.stages(config)]
+    plain = [stage.name for stage in training.stages.stages(TINY)]
     assert set(names) - set(plain) == {"filter", "dqn_team", "tours"}
     assert set(plain) - set(names) == {"dqn_camera", "dqn_lidar"}
     assert names.index("filter") + 1 == names.index("fusion")

@@ -103,7 +103,7 @@ def test_learn_and_a_run_come_to_the_same(trained):
 
 
 def test_learn_stops_after_the_stage_that_is_named():
-    names = [stage.name for stage in training.stages(TINY)]
+    names = [stage.name for stage in training.stages.stages(TINY)]
     shapes = jax.eval_shape(lambda: learn(KEY, TINY, until="best_jmvae"))
     assert set(shapes.outputs) == set(names[: names.index("best_jmvae") + 1])
     with pytest.raises(ValueError, match=r"until = 'vae': must be one of scenes, survey"):

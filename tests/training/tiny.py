@@ -22,4 +22,4 @@ TINY = dataclasses.replace(
 
 
 def stage_of(name, config=TINY):
-    return next(stage for stage in training.stages(config) if stage.name == name)
+    return next(stage for stage in training.stages.stages(config) if stage.name == name)

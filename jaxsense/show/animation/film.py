@@ -6,8 +6,8 @@ from xml.etree.ElementTree import Element
 import jax
 import numpy as np
 
-from jaxsense import Belief
 from jaxsense.config import Config
+from jaxsense.core.types import Belief
 from jaxsense.mission import MissionState, Record
 from jaxsense.show.animation.svg import Timeline, add
 from jaxsense.show.animation.views import SIZE, ArenaView, MapView

@@ -5,8 +5,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxsense import Belief
 from jaxsense.config import ROBOT_RADIUS, Config
+from jaxsense.core.types import Belief
 from jaxsense.mission import MissionState, Record
 from jaxsense.mission.state import ENDED, FACING
 from jaxsense.show.animation.svg import Timeline, add
