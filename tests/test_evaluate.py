@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import io
 import json
 import os
@@ -25,6 +26,7 @@ from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import cli, devices, files, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
+from jaxsense.show import animation
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +68,10 @@ def test_evaluate_writes_a_file_of_its_own_and_leaves_the_runs_figures(evaluated
 def write(arguments, missions):
     config, models = jaxsense.load(arguments.run)
     played = recording()
-    return evaluate._write(arguments, config, config, models.fusion.classes, missions, played)
+    draw = functools.partial(
+        animation.draw, config, played.records, played.end, models.fusion.classes
+    )
+    return evaluate._write(arguments, config, config, missions, draw)
 
 
 def test_policies_that_play_in_the_same_arenas_share_a_file(evaluated, tmp_path):

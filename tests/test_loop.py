@@ -25,7 +25,7 @@ def toy(monkeypatch, tmp_path):
     monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
 
     def train(*stages, saved=False):
-        monkeypatch.setattr(programs, "stages", lambda config, arena: list(stages))
+        monkeypatch.setattr(programs, "stages", lambda config: list(stages))
         heard, warned = [], []
         monitor = Monitor(lambda *report: heard.append(report), warned.append)
         checkpoints = Checkpoints(tmp_path if saved else None, warned.append)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from teams import CONFIG, POLICIES
 
-from jaxsense import cli, dqn, evaluate, mission, train
+from jaxsense import dqn, evaluate, mission, train
 from jaxsense.config import ConfigError
 from jaxsense.dqn.policies import Policy
 from jaxsense.mission import decide
 from jaxsense.mission.state import DRIVING
-from jaxsense.run import pipeline, programs
+from jaxsense.run import cli, pipeline, programs
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.sim import arena as arenas
 
