@@ -8,8 +8,11 @@ from pathlib import Path
 
 import pytest
 
+import jaxsense
+
 ROOT = Path(__file__).parent.parent
-SOURCES = sorted((ROOT / "jaxsense").rglob("*.py"))
+PACKAGE = Path(jaxsense.__file__).parent  # which may be installed elsewhere
+SOURCES = sorted(PACKAGE.rglob("*.py"))
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -64,7 +67,7 @@ def hits(prose):
     )
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_the_package_avoids_what_contributing_lists(path):
     assert not hits(prose_of_source(path.read_text(encoding="utf-8")))
 
