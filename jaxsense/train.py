@@ -37,7 +37,6 @@ from jaxsense.summary import compare, statistics
 from jaxsense.summary.blocks import Header
 
 PROGRAM = "jaxsense.train"
-_MOST_SEEDS = 10_000
 _MOST_TOGETHER = 16  # seeds in one program on an accelerator
 
 _COMMON = (
@@ -181,13 +180,7 @@ def parse(
         mission.require_policies(arguments.config, policies)
         if arguments.tensorboard:
             tensorboard.require()
-        if not 0 <= arguments.seed < 2**32:
-            raise ConfigError("seed", arguments.seed, "must be within 0 and 2^32 - 1")
-        if arguments.seed + arguments.num_seeds > 2**32:
-            raise ConfigError("num_seeds", arguments.num_seeds, "leads beyond seed 2^32 - 1")
-        if not 1 <= arguments.num_seeds <= _MOST_SEEDS:
-            reason = f"must be within 1 and {_MOST_SEEDS:,}"
-            raise ConfigError("num_seeds", arguments.num_seeds, reason)
+        seeds.check_range(arguments.seed, arguments.num_seeds)
         if arguments.file is not None and arguments.preset != stored.preset:
             raise ConfigError("config", str(arguments.file), "has a preset; omit --preset")
         if arguments.resume is not None:

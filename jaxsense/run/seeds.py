@@ -14,6 +14,26 @@ from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.training.agents import learner
 
+_MOST = 10_000
+
+
+def check_range(seed: int, number: int) -> None:
+    """Checks the first seed and how many there are.
+
+    Args:
+      seed: the first seed.
+      number: of seeds.
+
+    Raises:
+      ConfigError: if one is outside its range.
+    """
+    if not 0 <= seed < 2**32:
+        raise ConfigError("seed", seed, "must be within 0 and 2^32 - 1")
+    if seed + number > 2**32:
+        raise ConfigError("num_seeds", number, "leads beyond seed 2^32 - 1")
+    if not 1 <= number <= _MOST:
+        raise ConfigError("num_seeds", number, f"must be within 1 and {_MOST:,}")
+
 
 def paths(run: RunDirectory) -> dict[int, Path]:
     """The directory of each seed of a run."""
