@@ -11,9 +11,9 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import PRESETS, init, looks, make_jmvae, mission
+from jaxsense import PRESETS, init, make_jmvae, mission, sim
 from jaxsense.run import devices
-from jaxsense.vae import jmvae
+from jaxsense.vae import detect, posterior
 
 _SCENES = 256
 _SECONDS = 1.0
@@ -50,10 +50,14 @@ def _results() -> dict[str, np.ndarray]:
 
     @jax.jit
     def run(keys: jax.Array):
-        classes = looks.balanced_classes(jax.random.key(2), config, _SCENES)
-        _, windows = looks.surveys(keys, team.world, classes)
-        features = looks.detect_all(models.detectors, windows)
-        encode = jax.vmap(jax.vmap(lambda *f: jmvae.posterior(models.jmvae, model, f)))
+        shape = _SCENES, config.arena.num_pois
+        classes = jax.random.randint(jax.random.key(2), shape, 0, len(config.arena.classes))
+        _, windows = jax.vmap(lambda key, classes: sim.survey(key, team.world, classes))(
+            keys, classes
+        )
+        of_each = jax.vmap(jax.vmap(detect, (None, 0)), (None, 0))
+        features = [of_each(d, w) for d, w in zip(models.detectors, windows, strict=True)]
+        encode = jax.vmap(jax.vmap(lambda *f: posterior(models.jmvae, model, f)))
         states = jax.vmap(lambda key: mission.reset(key, team, team.policy("naive")))(keys)
         periods = round(_SECONDS / config.mission.control_period)
         states, _ = mission.rollout_batch(keys, team, models, states, periods, every=_SCENES)

@@ -12,7 +12,6 @@ from jaxsense import PRESETS, make_mdp
 from jaxsense.config import DqnConfig
 from jaxsense.dqn import training
 from jaxsense.dqn.map_mdp import MapMdp
-from jaxsense.models import make_agent
 
 _UNIT = "env-steps/s"
 
@@ -65,10 +64,9 @@ def dqn_seeds(options: Options) -> Row:
         paper = PRESETS["paper"].dqn
         # On a CPU a twentieth of the epochs: the rate is the same.
         epochs = paper.epochs if is_accelerated else paper.epochs // 20
-        settings = dataclasses.replace(paper, epochs=epochs)
-        task = dataclasses.replace(task, config=dataclasses.replace(task.config, dqn=settings))
+        task = untrained_task(dataclasses.replace(paper, epochs=epochs))
     settings, modalities = task.config.dqn, jnp.arange(len(task.config.modalities))
-    agent = make_agent(task.config)
+    agent = task.models.agent
 
     def train(keys: jax.Array, mdp: MapMdp):
         def of_one(key: jax.Array, modality: jax.Array):

@@ -8,7 +8,6 @@ import numpy as np
 from benchmarks import measure, peers
 from benchmarks.measure import Options, Row
 from jaxsense import PRESETS, make_jmvae
-from jaxsense.core.types import Samples
 from jaxsense.vae import jmvae as our_jmvae
 
 _STEPS, _STEPS_QUICK = 2000, 5
@@ -23,7 +22,7 @@ def jmvae(options: Options) -> Row:
     num_classes = len(PRESETS["default"].arena.classes)
     bank = random_bank(jax.random.key(0), model.feature_sizes, num_classes, _SAMPLES_PER_CLASS)
 
-    def train(key: jax.Array, bank: Samples):
+    def train(key: jax.Array, bank: tuple[jax.Array, ...]):
         init_key, train_key = jax.random.split(key)
         params = our_jmvae.init(init_key, model)
         return our_jmvae.train(train_key, params, model, bank, config)
@@ -45,7 +44,7 @@ def jmvae(options: Options) -> Row:
 
 def random_bank(
     key: jax.Array, feature_sizes: tuple[int, ...], num_classes: int, samples: int
-) -> Samples:
+) -> tuple[jax.Array, ...]:
     """For each modality `[C, S, D_m]` probabilities: what they are does not change the speed."""
     keys = jax.random.split(key, len(feature_sizes))
     return tuple(

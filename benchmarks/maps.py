@@ -6,12 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from benchmarks.jmvae import random_bank
 from jaxsense import PRESETS, Bank, Config, Models, init, make_jmvae, make_mdp
 from jaxsense.config import DqnConfig
-from jaxsense.core.networks import Params
-from jaxsense.core.types import Key, Samples
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn.episodes import Start
 from jaxsense.dqn.map_mdp import MapMdp
@@ -35,7 +34,7 @@ class Task:
 
     config: Config
     models: Models
-    bank: Samples
+    bank: tuple[jax.Array, ...]
 
     @property
     def mdp(self) -> MapMdp:
@@ -69,7 +68,7 @@ class Learner:
 
     start: Callable[[], Any]
     go_on: Callable[[Any], Any]
-    as_params: Callable[[Any], Params]
+    as_params: Callable[[Any], optax.Params]
 
 
 class Examiner:
@@ -88,17 +87,19 @@ class Examiner:
         play_keys = jax.random.split(play_key, num_starts)
         optimal = policies.POLICIES["optimal"].values
 
-        def mean_return(values: Callable[[Key, Known], jax.Array], starts: Start) -> jax.Array:
-            def act(key: Key, known: Known) -> jax.Array:
+        def mean_return(
+            values: Callable[[jax.Array, Known], jax.Array], starts: Start
+        ) -> jax.Array:
+            def act(key: jax.Array, known: Known) -> jax.Array:
                 return policies.best(values(key, known))
 
-            def play(key: Key, start: Start) -> jax.Array:
+            def play(key: jax.Array, start: Start) -> jax.Array:
                 return episodes.run_episode(key, mdp, exact, act, start, MODALITY)[0]
 
             return jnp.mean(jax.vmap(play)(play_keys, starts))
 
-        def greedy_return(params: Params, starts: Start) -> jax.Array:
-            def values(key: Key, known: Known) -> jax.Array:
+        def learned_return(params: optax.Params, starts: Start) -> jax.Array:
+            def values(key: jax.Array, known: Known) -> jax.Array:
                 del key
                 observed = agent.observe(known.belief, known.team, known.robot)
                 return agent.values(params, observed)
@@ -111,8 +112,8 @@ class Examiner:
         self.target = SHARE * float(jax.jit(optimal_return)(starts))
         self._starts = starts
         example = agent.init(jax.random.key(0))
-        self._greedy_return = jax.jit(greedy_return).lower(example, starts).compile()
+        self._learned_return = jax.jit(learned_return).lower(example, starts).compile()
 
-    def passes(self, params: Params) -> bool:
-        """Whether the greedy policy of a Q-network reaches the target."""
-        return float(self._greedy_return(params, self._starts)) >= self.target
+    def passes(self, params: optax.Params) -> bool:
+        """Whether the policy of a Q-network reaches the target."""
+        return float(self._learned_return(params, self._starts)) >= self.target

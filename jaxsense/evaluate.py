@@ -96,7 +96,7 @@ def main(
         arguments = dataclasses.replace(arguments, run=cli.find_run(arguments.run))
         workers = devices.start(arguments.devices)
         trained, models = rundir.load(arguments.run, arguments.trust)
-        config = _elsewhere(arguments, trained)
+        config = _elsewhere(arguments, trained, models.agent.plays)
         team = mission.make_mission(config, policies)
         played = _cases(arguments, team)
         # If these files cannot be written, fail now rather than after minutes of work.
@@ -208,13 +208,13 @@ def _place(config: Config) -> str:
     return f"{config.arena.num_pois}-points-{config.arena.side:g}-m-{robots}"
 
 
-def _elsewhere(arguments: Arguments, config: Config) -> Config:
+def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool]) -> Config:
     """The run's settings with the arena and the team of these missions."""
     sizes = dataclasses.asdict(arguments.arena)
     changed = {name: value for name, value in sizes.items() if value is not None}
     arena = dataclasses.replace(config.arena, **changed)
     # The Q-network of one agent has an input for each PoI.
-    if not config.dqn.is_team and arena.num_pois != config.arena.num_pois:
+    if not plays(arena.num_pois):
         number = config.arena.num_pois
         reason = (
             f"the policies of this run are for {number} points; must be {number}, or a run with"

@@ -18,9 +18,7 @@ from jaxsense.dqn.map_mdp import Looks, MapMdp
 from jaxsense.dqn.places import Places
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.models import Models
-from jaxsense.sim import windows as windowing
 from jaxsense.sim import world as worlds
-from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene, World
 from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Detector
@@ -104,19 +102,6 @@ class Bank:
         # A key from a split is as random as a draw from it.
         row = jax.random.key_data(key)[-1] % samples.shape[1]
         return samples[scene[poi], row], scene
-
-
-def features_of(
-    detector: Detector, sensor: Sensor, readings: Float[Array, "W ..."]
-) -> Float[Array, " D_m"]:
-    """Features of the rays that a detector reads.
-
-    Args:
-      detector: of the sensor.
-      sensor: the sensor.
-      readings: `[window, ...]` of the rays around the PoI's bearing.
-    """
-    return detectors.detect(detector, windowing.as_window(sensor, readings))
 
 
 def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapMdp | TeamMdp:

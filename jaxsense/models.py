@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from jaxsense.config import Config
 from jaxsense.core.networks import Params
@@ -12,8 +13,9 @@ from jaxsense.dqn import optimum
 from jaxsense.dqn.agents import MapAgent, TeamAgent
 from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.sim import sensors
-from jaxsense.vae import detectors, filter, fusion, jmvae, readout
+from jaxsense.sim import sensors, windows
+from jaxsense.sim.sensors import Sensor
+from jaxsense.vae import detectors, filter, fusion, jmvae, latent, readout
 from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.jmvae import Jmvae
@@ -42,6 +44,23 @@ class Models:
     agent: Agent
     q_networks: tuple[Params, ...]
     tours: Params | None
+
+    def features(
+        self, modality: int, sensor: Sensor, readings: Float[Array, "W ..."]
+    ) -> Float[Array, " D_m"]:
+        """Features of a look, from the rays that the detector reads.
+
+        Args:
+          modality: index of the sensor; static.
+          sensor: the sensor.
+          readings: `[window, ...]` of the rays around the PoI's bearing.
+        """
+        window = windows.as_window(sensor, readings)
+        return detectors.detect(self.detectors[modality], window)
+
+    def plausible_classes(self, belief: Belief) -> Bool[Array, " C"]:
+        """Classes that are plausible given a `[D]` belief, see `vae.plausible_classes`."""
+        return latent.plausible_classes(belief, self.fusion.classes.mean)
 
 
 def make_jmvae(config: Config) -> Jmvae:

@@ -18,7 +18,7 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import mission, summary
+from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, read_some
@@ -32,7 +32,6 @@ from jaxsense.run.programs import Programs
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.show import animation, page, plots, tables, tensorboard
 from jaxsense.show.terminal import Display, print_table, say
-from jaxsense.sim import sensors
 from jaxsense.summary import compare, statistics
 from jaxsense.summary.blocks import Header
 
@@ -176,8 +175,7 @@ def parse(
             num_seeds=stored.num_seeds,
         )
         arguments = cli.parse(PROGRAM, Arguments, argv, default, _COMMON)
-        sensors.make(arguments.config)
-        mission.require_policies(arguments.config, policies)
+        pipeline.check(arguments.config, policies)
         if arguments.tensorboard:
             tensorboard.require()
         seeds.check_range(arguments.seed, arguments.num_seeds)
@@ -351,7 +349,7 @@ def _write(run: RunDirectory, result: RunResult, timing: summary.Timing, monitor
     config, recording = run.settings.config, result.recording
     monitor.check_stop()
     pictures = plots.of_run(
-        config, result.results, result.posteriors, result.windows, result.detections
+        config, result.results, result.posteriors, result.windows, result.reliability
     )
     pictures |= plots.of_seeds(result.rewards, result.results)
     title = f"{config.mission.policies[0]} policy".replace("_", " ")

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
-PROGRAMS = ("show", "run/cli.py", "train.py", "evaluate.py")  # drawn from if named
+PROGRAMS = ("show", "train.py", "evaluate.py")  # drawn from if named
 LAST = "tests/test_same_numbers.py"  # trains once, and compares all figures
 TEST_SECONDS = 200
 RUNNING: set[int] = set()  # process groups

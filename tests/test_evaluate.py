@@ -165,10 +165,14 @@ def test_evaluate_prints_the_comparison(evaluated):
 
 def test_missions_elsewhere_have_the_settings_that_are_asked_for():
     config, path = PRESETS["smoke"], Path("run")
+
+    def any_number(num_pois: int) -> bool:
+        return True
+
     arguments = evaluate.Arguments(
         path, arena=evaluate.ArenaArguments(side=4.0), robots=("camera", "camera", "lidar")
     )
-    there = evaluate._elsewhere(arguments, config)
+    there = evaluate._elsewhere(arguments, config, any_number)
     assert (there.arena.side, there.arena.num_pois) == (4.0, 3)
     assert there.carried == ("camera", "camera", "lidar")
     assert evaluate._place(there) == "3-points-4-m-2-camera-1-lidar"
@@ -179,12 +183,12 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
     mixed = evaluate.Arguments(
         path, arena=evaluate.ArenaArguments(side=4.0), robots=("camera", "lidar", "camera")
     )
-    assert evaluate._elsewhere(mixed, config) == there
+    assert evaluate._elsewhere(mixed, config, any_number) == there
     # What is asked for is no other place if the run has it already.
     same = evaluate.Arguments(
         path, arena=evaluate.ArenaArguments(3, 3.0), robots=("lidar", "camera")
     )
-    assert evaluate._elsewhere(same, config) == config
+    assert evaluate._elsewhere(same, config, any_number) == config
     # A policy for any number of points has no limit to the looks of a start.
     team = PRESETS["team"]
     partly = dataclasses.replace(
@@ -194,13 +198,15 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
         evaluation=dataclasses.replace(team.evaluation, num_pois=(3, 8)),
     )
     there = evaluate._elsewhere(
-        evaluate.Arguments(path, arena=evaluate.ArenaArguments(30, 8.0)), partly
+        evaluate.Arguments(path, arena=evaluate.ArenaArguments(30, 8.0)), partly, any_number
     )
     assert there.arena.num_pois == 30
     with pytest.raises(
         ConfigError, match=r"arena\.num_pois = 4: the policies of this run are for 3"
     ):
-        evaluate._elsewhere(evaluate.Arguments(path, arena=evaluate.ArenaArguments(4)), config)
+        evaluate._elsewhere(
+            evaluate.Arguments(path, arena=evaluate.ArenaArguments(4)), config, lambda n: n == 3
+        )
 
 
 @pytest.mark.slow  # compiles missions of three robots

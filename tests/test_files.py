@@ -176,6 +176,25 @@ def test_a_missing_checkpoint_is_noticed(tmp_path):
     assert "tree.msgpack': is missing" in said[0]
 
 
+def test_a_process_that_is_killed_after_its_first_checkpoint_has_lost_no_list(
+    tmp_path, monkeypatch
+):
+    write = files.write
+
+    def killed(path, content):
+        write(path, content)
+        if path.name == "tree.msgpack":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(files, "write", killed)
+    with pytest.raises(KeyboardInterrupt):
+        Checkpoints(tmp_path).save("tree", TREE)
+    monkeypatch.undo()
+    checkpoints = Checkpoints(tmp_path, pytest.fail)
+    checkpoints.check()
+    assert checkpoints.load("tree", SHAPES) is not None
+
+
 @pytest.mark.parametrize(
     ("damage", "expected"),
     [

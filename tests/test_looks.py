@@ -108,6 +108,8 @@ def test_an_agent_of_a_team_has_the_mdp_of_a_team():
     assert mdp.map.num_pois == config.team.num_pois[1]
     assert mdp.places.poi_pitch == config.arena.poi_pitch
     assert mdp.places.robot_radius == config.navigation.robot_radius
+    # Nothing else of them is an input of a compiled program.
+    assert jax.tree.leaves(mdp.places) == [*config.team.sides, config.navigation.robot_radius]
     assert mdp.config is config.team
 
 

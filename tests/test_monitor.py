@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.run.monitor import Monitor, StageError
+from jaxsense.run.monitor import Monitor, StageError, Stopped
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -33,3 +33,17 @@ def test_another_run_has_times_and_a_listener_of_its_own():
     monitor.progress("dqn", 1, 2)
     assert monitor.seconds == {}
     assert heard == [("first", "jmvae", 1, 2, {}), ("second", "dqn", 1, 2, {})]
+
+
+def test_stages_stop_if_they_are_asked_to_and_if_one_of_them_has_failed():
+    asked, failed = Monitor(), Monitor()
+    assert not asked.is_stopping
+    asked.check_stop()
+    asked.stop()
+    failed.fail(StageError("jmvae: loss = nan"))
+    assert asked.is_stopping
+    assert failed.is_stopping
+    with pytest.raises(Stopped):
+        asked.check_stop()
+    with pytest.raises(StageError, match="jmvae: loss = nan"):
+        failed.check_stop()

@@ -10,8 +10,12 @@ from jaxsense.core.types import Belief
 from jaxsense.dqn import POLICIES
 from jaxsense.show import colours, mission_plots, plots
 from jaxsense.sim import sensors
+from jaxsense.training.measures import reliability
 
 CONFIG = PRESETS["smoke"]
+LIDAR = replace(
+    CONFIG, modalities=("lidar",), jmvae=replace(CONFIG.jmvae, reconstruction_weights=(1.0,))
+)
 CENTRES = np.array([[2.0, 0.0], [-2.0, 0.0], [-2.0, 0.05]])  # the last two look alike
 
 
@@ -62,8 +66,8 @@ def scanlines():
     for sensor in sensors.make(CONFIG):
         is_left = sensor.angles[:: sensor.stride][: sensor.window]
         readings = np.where(is_left > np.median(is_left), 0.8, 0.4)[:, None]
-        readings = np.repeat(readings, sensor.channels, axis=1).reshape(1, 1, -1)
-        windows[sensor.name] = np.repeat(readings, 3, axis=0)
+        readings = np.repeat(readings, sensor.channels, axis=1).reshape(1, -1)
+        windows[sensor.name] = sensor.from_left(np.repeat(readings, 3, axis=0))
     figure = plots.scanlines(CONFIG, windows)
     figure.draw_without_rendering()
     return np.reshape(figure.axes[:6], (2, 3))
@@ -87,8 +91,8 @@ def test_plots_of_sixteen_classes_have_room_for_all(recwarn):
     classes = tuple(f"{colour} {shape}" for colour in paints for shape in shapes)
     arena = ArenaConfig(shapes=shapes, colours=paints, classes=classes)
     config = replace(CONFIG, arena=arena, jmvae=replace(CONFIG.jmvae, latent_size=8))
-    sizes = {sensor.name: sensor.window * sensor.channels for sensor in sensors.make(config)}
-    windows = {name: np.full((16, 1, size), 0.5) for name, size in sizes.items()}
+    sizes = {sensor.name: (16, sensor.window, sensor.channels) for sensor in sensors.make(config)}
+    windows = {name: np.full(size, 0.5) for name, size in sizes.items()}
     belief = Belief(np.random.default_rng(0).normal(size=(16, 9, 8)), np.full((16, 9, 8), 0.1))
     of_all = dict.fromkeys(("joint", "camera", "lidar"), belief)
     for figure in (plots.scanlines(config, windows), plots.latent_space(config, of_all)):
@@ -149,16 +153,16 @@ def test_a_class_is_drawn_in_the_colour_of_its_pois_or_else_darker():
     np.testing.assert_allclose(found, [[0.1, 0.7, 0.1], [0.8, 0.1, 0.1], [0.4, 0.05, 0.05]])
 
 
-CURVES = {"reward": np.arange(40.0), "greedy": np.full(40, np.nan)}
-CURVES["greedy"][[9, 19, 29, 39]] = [1.0, 2.0, 3.0, 4.0]
+CURVES = {"reward": np.arange(40.0), "evaluation": np.full(40, np.nan)}
+CURVES["evaluation"][[9, 19, 29, 39]] = [1.0, 2.0, 3.0, 4.0]
 AGENT = {"return": 4.0, "optimal": 4.5, "naive": 3.0, "random": -1.0}
 
 
-def test_the_greedy_policy_is_drawn_where_it_was_played():
+def test_the_evaluation_is_drawn_where_it_was_played():
     figure = plots.rewards({"camera": CURVES}, {"camera": AGENT})
     lines = {line.get_label(): line for line in figure.axes[0].lines}
-    np.testing.assert_array_equal(lines["greedy"].get_xdata(), [9, 19, 29, 39])
-    np.testing.assert_array_equal(lines["greedy"].get_ydata(), [1, 2, 3, 4])
+    np.testing.assert_array_equal(lines["without exploration"].get_xdata(), [9, 19, 29, 39])
+    np.testing.assert_array_equal(lines["without exploration"].get_ydata(), [1, 2, 3, 4])
     # The mean of the last 20 epochs, from 20 to 39.
     assert lines["exploring"].get_ydata()[-1] == 29.5
     assert lines["optimal"].get_ydata()[0] == 4.5
@@ -176,7 +180,7 @@ def test_episodes_of_a_team_are_not_drawn_beside_those_of_a_robot_alone():
     figure = plots.rewards({"team": CURVES}, {"camera": AGENT, "lidar": AGENT})
     of_team, alone = ({line.get_label() for line in ax.lines} for ax in figure.axes)
     assert of_team == {"exploring"}
-    assert alone == {"greedy", "optimal", "naive", "random: -1.00"}
+    assert alone == {"without exploration", "optimal", "naive", "random: -1.00"}
     assert figure.axes[1].get_title() == "team: one camera robot alone on the map"
 
 
@@ -184,7 +188,7 @@ def test_curves_of_several_seeds_have_a_band():
     two = {kind: np.stack([values, values + 2]) for kind, values in CURVES.items()}
     axes = plots.rewards({"camera": two}, {"camera": AGENT}).axes[0]
     lines = {line.get_label(): line for line in axes.lines}
-    np.testing.assert_array_equal(lines["greedy"].get_ydata(), [2, 3, 4, 5])
+    np.testing.assert_array_equal(lines["without exploration"].get_ydata(), [2, 3, 4, 5])
     assert len(axes.collections) == 2
     nothing = {kind: np.zeros((0, 40)) for kind in CURVES}
     plots.rewards({"camera": nothing}, {"camera": AGENT}).draw_without_rendering()
@@ -260,10 +264,10 @@ def test_a_detector_that_is_calibrated_lies_on_the_diagonal():
     right, wrong = [0.9, 0.1], [0.1, 0.9]
     looks = np.array([[right] * 9 + [wrong], [right] * 9 + [wrong], [wrong] * 9 + [right]])
     belief = {"looks": [1, 2], "nll": [0.5, 0.2], "bayes_nll": [0.4, 0.1]}
-    detectors, beliefs = plots.calibration(CONFIG, {"lidar": looks}, belief).axes
+    detectors, beliefs = plots.calibration(CONFIG, reliability(LIDAR, (looks,)), belief).axes
     # A bin of fewer than twenty looks, six with .8, is left out.
     looks = np.concatenate([looks, np.tile([0.8, 0.2], (3, 2, 1))], axis=1)
-    detectors, _ = plots.calibration(CONFIG, {"lidar": looks}, belief).axes
+    detectors, _ = plots.calibration(CONFIG, reliability(LIDAR, (looks,)), belief).axes
     confidence, accuracy = detectors.lines[1].get_data()
     np.testing.assert_allclose(confidence[np.isfinite(confidence)], [0.9], rtol=1e-6)
     np.testing.assert_allclose(accuracy[np.isfinite(accuracy)], [0.9], rtol=1e-6)

@@ -16,6 +16,12 @@ from jaxsense.run.rundir import RunDirectory, Settings
 SETTINGS = Settings("smoke", 3, PRESETS["smoke"])
 
 
+def test_a_json_file_is_text_for_people(tmp_path):
+    rundir.write_json(tmp_path / "file", {"a": {"b": 1.5}, "c": [True]})
+    text = (tmp_path / "file").read_text(encoding="utf-8")
+    assert text == '{\n  "a": {\n    "b": 1.5\n  },\n  "c": [\n    true\n  ]\n}\n'
+
+
 def test_runs_of_one_second_get_directories_of_their_own(tmp_path):
     with ThreadPoolExecutor(8) as executor:
         made = list(executor.map(lambda _: rundir.unused(tmp_path / "runs" / "now"), range(8)))

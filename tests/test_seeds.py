@@ -50,10 +50,10 @@ def test_curves_are_those_of_all_seeds(seeds):
     config = read_settings(seeds / "config.json").config
     runs = [seeds / "seed-4", seeds / "seed-5"]
     curves = of_seeds.rewards(runs, config, pytest.fail)
-    saved = {name: np.full(60, np.nan, np.float32) for name in ("reward", "greedy", "epsilon")}
+    saved = {name: np.full(60, np.nan, np.float32) for name in ("reward", "evaluation", "epsilon")}
     saved["seconds"] = np.zeros(3, np.float32)
     of_5 = Checkpoints(seeds / "seed-5" / "checkpoints").load("curves_dqn_lidar", saved)
-    for name in ("reward", "greedy"):
+    for name in ("reward", "evaluation"):
         assert curves["lidar"][name].shape == (2, 60)
         np.testing.assert_array_equal(curves["lidar"][name][1], of_5[name])
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium  # pyright: ignore[reportMissingImports]
 import numpy as np
+import optax
 import torch  # pyright: ignore[reportMissingImports]
 from stable_baselines3 import DQN  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.callbacks import (  # pyright: ignore[reportMissingImports]
@@ -15,7 +16,6 @@ from stable_baselines3.common.callbacks import (  # pyright: ignore[reportMissin
 from benchmarks.maps import MODALITY, Task
 from benchmarks.measure import Options, Side
 from benchmarks.peers.numpy_mdp import NumpyMdp
-from jaxsense.core.networks import Params
 
 
 class MapEnv(gymnasium.Env):
@@ -73,7 +73,7 @@ def throughputs(task: Task, options: Options) -> list[Side]:
     return [side(1), side(4)]
 
 
-def as_our_params(model: DQN) -> Params:
+def as_our_params(model: DQN) -> optax.Params:
     """Its Q-network as one of ours."""
     linear = [m for m in model.q_net.q_net if isinstance(m, torch.nn.Linear)]
     return {
@@ -87,7 +87,7 @@ def as_our_params(model: DQN) -> Params:
     }
 
 
-def time_to(task: Task, passes: Callable[[Params], bool], limit: float) -> tuple[float, bool]:
+def time_to(task: Task, passes: Callable[[optax.Params], bool], limit: float) -> tuple[float, bool]:
     """Seconds of training until an examination is passed, without the examinations.
 
     Args:

@@ -253,11 +253,6 @@ class DqnConfig(Section, place="dqn"):
             require(is_multiple, self, field, f"must be a multiple of {unit} = {size}")
 
     @property
-    def is_team(self) -> bool:
-        """Whether robots learn together, in an MDP with travel time."""
-        return self.task == "team"
-
-    @property
     def block(self) -> int:
         """Size of a block of environments in the replay, see `dqn.replay`."""
         shared = math.gcd(self.num_envs, self.batch)

@@ -119,19 +119,9 @@ class Config(Section):
         require(leaves_some, self.detector, "calibration", expected)
 
     def _check_task(self) -> None:
-        """A team learns from stored detections; a dense network is for one number of PoIs."""
-        is_team, team = self.dqn.is_team, self.team
-        observes_bank = not is_team or self.dqn.observe == "bank"
-        expected = "must be 'bank' with dqn.task = 'team', whose MDP has no scans"
-        require(observes_bank, self.dqn, "observe", expected)
-        least = team.cells_per_side * self.arena.poi_pitch
-        expected = f"must be at least {least:.2f} m, so that {team.num_pois[1]} PoIs fit"
-        require(not is_team or team.sides[0] >= least, team, "sides", expected)
-        is_for_any = is_team or not self.evaluation.num_pois
-        expected = "needs dqn.task = 'team', whose policy is for any number; must be empty"
-        require(is_for_any, self.evaluation, "num_pois", expected)
-        of_team = team.num_pois if is_team else ()
-        most = max(self.arena.num_pois, *of_team, *self.evaluation.num_pois, 0)
+        """What is learned must fit the task, and states that are partly seen a number."""
+        self._task.check(self)
+        most = max(self._task.most_pois(self), *self.evaluation.num_pois, 0)
         looks = most * len(self.modalities)
         is_right = not self.mdp.partly_seen_starts or 2 <= looks <= 30
         expected = f"needs 2 to 30 pairs of PoI and modality, not {looks}; must be False"
@@ -184,19 +174,19 @@ class Config(Section):
         """Sizes of arrays that follow from several sections."""
         num_pois, windows = self.arena.num_pois, {"camera": 3 * self.camera.window}
         windows["lidar"] = self.lidar.window
-        state = 2 * self.jmvae.latent_size * num_pois
-        if self.dqn.is_team:
-            of_poi = 2 * self.jmvae.latent_size + 3 * len(self.modalities) + 4
-            state = max(self.team.num_pois[1], num_pois) * of_poi
         return Sizes(
             pois=num_pois,
             classes=len(self.arena.classes),
             modalities=len(self.modalities),
             labels=sum(len(self.labels(name)) for name in self.modalities),
             window=max(windows.get(name, 1) for name in self.modalities),
-            state=state,
+            state=self._task.most_pois(self) * self._task.features(self),
             views=num_pois * VIEW_SIDES * len(self.navigation.view_distances),
         )
+
+    @property
+    def _task(self) -> "_MapTask | _TeamTask":
+        return _TASKS[self.dqn.task]
 
     @property
     def carried(self) -> tuple[str, ...]:
@@ -232,3 +222,40 @@ class Config(Section):
     def label_of_class(self, modality: str) -> tuple[int, ...]:
         """For each class, the index of its label in a modality."""
         return self.arena.label_of_class(self.attribute(modality))
+
+
+class _MapTask:
+    """What `dqn.task` = map asks of the settings: a dense network is for one number of PoIs."""
+
+    def check(self, config: Config) -> None:
+        is_empty = not config.evaluation.num_pois
+        expected = "needs dqn.task = 'team', whose policy is for any number; must be empty"
+        require(is_empty, config.evaluation, "num_pois", expected)
+
+    def most_pois(self, config: Config) -> int:
+        return config.arena.num_pois
+
+    def features(self, config: Config) -> int:
+        """Numbers that a robot observes of each PoI."""
+        return 2 * config.jmvae.latent_size
+
+
+class _TeamTask(_MapTask):
+    """What `dqn.task` = team asks of the settings: a team learns from stored detections."""
+
+    def check(self, config: Config) -> None:
+        expected = "must be 'bank' with dqn.task = 'team', whose MDP has no scans"
+        require(config.dqn.observe == "bank", config.dqn, "observe", expected)
+        team = config.team
+        least = team.cells_per_side * config.arena.poi_pitch
+        expected = f"must be at least {least:.2f} m, so that {team.num_pois[1]} PoIs fit"
+        require(team.sides[0] >= least, team, "sides", expected)
+
+    def most_pois(self, config: Config) -> int:
+        return max(config.team.num_pois[1], config.arena.num_pois)
+
+    def features(self, config: Config) -> int:
+        return super().features(config) + 3 * len(config.modalities) + 4
+
+
+_TASKS = {"map": _MapTask(), "team": _TeamTask()}

@@ -49,6 +49,21 @@ class Belief:
     std: jax.Array
 
 
+@pytree
+class Reliability:
+    """Points of a reliability diagram, one for each of B bins of confidence.
+
+    Attributes:
+      confidence: `[B]` mean probability of the most likely label; NaN in an empty bin.
+      accuracy: `[B]` share of right labels; NaN in an empty bin.
+      looks: `[B]` float32 number of looks.
+    """
+
+    confidence: jax.Array
+    accuracy: jax.Array
+    looks: jax.Array
+
+
 class Fusion(Protocol):
     """How looks update beliefs; a frozen pytree."""
 

@@ -200,17 +200,6 @@ def optimal(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     return jnp.append(_expected(looks.q, looks.q_unseen, exact, known.is_seen), 0.0)
 
 
-def by_total(models: Trained, known: Known) -> jax.Array:
-    """Values `[N + 1]` of looks by dynamic programming on what the map shows.
-
-    Args:
-      models: trained models.
-      known: what the robot knows.
-    """
-    looks, on_map = _own(models, known), jax.vmap(models.fusion.class_probabilities)(known.belief)
-    return jnp.append(_expected(looks.q, looks.q_unseen, on_map, known.is_seen), 0.0)
-
-
 def naive(number: int) -> Values:
     """Explores naively: every robot looks at every PoI `number` times."""
 

@@ -1,8 +1,9 @@
-"""The reference that learned policies are measured against in the map MDP, `optimal` in a summary.
+"""The optimal policy of the map MDP, which learned policies are measured against.
 
-Where beliefs accumulate looks, it is the optimal policy by dynamic programming. Where a look
-replaces the one before, a second look by the same sensor never pays; then it takes every look whose
-simulated reward pays on average, given what the earlier looks can reveal.
+Where beliefs accumulate looks, it is the policy `optimal` of missions, by dynamic programming on
+the exact posterior. Where a look replaces the one before, a second look by the same sensor never
+pays; then it takes every look whose simulated reward pays on average, given what the earlier looks
+can reveal.
 """
 
 import math
@@ -26,7 +27,7 @@ Reference = Callable[[Known, jax.Array], jax.Array]
 def reference(
     key: Key, mdp: MapMdp, modality: Index, models: Trained, labels: Int[Array, "M C"]
 ) -> Reference:
-    """The reference policy of an MDP.
+    """The optimal policy of an MDP.
 
     Args:
       key: random key of the simulated rewards.
@@ -36,7 +37,7 @@ def reference(
       labels: the label of each class in each modality.
     """
     if mdp.fusion.accumulates:
-        return lambda known, classes: policies.by_total(models, known)
+        return lambda known, classes: policies.optimal(key, models, known)
     rewards = expected_rewards(key, mdp, modality)
     return lambda known, classes: _informed(rewards, labels, known.looks > 0, classes)
 

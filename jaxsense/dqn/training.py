@@ -56,7 +56,7 @@ class EpochInfo:
       loss: `[]` mean over the gradient steps.
       episode_return: `[]` mean total reward of the exploring policy's episodes that ended.
       episodes: `[]` int32 episodes that ended.
-      greedy_return: `[]` mean total reward of the learned policy after the epoch; NaN except in
+      evaluation_return: `[]` mean total reward of the learned policy after the epoch; NaN except in
         every tenth epoch.
       epsilon: `[]` chance of a random action.
       is_finite: `[]` bool, whether values, rewards, loss and new parameters are finite.
@@ -65,7 +65,7 @@ class EpochInfo:
     loss: jax.Array
     episode_return: jax.Array
     episodes: jax.Array
-    greedy_return: jax.Array
+    evaluation_return: jax.Array
     epsilon: jax.Array
     is_finite: jax.Array
 
@@ -186,8 +186,8 @@ def train_chunk(
     def advance(state: DqnState[S], of_group: tuple[Key, _Draws]) -> tuple[DqnState[S], EpochInfo]:
         key, draws = of_group
         state, infos = jax.lax.scan(epoch, state, draws)
-        found = infos.greedy_return.at[-1].set(evaluate(key, state.params))
-        return state, dataclasses.replace(infos, greedy_return=found)
+        found = infos.evaluation_return.at[-1].set(evaluate(key, state.params))
+        return state, dataclasses.replace(infos, evaluation_return=found)
 
     # `_draw` splits the key itself in three, as without evaluation.
     keys = jax.random.split(jax.random.fold_in(key, 3), config.chunk // every)
@@ -240,7 +240,7 @@ def _epoch(
         loss=loss,
         episode_return=ended_reward / jnp.maximum(episodes, 1),
         episodes=episodes,
-        greedy_return=jnp.float32(jnp.nan),
+        evaluation_return=jnp.float32(jnp.nan),
         epsilon=epsilon,
         is_finite=is_finite,
     )
@@ -270,8 +270,8 @@ def _explore(
     s_tm1 = observations(started)
     values = environment.agent.values(params, s_tm1)
     chex.assert_shape(values, (environment.num_actions, None))
-    greedy = jnp.argmax(values, axis=0).astype(jnp.int32)
-    a_tm1 = jnp.where(draws.coin < epsilon, _explored(environment, started, draws.action), greedy)
+    highest = jnp.argmax(values, axis=0).astype(jnp.int32)
+    a_tm1 = jnp.where(draws.coin < epsilon, _explored(environment, started, draws.action), highest)
 
     def step(key: Key, state: S, s_tm1: jax.Array, action: jax.Array):
         after, learned, outcome = environment.step(key, state, s_tm1, action)

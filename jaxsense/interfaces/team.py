@@ -49,13 +49,11 @@ def check_team(mdp: TeamMdp, config: Config) -> None:
     Raises:
       ValueError: if it is not.
     """
-    if not isinstance(mdp, TeamMdp):
-        reason = "must be a TeamMdp, from jaxsense.make_mdp with dqn.task = 'team'"
-        raise ValueError(f"mdp = {type(mdp).__name__}: {reason}")
-    if config.modalities != mdp.modalities:
-        raise ValueError(
-            f"config.modalities = {config.modalities}: must be {mdp.modalities}, as in mdp"
-        )
+    found = getattr(mdp, "modalities", None)
+    if found != config.modalities:
+        reason = f"must be a TeamMdp with {config.modalities}, as config.modalities are"
+        made = "from jaxsense.make_mdp with dqn.task = 'team'"
+        raise ValueError(f"mdp = {type(mdp).__name__} with modalities {found}: {reason}, {made}")
 
 
 def team_spaces(spaces: Any, mdp: TeamMdp) -> tuple[Any, Any]:

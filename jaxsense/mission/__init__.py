@@ -11,7 +11,7 @@ from jaxsense.mission.begin import start as start
 from jaxsense.mission.cases import Case as Case
 from jaxsense.mission.cases import cases as cases
 from jaxsense.mission.cases import is_fault as is_fault
-from jaxsense.mission.cases import require_policies as require_policies
+from jaxsense.mission.cases import require_playable as require_playable
 from jaxsense.mission.outcome import REASONS as REASONS
 from jaxsense.mission.outcome import measure as measure
 from jaxsense.mission.outcome import reason as reason

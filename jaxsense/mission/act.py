@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Belief, Index, Key, call, others, pytree
-from jaxsense.looks import features_of
 from jaxsense.mission import navigation, roadmap
 from jaxsense.mission.decide import is_taken, sees
 from jaxsense.mission.groups import where_due
@@ -258,7 +257,7 @@ def _look(
     error = jnp.radians(mission.config.viewpoint.bearing_error)
     arena = mission.config.arena
     shows = windows.shows_poi(sensor, readings, aim.bearing, aim.distance, arena, error)
-    features = features_of(models.detectors[modality], sensor, readings)
+    features = models.features(modality, sensor, readings)
     is_confident = jnp.max(features) >= mission.config.mission.least_confidence
     old = jax.tree.map(lambda x: x[aim.poi], state.belief)
     return _Look(

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxsense.config import Config, ConfigError
 from jaxsense.dqn.policies import POLICIES, Policy, Values, table
 from jaxsense.mission.state import Faults, no_faults
+from jaxsense.sim import sensors
 
 FAULT_TIME = 6.0  # s
 _FAULTS = ("alone", "stops", "blind")
@@ -26,17 +27,18 @@ class Case:
     faults: Faults
 
 
-def require_policies(config: Config, policies: Mapping[str, Values | Policy] | None = None) -> None:
-    """Checks that the policies of a run exist, before anything is trained.
+def require_playable(config: Config, policies: Mapping[str, Values | Policy] | None = None) -> None:
+    """Checks that missions can be made and their policies exist, before anything is trained.
 
     Args:
       config: all settings.
       policies: of your own, by name, besides `dqn.POLICIES`.
 
     Raises:
-      ConfigError: if `config.mission.policies` names an unknown policy, or a policy of your own is
-        named like a case with a fault.
+      ConfigError: if a custom sensor cannot be made, `config.mission.policies` names an unknown
+        policy, or a policy of your own is named like a case with a fault.
     """
+    sensors.make(config)
     known = table(policies)
     _require_names(known)
     if not set(config.mission.policies) <= set(known):

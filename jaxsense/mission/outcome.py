@@ -7,7 +7,6 @@ from jaxtyping import Array, Int, PyTree
 from jaxsense.dqn import rewards
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
 from jaxsense.models import Models
-from jaxsense.vae import latent
 
 REASONS = (
     "running",
@@ -64,9 +63,8 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
       `reason`: `[]` int32, see `reason`.
     """
     config = mission.config
-    means = models.fusion.classes.mean
     shown = jax.vmap(models.fusion.most_likely_class)(state.belief)
-    plausible = jax.vmap(lambda b: latent.plausible_classes(b, means))(state.belief)
+    plausible = jax.vmap(models.plausible_classes)(state.belief)
     is_seen = jnp.any(state.seen, axis=-1)
     is_right = is_seen & (shown == state.classes)
     told = {}

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxsense import mission, summary
 from jaxsense.config import Config
-from jaxsense.core.types import Belief, Key
+from jaxsense.core.types import Belief, Key, Reliability
 from jaxsense.dqn.policies import Policy, Values
 from jaxsense.models import Models
 from jaxsense.run import missions
@@ -20,6 +20,8 @@ from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs, compile_programs
 from jaxsense.training.agents import learner
+from jaxsense.training.comparison import permutations
+from jaxsense.training.measures import reliability
 from jaxsense.training.stages import mission_key, models
 
 
@@ -29,23 +31,28 @@ class RunResult:
 
     Attributes:
       models: the trained networks.
-      windows: for each modality `[C, 1, F]` one look at each class.
-      detections: for each modality `[C, S', D_m]` held-out detections.
+      windows: for each modality `[C, window, channels]` one look at each class, from left to right.
+      reliability: for each modality, see `training.measures.reliability`.
       posteriors: `[C, S', D]` beliefs of these, `joint` and for each modality.
       rewards: for each Q-network, named by its modality or `team`, the `[epochs]` mean total reward
-        of the episodes that ended, `reward`, and of the greedy policy of a robot that is alone on
-        the map, `greedy`; NaN in other epochs.
+        of the episodes that ended, `reward`, and of the learned policy of a robot that is alone on
+        the map, `evaluation`; NaN in other epochs.
       recording: the first mission of the first of `config.mission.policies`.
       results: the blocks of `summary.json`.
     """
 
     models: Models
     windows: dict[str, np.ndarray]
-    detections: dict[str, np.ndarray]
+    reliability: dict[str, Reliability]
     posteriors: dict[str, Belief]
     rewards: dict[str, dict[str, np.ndarray]]
     recording: missions.Recording
     results: summary.Results
+
+
+def check(config: Config, policies: Mapping[str, Values | Policy] | None = None) -> None:
+    """Checks what only making the parts of a run shows, see `mission.require_playable`."""
+    mission.require_playable(config, policies)
 
 
 @contextlib.contextmanager
@@ -68,9 +75,9 @@ def compiled(
       policies: of your own, by name; keep no programs with these, whose code may change.
 
     Raises:
-      ConfigError: if `config.mission.policies` names an unknown policy.
+      ConfigError: see `mission.require_playable`.
     """
-    mission.require_policies(config, policies)
+    check(config, policies)
     with Compiler(monitor, kept) as compiler:
         yield compile_programs(config, compiler, workers, num_seeds, policies)
 
@@ -104,14 +111,18 @@ def run(
     checkpoints.forget_unfinished()
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
+    sensors = player.mission.world.sensors
     return RunResult(
         models=networks,
-        windows=dict(zip(config.modalities, detections.windows, strict=True)),
-        detections=dict(zip(config.modalities, detections.held_out, strict=True)),
+        windows={
+            sensor.name: sensor.from_left(windows[:, 0])
+            for sensor, windows in zip(sensors, detections.windows, strict=True)
+        },
+        reliability=reliability(config, detections.held_out),
         posteriors=posteriors,
         rewards={
             network.removeprefix("dqn_"): {
-                name: np.array(trained.curves[network][name]) for name in ("reward", "greedy")
+                name: np.array(trained.curves[network][name]) for name in ("reward", "evaluation")
             }
             for network in (learner(config, n) for n in config.modalities)
         },
@@ -136,6 +147,7 @@ def _agent(config: Config, modality: str, trained: Trained) -> summary.Agent:
         config,
         total,
         first,
+        permutations(config),
         trained.curves[learner(config, modality)]["seconds"],
         {
             number: np.asarray(total)

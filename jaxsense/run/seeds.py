@@ -91,7 +91,7 @@ def rewards(
     """
     shapes = {
         "reward": np.zeros(config.dqn.epochs, np.float32),
-        "greedy": np.zeros(config.dqn.epochs, np.float32),
+        "evaluation": np.zeros(config.dqn.epochs, np.float32),
         "epsilon": np.zeros(config.dqn.epochs, np.float32),
         "seconds": np.zeros(config.dqn.epochs // config.dqn.chunk, np.float32),
     }
@@ -112,7 +112,7 @@ def rewards(
         found = [curves for run in runs for curves in load(run, network)]
         return {
             name: np.array([curves[name] for curves in found]).reshape(-1, config.dqn.epochs)
-            for name in ("reward", "greedy")
+            for name in ("reward", "evaluation")
         }
 
     networks = dict.fromkeys(learner(config, name) for name in config.modalities)

@@ -30,6 +30,12 @@ def policy_colour(name: str) -> str:
     return _POLICY_COLOURS.get(name, "C9")
 
 
+def policy_marker(name: str) -> str:
+    """The marker of a policy, the same in all plots."""
+    names = [*_POLICY_COLOURS]
+    return MARKERS[names.index(name) % len(MARKERS) if name in names else -1]
+
+
 def class_colour(arena: ArenaConfig, label: str) -> RGB:
     """The colour of a class, RGB in [0, 1], unique in the arena.
 

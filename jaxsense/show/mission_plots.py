@@ -7,8 +7,7 @@ from typing import cast
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxsense.dqn import POLICIES
-from jaxsense.show.colours import MARKERS, policy_colour
+from jaxsense.show.colours import policy_colour, policy_marker
 from jaxsense.summary.blocks import MISSIONS, Evaluation, Missions, cases
 from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.metrics import Number, mean
@@ -120,14 +119,14 @@ def _draw_times(ax: Axes, places: list[Evaluation], key: str) -> None:
     # Places of one number differ in something else, and no line leads from one to the other.
     line = "-" if len(set(map(number, places))) == len(places) else ""
     found = dict.fromkeys(name for place in places for name in policies_of(place["mission"]))
-    for i, name in enumerate({**POLICIES, **found}):
+    for name in found:
         played = [
             (number(place), mean(case["time_s"]))
             for place in places
             if (case := cases(place["mission"]).get(name))
         ]
         if played:
-            style = MARKERS[i % 4] + line
+            style = policy_marker(name) + line
             numbers, times = zip(*played, strict=True)
             ax.plot(numbers, times, style, color=policy_colour(name), label=name)
     label = "PoIs" if key == "num_pois" else "robots"

@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib import cm, colormaps
 from matplotlib.axes import Axes
@@ -16,20 +15,18 @@ from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
 from jaxsense.config import Config
-from jaxsense.core.types import Belief
+from jaxsense.core.types import Belief, Reliability
 from jaxsense.show import mission_plots
 from jaxsense.show.colours import MARKERS, RGB, as_srgb, class_colour, in_plane, policy_colour
-from jaxsense.sim import sensors
 from jaxsense.summary.blocks import AGENTS, Agent, Beliefs, Results
 from jaxsense.summary.compare import bounds
 from jaxsense.summary.metrics import mean
-from jaxsense.vae.calibration import reliability
 
 Arrays = dict[str, np.ndarray]
 Curves = dict[str, Arrays]
 """For each Q-network, named by its modality or `team`, `[epochs]` or `[K, epochs]` mean total
-rewards: `reward` of the exploring policy, and `greedy` of the greedy one alone on the map, NaN
-where it was not played."""
+rewards: `reward` of the exploring policy, and `evaluation` of the learned policy alone on the map,
+NaN where it was not played."""
 
 _MAX_ELLIPSES = 40
 _COLUMNS = 4  # of pictures of classes
@@ -43,7 +40,7 @@ def of_run(
     results: Results,
     posteriors: dict[str, Belief],
     windows: Arrays,
-    detections: Arrays,
+    reliability: Mapping[str, Reliability],
 ) -> dict[str, bytes]:
     """Draws what only a run of one seed has, as PNG files by their names.
 
@@ -52,12 +49,12 @@ def of_run(
       results: the blocks of the summary.
       posteriors: see `latent_space`.
       windows: see `scanlines`.
-      detections: see `calibration`.
+      reliability: see `calibration`.
     """
     return {
         "latent_space.png": png(latent_space(config, posteriors)),
         "scanlines.png": png(scanlines(config, windows)),
-        "calibration.png": png(calibration(config, detections, results["belief"])),
+        "calibration.png": png(calibration(config, reliability, results["belief"])),
     }
 
 
@@ -204,9 +201,9 @@ def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:
             continue
         # Episodes of a team are another task than those of a robot that is alone on the map.
         alone, agent = next(iter(agents.items()))
-        greedy = {"greedy": of_network["greedy"]}
+        evaluation = {"evaluation": of_network["evaluation"]}
         panels.append((f"episodes of the whole {name}", {"reward": of_network["reward"]}, None))
-        panels.append((f"{name}: one {alone} robot alone on the map", greedy, agent))
+        panels.append((f"{name}: one {alone} robot alone on the map", evaluation, agent))
     figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for ax, (title, of_panel, agent) in zip(axes, panels, strict=True):
@@ -229,7 +226,7 @@ def _draw_rewards(ax: Axes, kind: str, values: np.ndarray) -> None:
         shown = np.array([_smoothed(of_seed) for of_seed in values])
         epochs = np.arange(values.shape[1] - shown.shape[1], values.shape[1])
     else:
-        colour, label = "C0", "greedy"
+        colour, label = "C0", "without exploration"
         epochs = np.flatnonzero(np.isfinite(values).any(axis=0))
         shown = values[:, epochs]
     ax.plot(epochs, shown.mean(axis=0), color=colour, label=label, linewidth=1.2)
@@ -264,24 +261,20 @@ def scanlines(config: Config, windows: Arrays) -> Figure:
 
     Args:
       config: all settings.
-      windows: for each modality `[C, 1, F]` readings.
+      windows: for each modality `[C, window, channels]` readings, from left to right.
     """
     classes = config.arena.classes
     columns = min(len(classes), _COLUMNS)
     lines = math.ceil(len(classes) / columns)
-    made = sensors.make(config)
-    heights = [0.8 if sensor.channels == 3 else 2.2 for sensor in made for _ in range(lines)]
+    heights = [0.8 if x.shape[-1] == 3 else 2.2 for x in windows.values() for _ in range(lines)]
     figure = Figure(figsize=(3.2 * columns, sum(heights) + 0.6), layout="constrained")
     axes = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
-    for m, sensor in enumerate(made):
+    for m, (name, readings) in enumerate(windows.items()):
         rows = axes[m * lines : (m + 1) * lines].ravel()
-        from_left = 1 if sensor.angles[0] > sensor.angles[-1] else -1
-        readings = windows[sensor.name][:, 0].reshape(-1, sensor.window, sensor.channels)
-        readings = readings[:, ::from_left]
         top = 1.05 * np.max(readings, initial=0.0, where=np.isfinite(readings))
         for ax, label, values in zip(rows, classes, readings, strict=False):
-            ax.set_title(f"{sensor.name}: {label}", fontsize=10)
-            if sensor.channels == 3:  # an image
+            ax.set_title(f"{name}: {label}", fontsize=10)
+            if readings.shape[-1] == 3:  # an image
                 ax.imshow(as_srgb(values)[None], aspect="auto", interpolation="nearest")
                 ax.set(yticks=[], xticks=[])
             else:
@@ -293,28 +286,26 @@ def scanlines(config: Config, windows: Arrays) -> Figure:
     return figure
 
 
-def calibration(config: Config, detections: Arrays, belief: Beliefs) -> Figure:
+def calibration(config: Config, reliability: Mapping[str, Reliability], belief: Beliefs) -> Figure:
     """Whether probabilities are right: of the detectors, and of the map after several looks.
 
     Args:
       config: all settings.
-      detections: for each modality `[C, S, D_m]` held-out detections.
+      reliability: for each modality the points of its diagram.
       belief: the block `belief` of the summary.
     """
     figure = Figure(figsize=(10, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.plot([0, 1], [0, 1], ":", color="0.5", label="calibrated")
-    for i, (name, looks) in enumerate(detections.items()):
-        labels = jnp.repeat(jnp.array(config.label_of_class(name)), looks.shape[1])
-        flat = jnp.asarray(looks.reshape(-1, looks.shape[-1]))
-        confidence, accuracy, share = map(np.asarray, reliability(flat, labels))
-        is_shown = share * len(flat) > _MIN_LOOKS - 0.5
-        confidence, accuracy, share = (x[is_shown] for x in (confidence, accuracy, share))
+    for i, (name, of_detector) in enumerate(reliability.items()):
+        is_shown = of_detector.looks >= _MIN_LOOKS
+        confidence, accuracy = of_detector.confidence[is_shown], of_detector.accuracy[is_shown]
+        share = of_detector.looks[is_shown] / np.sum(of_detector.looks)
         style = {"color": f"C{i}", "marker": MARKERS[i % 4], "markersize": 4, "linewidth": 1}
         left.plot(confidence, accuracy, label=name, markerfacecolor="none", **style)
         # Hollow, for most lie on top of each other where detectors are confident.
         left.scatter(confidence, accuracy, 10 + 300 * share, facecolors="none", edgecolors=f"C{i}")
-    lowest = 1 / max(looks.shape[-1] for looks in detections.values())
+    lowest = 1 / max(len(config.labels(name)) for name in reliability)
     left.set(xlabel="confidence", ylabel="share of right labels", title="detectors")
     left.set(xlim=(lowest - 0.02, 1.02), ylim=(min(lowest, 0.5) - 0.1, 1.02))
     right.plot(belief["looks"], belief["nll"], "o-", label="map")

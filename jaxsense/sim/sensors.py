@@ -104,6 +104,17 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
           `[B]` readings, or `[B, channels]` if there are several channels.
         """
 
+    def from_left(
+        self, windows: Float[np.ndarray, "*S F"]
+    ) -> Float[np.ndarray, "*S window channels"]:
+        """Readings of the rays of a detector's inputs, from left to right.
+
+        Args:
+          windows: `[..., F]` inputs of the detector.
+        """
+        rays = windows.reshape(*windows.shape[:-1], self.window, self.channels)
+        return rays if self.angles[0] > self.angles[-1] else rays[..., ::-1, :]
+
     def shows(
         self, readings: Float[Array, "B *channels"], distance: Float[Array, ""], extent: float
     ) -> Bool[Array, "B"]:

@@ -84,7 +84,7 @@ class Beliefs(TypedDict):
 Returns = TypedDict(
     "Returns",
     {
-        "return": Annotated[float, "Q-network", "Reward of an episode with its greedy policy."],
+        "return": Annotated[float, "Q-network", "Reward of an episode without exploration."],
         "optimal": Annotated[float, "optimal", "Knows the mean reward of each look."],
         "naive": Annotated[float, "naive", "Looks at each PoI once, whatever the map holds."],
         "random": Annotated[float, "random"],

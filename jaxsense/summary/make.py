@@ -6,7 +6,6 @@ import jax
 import numpy as np
 
 from jaxsense.config import Config
-from jaxsense.dqn import episodes
 from jaxsense.mission.outcome import REASONS
 from jaxsense.mission.state import Mission
 from jaxsense.summary.blocks import (
@@ -22,7 +21,7 @@ from jaxsense.summary.blocks import (
 from jaxsense.summary.compare import REFERENCE, Measured, compared, differences
 
 MDP_POLICIES = ("return", "optimal", "naive", "random")
-"""The policies on the map: the greedy one of a Q-network, and those to compare it with."""
+"""The policies on the map: that of a Q-network, and those to compare it with."""
 
 _UNAMBIGUOUS = 0.9  # share of looks in a single class, above which the class counts as one
 _AS_GOOD = 0.01  # reward by which a policy may miss the optimum
@@ -50,6 +49,7 @@ def agent(
     config: Config,
     total: np.ndarray,
     first: np.ndarray,
+    is_permutation: np.ndarray,
     seconds: Sequence[float],
     others: Mapping[int, np.ndarray],
 ) -> Agent:
@@ -60,6 +60,7 @@ def agent(
       total: `[P, S]` total reward of each of `MDP_POLICIES` in an episode from every state of the
         map, then from `config.evaluation.num_starts` random ones.
       first: `[P, S]` reward of the first action.
+      is_permutation: for each state of the map, whether all classes differ, as in the paper.
       seconds: of the training, chunk by chunk.
       others: `total` with other numbers of PoIs, whose last starts are the random ones.
     """
@@ -68,13 +69,6 @@ def agent(
     one_step = dict(zip(MDP_POLICIES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
     missed = total[MDP_POLICIES.index("optimal"), :num_states] - total[0, :num_states]
     is_optimal = missed <= _AS_GOOD
-    states, _ = episodes.every_state(
-        config.arena.num_pois,
-        len(config.arena.classes),
-        len(config.modalities),
-        config.evaluation.num_states,
-    )
-    is_permutation = episodes.are_different(states)
     block: Agent = {
         **_returns(total[:, num_states:]),
         "one_step": {

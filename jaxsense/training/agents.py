@@ -24,7 +24,7 @@ from jaxsense.looks import Bank, Live
 from jaxsense.models import make_agent, make_bayes, make_prior
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
-from jaxsense.training import measures
+from jaxsense.training import comparison
 from jaxsense.training.mdp import held_out_mdp, mdp_of
 from jaxsense.training.perception import Detections, Starts
 from jaxsense.training.stage import Output, Progress, Stage, chunk_size, num_chunks
@@ -113,13 +113,13 @@ def agent_stages(arena: Arena, config: Config) -> list[Stage]:
         mdp = held_out_mdp(config, fusion, detections)
 
         def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
-            return measures.learned_return(key, modality, q_network, mdp, config)
+            return comparison.learned_return(key, modality, q_network, mdp, config)
 
         learning = environment(config, modality, detections, fusion, detectors)
         state, info = dqn.train_chunk(key, learning, config.dqn, state, starts, evaluate)
         reward = jnp.where(info.episodes > 0, info.episode_return, jnp.nan)
         loss = jnp.where(info.is_finite, info.loss, jnp.nan)
-        metrics = {"reward": reward, "greedy": info.greedy_return, "epsilon": info.epsilon}
+        metrics = {"reward": reward, "evaluation": info.evaluation_return, "epsilon": info.epsilon}
         return state, Progress(loss, metrics)
 
     def finish(config: Config, state: State, **_: Output) -> Params:

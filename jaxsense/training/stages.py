@@ -12,7 +12,7 @@ from jaxsense.core.types import Key
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
-from jaxsense.training import agents, measures, perception
+from jaxsense.training import agents, comparison, measures, perception
 from jaxsense.training.stage import Learned, Output, Stage, compose, key_of
 
 
@@ -52,9 +52,9 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
         Stage("beliefs", measures.beliefs, {**fusion, **detections}),
         *agents.agent_stages(arena, config),
         *agents.tour_stages(config),
-        *(Stage(f"policies_{n}", measures.play_policies, x) for n, x in policies.items()),
+        *(Stage(f"policies_{n}", comparison.play_policies, x) for n, x in policies.items()),
         *(
-            Stage(f"numbers_{name}", measures.play_numbers, inputs)
+            Stage(f"numbers_{name}", comparison.play_numbers, inputs)
             for name, inputs in policies.items()
             if config.evaluation.num_pois
         ),

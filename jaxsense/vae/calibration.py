@@ -4,6 +4,8 @@ import chex
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxsense.core.types import Reliability
+
 MIN_PROBABILITY = 1e-12
 _BINS = 15
 
@@ -35,22 +37,17 @@ def calibration_error(
       probabilities: `[S, L]` of each label.
       labels: `[S]` int32 true labels.
     """
-    confidence, accuracy, share = reliability(probabilities, labels)
-    return jnp.sum(jnp.where(share > 0, share * jnp.abs(confidence - accuracy), 0.0))
+    found = reliability(probabilities, labels)
+    share = found.looks / len(labels)
+    return jnp.sum(jnp.where(share > 0, share * jnp.abs(found.confidence - found.accuracy), 0.0))
 
 
-def reliability(
-    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
-) -> tuple[Float[Array, " B"], Float[Array, " B"], Float[Array, " B"]]:
+def reliability(probabilities: Float[Array, "S L"], labels: Int[Array, " S"]) -> Reliability:
     """Points of a reliability diagram with fifteen bins of equal width.
 
     Args:
       probabilities: `[S, L]` of each label.
       labels: `[S]` int32 true labels.
-
-    Returns:
-      For each bin `[B]` mean confidence and `[B]` accuracy, NaN if it is empty, and `[B]` share of
-      all looks.
     """
     chex.assert_rank(probabilities, 2, custom_message="probabilities")
     chex.assert_shape(labels, (len(probabilities),), custom_message="labels")
@@ -59,4 +56,4 @@ def reliability(
     bins = jnp.clip(jnp.ceil(confidence * _BINS).astype(jnp.int32) - 1, 0, _BINS - 1)
     of_looks = jnp.stack([confidence, is_right, jnp.ones(len(labels))])
     sums = jnp.zeros((3, _BINS)).at[:, bins].add(of_looks)
-    return sums[0] / sums[2], sums[1] / sums[2], sums[2] / len(labels)
+    return Reliability(sums[0] / sums[2], sums[1] / sums[2], sums[2])

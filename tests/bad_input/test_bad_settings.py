@@ -294,6 +294,16 @@ CHANGES = [
     ({"detector.hidden": (1.5,)}, "must be a list of whole numbers"),
     ({"detector.hidden": (10**7, 10**7)}, "detector.hidden = (10000000, 10000000): takes 372,"),
     ({"jmvae.hidden": (2**63,)}, "jmvae.hidden = "),
+    # An encoder for each of 2^3 subsets, of 6 labels, 40,000^2 and 4 parameters of a posterior.
+    (
+        {
+            "modalities": ("camera", "lidar", "x"),
+            "sensors": {"x": SensorConfig("a:b", "shape")},
+            "jmvae.reconstruction_weights": (1.0,) * 3,
+            "jmvae.hidden": (40_000, 40_000),
+        },
+        "jmvae.hidden = (40000, 40000): takes 48 GiB",
+    ),
     ({"filter.hidden": (10**7, 10**7)}, "filter.hidden = (10000000, 10000000): takes 372,"),
     ({"filter.batch": 10**9}, "filter.batch = 1000000000: takes"),
     ({"dqn.hidden": (4096,) * 400}, "dqn.hidden = (4096, 4096"),
@@ -361,7 +371,17 @@ CHANGES = [
     ({"dqn.num_starts": 65}, "dqn.num_starts = 65: must be a multiple of num_envs = 32"),
     ({"dqn.replay_capacity": 65}, "dqn.replay_capacity = 65: must be a multiple of num_envs = 32"),
     ({"dqn.replay_capacity": 32 * 10**8}, "dqn.replay_capacity = 3200000000: must be below 2^31"),
-    ({"dqn.replay_capacity": 32 * 10**7}, "dqn.replay_capacity = 320000000: takes"),
+    # Two states and 3 numbers each; of 3 PoIs with 4 numbers.
+    ({"dqn.replay_capacity": 32 * 10**7}, "dqn.replay_capacity = 320000000: takes 32 GiB"),
+    # Of a team, up to 8 PoIs or those of the arena, with 2 x 2 + 3 x 2 + 4 = 14 numbers.
+    (
+        {"dqn.task": "team", "dqn.replay_capacity": 32 * 10**6},
+        "dqn.replay_capacity = 32000000: takes 27 GiB",
+    ),
+    (
+        {"dqn.task": "team", "arena.num_pois": 16, "dqn.replay_capacity": 32 * 10**6},
+        "dqn.replay_capacity = 32000000: takes 54 GiB",
+    ),
     ({"dqn.num_starts": 32 * 5 * 10**7}, "dqn.num_starts = 1600000000: takes"),
     ({"dqn.updates": 10**8}, "dqn.updates = 100000000: takes"),
     ({"dqn.epsilon_start": 0.5, "dqn.epsilon_min": 0.6}, "must be at most epsilon_start = 0.5"),

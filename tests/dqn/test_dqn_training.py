@@ -96,7 +96,7 @@ def test_values_are_those_worked_by_hand(probe, seed):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_greedy_policy_is_optimal_after_training(probe, seed):
+def test_the_learned_policy_is_optimal_after_training(probe, seed):
     params = jax.tree.map(lambda x: x[seed], probe[0].params)
     actions = np.argmax(values(params), axis=1)
     assert actions[0] in (0, 1)
@@ -243,7 +243,7 @@ def with_bias(params, bias):
 
 
 def test_values_after_an_action_are_those_of_the_target_network():
-    # Nothing is left to see: every look costs 1, and the greedy one looks at PoI 0 for ever.
+    # Nothing is left to see: every look costs 1, and the policy looks at PoI 0 for ever.
     mdp = paying_once_mdp(num_pois=1, max_steps=9)
     config = replace(
         SMALL, discount=0.5, epsilon_start=0.0, epsilon_min=0.0, chunk=2, target_period=2,
@@ -344,17 +344,17 @@ def test_an_evaluation_changes_nothing_that_is_learnt():
     alone, infos_alone = trained_for(20, None)
     # To the last digit but one: two programs, which round differently.
     chex.assert_trees_all_close(evaluated, alone, rtol=1e-5, atol=1e-7)
-    assert np.all(np.isnan(infos_alone.greedy_return))
-    same = replace(infos, greedy_return=infos_alone.greedy_return)
+    assert np.all(np.isnan(infos_alone.evaluation_return))
+    same = replace(infos, evaluation_return=infos_alone.evaluation_return)
     chex.assert_trees_all_close(same, infos_alone, rtol=1e-5, atol=1e-7)
 
 
-def test_the_greedy_policy_is_evaluated_after_every_tenth_epoch():
+def test_the_policy_is_evaluated_after_every_tenth_epoch():
     # The target network is a copy of the parameters after epochs 15, 30 and so on: in a chunk that
     # begins after epoch 5 and ends after epoch 25, of those after its tenth.
     state, infos = trained_for(20, length_of, target_period=15)
-    np.testing.assert_array_equal(np.flatnonzero(~np.isnan(infos.greedy_return)), [9, 19])
-    found = infos.greedy_return[jnp.array([9, 19])]
+    np.testing.assert_array_equal(np.flatnonzero(~np.isnan(infos.evaluation_return)), [9, 19])
+    found = infos.evaluation_return[jnp.array([9, 19])]
     expected = [length_of(None, params) for params in (state.target, state.params)]
     np.testing.assert_allclose(found, expected, rtol=1e-6)
     assert found[0] != found[1]
@@ -362,11 +362,13 @@ def test_the_greedy_policy_is_evaluated_after_every_tenth_epoch():
 
 def test_a_chunk_that_ten_does_not_divide_is_evaluated_at_its_end():
     state, infos = trained_for(12, length_of)
-    np.testing.assert_array_equal(np.flatnonzero(~np.isnan(infos.greedy_return)), [11])
-    np.testing.assert_allclose(infos.greedy_return[11], length_of(None, state.params), rtol=1e-6)
+    np.testing.assert_array_equal(np.flatnonzero(~np.isnan(infos.evaluation_return)), [11])
+    np.testing.assert_allclose(
+        infos.evaluation_return[11], length_of(None, state.params), rtol=1e-6
+    )
 
 
 def test_every_evaluation_has_its_own_key():
     _, infos = trained_for(20, lambda key, params: jax.random.uniform(key))
-    found = np.asarray(infos.greedy_return)
+    found = np.asarray(infos.evaluation_return)
     assert found[9] != found[19]

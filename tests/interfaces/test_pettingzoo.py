@@ -192,7 +192,7 @@ def test_seeds_repeat_and_differ(env):
 
 def test_what_cannot_be_is_told(env):
     with pytest.raises(
-        ValueError, match=r"config.modalities = \('camera',\): must be \('camera', 'lidar'\), as in"
+        ValueError, match=r"modalities \('camera', 'lidar'\): must be a TeamMdp with \('camera',\)"
     ):
         TeamParallelEnv(small.team(), small.ONLY_CAMERAS)
     fresh = TeamParallelEnv(small.team(), small.TEAM)

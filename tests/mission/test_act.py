@@ -237,6 +237,16 @@ def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
     assert approach(replace(stuck, steps=steps), CAMERA).robots.phase[CAMERA] == IDLE
 
 
+def test_a_robot_that_is_stuck_in_its_last_attempt_gives_the_poi_up(approach, facing, set_robot):
+    stuck = driving(facing(CAMERA), set_robot, 0, act.STUCK_TIME + 0.2, 0.0)
+    last = CONFIG.mission.attempts - 1
+    for attempts, gives_up in ((last - 1, False), (last, True)):
+        # It has given PoI 1 up before.
+        state = set_robot(stuck, CAMERA, attempts=attempts, unreachable=[False, True, False])
+        found = approach(state, CAMERA).robots.unreachable[CAMERA]
+        np.testing.assert_array_equal(found, [gives_up, True, False])
+
+
 def test_a_viewpoint_on_which_a_robot_has_come_to_stand_is_left_without_blame(
     approach, facing, set_robot
 ):
@@ -263,6 +273,7 @@ def test_a_robot_that_has_ended_makes_room_for_one_that_is_stuck(approach, facin
     # But not for one that gets on, nor for one that is far away.
     gets_on = set_robot(state, CAMERA, progress_at=2.5)
     np.testing.assert_array_equal(approach(gets_on, LIDAR).robots.wanted[LIDAR], 0.0)
-    far = state.scene.poses.at[LIDAR, :2].set(jnp.array([-1.3, 0.0]))
-    far = replace(state, scene=replace(state.scene, poses=far))
-    np.testing.assert_array_equal(approach(far, LIDAR).robots.wanted[LIDAR], 0.0)
+    for place in ([-1.3, 0.0], [0.8, -0.8]):  # the second one is at 1.13 m
+        far = state.scene.poses.at[LIDAR, :2].set(jnp.array(place))
+        far = replace(state, scene=replace(state.scene, poses=far))
+        np.testing.assert_array_equal(approach(far, LIDAR).robots.wanted[LIDAR], 0.0)

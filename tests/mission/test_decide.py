@@ -66,6 +66,12 @@ def test_of_values_within_the_tolerance_the_nearest_is_taken(chosen, values, tar
     assert state.robots.goals[0] == (target == 2)
 
 
+def test_before_its_first_decision_a_robot_has_no_target(arena_of):
+    state = arena_of(POSITIONS, POSES)
+    np.testing.assert_array_equal(state.robots.phase, [IDLE, IDLE])
+    np.testing.assert_array_equal(state.robots.target, [3, 3])
+
+
 def test_progress_counts_from_the_moment_of_setting_out(chosen):
     later = lambda state: replace(state, steps=jnp.int32(70))  # noqa: E731
     # 70 control periods of 0.1 s, after which a robot that had set out at 0 would count as stuck.

@@ -106,16 +106,16 @@ def playing(*names):
 
 
 def test_a_run_with_an_unknown_policy_is_refused():
-    mission.require_policies(playing("naive", "mine"), OWN)
+    mission.require_playable(playing("naive", "mine"), OWN)
     expected = r"^mission.policies = \('naive', 'mine'\): must name some of latent, "
     with pytest.raises(ConfigError, match=expected):
-        mission.require_policies(playing("naive", "mine"))
+        mission.require_playable(playing("naive", "mine"))
 
 
 def test_a_policy_may_not_be_named_like_a_fault():
     expected = "^policies = 'wall_stops': must not end in _alone, _stops, _blind$"
     with pytest.raises(ConfigError, match=expected):
-        mission.require_policies(CONFIG, {"wall_stops": close})
+        mission.require_playable(CONFIG, {"wall_stops": close})
     with pytest.raises(ConfigError, match=expected):
         mission.cases(CONFIG, (*POLICIES, "wall_stops"))
 

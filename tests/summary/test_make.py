@@ -7,6 +7,7 @@ import pytest
 from jaxsense import mission
 from jaxsense.config import PRESETS, ArenaConfig, Config, EvaluationConfig, JmvaeConfig
 from jaxsense.summary import make
+from jaxsense.training.comparison import permutations
 
 CONFIG = PRESETS["smoke"]
 RETURNS = "return", "optimal", "naive", "random", "fraction_of_optimal"
@@ -53,7 +54,8 @@ def test_figures_of_policies_as_worked_by_hand():
     of_states[0, 15] = 1.0
     of_starts = np.array([[0.9, 1.0, 1.1], [1.0, 1.1, 1.2], [0.5, 0.5, 0.8], [-1.0, 0.0, -0.5]])
     total = np.concatenate([of_states, of_starts], axis=1)
-    figures = make.agent(SMALL, total, total / 2, [2.0, 3.0], {9: total})
+    different = permutations(SMALL)
+    figures = make.agent(SMALL, total, total / 2, different, [2.0, 3.0], {9: total})
     expected = {"return": 1.0, "optimal": 1.1, "naive": 0.6, "random": -0.5}
     assert {name: figures[name] for name in expected} == pytest.approx(expected)
     assert figures["fraction_of_optimal"] == pytest.approx(1 / 1.1)
@@ -64,7 +66,7 @@ def test_figures_of_policies_as_worked_by_hand():
     assert (figures["optimal_states"], figures["num_states"]) == (13, 16)
     assert (figures["optimal_permutations"], figures["num_permutations"]) == (6, 8)
     none = np.zeros((4, 19))
-    nothing = make.agent(SMALL, none, none, [1.0], {})
+    nothing = make.agent(SMALL, none, none, permutations(SMALL), [1.0], {})
     assert "other_numbers" not in nothing
     assert nothing["fraction_of_optimal"] is None
 
@@ -82,6 +84,8 @@ def test_summary_of_a_case_as_worked_by_hand():
         "episodes": 2,
         "ended": {"finished": 1, "time limit": 1},
     }
+    both = make.case(CONFIG, "latent", {**FOUND, "reason": np.array([1, 1])})
+    assert both["ended"] == {"finished": 2}
     # LiDAR alone cannot tell the two cylinders apart: classes 0 and 1, of which one of three is
     # reported as ambiguous.
     alone = make.case(CONFIG, "lidar_alone", FOUND)

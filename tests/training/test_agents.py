@@ -15,7 +15,7 @@ from jaxsense.config import MdpConfig, TeamConfig, ToursConfig
 from jaxsense.core.types import Belief
 from jaxsense.dqn import optimum
 from jaxsense.dqn import training as dqn
-from jaxsense.training import measures
+from jaxsense.training import comparison
 from jaxsense.training.perception import Detections
 
 BANK = dataclasses.replace(TINY, dqn=dataclasses.replace(TINY.dqn, observe="bank"))
@@ -63,7 +63,7 @@ def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(r
 
 
 @pytest.mark.parametrize("name", ["dqn_camera", "dqn_lidar"])
-def test_an_agent_learns_on_the_bank_and_its_greedy_curve_is_on_held_out_looks(monkeypatch, name):
+def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(monkeypatch, name):
     untrained = models.init(KEY, BANK)
     bank, held_out = (tuple(jnp.full((3, 4, 2), x) for _ in range(2)) for x in (0.5, 0.25))
     used = {}
@@ -74,14 +74,14 @@ def test_an_agent_learns_on_the_bank_and_its_greedy_curve_is_on_held_out_looks(m
         return state, SimpleNamespace(
             episodes=jnp.array([2, 0]), episode_return=jnp.array([1.5, 9.0]),
             is_finite=jnp.array([True, False]), loss=jnp.array([0.5, 0.25]),
-            greedy_return=jnp.array([jnp.nan, 3.0]), epsilon=jnp.ones(2),
+            evaluation_return=jnp.array([jnp.nan, 3.0]), epsilon=jnp.ones(2),
         )  # fmt: skip
 
     def learned_return(key, modality, q_network, mdp, config):
-        used["greedy"], used["of"] = mdp.looks.features, (int(modality), q_network)
+        used["evaluation"], used["of"] = mdp.looks.features, (int(modality), q_network)
 
     monkeypatch.setattr(dqn, "train_chunk", train_chunk)
-    monkeypatch.setattr(measures, "learned_return", learned_return)
+    monkeypatch.setattr(comparison, "learned_return", learned_return)
     stage, starts = stage_of(name, BANK), SimpleNamespace(classes=jnp.zeros((0, 3)))
     found = {
         "starts": None,
@@ -94,23 +94,34 @@ def test_an_agent_learns_on_the_bank_and_its_greedy_curve_is_on_held_out_looks(m
     number = int(name == "dqn_lidar")
     assert used["of"] == (number, "network")
     assert used["modality"] == number
-    for each, expected in (("learning", bank), ("greedy", held_out)):
+    for each, expected in (("learning", bank), ("evaluation", held_out)):
         np.testing.assert_array_equal(used[each], expected)
     # No episode ended in the second epoch, and its loss is not finite.
     np.testing.assert_array_equal(progress.loss, [0.5, np.nan])
     np.testing.assert_array_equal(progress.metrics["reward"], [1.5, np.nan])
-    np.testing.assert_array_equal(progress.metrics["greedy"], [np.nan, 3.0])
+    np.testing.assert_array_equal(progress.metrics["evaluation"], [np.nan, 3.0])
+
+
+TOURS = dataclasses.replace(
+    TINY,
+    dqn=dataclasses.replace(TINY.dqn, task="team", observe="bank"),
+    team=TeamConfig(
+        num_pois=(2, 3), tours=ToursConfig(states=20, tries=2, walk=1, steps=41, batch=8)
+    ),
+)
+
+
+def test_there_is_room_for_trials_in_all_states_with_the_most_pois():
+    _, trials = jax.eval_shape(stage_of("tours", TOURS).begin, KEY, TOURS)
+    # 41 steps are 14 chunks of 3, the last of which has 2; 20 states are 2 in each chunk.
+    assert trials.is_tried.shape == trials.seconds.shape == (3, 28)
+    # 2 x 2 + 3 x 2 + 4 = 14 numbers of each PoI.
+    assert trials.observation.shape == (3 * 14, 28)
 
 
 @pytest.mark.slow  # compiles trials of the auction, with the map's readout
 def test_a_team_learns_its_tours_from_all_trials_so_far():
-    config = dataclasses.replace(
-        TINY,
-        dqn=dataclasses.replace(TINY.dqn, task="team", observe="bank"),
-        team=TeamConfig(
-            num_pois=(2, 3), tours=ToursConfig(states=20, tries=2, walk=1, steps=41, batch=8)
-        ),
-    )
+    config = TOURS
     untrained = models.init(KEY, config)
     bank = tuple(jnp.ones((3, 4, n)) / n for n in models.make_jmvae(config).feature_sizes)
     # The first look at a PoI pays, and no other.

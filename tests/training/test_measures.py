@@ -22,7 +22,7 @@ from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import map_mdp, optimum, policies
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.models import make_in_place, make_jmvae, make_prior
-from jaxsense.training import measures, perception
+from jaxsense.training import comparison, measures, perception
 from jaxsense.training.mdp import held_out_mdp, models_of
 from jaxsense.training.perception import Detections
 from jaxsense.vae import filter
@@ -237,7 +237,7 @@ def models_with(bias, values, fusion=None):
 @jax.jit
 def play(modality, models, bank):
     mdp = held_out_mdp(CONFIG, models.fusion, detections(held_out=bank))
-    return measures.compare_policies(KEY, modality, models, mdp, CONFIG)
+    return comparison.compare_policies(KEY, modality, models, mdp, CONFIG)
 
 
 # Every look of the camera pays until it has looked, by `optimal`.
@@ -249,7 +249,7 @@ def test_policies_are_played_from_every_state_and_from_random_starts():
     models = models_with(jnp.array([0.0, 0.0, 0.0, 1.0]), (PAYS, PAYS))
     total, first = map(np.asarray, play(jnp.int32(0), models, EXACT))
     assert total.shape == first.shape == (4, NUM_STATES + 16)
-    of = dict(zip(measures.COMPARED, total, strict=True))
+    of = dict(zip(comparison.COMPARED, total, strict=True))
     np.testing.assert_array_equal(of["latent"], 0.0)  # always NOP
     # The means over all states; a policy is at best as good.
     optimal, naive, uniform = (
@@ -259,7 +259,7 @@ def test_policies_are_played_from_every_state_and_from_random_starts():
     # Naive exploration goes on where the camera has not seen all: bits 0, 2 and 4 of the number of
     # a state.
     goes_on = np.arange(NUM_STATES) % 64 & 0b010101 != 0b010101
-    of_naive = first[measures.COMPARED.index("naive"), :NUM_STATES]
+    of_naive = first[comparison.COMPARED.index("naive"), :NUM_STATES]
     np.testing.assert_array_equal(of_naive != 0, goes_on)
     # The camera's own looks alone: no state pays more than three of the best, from a variance of
     # 20 in three dimensions to sqrt(3).
@@ -280,7 +280,7 @@ def test_where_looks_add_up_the_optimum_is_by_the_total_of_the_own_sensors_looks
     fusion = filter.init(KEY, model, classes, prior, FilterConfig(hidden=(1,)))
     # No look of the camera pays by its total, and every look of the LiDAR does.
     models = models_with(jnp.zeros(4), (constant(1.0, -1.0), constant(-1.0, 1.0)), fusion)
-    optimal = measures.COMPARED.index("optimal")
+    optimal = comparison.COMPARED.index("optimal")
     total, first = play(jnp.int32(0), models, EXACT)
     np.testing.assert_array_equal(total[optimal], 0.0)
     total, first = play(jnp.int32(1), models, EXACT)
@@ -290,9 +290,9 @@ def test_where_looks_add_up_the_optimum_is_by_the_total_of_the_own_sensors_looks
 def test_policies_are_compared_on_the_same_starts_and_the_same_looks(monkeypatch):
     # Four times the same policy: what differs is the noise. Looks at a class are all different.
     always = policies.Policy(lambda key, models, known: jnp.array([1.0, 0.0, 0.0, 0.0]))
-    monkeypatch.setattr(policies, "POLICIES", dict.fromkeys(measures.COMPARED, always))
+    monkeypatch.setattr(policies, "POLICIES", dict.fromkeys(comparison.COMPARED, always))
     monkeypatch.setattr(
-        measures, "reference", lambda *_: lambda known, classes: always.values(*[0] * 3)
+        comparison, "reference", lambda *_: lambda known, classes: always.values(*[0] * 3)
     )
     settings = EvaluationConfig(num_starts=4, num_repeats=1, num_states=8)
     config = replace(CONFIG, evaluation=settings)
@@ -305,7 +305,7 @@ def test_policies_are_compared_on_the_same_starts_and_the_same_looks(monkeypatch
     @jax.jit
     def compared(models):
         mdp = held_out_mdp(config, models.fusion, detections(held_out=bank))
-        return measures.compare_policies(KEY, jnp.int32(0), models, mdp, config)
+        return comparison.compare_policies(KEY, jnp.int32(0), models, mdp, config)
 
     total, first = map(np.asarray, compared(models))
     assert total.shape == (4, 12)
@@ -318,7 +318,7 @@ def test_the_learned_return_is_the_mean_over_random_starts():
     @jax.jit
     def returned(bias):
         mdp = held_out_mdp(CONFIG, in_place(), detections(held_out=EXACT))
-        return measures.learned_return(KEY, jnp.int32(0), with_bias(bias), mdp, CONFIG)
+        return comparison.learned_return(KEY, jnp.int32(0), with_bias(bias), mdp, CONFIG)
 
     assert returned(jnp.array([0.0, 0.0, 0.0, 1.0])) == 0.0
     # Eight looks at PoI 0, of which all but the first are in vain, and that one in some starts: it
@@ -335,11 +335,11 @@ def test_other_numbers_of_pois_are_played_an_eighth_as_often_but_always_once(mon
         assert inputs == {"modality": 0}
         played.append((num_pois, config.evaluation.num_repeats, config.evaluation.num_states))
 
-    monkeypatch.setattr(measures, "play_policies", play)
+    monkeypatch.setattr(comparison, "play_policies", play)
     team = jaxsense.PRESETS["team"]
     for repeats in (1, 96):
         settings = replace(team.evaluation, num_repeats=repeats, num_pois=(5, 20))
-        measures.play_numbers(KEY, replace(team, evaluation=settings), modality=0)
+        comparison.play_numbers(KEY, replace(team, evaluation=settings), modality=0)
     assert played == [(5, 1, 1), (20, 1, 1), (5, 12, 1), (20, 12, 1)]
 
 

@@ -1,0 +1,181 @@
+"""Stages that compare policies in the map MDP."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsense.config import Config
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Fusion, Key
+from jaxsense.dqn import episodes, policies
+from jaxsense.dqn.map_mdp import MapMdp, random_start
+from jaxsense.dqn.optimum import LookValues
+from jaxsense.dqn.policies import Known
+from jaxsense.dqn.reference import reference
+from jaxsense.models import Models, make_agent, make_bayes
+from jaxsense.training.mdp import held_out_mdp, models_of
+from jaxsense.training.perception import Detections
+from jaxsense.training.stage import Output
+
+COMPARED = ("latent", "optimal", "naive", "random")
+"""Names of the policies to compare in the map MDP, from `dqn.policies.POLICIES`."""
+
+
+def learned_return(
+    key: Key, modality: Int[Array, ""], q_network: Params, mdp: MapMdp, config: Config
+) -> Float[Array, ""]:
+    """Mean total reward of a Q-network's policy, in one episode from each of random starts.
+
+    Args:
+      key: random key.
+      modality: `[]` int32 index of the agent's own sensor.
+      q_network: parameters of the Q-network.
+      mdp: from `held_out_mdp`.
+      config: all settings.
+    """
+    agent, exact = make_agent(config), make_bayes(config)
+
+    def act(key: Key, known: Known) -> jax.Array:
+        del key
+        classes = mdp.fusion.classes
+        values = agent.decide(q_network, None, classes, known.belief, known.team, known.robot)
+        return policies.best(values)
+
+    def episode(key: Key) -> jax.Array:
+        reset_key, episode_key = jax.random.split(key)
+        start = episodes.reset(reset_key, mdp, exact)
+        return episodes.run_episode(episode_key, mdp, exact, act, start, modality)[0]
+
+    return jnp.mean(jax.vmap(episode)(jax.random.split(key, config.evaluation.num_starts)))
+
+
+def compare_policies(
+    key: Key, modality: Int[Array, ""], models: Models, mdp: MapMdp, config: Config
+) -> tuple[Float[Array, "P S"], Float[Array, "P S"]]:
+    """Plays episodes with each of `COMPARED`, with the same looks and starts.
+
+    Args:
+      key: random key.
+      modality: `[]` int32 index of the agent's own sensor.
+      models: trained models, in whose `q_networks` all are of this modality.
+      mdp: from `held_out_mdp`.
+      config: all settings.
+
+    Returns:
+      `[P, S]` total reward and `[P, S]` reward of the first action, averaged over the noise of
+      looks; NaN where a value or a reward is NaN. The starts are the states of
+      `episodes.every_state`, then `config.evaluation.num_starts` random ones.
+    """
+    settings = config.evaluation
+    start_key, table_key, play_key = jax.random.split(key, 3)
+    starts = _every_start(start_key, mdp, config)
+    optimal = reference(table_key, mdp, modality, models, models.bayes.labels)
+
+    # By a switch, so that one program is compiled for all policies.
+    def with_policy(which: Int[Array, ""]) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
+        # Only the first two policies are compared state by state.
+        number = jnp.where(which < 2, settings.num_repeats, -(-settings.num_repeats // 8))
+
+        def episode(key: Key, classes: jax.Array, seen: jax.Array) -> tuple[jax.Array, jax.Array]:
+            reset_key, episode_key = jax.random.split(key)
+            start = episodes.reset(reset_key, mdp, models.bayes, classes, seen)
+
+            def act(key: Key, known: Known) -> jax.Array:
+                of_table = {
+                    name: functools.partial(policies.POLICIES[name].values, key, models, known)
+                    for name in ("latent", "naive", "random")
+                }
+                by_name = {**of_table, "optimal": lambda: optimal(known, classes)}
+                return policies.best(jax.lax.switch(which, [by_name[name] for name in COMPARED]))
+
+            return episodes.run_episode(episode_key, mdp, models.bayes, act, start, modality)
+
+        def repeat(i: jax.Array, sums: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            keys = jax.random.split(jax.random.fold_in(play_key, i), len(starts[0]))
+            return jax.tree.map(jnp.add, sums, jax.vmap(episode)(keys, starts[0], starts[1]))
+
+        zero = jnp.zeros(len(starts[0]))
+        total, first = jax.lax.fori_loop(0, number, repeat, (zero, zero))
+        return total / number, first / number
+
+    return jax.lax.map(with_policy, jnp.arange(len(COMPARED)))
+
+
+def _every_start(
+    key: Key, mdp: MapMdp, config: Config
+) -> tuple[Int[Array, "S N"], Bool[Array, "S N M"]]:
+    """Classes and looks of every state of the map, then of random starts."""
+    keys = jax.random.split(key, config.evaluation.num_starts)
+    random_classes, random_seen = jax.vmap(lambda key: random_start(key, mdp))(keys)
+    classes, seen = _every_state(mdp.num_pois, config)
+    return (
+        jnp.concatenate([jnp.asarray(classes), random_classes]),
+        jnp.concatenate([jnp.asarray(seen), random_seen]),
+    )
+
+
+def _every_state(
+    num_pois: int, config: Config
+) -> tuple[Int[np.ndarray, "S N"], Bool[np.ndarray, "S N M"]]:
+    """The states of the map in which policies are compared, see `episodes.every_state`."""
+    num_classes, num_modalities = len(config.arena.classes), len(config.modalities)
+    limit = config.evaluation.num_states
+    return episodes.every_state(num_pois, num_classes, num_modalities, limit)
+
+
+def permutations(config: Config) -> Bool[np.ndarray, " S"]:
+    """`[S]` whether the classes of each compared state of the map differ, as in the paper."""
+    classes, _ = _every_state(config.arena.num_pois, config)
+    return episodes.are_different(classes)
+
+
+def play_policies(
+    key: Key,
+    config: Config,
+    *,
+    modality: Int[Array, ""],
+    q_network: Params,
+    fusion: Fusion,
+    look_values: tuple[LookValues, ...],
+    detections: Detections,
+    num_pois: int | None = None,
+) -> tuple[Float[Array, "P S"], Float[Array, "P S"]]:
+    """Runs `compare_policies` for one modality.
+
+    Args:
+      key: random key.
+      config: all settings.
+      modality: `[]` int32 index of the agent's own sensor.
+      q_network: parameters of the Q-network.
+      fusion: how looks update the map.
+      look_values: for each modality, the values of looks.
+      detections: of all sensors.
+      num_pois: N; as in the arena by default.
+    """
+    q_networks = (q_network,) * len(config.modalities)
+    models = models_of(config, fusion, look_values, q_networks)
+    mdp = held_out_mdp(config, fusion, detections, num_pois)
+    return compare_policies(key, modality, models, mdp, config)
+
+
+def play_numbers(
+    key: Key, config: Config, **inputs: Output
+) -> list[tuple[Float[Array, "P S"], Float[Array, "P S"]]]:
+    """Runs `compare_policies` with each number of PoIs in `evaluation.num_pois`.
+
+    Args:
+      key: random key.
+      config: all settings.
+      **inputs: see `play_policies`.
+    """
+    settings = config.evaluation
+    fewer = dataclasses.replace(settings, num_states=1, num_repeats=-(-settings.num_repeats // 8))
+    there = dataclasses.replace(config, evaluation=fewer)
+    return [
+        play_policies(jax.random.fold_in(key, number), there, num_pois=number, **inputs)
+        for number in settings.num_pois
+    ]
