@@ -4,9 +4,9 @@
     python tests/mutation.py jaxsense/vae jaxsense/models.py --number 20
 
 The same seed draws the same lines while the package stays as it is. Mutants that no test could miss
-or notice are left out: annotations, decorators, texts, assertions of shapes, floating-point
-constants, and the numbers among settings and constants. Each mutant meets the tests of its module,
-then those of its package, then all that import the package, until one fails.
+or notice are left out: annotations, decorators, texts, assertions of shapes, the `strict` of a zip,
+floating-point constants, and the numbers among settings and constants. Each mutant meets the tests
+of its module, then those of its package, then all that import the package, until one fails.
 """
 
 import argparse
@@ -124,7 +124,7 @@ def _places(node: ast.AST, is_setting: bool = True) -> Iterator[tuple[ast.AST, b
 
 def _is_left_out(node: ast.AST) -> bool:
     match node:
-        case ast.JoinedStr() | ast.Assert():
+        case ast.JoinedStr() | ast.Assert() | ast.keyword(arg="strict"):
             return True
         case ast.Expr(value=ast.Call(func=ast.Attribute(value=ast.Name(id="chex")))):
             return True

@@ -7,6 +7,7 @@ import re
 import runpy
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -176,6 +177,7 @@ def printed(name, capsys):
     return capsys.readouterr().out
 
 
+@pytest.mark.slow  # compiles missions of all policies, as the next one does
 def test_new_fusion(capsys):
     told = printed("new_fusion", capsys)
     norms = [
@@ -202,11 +204,19 @@ def test_a_product_of_experts_is_the_fusion_of_the_mdp(example):
     np.testing.assert_allclose(twice.std**-2, 2 * alone.std**-2 - prior.std**-2, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_new_policy(capsys):
     told = printed("new_policy", capsys)
     assert re.search(r"map MDP: total reward -?\d+\.\d\d, of the first look -?\d+\.\d\d", told)
     # Untrained detectors say nothing: both look at PoIs that nobody knows yet.
     assert re.search(r"mission: the robots head for PoIs \[[0-3] [0-3]\]", told)
+
+
+def test_the_widest_belief_is_looked_at_twice_at_most(example):
+    widest = example("new_policy").widest
+    belief = Belief(jnp.zeros((3, 2)), jnp.array([[3.0, 4.0], [0.6, 0.8], [1.2, 0.5]]))
+    known = SimpleNamespace(belief=belief, looks=jnp.array([[2, 0], [0, 1], [1, 0]]), modality=0)
+    np.testing.assert_allclose(widest(None, None, known), [-1.0, 1.0, 1.3, 0.0], rtol=1e-6)
 
 
 def test_new_reward(capsys):

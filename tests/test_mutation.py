@@ -19,6 +19,7 @@ MODULE = Path("jaxsense/part/module.py")
         ("if a:\n    b = c.replace(d=e, g=h)", {"(not a)", "(c.replace(d=e))", "(c.replace(g=h))"}),
         ("a += jnp.argmax(b)", {"a -= jnp.argmax(b)", "(jnp.argmin)"}),
         ("a = b or not c", {"(b and (not c))", "(c)"}),
+        ("a = zip(b, c, strict=True)", set()),
         ("def f():\n    raise ValueError", {"pass"}),
         ("@d(frozen=True)\nclass A:\n    b = c.b(True)", {"(False)"}),
     ],

@@ -95,7 +95,7 @@ def test_the_film_is_named_after_the_policy_that_it_shows(tmp_path, monkeypatch)
     for name in ("of_run", "of_seeds"):
         monkeypatch.setattr(train.plots, name, lambda *inputs: {})
     monkeypatch.setattr(train.page, "render", lambda *inputs: "")
-    names = ("posteriors", "windows", "detections", "rewards")
+    names = ("posteriors", "windows", "reliability", "rewards")
     recorded = SimpleNamespace(records=None, end=None)
     models = SimpleNamespace(fusion=SimpleNamespace(classes=None))
     result = SimpleNamespace(models=models, recording=recorded, results={}, **dict.fromkeys(names))

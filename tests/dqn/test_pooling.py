@@ -52,7 +52,7 @@ def test_nop_is_worth_nothing_and_one_network_serves_every_number_of_pois(number
 
 def test_a_poi_counts_for_the_values_of_the_others():
     x = seen(3)
-    for row in (0, 4, FEATURES - 1):  # mean, time and place of PoI 2
+    for row in (0, 4, FEATURES - 2, FEATURES - 1):  # mean, time, x and y of PoI 2
         changed = apply(x.at[row, 2].add(0.5))
         assert np.all(changed[:3] != apply(x)[:3])
 

@@ -237,6 +237,16 @@ def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
     assert approach(replace(stuck, steps=steps), CAMERA).robots.phase[CAMERA] == IDLE
 
 
+def test_only_a_viewpoint_counts_as_a_goal_reached(approach, facing, set_robot):
+    here = facing(CAMERA)
+    viewpoints = here.roadmap.viewpoints[0]
+    at_viewpoint = facing(CAMERA, pose=(*viewpoints[0], 0.0))
+    # The last view is a look from the present place.
+    for state, view, reached in ((at_viewpoint, 0, 1), (here, len(viewpoints), 0)):
+        robots = approach(driving(state, set_robot, view, 1.0, 0.9), CAMERA).robots
+        assert (robots.phase[CAMERA], robots.reached[CAMERA]) == (FACING, reached)
+
+
 def test_a_robot_that_is_stuck_in_its_last_attempt_gives_the_poi_up(approach, facing, set_robot):
     stuck = driving(facing(CAMERA), set_robot, 0, act.STUCK_TIME + 0.2, 0.0)
     last = CONFIG.mission.attempts - 1

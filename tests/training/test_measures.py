@@ -287,15 +287,11 @@ def test_where_looks_add_up_the_optimum_is_by_the_total_of_the_own_sensors_looks
     assert np.all(first[optimal] != 0)
 
 
-def test_policies_are_compared_on_the_same_starts_and_the_same_looks(monkeypatch):
-    # Four times the same policy: what differs is the noise. Looks at a class are all different.
+@pytest.fixture(scope="module")
+def same_policy():
+    """Totals and first rewards of four times the same policy, by the number of repeats."""
+    # Looks at a class are all different: what differs is their noise.
     always = policies.Policy(lambda key, models, known: jnp.array([1.0, 0.0, 0.0, 0.0]))
-    monkeypatch.setattr(policies, "POLICIES", dict.fromkeys(comparison.COMPARED, always))
-    monkeypatch.setattr(
-        comparison, "reference", lambda *_: lambda known, classes: always.values(*[0] * 3)
-    )
-    settings = EvaluationConfig(num_starts=4, num_repeats=1, num_states=8)
-    config = replace(CONFIG, evaluation=settings)
     bank = tuple(
         jax.nn.softmax(3 * jax.random.normal(k, (3, 64, 2)))
         for k in jax.random.split(jax.random.key(3))
@@ -303,15 +299,34 @@ def test_policies_are_compared_on_the_same_starts_and_the_same_looks(monkeypatch
     models = models_with(jnp.zeros(4), (PAYS, PAYS))
 
     @jax.jit
-    def compared(models):
+    def compared(models, config):
         mdp = held_out_mdp(config, models.fusion, detections(held_out=bank))
         return comparison.compare_policies(KEY, jnp.int32(0), models, mdp, config)
 
-    total, first = map(np.asarray, compared(models))
+    def found(repeats):
+        settings = EvaluationConfig(num_starts=4, num_repeats=repeats, num_states=8)
+        return compared(models, replace(CONFIG, evaluation=settings))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(policies, "POLICIES", dict.fromkeys(comparison.COMPARED, always))
+        patch.setattr(
+            comparison, "reference", lambda *_: lambda known, classes: always.values(*[0] * 3)
+        )
+        return {repeats: np.asarray(found(repeats)) for repeats in (1, 2, 9)}
+
+
+def test_policies_are_compared_on_the_same_starts_and_the_same_looks(same_policy):
+    total, _ = found = same_policy[1]
     assert total.shape == (4, 12)
     assert len(np.unique(total[0])) > 6  # of 12; without a gain a look is worth -1
-    for each in (total, first):
-        np.testing.assert_array_equal(each, each[[0, 0, 0, 0]])
+    np.testing.assert_array_equal(found, found[:, [0, 0, 0, 0]])
+
+
+def test_naive_and_random_policies_are_played_an_eighth_as_often(same_policy):
+    # An eighth of nine, rounded up, is two.
+    often, seldom = same_policy[9][:, 0], same_policy[2][:, 0]
+    assert np.any(often != seldom)
+    np.testing.assert_array_equal(same_policy[9], np.stack([often, often, seldom, seldom], axis=1))
 
 
 def test_the_learned_return_is_the_mean_over_random_starts():
