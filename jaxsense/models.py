@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
-from jaxsense.dqn import optimum
+from jaxsense.dqn import optimum, rewards
 from jaxsense.dqn.agents import MapAgent, TeamAgent
 from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.optimum import LookValues
@@ -99,8 +99,9 @@ def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InP
       params: of the JMVAE.
       classes: `[C, D]` mean joint posterior of each class.
     """
-    matrix = readout.readout_matrix(classes)
-    return fusion.InPlace(params, classes, make_prior(config), matrix, make_jmvae(config))
+    prior = make_prior(config)
+    read = readout.make(classes, prior)
+    return fusion.InPlace(params, classes, prior, read, make_jmvae(config))
 
 
 def init(key: Key, config: Config) -> Models:
@@ -127,15 +128,23 @@ def init(key: Key, config: Config) -> Models:
             filter_key, model, classes, make_prior(config), config.filter
         ),
     }
-    lattice = optimum.lattice(shape[0], config.evaluation.value_points)
-    no_values, nothing = jnp.zeros(len(lattice)), jnp.zeros(())
     return Models(
         detectors=untrained,
         jmvae=params,
         fusion=fusions[config.jmvae.fusion](),
         bayes=make_bayes(config),
-        look_values=(LookValues(no_values, no_values, nothing, nothing),) * len(config.modalities),
+        look_values=tuple(_no_values(config, m) for m in config.modalities),
         agent=agent,
         q_networks=tuple(agent.init(k) for k in dqn_keys),
         tours=agent.init_tours(jax.random.fold_in(dqn_key, 1)),
     )
+
+
+def _no_values(config: Config, modality: str) -> LookValues:
+    """Values of looks that are all 0."""
+    is_of_labels = rewards.make(config.mdp).is_of_labels
+    classes, labels = len(config.arena.classes), len(config.labels(modality))
+    number = labels if is_of_labels else classes
+    table = jnp.zeros(len(optimum.lattice(number, config.evaluation.value_points)))
+    of_labels = jnp.zeros((classes, labels)) if is_of_labels else None
+    return LookValues(table, table, jnp.zeros(()), jnp.zeros(()), of_labels)

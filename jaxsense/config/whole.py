@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from jaxsense.config.checks import ConfigError, limited, require
 from jaxsense.config.frozen import FrozenDict
 from jaxsense.config.learning import (
@@ -107,11 +109,14 @@ class Config(Section):
             raise ConfigError("robots", self.carried, expected)
 
     def _check_learning(self) -> None:
-        """Beliefs must hold all classes, and calibration must leave scans to train on."""
-        number = len(self.arena.classes)
-        is_large = self.jmvae.fusion != "filter" or number <= 2 * self.jmvae.latent_size + 1
-        expected = f"must be at least {number // 2}, so that a filter can hold {number} classes"
-        require(is_large, self.jmvae, "latent_size", expected)
+        """Beliefs must hold all labels, and calibration must leave scans to train on."""
+        classes = self.arena.classes
+        of_labels = [np.eye(len(classes))[list(self.label_of_class(m))] for m in self.modalities]
+        # Two moments of each dimension; the probabilities have a sum of 1.
+        free = int(np.linalg.matrix_rank(np.concatenate(of_labels, axis=1))) - 1
+        least = -(-free // 2)
+        expected = f"must be at least {least}, so that beliefs can hold {len(classes)} classes"
+        require(self.jmvae.latent_size >= least, self.jmvae, "latent_size", expected)
         # Scans come in whole scenes.
         scans = -(-self.detector.num_scans // self.arena.num_pois) * self.arena.num_pois
         leaves_some = self.detector.num_training(scans) > 0

@@ -5,6 +5,11 @@ pays can be decided for each PoI on its own. What an agent knows of a PoI is the
 classes, a point of a simplex. The values are tabulated on a lattice in that simplex and
 interpolated linearly over the simplices of Freudenthal's triangulation (Lovejoy 1991, Operations
 Research 39(1), Sec. 3).
+
+In nats the values live on a smaller simplex. A robot's looks change only the posterior p over the
+L labels of its own sensor: `H(class) = H(p) + sum_l p_l h_l`, where `h_l`, the entropy of the
+classes with label l, stays as it is. The second term is a martingale, whose expected change is 0
+under any stopping rule. So the values depend on p alone, for any number of classes.
 """
 
 import itertools
@@ -15,7 +20,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxsense.config import MdpConfig
 from jaxsense.core import checks
@@ -36,12 +41,42 @@ class LookValues:
       q: `[P]` of the next look and all worthwhile looks after it.
       one_step_unseen: `[]` of the first look at a PoI alone.
       q_unseen: `[]` of the first look and all worthwhile looks after it.
+      labels: `[C, L]` float32, 1 where a class has a label of the sensor and 0 elsewhere, if the
+        lattice is of the labels; None if it is of the classes.
     """
 
     one_step: jax.Array
     q: jax.Array
     one_step_unseen: jax.Array
     q_unseen: jax.Array
+    labels: jax.Array | None = None
+
+    def of_next(
+        self, probabilities: Float[Array, " C"], is_seen: Bool[Array, ""]
+    ) -> Float[Array, ""]:
+        """Value of the next look alone.
+
+        Args:
+          probabilities: `[C]` of the PoI's classes.
+          is_seen: `[]` bool, whether anybody has looked at the PoI.
+        """
+        return jnp.where(is_seen, self._read(self.one_step, probabilities), self.one_step_unseen)
+
+    def of_all(
+        self, probabilities: Float[Array, " C"], is_seen: Bool[Array, ""]
+    ) -> Float[Array, ""]:
+        """Value of the next look and all worthwhile looks after it.
+
+        Args:
+          probabilities: `[C]` of the PoI's classes.
+          is_seen: `[]` bool, whether anybody has looked at the PoI.
+        """
+        return jnp.where(is_seen, self._read(self.q, probabilities), self.q_unseen)
+
+    def _read(self, table: jax.Array, probabilities: jax.Array) -> jax.Array:
+        """A table at class probabilities."""
+        of_labels = probabilities if self.labels is None else probabilities @ self.labels
+        return interpolate(table, of_labels)
 
 
 def steps_of_lattice(num_classes: int, max_points: int = MAX_POINTS) -> int:
@@ -147,18 +182,22 @@ def value_iteration(
     config: MdpConfig,
     horizon: int,
     max_points: int = MAX_POINTS,
+    start: Float[Array, " C"] | None = None,
 ) -> LookValues:
     """The values of one modality's looks.
+
+    Instead of classes, all may be of a sensor's labels, if the reward depends on them alone.
 
     Args:
       likelihoods: `[C, K, C]` logarithms of the likelihoods of all classes, up to a constant, in
         each of K equally likely looks at a PoI of each class.
       reward: of a look.
       mixture: `[C]` class probabilities to the `[D]` belief that holds them.
-      prior: `[D]` belief of an unseen PoI, whose classes are equally likely.
+      prior: `[D]` belief of an unseen PoI.
       config: `max_steps`, which also limits the looks at one PoI.
       horizon: maximum number of looks at one PoI; static.
       max_points: of the lattice; static.
+      start: `[C]` probabilities of an unseen PoI's classes; by default, they are equally likely.
 
     Returns:
       The values at the points of the lattice. The optimal policy takes every look whose `q` is
@@ -175,7 +214,8 @@ def value_iteration(
     points = jnp.asarray(lattice(number, max_points), jnp.float32)
     steps = steps_of_lattice(number, len(points))
     # The unseen PoI is the last row, to which no look leads.
-    points = jnp.concatenate([points, jnp.full((1, number), 1 / number)])
+    start = jnp.full(number, 1 / number) if start is None else start
+    points = jnp.concatenate([points, start[None]])
 
     def information(probabilities: jax.Array) -> jax.Array:
         return reward.information(mixture(probabilities), probabilities)

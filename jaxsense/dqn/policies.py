@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
-from jaxsense.dqn import optimum, rules
+from jaxsense.dqn import rules
 from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team_mdp import Team
@@ -132,17 +132,7 @@ def expected_gains(
       `[M, N]`.
     """
     on_map = jax.vmap(fusion.class_probabilities)(belief)
-    of_each = _stacked(look_values)
-    by_map = jax.vmap(_expected, in_axes=(0, 0, None, None))
-    return by_map(of_each.one_step, of_each.one_step_unseen, on_map, is_seen)
-
-
-def _expected(
-    values: jax.Array, of_unseen: jax.Array, probabilities: jax.Array, is_seen: jax.Array
-) -> jax.Array:
-    """`[N]` values of looks from a `[P]` table, that of a first look and `[N, C]` posteriors."""
-    known = jax.vmap(lambda p: optimum.interpolate(values, p))(probabilities)
-    return jnp.where(is_seen, known, of_unseen)
+    return jnp.stack([jax.vmap(values.of_next)(on_map, is_seen) for values in look_values])
 
 
 def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
@@ -182,9 +172,9 @@ def bayes(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
       known: what the robot knows.
     """
     del key
-    looks, exact = _own(models, known), jnp.exp(known.log_posterior)
-    gains = _expected(looks.one_step, looks.one_step_unseen, exact, known.is_seen)
-    return jnp.append(gains, 0.0)
+    exact = jnp.exp(known.log_posterior)
+    gains = [jax.vmap(x.of_next)(exact, known.is_seen) for x in models.look_values]
+    return jnp.append(jnp.stack(gains)[known.modality], 0.0)
 
 
 def optimal(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
@@ -196,8 +186,9 @@ def optimal(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
       known: what the robot knows.
     """
     del key
-    looks, exact = _own(models, known), jnp.exp(known.log_posterior)
-    return jnp.append(_expected(looks.q, looks.q_unseen, exact, known.is_seen), 0.0)
+    exact = jnp.exp(known.log_posterior)
+    values = [jax.vmap(x.of_all)(exact, known.is_seen) for x in models.look_values]
+    return jnp.append(jnp.stack(values)[known.modality], 0.0)
 
 
 def naive(number: int) -> Values:
@@ -239,11 +230,6 @@ def _gains(models: Trained, known: Known) -> jax.Array:
     """`[R, N]` expected gains of each robot's next look at each PoI, on the map."""
     of_modality = expected_gains(models.fusion, models.look_values, known.belief, known.is_seen)
     return of_modality[known.team.modality]
-
-
-def _own(models: Trained, known: Known) -> LookValues:
-    """The values of looks with the robot's own sensor."""
-    return jax.tree.map(lambda x: x[known.modality], _stacked(models.look_values))
 
 
 def _stacked(of_modalities: tuple[T, ...]) -> T:

@@ -15,6 +15,11 @@ from jaxsense.core.types import Belief, pytree
 class Reward(Protocol):
     """The reward of a look; a frozen pytree."""
 
+    @property
+    def is_of_labels(self) -> bool:
+        """Whether expected rewards depend only on the posterior over the own sensor's labels."""
+        ...
+
     def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
         """Information of a belief.
 
@@ -38,6 +43,11 @@ class Paper:
     """
 
     min_increase: jax.Array | float
+
+    @property
+    def is_of_labels(self) -> bool:
+        """False: the width of a belief depends on all classes."""
+        return False
 
     def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
         """Information of a belief, see the function `information`.
@@ -63,6 +73,11 @@ class Nats:
     """
 
     look_cost: jax.Array | float
+
+    @property
+    def is_of_labels(self) -> bool:
+        """True, see `dqn.optimum`."""
+        return True
 
     def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
         """Negative entropy of the classes, in nats.

@@ -1,10 +1,13 @@
 """Stages of agents: values of looks, Q-learning, and tours of a team."""
 
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsense.config import Config
@@ -49,19 +52,42 @@ def look_values(
     """
     del key
     settings, bayes = config.evaluation, make_bayes(config)
+    reward, prior = rewards.make(config.mdp), make_prior(config)
+    solve = functools.partial(
+        optimum.value_iteration,
+        reward=reward,
+        prior=prior,
+        config=config.mdp,
+        horizon=_MAX_LOOKS,
+        max_points=settings.value_points,
+    )
 
-    def of_modality(m: int) -> LookValues:
+    def of_classes(m: int) -> LookValues:
         features = detections.bank[m][:, : settings.value_looks]
-        return optimum.value_iteration(
-            jax.vmap(jax.vmap(lambda x: bayes.log_likelihoods(x, m)))(features),
-            reward=rewards.make(config.mdp),
-            mixture=lambda probabilities: readout.mixture(classes, probabilities),
-            prior=make_prior(config),
-            config=config.mdp,
-            horizon=_MAX_LOOKS,
-            max_points=settings.value_points,
-        )
+        likelihoods = jax.vmap(jax.vmap(lambda x: bayes.log_likelihoods(x, m)))(features)
+        return solve(likelihoods, mixture=lambda p: readout.mixture(classes, p))
 
+    def of_labels(m: int) -> LookValues:
+        labels = np.array(config.label_of_class(config.modalities[m]))
+        number = len(config.labels(config.modalities[m]))
+        of_each = np.eye(number, dtype=np.float32)[labels]
+        members = [np.flatnonzero(labels == label) for label in range(number)]
+        # As many looks at each class with the label.
+        features = jnp.stack(
+            [
+                jnp.swapaxes(detections.bank[m][of_label], 0, 1).reshape(-1, number)[
+                    : settings.value_looks
+                ]
+                for of_label in members
+            ]
+        )
+        firsts = np.array([of_label[0] for of_label in members])
+        likelihoods = jax.vmap(jax.vmap(lambda x: bayes.log_likelihoods(x, m)[firsts]))(features)
+        # The reward does not depend on the belief.
+        found = solve(likelihoods, mixture=lambda p: prior, start=jnp.asarray(of_each.mean(axis=0)))
+        return dataclasses.replace(found, labels=jnp.asarray(of_each))
+
+    of_modality = of_labels if reward.is_of_labels else of_classes
     return tuple(map(of_modality, range(len(config.modalities))))
 
 

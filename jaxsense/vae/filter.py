@@ -24,6 +24,7 @@ from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Key, Samples, pytree
 from jaxsense.vae import gaussian, readout
 from jaxsense.vae.jmvae import Jmvae
+from jaxsense.vae.readout import Readout
 
 _MIN_FEATURE = 1e-6
 
@@ -40,7 +41,7 @@ class Filter:
         the classes.
       classes: `[C, D]` mean joint posterior of each class.
       prior: `[D]` belief before any look.
-      readout: `[C, 2D + 1]` from `readout.readout_matrix`.
+      readout: reads class probabilities from beliefs.
       model: shape of the JMVAE.
       hidden: sizes of the networks' hidden layers.
     """
@@ -48,7 +49,7 @@ class Filter:
     networks: dict[str, Params]
     classes: Belief
     prior: Belief
-    readout: Float[Array, "C K"]
+    readout: Readout
     model: Jmvae = struct.field(pytree_node=False)
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
 
@@ -114,7 +115,7 @@ class Filter:
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
         """Probability of each class according to a `[D]` belief."""
-        return readout.class_probabilities(self.readout, self.prior, belief)
+        return self.readout.class_probabilities(belief)
 
     def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
         """Most likely class according to a `[D]` belief, int32."""
@@ -142,7 +143,7 @@ def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterC
         networks={name: networks.init(k, network, size) for k, name, size in of_each},
         classes=classes,
         prior=prior,
-        readout=readout.readout_matrix(classes),
+        readout=readout.make(classes, prior),
         model=model,
         hidden=config.hidden,
     )

@@ -17,8 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Features, pytree
-from jaxsense.vae import jmvae, latent, readout
+from jaxsense.vae import jmvae, latent
 from jaxsense.vae.jmvae import Jmvae
+from jaxsense.vae.readout import Readout
 
 
 @pytree
@@ -32,14 +33,14 @@ class InPlace:
       params: of the JMVAE.
       classes: `[C, D]` mean joint posterior of each class.
       prior: `[D]` belief before any look.
-      readout: `[C, 2D + 1]` from `readout.readout_matrix`.
+      readout: reads class probabilities from beliefs.
       model: shape of the JMVAE.
     """
 
     params: Params
     classes: Belief
     prior: Belief
-    readout: Float[Array, "C K"]
+    readout: Readout
     model: Jmvae = struct.field(pytree_node=False)
 
     @property
@@ -77,7 +78,7 @@ class InPlace:
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
         """Probability of each class according to a `[D]` belief."""
-        return readout.class_probabilities(self.readout, self.prior, belief)
+        return self.readout.class_probabilities(belief)
 
     def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
         """Class whose joint posterior is nearest to a `[D]` belief, int32."""

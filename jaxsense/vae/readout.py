@@ -1,18 +1,28 @@
 """Class probabilities as a belief, and read from a belief.
 
 The Gaussian with the moments of the mixture `sum_c w_c q*_c` of the classes' joint posteriors holds
-the probabilities `w_c`: its mean and mean square are linear in them.
+the probabilities `w_c`: its mean and mean square are linear in them. Of all probabilities with
+these moments, those of maximum entropy are read (Jaynes 1957, Physical Review 106(4), Sec. 2):
+`w_c ~ exp(theta . T(c))`, where `T(c)` holds the mean and mean square of `q*_c`. They are exact if
+the log-posterior of the looks is linear in `T`, as it is where the labels of each sensor have
+latent directions of their own.
 """
 
 import chex
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsense.core import checks
-from jaxsense.core.types import Belief
+from jaxsense.core.types import Belief, pytree
 
-MIN_PROBABILITY = 1e-5
-"""Smallest probability of a class that a belief can hold in float32."""
+MIN_PROBABILITY = 1e-6
+"""Smallest probability of a class that is read; float32 moments hold no smaller ones."""
+
+_STEPS = 25  # of Newton's method
+_LONGEST = 2.0  # step, in whitened coordinates; with longer ones it diverges near certainty
+_DAMPING = 1e-5
+_THRESHOLD = 0.05  # of the largest singular value; moments that differ less differ by error
 
 
 def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
@@ -35,48 +45,93 @@ def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
     return Belief(mean, jnp.sqrt(probabilities @ spread))
 
 
-def readout_matrix(classes: Belief) -> Float[Array, "C K"]:
-    """Linear map from the moments of a mixture to its weights.
+@pytree
+class Readout:
+    """Reads class probabilities from beliefs, see `make`.
 
-    With more than `2D + 1` classes, moments do not determine weights; the map returns the weights
-    of smallest norm.
+    Attributes:
+      prior: `[D]` belief before any look, in which all classes are equally likely.
+      of_classes: `[C, K]` whitened moments of the classes.
+      offset: `[2D]` mean of the classes' moments.
+      whitening: `[2D, K]` from moments less `offset` to whitened ones.
+    """
+
+    prior: Belief
+    of_classes: Float[Array, "C K"]
+    offset: Float[Array, " 2*D"]
+    whitening: Float[Array, "2*D K"]
+
+    def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
+        """Probability of each class according to a belief.
+
+        Args:
+          belief: `[D]`.
+
+        Returns:
+          `[C]` probabilities, each at least about `MIN_PROBABILITY`.
+
+        Raises:
+          ValueError: if the belief is not finite, or a standard deviation is not positive.
+        """
+        checks.require_finite("belief.mean", belief.mean)
+        checks.require_positive("belief.std", belief.std)
+        found = jnp.maximum(self._of_maximum_entropy(belief), MIN_PROBABILITY)
+        prior = self.prior
+        apart = jnp.maximum(jnp.abs(belief.mean - prior.mean), jnp.abs(belief.std - prior.std))
+        # Tolerates rounding between compiled programs.
+        is_prior = jnp.all(apart <= 1e-5 * prior.std)
+        return jnp.where(is_prior, 1 / len(found), found / jnp.sum(found))
+
+    def _of_maximum_entropy(self, belief: Belief) -> jax.Array:
+        """`[C]` probabilities whose moments are the belief's, by a damped Newton iteration."""
+        target = (_moments(belief) - self.offset) @ self.whitening
+
+        def step(_: int, theta: jax.Array) -> jax.Array:
+            probabilities = jax.nn.softmax(self.of_classes @ theta)
+            expected = probabilities @ self.of_classes
+            apart = self.of_classes - expected[None]
+            hessian = (apart * probabilities[:, None]).T @ apart
+            move = _solve(hessian + _DAMPING * jnp.eye(len(theta)), target - expected)
+            length = jnp.sqrt(jnp.sum(move**2) + 1e-12)
+            return theta + move * jnp.minimum(1.0, _LONGEST / length)
+
+        theta = jax.lax.fori_loop(0, _STEPS, step, jnp.zeros_like(target))
+        return jax.nn.softmax(self.of_classes @ theta)
+
+
+def make(classes: Belief, prior: Belief) -> Readout:
+    """The readout of beliefs in some classes.
 
     Args:
       classes: `[C, D]` joint posterior of each class.
-
-    Returns:
-      `[C, 2D + 1]`.
-    """
-    return jnp.linalg.pinv(_moments(classes).T)
-
-
-def class_probabilities(
-    matrix: Float[Array, "C K"], prior: Belief, belief: Belief
-) -> Float[Array, " C"]:
-    """Probability of each class according to a belief.
-
-    Args:
-      matrix: `[C, 2D + 1]` from `readout_matrix`.
       prior: `[D]` belief before any look, in which all classes are equally likely.
-      belief: `[D]`.
-
-    Returns:
-      `[C]` probabilities, each at least about `MIN_PROBABILITY`.
-
-    Raises:
-      ValueError: if the belief is not finite, or a standard deviation is not positive.
     """
-    checks.require_finite("belief.mean", belief.mean)
-    checks.require_positive("belief.std", belief.std)
-    found = jnp.maximum(matrix @ _moments(belief), MIN_PROBABILITY)
-    apart = jnp.maximum(jnp.abs(belief.mean - prior.mean), jnp.abs(belief.std - prior.std))
-    # Tolerates rounding between compiled programs.
-    is_prior = jnp.all(apart <= 1e-5 * prior.std)
-    return jnp.where(is_prior, 1 / len(found), found / jnp.sum(found))
+    chex.assert_rank(classes.mean, 2, custom_message="classes.mean")
+    moments = _moments(classes)
+    offset = jnp.mean(moments, axis=0)
+    _, singular, axes = jnp.linalg.svd(moments - offset[None], full_matrices=False)
+    # The moments less their mean span one direction less than there are classes.
+    rank = min(len(moments) - 1, moments.shape[1])
+    singular, axes = singular[:rank], axes[:rank]
+    is_kept = singular > _THRESHOLD * singular[0]
+    length = jnp.where(is_kept, jnp.sqrt(len(moments)) / jnp.where(is_kept, singular, 1.0), 0.0)
+    whitening = axes.T * length[None]
+    return Readout(prior, (moments - offset[None]) @ whitening, offset, whitening)
 
 
 def _moments(belief: Belief) -> Float[Array, "... K"]:
-    """Mean, mean square, and 1, `[..., 2D + 1]`: all linear in the weights of a mixture."""
-    square = belief.std**2 + belief.mean**2
-    one = jnp.ones((*belief.mean.shape[:-1], 1))
-    return jnp.concatenate([belief.mean, square, one], axis=-1)
+    """Mean and mean square, `[..., 2D]`: linear in the weights of a mixture."""
+    return jnp.concatenate([belief.mean, belief.std**2 + belief.mean**2], axis=-1)
+
+
+def _solve(matrix: Float[Array, "K K"], vector: Float[Array, " K"]) -> Float[Array, " K"]:
+    """Solves a positive definite system by elimination.
+
+    `jnp.linalg.solve` calls a library for each of a batch of small systems.
+    """
+    for k in range(len(vector)):
+        factor = matrix[:, k] / matrix[k, k]
+        factor = factor.at[k].set(1 - 1 / matrix[k, k])
+        matrix = matrix - factor[:, None] * matrix[k][None, :]
+        vector = vector - factor * vector[k]
+    return vector

@@ -37,6 +37,10 @@ class Of:
     rule: Reward
     of_prior: jax.Array | None = None
 
+    @property
+    def is_of_labels(self):
+        return False
+
     def information(self, belief, probabilities):
         known = self.information_of(probabilities)
         if self.of_prior is None:

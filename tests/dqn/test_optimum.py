@@ -28,6 +28,10 @@ KEY = jax.random.key(0)
 class OfOpenClasses:
     """A gain in the table above `MIN_INCREASE`, or -1."""
 
+    @property
+    def is_of_labels(self):
+        return False
+
     def information(self, belief, probabilities):
         return jnp.array(TABLE)[jnp.sum((probabilities > 0.01) << jnp.arange(3))]
 

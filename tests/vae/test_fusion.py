@@ -28,8 +28,8 @@ def in_place(model, params, classes=None):
     """Fusion in place; classes do not matter to an update."""
     shape = 3, model.latent_size
     classes = Belief(jnp.zeros(shape), jnp.ones(shape)) if classes is None else classes
-    matrix = readout.readout_matrix(classes)
-    return fusion.InPlace(params, classes, fusion.prior(model, 20.0), matrix, model)
+    prior = fusion.prior(model, 20.0)
+    return fusion.InPlace(params, classes, prior, readout.make(classes, prior), model)
 
 
 def look(model, modality, seed=0):
