@@ -99,9 +99,8 @@ def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InP
       params: of the JMVAE.
       classes: `[C, D]` mean joint posterior of each class.
     """
-    prior = make_prior(config)
-    read = readout.make(classes, prior)
-    return fusion.InPlace(params, classes, prior, read, make_jmvae(config))
+    read = readout.make(classes)
+    return fusion.InPlace(params, classes, make_prior(config), read, make_jmvae(config))
 
 
 def init(key: Key, config: Config) -> Models:

@@ -68,21 +68,19 @@ def look_values(
         return solve(likelihoods, mixture=lambda p: readout.mixture(classes, p))
 
     def of_labels(m: int) -> LookValues:
-        labels = np.array(config.label_of_class(config.modalities[m]))
+        bank, labels = detections.bank[m], np.array(config.label_of_class(config.modalities[m]))
         number = len(config.labels(config.modalities[m]))
         of_each = np.eye(number, dtype=np.float32)[labels]
-        members = [np.flatnonzero(labels == label) for label in range(number)]
-        # As many looks at each class with the label.
-        features = jnp.stack(
-            [
-                jnp.swapaxes(detections.bank[m][of_label], 0, 1).reshape(-1, number)[
-                    : settings.value_looks
-                ]
-                for of_label in members
-            ]
-        )
-        firsts = np.array([of_label[0] for of_label in members])
-        likelihoods = jax.vmap(jax.vmap(lambda x: bayes.log_likelihoods(x, m)[firsts]))(features)
+        size = min(settings.value_looks, bank.shape[1])
+
+        def looks(label: int) -> jax.Array:
+            """Likelihoods of the labels in as many looks at each class with this one."""
+            at_classes = jnp.swapaxes(bank[np.flatnonzero(labels == label)], 0, 1)
+            firsts = [np.flatnonzero(labels == each)[0] for each in range(number)]
+            of_look = lambda x: bayes.log_likelihoods(x, m)[np.array(firsts)]  # noqa: E731
+            return jax.vmap(of_look)(at_classes.reshape(-1, number)[:size])
+
+        likelihoods = jnp.stack([looks(label) for label in range(number)])
         # The reward does not depend on the belief.
         found = solve(likelihoods, mixture=lambda p: prior, start=jnp.asarray(of_each.mean(axis=0)))
         return dataclasses.replace(found, labels=jnp.asarray(of_each))

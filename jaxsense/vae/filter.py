@@ -115,7 +115,7 @@ class Filter:
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
         """Probability of each class according to a `[D]` belief."""
-        return self.readout.class_probabilities(belief)
+        return self.readout.class_probabilities(belief, self.prior)
 
     def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
         """Most likely class according to a `[D]` belief, int32."""
@@ -143,7 +143,7 @@ def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterC
         networks={name: networks.init(k, network, size) for k, name, size in of_each},
         classes=classes,
         prior=prior,
-        readout=readout.make(classes, prior),
+        readout=readout.make(classes),
         model=model,
         hidden=config.hidden,
     )

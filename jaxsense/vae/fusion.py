@@ -78,7 +78,7 @@ class InPlace:
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
         """Probability of each class according to a `[D]` belief."""
-        return self.readout.class_probabilities(belief)
+        return self.readout.class_probabilities(belief, self.prior)
 
     def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
         """Class whose joint posterior is nearest to a `[D]` belief, int32."""

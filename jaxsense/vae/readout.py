@@ -50,22 +50,21 @@ class Readout:
     """Reads class probabilities from beliefs, see `make`.
 
     Attributes:
-      prior: `[D]` belief before any look, in which all classes are equally likely.
       of_classes: `[C, K]` whitened moments of the classes.
       offset: `[2D]` mean of the classes' moments.
       whitening: `[2D, K]` from moments less `offset` to whitened ones.
     """
 
-    prior: Belief
     of_classes: Float[Array, "C K"]
     offset: Float[Array, " 2*D"]
     whitening: Float[Array, "2*D K"]
 
-    def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
+    def class_probabilities(self, belief: Belief, prior: Belief) -> Float[Array, " C"]:
         """Probability of each class according to a belief.
 
         Args:
           belief: `[D]`.
+          prior: `[D]` belief before any look, in which all classes are equally likely.
 
         Returns:
           `[C]` probabilities, each at least about `MIN_PROBABILITY`.
@@ -76,7 +75,6 @@ class Readout:
         checks.require_finite("belief.mean", belief.mean)
         checks.require_positive("belief.std", belief.std)
         found = jnp.maximum(self._of_maximum_entropy(belief), MIN_PROBABILITY)
-        prior = self.prior
         apart = jnp.maximum(jnp.abs(belief.mean - prior.mean), jnp.abs(belief.std - prior.std))
         # Tolerates rounding between compiled programs.
         is_prior = jnp.all(apart <= 1e-5 * prior.std)
@@ -99,12 +97,11 @@ class Readout:
         return jax.nn.softmax(self.of_classes @ theta)
 
 
-def make(classes: Belief, prior: Belief) -> Readout:
+def make(classes: Belief) -> Readout:
     """The readout of beliefs in some classes.
 
     Args:
       classes: `[C, D]` joint posterior of each class.
-      prior: `[D]` belief before any look, in which all classes are equally likely.
     """
     chex.assert_rank(classes.mean, 2, custom_message="classes.mean")
     moments = _moments(classes)
@@ -116,7 +113,7 @@ def make(classes: Belief, prior: Belief) -> Readout:
     is_kept = singular > _THRESHOLD * singular[0]
     length = jnp.where(is_kept, jnp.sqrt(len(moments)) / jnp.where(is_kept, singular, 1.0), 0.0)
     whitening = axes.T * length[None]
-    return Readout(prior, (moments - offset[None]) @ whitening, offset, whitening)
+    return Readout((moments - offset[None]) @ whitening, offset, whitening)
 
 
 def _moments(belief: Belief) -> Float[Array, "... K"]:

@@ -317,12 +317,12 @@ CHANGES = [
         "detector.calibration = 0.5: leaves none of 1 scans to train on; lower it",
     ),
     (
-        {"jmvae.fusion": "filter", "jmvae.latent_size": 1, "arena.classes": SIX[:5]},
-        "jmvae.latent_size = 1: must be at least 2, so that a filter can hold 5 classes",
+        {"jmvae.latent_size": 1, "arena.classes": SIX[:5]},
+        "jmvae.latent_size = 1: must be at least 2, so that beliefs can hold 5 classes",
     ),
     (
-        {"jmvae.fusion": "filter", "jmvae.latent_size": 2, "arena.classes": SIX},
-        "jmvae.latent_size = 2: must be at least 3, so that a filter can hold 6 classes",
+        {"jmvae.fusion": "filter", "jmvae.latent_size": 1, "arena.classes": SIX},
+        "jmvae.latent_size = 1: must be at least 2, so that beliefs can hold 6 classes",
     ),
     ({"jmvae.samples_per_class": 10**9}, "jmvae.samples_per_class = 1000000000: takes"),
     ({"jmvae.steps": 10**9}, "jmvae.steps = 1000000000: takes"),

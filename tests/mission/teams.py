@@ -23,7 +23,7 @@ def with_config(team, config):
 
 def with_class_beliefs(models, classes):
     """The same models with other joint posteriors of the classes."""
-    fusion = replace(models.fusion, classes=classes, readout=readout.make(classes, models.fusion.prior))
+    fusion = replace(models.fusion, classes=classes, readout=readout.make(classes))
     return replace(models, fusion=fusion)
 
 

@@ -13,7 +13,6 @@ from tiny import KEY, TINY, stage_of
 from jaxsense import models
 from jaxsense.config import MdpConfig, TeamConfig, ToursConfig
 from jaxsense.core.types import Belief
-from jaxsense.dqn import optimum
 from jaxsense.dqn import training as dqn
 from jaxsense.training import comparison
 from jaxsense.training.perception import Detections
@@ -54,11 +53,11 @@ def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(r
         # An unseen PoI has a variance of 20, so that even the LiDAR's first look pays.
         unseen = 1 / np.sqrt(20)
         first = [((1 - unseen) + 2 * (1 / 2 - unseen)) / 3, before - unseen]
-    found = [optimum.interpolate(values.one_step, even) for values in (camera, lidar)]
+    found = [values.of_next(even, True) for values in (camera, lidar)]
     np.testing.assert_allclose(found, expected, atol=1e-4)
     np.testing.assert_allclose([camera.one_step_unseen, lidar.one_step_unseen], first, atol=1e-4)
     # A second look of the camera adds nothing, and so costs more than it pays.
-    np.testing.assert_allclose(optimum.interpolate(camera.q, even), expected[0], atol=1e-4)
+    np.testing.assert_allclose(camera.of_all(even, True), expected[0], atol=1e-4)
     np.testing.assert_allclose(camera.q_unseen, first[0], atol=1e-4)
 
 

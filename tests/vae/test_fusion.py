@@ -29,7 +29,7 @@ def in_place(model, params, classes=None):
     shape = 3, model.latent_size
     classes = Belief(jnp.zeros(shape), jnp.ones(shape)) if classes is None else classes
     prior = fusion.prior(model, 20.0)
-    return fusion.InPlace(params, classes, prior, readout.make(classes, prior), model)
+    return fusion.InPlace(params, classes, prior, readout.make(classes), model)
 
 
 def look(model, modality, seed=0):

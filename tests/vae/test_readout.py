@@ -14,10 +14,11 @@ from jaxsense.vae.jmvae import Jmvae
 MODEL = Jmvae(("camera", "lidar"), (2, 2), 2, (4,))
 CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
 PRIOR = fusion.prior(MODEL, 20.0)
+READ = readout.make(CLASSES)
 
 
 def read(belief, prior=PRIOR):
-    return readout.make(CLASSES, prior).class_probabilities(belief)
+    return READ.class_probabilities(belief, prior)
 
 
 @given(st.lists(st.floats(0.001, 1.0), min_size=3, max_size=3))
@@ -37,7 +38,7 @@ def test_a_mixture_has_the_moments_by_hand():
 def test_a_single_dimension_holds_three_classes():
     line = Belief(jnp.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]), jnp.full((3, 2), 0.3))
     shares = jnp.array([0.2, 0.3, 0.5])
-    found = readout.make(line, PRIOR).class_probabilities(readout.mixture(line, shares))
+    found = readout.make(line).class_probabilities(readout.mixture(line, shares), PRIOR)
     np.testing.assert_allclose(found, shares, atol=1e-4)
 
 
@@ -60,29 +61,26 @@ def test_a_belief_that_is_only_near_the_prior_is_read_by_its_moments():
         np.testing.assert_allclose(read(near, prior), shares, atol=0.01)
 
 
-def looked_at(rng, labels, prototypes, looks, width=0.3):
-    """NLL of the true class by the map and by exact Bayes, after looks by sensors in turn."""
-    classes = Belief(jnp.array(prototypes, jnp.float32), jnp.full(np.shape(prototypes), width))
-    read = readout.make(classes, fusion.prior(MODEL, 20.0))
-    number, histories = len(prototypes), 2000
-    truth = rng.integers(number, size=histories)
-    exact, found = np.zeros((histories, number)), None
+def looked_at(labels, prototypes, looks):
+    """NLL of the true class by the map and by exact Bayes, after looks by the sensors in turn."""
+    rng, number, histories = np.random.default_rng(0), len(prototypes), 2000
+    mean = jnp.array(prototypes, jnp.float32)
+    classes = Belief(mean, jnp.full(mean.shape, 0.3))
+    prior = Belief(jnp.zeros(mean.shape[1]), jnp.full(mean.shape[1], 4.5))
+    read = readout.make(classes)
     write = jax.jit(jax.vmap(lambda p: readout.mixture(classes, p)))
-    back = jax.jit(jax.vmap(read.class_probabilities))
+    back = jax.jit(jax.vmap(lambda belief: read.class_probabilities(belief, prior)))
+    truth, exact = rng.integers(number, size=histories), np.zeros((histories, number))
     belief = write(jnp.full((histories, number), 1 / number))
     for look in range(looks):
         of_class = np.array(labels[look % len(labels)])
-        seen = of_class[truth]
         quality = rng.uniform(0.3, 4.0, size=(histories, 1))
-        noise = rng.normal(size=(histories, of_class.max() + 1))
-        logits = quality * np.eye(noise.shape[1])[seen] + np.sqrt(quality) * noise
-        evidence = logits[:, of_class]
-        exact = exact + evidence
-        found = np.log(np.array(back(belief))) + evidence
-        belief = write(jax.nn.softmax(jnp.array(found, jnp.float32)))
-    rows = np.arange(histories)
-    nll = [-np.mean(jax.nn.log_softmax(x)[rows, truth]) for x in (np.log(back(belief)), exact)]
-    return nll
+        logits = np.sqrt(quality) * rng.normal(size=(histories, of_class.max() + 1))
+        logits += quality * np.eye(logits.shape[1])[of_class[truth]]
+        exact += logits[:, of_class]
+        belief = write(jax.nn.softmax(jnp.log(back(belief)) + logits[:, of_class]))
+    right = np.arange(histories), truth
+    return [-float(np.mean(np.log(x)[right])) for x in (back(belief), jax.nn.softmax(exact))]
 
 
 SQUARE = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
@@ -93,8 +91,14 @@ WORLDS = {
         [[0, 0, 1, 1, 2, 2], [0, 1, 0, 1, 0, 1]],
         [[m, n] for m in (-1.1, 0.0, 1.1) for n in (-0.8, 0.8)],
     ),
-    "5 of 3x2": ([[0, 0, 1, 1, 2], [0, 1, 0, 1, 0]], [[m, n] for m in (-1.1, 0.0, 1.1) for n in (-0.8, 0.8)][:5]),
-    "4x4": ([[a for a, _ in GRID], [b for _, b in GRID]], [[*SQUARE[a], *SQUARE[b]] for a, b in GRID]),
+    "5 of 3x2": (
+        [[0, 0, 1, 1, 2], [0, 1, 0, 1, 0]],
+        [[m, n] for m in (-1.1, 0.0, 1.1) for n in (-0.8, 0.8)][:5],
+    ),
+    "4x4": (
+        [[a for a, _ in GRID], [b for _, b in GRID]],
+        [[*SQUARE[a], *SQUARE[b]] for a, b in GRID],
+    ),
     "one sensor": ([[0, 1, 2]], [[-1.0, 0.0], [1.0, 0.2], [0.1, 1.0]]),
 }
 
@@ -103,7 +107,7 @@ WORLDS = {
 @pytest.mark.parametrize("looks", [1, 6])
 def test_a_map_knows_what_exact_bayes_knows(world, looks):
     labels, prototypes = WORLDS[world]
-    of_map, of_bayes = looked_at(np.random.default_rng(0), labels, prototypes, looks)
+    of_map, of_bayes = looked_at(labels, prototypes, looks)
     assert of_map - of_bayes < 0.003
     assert of_map == pytest.approx(of_bayes, rel=0.02)
 
@@ -112,7 +116,7 @@ def test_a_prototype_that_is_slightly_off_is_read_as_its_class():
     # The mean squares of a grid are alike: what tells them apart is error, not class.
     grid = jnp.array([[-1.06, 1.14], [1.08, 1.14], [-1.06, -1.06], [1.06, -1.07]])
     classes = Belief(grid, jnp.array([[0.355, 0.353], [0.353, 0.365], [0.35, 0.367], [0.36, 0.36]]))
-    read = readout.make(classes, PRIOR)
+    read = readout.make(classes)
     for c in range(4):
         off = Belief(grid[c] + 0.01, classes.std[c] + 0.01)
-        assert read.class_probabilities(off)[c] > 0.99
+        assert read.class_probabilities(off, PRIOR)[c] > 0.99
