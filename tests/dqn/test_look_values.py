@@ -176,6 +176,38 @@ def test_values_are_those_of_all_histories(name, number):
     assert by_horizon[0] + 0.005 < by_horizon[2]
 
 
+# Of four classes on a grid, two are red and two are green; a look shows one of two colours.
+COLOUR_OF_CLASS = (0, 0, 1, 1)
+OF_COLOUR = ((0.8, 0.2), (0.2, 0.8))
+GRID_STARTS = ((0.25, 0.25, 0.25, 0.25), (0.5, 0.1, 0.3, 0.1), (0.05, 0.25, 0.6, 0.1))
+
+
+def over_classes(weights, horizon, cost):
+    """Expected nats of a look and of all that pay after it, from the posterior over classes."""
+    expected = 0.0
+    for shown in range(2):
+        joint = [w * OF_COLOUR[COLOUR_OF_CLASS[c]][shown] for c, w in enumerate(weights)]
+        after = [w / sum(joint) for w in joint]
+        reward = entropy(weights) - entropy(after) - cost
+        later = max(over_classes(after, horizon - 1, cost), 0.0) if horizon > 1 else 0.0
+        expected += sum(joint) * (reward + later)
+    return expected
+
+
+@pytest.mark.parametrize("horizon", [1, 4])
+def test_values_on_labels_are_those_of_all_histories_of_classes(horizon):
+    config = MdpConfig(reward="nats", look_cost=0.05)
+    # Of five looks at a red PoI four look red.
+    looks = jnp.log(jnp.array([OF_COLOUR[0], OF_COLOUR[1]]).T)
+    likelihoods = jnp.stack([looks[jnp.array(x)] for x in ([0, 0, 0, 0, 1], [1, 1, 1, 1, 0])])
+    found = solve(likelihoods, rewards.make(config), config, horizon)
+    found = replace(found, labels=jnp.eye(2)[jnp.array(COLOUR_OF_CLASS)])
+    for weights in GRID_STARTS:
+        expected = over_classes(weights, horizon, config.look_cost)
+        assert found.of_all(jnp.array(weights), True) == pytest.approx(expected, abs=1e-3)
+    assert over_classes(GRID_STARTS[0], 4, 0.05) > over_classes(GRID_STARTS[0], 1, 0.05) + 0.05
+
+
 def test_an_episode_of_few_steps_has_as_few_looks():
     _, information, config = REWARDS["nats"]
     reward = Of(information, rewards.make(config))
