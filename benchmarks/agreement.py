@@ -58,7 +58,7 @@ def _results() -> dict[str, np.ndarray]:
         of_each = jax.vmap(jax.vmap(detect, (None, 0)), (None, 0))
         features = [of_each(d, w) for d, w in zip(models.detectors, windows, strict=True)]
         encode = jax.vmap(jax.vmap(lambda *f: posterior(models.jmvae, model, f)))
-        states = jax.vmap(lambda key: mission.reset(key, team, team.policy("naive")))(keys)
+        states = jax.vmap(lambda key: mission.reset(key, team, models, team.policy("naive")))(keys)
         periods = round(_SECONDS / config.mission.control_period)
         states, _ = mission.rollout_batch(keys, team, models, states, periods, every=_SCENES)
         found = dict(zip(config.modalities, windows, strict=True))

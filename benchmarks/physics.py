@@ -131,7 +131,7 @@ def _mid_mission(batch: int, periods: int) -> tuple[Mission, MissionState]:
     def play(keys: jax.Array) -> MissionState:
         reset_keys, play_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
         naive = team.policy("naive")
-        states = jax.vmap(lambda key: mission.reset(key, team, naive))(reset_keys)
+        states = jax.vmap(lambda key: mission.reset(key, team, networks, naive))(reset_keys)
 
         def step(states: MissionState, keys: jax.Array):
             after, _ = mission_step(keys, team, networks, states)

@@ -52,7 +52,7 @@ def trips(config: Config, models: Models) -> tuple[np.ndarray, np.ndarray, np.nd
 
     @jax.jit
     def play(keys: jax.Array):
-        states = jax.vmap(lambda key: mission.reset(key, team, naive))(keys)
+        states = jax.vmap(lambda key: mission.reset(key, team, models, naive))(keys)
         _, records = mission.rollout_batch(keys, team, models, states, steps, 1)
         return states.scene.poses, states.scene.layout.position, records
 

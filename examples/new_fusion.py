@@ -14,6 +14,8 @@ from jaxsense.core.types import pytree
 class Product(vae.InPlace):
     """A look multiplies the belief with what it says alone, and the prior counts once."""
 
+    accumulates = True  # looks add up
+
     def update(self, belief, seen, features, modality):
         """The belief after one more look, whichever sensors have `seen` the PoI."""
         return vae.product_of_experts(belief, self.together({modality: features}), self.prior)
@@ -33,6 +35,6 @@ if __name__ == "__main__":
     for look in range(3):
         state, outcome = step(jax.random.key(look), mdp, state, jnp.int32(0), jnp.int32(look % 2))
         print(f"sigma {state.belief.std[0]} after look {look + 1}, reward {outcome.reward:.2f}")
-    played = mission.make_mission(config)
-    play = jax.jit(lambda key: mission.rollout(key, played, models, mission.reset(key, played), 50))
+    team = mission.make_mission(config)
+    play = jax.jit(lambda k: mission.rollout(k, team, models, mission.reset(k, team, models), 50))
     print(f"looks in a mission:\n{play(key)[0].times_seen}")

@@ -28,6 +28,6 @@ if __name__ == "__main__":
     total, first = jax.jit(lambda: episodes.run_episode(key, mdp, models.bayes, act, start, 0))()
     print(f"map MDP: total reward {total:.2f}, of the first look {first:.2f}")
     played = mission.make_mission(config, policies={"widest": widest})
-    state = mission.reset(key, played, played.policy("widest"))
+    state = mission.reset(key, played, models, played.policy("widest"))
     state, _ = jax.jit(lambda: mission.rollout(key, played, models, state, 50))()
     print(f"mission: the robots head for PoIs {state.robots.target}")

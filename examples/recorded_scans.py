@@ -5,13 +5,13 @@
     python examples/recorded_scans.py runs/smoke recorded.npz
 
 The second line writes a recording of simulated looks at a PoI of each class, the third reads it.
-Yours can come from anywhere. It holds for C PoIs
+Your own recording can come from anywhere. It must hold, for C PoIs:
 
     places      [C, 2]       their positions, in metres
     NAME_poses  [C, 3]       from where the sensor NAME looked: x, y in metres and yaw in radians
     NAME_scans  [C, B, ...]  what all its B rays read
 
-A run with sensors of your own needs `--trust`, for their functions are imported.
+A run with custom sensors needs `--trust`, because their functions are imported.
 """
 
 import argparse
@@ -24,6 +24,25 @@ import numpy as np
 
 import jaxsense
 from jaxsense import sim, vae
+
+
+def check(config: jaxsense.Config, recorded: dict[str, np.ndarray]) -> None:
+    """Raises `ValueError` if a recording lacks something or has another shape."""
+    shapes = {"places": (2,)}
+    for sensor in sim.sensors.make(config):
+        channels = () if sensor.channels == 1 else (sensor.channels,)
+        shapes[f"{sensor.name}_poses"] = (3,)
+        shapes[f"{sensor.name}_scans"] = (len(sensor.angles), *channels)
+    for name, shape in shapes.items():
+        if name not in recorded:
+            raise ValueError(f"{name} is missing; a recording holds {', '.join(shapes)}")
+        found, expected = recorded[name], ", ".join(("C", *map(str, shape)))
+        if found.dtype.kind not in "fiu":
+            raise ValueError(f"{name} must hold numbers, not {found.dtype}")
+        if found.shape != (*recorded["places"].shape[:1], *shape):
+            raise ValueError(
+                f"{name} has the shape {found.shape}; must be ({expected}) for C places"
+            )
 
 
 def read(config: jaxsense.Config, models: jaxsense.Models, recorded: dict[str, np.ndarray]) -> None:
@@ -101,8 +120,10 @@ def main(argv: list[str] | None = None) -> None:
                 np.savez(file, **found)
             return
         with np.load(arguments.recording, allow_pickle=False) as recorded:
-            read(config, models, dict(recorded))
-    except (OSError, ValueError, KeyError) as error:
+            arrays = dict(recorded)
+        check(config, arrays)
+        read(config, models, arrays)
+    except (OSError, ValueError) as error:
         sys.exit(f"recorded_scans: {error}")
 
 

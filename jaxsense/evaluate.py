@@ -68,7 +68,7 @@ class Arguments:
     """Number of accelerators, or of CPU threads, that share the missions. By default all
     accelerators, or one thread per core, at most 8."""
     cache: Path | None = cli.CACHE
-    """Directory of compiled programs for later runs, or `none`."""
+    """Directory in which to cache compiled programs; `none` for no cache."""
     animate: bool = False
     """Also write an animation of the first mission, `mission-POLICY-SEED.svg`."""
     trust: bool = False
@@ -76,9 +76,9 @@ class Arguments:
 
     def __post_init__(self):
         check_fields(self, bits=64)
-        most = f"must be within 1 and {MAX_EPISODES:,}"
+        most = f"must be from 1 to {MAX_EPISODES:,}"
         require(1 <= self.episodes <= MAX_EPISODES, self, "episodes", most)
-        require(0 <= self.seed < 2**32, self, "seed", "must be within 0 and 2^32 - 1")
+        require(0 <= self.seed < 2**32, self, "seed", "must be from 0 to 2^32 - 1")
         cli.require_directory("cache", self.cache)
 
 
@@ -89,7 +89,7 @@ def main(
 
     Args:
       argv: the command line without the program; by default the process's own.
-      policies: of your own, by name, to play besides `dqn.POLICIES`.
+      policies: custom policies by name, to play in addition to `dqn.POLICIES`.
     """
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
@@ -127,7 +127,8 @@ def main(
         config,
         found.recording.records,
         found.recording.end,
-        models.fusion.classes,
+        models.fusion,
+        {sensor.name: sensor.field_of_view for sensor in team.world.sensors},
     )
     try:
         written = _write(arguments, trained, config, block, draw)
@@ -217,9 +218,10 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
     if not plays(arena.num_pois):
         number = config.arena.num_pois
         reason = (
-            f"the policies of this run are for {number} points; must be {number}, or a run with"
+            f"must be {number}, as in training; only a run with dqn.task = team plays with other "
+            "numbers"
         )
-        raise ConfigError("arena.num_pois", arena.num_pois, f"{reason} dqn.task = team")
+        raise ConfigError("arena.num_pois", arena.num_pois, reason)
     robots, given = config.robots, arguments.robots
     if given is not None and sorted(given) != sorted(config.carried):
         # In one order, so that a team plays in the same arenas however it is named.

@@ -57,7 +57,7 @@ class Arguments:
     seed: int = 0
     """Seed of all randomness, from 0 to 2^32 - 1."""
     out: Path | None = None
-    """Directory to write; it must not exist yet or be empty. By default `runs/DATE-TIME-PRESET`."""
+    """New or empty directory to write. By default `runs/DATE-TIME-PRESET`."""
     num_seeds: int = 1
     """Number of seeds to train, starting from `--seed`. Each has its own directory within the run,
     which reports their means and 95 % confidence intervals."""
@@ -82,7 +82,7 @@ class Arguments:
     process_index: int | None = None
     """Index of this process, from 0."""
     cache: Path | None = cli.CACHE
-    """Directory of compiled programs for later runs, or `none`."""
+    """Directory in which to cache compiled programs; `none` for no cache."""
 
     def __post_init__(self):
         if isinstance(self.file, str):
@@ -106,7 +106,7 @@ def main(
     Args:
       argv: the command line without the program; by default the process's own.
       change: changes a preset in your own program, before the other options do.
-      policies: of your own, by name; missions play those that `config.mission.policies` names.
+      policies: custom policies by name; missions play those that `config.mission.policies` names.
     """
     begin = time.perf_counter()
     arguments = parse(sys.argv[1:] if argv is None else argv, change, policies)
@@ -158,7 +158,7 @@ def parse(
     Args:
       argv: the command line without the program.
       change: changes a preset before the other options do.
-      policies: of your own, by name.
+      policies: custom policies by name.
 
     Returns:
       The options.
@@ -250,7 +250,7 @@ def _train(
     is_left = np.array([not (path / "summary.json").exists() for _, path in paths])
     left = list(itertools.compress(paths, devices.of_first_process(is_left)))
     most = 1 if jax.default_backend() == "cpu" else _MOST_TOGETHER
-    size = max(1, min(len(left), most))  # of seeds that are all finished none is left
+    size = max(1, min(len(left), most))  # all seeds may already be finished
     try:
         with (
             on_interrupt(stop),
@@ -353,8 +353,8 @@ def _write(run: RunDirectory, result: RunResult, timing: summary.Timing, monitor
     )
     pictures |= plots.of_seeds(result.rewards, result.results)
     title = f"{config.mission.policies[0]} policy".replace("_", " ")
-    classes = result.models.fusion.classes
-    film = animation.draw(config, recording.records, recording.end, classes, title)
+    fusion, fields_of_view = result.models.fusion, result.fields_of_view
+    film = animation.draw(config, recording.records, recording.end, fusion, fields_of_view, title)
     found: summary.Summary = {**_header(run), "timing": timing, **result.results}
     _write_page(run, {**pictures, "mission.svg": film}, found)
     monitor.check_stop()

@@ -14,6 +14,11 @@ CLASS_BELIEFS = Belief(
     np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]], np.float32), np.full((3, 2), 0.4, np.float32)
 )
 
+FUSION = SimpleNamespace(
+    classes=CLASS_BELIEFS, prior=Belief(np.zeros(2), np.full(2, np.sqrt(20.0), np.float32))
+)
+FIELDS_OF_VIEW = {"camera": 60.0, "lidar": 240.0}
+
 
 def recording(steps: int = 60) -> Recording:
     """The camera robot drives to PoI 2, looks at it in period 40, and ends; the other one rests."""

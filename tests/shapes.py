@@ -54,7 +54,7 @@ def main() -> None:
     there, models = mission.make_mission(TINY), jaxsense.init(KEY, TINY)
 
     def play(key):
-        return mission.rollout(key, there, models, mission.reset(key, there), 3)
+        return mission.rollout(key, there, models, mission.reset(key, there, models), 3)
 
     jax.eval_shape(play, KEY)
 

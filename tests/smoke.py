@@ -9,7 +9,7 @@ import time
 import pytest
 
 from jaxsense import train
-from jaxsense.run.rundir import RunDirectory
+from jaxsense.run.rundir import RunDirectory, _named
 
 SMOKE = ("--preset", "smoke", "--seed", "5", "--quiet")
 MISSION_KEYS = {
@@ -25,6 +25,12 @@ def without_times(path):
     for block in summary["dqn"].values():
         del block["env_steps_per_s"]
     return summary
+
+
+def save_models(run, models):
+    """Saves models in the directory of a run, as if it had trained them."""
+    for name, tree in _named(models, run.settings.config).items():
+        run.checkpoints.save(name, tree)
 
 
 def error_line(argv, capsys, program=train):

@@ -1,7 +1,8 @@
 """A whole summary, made up."""
 
 AGENT = {
-    "return": 1.2345, "optimal": 1.25, "naive": 1.0, "random": -1.5, "fraction_of_optimal": 0.9876,
+    "return": 1.2345, "optimal": 1.25, "greedy": 1.24, "naive": 1.0, "random": -1.5,
+    "fraction_of_optimal": 0.9876,
     "one_step": {"policy": 0.86, "optimal": 0.87, "random": -0.1}, "optimal_states": 1700,
     "num_states": 1728, "optimal_permutations": 380, "num_permutations": 384,
     "env_steps": 409600, "env_steps_per_s": 50000.4,
@@ -15,6 +16,8 @@ BYTES = {"latent": 16.0, "features": 8.0, "raw": 2326.5}
 UNAMBIGUOUS = {"joint": [True] * 3, "camera": [True, False, False], "lidar": [False, True, True]}
 DETECTOR = {"accuracy": 0.9995, "ece": 0.01, "nll": 0.02}
 CURVES = "looks", "nll", "bayes_nll", "accuracy", "bayes_accuracy"
+RESULTS = "detectors", "jmvae", "belief", "dqn", "mission"
+RETURNS = {name: x for name, x in AGENT.items() if isinstance(x, float) and "env" not in name}
 SUMMARY = {
     "preset": "smoke",
     "seed": 90210,
@@ -34,6 +37,12 @@ SUMMARY = {
     "dqn": {"camera": AGENT, "lidar": AGENT},
     "mission": {"latent": CASE, "bytes_per_detection": BYTES},
 }
+OF_SEEDS = {
+    **SUMMARY,
+    "seeds": {"90210": {name: SUMMARY[name] for name in RESULTS}},
+    "failed": {"90211": "jmvae: loss at step 1 of 2 is not finite"},
+}
+OF_A_TEAM = {**SUMMARY, "dqn": {"camera": {**AGENT, "other_numbers": {"8": RETURNS}}}}
 EVALUATION = {
     "num_pois": 16,
     "side": 6.0,

@@ -6,17 +6,20 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from recordings import CLASS_BELIEFS, CONFIG, recording
+from recordings import CLASS_BELIEFS, CONFIG, FIELDS_OF_VIEW, FUSION, recording
 
+from jaxsense.core.types import Belief
 from jaxsense.show import animation
 from jaxsense.show.colours import modality_colour
 
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def draw(config=CONFIG, played=None):
+def draw(config=CONFIG, played=None, fusion=FUSION, fields_of_view=FIELDS_OF_VIEW):
     played = played or recording()
-    return animation.draw(config, played.records, played.end, CLASS_BELIEFS, "latent policy")
+    return animation.draw(
+        config, played.records, played.end, fusion, fields_of_view, "latent policy"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -152,3 +155,25 @@ def test_a_film_of_one_kind_of_robots_names_no_other():
     config = dataclasses.replace(CONFIG, robots=("camera", "camera"))
     picture = ElementTree.fromstring(draw(config))
     assert "robots with camera look at" in picture.find(f"{SVG}title").text
+
+
+def test_a_field_of_view_is_that_of_the_sensor():
+    # As with a sensor of one's own, the settings do not tell.
+    picture = ElementTree.fromstring(draw(fields_of_view={"camera": 90.0, "lidar": 270.0}))
+    fields = [p for p in part(picture, "film-still").iter(f"{SVG}path") if "A" in p.get("d")]
+    for field, is_wide, side in zip(fields, "01", (1, -1), strict=True):
+        x, y = map(float, field.get("d").removeprefix("M0,0L").split("A")[0].split(","))
+        assert x == pytest.approx(-side * y, abs=0.1)
+        assert field.get("d").split()[1:3] == ["0", is_wide]
+
+
+def test_the_map_begins_with_the_prior_of_the_fusion():
+    prior = Belief(np.array([1.0, -0.5]), np.array([0.25, 0.5]))
+    changed = SimpleNamespace(classes=CLASS_BELIEFS, prior=prior)
+    moving = part(ElementTree.fromstring(draw(fusion=changed)), "film-moving")
+    ellipse = [*moving.iter(f"{SVG}ellipse")][1]  # its PoI is seen later
+    first = {t.get("attributeName"): value_at(t, 0.0)[0] for t in tracks(ellipse)}
+    scale = 170 / 2.4  # as above
+    assert first["cx"] == pytest.approx(170 + scale, abs=0.1)
+    assert first["cy"] == pytest.approx(170 + scale * 0.5, abs=0.1)
+    assert first["rx"] == pytest.approx(scale * 0.25, abs=0.1)

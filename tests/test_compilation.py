@@ -362,7 +362,7 @@ def test_what_another_user_owns_is_not_run(tmp_path, monkeypatch):
     own = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: own + 1)
     assert kept.find("stage-run", (x,)) is None
-    with pytest.raises(PermissionError, match="compiled must be a directory of your own"):
+    with pytest.raises(PermissionError, match="compiled must be a directory that you own"):
         Kept(tmp_path)
 
 
@@ -371,7 +371,7 @@ def test_a_directory_that_others_may_write_is_refused(tmp_path):
     Kept(tmp_path)
     for name in ("compiled", "traced"):
         (tmp_path / name).chmod(0o770)
-        with pytest.raises(PermissionError, match=f"{name} must be a directory of your own"):
+        with pytest.raises(PermissionError, match=f"{name} must be a directory that you own"):
             Kept(tmp_path)
         (tmp_path / name).chmod(0o700)
 

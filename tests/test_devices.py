@@ -151,12 +151,12 @@ def test_two_processes_stop_and_resume_several_seeds(tmp_path):
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        (("localhost:1", None, 0), "None: must be given with coordinator and process_index"),
-        ((None, 2, 0), "coordinator = None: must be given with"),
+        (("localhost:1", None, 0), "coordinator = 'localhost:1': also needs --num-processes"),
+        ((None, 2, 0), "num_processes = 2: also needs --coordinator"),
         (("localhost", 2, 0), "coordinator = 'localhost': must be HOST:PORT"),
         (("localhost:99999", 2, 0), "must be HOST:PORT, with a port from 1 to 65535"),
         (("no.host.invalid:1", 2, 1), "coordinator = 'no.host.invalid:1': cannot be found"),
-        (("localhost:1", 2, 2), "process_index = 2: must be within 0 and 1"),
+        (("localhost:1", 2, 2), "process_index = 2: must be from 0 to 1"),
         (("localhost:1", 0, 0), "num_processes = 0: must be greater than 0"),
     ],
 )
@@ -234,7 +234,7 @@ def test_the_first_process_checks_its_options_before_others_join(tmp_path, monke
     shared = ["--coordinator", "localhost:1", "--num-processes", "2", "--process-index", "0"]
     for options, expected in (
         (["--out", str(tmp_path)], "is not empty"),
-        (["--devices", "999"], "devices = 999: must be within 1 and 256"),
+        (["--devices", "999"], "devices = 999: must be from 1 to 256"),
         (["--resume", str(tmp_path)], "is not a run directory"),
     ):
         with pytest.raises(SystemExit):
@@ -253,7 +253,7 @@ def test_a_system_that_cannot_tell_its_cores(monkeypatch):
 
 def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):
     for number in (0, -1, 10**9):
-        with pytest.raises(ConfigError, match=rf"devices = {number}: must be within 1 and 256"):
+        with pytest.raises(ConfigError, match=rf"devices = {number}: must be from 1 to 256"):
             devices.start(number)
     with pytest.raises(ValueError, match="devices = 0"):
         devices.make_mesh(0)
@@ -261,7 +261,7 @@ def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):
     assert devices.start(None).number == min(os.cpu_count(), 8)
     # The two devices of these tests, as if they were accelerators.
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    with pytest.raises(ConfigError, match=r"devices = 3: must be within 1 and 2"):
+    with pytest.raises(ConfigError, match=r"devices = 3: must be from 1 to 2"):
         devices.start(3)
     assert devices.start(1) == Workers()
     workers = devices.start(None)

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 import pytest
 import rich.console
-from recordings import recording
+from recordings import FIELDS_OF_VIEW, recording
 from smoke import MISSION_KEYS, error_line
 
 import jaxsense
@@ -69,7 +69,7 @@ def write(arguments, missions):
     config, models = jaxsense.load(arguments.run)
     played = recording()
     draw = functools.partial(
-        animation.draw, config, played.records, played.end, models.fusion.classes
+        animation.draw, config, played.records, played.end, models.fusion, FIELDS_OF_VIEW
     )
     return evaluate._write(arguments, config, config, missions, draw)
 
@@ -201,9 +201,7 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
         evaluate.Arguments(path, arena=evaluate.ArenaArguments(30, 8.0)), partly, any_number
     )
     assert there.arena.num_pois == 30
-    with pytest.raises(
-        ConfigError, match=r"arena\.num_pois = 4: the policies of this run are for 3"
-    ):
+    with pytest.raises(ConfigError, match=r"arena\.num_pois = 4: must be 3, as in training"):
         evaluate._elsewhere(
             evaluate.Arguments(path, arena=evaluate.ArenaArguments(4)), config, lambda n: n == 3
         )
@@ -266,9 +264,9 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
     ("options", "expected"),
     [
         (["--policy", "best"], "policy = 'best': must be one of all, policies, latent, greedy"),
-        (["--episodes", "0"], "episodes = 0: must be within 1 and 100,000"),
-        (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
-        (["--episode", "3"], "unknown option --episode. Did you mean --episodes?"),
+        (["--episodes", "0"], "episodes = 0: must be from 1 to 100,000"),
+        (["--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
+        (["--episode", "3"], "unknown option --episode; did you mean --episodes?"),
     ],
 )
 def test_bad_options_of_evaluate_are_named_in_one_line(smoke_run, options, expected, capsys):

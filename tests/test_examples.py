@@ -13,11 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from smoke import save_models
 
 import jaxsense
 from jaxsense import Belief, evaluate, sim, train
 from jaxsense.config import PRESETS
 from jaxsense.core.types import pytree
+from jaxsense.dqn import policies
+from jaxsense.dqn.reference import reference
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.training import learn, stages
 from jaxsense.vae import InPlace
@@ -58,7 +61,7 @@ def runs(learned, tmp_path_factory):
     models = stages.models(outputs | {f"dqn_{name}": q for name, q in q_networks}, config)
     path = tmp_path_factory.mktemp("runs")
     with RunDirectory.create(path / "thermal", Settings("smoke", 0, config)) as created:
-        created.save_models(models)
+        save_models(created, models)
     return path
 
 
@@ -122,6 +125,36 @@ def test_recorded_scans(recorded_scans, tmp_path, capsys):
     assert capsys.readouterr().out.count("thermal: cold 0.00, hot 1.00") == 4
 
 
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"places": None}, "places is missing; a recording holds places, lidar_poses, "),
+        ({"thermal_scans": None}, "thermal_scans is missing"),
+        ({"places": np.zeros((4, 3))}, "places has the shape (4, 3); must be (C, 2) for C places"),
+        ({"places": np.float32(1)}, "places has the shape (); must be (C, 2)"),
+        ({"lidar_poses": np.zeros((3, 3))}, "lidar_poses has the shape (3, 3); must be (C, 3)"),
+        (
+            {"lidar_scans": np.zeros((4, 600))},
+            "lidar_scans has the shape (4, 600); must be (C, 683)",
+        ),
+        ({"lidar_scans": np.full((4, 683), "x")}, "lidar_scans must hold numbers, not <U1"),
+    ],
+)
+def test_a_recording_that_does_not_fit_is_named_in_one_line(
+    recorded_scans, tmp_path, changes, expected, capsys
+):
+    recorded = {"places": np.zeros((4, 2))}
+    for name, rays in (("lidar", 683), ("thermal", 64)):
+        recorded |= {f"{name}_poses": np.zeros((4, 3)), f"{name}_scans": np.zeros((4, rays))}
+    recorded = {name: x for name, x in {**recorded, **changes}.items() if x is not None}
+    np.savez(tmp_path / "recorded.npz", **recorded)
+    with pytest.raises(SystemExit) as stop:
+        recorded_scans(tmp_path / "recorded.npz")
+    assert str(stop.value).startswith(f"recorded_scans: {expected}")
+    assert "\n" not in str(stop.value)
+    assert capsys.readouterr().out == ""
+
+
 @pytest.mark.parametrize("is_there", [True, False])
 def test_recorded_scans_neither_invents_nor_replaces_a_recording(
     recorded_scans, tmp_path, is_there, capsys
@@ -167,7 +200,7 @@ def test_recorded_scans_uses_the_fusion_of_the_run(recorded_scans, tmp_path, mon
 
 
 def test_own_values_take_at_most_forty_lines():
-    for name in ("new_fusion", "new_policy", "new_reward"):
+    for name in ("new_fusion", "new_modality", "new_policy", "new_reward"):
         assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= 40
 
 
@@ -202,6 +235,15 @@ def test_a_product_of_experts_is_the_fusion_of_the_mdp(example):
     np.testing.assert_allclose(once.mean, alone.mean, rtol=1e-3, atol=1e-5)
     twice = mdp.fusion.update(once, np.ones(2, bool), features, 0)
     np.testing.assert_allclose(twice.std**-2, 2 * alone.std**-2 - prior.std**-2, rtol=1e-4)
+
+
+def test_the_optimum_of_a_product_of_experts_is_that_of_looks_which_add_up(example, monkeypatch):
+    config, key = PRESETS["smoke"], jax.random.key(0)
+    models = example("new_fusion").multiplying(jaxsense.init(key, config))
+    mdp = jaxsense.make_mdp(config, models)
+    monkeypatch.setattr(policies, "optimal", lambda key, models, known: "dynamic programming")
+    found = reference(key, mdp, 0, models, models.bayes.labels)
+    assert found(None, None) == "dynamic programming"
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from smoke import error_line
+from smoke import error_line, save_models
 
 from jaxsense import export
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
@@ -81,7 +81,7 @@ def run(models, tmp_path_factory):
     """The directory of a run that trained nothing."""
     path = tmp_path_factory.mktemp("runs") / "run"
     with RunDirectory.create(path, Settings("smoke", 0, CONFIG)) as created:
-        created.save_models(models)
+        save_models(created, models)
     return path
 
 

@@ -207,7 +207,7 @@ def test_the_narrowest_side_of_all_shapes_in_use_counts():
             "shape.half_sides = (1.0, 0.1): must each be from 0.5 to 1",
         ),
         (lambda: Shape("cylinder", (1.0, 0.5)), "must be the same number twice for a cylinder"),
-        (lambda: Attribute({"hot": float("inf")}), "from names to finite numbers"),
+        (lambda: Attribute({"hot": float("inf")}), "from names to numbers, each 0"),
         (
             lambda: ArenaConfig(attributes={"shape": TEMPERATURE["temperature"]}),
             "arena.attributes = 'shape': already exists",
@@ -227,7 +227,7 @@ def test_the_narrowest_side_of_all_shapes_in_use_counts():
         ),
         (
             lambda: dataclasses.replace(OWN, modalities=("lidar", "sonar")),
-            "must be some of camera, lidar, thermal",
+            "must be among camera, lidar, thermal",
         ),
     ],
 )

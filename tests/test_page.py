@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 
 import pytest
 from matplotlib.figure import Figure
-from recordings import CLASS_BELIEFS, CONFIG, recording
+from recordings import CONFIG, FIELDS_OF_VIEW, FUSION, recording
 from summaries import CASE, EVALUATION, SUMMARY
 
 from jaxsense import summary
@@ -35,7 +35,9 @@ def run(tmp_path_factory):
     for name in ("latent_space", "reward"):
         Figure(figsize=(8, 4)).savefig(path / f"{name}.png", dpi=20)
     played = recording()
-    film = animation.draw(CONFIG, played.records, played.end, CLASS_BELIEFS, "latent policy")
+    film = animation.draw(
+        CONFIG, played.records, played.end, FUSION, FIELDS_OF_VIEW, "latent policy"
+    )
     (path / "mission.svg").write_text(film)
     (path / "report.html").write_text(page.render(path, CONFIG, SUMMARY), encoding="utf-8")
     return path
@@ -94,7 +96,7 @@ def test_figures_stand_in_tables(read):
     assert rows[0] == ["latent", "0.998", "1.68", "13.8", "0", "1 time limit"]
     rows = [tuple(row) for row in rows]
     assert ("camera", "0.9995", "0.0100", "0.0200") in rows
-    agent = ("1.234", "1.250", "1.000", "-1.500", "0.988", "1,700", "1,728")
+    agent = ("1.234", "1.250", "1.240", "1.000", "-1.500", "0.988", "1,700", "1,728")
     assert ("lidar", *agent) in rows
     assert ("here", "2", "0.007", "0.9996", "0.021", "0.030", "0.938") in rows
     # Camera, LiDAR and both; the paper's LiDAR cannot tell a red cylinder. In brackets the looks

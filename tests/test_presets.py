@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from jaxsense import summary
+
 pytestmark = pytest.mark.slow
 
 TABLE_1 = {
@@ -178,8 +180,12 @@ def test_team_preset(tmp_path, summary_of, run_program):
     for policy in ("latent", "auction", "naive"):
         run_program("evaluate", path, str(path), *large, "--policy", policy)
     four = "--robots", "camera", "camera", "lidar", "lidar", "--policy", "latent"
-    elsewhere = run_program("evaluate", path, str(path), *large, *four)["elsewhere"]
-    of_two, of_four = (place["mission"] for place in elsewhere.values())
+    run_program("evaluate", path, str(path), *large, *four)
+    evaluations = summary.read_evaluations(path)
+    of_two, of_four = (
+        evaluations[f"16-points-6-m-{robots}-seed-0-128-missions"]["mission"]
+        for robots in ("1-camera-1-lidar", "2-camera-2-lidar")
+    )
     check_team_missions(of_two, rules=("auction",), of_naive=0.92, of_rules=1.0)
     assert of_four["latent"]["time_s"] <= 0.65 * of_two["latent"]["time_s"]
 

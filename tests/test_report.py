@@ -177,11 +177,13 @@ def test_the_evaluation_is_drawn_where_it_was_played():
 
 
 def test_episodes_of_a_team_are_not_drawn_beside_those_of_a_robot_alone():
-    figure = plots.rewards({"team": CURVES}, {"camera": AGENT, "lidar": AGENT})
+    figure = plots.rewards({"team": CURVES}, {"camera": AGENT, "lidar": {**AGENT, "optimal": 9.0}})
     of_team, alone = ({line.get_label() for line in ax.lines} for ax in figure.axes)
     assert of_team == {"exploring"}
     assert alone == {"without exploration", "optimal", "naive", "random: -1.00"}
     assert figure.axes[1].get_title() == "team: one camera robot alone on the map"
+    (optimal,) = (line for line in figure.axes[1].lines if line.get_label() == "optimal")
+    assert optimal.get_ydata()[0] == 4.5
 
 
 def test_curves_of_several_seeds_have_a_band():

@@ -2,11 +2,13 @@
 
 import json
 import os
+import platform
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import jax
 import pytest
 
 from jaxsense.config import PRESETS, ConfigError
@@ -20,6 +22,15 @@ def test_a_json_file_is_text_for_people(tmp_path):
     rundir.write_json(tmp_path / "file", {"a": {"b": 1.5}, "c": [True]})
     text = (tmp_path / "file").read_text(encoding="utf-8")
     assert text == '{\n  "a": {\n    "b": 1.5\n  },\n  "c": [\n    true\n  ]\n}\n'
+
+
+def test_versions_are_of_python_too():
+    assert version.versions()["python"] == platform.python_version()
+
+
+def test_64_bits_are_named_before_a_checkpoint_is(tmp_path):
+    with jax.enable_x64(True), pytest.raises(ConfigError, match=r"^JAX_ENABLE_X64 = True"):
+        rundir.load(tmp_path)
 
 
 def test_runs_of_one_second_get_directories_of_their_own(tmp_path):
@@ -50,7 +61,7 @@ def test_of_two_that_want_one_directory_the_second_is_refused(tmp_path):
     with RunDirectory.create(path, SETTINGS):
         assert {file.name for file in path.iterdir()} == {".lock", "config.json"}
     with (
-        pytest.raises(ConfigError, match="is not empty; must be a new directory"),
+        pytest.raises(ConfigError, match="is not empty; must be a new or empty directory"),
         RunDirectory.create(path, SETTINGS),
     ):
         pass

@@ -22,6 +22,7 @@ def test_other_figures_are_found():
     found = different({"a": 1.0, "b": 2.0, "c": 0}, {"a": 1.001, "b": 2.0, "d": 0}, 1e-4)
     assert set(found) == {"a", "c", "d"}
     assert not different({"a": 1.0}, {"a": 1.001}, 1e-2)
+    assert not different({"a": 0.0}, {"a": 0.01}, near=0.01)
     assert set(numbers({"a": [1, {"b": True}], "c": "x"})) == {"/a/0", "/a/1/b"}
 
 
@@ -32,6 +33,11 @@ def test_what_other_compilers_must_not_change_is_compared():
         other[block][name] = other[block].get(name, 1.0) * factor
         assert different_across_compilers(reference, other)
     other = copy.deepcopy(reference)
+    other["belief"]["bayes_nll"][2] *= 1.1
     other["dqn"]["lidar"]["naive"] *= 1.03
+    other["dqn"]["lidar"]["optimal"] += 0.05
     other["dqn"]["camera"]["return"] *= 2  # of a policy that was trained
-    assert set(different_across_compilers(reference, other)) == {"naive"}
+    other["mission"]["latent"]["accuracy"] /= 2
+    other["mission"]["naive"]["accuracy"] -= 2 / 12
+    found = different_across_compilers(reference, other)
+    assert set(found) == {"/bayes_nll/2", "naive", "optimal", "accuracy"}

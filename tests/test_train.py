@@ -65,7 +65,7 @@ def test_summary_keeps_its_contract(smoke_run):
     assert set(latent["fusion"]) == {"accuracy", "mean_error", "std_error"}
     for block in summary["dqn"].values():
         assert set(block) == {
-            "return", "optimal", "naive", "random", "fraction_of_optimal", "one_step",
+            "return", "optimal", "greedy", "naive", "random", "fraction_of_optimal", "one_step",
             "optimal_states", "num_states", "optimal_permutations", "num_permutations", "env_steps",
             "env_steps_per_s",
         }  # fmt: skip
@@ -95,9 +95,9 @@ def test_the_film_is_named_after_the_policy_that_it_shows(tmp_path, monkeypatch)
     for name in ("of_run", "of_seeds"):
         monkeypatch.setattr(train.plots, name, lambda *inputs: {})
     monkeypatch.setattr(train.page, "render", lambda *inputs: "")
-    names = ("posteriors", "windows", "reliability", "rewards")
+    names = ("posteriors", "windows", "fields_of_view", "reliability", "rewards")
     recorded = SimpleNamespace(records=None, end=None)
-    models = SimpleNamespace(fusion=SimpleNamespace(classes=None))
+    models = SimpleNamespace(fusion=None)
     result = SimpleNamespace(models=models, recording=recorded, results={}, **dict.fromkeys(names))
     with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as run:
         train._write(run, result, {}, Monitor())  # pyright: ignore
@@ -135,7 +135,7 @@ def test_a_run_with_a_filter_trains_plays_and_is_loaded(tmp_path, cache):
 def test_another_run_is_never_overwritten(smoke_run, capsys):
     before = {path: path.stat().st_mtime_ns for path in smoke_run.rglob("*")}
     line = error_line([*SMOKE, "--out", str(smoke_run)], capsys)
-    assert f"out = {str(smoke_run)!r}: is not empty; must be a new directory" in line
+    assert f"out = {str(smoke_run)!r}: is not empty; must be a new or empty directory" in line
     assert {path: path.stat().st_mtime_ns for path in smoke_run.rglob("*")} == before
 
 
@@ -168,17 +168,17 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
             ["--preset", "best"],
             "preset = 'best': must be one of default, paper, noisy, team, smoke",
         ),
-        (["--taste", "sweet"], "train: unknown option --taste. See --help-all."),
-        (["--jmvae.hiden", "3"], "unknown option --jmvae.hiden. Did you mean --jmvae.hidden?"),
-        (["--arena.side", "x"], "arena.side = 'x': must be a finite number"),
-        (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
+        (["--taste", "sweet"], "train: unknown option --taste; see --help-all"),
+        (["--jmvae.hiden", "3"], "unknown option --jmvae.hiden; did you mean --jmvae.hidden?"),
+        (["--arena.side", "x"], "arena.side = 'x': must be a number"),
+        (["--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
         (["--seed", "one"], "seed = 'one': must be a whole number"),
         (["--dqn.num-envs", "-4"], "dqn.num_envs = -4: must be at least 1"),
         (["--dqn.observe", "ideal"], "'ideal'"),
         (["--jmvae.hidden", "64", "0"], "jmvae.hidden = (64, 0): must have 1 or more values"),
-        (["--jmvae.beta", "nan"], "jmvae.beta = nan: must be a finite number"),
+        (["--jmvae.beta", "nan"], "jmvae.beta = nan: must be a number"),
         (["--modalities"], "modalities = (): must have 1 to 8 values"),
-        (["--modalities", "sonar"], "modalities = ('sonar',): must be some of camera, lidar"),
+        (["--modalities", "sonar"], "modalities = ('sonar',): must be among camera, lidar"),
         (["--arena.num-pois", "50"], "arena.num_pois = 50: must be at most"),
         (["--arena.classes", "pink cube", "red cube"], "'pink cube' must be"),
         (["--dqn.replay-capacity", "1000"], "dqn.replay_capacity = 1000: must be a multiple of"),
@@ -242,6 +242,7 @@ def test_all_help_explains_every_field(capsys, monkeypatch):
     assert {"--process-index", "--arena.side", "--dqn.epsilon-decay"} <= set(options)
     assert "  --arena.side NUMBER\n      Inner length and width of the arena, in metres." in text
     assert "(default: on; --mission.no-redecides turns it off)" in " ".join(text.split())
+    assert "`" not in text
     # Each option has a text.
     assert not re.search(r"^  --.*\n(?!      \S)", text, re.MULTILINE)
 

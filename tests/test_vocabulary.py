@@ -13,14 +13,19 @@ import jaxsense
 ROOT = Path(__file__).parent.parent
 PACKAGE = Path(jaxsense.__file__).parent  # which may be installed elsewhere
 SOURCES = sorted(PACKAGE.rglob("*.py"))
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SCRIPTS = sorted([*(ROOT / "benchmarks").rglob("*.py"), *(ROOT / "examples").glob("*.py")])
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
+    ROOT / "benchmarks" / "RESULTS.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+TABLE = "| not | but |\n| --- | --- |\n"
 
 
 def banned():
     """A pattern of each phrase in the table of CONTRIBUTING.md."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    _, table = text.split("| not | but |\n| --- | --- |\n")
-    rows = [line for line in table.partition("\n\n")[0].splitlines()]
+    rows = text.split(TABLE)[1].partition("\n\n")[0].splitlines()
     phrases = [row.strip("| ").split(" | ")[0] for row in rows]
     return {phrase: pattern(phrase) for phrase in phrases}
 
@@ -45,10 +50,22 @@ def prose_of_source(text):
 
 
 def prose_of_page(text):
-    """The paragraphs of a page, without its programs and the targets of its links."""
-    text = re.sub(r"```.*?```", lambda block: "\n" * block[0].count("\n"), text, flags=re.DOTALL)
+    """The paragraphs of a page, without its programs, the targets of its links and that table."""
+    table = re.escape(TABLE) + r"(\|[^\n]*\n)*"
+    text = re.sub(rf"```.*?```|(?m:^{table})", only_lines, text, flags=re.DOTALL)
     text = re.sub(r"^(    .*)$|\]\(.*?\)|<.*?>", "", text, flags=re.MULTILINE)
     yield 1, without_code(text)
+
+
+def prose_of_template(text):
+    """What a template of HTML says, without its styles, its programs and its expressions."""
+    code = r"<(style|pre)>.*?</\1>|{[{%].*?[%}]}"
+    yield from prose_of_page(re.sub(code, only_lines, text, flags=re.DOTALL))
+
+
+def only_lines(found):
+    """As many lines as a match, empty."""
+    return "\n" * found[0].count("\n")
 
 
 def without_code(text):
@@ -77,6 +94,16 @@ def test_pages_avoid_what_contributing_lists(path):
     assert not hits(prose_of_page(path.read_text(encoding="utf-8")))
 
 
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_scripts_avoid_what_contributing_lists(path):
+    assert not hits(prose_of_source(path.read_text(encoding="utf-8")))
+
+
+def test_the_report_avoids_what_contributing_lists():
+    path = PACKAGE / "show" / "report.html.jinja"
+    assert not hits(prose_of_template(path.read_text(encoding="utf-8")))
+
+
 def test_prose_is_told_from_names():
     source = '''"""Robots are
 unsure of `lidar`, likewise dqn_lidar and --lidar.range."""
@@ -89,3 +116,7 @@ name = "lidar", "LiDAR scans"
     ]  # fmt: skip
     page = "Likewise `unsure`.\n```python\nlidar = 1\n```\nA lidar [x](lidar.md).\n\n    lidar x\n"
     assert hits(prose_of_page(page)) == [(1, "likewise"), (5, "lidar")]
+    listed = f"Likewise.\n\n{TABLE}| likewise | also |\n\nUnsure.\n"
+    assert hits(prose_of_page(listed)) == [(1, "likewise"), (7, "unsure")]
+    template = "<style>\nlidar</style>\n<p>Likewise {{ lidar }}{% set unsure %}\nunsure</p>\n"
+    assert hits(prose_of_template(template)) == [(3, "likewise"), (4, "unsure")]

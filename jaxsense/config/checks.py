@@ -91,11 +91,11 @@ def limited(
     Args:
       default: the field's default value.
       above: every number is greater than this.
-      at_least: smallest number.
+      at_least: minimum of every number.
       below: every number is less than this.
-      at_most: largest number.
-      min_items: smallest length of a tuple.
-      max_items: largest length of a tuple; needs `min_items`.
+      at_most: maximum of every number.
+      min_items: minimum length of a tuple.
+      max_items: maximum length of a tuple; needs `min_items`.
     """
     limits = Limits(above, at_least, below, at_most, min_items, max_items)
     return cast(T, dataclasses.field(default=default, metadata={"limits": limits}))
@@ -195,10 +195,10 @@ def _converted(value: object, kind: object) -> object:
     raise TypeError
 
 
-_SIZES = f"of a size from {_SMALLEST} to {_LARGEST} or 0"
+_SIZES = f"0 or of magnitude {_SMALLEST} to {_LARGEST}"
 _ONE_AND_MANY: dict[type, tuple[str, str]] = {
     int: ("a whole number", "whole numbers"),
-    float: (f"a finite number, {_SIZES}", f"finite numbers, {_SIZES}"),
+    float: (f"a number, {_SIZES}", f"numbers, each {_SIZES}"),
     bool: ("True or False", "True or False"),
     str: ("text", "texts"),
     Path: ("a path of printable characters", "paths of printable characters"),

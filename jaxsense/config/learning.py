@@ -124,7 +124,7 @@ class MdpConfig(Section, place="mdp"):
     max_steps: Traced[int] = limited(20, at_least=1, at_most=10_000)
     """Maximum length of an episode, in actions."""
     partly_seen_starts: bool = False
-    """Exclude starts in which all modalities have seen all PoIs, or none any."""
+    """Exclude starts where every modality has seen every PoI, or none has seen any."""
 
 
 class TravelConfig(Section, place="team.travel"):
@@ -178,7 +178,7 @@ class TeamConfig(Section, place="team"):
     sides: Traced[tuple[float, float]] = limited((3.0, 6.0), above=0, at_most=100)
     """Shortest and longest side of an episode's arena, in metres."""
     alone: Traced[float] = limited(0.25, at_least=0, at_most=1)
-    """Share of episodes of the paper's MDP: one robot is alone, and nothing is far away."""
+    """Share of episodes with one robot and no travel, as in the paper."""
     partly_seen: Traced[float] = limited(0.5, at_least=0, at_most=1)
     """Share of the other episodes that start with some looks taken."""
     second_cost: Traced[float] = limited(0.0, at_least=0)

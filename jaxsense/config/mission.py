@@ -40,8 +40,9 @@ class MissionConfig(Section, place="mission"):
     """The closed loop of all robots in one arena."""
 
     policies: tuple[str, ...] = limited(("latent", "naive", "random"), min_items=1)
-    """Policies to play missions with at the end of a run; `jaxsense.evaluate` plays all. See
-    `dqn.POLICIES`."""
+    """Policies that play missions at the end of a run, of `latent`, `greedy`, `bayes`, `optimal`,
+    `naive`, `naive_2`, `naive_3`, `random`, `nearest`, `auction`, `rollout` and custom ones;
+    `jaxsense.evaluate` plays all."""
     episodes: int = limited(128, at_least=1, at_most=MAX_EPISODES)
     """Missions per policy at the end of a run."""
     time_limit: Traced[float] = limited(120.0, above=0, at_most=3600)
@@ -60,8 +61,8 @@ class MissionConfig(Section, place="mission"):
     least_confidence: Traced[float] = limited(0.98, at_least=0, below=1)
     """Minimum probability of the most likely label for a scan to update the map."""
     attempts: Traced[int] = limited(3, at_least=1)
-    """Failed looks or goals after which a robot gives up a PoI. If it was stuck, it tries as often
-    once more before it ends."""
+    """Failed looks or goals after which a robot gives up a PoI. Before it finishes, it retries PoIs
+    where it was stuck, with as many attempts."""
 
     def check(self) -> None:
         """Checks the control period, and that no policy repeats; raises `ConfigError`."""
@@ -69,7 +70,7 @@ class MissionConfig(Section, place="mission"):
         require(is_once, self, "policies", "must name no policy twice")
         steps = self.control_period / TIMESTEP
         is_multiple = abs(steps - round(steps)) < 1e-6 and 5 <= round(steps) <= 20
-        limits = f"within {5 * TIMESTEP} and {20 * TIMESTEP} s"
+        limits = f"from {5 * TIMESTEP} to {20 * TIMESTEP} s"
         expected = f"must be a multiple of {TIMESTEP} s {limits}"
         require(is_multiple, self, "control_period", expected)
         is_long = self.time_limit >= self.control_period

@@ -88,7 +88,7 @@ def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
     words = [name for name in shown if not name.startswith("-")]
     parser = argparse.ArgumentParser(
         usage=" ".join([f"python -m {program} [OPTIONS]", *words]),
-        description=base.__doc__,
+        description=_plain(base.__doc__ or ""),
         epilog=f"--help-all lists all {len(shown)} options." if common else None,
         add_help=False,
         formatter_class=_Formatter,
@@ -97,7 +97,7 @@ def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
     for option in (shown[name] for name in common or shown):
         place = "" if common else option.place
         if place not in groups:
-            groups[place] = parser.add_argument_group(place, option.section.__doc__)
+            groups[place] = parser.add_argument_group(place, _plain(option.section.__doc__ or ""))
         option.add_to(groups[place], _text(option), _metavar(option))
     return parser.format_help()
 
@@ -110,7 +110,7 @@ class _Option:
       path: fields and keys that lead to its value.
       name: on the command line.
       kind: type of the value.
-      default: value if it is missing; `dataclasses.MISSING` if it must be given.
+      default: value if it is missing; `dataclasses.MISSING` if it is required.
       section: dataclass that declares it.
       place: what precedes the section's options, such as "team.travel"; "" for the program's own.
     """
@@ -212,6 +212,11 @@ def _of_type(kind: object, word: str) -> object:
     return word
 
 
+def _plain(text: str) -> str:
+    """A docstring without the marks of code."""
+    return text.replace("`", "")
+
+
 @functools.cache
 def _docs(section: type) -> dict[str, str]:
     """Docstrings of the fields of a dataclass, each as one line."""
@@ -220,7 +225,7 @@ def _docs(section: type) -> dict[str, str]:
     for pair in itertools.pairwise(getattr(node, "body", ())):
         match pair:
             case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                found[name] = " ".join(text.split()).replace("`", "")
+                found[name] = " ".join(_plain(text).split())
     return found
 
 
@@ -300,5 +305,5 @@ def _unknown(words: list[str], names: list[str]) -> str:
     # Without a section, an option of any section may be meant; the first one is the likeliest.
     known = {each if "." in name else re.sub(r"^.*\.", "--", each): each for each in names[::-1]}
     similar = difflib.get_close_matches(name[2:], [each[2:] for each in known], 1, 0.7)
-    hint = f"Did you mean {known['--' + similar[0]]}?" if similar else "See --help-all."
-    return f"unknown option {name}. {hint}"
+    hint = f"did you mean {known['--' + similar[0]]}?" if similar else "see --help-all"
+    return f"unknown option {name}; {hint}"

@@ -60,6 +60,8 @@ class ArenaConfig(Section, place="arena"):
         expected = (
             f"must be at most {most}: so many PoIs of radius {self.poi_radius} m with gaps of "
             f"{self.poi_gap} m fit into an arena of side {self.side} m"
+            if most
+            else "no PoI fits; lower arena.poi_gap or arena.poi_radius, or raise arena.side"
         )
         require(self.num_pois <= most, self, "num_pois", expected)
 
@@ -151,8 +153,8 @@ class LidarConfig(Section, place="lidar"):
     range_noise_growth: float = limited(0.0, at_least=0, at_most=1)
     """Growth of that standard deviation with the distance, in metres per metre."""
     mixed_pixels: float = limited(0.0, at_least=0, at_most=1)
-    """Probability that a beam also meets the surface that the next beam meets, and measures a
-    distance between the two: at edges, a distance at which there is nothing."""
+    """Probability that a beam returns a distance between its surface and its neighbour's; at an
+    edge, nothing is there."""
     dropout: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam has no return."""
     window: int = limited(128, at_least=1)
@@ -187,8 +189,7 @@ class CameraConfig(Section, place="camera"):
     low_light: float = limited(0.0, at_least=0, at_most=1)
     """Largest share of the light that may be missing in an image; the share is uniform."""
     shadow: float = limited(0.0, at_least=0, at_most=1)
-    """Probability that a shadow falls into the view. From a random pixel on, one of its sides has
-    ambient light only."""
+    """Probability of a shadow: on one side of a random pixel, only ambient light remains."""
     window: int = limited(80, at_least=1)
     """Pixels around the PoI's bearing that the detector reads."""
     stride: int = limited(4, at_least=1)

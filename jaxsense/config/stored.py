@@ -76,7 +76,7 @@ def _made(kind: object, stored: object, base: object, place: str) -> object:
         return dataclasses.replace(base, **given)
     for field in dataclasses.fields(kind):
         if field.name not in given and field.default is dataclasses.MISSING:
-            raise ConfigError(f"{place}.{field.name}", None, "must be given")
+            raise ConfigError(place, stored, f"missing setting {field.name}")
     return kind(**given)
 
 

@@ -82,7 +82,7 @@ class Config(Section):
                 raise ConfigError(f"sensors.{name}.attribute", sensor.attribute, expected)
         known = [*MODALITIES, *self.sensors]
         is_known = set(self.modalities) <= set(known)
-        require(is_known, self, "modalities", f"must be some of {', '.join(known)}")
+        require(is_known, self, "modalities", f"must be among {', '.join(known)}")
         is_once = len(set(self.modalities)) == len(self.modalities)
         require(is_once, self, "modalities", "must name no modality twice")
         weights = self.jmvae.reconstruction_weights
@@ -129,7 +129,7 @@ class Config(Section):
         most = max(self._task.most_pois(self), *self.evaluation.num_pois, 0)
         looks = most * len(self.modalities)
         is_right = not self.mdp.partly_seen_starts or 2 <= looks <= 30
-        expected = f"needs 2 to 30 pairs of PoI and modality, not {looks}; must be False"
+        expected = f"must be off: it needs 2 to 30 pairs of PoI and modality, and there are {looks}"
         require(is_right, self.mdp, "partly_seen_starts", expected)
 
     def _check_viewpoints(self) -> None:
@@ -234,7 +234,9 @@ class _MapTask:
 
     def check(self, config: Config) -> None:
         is_empty = not config.evaluation.num_pois
-        expected = "needs dqn.task = 'team', whose policy is for any number; must be empty"
+        expected = (
+            "must be empty unless dqn.task is 'team', whose policy handles any number of PoIs"
+        )
         require(is_empty, config.evaluation, "num_pois", expected)
 
     def most_pois(self, config: Config) -> int:

@@ -1,1 +1,1 @@
-"""The ground floor: types, argument checks, networks and the supervised fit."""
+"""The lowest layer: types, argument checks, networks and the supervised fit."""

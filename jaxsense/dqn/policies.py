@@ -1,7 +1,7 @@
 """The table of policies, for the map MDP and for missions.
 
 A policy maps trained models and what a robot knows to `[N + 1]` values of actions, the highest of
-which is taken; the last is NOP's. A policy of your own is one more entry of a table.
+which is taken; the last is NOP's. A custom policy is one more entry of a table.
 """
 
 import dataclasses
@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsense.config import ConfigError
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
 from jaxsense.dqn import rules
@@ -101,11 +102,18 @@ class Policy:
 
 
 def table(own: Mapping[str, Values | Policy] | None = None) -> dict[str, Policy]:
-    """All policies by name: `POLICIES`, then your own."""
+    """All policies by name: `POLICIES`, then your own.
+
+    Raises:
+      ConfigError: if a custom policy has the name of one of `POLICIES`.
+    """
     wrapped = {
         name: each if isinstance(each, Policy) else Policy(each)
         for name, each in (own or {}).items()
     }
+    for name, each in wrapped.items():
+        if POLICIES.get(name, each) is not each:
+            raise ConfigError("policies", name, f"must not be {', '.join(POLICIES)}")
     return {**POLICIES, **wrapped}
 
 

@@ -13,12 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxsense.core.types import Index, Key
+from jaxsense.core.types import Fusion, Index, Key
 from jaxsense.dqn import map_mdp, policies
 from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn.optimum import LookValues, steps_of_lattice
 from jaxsense.dqn.policies import Known, Trained
 
 _NUM_DRAWS = 1024
+_FINE = 16  # steps of a lattice between whose points values are right to a hundredth
 
 Reference = Callable[[Known, jax.Array], jax.Array]
 """`(known, classes [N]) -> [N + 1]` values; the true classes are hidden from all other policies."""
@@ -40,6 +42,17 @@ def reference(
         return lambda known, classes: policies.optimal(key, models, known)
     rewards = expected_rewards(key, mdp, modality)
     return lambda known, classes: _informed(rewards, labels, known.looks > 0, classes)
+
+
+def has_optimum(fusion: Fusion, values: LookValues) -> bool:
+    """Whether `reference` is the optimum, up to the error of a fine lattice.
+
+    Args:
+      fusion: of the MDP.
+      values: of the agent's own sensor.
+    """
+    number = len(fusion.classes.mean) if values.labels is None else values.labels.shape[1]
+    return not fusion.accumulates or steps_of_lattice(number, len(values.q)) >= _FINE
 
 
 def expected_rewards(

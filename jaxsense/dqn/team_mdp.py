@@ -81,7 +81,7 @@ class TeamMdp:
 
     Attributes:
       config: size of teams, travel, and the price of time.
-      map: the map MDP, with the largest number of PoIs.
+      map: the map MDP, with the maximum number of PoIs.
       places: draws positions of PoIs and robots.
       modalities: names of the sensors, in the order of their indices.
     """

@@ -11,7 +11,7 @@ from jaxsense.core.types import Key
 from jaxsense.mission import roadmap
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.mission.state import IDLE, Faults, Mission, MissionState, Robots, no_faults
-from jaxsense.models import make_bayes, make_prior
+from jaxsense.models import Models
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors
 from jaxsense.sim.world import Scene
@@ -22,6 +22,7 @@ _NUM_CANDIDATES = 32  # positions drawn for each robot
 def reset(
     key: Key,
     mission: Mission,
+    models: Models,
     policy: Int[Array, ""] | int = 0,
     faults: Faults | None = None,
     classes: Int[Array, " N"] | None = None,
@@ -31,6 +32,7 @@ def reset(
     Args:
       key: random key, which alone determines the arena.
       mission: the mission.
+      models: trained models; the map starts from the prior of their fusion.
       policy: `[]` int32 index into `Mission.policies`; by default `latent`, the trained one.
       faults: which robots will fail; none by default.
       classes: `[N]` int32 classes of the PoIs; independent by default.
@@ -51,11 +53,12 @@ def reset(
     poses = _random_poses(pose_key, config, layout, paths)
     scene = Scene(layout, sensors.random_light(light_key), poses)
     faults = no_faults(config) if faults is None else faults
-    return start(mission, scene, classes, jnp.asarray(policy, jnp.int32), faults, paths)
+    return start(mission, models, scene, classes, jnp.asarray(policy, jnp.int32), faults, paths)
 
 
 def start(
     mission: Mission,
+    models: Models,
     scene: Scene,
     classes: Int[Array, " N"],
     policy: Int[Array, ""],
@@ -66,6 +69,7 @@ def start(
 
     Args:
       mission: the mission.
+      models: trained models; the map starts from the prior of their fusion.
       scene: PoIs, light and the robots' poses.
       classes: `[N]` int32 classes of the PoIs.
       policy: `[]` int32 index into `Mission.policies`.
@@ -83,7 +87,6 @@ def start(
     checks.require_index("policy", policy, len(mission.policies))
     chex.assert_shape(scene.poses, (num_robots, 3), custom_message="scene.poses")
     _check_faults(faults, num_robots)
-    prior, exact = make_prior(config), make_bayes(config)
     paths = roadmap.build(config, scene.layout) if paths is None else paths
     return MissionState(
         scene=scene,
@@ -93,8 +96,8 @@ def start(
         policy=policy,
         velocity=jnp.zeros((num_robots, 3)),
         warmstart=jnp.zeros(3 * num_robots),
-        belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), prior),
-        log_posterior=jnp.tile(exact.prior, (num_pois, 1)),
+        belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), models.fusion.prior),
+        log_posterior=jnp.tile(models.bayes.prior, (num_pois, 1)),
         times_seen=jnp.zeros((num_pois, len(config.modalities)), jnp.int32),
         version=jnp.int32(0),
         robots=_idle_robots(num_robots, num_pois, paths.is_free.shape[1]),

@@ -6,12 +6,14 @@ from collections.abc import Iterable, Mapping
 import jax.numpy as jnp
 
 from jaxsense.config import Config, ConfigError
+from jaxsense.config.objects import require_words
 from jaxsense.dqn.policies import POLICIES, Policy, Values, table
 from jaxsense.mission.state import Faults, no_faults
 from jaxsense.sim import sensors
 
 FAULT_TIME = 6.0  # s
 _FAULTS = ("alone", "stops", "blind")
+_TAKEN = ("all", "policies", "bytes_per_detection")  # by `evaluate` and by the summary
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,24 +34,29 @@ def require_playable(config: Config, policies: Mapping[str, Values | Policy] | N
 
     Args:
       config: all settings.
-      policies: of your own, by name, besides `dqn.POLICIES`.
+      policies: custom policies by name, in addition to `dqn.POLICIES`.
 
     Raises:
       ConfigError: if a custom sensor cannot be made, `config.mission.policies` names an unknown
-        policy, or a policy of your own is named like a case with a fault.
+        policy, or a custom policy has a name that is taken or no word.
     """
     sensors.make(config)
     known = table(policies)
     _require_names(known)
     if not set(config.mission.policies) <= set(known):
-        reason = f"must name some of {', '.join(known)}"
+        reason = f"must be among {', '.join(known)}"
         raise ConfigError("mission.policies", config.mission.policies, reason)
 
 
 def _require_names(policies: Iterable[str]) -> None:
-    """Raises `ConfigError` if a policy is named like a case with a fault."""
-    for name in filter(is_fault, policies):
+    """Raises `ConfigError` if a policy's name is no word, or names a fault or something else."""
+    names = dict.fromkeys(policies)
+    require_words(names, "policies")
+    for name in filter(is_fault, names):
         raise ConfigError("policies", name, f"must not end in _{', _'.join(_FAULTS)}")
+    for name in _TAKEN:
+        if name in names:
+            raise ConfigError("policies", name, f"must not be {', '.join(_TAKEN)}")
 
 
 def is_fault(case: str) -> bool:
@@ -69,7 +76,7 @@ def cases(config: Config, policies: Iterable[str] = POLICIES) -> dict[str, Case]
       policies: names in the order of `Mission.policies`.
 
     Raises:
-      ConfigError: if a policy is named like a case with a fault.
+      ConfigError: if the name of a policy is taken or no word.
     """
     healthy, names = no_faults(config), tuple(policies)
     _require_names(names)

@@ -43,6 +43,8 @@ def decide(
 ) -> MissionState:
     """Asks a robot's policy if a decision is due, and sets out for a viewpoint of the PoI.
 
+    If a value is NaN, the robot fails, with -1 for its target.
+
     Args:
       key: random key.
       mission: the mission.
@@ -54,7 +56,8 @@ def decide(
     is_idle, decides = own.phase == IDLE, is_due(mission, state, robot)
     action = jnp.where(decides, _choose(key, mission, models, state, robot), own.target)
     is_new = action != own.target
-    sets_out = decides & (is_idle | is_new) & (action < config.arena.num_pois)
+    is_poi = (action >= 0) & (action < config.arena.num_pois)
+    sets_out = decides & (is_idle | is_new) & is_poi
 
     # Failures belong to one target.
     excluded = jnp.where(is_new, False, own.excluded)
@@ -76,7 +79,9 @@ def decide(
     return state.with_robot(
         robot,
         phase=jnp.select(
-            [ends, sets_out_now, gives_up | tries_again], [ENDED, DRIVING, IDLE], own.phase
+            [action < 0, ends, sets_out_now, gives_up | tries_again],
+            [FAILED, ENDED, DRIVING, IDLE],
+            own.phase,
         ),
         target=action,
         view=jnp.where(sets_out_now, view, own.view),
@@ -94,7 +99,7 @@ def decide(
 def _choose(
     key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> Int[Array, ""]:
-    """PoI that a robot's policy chooses, or N for NOP."""
+    """PoI that a robot's policy chooses, N for NOP, or -1 if any value is NaN."""
     config, robots = mission.config, state.robots
     settings, num_pois = config.mission, config.arena.num_pois
     given_up = robots.unreachable[robot] | robots.undetected[robot]
@@ -115,7 +120,8 @@ def _choose(
     rank = jnp.where(settings.nearest_first, distance, jnp.arange(num_pois))
     rank += _KEPT * is_kept + _HEADED_FOR * (is_others & settings.avoids_targets)
     poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
-    return jnp.where(jnp.any(is_best), poi, num_pois)
+    choice = jnp.where(jnp.any(is_best), poi, num_pois)
+    return jnp.where(jnp.any(jnp.isnan(jnp.append(of_pois, values[num_pois]))), -1, choice)
 
 
 def _values(

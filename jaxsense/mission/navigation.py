@@ -277,8 +277,8 @@ def sidestep(
       blocking: `[K, 2]` positions of the other robots, in metres.
 
     Returns:
-      `[2]` the waypoint, or a position beside the blocking robot: on the shorter side with room, on
-      the right if both are equal.
+      `[2]` the waypoint, or a position next to the blocking robot: on the shorter side with room,
+      on the right if both are equal.
     """
     keep = 2 * settings.robot_radius + _SIDESTEP
     reach = arena.side / 2 - settings.robot_radius
@@ -288,7 +288,7 @@ def sidestep(
     right = jnp.stack([along[1], -along[0]])
 
     def beside(other: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Position beside another robot, and whether to go there."""
+        """Position next to another robot, and whether to go there."""
         to_other = other - position
         ahead, aside = jnp.dot(to_other, along), jnp.dot(to_other, right)
         blocks = (jnp.abs(aside) < keep - _SIDESTEP / 2) & (ahead > 0) & (ahead < length)

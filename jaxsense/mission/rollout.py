@@ -159,7 +159,7 @@ def _act(
 def _fail(mission: Mission, state: MissionState, robot: Index) -> MissionState:
     """Stops a robot when its time to fail has come."""
     own = state.robot(robot)
-    fails = (mission.time(state) >= state.faults.stops_at[robot]) & (own.phase != ENDED)
+    fails = (mission.time(state) >= state.faults.stops_at[robot]) & (own.phase < ENDED)
     return state.with_robot(
         robot,
         phase=jnp.where(fails, FAILED, own.phase),

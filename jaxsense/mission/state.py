@@ -40,7 +40,7 @@ class Robots:
 
     Attributes:
       phase: int32, one of IDLE to FAILED.
-      target: int32 PoI, or N for none.
+      target: int32 PoI, N for none, or -1 if the policy's values were NaN.
       view: int32 viewpoint of the target, or V for the robot's current position.
       command: `[R, 2]` current speeds, see `navigation`.
       wanted: `[R, 2]` target speeds.
@@ -221,7 +221,7 @@ def make_mission(
 
     Args:
       config: all settings; numbers that are declared `Traced` may be traced.
-      policies: of your own, by name, besides `dqn.POLICIES`.
+      policies: custom policies by name, in addition to `dqn.POLICIES`.
       contacts: whether robots collide with PoIs, with each other and with the walls.
       arenas: `world.arena` and `free_arena` of a mission with the same sizes, to reuse; by default
         they are compiled, which cannot be traced.

@@ -148,7 +148,7 @@ def keep_programs(
       program: module that runs.
       directory: where to keep them, if anywhere.
       config: all settings.
-      has_own_code: whether missions play policies of the user's own.
+      has_own_code: whether missions play custom policies.
 
     Returns:
       The programs with these settings; None with custom sensors or policies, whose code may

@@ -324,7 +324,7 @@ class Program:
 
         Raises:
           Stopped: if the run must stop.
-          StageError: if a stage beside this one failed.
+          StageError: if a concurrent stage failed.
         """
         if not self._compiled.done():
             self._monitor.announce(self._stage)
@@ -362,7 +362,7 @@ def _make_private(path: Path) -> None:
         path.mkdir(mode=0o700, parents=True)
     found = path.lstat()
     if not (stat.S_ISDIR(found.st_mode) and _is_private(found, 0o077)):
-        raise PermissionError(f"{path} must be a directory of your own, with mode 0700")
+        raise PermissionError(f"{path} must be a directory that you own, with mode 0700")
 
 
 def _is_private(found: os.stat_result, others: int) -> bool:

@@ -95,7 +95,7 @@ def check(number: int | None) -> None:
       ConfigError: if no machine has so many.
     """
     if number is not None and not 1 <= number <= _MAX_DEVICES:
-        raise ConfigError("devices", number, f"must be within 1 and {_MAX_DEVICES}")
+        raise ConfigError("devices", number, f"must be from 1 to {_MAX_DEVICES}")
 
 
 def start(number: int | None) -> Workers:
@@ -122,7 +122,7 @@ def start(number: int | None) -> Workers:
     if number > there:
         # All processes refuse; one that ends without the others makes them abort.
         leave(LEAVE_TIMEOUT)
-        raise ConfigError("devices", number, f"must be within 1 and {there}")
+        raise ConfigError("devices", number, f"must be from 1 to {there}")
     return Workers(mesh=make_mesh(number) if number > 1 else None)
 
 
@@ -155,7 +155,7 @@ def make_mesh(number: int | None = None) -> Mesh:
     number = len(there) if number is None else number
     if not 1 <= number <= len(there):
         raise ValueError(
-            f"devices = {number}: must be within 1 and {len(there)}, the number of devices"
+            f"devices = {number}: must be from 1 to {len(there)}, the number of devices"
         )
     return Mesh(np.array(there[:number]), (AXIS,))
 
@@ -183,10 +183,10 @@ def join(
     given = {"coordinator": coordinator, "num_processes": number, "process_index": index}
     if set(given.values()) == {None}:
         return
-    for name, value in given.items():
-        if value is None:
-            others = " and ".join(other for other, x in given.items() if x is not None)
-            raise ConfigError(name, value, f"must be given with {others}")
+    if missing := [name for name, value in given.items() if value is None]:
+        name, value = next((name, value) for name, value in given.items() if value is not None)
+        others = " and ".join(f"--{other.replace('_', '-')}" for other in missing)
+        raise ConfigError(name, value, f"also needs {others}")
     assert coordinator is not None
     assert number is not None
     assert index is not None
@@ -197,7 +197,7 @@ def join(
     if number < 1:
         raise ConfigError("num_processes", number, "must be greater than 0")
     if not 0 <= index < number:
-        raise ConfigError("process_index", index, f"must be within 0 and {number - 1}")
+        raise ConfigError("process_index", index, f"must be from 0 to {number - 1}")
     host, port = host.strip("[]"), int(port)
     try:
         socket.getaddrinfo(host, port)

@@ -28,6 +28,7 @@ from jaxsense.mission import (
 from jaxsense.models import Models, init
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.monitor import StageError
 
 _CHUNK_TIME = 2.5  # s
 Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
@@ -124,12 +125,17 @@ class Player:
             )
 
         def begin(
-            key: Key, config: Config, episode: jax.Array, policies: jax.Array, faults: Faults
+            key: Key,
+            config: Config,
+            models: Models,
+            episode: jax.Array,
+            policies: jax.Array,
+            faults: Faults,
         ):
             team = with_numbers(config)
 
             def begin_one(episode: jax.Array, policy: jax.Array, faults: Faults):
-                return reset(keys_of_episode(key, episode)[0], team, policy, faults)
+                return reset(keys_of_episode(key, episode)[0], team, models, policy, faults)
 
             return jax.vmap(begin_one)(episode, policies, faults)
 
@@ -151,11 +157,11 @@ class Player:
         faults = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((batch, *x.shape), x.dtype), no_faults(config)
         )
+        models = jax.eval_shape(lambda: init(jax.random.key(0), config))
         self._begin = Program(compiler, "mission", "begin")
         state = self._begin.compile(
-            begin, key, config, numbers, numbers, faults, workers=workers, whole=(0, 1)
+            begin, key, config, models, numbers, numbers, faults, workers=workers, whole=(0, 1, 2)
         )
-        models = jax.eval_shape(lambda: init(jax.random.key(0), config))
         self._go_on = Program(compiler, "mission", "go_on")
         self._go_on.compile(
             go_on, key, config, models, numbers, numbers, state, workers=workers, whole=(0, 1, 2)
@@ -177,14 +183,14 @@ class Player:
 
         Raises:
           StageError: if the models or the beliefs of a mission are not finite, which policies would
-            take for the end of the mission.
+            take for the end of the mission, or if a policy's values are NaN.
           Stopped: if the run was asked to stop.
         """
         with self._lock:  # one call uses the whole machine
             return self._play(key, models, played, episodes)
 
     def _starts(
-        self, key: Key, played: dict[str, Case], episodes: int
+        self, key: Key, models: Models, played: dict[str, Case], episodes: int
     ) -> tuple[np.ndarray, MissionState]:
         """Episodes and first states of all missions; the first ones repeat to fill a batch."""
         total = episodes * len(played)
@@ -197,7 +203,7 @@ class Player:
             rows = slice(first, first + self._batch)
             some = jax.tree.map(lambda x: x[rows], faults)
             config = self.mission.config
-            state = self._begin(key, config, episode[rows], policies[rows], some)
+            state = self._begin(key, config, models, episode[rows], policies[rows], some)
             return jax.tree.map(np.asarray, state)
 
         begun = [begin(first) for first in range(0, len(row), self._batch)]
@@ -207,7 +213,7 @@ class Player:
         """See `play`."""
         self._monitor.check_finite("mission", "models", models)
         config, total = self.mission.config, episodes * len(played)
-        episode, starts = self._starts(key, played, episodes)
+        episode, starts = self._starts(key, models, played, episodes)
 
         # The next mission takes the slot of one that is done, so that short ones do not wait.
         state = jax.tree.map(lambda x: x[: self._batch].copy(), starts)
@@ -222,6 +228,7 @@ class Player:
             state, found, records = jax.tree.map(np.array, (state, found, records))
             at = f"beliefs after {chunk.max() + 1} chunks"
             self._monitor.check_finite("mission", at, state.belief)
+            _check_choices(self.mission, state)
             if not done[0]:
                 ends.append(jax.tree.map(lambda x: x[0].copy(), state))
                 recorded.append(jax.tree.map(lambda x: x[0].copy(), records))
@@ -245,6 +252,12 @@ class Player:
             for i, name in enumerate(played)
         }
         return Played(metrics, Recording(ends[-1], whole), control_steps)
+
+
+def _check_choices(mission: Mission, states: MissionState) -> None:
+    """Raises `StageError` if values of a policy were NaN in one of several missions."""
+    for policy in states.policy[np.any(states.robots.target < 0, axis=-1)]:
+        raise StageError(f"mission: values of policy {[*mission.policies][policy]} are not finite")
 
 
 def _set_row(target: PyTree, row: int, source: PyTree, from_row: int) -> None:

@@ -71,7 +71,7 @@ class Monitor:
         self._stop.set()
 
     def fail(self, failure: StageError) -> None:
-        """Stops the stages that run beside a failed one."""
+        """Stops the stages that run concurrently with a failed one."""
         self._failure = failure
 
     @property
@@ -80,7 +80,7 @@ class Monitor:
         return self._stop.is_set() or self._failure is not None
 
     def check_stop(self) -> None:
-        """Checks whether the run goes on.
+        """Checks whether the run continues.
 
         Raises:
           Stopped: if it was asked to stop.

@@ -11,6 +11,7 @@ from jaxsense import mission, summary
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Key, Reliability
 from jaxsense.dqn.policies import Policy, Values
+from jaxsense.dqn.reference import has_optimum
 from jaxsense.models import Models
 from jaxsense.run import missions
 from jaxsense.run.checkpoints import Checkpoints
@@ -33,6 +34,7 @@ class RunResult:
       models: the trained networks.
       windows: for each modality `[C, window, channels]` one look at each class, from left to right.
       reliability: for each modality, see `training.measures.reliability`.
+      fields_of_view: of each sensor, by modality, in degrees.
       posteriors: `[C, S', D]` beliefs of these, `joint` and for each modality.
       rewards: for each Q-network, named by its modality or `team`, the `[epochs]` mean total reward
         of the episodes that ended, `reward`, and of the learned policy of a robot that is alone on
@@ -43,6 +45,7 @@ class RunResult:
 
     models: Models
     windows: dict[str, np.ndarray]
+    fields_of_view: dict[str, float]
     reliability: dict[str, Reliability]
     posteriors: dict[str, Belief]
     rewards: dict[str, dict[str, np.ndarray]]
@@ -72,7 +75,7 @@ def compiled(
       workers: what shares scenes, missions and seeds.
       kept: where to keep compiled programs for later runs, if anywhere.
       num_seeds: runs side by side, see `compile_programs`.
-      policies: of your own, by name; keep no programs with these, whose code may change.
+      policies: custom policies by name; keep no programs with these, whose code may change.
 
     Raises:
       ConfigError: see `mission.require_playable`.
@@ -118,6 +121,7 @@ def run(
             sensor.name: sensor.from_left(windows[:, 0])
             for sensor, windows in zip(sensors, detections.windows, strict=True)
         },
+        fields_of_view={sensor.name: sensor.field_of_view for sensor in sensors},
         reliability=reliability(config, detections.held_out),
         posteriors=posteriors,
         rewards={
@@ -141,16 +145,14 @@ def run(
 
 def _agent(config: Config, modality: str, trained: Trained) -> summary.Agent:
     """One modality's block of `dqn`."""
-    total, first = map(np.asarray, trained.outputs[f"policies_{modality}"])
-    others = trained.outputs.get(f"numbers_{modality}", ())
+    rewards = jax.tree.map(np.asarray, trained.outputs[f"policies_{modality}"])
+    others = jax.tree.map(np.asarray, trained.outputs.get(f"numbers_{modality}", []))
+    fusion, values = trained.outputs["fusion"], trained.outputs["look_values"]
     return summary.agent(
         config,
-        total,
-        first,
+        rewards,
         permutations(config),
         trained.curves[learner(config, modality)]["seconds"],
-        {
-            number: np.asarray(total)
-            for number, (total, _) in zip(config.evaluation.num_pois, others, strict=True)
-        },
+        dict(zip(config.evaluation.num_pois, others, strict=True)),
+        has_optimum(fusion, values[config.modalities.index(modality)]),
     )

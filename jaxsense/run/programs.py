@@ -99,7 +99,7 @@ class Programs:
       player: of the missions.
       workers: what shares rows and missions.
       trainings: those side by side.
-      policies: of missions, by name, besides `dqn.POLICIES`.
+      policies: of missions, by name, in addition to `dqn.POLICIES`.
     """
 
     config: Config
@@ -138,7 +138,7 @@ def compile_programs(
       compiler: compiles them.
       workers: what shares rows, missions and seeds.
       num_seeds: trainings side by side; each calls the programs from its own threads.
-      policies: of missions, by name, besides `dqn.POLICIES`.
+      policies: of missions, by name, in addition to `dqn.POLICIES`.
     """
     found, trainings = stages(config), Trainings(num_seeds)
 

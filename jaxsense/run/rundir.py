@@ -21,6 +21,7 @@ from jaxsense.config import (
     as_plain,
     from_plain,
     parse_json,
+    require_32_bits,
     require_trust,
 )
 from jaxsense.models import Models
@@ -142,11 +143,6 @@ class RunDirectory:
             run._read_metrics()
             yield run
 
-    def save_models(self, models: Models) -> None:
-        """Saves trained models for `load`; see `Checkpoints.save`."""
-        for name, tree in _named(models, self.settings.config).items():
-            self.checkpoints.save(name, tree)
-
     def append_metrics(self, *, stage: str, step: int, **metrics: float) -> None:
         """Adds a line to `metrics.jsonl`, unless this run wrote it before it was killed.
 
@@ -221,7 +217,7 @@ def unused(path: Path) -> Path:
 def _check_empty(path: Path) -> None:
     """Raises `ConfigError` if a directory holds more than a lock and a partial `config.json`."""
     if any(f.name != ".lock" and not files.is_unfinished(f, "config.json") for f in path.iterdir()):
-        raise ConfigError("out", str(path), "is not empty; must be a new directory")
+        raise ConfigError("out", str(path), "is not empty; must be a new or empty directory")
 
 
 def resumable(path: Path, trust: bool = False) -> Settings:
@@ -296,8 +292,9 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
 
     Raises:
       ConfigError: if the directory holds no finished run, a run of another version or a damaged
-        checkpoint, or if the run names custom sensors without trust.
+        checkpoint, if the run names custom sensors without trust, or if JAX computes in 64 bits.
     """
+    require_32_bits()
     path = Path(path)
     content = _read_config(path / "config.json", "run", path)
     _check_origin(content, "run", path)

@@ -28,11 +28,11 @@ def check_range(seed: int, number: int) -> None:
       ConfigError: if one is outside its range.
     """
     if not 0 <= seed < 2**32:
-        raise ConfigError("seed", seed, "must be within 0 and 2^32 - 1")
+        raise ConfigError("seed", seed, "must be from 0 to 2^32 - 1")
     if seed + number > 2**32:
         raise ConfigError("num_seeds", number, "leads beyond seed 2^32 - 1")
     if not 1 <= number <= _MOST:
-        raise ConfigError("num_seeds", number, f"must be within 1 and {_MOST:,}")
+        raise ConfigError("num_seeds", number, f"must be from 1 to {_MOST:,}")
 
 
 def paths(run: RunDirectory) -> dict[int, Path]:

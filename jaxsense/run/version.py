@@ -1,6 +1,7 @@
-"""Versions of jaxsense and of the packages that results depend on."""
+"""Versions of jaxsense, of Python and of the packages that results depend on."""
 
 import importlib.metadata
+import platform
 import subprocess
 from pathlib import Path
 
@@ -10,9 +11,9 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
 def versions() -> dict[str, str]:
-    """Versions of jaxsense and of the packages that results depend on, by name."""
+    """Versions of jaxsense, of Python and of the packages that results depend on, by name."""
     others = {package: importlib.metadata.version(package) for package in _PACKAGES}
-    return {"jaxsense": __version__, **others}
+    return {"jaxsense": __version__, "python": platform.python_version(), **others}
 
 
 def commit(source: Path = _ROOT) -> str | None:

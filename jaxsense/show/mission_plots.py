@@ -1,4 +1,4 @@
-"""The plots of missions: policies beside each other, and in other arenas and teams."""
+"""The plots of missions: policies compared in the same arenas, and in other arenas and teams."""
 
 import math
 from collections.abc import Iterable

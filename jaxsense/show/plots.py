@@ -237,8 +237,10 @@ def _draw_rewards(ax: Axes, kind: str, values: np.ndarray) -> None:
 
 def _draw_references(ax: Axes, agent: Agent) -> None:
     """Draws the policies that an agent is compared with; random ones are far below."""
-    optimal, naive, random = (mean(agent[key]) for key in ("optimal", "naive", "random"))
-    ax.axhline(optimal, color="C2", linestyle="--", label=AGENTS["optimal"].label)
+    naive, random = mean(agent["naive"]), mean(agent["random"])
+    optimal = naive if agent["optimal"] is None else mean(agent["optimal"])
+    if agent["optimal"] is not None:
+        ax.axhline(optimal, color="C2", linestyle="--", label=AGENTS["optimal"].label)
     ax.axhline(naive, color=policy_colour("naive"), linestyle=":", label=AGENTS["naive"].label)
     bottom = min(naive, mean(agent["return"])) - max(0.5, optimal - naive)
     ax.set_ylim(bottom=bottom)

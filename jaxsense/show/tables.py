@@ -64,8 +64,8 @@ def detectors(results: Results) -> Table:
 
 
 def agents(results: Results) -> Table:
-    """The Q-networks beside other policies on the map."""
-    keys = "return", "optimal", "naive", "random", "fraction_of_optimal", "optimal_states"
+    """The Q-networks compared with other policies on the map."""
+    keys = "return", "optimal", "greedy", "naive", "random", "fraction_of_optimal", "optimal_states"
     metrics = [AGENTS[key] for key in (*keys, "num_states")]
     return _table("Policies of a robot alone on the map: mean reward", results["dqn"], metrics)
 
@@ -108,7 +108,7 @@ def unambiguous(results: Results, classes: tuple[str, ...]) -> Table:
 
 
 def paper(results: Results) -> Table | None:
-    """The Q-networks beside the paper's; None if its task is another."""
+    """The Q-networks compared with the paper's; None if its task is another."""
     agents = results["dqn"]
     if any(mean(agent["num_permutations"]) != _PAPER_PERMUTATIONS for agent in agents.values()):
         return None
@@ -187,6 +187,8 @@ def cards(results: Results) -> list[tuple[str, str, str]]:
             found.append((text(mean(latent[key]), MISSIONS[key].digits), what, ", ".join(beside)))
     for modality, agent in results["dqn"].items():
         states = f"{mean(agent['num_states']):,.0f} states of the map"
+        if agent["optimal_states"] is None:  # without an optimum to compare with
+            continue
         number = f"{mean(agent['optimal_states']):,.0f}"
         found.append((number, f"of {states} played optimally", modality))
     return found

@@ -1,7 +1,6 @@
 """Noise of the sensors: ranges, edges and lost beams of the LiDAR, light of the camera.
 
-All of it but the noise of single readings is off by default. What is off is not compiled: it takes
-no time and changes no bit of a reading.
+Only reading noise is on by default; other disturbances cost nothing while off.
 """
 
 import chex

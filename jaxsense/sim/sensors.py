@@ -141,6 +141,11 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
         return self.rays.angles
 
     @property
+    def field_of_view(self) -> float:
+        """Angle between the outermost rays, in degrees."""
+        return float(np.degrees(np.ptp(self.angles)))
+
+    @property
     def directions(self) -> Float[np.ndarray, "2 B"]:
         """Unit vectors along the rays in the robot's frame."""
         angles = self.angles.astype(np.float64)

@@ -68,13 +68,13 @@ def cut_out(
     channels = () if sensor.channels == 1 else (sensor.channels,)
     shape = (len(sensor.angles), *channels)
     chex.assert_shape(readings, shape, custom_message=f"readings of {sensor.name}")
-    is_turn = "must be within -pi and pi: it is in radians"
+    is_turn = "must be from -pi to pi: it is in radians"
     checks.require("bearing", bearing, lambda x: np.abs(x) <= np.pi, is_turn)
     dtype = jnp.result_type(readings)
     if jnp.issubdtype(dtype, jnp.integer):
         reason = "must be real numbers, in metres or from 0 to 1"
         raise ValueError(f"readings of dtype {dtype}: {reason}")
-    at_least = "must be a number that is not negative"
+    at_least = "must be at least 0"
     checks.require(f"readings of {sensor.name}", readings, lambda x: x >= 0, at_least)
     bearing = jnp.asarray(bearing, jnp.float32)
     rays = _first_ray(sensor, bearing) + sensor.stride * jnp.arange(sensor.window)

@@ -10,7 +10,6 @@ from jaxsense.summary.blocks import Summary as Summary
 from jaxsense.summary.blocks import Timing as Timing
 from jaxsense.summary.blocks import cases as cases
 from jaxsense.summary.blocks import traffic as traffic
-from jaxsense.summary.make import MDP_POLICIES as MDP_POLICIES
 from jaxsense.summary.make import agent as agent
 from jaxsense.summary.make import beliefs as beliefs
 from jaxsense.summary.make import jmvae as jmvae

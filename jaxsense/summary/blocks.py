@@ -40,7 +40,9 @@ class Detector(TypedDict):
 class Fusion(TypedDict):
     """`jmvae.fusion`: beliefs after one sensor's look and then another's; null with one sensor."""
 
-    accuracy: Annotated[float | None, "fusion: right", "Share of beliefs in the true class.", 4]
+    accuracy: Annotated[
+        float | None, "fusion: right", "Share of beliefs whose likeliest class is the true one.", 4
+    ]
     mean_error: Annotated[float | None, "fusion: error", "Distance from the joint belief in sigma."]
     std_error: Annotated[
         float | None, "fusion: error of sigma", "Mean |log(ratio)| to the joint's."
@@ -50,7 +52,11 @@ class Fusion(TypedDict):
 class Jmvae(TypedDict):
     """`jmvae`: the latent space."""
 
-    active_units: Annotated[int, "dimensions in use", "One of two in the paper's Fig. 4."]
+    active_units: Annotated[
+        int,
+        "dimensions in use",
+        "Latent dimensions that vary between classes; one in the paper.",
+    ]
     sigma_norm: Annotated[PerClass, "sigma norm", "Mean of each class, `joint` and by sensor."]
     unambiguous: Annotated[
         dict[str, list[bool]],
@@ -69,7 +75,7 @@ class Jmvae(TypedDict):
 
 
 class Beliefs(TypedDict):
-    """`belief`: the map after random looks at one PoI, beside exact Bayes on the same looks."""
+    """`belief`: the map after random looks at one PoI, compared with exact Bayes on them."""
 
     looks: Annotated[list[int], "looks", "1 to 6."]
     nll: Annotated[list[float], "NLL of the map", "Mean -log p of the true class."]
@@ -85,7 +91,8 @@ Returns = TypedDict(
     "Returns",
     {
         "return": Annotated[float, "Q-network", "Reward of an episode without exploration."],
-        "optimal": Annotated[float, "optimal", "Knows the mean reward of each look."],
+        "optimal": Annotated[float | None, "optimal", "The optimal policy; see concepts."],
+        "greedy": Annotated[float, "greedy", "Takes the look with the highest expected gain."],
         "naive": Annotated[float, "naive", "Looks at each PoI once, whatever the map holds."],
         "random": Annotated[float, "random"],
         "fraction_of_optimal": Annotated[float | None, "of optimal", "Q-network over optimal."],
@@ -98,7 +105,7 @@ class OneStep(TypedDict):
     """`dqn.MODALITY.one_step`: the reward of the first step, as in the authors' code."""
 
     policy: Annotated[float, "one step: Q-network"]
-    optimal: Annotated[float, "one step: optimal"]
+    optimal: Annotated[float | None, "one step: optimal"]
     random: Annotated[float, "one step: random"]
 
 
@@ -106,15 +113,21 @@ class Agent(Returns):
     """`dqn.MODALITY`: a robot alone on the map."""
 
     one_step: OneStep
-    optimal_states: Annotated[int, "optimal in", "States with a reward within 0.01 of optimal.", 1]
-    num_states: Annotated[int, "states", "Combinations of classes and looks, or 4,096 of them.", 0]
-    optimal_permutations: Annotated[int, "optimal permutations", "", 1]
+    optimal_states: Annotated[
+        int | None, "optimal in", "States with a reward within 0.01 of optimal.", 1
+    ]
+    num_states: Annotated[
+        int, "states", "Combinations of classes and looks, or a sample of them.", 0
+    ]
+    optimal_permutations: Annotated[int | None, "optimal permutations", "", 1]
     num_permutations: Annotated[int, "permutations", "States in which all classes differ.", 0]
     other_numbers: NotRequired[
         Annotated[dict[str, Returns], "other numbers", "Rewards with `evaluation.num_pois` PoIs."]
     ]
     env_steps: Annotated[int, "steps of training", "In all environments together.", 0]
-    env_steps_per_s: Annotated[float, "steps per second", "In all environments, learning.", 0]
+    env_steps_per_s: Annotated[
+        float, "steps per second", "Environment steps per second of training.", 0
+    ]
 
 
 class Differences(TypedDict):
@@ -182,9 +195,9 @@ class Results(TypedDict):
 class Evaluation(TypedDict):
     """Missions of `evaluate` in the same arenas: `RUN/evaluations/NAME.json`."""
 
-    num_pois: int
-    side: float
-    robots: list[str]
+    num_pois: Annotated[int, "PoIs", "Points of interest of an evaluation.", 0]
+    side: Annotated[float, "side [m]", "Of its arena.", 2]
+    robots: Annotated[list[str], "robots", "The sensor of each."]
     mission: Missions
 
 
@@ -203,7 +216,6 @@ class Summary(Header, Results):
     """The whole file."""
 
     timing: Timing
-    elsewhere: NotRequired[dict[str, Evaluation]]  # of older versions
 
 
 def cases(missions: Missions) -> dict[str, Case]:
@@ -246,5 +258,7 @@ BLOCKS = {
     "dqn.MODALITY.": AGENTS,
     "mission.POLICY.": MISSIONS,
     f"mission.{_TRAFFIC}.": _table(Traffic),
+    "evaluations.NAME.": _table(Evaluation),
 }
-"""All metrics, by the beginning of their keys in `summary.json` and by the rest."""
+"""All metrics, by the beginning of their keys in `summary.json` and by the rest; evaluations have
+their own files, `evaluations/NAME.json`, each with a block `mission` too."""

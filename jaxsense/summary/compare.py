@@ -103,7 +103,7 @@ def compared(missions: Missions) -> Missions:
 
 
 def verdict(played: dict[str, Case]) -> str | None:
-    """Says how fast the latent policy is beside naive exploration and beside the fastest policy.
+    """Says how fast the latent policy is compared with naive exploration and the fastest policy.
 
     Args:
       played: cases in the same arenas.

@@ -20,9 +20,6 @@ from jaxsense.summary.blocks import (
 )
 from jaxsense.summary.compare import REFERENCE, Measured, compared, differences
 
-MDP_POLICIES = ("return", "optimal", "naive", "random")
-"""The policies on the map: that of a Q-network, and those to compare it with."""
-
 _UNAMBIGUOUS = 0.9  # share of looks in a single class, above which the class counts as one
 _AS_GOOD = 0.01  # reward by which a policy may miss the optimum
 _FLOAT_BYTES = 4
@@ -47,59 +44,66 @@ def beliefs(measured: Mapping[str, jax.Array]) -> Beliefs:
 
 def agent(
     config: Config,
-    total: np.ndarray,
-    first: np.ndarray,
+    rewards: Mapping[str, tuple[np.ndarray, np.ndarray]],
     is_permutation: np.ndarray,
     seconds: Sequence[float],
-    others: Mapping[int, np.ndarray],
+    others: Mapping[int, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    has_optimum: bool = True,
 ) -> Agent:
     """One modality's block of `dqn`.
 
     Args:
       config: all settings.
-      total: `[P, S]` total reward of each of `MDP_POLICIES` in an episode from every state of the
-        map, then from `config.evaluation.num_starts` random ones.
-      first: `[P, S]` reward of the first action.
+      rewards: by policy, `[S]` total reward of an episode and `[S]` reward of its first action,
+        from every state of the map, then from `config.evaluation.num_starts` random starts.
       is_permutation: for each state of the map, whether all classes differ, as in the paper.
       seconds: of the training, chunk by chunk.
-      others: `total` with other numbers of PoIs, whose last starts are the random ones.
+      others: `rewards` with other numbers of PoIs, whose last starts are the random ones.
+      has_optimum: whether `optimal` is the optimum; what rests on it is None otherwise.
     """
     num_starts, env_steps = config.evaluation.num_starts, config.dqn.epochs * config.dqn.num_envs
-    num_states = total.shape[1] - num_starts
-    one_step = dict(zip(MDP_POLICIES, first[:, num_states:].mean(axis=1).tolist(), strict=True))
-    missed = total[MDP_POLICIES.index("optimal"), :num_states] - total[0, :num_states]
+    num_states = len(is_permutation)
+
+    def first(policy: str) -> float:
+        return float(rewards[policy][1][num_states:].mean())
+
+    missed = (rewards["optimal"][0] - rewards["latent"][0])[:num_states]
     is_optimal = missed <= _AS_GOOD
     block: Agent = {
-        **_returns(total[:, num_states:]),
+        **_returns(rewards, num_starts, has_optimum),
         "one_step": {
-            "policy": one_step["return"],
-            "optimal": one_step["optimal"],
-            "random": one_step["random"],
+            "policy": first("latent"),
+            "optimal": first("optimal") if has_optimum else None,
+            "random": first("random"),
         },
-        "optimal_states": int(np.sum(is_optimal)),
+        "optimal_states": int(np.sum(is_optimal)) if has_optimum else None,
         "num_states": num_states,
-        "optimal_permutations": int(np.sum(is_optimal & is_permutation)),
+        "optimal_permutations": int(np.sum(is_optimal & is_permutation)) if has_optimum else None,
         "num_permutations": int(np.sum(is_permutation)),
         "env_steps": env_steps,
         "env_steps_per_s": env_steps / sum(seconds),
     }
     if others:
         block["other_numbers"] = {
-            str(number): _returns(each[:, -num_starts:]) for number, each in others.items()
+            str(number): _returns(each, num_starts, has_optimum) for number, each in others.items()
         }
     return block
 
 
-def _returns(total: np.ndarray) -> Returns:
-    """Means of `[P, S]` rewards from random starts."""
-    policy, optimal, naive, random = total.mean(axis=1).tolist()
+def _returns(
+    rewards: Mapping[str, tuple[np.ndarray, np.ndarray]], num_starts: int, has_optimum: bool
+) -> Returns:
+    """Mean total rewards from random starts, the last ones."""
+    of = {name: float(total[-num_starts:].mean()) for name, (total, _) in rewards.items()}
+    optimal = of["optimal"] if has_optimum else None
     return {
-        "return": policy,
+        "return": of["latent"],
         "optimal": optimal,
-        "naive": naive,
-        "random": random,
+        "greedy": of["greedy"],
+        "naive": of["naive"],
+        "random": of["random"],
         # Where no look pays, the optimum is 0.
-        "fraction_of_optimal": policy / optimal if optimal else None,
+        "fraction_of_optimal": of["latent"] / optimal if optimal else None,
     }
 
 

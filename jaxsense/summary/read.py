@@ -1,6 +1,7 @@
-"""Reads and checks `summary.json` and the evaluations beside it."""
+"""Reads and checks `summary.json` and the evaluations of the same run."""
 
 import json
+import shlex
 import types
 from pathlib import Path
 from typing import Annotated, NotRequired, Union, cast, get_args, get_origin, get_type_hints
@@ -27,7 +28,7 @@ def read(run: Path) -> Summary:
 
 
 def read_evaluations(run: Path) -> dict[str, Evaluation]:
-    """Reads the evaluations of a run, those in the summary of an older version first.
+    """Reads the evaluations of a run.
 
     Args:
       run: its directory.
@@ -39,11 +40,21 @@ def read_evaluations(run: Path) -> dict[str, Evaluation]:
       ConfigError: if one cannot be read, or a value in it is missing or wrong.
     """
     files = sorted((run / EVALUATIONS).glob("*.json"))
-    found = {file.stem: cast(Evaluation, _read(run, file, Evaluation)) for file in files}
-    return {**read(run).get("elsewhere", {}), **found}
+    return {file.stem: cast(Evaluation, _read(run, file, Evaluation)) for file in files}
+
+
+class NotFinishedError(ConfigError):
+    """A run that has not finished."""
+
+    def __init__(self, run: Path):
+        resume = f"python -m jaxsense.train --resume {shlex.quote(str(run))}"
+        self.expected = f"is not finished: it has no summary.json; continue it with {resume}"
+        ValueError.__init__(self, f"{run} {self.expected}")
 
 
 def _read(run: Path, file: Path, kind: type) -> object:
+    if kind is Summary and not file.exists():
+        raise NotFinishedError(run)
     try:
         content = parse_json(file.read_text(encoding="utf-8"))
         json.dumps(content, allow_nan=False)

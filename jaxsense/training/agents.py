@@ -152,7 +152,10 @@ def agent_stages(arena: Arena, config: Config) -> list[Stage]:
 
     names = tuple(f"detector_{name}" for name in config.modalities)
     learned = {"detections": "detections", "fusion": "fusion", "detectors": names}
-    learners = {learner(config, name): m for m, name in enumerate(config.modalities)}
+    learners: dict[str, int] = {}
+    for m, name in enumerate(config.modalities):
+        # A team's one network is evaluated with the first sensor.
+        learners.setdefault(learner(config, name), m)
     return [
         Stage("starts", starts, learned),
         *(

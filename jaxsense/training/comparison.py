@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -14,15 +15,22 @@ from jaxsense.core.types import Fusion, Key
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn.map_mdp import MapMdp, random_start
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.policies import Known
+from jaxsense.dqn.policies import Known, Policy, Values
 from jaxsense.dqn.reference import reference
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.training.mdp import held_out_mdp, models_of
 from jaxsense.training.perception import Detections
 from jaxsense.training.stage import Output
 
-COMPARED = ("latent", "optimal", "naive", "random")
-"""Names of the policies to compare in the map MDP, from `dqn.policies.POLICIES`."""
+COMPARED = ("latent", "optimal", "greedy", "naive", "random")
+"""Names of the policies to compare in the map MDP, from `dqn.policies.POLICIES`; `optimal` is the
+reference of the MDP, see `dqn.reference`."""
+
+Rewards = dict[str, tuple[Float[Array, " S"], Float[Array, " S"]]]
+"""By policy, `[S]` total reward and `[S]` reward of the first action from each start, averaged over
+the noise of looks; NaN where a value or a reward is NaN."""
+
+_STATE_BY_STATE = ("latent", "optimal")
 
 
 def learned_return(
@@ -54,9 +62,14 @@ def learned_return(
 
 
 def compare_policies(
-    key: Key, modality: Int[Array, ""], models: Models, mdp: MapMdp, config: Config
-) -> tuple[Float[Array, "P S"], Float[Array, "P S"]]:
-    """Plays episodes with each of `COMPARED`, with the same looks and starts.
+    key: Key,
+    modality: Int[Array, ""],
+    models: Models,
+    mdp: MapMdp,
+    config: Config,
+    own: Mapping[str, Values | Policy] | None = None,
+) -> Rewards:
+    """Plays episodes with `COMPARED` and custom policies, with the same looks and starts.
 
     Args:
       key: random key.
@@ -64,33 +77,35 @@ def compare_policies(
       models: trained models, in whose `q_networks` all are of this modality.
       mdp: from `held_out_mdp`.
       config: all settings.
+      own: custom policies by name.
 
     Returns:
-      `[P, S]` total reward and `[P, S]` reward of the first action, averaged over the noise of
-      looks; NaN where a value or a reward is NaN. The starts are the states of
-      `episodes.every_state`, then `config.evaluation.num_starts` random ones.
+      Rewards from the states of `episodes.every_state`, then from `config.evaluation.num_starts`
+      random starts.
     """
     settings = config.evaluation
     start_key, table_key, play_key = jax.random.split(key, 3)
     starts = _every_start(start_key, mdp, config)
     optimal = reference(table_key, mdp, modality, models, models.bayes.labels)
+    table, names = policies.table(own), (*COMPARED, *(own or {}))
+    often = jnp.array([name in _STATE_BY_STATE for name in names])
 
     # By a switch, so that one program is compiled for all policies.
     def with_policy(which: Int[Array, ""]) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
-        # Only the first two policies are compared state by state.
-        number = jnp.where(which < 2, settings.num_repeats, -(-settings.num_repeats // 8))
+        number = jnp.where(often[which], settings.num_repeats, -(-settings.num_repeats // 8))
 
         def episode(key: Key, classes: jax.Array, seen: jax.Array) -> tuple[jax.Array, jax.Array]:
             reset_key, episode_key = jax.random.split(key)
             start = episodes.reset(reset_key, mdp, models.bayes, classes, seen)
 
             def act(key: Key, known: Known) -> jax.Array:
-                of_table = {
-                    name: functools.partial(policies.POLICIES[name].values, key, models, known)
-                    for name in ("latent", "naive", "random")
-                }
-                by_name = {**of_table, "optimal": lambda: optimal(known, classes)}
-                return policies.best(jax.lax.switch(which, [by_name[name] for name in COMPARED]))
+                of_each = [
+                    functools.partial(optimal, known, classes)
+                    if name == "optimal"
+                    else functools.partial(table[name].values, key, models, known)
+                    for name in names
+                ]
+                return policies.best(jax.lax.switch(which, of_each))
 
             return episodes.run_episode(episode_key, mdp, models.bayes, act, start, modality)
 
@@ -102,7 +117,8 @@ def compare_policies(
         total, first = jax.lax.fori_loop(0, number, repeat, (zero, zero))
         return total / number, first / number
 
-    return jax.lax.map(with_policy, jnp.arange(len(COMPARED)))
+    total, first = jax.lax.map(with_policy, jnp.arange(len(names)))
+    return {name: (total[i], first[i]) for i, name in enumerate(names)}
 
 
 def _every_start(
@@ -143,7 +159,7 @@ def play_policies(
     look_values: tuple[LookValues, ...],
     detections: Detections,
     num_pois: int | None = None,
-) -> tuple[Float[Array, "P S"], Float[Array, "P S"]]:
+) -> Rewards:
     """Runs `compare_policies` for one modality.
 
     Args:
@@ -162,9 +178,7 @@ def play_policies(
     return compare_policies(key, modality, models, mdp, config)
 
 
-def play_numbers(
-    key: Key, config: Config, **inputs: Output
-) -> list[tuple[Float[Array, "P S"], Float[Array, "P S"]]]:
+def play_numbers(key: Key, config: Config, **inputs: Output) -> list[Rewards]:
     """Runs `compare_policies` with each number of PoIs in `evaluation.num_pois`.
 
     Args:

@@ -1,7 +1,7 @@
 """Fusion in place, the paper's.
 
-Korthals et al. 2018, Sec. III and Fig. 3. `vae.filter` holds another kind of fusion. A kind of your
-own is a class with the attributes and methods of `core.types.Fusion`.
+Korthals et al. 2018, Sec. III and Fig. 3. `vae.filter` holds another kind of fusion. A custom
+fusion is a class with the attributes and methods of `core.types.Fusion`.
 """
 
 import itertools

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import ANYTHING, NUMBERS, SMOKE, check_message
+from smoke import save_models
 
 import jaxsense
 from benchmarks import __main__ as benchmarks
@@ -36,7 +37,7 @@ def run(tmp_path_factory):
     path = tmp_path_factory.mktemp("runs") / "run"
     models = jaxsense.init(jax.random.key(0), SMOKE)
     with RunDirectory.create(path, Settings("smoke", 0, SMOKE)) as created:
-        created.save_models(models)
+        save_models(created, models)
     return path
 
 
@@ -106,16 +107,16 @@ TRAIN = [
     (["--seed", ""], "seed = '': must be a whole number"),
     (["--seed"], "argument --seed: expected one argument"),
     (["--seed", "nan"], "seed = 'nan': must be a whole number"),
-    (["--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
-    (["--seed", "4294967296"], "seed = 4294967296: must be within"),
+    (["--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
+    (["--seed", "4294967296"], "seed = 4294967296: must be from"),
     (["--seed", "9" * 5000], "seed = '999"),
     (["--cache", 300 * "x"], "cache = 'xxx"),
-    (["--num-seeds", "1000000000"], "num_seeds = 1000000000: must be within 1 and 10,000"),
-    (["--num-seeds", "0"], "num_seeds = 0: must be within 1 and 10,000"),
+    (["--num-seeds", "1000000000"], "num_seeds = 1000000000: must be from 1 to 10,000"),
+    (["--num-seeds", "0"], "num_seeds = 0: must be from 1 to 10,000"),
     (["--num-seeds", "2", "--seed", "4294967295"], "leads beyond seed"),
-    (["--devices", "0"], "devices = 0: must be within 1 and"),
-    (["--devices", "-1"], "devices = -1: must be within 1 and"),
-    (["--devices", "1000000000"], "devices = 1000000000: must be within 1 and"),
+    (["--devices", "0"], "devices = 0: must be from 1 to"),
+    (["--devices", "-1"], "devices = -1: must be from 1 to"),
+    (["--devices", "1000000000"], "devices = 1000000000: must be from 1 to"),
     (["--devices", "1e9"], "devices = '1e9': must be a whole number or None"),
     (["--preset", ""], "preset = '': must be one of default, paper, noisy, team, smoke"),
     (["--preset", "Smoke"], "preset = 'Smoke': must be one of"),
@@ -126,7 +127,7 @@ TRAIN = [
     (["--out", "\udc80"], "must be a path of printable characters"),
     (["--out", "file"], "out = 'file': cannot be written"),
     (["--out", "file/run"], "out = 'file/run': cannot be written"),
-    (["--out", "full"], "out = 'full': is not empty; must be a new directory"),
+    (["--out", "full"], "out = 'full': is not empty; must be a new or empty directory"),
     (["--out", "x" * 300], "cannot be written (File name too long)"),
     (["--out", "/proc/run"], "out = '/proc/run': cannot be written"),
     (["--cache", "file"], "cache = 'file': must be a directory"),
@@ -143,13 +144,13 @@ TRAIN = [
     (["--config", "empty.json"], "empty.json is not JSON"),
     (["--config", "null.json"], "null.json must hold an object"),
     (["--config", "list.json"], "list.json must hold an object"),
-    (["--config", "nan.json"], "jmvae.beta = nan: must be a finite number"),
-    (["--config", "inf.json"], "jmvae.beta = inf: must be a finite number"),
+    (["--config", "nan.json"], "jmvae.beta = nan: must be a number"),
+    (["--config", "inf.json"], "jmvae.beta = inf: must be a number"),
     (["--config", "float.json"], "seed = 1.0: must be a whole number"),
     (["--config", "bool.json"], "seed = True: must be a whole number"),
-    (["--config", "negative.json"], "seed = -1: must be within 0 and 2^32 - 1"),
-    (["--config", "large.json"], "seed = 4294967296: must be within 0 and 2^32 - 1"),
-    (["--config", "seeds.json"], "num_seeds = 0: must be within 1 and 10,000"),
+    (["--config", "negative.json"], "seed = -1: must be from 0 to 2^32 - 1"),
+    (["--config", "large.json"], "seed = 4294967296: must be from 0 to 2^32 - 1"),
+    (["--config", "seeds.json"], "num_seeds = 0: must be from 1 to 10,000"),
     (["--config", "preset.json"], "preset = ['smoke']: must be one of"),
     (["--config", "section.json"], "dqn = [1]: must be an object with names and values"),
     (["--config", "sections.json"], "config = [1]: must be an object with names"),
@@ -157,8 +158,11 @@ TRAIN = [
     (["--config", "unknown.json"], "colour = 3: unknown field of a run's config.json"),
     (["--config", "text.json"], "dqn.epochs = '3': must be a whole number"),
     (["--config", "whole.json"], "dqn.epochs = 60.0: must be a whole number"),
-    (["--config", "sensor.json"], "sensors.x.attribute = None: must be given"),
-    (["--config", "shape.json"], "arena.shapes.cube.primitive = None: must be given"),
+    (["--config", "sensor.json"], "sensors.x = {'make': 'a:b'}: missing setting attribute"),
+    (
+        ["--config", "shape.json"],
+        "arena.shapes.cube = {'half_sides': [1, 1, 1]}: missing setting primitive",
+    ),
     (["--config", "memory.json"], "detector.hidden = (10000000, 10000000): takes"),
     (["--config", "twice.json", "--preset", "smoke"], "is not JSON"),
     (["--resume", ""], "resume = '': must be a path"),
@@ -170,13 +174,13 @@ TRAIN = [
     (["--dqn.hidden"], "dqn.hidden = (): must have 1 or more values, each at least 1"),
     (["--dqn.hidden", "a"], "dqn.hidden = ('a',): must be a list of whole numbers"),
     (["--dqn.observe", "LIVE"], "dqn.observe = 'LIVE': must be one of live, bank"),
-    (["--team.travel.speed", "x"], "team.travel.speed = 'x': must be a finite number"),
-    (["--team.travel.spee", "1"], "Did you mean --team.travel.speed?"),
+    (["--team.travel.speed", "x"], "team.travel.speed = 'x': must be a number"),
+    (["--team.travel.spee", "1"], "; did you mean --team.travel.speed?"),
     (["--team.num-pois", "3"], "argument --team.num-pois: expected 2 arguments"),
     (["--team.num-pois", "4", "3"], "team.num_pois = (4, 3): must be a minimum and a maximum"),
     (["--robots"], "robots = (): must have 1 to 64 values"),
     (["--robots", "camera", "sonar"], "must each be one of modalities: camera, lidar"),
-    (["--arena.side", "3m"], "arena.side = '3m': must be a finite number"),
+    (["--arena.side", "3m"], "arena.side = '3m': must be a number"),
     (
         ["--arena.side", "1_000_000"],
         "arena.side = 1000000.0: must be greater than 0 and at most 100",
@@ -186,12 +190,12 @@ TRAIN = [
     (["--arena.shapes.cube.half-sides", "1"], "half-sides: expected 2 arguments"),
     (["--mdp.partly-seen-starts", "maybe"], "unexpected argument 'maybe'"),
     (["--quiet=3"], "argument --quiet: ignored explicit argument '3'"),
-    (["--taste", "sweet"], "unknown option --taste. See --help-all."),
-    (["--num-poi", "3"], "unknown option --num-poi. Did you mean --arena.num-pois?"),
-    (["--num_seed=3"], "unknown option --num-seed. Did you mean --num-seeds?"),
-    (["--dqn.epoch", "3"], "unknown option --dqn.epoch. Did you mean --dqn.epochs?"),
+    (["--taste", "sweet"], "unknown option --taste; see --help-all"),
+    (["--num-poi", "3"], "unknown option --num-poi; did you mean --arena.num-pois?"),
+    (["--num_seed=3"], "unknown option --num-seed; did you mean --num-seeds?"),
+    (["--dqn.epoch", "3"], "unknown option --dqn.epoch; did you mean --dqn.epochs?"),
     (["--" + "x" * 5000], "unknown option --xxx"),
-    (["--mission.policies", "naive", "best"], "('naive', 'best'): must name some of latent, gr"),
+    (["--mission.policies", "naive", "best"], "('naive', 'best'): must be among latent, greedy"),
     (["smoke"], "unexpected argument 'smoke'"),
     (["--jmvae.hidden", "10000000", "10000000"], "jmvae.hidden = (10000000, 10000000): takes"),
 ]
@@ -241,12 +245,12 @@ OTHERS = [
     (evaluate, ["file"], "file is not a run directory: it has no config.json"),
     (evaluate, ["full"], "full is not a run directory: it has no config.json"),
     (evaluate, ["none", "more"], "unexpected argument 'more'"),
-    (evaluate, ["RUN"], "must hold the summary.json of a finished run"),
-    (evaluate, ["RUN", "--episodes", "0"], "episodes = 0: must be within 1 and 100,000"),
-    (evaluate, ["RUN", "--episodes", "-1"], "episodes = -1: must be within"),
+    (evaluate, ["RUN"], "is not finished: it has no summary.json; continue it with python -m "),
+    (evaluate, ["RUN", "--episodes", "0"], "episodes = 0: must be from 1 to 100,000"),
+    (evaluate, ["RUN", "--episodes", "-1"], "episodes = -1: must be from"),
     (evaluate, ["RUN", "--episodes", "1e9"], "episodes = '1e9': must be a whole number"),
-    (evaluate, ["RUN", "--episodes", "1000000000"], "episodes = 1000000000: must be within"),
-    (evaluate, ["RUN", "--seed", "-1"], "seed = -1: must be within 0 and 2^32 - 1"),
+    (evaluate, ["RUN", "--episodes", "1000000000"], "episodes = 1000000000: must be from"),
+    (evaluate, ["RUN", "--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
     (evaluate, ["RUN", "--seed", "x"], "seed = 'x': must be a whole number"),
     (evaluate, ["RUN", "--policy", ""], "policy = '': must be one of all, policies, latent"),
     (evaluate, ["RUN", "--policy", "sonar_alone"], "policy = 'sonar_alone': must be one of"),
@@ -254,8 +258,8 @@ OTHERS = [
     (
         evaluate,
         ["RUN", "--arena.num-pois", "4"],
-        "arena.num_pois = 4: the policies of this run are for 3 points; must be 3, or a run with "
-        "dqn.task = team",
+        "arena.num_pois = 4: must be 3, as in training; only a run with dqn.task = team plays with "
+        "other numbers",
     ),
     (evaluate, ["RUN", "--arena.num-pois", "x"], "num_pois = 'x': must be a whole number or"),
     (evaluate, ["RUN", "--arena.side", "0"], "arena.side = 0.0: must be greater than 0"),
@@ -266,7 +270,7 @@ OTHERS = [
         ["RUN", "--robots", "camera", "camera", "--policy", "camera_alone"],
         "policy = 'camera_alone': must be one of all, policies, latent",
     ),
-    (evaluate, ["RUN", "--devices", "0"], "devices = 0: must be within 1 and"),
+    (evaluate, ["RUN", "--devices", "0"], "devices = 0: must be from 1 to"),
     (evaluate, ["RUN", "--cache", "file"], "cache = 'file': must be a directory"),
     (export, [], "missing argument RUN: the directory of a finished run, e.g. runs/2026"),
     (export, ["none"], "none is not a run directory: it has no config.json"),
@@ -283,7 +287,7 @@ OTHERS = [
     (benchmarks, ["--json", "full"], "json = 'full': exists already; must be new"),
     (benchmarks, ["--json", "none/x"], "json = 'none/x': cannot be written"),
     (benchmarks, ["--json"], "argument --json: expected one argument"),
-    (benchmarks, ["--peer"], "unknown option --peer. Did you mean --peers?"),
+    (benchmarks, ["--peer"], "unknown option --peer; did you mean --peers?"),
 ]
 
 

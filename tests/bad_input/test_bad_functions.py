@@ -387,10 +387,10 @@ def test_functions_refuse(given_world, name):
     ],
 )
 def test_a_mission_refuses(given_world, inputs, expected):
-    team = given_world.mission
+    team, models = given_world.mission, given_world.models
     base = {"classes": given_world.classes, "policy": 0, "faults": mission.no_faults(SMOKE)}
     with pytest.raises(ValueError, match=re.escape(expected)):
-        mission.start(team, given_world.scene, **{**base, **inputs})
+        mission.start(team, models, given_world.scene, **{**base, **inputs})
 
 
 def test_environments_refuse(given_world):

@@ -243,8 +243,8 @@ CHANGES = [
         },
         "must not have both 'red cube hot' and 'red cube cold', which no sensor can distinguish",
     ),
-    ({"modalities": ("lidar", "")}, "must be some of camera, lidar"),
-    ({"modalities": ("lidar\n",)}, "must be some of camera, lidar"),
+    ({"modalities": ("lidar", "")}, "must be among camera, lidar"),
+    ({"modalities": ("lidar\n",)}, "must be among camera, lidar"),
     ({"arena": 3}, "arena = 3: must be of type ArenaConfig"),
     ({"arena": None}, "arena = None: must be of type"),
     ({"sensors": {1: SensorConfig("a:b", "shape")}}, "must be a dictionary from names"),
@@ -267,13 +267,17 @@ CHANGES = [
         "no sensor can distinguish",
     ),
     ({"arena.colours": {}}, "must name one or more"),
-    ({"arena.colours": {"red": (1.0, 0.0)}}, "lists of 3 finite numbers"),
-    ({"arena.colours": {"red": (NAN, 0.0, 0.0)}}, "lists of 3 finite numbers"),
-    ({"arena.colours": {"red": "red"}}, "lists of 3 finite numbers"),
+    ({"arena.colours": {"red": (1.0, 0.0)}}, "lists of 3 numbers, each 0 or of"),
+    ({"arena.colours": {"red": (NAN, 0.0, 0.0)}}, "lists of 3 numbers, each 0 or of"),
+    ({"arena.colours": {"red": "red"}}, "lists of 3 numbers, each 0 or of"),
     (
         {"arena.num_pois": 26},
         "arena.num_pois = 26: must be at most 25: so many PoIs of radius 0.1 m with gaps of 0.3 m "
         "fit into an arena of side 3.0 m",
+    ),
+    (
+        {"arena.side": 0.5},
+        "arena.num_pois = 3: no PoI fits; lower arena.poi_gap or arena.poi_radius",
     ),
     (
         {"camera.field_of_view": 30.0},
@@ -328,7 +332,7 @@ CHANGES = [
     ({"jmvae.steps": 10**9}, "jmvae.steps = 1000000000: takes"),
     ({"jmvae.batch": 10**9}, "jmvae.batch = 1000000000: takes"),
     ({"jmvae.reconstruction_weights": (1.0,) * 9}, "must have one value for each of modalities ="),
-    ({"jmvae.reconstruction_weights": (NAN, 1.0)}, "must be a list of finite numbers"),
+    ({"jmvae.reconstruction_weights": (NAN, 1.0)}, "must be a list of numbers, each 0 or"),
     ({"mdp.reward": "bits"}, "mdp.reward = 'bits': must be one of paper, nats"),
     (
         {
@@ -337,7 +341,7 @@ CHANGES = [
             "team.sides": (4.0, 6.0),
             "mdp.partly_seen_starts": True,
         },
-        "mdp.partly_seen_starts = True: needs 2 to 30 pairs of PoI and modality, not 32; must be",
+        "mdp.partly_seen_starts = True: must be off: it needs 2 to 30 pairs of PoI and",
     ),
     (
         {
@@ -345,11 +349,11 @@ CHANGES = [
             "evaluation.num_pois": (3, 20),
             "mdp.partly_seen_starts": True,
         },
-        "mdp.partly_seen_starts = True: needs 2 to 30 pairs of PoI and modality, not 40; must be",
+        "mdp.partly_seen_starts = True: must be off: it needs 2 to 30 pairs of PoI and",
     ),
     ({"dqn.task": "robots"}, "dqn.task = 'robots': must be one of map, team"),
     ({"dqn.task": "team", "dqn.observe": "live"}, "dqn.observe = 'live': must be 'bank' with dqn"),
-    ({"evaluation.num_pois": (3,)}, "evaluation.num_pois = (3,): needs dqn.task = 'team'"),
+    ({"evaluation.num_pois": (3,)}, "evaluation.num_pois = (3,): must be empty unless"),
     ({"team.num_pois": (4, 3)}, "team.num_pois = (4, 3): must be a minimum and a maximum, in this"),
     ({"team.num_pois": (3,)}, "team.num_pois = (3,): must be a list of 2 whole numbers"),
     ({"team.sides": (4.0, 3.0)}, "team.sides = (4.0, 3.0): must be a minimum and a maximum, in"),
@@ -395,7 +399,7 @@ CHANGES = [
         {"mission.episodes": 10**5, "arena.num_pois": 16},
         "mission.episodes = 100000: takes 31 GiB",
     ),
-    ({"navigation.view_distances": (0.6, NAN)}, "must be a list of finite numbers"),
+    ({"navigation.view_distances": (0.6, NAN)}, "must be a list of numbers, each 0 or"),
     ({"mission.policies": ("naive", "latent", "naive")}, "must name no policy twice"),
     ({"mission.policies": "naive"}, "mission.policies = 'naive': must be a list of texts"),
     ({"mission.control_period": 0.033}, "must be a multiple of 0.01 s"),
@@ -449,12 +453,12 @@ def test_settings_that_cannot_be_used_are_named(changes, expected):
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
-        (lambda: Shape("box", (0.5,)), "shape.half_sides = (0.5,): must be a list of 2 finite"),  # pyright: ignore
+        (lambda: Shape("box", (0.5,)), "shape.half_sides = (0.5,): must be a list of 2 numbers"),  # pyright: ignore
         (lambda: Shape("cylinder", (1.0, 0.5)), "must be the same number twice for a cylinder"),
         (lambda: Shape("Box"), "shape.primitive = 'Box': must be one of cylinder, box"),  # pyright: ignore
         (lambda: Attribute({"hot": "x"}), "attribute.values = {'hot': 'x'}: must be a dictionary"),  # pyright: ignore
         (lambda: Attribute({}), "must name one or more"),
-        (lambda: Attribute({"hot": 1.0}, NAN), "attribute.elsewhere = nan: must be a finite"),
+        (lambda: Attribute({"hot": 1.0}, NAN), "attribute.elsewhere = nan: must be a number"),
         (lambda: SensorConfig("a.b", "shape"), "must be package.module:function"),
         (lambda: SensorConfig(":", "shape"), "must be package.module:function"),
         (lambda: SensorConfig(3, "shape"), "sensor.make = 3: must be text"),  # pyright: ignore
@@ -503,7 +507,10 @@ def test_an_error_survives_pickling():
         ({"team": {"side": 4}}, "team.side = 4: unknown setting; did you mean team.sides?"),
         ({"zzz": 4}, "zzz = 4: unknown setting"),
         ({"arena": 4}, "arena = 4: must be an object with names and values"),
-        ({"sensors": {"x": {"make": "a:b"}}}, "sensors.x.attribute = None: must be given"),
+        (
+            {"sensors": {"x": {"make": "a:b"}}},
+            "sensors.x = {'make': 'a:b'}: missing setting attribute",
+        ),
     ],
 )
 def test_plain_settings_that_are_unknown_are_named(stored, expected):

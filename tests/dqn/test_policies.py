@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from toys import known_of, policy
 
+from jaxsense.config import ConfigError
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import agents, optimum, policies
 from jaxsense.dqn.optimum import LookValues
@@ -137,10 +138,11 @@ def test_a_policy_of_ones_own_is_one_more_entry():
         return jnp.append(jnp.arange(len(known.looks)), -1)
 
     timed = Policy(backwards, lambda agent: True)
-    table = policies.table({"backwards": backwards, "timed": timed, "greedy": backwards})
+    table = policies.table({"backwards": backwards, "timed": timed})
     assert [*table] == [*policies.POLICIES, "backwards", "timed"]
     known = known_of(UNKNOWN, np.zeros((3, 2)))
-    for name in ("backwards", "greedy"):
-        assert policies.best(table[name].values(KEY, None, known)) == 2
-        assert not table[name].counts_time(None)
+    assert policies.best(table["backwards"].values(KEY, None, known)) == 2
+    assert not table["backwards"].counts_time(None)
     assert table["timed"] is timed
+    with pytest.raises(ConfigError, match=r"^policies = 'greedy': must not be latent, "):
+        policies.table({"greedy": backwards})

@@ -22,7 +22,7 @@ def models():
 
 
 @pytest.fixture(scope="session")
-def arena_of(team):
+def arena_of(team, models):
     """A mission in a chosen arena: PoIs, robots' poses, classes, policy and faults."""
 
     @jax.jit
@@ -30,7 +30,7 @@ def arena_of(team):
         layout = jaxsense.sim.make_layout(CONFIG.arena, positions, jnp.zeros(len(classes)), classes)
         light = jaxsense.sim.Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
         return mission.start(
-            team, jaxsense.sim.Scene(layout, light, poses), classes, policy, faults
+            team, models, jaxsense.sim.Scene(layout, light, poses), classes, policy, faults
         )
 
     def make(positions, poses, classes=(0, 1, 2), policy=NAIVE, faults=None):

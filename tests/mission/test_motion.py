@@ -22,7 +22,7 @@ def test_missions_with_contacts_always_and_never_computed_take_the_same_decision
     keys = jax.random.split(jax.random.key(2), 6)
     records = []
     for each in (never, always):
-        reset = jax.jit(jax.vmap(lambda k, m=each: mission.reset(k, m, NAIVE)))
+        reset = jax.jit(jax.vmap(lambda k, m=each: mission.reset(k, m, models, NAIVE)))
         roll = jax.jit(jax.vmap(lambda k, s, m=each: mission.rollout(k, m, models, s, 150)[1]))
         records.append(roll(keys, reset(keys)))
     for name in ("phase", "target", "scanned", "detected", "seen"):

@@ -107,10 +107,10 @@ def test_cases_are_the_policies_and_every_failure_of_every_robot():
     assert list(mission.cases(single)) == list(POLICIES)
 
 
-def test_a_mission_of_another_size_is_named(team, arena_of):
+def test_a_mission_of_another_size_is_named(team, models, arena_of):
     scene = arena_of(POSITIONS, POSES).scene
     with pytest.raises(AssertionError, match="classes"):
-        mission.start(team, scene, jnp.zeros(4, int), 0, mission.no_faults(CONFIG))
+        mission.start(team, models, scene, jnp.zeros(4, int), 0, mission.no_faults(CONFIG))
     faults = mission.Faults(jnp.zeros(3), jnp.zeros(2))
     with pytest.raises(AssertionError, match=r"faults\.stops_at"):
-        jax.eval_shape(lambda: mission.start(team, scene, jnp.zeros(3, int), 0, faults))
+        jax.eval_shape(lambda: mission.start(team, models, scene, jnp.zeros(3, int), 0, faults))

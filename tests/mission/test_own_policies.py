@@ -15,7 +15,7 @@ from jaxsense import dqn, evaluate, mission, train
 from jaxsense.config import ConfigError
 from jaxsense.dqn.policies import Policy
 from jaxsense.mission import decide
-from jaxsense.mission.state import DRIVING
+from jaxsense.mission.state import DRIVING, FAILED
 from jaxsense.run import cli, pipeline, programs
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.sim import arena as arenas
@@ -38,7 +38,13 @@ def close(key, models, known):
     return jnp.array([1.0, 0.95, 0.0, 0.0])
 
 
-OWN = {"mine": last_first, "close": close, "timed": Policy(close, lambda agent: True)}
+def lost(key, models, known):
+    """A value that is NaN, of the last PoI."""
+    del key, models, known
+    return jnp.array([1.0, 0.5, jnp.nan, 0.0])
+
+
+OWN = {"mine": last_first, "close": close, "lost": lost, "timed": Policy(close, lambda agent: True)}
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +74,17 @@ def test_values_that_count_time_are_taken_in_their_own_order(own, decides, arena
     for name, target in (("close", 1), ("timed", 0)):
         state = replace(state, policy=jnp.int32(own.policy(name)))
         assert decides(state).robots.target[0] == target
+
+
+def test_a_robot_whose_policy_has_no_value_fails(own, decides, arena_of):
+    state = arena_of(POSITIONS, POSES)
+    state = replace(state, policy=jnp.int32(own.policy("lost")))
+    after = decides(state).robots
+    assert (after.target[0], after.phase[0]) == (-1, FAILED)
+    # Not of a PoI that it has given up.
+    given_up = state.robots.undetected.at[0, 2].set(True)
+    state = replace(state, robots=replace(state.robots, undetected=given_up))
+    assert decides(state).robots.phase[0] == DRIVING
 
 
 def test_every_policy_of_the_table_is_played(own, models, arena_of):
@@ -107,7 +124,7 @@ def playing(*names):
 
 def test_a_run_with_an_unknown_policy_is_refused():
     mission.require_playable(playing("naive", "mine"), OWN)
-    expected = r"^mission.policies = \('naive', 'mine'\): must name some of latent, "
+    expected = r"^mission.policies = \('naive', 'mine'\): must be among latent, "
     with pytest.raises(ConfigError, match=expected):
         mission.require_playable(playing("naive", "mine"))
 
@@ -118,6 +135,30 @@ def test_a_policy_may_not_be_named_like_a_fault():
         mission.require_playable(CONFIG, {"wall_stops": close})
     with pytest.raises(ConfigError, match=expected):
         mission.cases(CONFIG, (*POLICIES, "wall_stops"))
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("bytes_per_detection", "must not be all, policies, bytes_per_detection"),
+        ("all", "must not be all, policies, bytes_per_detection"),
+        ("latent", "must not be latent, greedy, "),
+        ("a/b", "must be a word of 1 to 64 letters"),
+        (" ", "must be a word of 1 to 64 letters"),
+        ("", "must be a word of 1 to 64 letters"),
+    ],
+)
+def test_the_name_of_a_policy_is_a_word_that_is_free(name, reason):
+    with pytest.raises(ConfigError, match=rf"^policies = {name!r}: {reason}"):
+        mission.require_playable(CONFIG, {name: close})
+
+
+def test_a_policy_may_not_replace_one_of_the_package(team):
+    arenas = team.world.arena, team.free_arena
+    with pytest.raises(ConfigError, match=r"^policies = 'naive': must not be latent, "):
+        mission.make_mission(CONFIG, {"naive": close}, arenas=arenas)
+    # The whole table may be given.
+    assert [*mission.make_mission(CONFIG, dqn.POLICIES, arenas=arenas).policies] == [*POLICIES]
 
 
 RUN = ["--preset", "smoke", "--quiet", "--mission.policies", "latent", "mine"]
@@ -143,7 +184,7 @@ def test_train_passes_own_policies_on_and_keeps_no_programs(tmp_path, monkeypatc
 def test_train_refuses_a_policy_that_it_is_not_given(tmp_path, capsys):
     with pytest.raises(SystemExit):
         train.main([*RUN, "--out", str(tmp_path / "run"), "--cache", "None"])
-    line = "jaxsense.train: mission.policies = ('latent', 'mine'): must name some of latent, greedy"
+    line = "jaxsense.train: mission.policies = ('latent', 'mine'): must be among latent, greedy"
     assert capsys.readouterr().err.startswith(line)
     assert not (tmp_path / "run").exists()
 
@@ -153,7 +194,7 @@ def test_own_policies_reach_the_programs_of_a_run(monkeypatch):
     with pipeline.compiled(playing("mine"), Monitor(), policies=OWN) as made:
         assert made.policies == OWN
     with (
-        pytest.raises(ConfigError, match=r"mission\.policies = \('mine',\): must name some of"),
+        pytest.raises(ConfigError, match=r"mission\.policies = \('mine',\): must be among"),
         pipeline.compiled(playing("mine"), Monitor()),
     ):
         pass

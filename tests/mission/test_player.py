@@ -10,8 +10,8 @@ import pytest
 from teams import CONFIG, NAIVE
 
 from jaxsense import mission
+from jaxsense.core.types import Belief
 from jaxsense.mission.state import Record
-from jaxsense.models import init
 from jaxsense.run import devices, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
@@ -43,13 +43,15 @@ WORKERS = {
 
 
 @pytest.fixture
-def play(team, monkeypatch):
+def play(team, models, monkeypatch):
     """Plays nine missions of the naive policy with `fake_step`, four at a time."""
-    state = jax.jit(lambda: mission.reset(KEY, team, NAIVE))()
+    state = jax.jit(lambda: mission.reset(KEY, team, models, NAIVE))()
 
-    def fake_reset(key, team, policy, faults):
+    def fake_reset(key, team, models, policy, faults):
         poses = jax.random.normal(key, state.scene.poses.shape)
-        return dataclasses.replace(state, scene=dataclasses.replace(state.scene, poses=poses))
+        belief = jax.tree.map(lambda x: jnp.tile(x, (3, 1)), models.fusion.prior)
+        scene = dataclasses.replace(state.scene, poses=poses)
+        return dataclasses.replace(state, scene=scene, belief=belief)
 
     def measure(team, models, s):
         return {"steps": s.steps, "poses": s.scene.poses}
@@ -58,10 +60,9 @@ def play(team, monkeypatch):
     monkeypatch.setattr(missions, "reset", fake_reset)
     monkeypatch.setattr(missions, "measure", measure)
 
-    def run(workers):
+    def run(workers, models=models):
         with Compiler(Monitor()) as compiler:
             player = missions.Player(team, compiler, 4, workers)
-            models = init(jax.random.key(0), CONFIG)
             return player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, 9)
 
     return run
@@ -77,6 +78,13 @@ def walk_of(episode, shape):
     ]
     moves = [jax.random.normal(key, shape) for key in step_keys[:LAST]]
     return np.asarray(jax.random.normal(arena_key, shape)) + np.cumsum(moves, axis=0)
+
+
+def test_missions_begin_with_the_models_that_play_them(play, models):
+    prior = Belief(jnp.array([0.5, -1.0]), jnp.array([2.0, 3.0]))
+    fusion = dataclasses.replace(models.fusion, prior=prior)
+    end = play(Workers(), dataclasses.replace(models, fusion=fusion)).recording.end
+    np.testing.assert_array_equal(end.belief.mean, [[0.5, -1.0]] * 3)
 
 
 @pytest.mark.parametrize("split", WORKERS)
@@ -113,6 +121,18 @@ def test_a_map_that_is_not_finite_ends_the_missions(play, monkeypatch):
 
     monkeypatch.setattr(ROLLOUT, "step", diverging)
     with pytest.raises(StageError, match="mission: beliefs after 2 chunks are not finite"):
+        play(Workers())
+
+
+def test_values_that_are_not_finite_end_the_missions(play, monkeypatch):
+    def lost(keys, team, models, states, parts):
+        states, record = fake_step(keys, team, models, states, parts)
+        target = jnp.where((states.steps > CHUNK)[:, None], -1, states.robots.target)
+        robots = dataclasses.replace(states.robots, target=target)
+        return dataclasses.replace(states, robots=robots), record
+
+    monkeypatch.setattr(ROLLOUT, "step", lost)
+    with pytest.raises(StageError, match="mission: values of policy naive are not finite"):
         play(Workers())
 
 

@@ -38,7 +38,7 @@ def go_on(team, models):
 
 
 @pytest.fixture(scope="module")
-def played(team, go_on, as_numpy):
+def played(team, models, go_on, as_numpy):
     """For each case: states before, states after and records; and all states after 4 s."""
     stops_at, blind_at = (
         jnp.array([case[i] for case in CASES.values() for _ in range(case[2])], jnp.float32)
@@ -47,7 +47,7 @@ def played(team, go_on, as_numpy):
 
     @jax.jit
     def begin(keys, faults):
-        return jax.vmap(lambda k, f: mission.reset(k, team, NAIVE, f))(keys, faults)
+        return jax.vmap(lambda k, f: mission.reset(k, team, models, NAIVE, f))(keys, faults)
 
     number = len(stops_at)
     start = begin(jax.random.split(jax.random.key(4), number), Faults(stops_at, blind_at))
@@ -205,8 +205,8 @@ def test_without_any_robot_the_mission_ends_at_once(played):
     assert np.all(end.robots.looks == 0)
 
 
-def test_same_keys_give_the_same_mission_and_the_policy_does_not_change_the_arena(team):
-    reset = jax.jit(lambda key, policy: mission.reset(key, team, policy))
+def test_same_keys_give_the_same_mission_and_the_policy_does_not_change_the_arena(team, models):
+    reset = jax.jit(lambda key, policy: mission.reset(key, team, models, policy))
     first, again = (reset(jax.random.key(3), NAIVE) for _ in range(2))
     latent, other = reset(jax.random.key(3), LATENT), reset(jax.random.key(4), 0)
     jax.tree.map(np.testing.assert_array_equal, first, again)

@@ -1,12 +1,15 @@
 """Where robots stand at the start of a mission."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import sim
+from jaxsense import mission, sim
 from jaxsense.config import ArenaConfig, Config
+from jaxsense.core.types import Belief
 from jaxsense.mission import begin, roadmap
 
 # So narrow that from some places there is no way out.
@@ -59,3 +62,13 @@ def test_robots_start_at_the_first_places_with_room_and_ways_to_all_pois(started
     # All conditions matter.
     assert only_cut_off > 0
     assert only_too_close > 0
+
+
+def test_the_map_starts_from_the_prior_of_the_fusion(team, models):
+    prior = Belief(jnp.array([0.5, -1.0]), jnp.array([2.0, 3.0]))
+    other = replace(models, fusion=replace(models.fusion, prior=prior))
+    begin = jax.jit(lambda key, models: mission.reset(key, team, models).belief)
+    for each, mean, std in ((models, [0, 0], [20**0.5] * 2), (other, [0.5, -1.0], [2.0, 3.0])):
+        belief = begin(jax.random.key(0), each)
+        np.testing.assert_allclose(belief.mean, [mean] * 3)
+        np.testing.assert_allclose(belief.std, [std] * 3, rtol=1e-6)

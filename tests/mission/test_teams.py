@@ -28,8 +28,8 @@ def many():
 
 
 @pytest.fixture(scope="module")
-def start_of(many):
-    begin = jax.jit(lambda *given: mission.start(many, *given))
+def start_of(many, models):
+    begin = jax.jit(lambda *given: mission.start(many, models, *given))
 
     def make(poses=POSES, policy=NAIVE, faults=None, classes=(2, 0, 1)):
         classes = jnp.array(classes)
@@ -241,7 +241,7 @@ def test_the_program_of_a_mission_does_not_grow_with_its_robots(models):
         team = mission.make_mission(replace(CONFIG, robots=("camera", "lidar") * pairs))
         play = jax.jit(lambda key, state: mission.rollout(key, team, models, state, 4))
         key = jax.random.key(0)
-        state = jax.eval_shape(lambda key: mission.reset(key, team, NAIVE), key)
+        state = jax.eval_shape(lambda key: mission.reset(key, team, models, NAIVE), key)
         return str(play.trace(key, state).jaxpr).count("\n")
 
     assert lines(4) <= 1.3 * lines(1)
@@ -251,7 +251,7 @@ def test_the_program_of_a_mission_does_not_grow_with_its_robots(models):
 def test_a_team_of_three_visits_every_poi_with_both_sensors(many, models):
     # Naive exploration counts what robots with the same sensor have seen.
     roll = jax.jit(lambda key, state: mission.rollout(key, many, models, state, 400))
-    state = jax.jit(lambda key: mission.reset(key, many, NAIVE))(jax.random.key(2))
+    state = jax.jit(lambda key: mission.reset(key, many, models, NAIVE))(jax.random.key(2))
     end, record = roll(jax.random.key(3), state)
     assert mission.REASONS[mission.reason(end)] == "finished"
     assert np.all(end.seen)

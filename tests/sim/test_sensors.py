@@ -64,6 +64,7 @@ def view(scans, known_layout):
 def test_lidar_rays():
     angles = np.degrees(sensors.lidar(LidarConfig()).angles)
     assert angles.shape == (683,)
+    assert sensors.lidar(LidarConfig()).field_of_view == pytest.approx(240)
     np.testing.assert_allclose(angles[[0, 341, 682]], [-120, 0, 120], atol=1e-4)
     np.testing.assert_allclose(np.diff(angles), 240 / 682, atol=1e-3)
 

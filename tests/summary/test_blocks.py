@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from summaries import SUMMARY
+from summaries import BYTES, CASE, EVALUATION, OF_A_TEAM, OF_SEEDS, SUMMARY
 
 from jaxsense.summary import BLOCKS, metrics
 
@@ -12,6 +12,7 @@ KEYS = {place + key for place, block in BLOCKS.items() for key in block}
 # Only in some runs: of several seeds, of a team, or of one robot alone.
 RARE = {"seeds", "failed", "dqn.MODALITY.other_numbers", "mission.POLICY.seed"}
 RARE |= {f"mission.POLICY.{key}" for key in ("told", "ambiguous_reported")}
+RARE |= {f"evaluations.NAME.{key}" for key in ("num_pois", "side", "robots")}
 OF_ALL_NAIVE = {key for key in KEYS if ".of_naive." in key}
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -33,6 +34,15 @@ def test_a_real_summary_has_every_documented_key_and_no_other(smoke_run):
     assert found == KEYS - RARE - OF_ALL_NAIVE
     # What tests of the page and the terminal show is a summary too.
     assert keys(SUMMARY) == {key for key in found if ".intervals." not in key}
+
+
+def test_every_rare_key_is_somewhere():
+    of_naive = dict.fromkeys(("observations_per_poi", "time_s", "mean_time_s"), 0.5)
+    alone = {**CASE, "seed": 7, "of_naive": of_naive, "told": 1.0, "ambiguous_reported": None}
+    evaluation = {**EVALUATION, "mission": {"camera_alone": alone, "bytes_per_detection": BYTES}}
+    found = keys(OF_SEEDS) | keys(OF_A_TEAM)
+    found |= {key if key in KEYS else f"evaluations.NAME.{key}" for key in keys(evaluation)}
+    assert RARE | OF_ALL_NAIVE <= found <= KEYS
 
 
 def test_the_page_about_runs_shows_this_table():

@@ -10,7 +10,7 @@ from jaxsense.summary import make
 from jaxsense.training.comparison import permutations
 
 CONFIG = PRESETS["smoke"]
-RETURNS = "return", "optimal", "naive", "random", "fraction_of_optimal"
+RETURNS = "return", "optimal", "greedy", "naive", "random", "fraction_of_optimal"
 
 FOUND = {
     "classes": np.array([[0, 1, 2], [2, 2, 1]]),
@@ -47,16 +47,20 @@ SMALL = Config(
 
 def test_figures_of_policies_as_worked_by_hand():
     # Sixteen states and three random starts, of which the figures are means.
-    of_states = np.zeros((4, 16))
+    names = "latent", "optimal", "naive", "random", "greedy"
+    of_states = np.zeros((5, 16))
     # .02 and .009 below the optimum, of which .01 is let pass; more than the optimum is too. The
     # classes of the first and last four states are equal, of the others different.
     of_states[1, [0, 1, 4, 5, 10]] = 0.02, 0.009, 0.02, 0.009, 0.5
     of_states[0, 15] = 1.0
-    of_starts = np.array([[0.9, 1.0, 1.1], [1.0, 1.1, 1.2], [0.5, 0.5, 0.8], [-1.0, 0.0, -0.5]])
+    of_starts = np.array(
+        [[0.9, 1.0, 1.1], [1.0, 1.1, 1.2], [0.5, 0.5, 0.8], [-1.0, 0.0, -0.5], [1.0, 1.0, 1.3]]
+    )
     total = np.concatenate([of_states, of_starts], axis=1)
+    rewards = {name: (x, x / 2) for name, x in zip(names, total, strict=True)}
     different = permutations(SMALL)
-    figures = make.agent(SMALL, total, total / 2, different, [2.0, 3.0], {9: total})
-    expected = {"return": 1.0, "optimal": 1.1, "naive": 0.6, "random": -0.5}
+    figures = make.agent(SMALL, rewards, different, [2.0, 3.0], {9: rewards})
+    expected = {"return": 1.0, "optimal": 1.1, "greedy": 1.1, "naive": 0.6, "random": -0.5}
     assert {name: figures[name] for name in expected} == pytest.approx(expected)
     assert figures["fraction_of_optimal"] == pytest.approx(1 / 1.1)
     assert figures["other_numbers"]["9"] == {name: figures[name] for name in RETURNS}
@@ -65,8 +69,13 @@ def test_figures_of_policies_as_worked_by_hand():
     assert figures["one_step"] == pytest.approx(one_step)
     assert (figures["optimal_states"], figures["num_states"]) == (13, 16)
     assert (figures["optimal_permutations"], figures["num_permutations"]) == (6, 8)
-    none = np.zeros((4, 19))
-    nothing = make.agent(SMALL, none, none, permutations(SMALL), [1.0], {})
+    without = make.agent(SMALL, rewards, different, [2.0, 3.0], {}, has_optimum=False)
+    ends = "optimal", "fraction_of_optimal", "optimal_states", "optimal_permutations"
+    assert [without[end] for end in ends] == [None] * 4
+    assert without["one_step"]["optimal"] is None
+    assert without["return"] == figures["return"]
+    none = dict.fromkeys(names, (np.zeros(19), np.zeros(19)))
+    nothing = make.agent(SMALL, none, permutations(SMALL), [1.0], {})
     assert "other_numbers" not in nothing
     assert nothing["fraction_of_optimal"] is None
 

@@ -32,7 +32,6 @@ def test_a_summary_is_read_with_keys_of_later_versions(tmp_path):
         ("mission.bytes_per_detection", 3, "bytes_per_detection has the wrong type"),
         ("jmvae.unambiguous.joint", [1], "summary.jmvae.unambiguous.joint.0 has the wrong type"),
         ("belief", [], "summary.belief has the wrong type"),
-        ("elsewhere", {"there": {}}, "summary.elsewhere.there.mission is missing"),
         ("seeds", {"3": {}}, "summary.3.belief is missing"),
     ],
 )
@@ -52,11 +51,14 @@ def test_what_is_missing_or_wrong_is_named(tmp_path, place, value, reason):
     assert "\n" not in str(error.value)
 
 
-def test_evaluations_are_read_with_those_of_an_older_version(tmp_path):
-    written(tmp_path, {**SUMMARY, "elsewhere": {"there": EVALUATION}})
-    assert summary.read_evaluations(tmp_path) == {"there": EVALUATION}
-    written(tmp_path, EVALUATION, "evaluations/here.json")
-    assert [*summary.read_evaluations(tmp_path)] == ["there", "here"]
+def test_evaluations_are_read_in_the_order_of_their_names(tmp_path):
+    assert summary.read_evaluations(tmp_path) == {}
+    for name in ("there", "here"):
+        written(tmp_path, EVALUATION, f"evaluations/{name}.json")
+    assert [*summary.read_evaluations(tmp_path).items()] == [
+        ("here", EVALUATION),
+        ("there", EVALUATION),
+    ]
     wrong = {**EVALUATION, "mission": {"latent": {**CASE, "time_s": None}}}
     written(tmp_path, wrong, "evaluations/here.json")
     with pytest.raises(ConfigError, match=r"must hold the evaluations/here\.json of a finished"):

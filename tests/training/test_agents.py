@@ -101,6 +101,12 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
     np.testing.assert_array_equal(progress.metrics["evaluation"], [np.nan, 3.0])
 
 
+def test_the_network_of_a_team_is_evaluated_with_its_first_sensor():
+    team = dataclasses.replace(BANK, dqn=dataclasses.replace(BANK.dqn, task="team"))
+    # As its curve is titled, beside the optimum of that sensor, see `plots.rewards`.
+    assert stage_of("dqn_team", team).inputs["modality"] == 0
+
+
 TOURS = dataclasses.replace(
     TINY,
     dqn=dataclasses.replace(TINY.dqn, task="team", observe="bank"),

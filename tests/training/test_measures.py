@@ -247,9 +247,10 @@ PAYS = constant(1.0, 1.0)
 def test_policies_are_played_from_every_state_and_from_random_starts():
     # Where a look replaces the one before, the values of looks do not matter.
     models = models_with(jnp.array([0.0, 0.0, 0.0, 1.0]), (PAYS, PAYS))
-    total, first = map(np.asarray, play(jnp.int32(0), models, EXACT))
-    assert total.shape == first.shape == (4, NUM_STATES + 16)
-    of = dict(zip(comparison.COMPARED, total, strict=True))
+    found = jax.tree.map(np.asarray, play(jnp.int32(0), models, EXACT))
+    of = {name: total for name, (total, _) in found.items()}
+    assert {x.shape for pair in found.values() for x in pair} == {(NUM_STATES + 16,)}
+    assert set(of) == {"latent", "optimal", "greedy", "naive", "random"}
     np.testing.assert_array_equal(of["latent"], 0.0)  # always NOP
     # The means over all states; a policy is at best as good.
     optimal, naive, uniform = (
@@ -259,20 +260,19 @@ def test_policies_are_played_from_every_state_and_from_random_starts():
     # Naive exploration goes on where the camera has not seen all: bits 0, 2 and 4 of the number of
     # a state.
     goes_on = np.arange(NUM_STATES) % 64 & 0b010101 != 0b010101
-    of_naive = first[comparison.COMPARED.index("naive"), :NUM_STATES]
+    of_naive = found["naive"][1][:NUM_STATES]
     np.testing.assert_array_equal(of_naive != 0, goes_on)
     # The camera's own looks alone: no state pays more than three of the best, from a variance of
     # 20 in three dimensions to sqrt(3).
     most = 3 * (1 / 3**0.5 - 1 / 60**0.5)
-    assert np.max(total) <= most + 1e-4
+    assert max(total.max() for total in of.values()) <= most + 1e-4
 
 
 def test_values_that_are_not_numbers_give_totals_that_are_none():
     models = models_with(jnp.array([0.0, jnp.nan, 0.0, 1.0]), (PAYS, PAYS))
-    total, first = map(np.asarray, play(jnp.int32(0), models, EXACT))
-    assert np.isnan(total[0]).all()
-    assert np.isnan(first[0]).all()
-    assert np.isfinite(total[1:]).all()
+    found = jax.tree.map(np.asarray, play(jnp.int32(0), models, EXACT))
+    assert all(np.isnan(x).all() for x in found.pop("latent"))
+    assert all(np.isfinite(x).all() for pair in found.values() for x in pair)
 
 
 def test_where_looks_add_up_the_optimum_is_by_the_total_of_the_own_sensors_looks():
@@ -280,11 +280,10 @@ def test_where_looks_add_up_the_optimum_is_by_the_total_of_the_own_sensors_looks
     fusion = filter.init(KEY, model, classes, prior, FilterConfig(hidden=(1,)))
     # No look of the camera pays by its total, and every look of the LiDAR does.
     models = models_with(jnp.zeros(4), (constant(1.0, -1.0), constant(-1.0, 1.0)), fusion)
-    optimal = comparison.COMPARED.index("optimal")
-    total, first = play(jnp.int32(0), models, EXACT)
-    np.testing.assert_array_equal(total[optimal], 0.0)
-    total, first = play(jnp.int32(1), models, EXACT)
-    assert np.all(first[optimal] != 0)
+    total, _ = play(jnp.int32(0), models, EXACT)["optimal"]
+    np.testing.assert_array_equal(total, 0.0)
+    _, first = play(jnp.int32(1), models, EXACT)["optimal"]
+    assert np.all(first != 0)
 
 
 @pytest.fixture(scope="module")
@@ -301,7 +300,9 @@ def same_policy():
     @jax.jit
     def compared(models, config):
         mdp = held_out_mdp(config, models.fusion, detections(held_out=bank))
-        return comparison.compare_policies(KEY, jnp.int32(0), models, mdp, config)
+        return comparison.compare_policies(
+            KEY, jnp.int32(0), models, mdp, config, {"mine": lambda *_: always.values(*[0] * 3)}
+        )
 
     def found(repeats):
         settings = EvaluationConfig(num_starts=4, num_repeats=repeats, num_states=8)
@@ -312,21 +313,23 @@ def same_policy():
         patch.setattr(
             comparison, "reference", lambda *_: lambda known, classes: always.values(*[0] * 3)
         )
-        return {repeats: np.asarray(found(repeats)) for repeats in (1, 2, 9)}
+        names = *comparison.COMPARED, "mine"
+        of_repeats = {n: found(n) for n in (1, 2, 9)}
+        return {n: np.array([by_name[name] for name in names]) for n, by_name in of_repeats.items()}
 
 
 def test_policies_are_compared_on_the_same_starts_and_the_same_looks(same_policy):
-    total, _ = found = same_policy[1]
-    assert total.shape == (4, 12)
-    assert len(np.unique(total[0])) > 6  # of 12; without a gain a look is worth -1
-    np.testing.assert_array_equal(found, found[:, [0, 0, 0, 0]])
+    found = same_policy[1]
+    assert found.shape == (6, 2, 12)  # with one of our own
+    assert len(np.unique(found[0, 0])) > 6  # of 12; without a gain a look is worth -1
+    np.testing.assert_array_equal(found, found[[0] * 6])
 
 
 def test_naive_and_random_policies_are_played_an_eighth_as_often(same_policy):
     # An eighth of nine, rounded up, is two.
-    often, seldom = same_policy[9][:, 0], same_policy[2][:, 0]
+    often, seldom = same_policy[9][0], same_policy[2][0]
     assert np.any(often != seldom)
-    np.testing.assert_array_equal(same_policy[9], np.stack([often, often, seldom, seldom], axis=1))
+    np.testing.assert_array_equal(same_policy[9], [often, often, *[seldom] * 4])
 
 
 def test_the_learned_return_is_the_mean_over_random_starts():

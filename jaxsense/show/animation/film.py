@@ -1,5 +1,6 @@
 """The whole picture: both views, what each robot does, and the time."""
 
+from collections.abc import Mapping
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -7,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxsense.config import Config
-from jaxsense.core.types import Belief
+from jaxsense.core.types import Belief, Fusion
 from jaxsense.mission import MissionState, Record
 from jaxsense.show.animation.svg import Timeline, add
 from jaxsense.show.animation.views import SIZE, ArenaView, MapView
@@ -35,7 +36,12 @@ _STYLE = """
 
 
 def draw(
-    config: Config, records: Record, end: MissionState, class_beliefs: Belief, title: str
+    config: Config,
+    records: Record,
+    end: MissionState,
+    fusion: Fusion,
+    fields_of_view: Mapping[str, float],
+    title: str,
 ) -> str:
     """Draws a mission as an animated SVG.
 
@@ -43,16 +49,17 @@ def draw(
       config: all settings.
       records: `[steps]` of all control periods.
       end: the state in which the mission ended.
-      class_beliefs: `[C, D]` beliefs of the classes, to show where they are in the map.
+      fusion: of the map, whose prior and classes are shown in it.
+      fields_of_view: of each sensor, by its name, in degrees.
       title: what to call it.
 
     Returns:
       The content of the file.
     """
-    record, seconds = _frames(config, records, int(end.steps))
+    record, seconds = _frames(config, records, fusion.prior, int(end.steps))
     shown = np.asarray(record.time) / _SPEED
     duration = float(shown[-1]) + _PAUSE
-    views = ArenaView(config, end), MapView(config, end, class_beliefs)
+    views = ArenaView(config, end, fields_of_view), MapView(config, end, fusion.classes)
     height = _TOP + SIZE + _LINE * max(2, len(config.carried)) + 16
     root = Element("svg", {"xmlns": "http://www.w3.org/2000/svg", "class": "film", "role": "img"})
     root.set("viewBox", f"0 0 {WIDTH} {height}")
@@ -75,7 +82,7 @@ def draw(
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _frames(config: Config, records: Record, steps: int) -> tuple[Record, float]:
+def _frames(config: Config, records: Record, prior: Belief, steps: int) -> tuple[Record, float]:
     """The frames from just before a mission until shortly after its end, and its length in s."""
     period = config.mission.control_period
     rows = np.minimum(np.arange(-1, steps + _AFTER).clip(0), len(records.time) - 1)
@@ -83,8 +90,7 @@ def _frames(config: Config, records: Record, steps: int) -> tuple[Record, float]
     record.time[:] = period * np.arange(len(rows))
     record.seen[0], record.scanned[0], record.detected[0] = False, False, False
     record.phase[0], record.target[0] = 0, config.arena.num_pois
-    record.belief.mean[0] = 0.0
-    record.belief.std[0] = np.sqrt(config.mdp.unseen_variance)
+    record.belief.mean[0], record.belief.std[0] = prior.mean, prior.std
     return record, steps * period
 
 

@@ -1,5 +1,6 @@
 """The two halves of the picture: the arena from above, and the shared map."""
 
+from collections.abc import Mapping
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -22,8 +23,8 @@ _SMOOTHING = 8  # frames in which an ellipse comes to its new shape
 class ArenaView:
     """The arena from above: PoIs, robots, their trails, fields of view and looks."""
 
-    def __init__(self, config: Config, end: MissionState):
-        self._config, self._end = config, end
+    def __init__(self, config: Config, end: MissionState, fields_of_view: Mapping[str, float]):
+        self._config, self._end, self._fields_of_view = config, end, fields_of_view
         self._scale = SIZE / config.arena.side
 
     def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
@@ -128,11 +129,8 @@ class ArenaView:
         field, body = (add(each, "g") for each in (field, robot))
         for group in (field, body):
             timeline.animate(group, "rotate", angles)
-        settings = getattr(self._config, self._config.carried[r], None)
-        shape = _sector(
-            self._scale * self._config.navigation.view_range,
-            getattr(settings, "field_of_view", 360.0),
-        )
+        reach = self._scale * self._config.navigation.view_range
+        shape = _sector(reach, self._fields_of_view[self._config.carried[r]])
         view = add(field, "path", d=shape, fill=colour)
         phase, is_blind = record.phase[:, r], record.time >= self._end.faults.blind_at[r]
         opacity = np.where(phase == FACING, 0.34, 0.16)
