@@ -36,6 +36,7 @@ _PAPER = Config(
         replay_capacity=1024000,
         target_period=100,
     ),
+    mission=MissionConfig(auctions=False),
 )
 
 _SMOKE = Config(

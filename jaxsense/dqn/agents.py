@@ -128,6 +128,10 @@ class MapAgent:
         A PoI that is not present is shown to the network as one of a known class, about which
         nothing is left to learn. As its class is unknown, the values are means over all classes.
 
+        A look that gains nothing is still worth what can be done after it, `discount * max Q`. Less
+        this, values of looks are above NOP's only if the looks themselves pay; the highest stays
+        the highest.
+
         Args:
           params: of the Q-network.
           tour_params: not used.
@@ -146,7 +150,9 @@ class MapAgent:
             )
             return self.values(params, self.observe(seen, team, robot))
 
-        return jnp.mean(jax.vmap(values_if)(classes), axis=0)
+        values = jnp.mean(jax.vmap(values_if)(classes), axis=0)
+        later = jnp.maximum(jnp.max(values[:-1]) - values[-1], 0.0)
+        return values.at[:-1].add(-self.discount * later)
 
     @property
     def _network(self) -> MLP:

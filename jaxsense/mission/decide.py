@@ -1,10 +1,13 @@
 """The choice of the PoI that a robot looks at next, and of the viewpoint."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Index, Key, others
-from jaxsense.dqn import team_mdp
+from jaxsense.dqn import rules, team_mdp
 from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission import roadmap
@@ -104,10 +107,17 @@ def _choose(
     settings, num_pois = config.mission, config.arena.num_pois
     given_up = robots.unreachable[robot] | robots.undetected[robot]
     known = _known_to(mission, state, robot, given_up)
-    values = _values(key, mission, models, known, state.policy)
-    counts_time = [policy.counts_time(models.agent) for policy in mission.policies.values()]
-    # Values that include travel time need no tie-breaking.
-    tolerance = jnp.where(jnp.array(counts_time), 0.0, settings.equal_values)[state.policy]
+    of_robots = jax.vmap(
+        lambda each: _values(
+            key, mission, models, dataclasses.replace(known, robot=each), state.policy
+        )
+    )(jnp.arange(len(config.carried)))
+    values = of_robots[robot]
+    # Values that include travel time need no order.
+    counts_time = jnp.array(
+        [policy.counts_time(models.agent) for policy in mission.policies.values()]
+    )[state.policy]
+    tolerance = jnp.where(counts_time, 0.0, settings.equal_values)
     of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
     is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > values[num_pois])
 
@@ -119,8 +129,10 @@ def _choose(
     # Prefer the robot's present target, then PoIs that no other robot heads for, then near ones.
     rank = jnp.where(settings.nearest_first, distance, jnp.arange(num_pois))
     rank += _KEPT * is_kept + _HEADED_FOR * (is_others & settings.avoids_targets)
-    poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
-    choice = jnp.where(jnp.any(is_best), poi, num_pois)
+    by_values = jnp.where(jnp.any(is_best), jnp.argmin(jnp.where(is_best, rank, jnp.inf)), num_pois)
+    gains = of_robots[:, :num_pois] - of_robots[:, num_pois:]
+    by_auction = jnp.argmax(rules.auction(gains, known.times, known.team, known.robot))
+    choice = jnp.where(settings.auctions & ~counts_time, by_auction, by_values)
     return jnp.where(jnp.any(jnp.isnan(jnp.append(of_pois, values[num_pois]))), -1, choice)
 
 
