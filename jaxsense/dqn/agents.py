@@ -3,6 +3,7 @@
 Another kind is a new class with the attributes and methods of `environments.Agent`.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import chex
@@ -128,10 +129,6 @@ class MapAgent:
         A PoI that is not present is shown to the network as one of a known class, about which
         nothing is left to learn. As its class is unknown, the values are means over all classes.
 
-        A look that gains nothing is still worth what can be done after it, `discount * max Q`. Less
-        this, values of looks are above NOP's only if the looks themselves pay; the highest stays
-        the highest.
-
         Args:
           params: of the Q-network.
           tour_params: not used.
@@ -150,9 +147,36 @@ class MapAgent:
             )
             return self.values(params, self.observe(seen, team, robot))
 
-        values = jnp.mean(jax.vmap(values_if)(classes), axis=0)
-        later = jnp.maximum(jnp.max(values[:-1]) - values[-1], 0.0)
-        return values.at[:-1].add(-self.discount * later)
+        return jnp.mean(jax.vmap(values_if)(classes), axis=0)
+
+    def worth(
+        self,
+        params: Params,
+        classes: Belief,
+        belief: Belief,
+        team: Team,
+        robot: Int[Array, ""],
+    ) -> Float[Array, " N"]:
+        """What a look at each PoI is worth, see `Agent.worth`.
+
+        In a map with other open PoIs, a look that gains nothing is still worth what can be done
+        after it, so each PoI is shown alone.
+
+        Args:
+          params: of the Q-network.
+          classes: `[C, D]` joint posterior of each class.
+          belief: `[N, D]` the map.
+          team: which PoIs are present.
+          robot: not used.
+        """
+
+        def of_poi(poi: Int[Array, ""]) -> jax.Array:
+            only = team.present & (jnp.arange(self.num_pois) == poi)
+            alone = dataclasses.replace(team, present=only)
+            values = self.decide(params, None, classes, belief, alone, robot)
+            return values[poi] - values[-1]
+
+        return jax.vmap(of_poi)(jnp.arange(self.num_pois))
 
     @property
     def _network(self) -> MLP:
@@ -298,6 +322,26 @@ class TeamAgent:
         of_pois = jnp.where(is_worth_it, -seconds, 2 * _NOT_WORTH_IT)
         # Comparisons with NaN are false; propagate it instead.
         return jnp.append(jnp.where(jnp.isnan(after), after, of_pois), _NOT_WORTH_IT)
+
+    def worth(
+        self,
+        params: Params,
+        classes: Belief,
+        belief: Belief,
+        team: Team,
+        robot: Int[Array, ""],
+    ) -> Float[Array, " N"]:
+        """What a look at each PoI is worth, see `Agent.worth`.
+
+        Args:
+          params: of the Q-network.
+          classes: not used.
+          belief: `[N, D]` the map.
+          team: where everybody is.
+          robot: `[]` int32, the robot that chooses.
+        """
+        values = self.decide(params, None, classes, belief, team, robot)
+        return values[:-1] - values[-1]
 
     def _own_seconds(self, observed: jax.Array) -> jax.Array:
         """The robot's own time to look at each PoI, `[N, ...]`."""

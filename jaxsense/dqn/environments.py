@@ -128,6 +128,25 @@ class Agent(Protocol):
         """
         ...
 
+    def worth(
+        self,
+        params: Params,
+        classes: Belief,
+        belief: Belief,
+        team: Team,
+        robot: Int[Array, ""],
+    ) -> Float[Array, " N"]:
+        """What a look at each PoI is worth, `[N]`: its value, less NOP's, if no other is left.
+
+        Args:
+          params: of the robot's Q-network.
+          classes: `[C, D]` joint posterior of each class.
+          belief: `[N, D]` the map.
+          team: where everybody is.
+          robot: `[]` int32, the robot that chooses.
+        """
+        ...
+
 
 class Environment(Protocol, Generic[S]):
     """An environment of one learner; a frozen pytree.

@@ -94,11 +94,27 @@ class Policy:
     Attributes:
       values: see `Values`.
       counts_time: `agent -> bool`, whether the values include travel time, so that no other rule
-        needs to break ties.
+        needs to order looks.
+      worth: `(key, models, known) -> [N]`, which looks pay: those above 0. By default, values less
+        that of NOP.
     """
 
     values: Values
     counts_time: Callable[[Agent], bool] = lambda agent: False
+    worth: Values | None = None
+
+    def gains(self, key: Key, models: "Trained", known: Known) -> Float[Array, " N"]:
+        """Numbers above 0 for the looks that pay, see `worth`.
+
+        Args:
+          key: random key.
+          models: trained models.
+          known: what the robot knows.
+        """
+        if self.worth is not None:
+            return self.worth(key, models, known)
+        values = self.values(key, models, known)
+        return values[:-1] - values[-1]
 
 
 def table(own: Mapping[str, Values | Policy] | None = None) -> dict[str, Policy]:
@@ -157,6 +173,20 @@ def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     return models.agent.decide(
         q_network, models.tours, classes, known.belief, known.team, known.robot
     )
+
+
+def latent_worth(key: Key, models: Trained, known: Known) -> Float[Array, " N"]:
+    """Asks the trained Q-network which looks pay.
+
+    Args:
+      key: not used.
+      models: trained models.
+      known: what the robot knows.
+    """
+    del key
+    q_network = jax.tree.map(lambda x: x[known.modality], _stacked(models.q_networks))
+    classes = models.fusion.classes
+    return models.agent.worth(q_network, classes, known.belief, known.team, known.robot)
 
 
 def greedy(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
@@ -251,7 +281,7 @@ def _always(agent: Agent) -> bool:
 
 
 POLICIES: dict[str, Policy] = {
-    "latent": Policy(latent, lambda agent: agent.counts_time),
+    "latent": Policy(latent, lambda agent: agent.counts_time, latent_worth),
     "greedy": Policy(greedy),
     "bayes": Policy(bayes),
     "optimal": Policy(optimal),

@@ -107,12 +107,7 @@ def _choose(
     settings, num_pois = config.mission, config.arena.num_pois
     given_up = robots.unreachable[robot] | robots.undetected[robot]
     known = _known_to(mission, state, robot, given_up)
-    of_robots = jax.vmap(
-        lambda each: _values(
-            key, mission, models, dataclasses.replace(known, robot=each), state.policy
-        )
-    )(jnp.arange(len(config.carried)))
-    values = of_robots[robot]
+    values = _values(key, mission, models, known, state.policy)
     # Values that include travel time need no order.
     counts_time = jnp.array(
         [policy.counts_time(models.agent) for policy in mission.policies.values()]
@@ -130,7 +125,7 @@ def _choose(
     rank = jnp.where(settings.nearest_first, distance, jnp.arange(num_pois))
     rank += _KEPT * is_kept + _HEADED_FOR * (is_others & settings.avoids_targets)
     by_values = jnp.where(jnp.any(is_best), jnp.argmin(jnp.where(is_best, rank, jnp.inf)), num_pois)
-    gains = of_robots[:, :num_pois] - of_robots[:, num_pois:]
+    gains = _gains(key, mission, models, known, state.policy)
     by_auction = jnp.argmax(rules.auction(gains, known.times, known.team, known.robot))
     choice = jnp.where(settings.auctions & ~counts_time, by_auction, by_values)
     return jnp.where(jnp.any(jnp.isnan(jnp.append(of_pois, values[num_pois]))), -1, choice)
@@ -142,6 +137,19 @@ def _values(
     """Values of the A = N + 1 actions of a policy, NOP's last."""
     of_each = [each.values(key, models, known) for each in mission.policies.values()]
     return jnp.stack(of_each)[policy]
+
+
+def _gains(
+    key: Key, mission: Mission, models: Models, known: Known, policy: Int[Array, ""]
+) -> Float[Array, "R N"]:
+    """What a policy expects of each robot's look at each PoI: above 0 if it pays."""
+
+    def of_robot(robot: Int[Array, ""]) -> jax.Array:
+        there = dataclasses.replace(known, robot=robot)
+        of_each = [each.gains(key, models, there) for each in mission.policies.values()]
+        return jnp.stack(of_each)[policy]
+
+    return jax.vmap(of_robot)(jnp.arange(len(mission.config.carried)))
 
 
 def _known_to(
