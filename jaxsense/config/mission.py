@@ -51,7 +51,7 @@ class MissionConfig(Section, place="mission"):
     """Seconds between a robot's decisions, and between its scans."""
     auctions: Traced[bool] = True
     """Whether robots divide the PoIs that a policy finds worth a look by an auction of travel
-    times, unless its values include time; otherwise, they follow the values and the next three
+    times, where their order is free. Otherwise, they follow the values and the next three
     rules."""
     equal_values: Traced[float] = limited(0.1, at_least=0)
     """Actions whose values are this close to the best, in units of the reward, count as equally

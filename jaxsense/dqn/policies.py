@@ -95,12 +95,15 @@ class Policy:
       values: see `Values`.
       counts_time: `agent -> bool`, whether the values include travel time, so that no other rule
         needs to order looks.
+      is_unordered: whether looks that pay may be taken in any order, so that missions choose one,
+        see `mission.auctions` in the settings.
       worth: `(key, models, known) -> [N]`, which looks pay: those above 0. By default, values less
         that of NOP.
     """
 
     values: Values
     counts_time: Callable[[Agent], bool] = lambda agent: False
+    is_unordered: bool = False
     worth: Values | None = None
 
     def gains(self, key: Key, models: "Trained", known: Known) -> Float[Array, " N"]:
@@ -281,13 +284,13 @@ def _always(agent: Agent) -> bool:
 
 
 POLICIES: dict[str, Policy] = {
-    "latent": Policy(latent, lambda agent: agent.counts_time, latent_worth),
-    "greedy": Policy(greedy),
-    "bayes": Policy(bayes),
-    "optimal": Policy(optimal),
-    "naive": Policy(naive(1)),
-    "naive_2": Policy(naive(2)),
-    "naive_3": Policy(naive(3)),
+    "latent": Policy(latent, lambda agent: agent.counts_time, True, latent_worth),
+    "greedy": Policy(greedy, is_unordered=True),
+    "bayes": Policy(bayes, is_unordered=True),
+    "optimal": Policy(optimal, is_unordered=True),
+    "naive": Policy(naive(1), is_unordered=True),
+    "naive_2": Policy(naive(2), is_unordered=True),
+    "naive_3": Policy(naive(3), is_unordered=True),
     "random": Policy(random),
     "nearest": Policy(_by_rule(rules.nearest), _always),
     "auction": Policy(_by_rule(rules.auction), _always),

@@ -127,7 +127,9 @@ def _choose(
     by_values = jnp.where(jnp.any(is_best), jnp.argmin(jnp.where(is_best, rank, jnp.inf)), num_pois)
     gains = _gains(key, mission, models, known, state.policy)
     by_auction = jnp.argmax(rules.auction(gains, known.times, known.team, known.robot))
-    choice = jnp.where(settings.auctions & ~counts_time, by_auction, by_values)
+    is_unordered = jnp.array([each.is_unordered for each in mission.policies.values()])
+    is_auction = settings.auctions & is_unordered[state.policy] & ~counts_time
+    choice = jnp.where(is_auction, by_auction, by_values)
     return jnp.where(jnp.any(jnp.isnan(jnp.append(of_pois, values[num_pois]))), -1, choice)
 
 
@@ -146,7 +148,11 @@ def _gains(
 
     def of_robot(robot: Int[Array, ""]) -> jax.Array:
         there = dataclasses.replace(known, robot=robot)
-        of_each = [each.gains(key, models, there) for each in mission.policies.values()]
+        nothing = jnp.zeros(mission.config.arena.num_pois)
+        of_each = [
+            each.gains(key, models, there) if each.is_unordered else nothing
+            for each in mission.policies.values()
+        ]
         return jnp.stack(of_each)[policy]
 
     return jax.vmap(of_robot)(jnp.arange(len(mission.config.carried)))

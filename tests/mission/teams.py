@@ -9,8 +9,9 @@ from jaxsense import dqn, mission
 from jaxsense.config import PRESETS
 from jaxsense.vae import readout
 
-# Untrained detectors are never sure; what they say is of no importance here.
-CONFIG = replace(PRESETS["smoke"], mission=replace(PRESETS["smoke"].mission, least_confidence=0.0))
+# Untrained detectors are never sure; what they say is of no importance here. Robots follow values.
+_FOLLOWING = replace(PRESETS["smoke"].mission, least_confidence=0.0, auctions=False)
+CONFIG = replace(PRESETS["smoke"], mission=_FOLLOWING)
 POLICIES = tuple(dqn.POLICIES)
 LATENT, NAIVE = POLICIES.index("latent"), POLICIES.index("naive")
 

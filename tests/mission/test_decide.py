@@ -19,7 +19,7 @@ from jaxsense.vae import readout
 POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
 POSES = [[0.0, 0.0, 0.0], [1.2, 1.2, 0.0]]
 SURE = Belief(jnp.array([[3.0, 0.0], [-2.0, 0.0], [0.0, 2.0]]), jnp.full((3, 2), 0.25))
-RULES = {"nearest_first": True, "redecides": True, "avoids_targets": True}
+RULES = {"auctions": False, "nearest_first": True, "redecides": True, "avoids_targets": True}
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +64,31 @@ def test_of_values_within_the_tolerance_the_nearest_is_taken(chosen, values, tar
     assert state.robots.phase[0] == DRIVING
     # PoIs 0 and 1 are in view from where the robot stands: nothing to drive to.
     assert state.robots.goals[0] == (target == 2)
+
+
+@pytest.mark.parametrize(
+    ("values", "target"),
+    [
+        # PoI 0 is straight ahead, 0.04 m from where it is seen; PoI 1 is a quarter turn away.
+        ([0.1, 5.0, 0.2, 0.0], 0),
+        ([-0.1, 0.2, 5.0, 0.0], 1),
+        ([-0.1, -0.2, 5.0, 0.0], 2),
+        ([0.5, 0.5, 0.5, 0.6], 3),
+    ],
+)
+def test_in_an_auction_a_robot_takes_what_is_near_of_all_that_pays(chosen, values, target):
+    state = chosen(values, auctions=True)
+    assert state.robots.target[0] == target
+    assert state.robots.phase[0] == (ENDED if target == 3 else DRIVING)
+
+
+def test_in_an_auction_another_robot_takes_what_is_nearer_to_it(chosen, set_robot):
+    # The other robot stands on PoI 0's far side, turned towards it.
+    there = jnp.array([[0.0, 0.0, 0.0], [1.5, 0.0, jnp.pi]])
+    moved = lambda s: replace(s, scene=replace(s.scene, poses=there))  # noqa: E731
+    assert chosen([1.0, 1.0, 1.0, 0.0], change=moved, auctions=True).robots.target[0] == 1
+    done = lambda s: set_robot(moved(s), 1, phase=ENDED)  # noqa: E731
+    assert chosen([1.0, 1.0, 1.0, 0.0], change=done, auctions=True).robots.target[0] == 0
 
 
 def test_before_its_first_decision_a_robot_has_no_target(arena_of):
