@@ -392,6 +392,8 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
         print_table(console, table)
     if verdict := compare.verdict(summary.cases(found["mission"])):
         say(verdict)
+    if unsound := compare.unsound(found["belief"]):
+        say(unsound)
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ def render(
         argument=lambda path: shlex.quote(str(path)),
         trust=" --trust" if config.sensors else "",
         summary=summary,
+        unsound=compare.unsound(summary["belief"]),
         cards=tables.cards(summary),
         missions=[here, *elsewhere],
         bytes=traffic(summary["mission"]),

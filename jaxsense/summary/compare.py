@@ -8,7 +8,7 @@ import scipy.special
 from jaxtyping import PyTree
 
 from jaxsense.mission import is_fault
-from jaxsense.summary.blocks import Case, Differences, Missions, OfNaive, cases
+from jaxsense.summary.blocks import Beliefs, Case, Differences, Missions, OfNaive, cases
 from jaxsense.summary.metrics import Interval, mean
 
 REFERENCE = "latent"
@@ -19,6 +19,7 @@ Measured = Mapping[str, PyTree[np.ndarray]]
 
 _CONFIDENCE = 0.95
 _NAIVE = ("naive", "naive_2", "naive_3")
+_MOST_TIMES, _MOST_NATS = 1.2, 0.01  # NLL of a sound map, of that of exact Bayes
 _AS_ACCURATE = 0.005  # difference of accuracies that does not matter
 
 
@@ -100,6 +101,29 @@ def compared(missions: Missions) -> Missions:
         kept.pop("of_naive", None)
         found[name] = kept if ratios is None else {**kept, "of_naive": ratios}
     return found
+
+
+def unsound(block: Beliefs) -> str | None:
+    """Says so if the map knows much less than exact Bayes on the same looks.
+
+    Args:
+      block: `belief` of a summary.
+
+    Returns:
+      A sentence with what to change; None if the negative log-likelihood is at most 1.2 times that
+      of exact Bayes plus 0.01 nats, after any number of looks.
+    """
+    rows = zip(block["looks"], block["nll"], block["bayes_nll"], strict=True)
+    of_looks = [(int(mean(looks)), mean(nll), mean(bayes)) for looks, nll, bayes in rows]
+    worse = [row for row in of_looks if not row[1] <= _MOST_TIMES * row[2] + _MOST_NATS]
+    if not worse:
+        return None
+    looks, nll, bayes = max(worse, key=lambda row: row[1] - row[2])
+    after = f"{looks} looks" if looks > 1 else "1 look"
+    return (
+        f"The map loses information: its NLL after {after} is {nll:.2f}, that of exact Bayes "
+        f"{bayes:.2f}. Try jmvae.fusion = filter, or a larger jmvae.latent_size."
+    )
 
 
 def verdict(played: dict[str, Case]) -> str | None:

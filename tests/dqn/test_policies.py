@@ -133,6 +133,29 @@ def test_latent_takes_the_action_that_the_own_q_network_values_most():
             assert policy("latent", **models)(KEY, known) == (best + modality) % 4
 
 
+@pytree
+class Widths(agents.MapAgent):
+    """Values of looks at all PoIs are the sum of all widths, and that of NOP is 1."""
+
+    def values(self, params, observed):
+        width = observed.reshape(self.num_pois, 2, -1)[:, 1].sum()
+        return jnp.append(jnp.full(self.num_pois, width), 1.0)
+
+
+def test_a_look_is_worth_what_it_is_worth_alone():
+    agent = Widths(0.5, 3, 1, (4,))
+    belief = Belief(jnp.zeros((3, 1)), jnp.array([[2.0], [4.0], [8.0]]))
+    # Classes of widths .25 and .75: each of the other two PoIs counts .5.
+    classes = Belief(jnp.zeros((2, 1)), jnp.array([[0.25], [0.75]]))
+    team = known_of(UNKNOWN, np.zeros((3, 2))).team
+    found = agent.worth(None, classes, belief, team, jnp.int32(0))
+    np.testing.assert_allclose(found, [2 + 1 - 1, 4 + 1 - 1, 8 + 1 - 1])
+    # One that was given up is worth what a known one is.
+    there = team.replace(present=jnp.array([True, False, True]))
+    found = agent.worth(None, classes, belief, there, jnp.int32(0))
+    np.testing.assert_allclose(found, [2, 1.5 - 1, 8])
+
+
 def test_a_policy_of_ones_own_is_one_more_entry():
     def backwards(key, models, known):
         return jnp.append(jnp.arange(len(known.looks)), -1)

@@ -1,5 +1,7 @@
 """Differences between policies, and looks and time at equal accuracy, as worked by hand."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -112,3 +114,19 @@ def test_the_verdict_names_naive_exploration_and_the_fastest_policy():
     seeds = {"mean": 50.0, "low": 40.0, "high": 60.0}
     slow = {**latent, "time_s": seeds}
     assert "25 % slower than naive" in compare.verdict({**NAIVE, "latent": slow})
+
+
+@pytest.mark.parametrize(
+    ("nll", "expected"),
+    [
+        # At most 1.2 x .5 + .01 = .61 and 1.2 x .1 + .01 = .13.
+        ([0.61, 0.13], None),
+        ([0.5, 0.14], "NLL after 2 looks is 0.14, that of exact Bayes 0.10."),
+        ([0.9, 0.14], "NLL after 1 look is 0.90, that of exact Bayes 0.50."),
+        ([0.5, math.nan], "NLL after 2 looks is nan"),
+    ],
+)
+def test_a_map_that_loses_information_is_told(nll, expected):
+    block = {"looks": [1, 2], "nll": nll, "bayes_nll": [0.5, 0.1]}
+    told = compare.unsound(block)
+    assert told is None if expected is None else expected in told
