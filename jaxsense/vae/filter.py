@@ -5,8 +5,8 @@ histories of looks instead of subsets, it is `E[sum_t KL(q*_c || q_t)]`: q*_c is
 posterior of the true class c, and q_t the belief after t looks. Among Gaussians, q_t minimises this
 divergence if it has the moments of the mixture `sum_c w_c q*_c`, weighted by the probabilities of
 the classes after the looks. So the mean shows which classes are plausible, and the width how
-uncertain the belief is. The weights can be computed from the moments: a belief is a sufficient
-memory.
+uncertain the belief is. Log-likelihoods that are linear in the moments of the classes keep the
+weights among those that `readout` reads without error: a belief is a sufficient memory.
 """
 
 from collections.abc import Mapping
@@ -37,8 +37,8 @@ class Filter:
     """Fusion by a filter.
 
     Attributes:
-      networks: by modality, parameters of the network that maps features to log-likelihoods of
-        the classes.
+      networks: by modality, parameters of the network that maps features to K coefficients of the
+        classes' moments in the log-likelihood, see `log_likelihood`.
       classes: `[C, D]` mean joint posterior of each class.
       prior: `[D]` belief before any look.
       readout: reads class probabilities from beliefs.
@@ -101,6 +101,8 @@ class Filter:
     ) -> Float[Array, "C *B"]:
         """Log-likelihood of each class given one look, up to a constant.
 
+        It is linear in the whitened moments of the classes, see `Readout`.
+
         Args:
           params: of the networks, by modality.
           features: `[D_m]` probabilities of the labels, or `[D_m, B]`.
@@ -109,9 +111,11 @@ class Filter:
         Returns:
           `[C]`, or `[C, B]`.
         """
-        network = MLP(self.hidden, len(self.classes.mean))
+        moments = self.readout.of_classes
+        network = MLP(self.hidden, moments.shape[1])
         logarithm = jnp.log(jnp.maximum(features, _MIN_FEATURE))
-        return networks.apply(network, params[self.model.modalities[modality]], logarithm)
+        found = networks.apply(network, params[self.model.modalities[modality]], logarithm)
+        return jnp.matmul(moments, found, precision=jax.lax.Precision.HIGHEST)
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
         """Probability of each class according to a `[D]` belief."""
@@ -136,14 +140,15 @@ def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterC
     chex.assert_shape(classes.std, classes.mean.shape, custom_message="classes.std")
     chex.assert_shape(prior.mean, (model.latent_size,), custom_message="prior.mean")
     chex.assert_shape(prior.std, (model.latent_size,), custom_message="prior.std")
-    network = MLP(config.hidden, len(classes.mean))
+    read = readout.make(classes)
+    network = MLP(config.hidden, read.of_classes.shape[1])
     keys = jax.random.split(key, len(model.modalities))
     of_each = zip(keys, model.modalities, model.feature_sizes, strict=True)
     return Filter(
         networks={name: networks.init(k, network, size) for k, name, size in of_each},
         classes=classes,
         prior=prior,
-        readout=readout.make(classes),
+        readout=read,
         model=model,
         hidden=config.hidden,
     )
