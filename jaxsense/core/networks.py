@@ -78,3 +78,16 @@ def apply(
       `[A]`, or `[A, B]`.
     """
     return jnp.asarray(network.apply(params, x))
+
+
+def scale_last(network: MLP, params: Params, factor: float | jax.Array) -> Params:
+    """Multiplies the last layer, and so the outputs, of an `MLP`.
+
+    Args:
+      network: the network.
+      params: its parameters.
+      factor: `[]` what to multiply with.
+    """
+    layers, last = dict(params["params"]), f"Dense_{len(network.hidden)}"
+    layers[last] = jax.tree.map(lambda x: factor * x, layers[last])
+    return {**params, "params": layers}

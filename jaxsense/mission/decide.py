@@ -115,7 +115,20 @@ def _choose(
     tolerance = jnp.where(counts_time, 0.0, settings.equal_values)
     of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
     is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > values[num_pois])
+    by_values = _by_values(mission, state, robot, is_best)
+    gains = _gains(key, mission, models, known, state.policy)
+    by_auction = jnp.argmax(rules.auction(gains, known.times, known.team, known.robot))
+    is_unordered = jnp.array([each.is_unordered for each in mission.policies.values()])
+    is_auction = settings.auctions & is_unordered[state.policy] & ~counts_time
+    choice = jnp.where(is_auction, by_auction, by_values)
+    return jnp.where(jnp.any(jnp.isnan(jnp.append(of_pois, values[num_pois]))), -1, choice)
 
+
+def _by_values(
+    mission: Mission, state: MissionState, robot: Index, is_best: Bool[Array, " N"]
+) -> Int[Array, ""]:
+    """One of the PoIs with the best values, by the rules; N if there is none."""
+    settings, robots, num_pois = mission.config.mission, state.robots, len(is_best)
     position = state.scene.poses[robot, :2]
     distance = jnp.linalg.norm(state.scene.layout.position - position[None], axis=-1)
     is_kept = jnp.arange(num_pois) == robots.target[robot]
@@ -124,13 +137,8 @@ def _choose(
     # Prefer the robot's present target, then PoIs that no other robot heads for, then near ones.
     rank = jnp.where(settings.nearest_first, distance, jnp.arange(num_pois))
     rank += _KEPT * is_kept + _HEADED_FOR * (is_others & settings.avoids_targets)
-    by_values = jnp.where(jnp.any(is_best), jnp.argmin(jnp.where(is_best, rank, jnp.inf)), num_pois)
-    gains = _gains(key, mission, models, known, state.policy)
-    by_auction = jnp.argmax(rules.auction(gains, known.times, known.team, known.robot))
-    is_unordered = jnp.array([each.is_unordered for each in mission.policies.values()])
-    is_auction = settings.auctions & is_unordered[state.policy] & ~counts_time
-    choice = jnp.where(is_auction, by_auction, by_values)
-    return jnp.where(jnp.any(jnp.isnan(jnp.append(of_pois, values[num_pois]))), -1, choice)
+    poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
+    return jnp.where(jnp.any(is_best), poi, num_pois)
 
 
 def _values(

@@ -20,6 +20,7 @@ from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs, compile_programs
+from jaxsense.summary import compare
 from jaxsense.training.agents import learner
 from jaxsense.training.comparison import permutations
 from jaxsense.training.measures import reliability
@@ -115,6 +116,8 @@ def run(
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
     sensors = player.mission.world.sensors
+    beliefs = summary.beliefs(trained.outputs["beliefs"])
+    is_sound = compare.unsound(beliefs) is None
     return RunResult(
         models=networks,
         windows={
@@ -136,15 +139,15 @@ def run(
                 lambda x: np.asarray(x).tolist(), trained.outputs["detector_metrics"]
             ),
             "jmvae": summary.jmvae(vars(latent)),
-            "belief": summary.beliefs(trained.outputs["beliefs"]),
-            "dqn": {name: _agent(config, name, trained) for name in config.modalities},
+            "belief": beliefs,
+            "dqn": {name: _agent(config, name, trained, is_sound) for name in config.modalities},
             "mission": summary.missions(player.mission, found.metrics),
         },
     )
 
 
-def _agent(config: Config, modality: str, trained: Trained) -> summary.Agent:
-    """One modality's block of `dqn`."""
+def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> summary.Agent:
+    """One modality's block of `dqn`, without an optimum if the map is not sound."""
     rewards = jax.tree.map(np.asarray, trained.outputs[f"policies_{modality}"])
     others = jax.tree.map(np.asarray, trained.outputs.get(f"numbers_{modality}", []))
     fusion, values = trained.outputs["fusion"], trained.outputs["look_values"]
@@ -154,5 +157,5 @@ def _agent(config: Config, modality: str, trained: Trained) -> summary.Agent:
         permutations(config),
         trained.curves[learner(config, modality)]["seconds"],
         dict(zip(config.evaluation.num_pois, others, strict=True)),
-        has_optimum(fusion, values[config.modalities.index(modality)]),
+        is_sound and has_optimum(fusion, values[config.modalities.index(modality)]),
     )

@@ -146,10 +146,8 @@ def calibrate(
 
     each = jnp.geomspace(1 / _MAX_TEMPERATURE, _MAX_TEMPERATURE, 257)
     best = each[jnp.argmin(jax.lax.map(loss, each))]
-    layers = dict(detector.params["params"])
-    last = f"Dense_{len(detector.hidden)}"
-    layers[last] = jax.tree.map(lambda x: best * x, layers[last])
-    return dataclasses.replace(detector, params={**detector.params, "params": layers})
+    params = networks.scale_last(_network(detector), detector.params, best)
+    return dataclasses.replace(detector, params=params)
 
 
 def _network(detector: Detector) -> MLP:

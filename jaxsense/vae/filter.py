@@ -127,7 +127,7 @@ class Filter:
 
 
 def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterConfig) -> Filter:
-    """Untrained filter.
+    """Untrained filter, to which looks say nothing.
 
     Args:
       key: random key.
@@ -144,8 +144,13 @@ def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterC
     network = MLP(config.hidden, read.of_classes.shape[1])
     keys = jax.random.split(key, len(model.modalities))
     of_each = zip(keys, model.modalities, model.feature_sizes, strict=True)
+    # From zero: probabilities that random log-likelihoods have saturated would hardly learn.
+    silent = {
+        name: networks.scale_last(network, networks.init(k, network, size), 0.0)
+        for k, name, size in of_each
+    }
     return Filter(
-        networks={name: networks.init(k, network, size) for k, name, size in of_each},
+        networks=silent,
         classes=classes,
         prior=prior,
         readout=read,

@@ -22,5 +22,5 @@ def test_a_poi_must_be_higher_than_the_beams():
 def test_a_control_period_is_some_steps_of_the_physics(monkeypatch):
     monkeypatch.setattr(mission_settings, "TIMESTEP", 0.02)
     MissionConfig(control_period=0.1)
-    with pytest.raises(ConfigError, match=r"must be a multiple of 0.02 s within 0.1 and 0.4 s"):
+    with pytest.raises(ConfigError, match=r"must be a multiple of 0.02 s from 0.1 to 0.4 s"):
         MissionConfig(control_period=0.09)

@@ -158,3 +158,9 @@ def test_what_the_filter_refuses_is_named(change, expected):
     }
     with pytest.raises(ValueError, match="^" + expected.replace(".", r"\.")):
         exact().update(**given)
+
+
+def test_looks_say_nothing_to_an_untrained_filter():
+    found = untrained()
+    after = update(found, PRIOR, [0.9, 0.1], 0)
+    np.testing.assert_allclose(found.class_probabilities(after), 1 / 3, atol=1e-6)
