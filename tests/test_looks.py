@@ -167,7 +167,9 @@ def test_the_reward_in_nats_is_the_fall_of_the_maps_entropy_minus_the_cost(model
     classes = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
     prior, sizes = fusion.prior(MODEL, 20.0), FilterConfig(hidden=(1,))
     found = jax.jit(lambda key: filter.init(key, MODEL, classes, prior, sizes))(jax.random.key(0))
-    layer = {"kernel": jnp.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0]]), "bias": jnp.zeros(3)}
+    of_moments = np.linalg.pinv(found.readout.of_classes)
+    kernel = jnp.float32(np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0]]) @ of_moments.T)
+    layer = {"kernel": kernel, "bias": jnp.zeros(len(of_moments))}
     of_each = {m: {"params": {"Dense_0": layer}} for m in MODEL.modalities}
     found = replace(found, networks=of_each, hidden=())
     config = replace(

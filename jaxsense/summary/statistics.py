@@ -57,8 +57,8 @@ def statistics(results: Sequence[Results]) -> Results:
       results: of one or more runs, with the same structure.
 
     Returns:
-      The same structure with an `Interval` in place of each number. Omits what some run lacks and
-      what is not a number; in a list, None takes its place.
+      The same structure with an `Interval` in place of each number, and None where some run has
+      None. Omits what some run lacks and what is not a number; in a list, None takes its place.
     """
     return cast(Results, _statistics(list(results)))
 
@@ -68,8 +68,9 @@ def _statistics(values: Sequence[object]) -> object:
     if isinstance(first, dict):
         blocks = [value if isinstance(value, dict) else {} for value in values]
         names = [name for name in first if all(name in block for block in blocks)]
-        found = {name: _statistics([block[name] for block in blocks]) for name in names}
-        return {name: value for name, value in found.items() if value is not None}
+        columns = {name: [block[name] for block in blocks] for name in names}
+        found = {name: _statistics(column) for name, column in columns.items()}
+        return {name: x for name, x in found.items() if x is not None or None in columns[name]}
     if isinstance(first, list):
         lists = [value for value in values if isinstance(value, list)]
         return [_statistics(row) for row in zip(*lists, strict=True)]

@@ -13,6 +13,8 @@ def test_statistics_are_those_of_student():
     assert found["a"]["b"] == pytest.approx({"mean": 2.0, "low": -10.706, "high": 14.706}, abs=1e-3)
     assert found["c"] == [{"mean": 5.0, "low": 5.0, "high": 5.0}, None]
     assert "d" not in found
+    some = statistics.statistics([{"a": None, "b": 1.0}, {"a": 2.0, "b": None}, {"a": 2.0}])
+    assert some == {"a": None}
     assert statistics.statistics([{"a": 3.0}]) == {"a": {"mean": 3.0, "low": None, "high": None}}
 
 
