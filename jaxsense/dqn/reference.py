@@ -44,13 +44,17 @@ def reference(
     return lambda known, classes: _informed(rewards, labels, known.looks > 0, classes)
 
 
-def has_optimum(fusion: Fusion, values: LookValues) -> bool:
+def has_optimum(fusion: Fusion, values: LookValues, is_sound: bool) -> bool:
     """Whether `reference` is the optimum, up to the error of a fine lattice.
 
     Args:
       fusion: of the MDP.
       values: of the agent's own sensor.
+      is_sound: whether class probabilities of the map are about those of exact Bayes. Only rewards
+        that do not read them, in a map that does not accumulate looks, have an optimum without.
     """
+    if not is_sound and (fusion.accumulates or values.labels is not None):
+        return False
     number = len(fusion.classes.mean) if values.labels is None else values.labels.shape[1]
     return not fusion.accumulates or steps_of_lattice(number, len(values.q)) >= _FINE
 

@@ -147,7 +147,7 @@ def run(
 
 
 def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> summary.Agent:
-    """One modality's block of `dqn`, without an optimum if the map is not sound."""
+    """One modality's block of `dqn`."""
     rewards = jax.tree.map(np.asarray, trained.outputs[f"policies_{modality}"])
     others = jax.tree.map(np.asarray, trained.outputs.get(f"numbers_{modality}", []))
     fusion, values = trained.outputs["fusion"], trained.outputs["look_values"]
@@ -157,5 +157,5 @@ def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> s
         permutations(config),
         trained.curves[learner(config, modality)]["seconds"],
         dict(zip(config.evaluation.num_pois, others, strict=True)),
-        is_sound and has_optimum(fusion, values[config.modalities.index(modality)]),
+        has_optimum(fusion, values[config.modalities.index(modality)], is_sound),
     )

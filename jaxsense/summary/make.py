@@ -22,6 +22,7 @@ from jaxsense.summary.compare import REFERENCE, Measured, compared, differences
 
 _UNAMBIGUOUS = 0.9  # share of looks in a single class, above which the class counts as one
 _AS_GOOD = 0.01  # reward by which a policy may miss the optimum
+_ERROR = 0.01  # of the optimum, as a share of it
 _FLOAT_BYTES = 4
 
 
@@ -59,10 +60,13 @@ def agent(
       is_permutation: for each state of the map, whether all classes differ, as in the paper.
       seconds: of the training, chunk by chunk.
       others: `rewards` with other numbers of PoIs, whose last starts are the random ones.
-      has_optimum: whether `optimal` is the optimum; what rests on it is None otherwise.
+      has_optimum: whether `optimal` is the optimum; what rests on it is None otherwise, and where
+        another policy gets clearly more.
     """
     num_starts, env_steps = config.evaluation.num_starts, config.dqn.epochs * config.dqn.num_envs
     num_states = len(is_permutation)
+
+    has_optimum &= not _is_exceeded(rewards, num_starts)
 
     def first(policy: str) -> float:
         return float(rewards[policy][1][num_states:].mean())
@@ -95,7 +99,8 @@ def _returns(
 ) -> Returns:
     """Mean total rewards from random starts, the last ones."""
     of = {name: float(total[-num_starts:].mean()) for name, (total, _) in rewards.items()}
-    optimal = of["optimal"] if has_optimum else None
+    is_optimum = has_optimum and not _is_exceeded(rewards, num_starts)
+    optimal = of["optimal"] if is_optimum else None
     return {
         "return": of["latent"],
         "optimal": optimal,
@@ -105,6 +110,16 @@ def _returns(
         # Where no look pays, the optimum is 0.
         "fraction_of_optimal": of["latent"] / optimal if optimal else None,
     }
+
+
+def _is_exceeded(rewards: Mapping[str, tuple[np.ndarray, np.ndarray]], num_starts: int) -> bool:
+    """Whether some policy gets more than `optimal` from random starts, by more than its error."""
+    of = {name: total[-num_starts:] for name, (total, _) in rewards.items()}
+    error = _ERROR * abs(of["optimal"].mean())
+    return any(
+        np.mean(more) > error + 2 * np.std(more) / np.sqrt(num_starts)
+        for more in (each - of["optimal"] for each in of.values())
+    )
 
 
 def missions(mission: Mission, played: Mapping[str, Measured]) -> Missions:

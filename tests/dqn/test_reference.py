@@ -1,5 +1,7 @@
 """The reference of the map MDP, on rewards that are known."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -76,3 +78,21 @@ def test_rewards_of_one_poi_and_three_modalities():
     np.testing.assert_allclose(rewards, np.repeat(of_codes, 3).reshape(8, 3), rtol=1e-4)
     for seen, expected in (((0, 0, 1), 0), ((0, 1, 1), 1)):
         assert chosen(rewards, [seen], [2], jnp.zeros((3, 3), int)) == expected
+
+
+@pytest.mark.parametrize(
+    ("accumulates", "number", "of_labels", "is_sound", "expected"),
+    [
+        (False, 16, False, False, True),  # as in the paper: rewards do not read probabilities
+        (False, 16, True, False, False),
+        (False, 16, True, True, True),
+        (True, 3, False, True, True),
+        (True, 3, False, False, False),
+        (True, 16, False, True, False),  # a lattice of 16 classes is coarse
+    ],
+)
+def test_where_an_optimum_can_be_had(accumulates, number, of_labels, is_sound, expected):
+    fusion = SimpleNamespace(accumulates=accumulates, classes=SimpleNamespace(mean=range(number)))
+    labels = np.zeros((2, 2)) if of_labels else None
+    values = SimpleNamespace(labels=labels, q=range(2048))
+    assert reference.has_optimum(fusion, values, is_sound) is expected  # pyright: ignore

@@ -74,6 +74,13 @@ def test_figures_of_policies_as_worked_by_hand():
     assert [without[end] for end in ends] == [None] * 4
     assert without["one_step"]["optimal"] is None
     assert without["return"] == figures["return"]
+    # More than the optimum, of which .011 and two standard errors are let pass: .020, then .038.
+    for more, is_null in (([0.02, 0.03, 0.04], True), ([0.0, 0.0, 0.05], False)):
+        better = {**rewards, "greedy": (total[1] + np.append(np.zeros(16), more), total[1])}
+        found = make.agent(SMALL, better, different, [1.0], {9: better})
+        for block in (found, found["other_numbers"]["9"]):
+            assert (block["optimal"] is None) is is_null
+        assert (found["optimal_states"] is None) is is_null
     none = dict.fromkeys(names, (np.zeros(19), np.zeros(19)))
     nothing = make.agent(SMALL, none, permutations(SMALL), [1.0], {})
     assert "other_numbers" not in nothing
