@@ -261,6 +261,7 @@ def test_the_widest_belief_is_looked_at_twice_at_most(example):
     np.testing.assert_allclose(widest(None, None, known), [-1.0, 1.0, 1.3, 0.0], rtol=1e-6)
 
 
+@pytest.mark.slow  # compiles a training
 def test_new_reward(capsys):
     told = printed("new_reward", capsys)
     first, last = map(float, re.findall(r"-?\d+\.\d{3}", told))

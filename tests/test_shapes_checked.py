@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow  # half a minute: a training and a mission, every call checked
+
 
 @pytest.fixture(scope="module")
 def found():

@@ -102,6 +102,7 @@ def test_the_table_has_all_numbers_of_learning_that_may_be_traced():
     assert set(VALUES) == learning - {"jmvae.reconstruction_weights", "mdp.look_cost"}
 
 
+@pytest.mark.slow
 def test_all_settings_together_do_what_the_constants_do(together):
     second = {name: values[1] for name, values in VALUES.items()}
     alone = jax.jit(lambda: learn(with_values(second)))()

@@ -87,6 +87,7 @@ def check_printed(rows, output, errors):
         assert has_package(package) or f"peer {adapter} is left out" in errors
 
 
+@pytest.mark.slow
 def test_quick_rows_with_a_table_and_the_names_of_missing_peers(quick):
     assert tuple(quick[0]) == QUICK
     check_rows(quick[0])

@@ -25,6 +25,7 @@ def env():
     return TeamParallelEnv(small.team(), small.TEAM)
 
 
+@pytest.mark.slow
 def test_pettingzoos_own_tests_pass(env):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
@@ -32,6 +33,7 @@ def test_pettingzoos_own_tests_pass(env):
         parallel_seed_test(lambda: TeamParallelEnv(small.team(), small.TEAM), num_cycles=40)
 
 
+@pytest.mark.slow
 def test_pettingzoos_own_tests_of_turns_pass():
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)

@@ -65,6 +65,7 @@ def way(before, after):
     return after.scene.poses[:, 0, 0] - before.scene.poses[:, 0, 0]
 
 
+@pytest.mark.slow  # compiles contacts
 def test_contacts_hold_a_robot_back_where_there_are_any(move, pushing):
     free = mission.make_mission(CONFIG, contacts=False)
     ends, start = {}, pushing(0.002, 0.002, 0.002)
