@@ -49,6 +49,14 @@ def test_a_file_that_cannot_be_written_stays_as_it_was(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_line_that_cannot_be_added_is_an_error_that_names_the_file(tmp_path):
+    files.append(tmp_path / "file", "first")
+    files.append(tmp_path / "file", "second")
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "first\nsecond\n"
+    with pytest.raises(files.WriteError, match=r"No such file or directory: '.*nowhere/file'"):
+        files.append(tmp_path / "nowhere" / "file", "third")
+
+
 def test_many_writers_of_one_file_never_mix(tmp_path):
     path, texts = tmp_path / "file", [letter * 100_000 for letter in "abcdefgh"]
     with ThreadPoolExecutor(8) as executor:

@@ -122,7 +122,7 @@ def _idle_robots(num_robots: int, num_pois: int, num_views: int) -> Robots:
     number = jnp.zeros(num_robots, jnp.int32)
     seconds = jnp.zeros(num_robots)
     return Robots(
-        phase=number + IDLE,
+        phase=jnp.full(num_robots, IDLE, jnp.int32),
         target=number + num_pois,
         view=number,
         command=jnp.zeros((num_robots, 2)),

@@ -5,7 +5,6 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 from mujoco import mjx
 
@@ -88,10 +87,9 @@ def _integrate(
     layout: Layout,
 ) -> _Motion:
     """Makes the physics steps, in each of which the commands approach the wanted ones."""
-    is_empty = not np.any(arena.poi_of_geom >= 0)
 
     def place_pois(layout: Layout, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
-        data = arena.data if is_empty else arenas.put(arena, layout, poses)
+        data = arenas.put(arena, layout, poses)
         return data.mocap_pos, data.mocap_quat
 
     placed = jax.vmap(place_pois)(layout, motion.poses)

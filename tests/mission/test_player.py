@@ -63,6 +63,12 @@ def play(team, models, monkeypatch):
     def run(workers, models=models):
         with Compiler(Monitor()) as compiler:
             player = missions.Player(team, compiler, 4, workers)
+            waited = []
+            wait = missions.Program.wait
+            with monkeypatch.context() as patch:
+                patch.setattr(missions.Program, "wait", lambda p: (waited.append(p), wait(p)))
+                player.wait()
+            assert len(set(waited)) == 2  # before anything is timed
             return player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, 9)
 
     return run
