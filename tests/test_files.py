@@ -35,16 +35,21 @@ def test_a_file_is_replaced_as_a_whole_and_made_durable(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_file_that_cannot_be_written_stays_as_it_was(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [(OSError(28, "full"), "No space left on device"), (OSError("too far"), "too far")],
+)
+def test_a_file_that_cannot_be_written_stays_as_it_was(tmp_path, monkeypatch, error, reason):
     path = tmp_path / "file"
     files.write(path, "first")
 
-    def full(number):
-        raise OSError(28, "No space left on device")
+    def fail(number):
+        raise error
 
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match=r"No space left on device: '.*file'"):
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(files.WriteError) as raised:
         files.write(path, "second")
+    assert (raised.value.strerror, raised.value.filename) == (reason, str(path))
     assert path.read_text(encoding="utf-8") == "first"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -284,13 +289,15 @@ def test_a_new_file_has_its_name_once_it_is_whole_and_takes_that_of_no_other(
 
     if not has_links:
         monkeypatch.setattr(os, "link", without_links)
-    path = tmp_path / "file"
+    path, synced, sync = tmp_path / "file", [], os.fsync
+    monkeypatch.setattr(os, "fsync", lambda n: (synced.append(os.fstat(n).st_mode), sync(n)))
     with files.new(path) as file:
         file.write(b"new")
         assert not path.exists()
         (partial,) = tmp_path.iterdir()
         assert files.is_unfinished(partial, "file")
     assert path.read_bytes() == b"new"
+    assert [stat.S_ISDIR(mode) for mode in synced] == [False, True]
     with pytest.raises(FileExistsError), files.new(path):
         pass
     other = tmp_path / "other"

@@ -95,6 +95,15 @@ def test_what_was_saved_is_not_trained_again(toy):
     np.testing.assert_array_equal(first.curves["count"]["double"], again.curves["count"]["double"])
 
 
+def test_what_cannot_be_saved_ends_the_run_with_its_error(toy, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Checkpoints, "save", full)
+    with pytest.raises(OSError, match="No space left on device"):
+        toy(counting("count"), saved=True)
+
+
 @pytest.mark.parametrize("bad", [(), (0,), (1,)])
 def test_an_optional_training_that_is_not_finite_is_left_out_and_named(toy, bad):
     def finish(config, state):

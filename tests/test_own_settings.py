@@ -136,6 +136,12 @@ def test_a_dictionary_of_the_caller_is_copied():
     assert found.values == {"cold": 5.0}
 
 
+def test_plain_dictionaries_are_compared_as_everywhere():
+    found = Attribute({"cold": 5.0, "hot": 60.0}).values
+    assert found == {"hot": 60.0, "cold": 5.0}
+    assert found != {"hot": 60.0, "cold": 6.0}
+
+
 @pytest.mark.parametrize(
     "again",
     [copy.copy, copy.deepcopy, lambda config: pickle.loads(pickle.dumps(config))],

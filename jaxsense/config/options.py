@@ -73,7 +73,8 @@ def read_some(arguments: type, argv: list[str], fields: Sequence[str]) -> dict[s
       OptionError: if the value of one of these options is missing.
     """
     options = [option for option in _options(arguments) if option.path[0] in fields]
-    return {path[0]: value for path, value in _split(options, argv)[0].items()}
+    values, _ = _split(options, argv)
+    return {field: value for (field,), value in values.items()}
 
 
 def describe(program: str, base: object, common: Sequence[str] = ()) -> str:

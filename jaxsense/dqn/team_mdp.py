@@ -347,7 +347,7 @@ def step(
     terminated, others_ask = ~jnp.any(works), jnp.any(asks)
     passes = ~others_ask & ~terminated
 
-    goals = team.positions[jnp.minimum(target, num_pois - 1)]
+    goals = team.positions.at[target].get(mode="clip")
     times = jax.vmap(lambda pose, goal: travel_seconds(travel, pose, goal[None])[0])(
         team.poses, goals
     )

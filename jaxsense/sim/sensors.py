@@ -353,7 +353,8 @@ def scan(
     check_layout(arena.config, layout)
     pose = robot_poses(data)[robot]
     section = _section(arena, data, sensor.height, robot)
-    in_world = raycast.turned((directions[0], directions[1]), pose[2])
+    x, y = directions
+    in_world = raycast.turned((x, y), pose[2])
     hits = raycast.cast_along(section, pose[:2], in_world)
     return sensor.read(key, hits, surfaces(arena, layout), light)
 

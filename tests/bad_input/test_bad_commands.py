@@ -57,7 +57,7 @@ def place(tmp_path, monkeypatch):
         "binary": bytes(range(256)),
         "deep": b"[" * 100_000,
         "deep_object": b'{"config":' * 100_000,
-        "twice": b'{"seed": 1, "seed": 2}',
+        "twice": b'{"preset": "smoke", "seed": 1, "seed": 2}',
         "digits": b'{"seed": 1' + b"0" * 10_000 + b"}",
         "empty": b"",
         "null": b"null",

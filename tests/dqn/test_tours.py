@@ -96,6 +96,8 @@ def test_trials_start_some_choices_on():
     assert 5 < found.is_tried.any(axis=0).sum() < 60
     assert set(found.is_tried.sum(axis=0).tolist()) == {0, 2}
     assert len(np.unique(np.round(own_seconds(found)[0], 3))) > 1
+    # Seconds count from the choice on, of which no way is longer than the whole.
+    assert found.seconds.max() <= 1.0001 * max(IN_ORDER, (BACKWARDS + IN_ORDER) / 2)
 
 
 def test_a_team_that_never_ends_stops_at_the_limit():
