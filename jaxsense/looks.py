@@ -185,6 +185,34 @@ def surveys(
     return jax.tree.map(lambda x: x[:number], found)
 
 
+def pairs(
+    keys: Key, world: World, classes: Int[Array, "S N"], modality: int
+) -> tuple[Float[Array, "S F"], Float[Array, "S F"], Float[Array, " S"]]:
+    """Looks twice at the first PoI of many scenes, from places near each other.
+
+    Args:
+      keys: `[S]` random keys.
+      world: the simulation.
+      classes: `[S, N]` int32 classes of the PoIs.
+      modality: index of the sensor; static.
+
+    Returns:
+      `[S, F]` windows of the first look and of the second, and the `[S]` distances between their
+      places, in metres.
+    """
+
+    def look_twice(scene: tuple[Key, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        key, classes = scene
+        scene_key, first_key, second_key = jax.random.split(key, 3)
+        drawn, poi = worlds.random_scene(scene_key, world, classes), jnp.int32(0)
+        first, seen = worlds.look(first_key, world, drawn, modality, poi)
+        second, moved = worlds.look_again(second_key, world, seen, modality, poi)
+        return first, second, moved
+
+    batch = min(_SCENES_AT_ONCE, len(keys))
+    return jax.lax.map(look_twice, (keys, classes), batch_size=batch)
+
+
 def detect_all(
     trained: tuple[Detector, ...], windows: tuple[Float[Array, "S N _"], ...]
 ) -> tuple[Float[Array, "S N _"], ...]:

@@ -15,10 +15,11 @@ from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.sim import sensors, windows
 from jaxsense.sim.sensors import Sensor
-from jaxsense.vae import detectors, filter, fusion, jmvae, latent, readout
+from jaxsense.vae import detectors, filter, fusion, jmvae, latent, novelty, readout
 from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.jmvae import Jmvae
+from jaxsense.vae.novelty import Novelty
 
 
 @pytree
@@ -30,6 +31,7 @@ class Models:
       jmvae: parameters of the JMVAE.
       fusion: how looks update the map.
       bayes: the exact Bayes filter over classes, to compare with.
+      novelty: how much of a look is new evidence.
       look_values: for each modality, the values of looks by dynamic programming.
       agent: how the Q-networks are used.
       q_networks: for each modality, parameters of the Q-network; the same for all in a team.
@@ -40,6 +42,7 @@ class Models:
     jmvae: Params
     fusion: Fusion
     bayes: Bayes
+    novelty: Novelty
     look_values: tuple[LookValues, ...]
     agent: Agent
     q_networks: tuple[Params, ...]
@@ -132,6 +135,7 @@ def init(key: Key, config: Config) -> Models:
         jmvae=params,
         fusion=fusions[config.jmvae.fusion](),
         bayes=make_bayes(config),
+        novelty=novelty.independent(len(config.modalities)),
         look_values=tuple(_no_values(config, m) for m in config.modalities),
         agent=agent,
         q_networks=tuple(agent.init(k) for k in dqn_keys),

@@ -23,6 +23,9 @@ class DetectorConfig(Section, place="detector"):
     temperature of its probabilities."""
     num_held_out: int = limited(8192, at_least=1)
     """Simulated scans that measure the accuracy."""
+    num_repeats: int = limited(0, at_least=0, at_most=1_000_000)
+    """Pairs of looks at one PoI by each sensor, from which it is learned how much of a look from
+    near an earlier one is new, see `vae.novelty`. With 0, all of it counts."""
     steps: int = limited(4000, at_least=1)
     """Gradient steps."""
     batch: int = limited(512, at_least=1)
@@ -39,6 +42,7 @@ class DetectorConfig(Section, place="detector"):
         return {
             "hidden": _weights(sizes.window, *self.hidden, sizes.labels),
             "num_scans num_held_out": max(self.num_scans, self.num_held_out) * sizes.window,
+            "num_repeats": self.num_repeats * sizes.classes,
             "batch steps": self.batch * max(self.steps, sizes.window),
         }
 

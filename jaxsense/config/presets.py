@@ -82,7 +82,11 @@ _NOISY = Config(
     ),
     viewpoint=ViewpointConfig(max_distance=4.0),
     detector=DetectorConfig(
-        hidden=(64, 64, 64), num_scans=131072, calibration=0.1, num_held_out=32768
+        hidden=(64, 64, 64),
+        num_scans=131072,
+        calibration=0.1,
+        num_held_out=32768,
+        num_repeats=16384,
     ),
     jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000, restarts=1),
     mdp=MdpConfig(reward="nats", look_cost=0.1),

@@ -88,6 +88,7 @@ class Fusion(Protocol):
         seen: Bool[Array | np.ndarray, " M"],
         features: Float[Array, " D_m"],
         modality: int,
+        weight: Float[Array, ""] | float = 1.0,
     ) -> Belief:
         """Belief after one more look.
 
@@ -96,6 +97,7 @@ class Fusion(Protocol):
           seen: `[M]` bool, which modalities have looked before.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
+          weight: `[]` share of the look that is new evidence, see `vae.novelty`.
         """
         ...
 

@@ -16,6 +16,7 @@ from jaxsense.mission.state import (
     ENDED,
     FACING,
     IDLE,
+    RECENT_LOOKS,
     Mission,
     MissionState,
     Robots,
@@ -260,10 +261,12 @@ def _look(
     features = models.features(modality, sensor, readings)
     is_confident = jnp.max(features) >= mission.config.mission.least_confidence
     old = jax.tree.map(lambda x: x[aim.poi], state.belief)
+    moved = state.moved(scene.poses[robot, :2][None], aim.poi, modality)[0]
+    weight = models.novelty.weight(moved, modality)
     return _Look(
         detects=shows & is_confident,
-        belief=models.fusion.update(old, state.seen[aim.poi], features, modality),
-        log_posterior=models.bayes.update(state.log_posterior[aim.poi], features, modality),
+        belief=models.fusion.update(old, state.seen[aim.poi], features, modality, weight),
+        log_posterior=models.bayes.update(state.log_posterior[aim.poi], features, modality, weight),
     )
 
 
@@ -291,8 +294,13 @@ def _write(
         (state.belief, state.log_posterior),
         (look.belief, look.log_posterior),
     )
+    number = state.times_seen[poi, modality] % RECENT_LOOKS
+    place = jnp.where(
+        detects, state.scene.poses[robot, :2], state.looked_from[poi, modality, number]
+    )
     return dataclasses.replace(
         state,
+        looked_from=state.looked_from.at[poi, modality, number].set(place),
         belief=belief,
         log_posterior=log_posterior,
         times_seen=state.times_seen.at[poi, modality].add(detects),

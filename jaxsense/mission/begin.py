@@ -10,7 +10,15 @@ from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.mission import roadmap
 from jaxsense.mission.roadmap import Roadmap
-from jaxsense.mission.state import IDLE, Faults, Mission, MissionState, Robots, no_faults
+from jaxsense.mission.state import (
+    IDLE,
+    RECENT_LOOKS,
+    Faults,
+    Mission,
+    MissionState,
+    Robots,
+    no_faults,
+)
 from jaxsense.models import Models
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors
@@ -99,6 +107,7 @@ def start(
         belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), models.fusion.prior),
         log_posterior=jnp.tile(models.bayes.prior, (num_pois, 1)),
         times_seen=jnp.zeros((num_pois, len(config.modalities)), jnp.int32),
+        looked_from=jnp.full((num_pois, len(config.modalities), RECENT_LOOKS, 2), jnp.inf),
         version=jnp.int32(0),
         robots=_idle_robots(num_robots, num_pois, paths.is_free.shape[1]),
         steps=jnp.int32(0),

@@ -25,6 +25,7 @@ from jaxsense.sim import viewpoints
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
+_REPEATED = 1e3  # m, above any path, so that places from which a look tells little come last
 
 
 def is_due(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, ""]:
@@ -64,7 +65,7 @@ def decide(
 
     # Failures belong to one target.
     excluded = jnp.where(is_new, False, own.excluded)
-    view, length, excluded = _best_view(mission, state, robot, action, excluded)
+    view, length, excluded = _best_view(mission, models, state, robot, action, excluded)
     has_path = jnp.isfinite(length)
     sets_out_now, gives_up = sets_out & has_path, sets_out & ~has_path
     poi = jnp.minimum(action, config.arena.num_pois - 1)
@@ -106,7 +107,7 @@ def _choose(
     config, robots = mission.config, state.robots
     settings, num_pois = config.mission, config.arena.num_pois
     given_up = robots.unreachable[robot] | robots.undetected[robot]
-    known = _known_to(mission, state, robot, given_up)
+    known = _known_to(mission, models, state, robot, given_up)
     values = _values(key, mission, models, known, state.policy)
     # Values that include travel time need no order.
     counts_time = jnp.array(
@@ -166,8 +167,17 @@ def _gains(
     return jax.vmap(of_robot)(jnp.arange(len(mission.config.carried)))
 
 
+def _modality(mission: Mission, robot: Index) -> Int[Array, ""]:
+    """Index of a robot's sensor."""
+    return jnp.array(mission.config.modality_of_robot)[robot]
+
+
 def _known_to(
-    mission: Mission, state: MissionState, robot: Index, given_up: Bool[Array, " N"]
+    mission: Mission,
+    models: Models,
+    state: MissionState,
+    robot: Index,
+    given_up: Bool[Array, " N"],
 ) -> Known:
     """What a robot that has given up some PoIs knows when it chooses."""
     phase = state.robots.phase
@@ -184,19 +194,39 @@ def _known_to(
         looks=state.times_seen,
         log_posterior=state.log_posterior,
         team=team,
-        times=team_mdp.travel_times(mission.config.team.travel, team),
+        times=team_mdp.travel_times(mission.config.team.travel, team)
+        + _times_to_new_places(mission, models, state),
         robot=jnp.asarray(robot),
+    )
+
+
+def _times_to_new_places(
+    mission: Mission, models: Models, state: MissionState
+) -> Float[Array, "R N"]:
+    """Seconds until each robot is where a look at each PoI is new, which travel times leave out."""
+
+    def of_look(position: jax.Array, modality: jax.Array, poi: jax.Array) -> jax.Array:
+        missing = models.novelty.fresh_distance(modality)
+        missing -= state.moved(position[None], poi, modality)[0]
+        return jnp.maximum(missing, 0.0) / mission.config.team.travel.speed
+
+    of_robot = jax.vmap(of_look, (None, None, 0))
+    return jax.vmap(of_robot, (0, 0, None))(
+        state.scene.poses[:, :2],
+        jnp.array(mission.config.modality_of_robot),
+        jnp.arange(mission.config.arena.num_pois),
     )
 
 
 def _best_view(
     mission: Mission,
+    models: Models,
     state: MissionState,
     robot: Index,
     target: Int[Array, ""],
     excluded: Bool[Array, " W"],
 ) -> tuple[Int[Array, ""], Float[Array, ""], Bool[Array, " W"]]:
-    """Nearest viewpoint of a PoI, V for the robot's current position.
+    """Nearest viewpoint of a PoI from which a look is new, V for the robot's current position.
 
     Returns:
       The viewpoint, the length of the path in metres, and the excluded ones of W = V + 1: none
@@ -207,8 +237,11 @@ def _best_view(
     length = roadmap.lengths(config, scene.layout, state.roadmap, scene.poses[robot, :2], poi)
     positions, margin = state.roadmap.viewpoints[poi], config.navigation.margin
     length += jnp.where(_room(mission, state, robot, poi, positions, margin) > 0, 0.0, _DETOUR)
+    position, modality = scene.poses[robot, :2], _modality(mission, robot)
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
-    cost = jnp.append(length, here)
+    moved = state.moved(jnp.concatenate([positions, position[None]]), poi, modality)
+    is_new = moved >= models.novelty.fresh_distance(modality)
+    cost = jnp.append(length, here) + jnp.where(is_new, 0.0, _REPEATED)
     excluded &= jnp.any(jnp.isfinite(cost) & ~excluded)
     cost = jnp.where(excluded, jnp.inf, cost)
     view = jnp.argmin(cost)

@@ -53,6 +53,8 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
       `seen`: `[N]` bool, PoIs that were detected; others are neither right nor ambiguous.
       `is_right`: `[N]` bool, whether the map's most likely class is the true one.
       `ambiguous`: `[N]` bool, whether several classes are plausible.
+      `confidence`: `[N]` probability of the map's most likely class.
+      `nll`: `[N]` negative log-likelihood of the true class, read from the map.
       `told`: for each modality, `[]` share of PoIs whose label the map has right.
       `observations_per_poi`: `[]` looks per PoI.
       `time_s`: `[]` duration, in seconds.
@@ -65,6 +67,8 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
     config = mission.config
     shown = jax.vmap(models.fusion.most_likely_class)(state.belief)
     plausible = jax.vmap(models.plausible_classes)(state.belief)
+    probabilities = jax.vmap(models.fusion.class_probabilities)(state.belief)
+    of_truth = jnp.take_along_axis(probabilities, state.classes[:, None], axis=1)[:, 0]
     is_seen = jnp.any(state.seen, axis=-1)
     is_right = is_seen & (shown == state.classes)
     told = {}
@@ -77,6 +81,8 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
         "is_right": is_right,
         "told": told,
         "ambiguous": is_seen & (jnp.sum(plausible, axis=-1) > 1),
+        "confidence": jnp.max(probabilities, axis=-1),
+        "nll": -jnp.log(of_truth),
         "seen": is_seen,
         "observations_per_poi": jnp.sum(robots.looks) / config.arena.num_pois,
         "time_s": state.steps * config.mission.control_period,

@@ -16,6 +16,9 @@ from jaxsense.sim import world as worlds
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import Scene, World
 
+RECENT_LOOKS = 4
+"""Looks by a sensor at a PoI whose places are remembered."""
+
 IDLE, DRIVING, FACING, BACKING, ENDED, FAILED = range(6)
 """Phases of a robot: asking its policy, driving to a viewpoint, turning to a PoI to scan it,
 backing off when stuck, ended by NOP, or failed."""
@@ -97,6 +100,8 @@ class MissionState:
       log_posterior: `[N, C]` logarithms of the classes' probabilities by exact Bayes, for the
         policies `bayes` and `optimal`.
       times_seen: `[N, M]` int32, number of detections of each PoI by each modality.
+      looked_from: `[N, M, RECENT_LOOKS, 2]` places from which each modality has last detected each
+        PoI, in metres; infinite for none.
       version: `[]` int32, number of updates of the map.
       robots: their state.
       steps: `[]` int32 control periods since the start.
@@ -115,6 +120,7 @@ class MissionState:
     belief: Belief
     log_posterior: Float[Array, "N C"]
     times_seen: Int[Array, "N M"]
+    looked_from: Float[Array, "N M K 2"]
     version: Int[Array, ""]
     robots: Robots
     steps: Int[Array, ""]
@@ -126,6 +132,20 @@ class MissionState:
     def seen(self) -> Bool[Array, "... N M"]:
         """Which modalities have detected which PoI."""
         return self.times_seen > 0
+
+    def moved(
+        self, positions: Float[Array, "C 2"], poi: Int[Array, ""], modality: Index
+    ) -> Float[Array, " C"]:
+        """Distances from the nearest recent look by a sensor at a PoI, in metres.
+
+        Args:
+          positions: `[C, 2]` places to look from.
+          poi: index of the PoI.
+          modality: index of the sensor.
+        """
+        places = self.looked_from[poi, modality]
+        apart = jnp.linalg.norm(positions[:, None] - places[None], axis=-1)
+        return jnp.min(apart, axis=-1)
 
     def robot(self, robot: Index) -> Robots:
         """State of one robot: the fields of `Robots` without their first axis."""

@@ -5,7 +5,7 @@ import platform
 import subprocess
 from pathlib import Path
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 _ROOT = Path(__file__).parents[2]
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 

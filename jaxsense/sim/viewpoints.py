@@ -52,10 +52,59 @@ def random_viewpoint(
     first_free = jnp.argmax(room > 0)
     chosen = jnp.where(jnp.any(room > 0), first_free, jnp.argmax(room))
 
-    bearing = jnp.radians(config.max_bearing) * (2 * draws[-2] - 1)
-    believed = bearing + jnp.radians(config.bearing_error) * (2 * draws[-1] - 1)
+    bearing, believed = _bearings(draws[-2], draws[-1], config)
     yaw = side[chosen] + jnp.pi - bearing
     return jnp.stack([position[0][chosen], position[1][chosen], yaw]), believed
+
+
+def moved_viewpoint(
+    key: Key,
+    config: ViewpointConfig,
+    arena: ArenaConfig,
+    layout: Layout,
+    others: Float[Array, "K 2"],
+    poi: Int[Array, ""],
+    position: Float[Array, "2"],
+    distance: Float[Array, ""],
+) -> tuple[Float[Array, "3"], Float[Array, ""], Float[Array, ""]]:
+    """Draws another pose from which a robot looks at a PoI, at a given distance from a place.
+
+    Args:
+      key: random key.
+      config: settings of viewpoints.
+      arena: the sizes of arena and PoIs.
+      layout: the PoIs.
+      others: positions of the other robots, in metres.
+      poi: index of the PoI to look at.
+      position: x and y of the place, in metres.
+      distance: between the place and the pose, in metres.
+
+    Returns:
+      The pose and the believed bearing of the PoI as in `random_viewpoint`, and the distance: 0 if
+      no free pose at that distance is in range and shows the PoI.
+    """
+    chex.assert_shape(position, (2,), custom_message="position")
+    chex.assert_rank([poi, distance], 0, custom_message="poi, distance")
+    draws = jax.random.uniform(key, (NUM_CANDIDATES + 2,))
+    direction, target = jnp.pi * (2 * draws[:-2] - 1), layout.position[poi]
+    x = position[0] + distance * jnp.cos(direction)
+    y = position[1] + distance * jnp.sin(direction)
+    to_poi = jnp.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
+    is_free = free_room(x, y, config.clearance, arena, layout, others, poi) > 0
+    is_free &= (to_poi >= config.min_distance) & (to_poi <= config.max_distance)
+    chosen, moves = jnp.argmax(is_free), jnp.any(is_free)
+    stand = jnp.where(moves, jnp.stack([x[chosen], y[chosen]]), position)
+    bearing, believed = _bearings(draws[-2], draws[-1], config)
+    yaw = jnp.arctan2(target[1] - stand[1], target[0] - stand[0]) - bearing
+    return jnp.append(stand, yaw), believed, jnp.where(moves, distance, 0.0)
+
+
+def _bearings(
+    heading: jax.Array, error: jax.Array, config: ViewpointConfig
+) -> tuple[jax.Array, jax.Array]:
+    """Bearing of a PoI, and the one that the robot believes, from uniform draws."""
+    bearing = jnp.radians(config.max_bearing) * (2 * heading - 1)
+    return bearing, bearing + jnp.radians(config.bearing_error) * (2 * error - 1)
 
 
 def bearing(

@@ -15,6 +15,8 @@ from jaxsense.core.types import Index, Key, others, pytree
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors, viewpoints, windows
 
+_FARTHEST_MOVE = 2.0  # m, between two looks
+
 
 @struct.dataclass
 class World:
@@ -128,6 +130,43 @@ def look(
     data = arenas.place(world.arena, scene.layout, scene.poses)
     readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
     return windows.as_window(world.sensors[robot], readings), scene
+
+
+def look_again(
+    key: Key, world: World, scene: Scene, robot: int, poi: Int[Array, ""]
+) -> tuple[Float[Array, "F"], Float[Array, ""]]:
+    """Moves a robot a random distance from its viewpoint of a PoI, often a short one, and scans.
+
+    Args:
+      key: random key.
+      world: the simulation.
+      scene: the scene after `look`.
+      robot: index of the robot and of its modality; static.
+      poi: index of the PoI.
+
+    Returns:
+      The detector's input, and the distance that the robot has moved, in metres.
+
+    Raises:
+      ValueError: if there is no such PoI.
+    """
+    chex.assert_rank(poi, 0, custom_message="poi")
+    checks.require_index("poi", poi, world.arena.config.num_pois)
+    distance_key, viewpoint_key, noise_key = jax.random.split(key, 3)
+    pose, bearing, moved = viewpoints.moved_viewpoint(
+        viewpoint_key,
+        world.viewpoint,
+        world.arena.config,
+        scene.layout,
+        jnp.delete(scene.poses, robot, axis=0)[:, :2],
+        poi,
+        scene.poses[robot, :2],
+        _FARTHEST_MOVE * jax.random.uniform(distance_key) ** 3,
+    )
+    scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
+    data = arenas.place(world.arena, scene.layout, scene.poses)
+    readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
+    return windows.as_window(world.sensors[robot], readings), moved
 
 
 def scan_around(

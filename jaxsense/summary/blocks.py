@@ -148,6 +148,16 @@ class OfNaive(TypedDict):
     mean_time_s: Annotated[float, "mean time, of naive", "", 2]
 
 
+class Calibration(TypedDict):
+    """`mission.POLICY.calibration`: maps at the end of missions, PoIs that were detected."""
+
+    confidence: Annotated[
+        float | None, "confidence", "Mean probability of the likeliest class; as it is right."
+    ]
+    accuracy: Annotated[float | None, "right, of detected", "Share of PoIs that were detected."]
+    nll: Annotated[float | None, "NLL of the maps", "Mean -log p of the true class."]
+
+
 class Case(TypedDict):
     """`mission.POLICY`: missions of one policy, or with a robot that fails."""
 
@@ -158,6 +168,7 @@ class Case(TypedDict):
     collisions: Annotated[int, "collisions", "Control periods with contact.", 0]
     goals_reached_fraction: Annotated[float | None, "goals reached", "Share of chosen viewpoints."]
     information: Annotated[float, "information", "Sum of 1 / sigma norm over the map.", 2]
+    calibration: Calibration
     episodes: Annotated[int, "missions", "", 0]
     ended: Annotated[dict[str, int], "ends", "Number of missions by how they ended."]
     told: NotRequired[Annotated[float, "right labels", "A robot alone: share of PoIs."]]

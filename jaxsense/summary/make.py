@@ -11,6 +11,7 @@ from jaxsense.mission.state import Mission
 from jaxsense.summary.blocks import (
     Agent,
     Beliefs,
+    Calibration,
     Case,
     Jmvae,
     Missions,
@@ -156,6 +157,7 @@ def case(config: Config, name: str, found: Measured) -> Case:
         "collisions": int(found["collisions"].sum()),
         "goals_reached_fraction": _share(found["goals_reached"].sum(), found["goals"].sum()),
         "information": float(found["information"].mean()),
+        "calibration": calibration(found),
         "episodes": len(found["time_s"]),
         "ended": {
             reason: int(np.sum(found["reason"] == code))
@@ -172,6 +174,25 @@ def case(config: Config, name: str, found: Measured) -> Case:
         block["told"] = float(found["told"][modality].mean())
         block["ambiguous_reported"] = _share(reported.sum(), reported.size)
     return block
+
+
+def calibration(found: Measured) -> Calibration:
+    """Whether maps are as sure of the PoIs that were detected as they are right.
+
+    Args:
+      found: metrics of missions.
+    """
+    is_seen = np.asarray(found["seen"])
+
+    def of_seen(name: str) -> float | None:
+        values = np.asarray(found[name], float)[is_seen]
+        return float(values.mean()) if values.size else None
+
+    return {
+        "confidence": of_seen("confidence"),
+        "accuracy": of_seen("is_right"),
+        "nll": of_seen("nll"),
+    }
 
 
 def _share(part: int, whole: int) -> float | None:

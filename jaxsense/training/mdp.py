@@ -11,6 +11,7 @@ from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.training.perception import Detections
+from jaxsense.vae import novelty
 
 
 def models_of(
@@ -32,6 +33,7 @@ def models_of(
         jmvae={},
         fusion=fusion,
         bayes=make_bayes(config),
+        novelty=novelty.independent(len(config.modalities)),
         look_values=look_values,
         agent=make_agent(config),
         q_networks=q_networks,

@@ -12,15 +12,16 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, Samples, pytree
-from jaxsense.models import make_in_place, make_jmvae, make_prior
+from jaxsense.models import make_bayes, make_in_place, make_jmvae, make_prior
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import Scene, make_world
 from jaxsense.training.fits import fit_stage
 from jaxsense.training.stage import Output, Stage
-from jaxsense.vae import detectors, filter, jmvae
+from jaxsense.vae import detectors, filter, jmvae, novelty
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.filter import Filter
 from jaxsense.vae.fusion import InPlace
+from jaxsense.vae.novelty import Novelty
 
 Examples = tuple[Float[Array, "_ _"], Int[Array, "_"]]
 """`[L, F]` windows of a detector, and their `[L]` int32 labels."""
@@ -217,6 +218,37 @@ def detect(
         starts=jax.tree.map(lambda x: x[: _num_starts(config)], starts),
         windows=by_class(others.windows, for_measuring, 1),
     )
+
+
+def novelty_stages(arena: Arena, config: Config) -> list[Stage]:
+    """Makes the stage that learns how much of a look is new, if there are pairs of looks.
+
+    Args:
+      arena: of the simulation.
+      config: all settings.
+    """
+    number = config.detector.num_repeats
+    if not number:
+        return []
+
+    def begin(key: Key, config: Config, *, trained: tuple[Detector, ...]) -> Novelty:
+        world, exact = make_world(config, arena=arena), make_bayes(config)
+        class_key, *keys = jax.random.split(key, 1 + len(trained))
+        classes = jax.random.randint(
+            class_key, (number, config.arena.num_pois), 0, len(config.arena.classes)
+        )
+
+        def fit(m: int) -> tuple[jax.Array, jax.Array]:
+            first, second, moved = looks.pairs(jax.random.split(keys[m], number), world, classes, m)
+            read = lambda x: exact.log_likelihoods(detectors.detect(trained[m], x), m)  # noqa: E731
+            found = jax.vmap(read)(first), jax.vmap(read)(second)
+            return novelty.fit(first=found[0], second=found[1], moved=moved, classes=classes[:, 0])
+
+        near, length = zip(*map(fit, range(len(trained))), strict=True)
+        return Novelty(jnp.stack(near), jnp.stack(length))
+
+    names = tuple(f"detector_{name}" for name in config.modalities)
+    return [Stage("novelty", begin, {"trained": names})]
 
 
 def jmvae_stages(config: Config) -> list[Stage]:

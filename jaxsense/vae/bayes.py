@@ -43,7 +43,10 @@ def log_likelihoods(features: _Features, label_of_class: _Labels) -> Float[Array
 
 
 def bayes_update(
-    log_weights: Float[Array, " C"], features: _Features, label_of_class: _Labels
+    log_weights: Float[Array, " C"],
+    features: _Features,
+    label_of_class: _Labels,
+    weight: Float[Array, ""] | float = 1.0,
 ) -> Float[Array, " C"]:
     """Updates the exact posterior over the classes by one look.
 
@@ -51,6 +54,7 @@ def bayes_update(
       log_weights: `[C]` logarithms of the classes' probabilities before the look.
       features: see `log_likelihoods`.
       label_of_class: see `log_likelihoods`.
+      weight: `[]` share of the look that is new evidence, see `vae.novelty`.
 
     Returns:
       `[C]` logarithms after the look, normalised.
@@ -62,7 +66,8 @@ def bayes_update(
     chex.assert_shape(label_of_class, log_weights.shape, custom_message="label_of_class")
     # Rejects -inf (all classes excluded) and NaN.
     checks.require_finite("largest of log_weights", jnp.max(log_weights))
-    return jax.nn.log_softmax(log_weights + log_likelihoods(features, label_of_class))
+    found = log_likelihoods(features, label_of_class)
+    return jax.nn.log_softmax(log_weights + weight * found)
 
 
 @pytree
@@ -91,7 +96,11 @@ class Bayes:
         return log_likelihoods(features, self.labels[modality])
 
     def update(
-        self, log_posterior: Float[Array, " C"], features: _Features, modality: int
+        self,
+        log_posterior: Float[Array, " C"],
+        features: _Features,
+        modality: int,
+        weight: Float[Array, ""] | float = 1.0,
     ) -> Float[Array, " C"]:
         """Posterior after one more look, see `bayes_update`.
 
@@ -99,8 +108,9 @@ class Bayes:
           log_posterior: `[C]` logarithms of the classes' probabilities before the look.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
+          weight: see `bayes_update`.
         """
-        return bayes_update(log_posterior, features, self.labels[modality])
+        return bayes_update(log_posterior, features, self.labels[modality], weight)
 
 
 def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Belief:

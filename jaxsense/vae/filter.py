@@ -64,6 +64,7 @@ class Filter:
         seen: Bool[Array | np.ndarray, " M"],
         features: Float[Array, " D_m"],
         modality: int,
+        weight: Float[Array, ""] | float = 1.0,
     ) -> Belief:
         """Belief after one more look.
 
@@ -72,6 +73,7 @@ class Filter:
           seen: not used.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
+          weight: `[]` share of the look that is new evidence, see `vae.novelty`.
 
         Raises:
           ValueError: if there is no such modality, `features` are not probabilities, or the belief
@@ -87,7 +89,7 @@ class Filter:
         chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
         found = self.log_likelihood(self.networks, features, modality)
         before = jnp.log(self.class_probabilities(belief))
-        return readout.mixture(self.classes, jax.nn.softmax(before + found))
+        return readout.mixture(self.classes, jax.nn.softmax(before + weight * found))
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """Belief after looks by several sensors, `[D_m]` features by modality."""

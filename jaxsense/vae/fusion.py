@@ -54,6 +54,7 @@ class InPlace:
         seen: Bool[Array | np.ndarray, " M"],
         features: Float[Array, " D_m"],
         modality: int,
+        weight: Float[Array, ""] | float = 1.0,
     ) -> Belief:
         """Belief after one more look, see `fuse`.
 
@@ -62,10 +63,12 @@ class InPlace:
           seen: `[M]` bool, which modalities have looked before.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
+          weight: not used: a look replaces the one before.
 
         Raises:
           ValueError: if there is no such modality; see also `fuse`.
         """
+        del weight
         number = len(self.model.modalities)
         checks.require_index("modality", modality, number)
         of_all = tuple(features if m == modality else None for m in range(number))

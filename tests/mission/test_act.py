@@ -12,6 +12,7 @@ from jaxsense.mission import act
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import windows, world
+from jaxsense.vae.novelty import Novelty
 
 # PoI 0 is 0.8 m ahead of the robot under test, a red cube.
 POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
@@ -80,6 +81,28 @@ def test_a_detection_updates_the_exact_posterior_and_is_counted(
     np.testing.assert_allclose(np.exp(after.log_posterior[0]), expected, rtol=1e-5)
     np.testing.assert_array_equal(after.log_posterior[1:], posterior[1:])
     np.testing.assert_array_equal(after.times_seen, counts.at[0, robot].set(5))
+
+
+@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
+def test_a_look_from_near_an_earlier_one_counts_in_part(scan, models, facing, robot):
+    trained = sure(models, robot, 0.8)
+    half = Novelty(near=jnp.full(2, 0.5), length=jnp.full(2, 0.1))
+    before = facing(robot)
+    whole = scan(jax.random.key(0), before, robot, trained)
+    np.testing.assert_allclose(whole.looked_from[0, robot, 0], [0.0, 0.0], atol=1e-6)
+    assert np.all(np.isinf(np.delete(whole.looked_from.reshape(-1, 2), 4 * robot, axis=0)))
+    # Another look from the same place adds half of what the first one has said.
+    again = replace(before, looked_from=whole.looked_from, times_seen=whole.times_seen)
+    after = scan(jax.random.key(0), again, robot, replace(trained, novelty=half))
+    said = whole.log_posterior[0] - before.log_posterior[0]
+    expected = jax.nn.log_softmax(before.log_posterior[0] + said / 2)
+    np.testing.assert_allclose(after.log_posterior[0], expected, atol=1e-5)
+    # The fifth look takes the place of the first.
+    fifth = replace(again, times_seen=again.times_seen.at[0, robot].set(4))
+    moved = replace(fifth, looked_from=fifth.looked_from.at[0, robot].set(7.0))
+    after = scan(jax.random.key(0), moved, robot, trained)
+    np.testing.assert_allclose(after.looked_from[0, robot, 0], [0.0, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(after.looked_from[0, robot, 1:], 7.0)
 
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])

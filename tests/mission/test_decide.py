@@ -14,6 +14,7 @@ from jaxsense.dqn.optimum import LookValues
 from jaxsense.mission import decide
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE
 from jaxsense.vae import readout
+from jaxsense.vae.novelty import Novelty
 
 # The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
 POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
@@ -392,3 +393,39 @@ def test_what_was_given_up_is_of_every_class_alike(after_giving_up, turn, other,
 def test_of_what_was_given_up_nothing_is_left_to_learn(after_giving_up, other, expected):
     # Its standard deviation is 0.25, that of what is known, not 4.5, that of what nobody has seen.
     assert after_giving_up(2, [0.0, 0.0, other, 0.0]) == expected
+
+
+STAYS_OLD = Novelty(near=jnp.zeros(2), length=jnp.full(2, 0.5))  # half of a look is new at .59 m
+
+
+def looked_from(place, poi=0, modality=0):
+    """A sensor has looked at a PoI from a place."""
+    return lambda state: replace(
+        state, looked_from=state.looked_from.at[poi, modality, 2].set(jnp.array(place))
+    )
+
+
+def test_a_robot_looks_again_from_where_the_look_is_new(decides, models, arena_of):
+    values = with_values(models, [1.0, 0.0, 0.0, 0.0], [0.0] * 4)
+    state = looked_from([0.1, 0.0])(arena_of(POSITIONS, POSES, policy=LATENT))
+    here = state.roadmap.viewpoints.shape[1]
+    # All of a look counts from anywhere: it stays.
+    assert decides(values, state).robots.view[0] == here
+    found = decides(replace(values, novelty=STAYS_OLD), state)
+    assert found.robots.phase[0] == DRIVING
+    chosen = state.roadmap.viewpoints[0, found.robots.view[0]]
+    assert np.hypot(chosen[0] - 0.1, chosen[1]) >= 0.588
+    # What another sensor has looked at, or the own one elsewhere, does not count.
+    for other in (looked_from([0.1, 0.0], modality=1), looked_from([0.1, 0.0], poi=1)):
+        there = other(arena_of(POSITIONS, POSES, policy=LATENT))
+        assert decides(replace(values, novelty=STAYS_OLD), there).robots.view[0] == here
+
+
+def test_an_auction_counts_the_way_to_where_a_look_is_new(decides, models, arena_of):
+    values = replace(with_values(models, [1.0, 1.0, 0.0, 0.0], [0.0] * 4), novelty=STAYS_OLD)
+    state = arena_of(POSITIONS, POSES, policy=LATENT)
+    # PoI 0 is straight ahead, PoI 1 a quarter turn away: 1.3 s.
+    assert decides(values, state, auctions=True).robots.target[0] == 0
+    # .59 m of driving, 2.9 s, before a look at PoI 0 is new.
+    again = looked_from([0.0, 0.0])(state)
+    assert decides(values, again, auctions=True).robots.target[0] == 1

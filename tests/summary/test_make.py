@@ -16,6 +16,10 @@ FOUND = {
     "classes": np.array([[0, 1, 2], [2, 2, 1]]),
     "is_right": np.array([[True, True, False], [True, True, True]]),
     "ambiguous": np.array([[False, True, False], [True, True, False]]),
+    # The third PoI of the second mission was never detected: .9, .8, .4, .7 and 1 count.
+    "seen": np.array([[True, True, True], [True, True, False]]),
+    "confidence": np.array([[0.9, 0.8, 0.4], [0.7, 1.0, 0.2]]),
+    "nll": np.array([[0.1, 0.2, 1.5], [0.3, 0.0, 9.0]]),
     "told": {"camera": np.array([2 / 3, 1.0]), "lidar": np.array([1 / 3, 2 / 3])},
     "observations_per_poi": np.array([1.0, 2.0]),
     "time_s": np.array([10.0, 20.0]),
@@ -97,6 +101,8 @@ def test_summary_of_a_case_as_worked_by_hand():
         "collisions": 2,
         "goals_reached_fraction": 0.9,
         "information": 5.5,
+        # .76 = 3.8 / 5, four of five, and .42 = 2.1 / 5.
+        "calibration": pytest.approx({"confidence": 0.76, "accuracy": 0.8, "nll": 0.42}),
         "episodes": 2,
         "ended": {"finished": 1, "time limit": 1},
     }
@@ -110,6 +116,8 @@ def test_summary_of_a_case_as_worked_by_hand():
     # Nothing of nothing is no number.
     nothing = {**FOUND, "goals": np.zeros(2, int), "goals_reached": np.zeros(2, int)}
     assert make.case(CONFIG, "latent", nothing)["goals_reached_fraction"] is None
+    unseen = make.case(CONFIG, "latent", {**FOUND, "seen": np.zeros((2, 3), bool)})["calibration"]
+    assert unseen == {"confidence": None, "accuracy": None, "nll": None}
     # The camera cannot tell red ones apart: classes 1 and 2; three of five.
     assert make.case(CONFIG, "camera_alone", FOUND)["ambiguous_reported"] == pytest.approx(3 / 5)
 
