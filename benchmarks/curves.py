@@ -1,0 +1,384 @@
+"""`python -m benchmarks.curves RUN`: looks and time that policies need for the same accuracy.
+
+A single figure of a policy depends on when it stops, so each plays missions with several costs of a
+look: the values of looks are computed and the Q-networks trained for each of them, with the
+detectors and the fusion of the run. Naive exploration plays with one to five looks. The oracle
+knows the classes: it looks at what its own sensor has to tell the map until that has the true class
+with some probability, along the shortest tour. Between two points of a curve, looks and time are
+interpolated linearly; intervals are a bootstrap over the arenas, the same for all policies.
+"""
+
+import dataclasses
+import itertools
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxsense import Config, Models, looks, mission
+from jaxsense.config.checks import check_fields, require
+from jaxsense.config.options import Name
+from jaxsense.core.types import Key
+from jaxsense.dqn import policies
+from jaxsense.dqn.policies import Known, Policy, Trained
+from jaxsense.mission import MissionState
+from jaxsense.run import cli, rundir
+from jaxsense.run.version import commit, versions
+from jaxsense.show.colours import policy_colour, policy_marker
+from jaxsense.sim.world import Scene, make_world
+from jaxsense.training import agents
+from jaxsense.training.perception import Detections, Starts
+from jaxsense.training.stage import Stage, compose
+
+PROGRAM = "benchmarks.curves"
+ACCURACIES = (0.95, 0.98, 0.99)
+ORACLE = (0.8, 0.95, 0.99)
+NAIVE = 5
+_BY_COST = ("latent", "greedy", "bayes", "optimal", "nearest", "auction", "rollout")
+_SAMPLES = 4000  # detections of each class by each sensor
+_CHUNK = 25  # control periods
+_DRAWS = 1000  # of the bootstrap
+_MOST_POIS = 6  # whose orders the oracle tries
+
+Points = dict[str, np.ndarray]
+"""`accuracy`, `looks` and `time` of K points of a curve in E arenas, `[K, E]` each."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Play every policy with several costs of a look, and compare them at the same accuracy."""
+
+    run: Annotated[Path, Name("RUN")]
+    """The directory of a finished run, or `latest`."""
+    episodes: int = 256
+    """Missions of each policy with each cost."""
+    seed: int = 0
+    """Seed of the arenas and of the trainings."""
+    costs: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)
+    """Costs of a look, which only rewards in nats read."""
+    json: Path | None = None
+    """File to write the curves to."""
+    plot: Path | None = None
+    """Picture to write, for example `policies.png`."""
+
+    def __post_init__(self):
+        check_fields(self, bits=64)
+        require(self.episodes >= 2, self, "episodes", "must be at least 2")
+
+
+def oracle(share: float) -> Policy:
+    """The policy that knows the classes, which `_start` writes into the exact posterior.
+
+    Args:
+      share: probability of the true class on the map at which it stops.
+    """
+
+    def values(key: Key, models: Trained, known: Known) -> jax.Array:
+        del key
+        assert isinstance(models, Models)
+        truth = jnp.argmax(known.log_posterior, axis=-1)
+        on_map = jax.vmap(models.fusion.class_probabilities)(known.belief)
+        labels = jnp.asarray(models.bayes.labels)[known.modality]
+        has_label = labels[None] == labels[truth][:, None]
+        of_label = jnp.sum(jnp.where(has_label, on_map, 0.0), axis=-1)
+        is_useful = known.team.present & (of_label < share)
+        return jnp.append(jnp.where(is_useful, -_tours(known, is_useful), -1e6), -1e5)
+
+    return Policy(values, counts_time=lambda agent: True)
+
+
+def _tours(known: Known, is_useful: jax.Array) -> jax.Array:
+    """`[N]` metres of the shortest tour of the useful PoIs that starts with each."""
+    places, start = known.team.positions, known.team.poses[known.robot, :2]
+    orders = np.array([*itertools.permutations(range(len(places)))])
+
+    def length(order: jax.Array) -> jax.Array:
+        def go_on(carry: tuple[jax.Array, jax.Array], poi: jax.Array):
+            position, total = carry
+            onwards = total + jnp.linalg.norm(places[poi] - position)
+            return jax.tree.map(
+                lambda new, old: jnp.where(is_useful[poi], new, old), (places[poi], onwards), carry
+            ), None
+
+        return jax.lax.scan(go_on, (start, jnp.float32(0)), order)[0][1]
+
+    lengths = jax.vmap(length)(jnp.asarray(orders))
+    is_first = jnp.asarray(orders)[:, :1] == jnp.arange(len(places))[None]
+    return jnp.min(jnp.where(is_first, lengths[:, None], jnp.inf), axis=0)
+
+
+def of_costs(key: Key, config: Config, models: Models, costs: jax.Array) -> Models:
+    """Models with the values of looks and the Q-networks for each of K costs, `[K]`.
+
+    Args:
+      key: random key.
+      config: all settings.
+      models: of a finished run.
+      costs: `[K]` of a look.
+    """
+    world = make_world(config)
+    bank_key, held_out_key, train_key = jax.random.split(key, 3)
+    bank = looks.detections(bank_key, config, models, _SAMPLES)
+    held_out = looks.detections(held_out_key, config, models, _SAMPLES)
+    none = jnp.zeros((0, config.arena.num_pois), jnp.int32)
+    found = Detections(
+        bank=bank,
+        held_out=held_out,
+        starts=Starts(none, cast(Scene, ()), ()),
+        windows=(),
+    )
+    names = tuple(f"detector_{name}" for name in config.modalities)
+    given = {
+        "detections": found,
+        "fusion": models.fusion,
+        "class_beliefs": models.fusion.classes,
+        **dict(zip(names, models.detectors, strict=True)),
+    }
+
+    def known(name: str) -> Stage:
+        return Stage(name, lambda key, config: given[name])
+
+    inputs = {"classes": "class_beliefs", "detections": "detections"}
+    stages = [
+        *map(known, given),
+        Stage("look_values", agents.look_values, inputs),
+        *agents.agent_stages(world.arena, config),
+    ]
+
+    @jax.jit
+    def train(cost: jax.Array) -> Models:
+        priced = dataclasses.replace(config, mdp=dataclasses.replace(config.mdp, look_cost=cost))
+        outputs = compose(train_key, priced, stages).outputs
+        learned = tuple(outputs[agents.learner(config, name)] for name in config.modalities)
+        return dataclasses.replace(models, look_values=outputs["look_values"], q_networks=learned)
+
+    return jax.tree.map(lambda *x: jnp.stack(x), *map(train, costs))
+
+
+class Curves:
+    """Plays missions of policies in the same arenas."""
+
+    def __init__(self, key: Key, config: Config, episodes: int):
+        """Missions of E arenas, with a program that is compiled once."""
+        own = {f"naive_{k}": Policy(policies.naive(k), is_unordered=True) for k in (4, NAIVE)}
+        own |= {f"oracle_{share}": oracle(share) for share in ORACLE}
+        self.team = mission.make_mission(config, own)
+        self._keys = jax.random.split(key, episodes)
+        self._begin = jax.jit(jax.vmap(self._start, in_axes=(0, None, None)))
+        self._go_on = jax.jit(self._play_on)
+        self._measure = jax.jit(jax.vmap(self._result, in_axes=(None, 0)))
+
+    def _start(self, key: Key, models: Models, policy: jax.Array) -> MissionState:
+        """A mission in which the policies `oracle` read the true classes."""
+        state = mission.reset(key, self.team, models, policy)
+        names = [*self.team.policies]
+        knows = jnp.array([name.startswith("oracle") for name in names])[policy]
+        of_class = jax.nn.one_hot(state.classes, state.log_posterior.shape[1])
+        truth = jax.nn.log_softmax(100 * of_class)
+        return dataclasses.replace(
+            state, log_posterior=jnp.where(knows, truth, state.log_posterior)
+        )
+
+    def _play_on(self, keys: Key, models: Models, states: MissionState) -> MissionState:
+        each = len(self._keys)
+        return mission.rollout_batch(keys, self.team, models, states, _CHUNK, each)[0]
+
+    def _result(self, models: Models, state: MissionState) -> dict[str, jax.Array]:
+        found = mission.measure(self.team, models, state)
+        return {
+            "accuracy": jnp.mean(found["is_right"].astype(jnp.float32)),
+            "looks": found["observations_per_poi"],
+            "time": found["time_s"],
+        }
+
+    def play(self, models: Models, policy: str) -> dict[str, np.ndarray]:
+        """`accuracy`, `looks` per PoI and `time` of a policy, `[E]` each.
+
+        Args:
+          models: trained models.
+          policy: its name.
+        """
+        states = self._begin(self._keys, models, jnp.int32(self.team.policy(policy)))
+        for chunk in itertools.count(1):
+            keys = jax.vmap(lambda key: jax.random.fold_in(key, chunk))(self._keys)  # noqa: B023
+            states = self._go_on(keys, models, states)
+            if np.all(states.done):
+                return jax.tree.map(np.asarray, self._measure(models, states))
+        raise AssertionError
+
+
+def play_all(curves: Curves, costs: tuple[float, ...], priced: Models, free: Models) -> Iterator:
+    """The curve of every policy: its name, what varies along it, and its points.
+
+    Args:
+      curves: plays missions.
+      costs: of a look.
+      priced: models for each cost, `[K]`.
+      free: models of the run.
+    """
+    each = [jax.tree.map(lambda x: x[i], priced) for i in range(len(costs))]  # noqa: B023
+    for name in _BY_COST:
+        yield name, {"look_cost": costs}, _stacked([curves.play(m, name) for m in each])
+    names = [name for name in curves.team.policies if name.startswith("naive")]
+    yield "naive", {"looks": tuple(range(1, NAIVE + 1))}, _of(curves, free, names)
+    names = [f"oracle_{share}" for share in ORACLE]
+    yield "oracle", {"probability": ORACLE}, _of(curves, free, names)
+    yield "random", {"look_cost": (None,)}, _of(curves, free, ["random"])
+
+
+def _of(curves: Curves, models: Models, names: list[str]) -> Points:
+    return _stacked([curves.play(models, name) for name in names])
+
+
+def _stacked(points: list[dict[str, np.ndarray]]) -> Points:
+    return {key: np.stack([point[key] for point in points]) for key in points[0]}
+
+
+def at_accuracy(points: Points, accuracy: float, key: str) -> dict[str, float] | None:
+    """What a policy needs for an accuracy, with a 95% interval; None if it never gets there.
+
+    Args:
+      points: of its curve.
+      accuracy: to reach, on average over the arenas.
+      key: `looks` or `time`.
+    """
+    middle = _needed(points["accuracy"].mean(axis=1), points[key].mean(axis=1), accuracy)
+    if not np.isfinite(middle):
+        return None
+    arenas = points["accuracy"].shape[1]
+    draws = np.random.default_rng(0).integers(arenas, size=(_DRAWS, arenas))
+    again = [
+        _needed(
+            points["accuracy"][:, rows].mean(axis=1), points[key][:, rows].mean(axis=1), accuracy
+        )
+        for rows in draws
+    ]
+    low, high = np.quantile(again, (0.025, 0.975), method="inverted_cdf")
+    return {"mean": float(middle), "low": float(low), "high": float(high)}
+
+
+def _needed(accuracies: np.ndarray, needs: np.ndarray, accuracy: float) -> float:
+    """Least need for an accuracy along a line through points; infinite if none is as accurate."""
+    best = np.inf
+    for i, j in itertools.combinations_with_replacement(range(len(needs)), 2):
+        low, high = sorted((i, j), key=lambda k: accuracies[k])
+        if accuracies[high] < accuracy:
+            continue
+        if accuracies[low] >= accuracy:
+            best = min(best, needs[low])
+            continue
+        share = (accuracy - accuracies[low]) / (accuracies[high] - accuracies[low])
+        best = min(best, needs[low] + share * (needs[high] - needs[low]))
+    return float(best)
+
+
+def as_block(name: str, varies: dict[str, tuple], points: Points) -> dict:
+    """A curve for JSON.
+
+    Args:
+      name: of the policy.
+      varies: what varies along the curve.
+      points: of the curve.
+    """
+    means = {
+        key: [round(float(x), 4) for x in values.mean(axis=1)] for key, values in points.items()
+    }
+    needs = {
+        str(accuracy): {key: at_accuracy(points, accuracy, key) for key in ("looks", "time")}
+        for accuracy in ACCURACIES
+    }
+    return {
+        "policy": name,
+        **{key: list(values) for key, values in varies.items()},
+        **means,
+        "at": needs,
+    }
+
+
+def as_table(blocks: list[dict]) -> str:
+    """What every policy needs for each accuracy, as a Markdown table.
+
+    Args:
+      blocks: of `as_block`.
+    """
+
+    def text(need: dict[str, float] | None, digits: int) -> str:
+        if need is None:
+            return "-"
+        return f"{need['mean']:.{digits}f} ({need['low']:.{digits}f} to {need['high']:.{digits}f})"
+
+    heads = [f"{key} at {a:g}" for key in ("looks", "time [s]") for a in ACCURACIES]
+    rows = [f"| policy | {' | '.join(heads)} |", "| --- |" + " --- |" * len(heads)]
+    for block in blocks:
+        cells = [
+            text(block["at"][str(a)][key], digits)
+            for key, digits in (("looks", 2), ("time", 1))
+            for a in ACCURACIES
+        ]
+        rows.append(f"| `{block['policy']}` | {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def draw(blocks: list[dict]) -> Figure:
+    """Looks and time of every policy against its share of wrong PoIs.
+
+    Args:
+      blocks: of `as_block`.
+    """
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, key, label in zip(
+        axes, ("looks", "time"), ("looks per PoI", "mean time of a mission [s]"), strict=True
+    ):
+        for block in blocks:
+            name = block["policy"]
+            if name == "random":
+                continue
+            order = np.argsort(block[key])
+            wrong = 100 * (1 - np.array(block["accuracy"]))[order]
+            axis.plot(
+                np.array(block[key])[order],
+                np.maximum(wrong, 0.05),
+                color="k" if name == "oracle" else policy_colour(name),
+                marker=policy_marker(name),
+                linewidth=2.5 if name == "latent" else 1.2,
+                linestyle=":" if name == "oracle" else "-",
+                label=name,
+            )
+        axis.set(xlabel=label, yscale="log", xlim=(0, None))
+        axis.grid(alpha=0.3, which="both")
+    axes[0].set_ylabel("wrong PoIs [%]")
+    axes[0].legend(fontsize="small")
+    return figure
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    config, models = rundir.load(cli.find_run(arguments.run))
+    if config.arena.num_pois > _MOST_POIS:
+        cli.fail(PROGRAM, f"num_pois = {config.arena.num_pois}: must be at most {_MOST_POIS}")
+    train_key, play_key = jax.random.split(jax.random.key(arguments.seed))
+    priced = of_costs(train_key, config, models, jnp.array(arguments.costs))
+    curves = Curves(play_key, config, arguments.episodes)
+    blocks = []
+    for name, varies, points in play_all(curves, arguments.costs, priced, models):
+        blocks.append(as_block(name, varies, points))
+        print(as_table(blocks[-1:]).splitlines()[-1], flush=True)
+    print(as_table(blocks))
+    if arguments.json is not None:
+        whole = {"commit": commit(), "versions": versions(), "episodes": arguments.episodes}
+        text = json.dumps({**whole, "seed": arguments.seed, "policies": blocks}, indent=1)
+        arguments.json.write_text(text + "\n", encoding="utf-8")
+    if arguments.plot is not None:
+        draw(blocks).savefig(arguments.plot, dpi=120)
+
+
+if __name__ == "__main__":
+    main()
