@@ -190,6 +190,11 @@ class CameraConfig(Section, place="camera"):
     """Largest share of the light that may be missing in an image; the share is uniform."""
     shadow: float = limited(0.0, at_least=0, at_most=1)
     """Probability of a shadow: on one side of a random pixel, only ambient light remains."""
+    light_distance: Traced[float] = limited(0.5, above=0)
+    """Distance between two positions over which exposure, colour cast, low light and shadow
+    change, in metres: their correlation falls as a Gaussian function with this deviation."""
+    light_time: Traced[float] = limited(60.0, above=0)
+    """Time over which they change in the same way, in seconds."""
     window: int = limited(80, at_least=1)
     """Pixels around the PoI's bearing that the detector reads."""
     stride: int = limited(4, at_least=1)

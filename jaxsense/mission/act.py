@@ -252,8 +252,11 @@ def _look(
     """Simulates a scan; it detects a PoI that it shows if the detector is confident enough."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
     data = arenas.place(world.arena, scene.layout, scene.poses)
-    readings = worlds.scan_around(aim.noise_key, world, scene, data, robot, aim.bearing, modality)
-    is_blind = mission.time(state) >= state.faults.blind_at[robot]
+    time = mission.time(state)
+    readings = worlds.scan_around(
+        aim.noise_key, world, scene, data, robot, aim.bearing, modality, time
+    )
+    is_blind = time >= state.faults.blind_at[robot]
     readings = jnp.where(is_blind, sensor.blind, readings)
     error = jnp.radians(mission.config.viewpoint.bearing_error)
     arena = mission.config.arena

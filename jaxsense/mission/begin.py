@@ -21,7 +21,7 @@ from jaxsense.mission.state import (
 )
 from jaxsense.models import Models
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import sensors
+from jaxsense.sim.light import random_light
 from jaxsense.sim.world import Scene
 
 _NUM_CANDIDATES = 32  # positions drawn for each robot
@@ -59,7 +59,8 @@ def reset(
     layout = arenas.random_layout(layout_key, config.arena, classes)
     paths = roadmap.build(config, layout)
     poses = _random_poses(pose_key, config, layout, paths)
-    scene = Scene(layout, sensors.random_light(light_key), poses)
+    light = random_light(light_key, mission.world.reads_conditions)
+    scene = Scene(layout, light, poses)
     faults = no_faults(config) if faults is None else faults
     return start(mission, models, scene, classes, jnp.asarray(policy, jnp.int32), faults, paths)
 

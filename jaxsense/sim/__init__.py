@@ -17,6 +17,8 @@ from jaxsense.sim.arena import make_layout as make_layout
 from jaxsense.sim.arena import place as place
 from jaxsense.sim.arena import random_layout as random_layout
 from jaxsense.sim.arena import robot_poses as robot_poses
+from jaxsense.sim.light import Light as Light
+from jaxsense.sim.light import random_light as random_light
 from jaxsense.sim.raycast import CrossSection as CrossSection
 from jaxsense.sim.raycast import Hit as Hit
 from jaxsense.sim.raycast import cast as cast
@@ -26,10 +28,8 @@ from jaxsense.sim.raycast import cross_section as cross_section
 from jaxsense.sim.rays import Fan as Fan
 from jaxsense.sim.rays import Pinhole as Pinhole
 from jaxsense.sim.rays import Rays as Rays
-from jaxsense.sim.sensors import Light as Light
 from jaxsense.sim.sensors import Sensor as Sensor
 from jaxsense.sim.sensors import Surfaces as Surfaces
-from jaxsense.sim.sensors import random_light as random_light
 from jaxsense.sim.sensors import scan as scan
 from jaxsense.sim.viewpoints import bearing as bearing
 from jaxsense.sim.windows import cut_out as cut_out

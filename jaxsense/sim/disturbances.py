@@ -1,6 +1,8 @@
 """Noise of the sensors: ranges, edges and lost beams of the LiDAR, light of the camera.
 
-Only reading noise is on by default; other disturbances cost nothing while off.
+The noise of beams and pixels is new in each scan. What changes the light persists in the scene:
+it depends on where and when a camera looks. Only reading noise is on by default; other disturbances
+cost nothing while off.
 """
 
 import chex
@@ -55,12 +57,12 @@ def changes_light(config: CameraConfig) -> bool:
 
 
 def lighting(
-    key: Key, num_pixels: int, config: CameraConfig
+    values: Float[Array, "8"], num_pixels: int, config: CameraConfig
 ) -> tuple[Float[Array, "3"], Float[Array, "B"]]:
-    """Draws how an image is lit and exposed.
+    """Tells how an image is lit and exposed.
 
     Args:
-      key: random key.
+      values: of the light's conditions where and when the camera looks.
       num_pixels: number of pixels, B.
       config: settings of the camera.
 
@@ -68,10 +70,8 @@ def lighting(
       Factors on the brightness of red, green and blue, and for each pixel 1 where the distant light
       reaches the surface, 0 in shadow.
     """
-    # Folded in: `key` draws the noise, which must not depend on what is switched on.
-    normal_key, uniform_key = jax.random.split(jax.random.fold_in(key, 1))
-    brightness, *casts = jax.random.normal(normal_key, (4,))
-    missing, falls, edge, side = jax.random.uniform(uniform_key, (4,))
+    brightness, *casts = values[:4]
+    missing, falls, edge, side = jax.scipy.special.ndtr(values[4:])  # uniform from 0 to 1
     logarithm = config.exposure_error * brightness + config.colour_cast * jnp.stack(casts)
     gain = (1 - config.low_light * missing) * jnp.exp(logarithm)
     is_beyond = jnp.arange(num_pixels) >= edge * num_pixels

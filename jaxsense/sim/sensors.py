@@ -19,31 +19,16 @@ from mujoco import mjx
 
 from jaxsense.config import LIDAR_HEIGHT, CameraConfig, Config, ConfigError, LidarConfig
 from jaxsense.core import checks
-from jaxsense.core.types import Index, Key, is_static, pytree
+from jaxsense.core.types import Index, Key, is_static
 from jaxsense.sim import amiro, disturbances, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
+from jaxsense.sim.light import Light
 from jaxsense.sim.rays import Fan, Pinhole, Rays
 
 _MIN_CHROMA = 0.1  # difference of a pixel's channels; 0 on walls, on robots and in the dark
 _RANGE_TOLERANCE = 5.0  # standard deviations of the LiDAR's noise
 _MIN_RANGE_TOLERANCE = 0.001  # m, above the rounding error of a distance
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour outside the arena
-
-
-@pytree
-class Light:
-    """A distant light source and ambient light.
-
-    Attributes:
-      direction: `[3]` unit vector towards the light.
-      diffuse: `[]` strength of the distant light.
-      ambient: `[]` strength of the ambient light.
-    """
-
-    direction: jax.Array
-    diffuse: jax.Array
-    ambient: jax.Array
-
 
 Surfaces = dict[str, jax.Array]
 """Surfaces of G geoms: `colour`, the `[G, 3]` albedo, and the `[G]` values of each of
@@ -98,7 +83,7 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
           key: random key of the noise.
           hits: `[B]` first hits of the rays.
           surfaces: colour and attributes of all geoms, for `raycast.choose`.
-          light: the light.
+          light: the light, with the point where and when the sensor looks.
 
         Returns:
           `[B]` readings, or `[B, channels]` if there are several channels.
@@ -130,6 +115,11 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
         """
         del distance, extent
         return jnp.ones(len(readings), bool)
+
+    @property
+    def reads_conditions(self) -> bool:
+        """Whether `read` needs `light.conditions`; by default not, and they may not be drawn."""
+        return False
 
     def centre(self, bearing: Float[Array, ""]) -> Float[Array, ""]:
         """Real-valued index of the ray along a bearing, in radians."""
@@ -198,8 +188,9 @@ class Camera(Sensor):
         normal_x, normal_y = hits.normal
         facing = normal_x * light.direction[0] + normal_y * light.direction[1]
         direct, gain = light.diffuse * jnp.maximum(facing, 0.0), None
-        if disturbances.changes_light(self.config):
-            gain, is_lit = disturbances.lighting(key, len(facing), self.config)
+        if self.reads_conditions:
+            values = light.changes(self.config.light_distance, self.config.light_time)
+            gain, is_lit = disturbances.lighting(values, len(facing), self.config)
             direct = direct * is_lit
         shade = light.ambient + direct
         noise = self.config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape))
@@ -222,14 +213,10 @@ class Camera(Sensor):
         del distance, extent
         return readings.max(axis=-1) - readings.min(axis=-1) >= _MIN_CHROMA
 
-
-def random_light(key: Key) -> Light:
-    """Draws a light of random strength from any side, 20 to 70 degrees above the floor."""
-    side, height, diffuse, ambient = jax.random.uniform(key, (4,))
-    side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)
-    flat = jnp.cos(height)
-    direction = jnp.stack([flat * jnp.cos(side), flat * jnp.sin(side), jnp.sin(height)])
-    return Light(direction, diffuse=0.2 + 0.6 * diffuse, ambient=0.3 + 0.3 * ambient)
+    @property
+    def reads_conditions(self) -> bool:
+        """See `Sensor.reads_conditions`: whether the settings change the light."""
+        return disturbances.changes_light(self.config)
 
 
 def lidar(config: LidarConfig) -> Lidar:
@@ -331,6 +318,7 @@ def scan(
     light: Light,
     robot: Index,
     directions: Float[Array | np.ndarray, "2 B"],
+    seconds: Float[Array, ""] | float = 0.0,
 ) -> Float[Array, "B *channels"]:
     """Scans along some rays of one robot's sensor.
 
@@ -344,9 +332,13 @@ def scan(
       robot: index of the robot that carries the sensor and does not see its own body. May be
         traced; a static index saves casting rays at that body.
       directions: unit vectors in the robot's frame; `sensor.directions` for a whole scan.
+      seconds: time of the scan, over which the light changes.
 
     Returns:
       The readings of these rays.
+
+    Raises:
+      ValueError: if the sensor reads the light's conditions, and they have not been drawn.
     """
     chex.assert_shape(directions, (2, None), custom_message="directions")
     chex.assert_shape(light.direction, (3,), custom_message="light.direction")
@@ -356,6 +348,7 @@ def scan(
     x, y = directions
     in_world = raycast.turned((x, y), pose[2])
     hits = raycast.cast_along(section, pose[:2], in_world)
+    light = dataclasses.replace(light, point=jnp.append(pose[:2], seconds))
     return sensor.read(key, hits, surfaces(arena, layout), light)
 
 

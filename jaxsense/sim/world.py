@@ -14,6 +14,7 @@ from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, others, pytree
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors, viewpoints, windows
+from jaxsense.sim.light import Light, random_light
 
 _FARTHEST_MOVE = 2.0  # m, between two looks
 
@@ -32,6 +33,11 @@ class World:
     sensors: tuple[sensors.Sensor, ...]
     viewpoint: ViewpointConfig
 
+    @property
+    def reads_conditions(self) -> bool:
+        """Whether a sensor reads the conditions of the light, see `Sensor.reads_conditions`."""
+        return any(sensor.reads_conditions for sensor in self.sensors)
+
 
 @pytree
 class Scene:
@@ -44,7 +50,7 @@ class Scene:
     """
 
     layout: arenas.Layout
-    light: sensors.Light
+    light: Light
     poses: jax.Array
 
 
@@ -95,7 +101,7 @@ def random_scene(key: Key, world: World, classes: Int[Array, "N"]) -> Scene:
     for robot_key, poi in zip(robot_keys, pois, strict=True):
         pose, _ = _viewpoint(robot_key, world, layout, poses, poi)
         poses = jnp.concatenate([poses, pose[None]])
-    return Scene(layout, sensors.random_light(light_key), poses)
+    return Scene(layout, random_light(light_key, world.reads_conditions), poses)
 
 
 def look(
@@ -177,6 +183,7 @@ def scan_around(
     robot: Index,
     bearing: Float[Array, ""],
     modality: int,
+    seconds: Float[Array, ""] | float = 0.0,
 ) -> Float[Array, "window *channels"]:
     """Scans around a bearing from a robot's current pose.
 
@@ -188,13 +195,15 @@ def scan_around(
       robot: index of the robot, which may be traced.
       bearing: bearing of the window's centre in the robot's frame, in radians.
       modality: index of the robot's sensor; static, because sensors differ in shape.
+      seconds: time of the scan, over which the light changes.
 
     Returns:
       The readings of the rays that the detector reads.
     """
     sensor = world.sensors[modality]
     rays = windows.window_of(sensor, sensor.directions, bearing)
-    return sensors.scan(key, sensor, world.arena, data, scene.layout, scene.light, robot, rays)
+    layout, light = scene.layout, scene.light
+    return sensors.scan(key, sensor, world.arena, data, layout, light, robot, rays, seconds)
 
 
 def survey(

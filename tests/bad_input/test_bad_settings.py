@@ -62,7 +62,7 @@ def test_no_number_may_be_something_else(value):
 LIMITS = {
     Limits(above=0): "arena.poi_radius arena.poi_gap lidar.min_range lidar.window_range "
     "viewpoint.min_distance viewpoint.max_distance team.travel.speed team.travel.turn_rate "
-    "team.travel.look_seconds navigation.view_range",
+    "team.travel.look_seconds navigation.view_range camera.light_distance camera.light_time",
     Limits(above=0, at_most=1): "detector.learning_rate jmvae.learning_rate filter.learning_rate "
     "team.tours.learning_rate dqn.learning_rate dqn.epsilon_decay",
     Limits(above=0, at_most=100): "arena.side team.sides",

@@ -12,6 +12,7 @@ from jaxsense.mission import act
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import windows, world
+from jaxsense.sim.light import random_conditions
 from jaxsense.vae.novelty import Novelty
 
 # PoI 0 is 0.8 m ahead of the robot under test, a red cube.
@@ -146,6 +147,26 @@ def test_the_lidar_looks_over_a_robot_without_one(scan, facing):
     # Its beams are at 0.152 m; the camera robot is 0.094 m high.
     after = scan(jax.random.key(0), facing(LIDAR, other=IN_THE_VIEW), LIDAR)
     assert after.robots.detections[LIDAR] == 1
+
+
+def test_the_light_of_a_scan_is_that_of_its_time(scan, models, facing):
+    # An untrained detector divides by almost nothing, and is always certain.
+    detector = replace(models.detectors[CAMERA], scale=jnp.float32(1.0))
+    reads = replace(models, detectors=(detector, *models.detectors[1:]))
+    before = facing(CAMERA)
+    light = replace(before.scene.light, conditions=random_conditions(jax.random.key(0)))
+    before = replace(before, scene=replace(before.scene, light=light))
+
+    def belief_after(seconds, light_time):
+        camera = replace(CONFIG.camera, exposure_error=0.3, light_time=light_time)
+        steps = jnp.int32(seconds / CONFIG.mission.control_period)
+        state, config = replace(before, steps=steps), replace(CONFIG, camera=camera)
+        return scan(jax.random.key(0), state, CAMERA, reads, config).log_posterior[0]
+
+    at_first, later = belief_after(0.0, 60.0), belief_after(30.0, 60.0)
+    assert np.abs(later - at_first).max() > 1e-4
+    # Half of both times.
+    np.testing.assert_allclose(belief_after(15.0, 30.0), later, atol=1e-6)
 
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])

@@ -7,8 +7,8 @@ import pytest
 
 from jaxsense.config import ArenaConfig, CameraConfig, LidarConfig
 from jaxsense.sim import disturbances, sensors, windows
+from jaxsense.sim.light import Light, random_conditions
 from jaxsense.sim.raycast import Hit
-from jaxsense.sim.sensors import Light
 
 NUMBER = 20_000
 KEYS = jax.random.split(jax.random.key(0), NUMBER)
@@ -22,10 +22,21 @@ def ranges(distance, **settings):
     return np.asarray(measure(KEYS))
 
 
-def lighting(**settings):
-    config = CameraConfig(**settings)
-    gain, is_lit = jax.vmap(lambda key: disturbances.lighting(key, 10, config))(KEYS)
-    return np.asarray(gain), np.asarray(is_lit)
+@pytest.fixture(scope="module")
+def values():
+    """`[NUMBER, 8]` conditions of many scenes where and when somebody looks."""
+    point = jnp.array([1.0, -2.0, 3.0])
+    return jax.jit(jax.vmap(lambda key: random_conditions(key).at(point)))(KEYS)
+
+
+@pytest.fixture(scope="module")
+def lighting(values):
+    def of_scenes(**settings):
+        config = CameraConfig(**settings)
+        gain, is_lit = jax.vmap(lambda v: disturbances.lighting(v, 10, config))(values)
+        return np.asarray(gain), np.asarray(is_lit)
+
+    return of_scenes
 
 
 def test_a_lidar_without_disturbances_has_noise_alone():
@@ -61,13 +72,13 @@ def test_a_beam_that_drops_out_reads_as_one_without_a_return():
     assert np.mean(np.all(found == 5.0, axis=1)) == pytest.approx(0.09, abs=0.01)
 
 
-def test_a_camera_without_disturbances_changes_nothing():
+def test_a_camera_without_disturbances_changes_nothing(lighting):
     gain, is_lit = lighting()
     np.testing.assert_array_equal(gain, 1.0)
     np.testing.assert_array_equal(is_lit, 1.0)
 
 
-def test_exposure_is_that_of_all_channels_and_a_cast_that_of_each():
+def test_exposure_is_that_of_all_channels_and_a_cast_that_of_each(lighting):
     logarithm = np.log(lighting(exposure_error=0.5)[0])
     np.testing.assert_allclose(logarithm, logarithm[:, :1] * [1.0, 1.0, 1.0], atol=1e-6)
     assert logarithm.std() == pytest.approx(0.5, rel=0.02)
@@ -75,24 +86,47 @@ def test_exposure_is_that_of_all_channels_and_a_cast_that_of_each():
     np.testing.assert_allclose(np.cov(logarithm.T), 0.04 * np.eye(3), atol=0.002)
 
 
-def test_missing_light_is_uniform():
+def test_missing_light_is_uniform(lighting):
     gain, _ = lighting(low_light=0.8)
     np.testing.assert_array_equal(gain[:, 0], gain[:, 1])
     assert gain.min() == pytest.approx(0.2, abs=0.001)
     assert gain.max() == pytest.approx(1.0, abs=0.001)
     assert gain.mean() == pytest.approx(0.6, abs=0.01)
+    assert gain.std() == pytest.approx(0.8 / 12**0.5, rel=0.02)
 
 
-def test_a_shadow_covers_one_side_from_a_random_pixel_on():
+def test_a_shadow_covers_one_side_from_a_random_pixel_on(lighting):
     _, is_lit = lighting(shadow=0.4)
     # One edge at most; half of all shadows in each pixel.
     assert np.abs(np.diff(is_lit, axis=1)).sum(axis=1).max() == 1
     np.testing.assert_allclose(np.mean(is_lit == 0, axis=0), 0.2, atol=0.015)
 
 
+def test_hand_worked_light():
+    config = CameraConfig(exposure_error=0.5, colour_cast=0.1, low_light=0.8, shadow=0.4)
+    # A standard normal value is below -.253347 with a chance of .4, below .524401 with .7, and
+    # below .5 with .691.
+    values = jnp.array([2.0, 1.0, 0.0, -1.0, 0.524401, -0.2534, 0.5, 0.1])
+    gain, is_lit = disturbances.lighting(values, 10, config)
+    # (1 - .8 * .7) exp(.5 * 2 + .1 * {1, 0, -1}); dark before pixel 7, the first beyond .691.
+    expected = 0.44 * np.exp([1.1, 1.0, 0.9])
+    np.testing.assert_allclose(gain, expected, rtol=1e-5)
+    np.testing.assert_array_equal(is_lit, [0] * 7 + [1] * 3)
+    _, is_lit = disturbances.lighting(values.at[7].set(-0.1), 10, config)
+    np.testing.assert_array_equal(is_lit, [1] * 7 + [0] * 3)
+    _, is_lit = disturbances.lighting(values.at[5].set(-0.2532), 10, config)
+    np.testing.assert_array_equal(is_lit, 1)
+
+
 def test_a_shadow_leaves_the_ambient_light():
     camera = sensors.camera(CameraConfig(pixel_noise=0.0, shadow=1.0))
-    light = Light(jnp.array([1.0, 0.0, 0.0]), jnp.float32(0.5), jnp.float32(0.25))
+    light = Light(
+        jnp.array([1.0, 0.0, 0.0]),
+        jnp.float32(0.5),
+        jnp.float32(0.25),
+        random_conditions(KEYS[0]),
+        jnp.zeros(3),
+    )
     rays = jnp.ones(80)
     hits = Hit(rays, jnp.zeros(80, jnp.int32), (rays, 0 * rays))
     colour = {"colour": jnp.array([[0.8, 0.4, 0.2]])}

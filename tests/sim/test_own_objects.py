@@ -124,6 +124,24 @@ class ThreeRays:
         return 1.0 - 2.0 * bearing
 
 
+class Clock(sim.Sensor):
+    """Where and when it looks, instead of what it sees."""
+
+    def read(self, key, hits, surfaces, light):
+        return light.point
+
+
+def test_a_scan_tells_the_sensor_where_and_when_it_looks(view):
+    arena, data = view
+    clock = Clock(height=0.05, rays=ThreeRays(), window=3)
+    for seconds in (0.0, jnp.float32(2.5)):
+        found = sim.scan(
+            jax.random.key(0), clock, arena, data, LAYOUT, LIGHT, 0, clock.directions, seconds
+        )
+        np.testing.assert_array_equal(found, [*sim.robot_poses(data)[0, :2], seconds])
+    assert LIGHT.point is None
+
+
 class Sonar(sim.Sensor):
     """One range for all rays, in a unit of its own."""
 

@@ -8,7 +8,7 @@ import pytest
 
 import jaxsense.looks
 from jaxsense import sim
-from jaxsense.config import ArenaConfig, Config, ConfigError, ViewpointConfig
+from jaxsense.config import ArenaConfig, CameraConfig, Config, ConfigError, ViewpointConfig
 from jaxsense.sim import viewpoints, world
 
 CLASSES = jnp.array([0, 1, 2])  # green cylinder, red cylinder, red cube
@@ -166,6 +166,37 @@ def test_surveys_equal_single_ones(simulation, monkeypatch):
     for i in range(5):
         alone = single(keys[i], classes[i])
         chex.assert_trees_all_close(jax.tree.map(lambda x: x[i], together), alone, atol=1e-5)  # noqa: B023
+
+
+def test_looks_at_a_scene_share_what_changes_its_light(simulation):
+    camera = CameraConfig(pixel_noise=0.0, exposure_error=0.5)
+    changing = world.make_world(Config(camera=camera), arena=simulation.arena)
+    assert not simulation.reads_conditions
+    assert changing.reads_conditions
+    key = jax.random.key(3)
+    plain, scene = (jax.jit(sim.random_scene)(key, w, CLASSES) for w in (simulation, changing))
+    assert plain.light.conditions is None
+    unchanged = dataclasses.replace(scene.light, conditions=None)
+    chex.assert_trees_all_equal(dataclasses.replace(scene, light=unchanged), plain)
+
+    @jax.jit
+    def scan(key, pose, seconds):
+        here = dataclasses.replace(scene, poses=scene.poses.at[0].set(pose))
+        data = sim.place(changing.arena, here.layout, here.poses)
+        return world.scan_around(key, changing, here, data, 0, jnp.float32(0), 0, seconds)
+
+    def brightness(seed, seconds=0.0):
+        return np.log(scan(jax.random.key(seed), jnp.array([0.5, 0.0, 0.0]), seconds))
+
+    first, later = brightness(0), brightness(0, 90.0)
+    np.testing.assert_array_equal(brightness(1), first)
+    # .5 m are one unit of distance, and 90 s one and a half of time.
+    values = [scene.light.conditions.at(jnp.array([1.0, 0.0, time])) for time in (0.0, 1.5)]
+    drift = 0.5 * (values[1] - values[0])[0]
+    assert abs(drift) > 0.1
+    within = (first < 0) & (later < 0)  # of the full scale
+    assert within.any()
+    np.testing.assert_allclose((later - first)[within], drift, atol=1e-4)
 
 
 def test_the_world_of_other_settings_keeps_the_arena():

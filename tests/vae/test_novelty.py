@@ -67,7 +67,10 @@ def test_it_learns_the_share_that_is_new():
 
 @pytest.mark.parametrize(
     ("moved", "classes", "expected"),
-    [(-1.0, 0, "moved = -1.0: must be at least 0"), (1.0, 2, "classes = 2: must be a whole number from 0 to 1")],
+    [
+        (-1.0, 0, "moved = -1.0: must be at least 0"),
+        (1.0, 2, "classes = 2: must be a whole number from 0 to 1"),
+    ],
 )
 def test_wrong_pairs_are_refused(moved, classes, expected):
     look = jnp.zeros((1, 2))

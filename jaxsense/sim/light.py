@@ -1,0 +1,103 @@
+"""The light of a scene, and what changes it over positions and time."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsense.core.types import Key, pytree
+
+_NUM_WAVES = 32
+_NUM_CONDITIONS = 8  # numbers that `disturbances.lighting` takes
+
+
+@pytree
+class Conditions:
+    """What changes the light of a scene: eight independent values at each position and time.
+
+    Each is a Gaussian random field by random Fourier features (Rahimi & Recht 2007): over scenes,
+    its value at any point is standard normal, and `exp(-d^2 / 2)` is the correlation of its values
+    at two points at a distance d.
+
+    Attributes:
+      frequencies: `[K, 3]` of K plane waves, in radians.
+      weights: `[8, 2 K]` of their cosines and sines.
+    """
+
+    frequencies: jax.Array
+    weights: jax.Array
+
+    def at(self, point: Float[Array, "3"]) -> Float[Array, "8"]:
+        """Values at a point: x, y and time, each in units over which the values change."""
+        # No matrix products, which accelerators round.
+        phase = jnp.sum(self.frequencies * point[None], axis=-1)
+        waves = jnp.concatenate([jnp.cos(phase), jnp.sin(phase)])
+        return jnp.sum(self.weights * waves[None], axis=-1) / len(phase) ** 0.5
+
+
+@pytree
+class Light:
+    """A distant light source and ambient light.
+
+    Attributes:
+      direction: `[3]` unit vector towards the light.
+      diffuse: `[]` strength of the distant light.
+      ambient: `[]` strength of the ambient light.
+      conditions: what changes the light; None if no sensor reads it.
+      point: `[3]` where and when a sensor looks: x [m], y [m] and time [s]; None until
+        `sensors.scan` sets it.
+    """
+
+    direction: jax.Array
+    diffuse: jax.Array
+    ambient: jax.Array
+    conditions: Conditions | None = None
+    point: jax.Array | None = None
+
+    def changes(
+        self, distance: Float[Array, ""] | float, time: Float[Array, ""] | float
+    ) -> Float[Array, "8"]:
+        """Values of the conditions where and when a sensor looks.
+
+        Args:
+          distance: over which they change, in metres.
+          time: over which they change, in seconds.
+
+        Returns:
+          Values that are standard normal over scenes.
+
+        Raises:
+          ValueError: if the conditions have not been drawn, or the point has not been set.
+        """
+        if self.conditions is None:
+            raise ValueError(
+                "light.conditions = None: must be drawn, as by random_light(key, "
+                "world.reads_conditions), because the settings of a sensor change the light"
+            )
+        if self.point is None:
+            raise ValueError("light.point = None: must be set, as by sim.scan")
+        return self.conditions.at(self.point / jnp.stack([distance, distance, time]))
+
+
+def random_conditions(key: Key) -> Conditions:
+    """Draws the conditions of a scene."""
+    frequency_key, weight_key = jax.random.split(key)
+    return Conditions(
+        frequencies=jax.random.normal(frequency_key, (_NUM_WAVES, 3)),
+        weights=jax.random.normal(weight_key, (_NUM_CONDITIONS, 2 * _NUM_WAVES)),
+    )
+
+
+def random_light(key: Key, has_conditions: bool = False) -> Light:
+    """Draws a light of random strength from any side, 20 to 70 degrees above the floor.
+
+    Args:
+      key: random key.
+      has_conditions: whether to draw what changes the light, see `World.reads_conditions`.
+    """
+    side, height, diffuse, ambient = jax.random.uniform(key, (4,))
+    side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)
+    flat = jnp.cos(height)
+    direction = jnp.stack([flat * jnp.cos(side), flat * jnp.sin(side), jnp.sin(height)])
+    # Folded in: the light must not depend on what is switched on.
+    conditions = random_conditions(jax.random.fold_in(key, 1)) if has_conditions else None
+    return Light(direction, 0.2 + 0.6 * diffuse, 0.3 + 0.3 * ambient, conditions)

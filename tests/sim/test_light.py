@@ -1,0 +1,157 @@
+"""The light of a scene, and how it changes: moments and correlations over many scenes."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import sim
+from jaxsense.config import CameraConfig
+from jaxsense.sim import sensors
+from jaxsense.sim.light import Conditions, random_conditions
+from jaxsense.sim.raycast import Hit
+
+NUMBER = 20_000
+KEYS = jax.random.split(jax.random.key(0), NUMBER)
+SOMEWHERE = np.array([1.0, -2.0, 3.0])
+ONE_RAY = Hit(jnp.ones(1), jnp.zeros(1, jnp.int32), (jnp.ones(1), jnp.zeros(1)))
+WHITE = {"colour": jnp.ones((1, 3))}
+
+
+@pytest.fixture(scope="module")
+def conditions():
+    """Those of many scenes."""
+    return jax.jit(jax.vmap(random_conditions))(KEYS)
+
+
+@pytest.fixture(scope="module")
+def values(conditions):
+    """`[NUMBER, P, 8]` conditions of many scenes at some points."""
+    at = jax.jit(jax.vmap(lambda scene, point: scene.at(point), (0, None)))
+
+    def of_scenes(*points):
+        each = [at(conditions, jnp.array(point, jnp.float32)) for point in points]
+        return np.stack(each, axis=1)
+
+    return of_scenes
+
+
+def test_random_light_is_a_unit_vector_from_20_to_70_degrees():
+    light = jax.jit(jax.vmap(sim.random_light))(jax.random.split(jax.random.key(0), 500))
+    np.testing.assert_allclose(np.linalg.norm(light.direction, axis=-1), 1.0, atol=1e-6)
+    height = np.degrees(np.arcsin(light.direction[:, 2]))
+    assert 20 <= height.min() < 22
+    assert 68 < height.max() <= 70.001
+    for quarter in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        assert (np.sign(light.direction[:, :2]) == quarter).all(axis=-1).mean() > 0.15
+    # Between the weakest and the strongest light, to within 1 % of 500 draws.
+    for strength, low, high in ((light.diffuse, 0.2, 0.8), (light.ambient, 0.3, 0.6)):
+        assert low <= strength.min() < low + 0.02 * (high - low)
+        assert high - 0.02 * (high - low) < strength.max() <= high + 1e-6
+
+
+def test_conditions_leave_the_light_as_it_is():
+    plain, changing = (sim.random_light(KEYS[0], given) for given in (False, True))
+    assert plain.conditions is None
+    assert changing.conditions is not None
+    jax.tree.map(
+        np.testing.assert_array_equal, plain, dataclasses.replace(changing, conditions=None)
+    )
+
+
+def test_hand_worked_conditions():
+    # One wave of 2 rad per unit of x and 1 of time: at (.5, 9, 2) its phase is 3.
+    weights = jnp.stack([jnp.array([1.0, 0.0]), jnp.array([0.5, 2.0])])
+    conditions = Conditions(jnp.array([[2.0, 0.0, 1.0]]), weights)
+    found = conditions.at(jnp.array([0.5, 9.0, 2.0]))
+    expected = [np.cos(3), 0.5 * np.cos(3) + 2 * np.sin(3)]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_conditions_are_independent_standard_normal_values_anywhere(values):
+    for point in (np.zeros(3), SOMEWHERE, [20.0, -20.0, 60.0]):
+        found = values(point)[:, 0]
+        # Standard errors of 20,000 draws: .007 of a mean, .01 of a variance, .035 of the fourth
+        # moment, which is 3.
+        np.testing.assert_allclose(found.mean(axis=0), 0.0, atol=0.03)
+        np.testing.assert_allclose(np.cov(found.T), np.eye(8), atol=0.045)
+        np.testing.assert_allclose((found**2).mean() ** 2, 1.0, atol=0.02)
+        assert (found**4).mean() == pytest.approx(3.0, abs=0.07)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_conditions_correlate_less_the_further_apart(values, axis):
+    distances = [0.0, 0.02, 0.5, 1.0, 2.0, 4.0]
+    found = values(*(SOMEWHERE + distance * np.eye(3)[axis] for distance in distances))
+    correlation = (found * found[:, :1]).mean(axis=(0, 2))
+    # exp(-d^2 / 2): 1, .9998, .8825, .6065, .1353, .0003.
+    expected = np.exp(-np.square(distances) / 2)
+    np.testing.assert_allclose(correlation, expected, atol=0.015)
+    assert np.abs(found[:, 1] - found[:, 0]).max() < 0.2  # 5 to 10 times the deviation of .02
+
+
+def test_distance_and_time_add_up_as_squares(values):
+    found = values(SOMEWHERE, SOMEWHERE + np.array([0.6, -0.8, 1.0]))
+    correlation = (found[:, 0] * found[:, 1]).mean()
+    assert correlation == pytest.approx(np.exp(-1.0), abs=0.015)
+
+
+@pytest.fixture(scope="module")
+def brightness(conditions):
+    """`[P, NUMBER]` logarithms of what a camera reads of one surface at points [m, m, s]."""
+
+    @jax.jit
+    def read(camera, conditions, point):
+        def of_scene(conditions):
+            light = sim.Light(jnp.zeros(3), jnp.zeros(()), jnp.float32(0.25), conditions, point)
+            return camera.read(KEYS[0], ONE_RAY, WHITE, light)[0, 0]
+
+        return jax.vmap(of_scene)(conditions)
+
+    def of_scenes(camera, *points):
+        each = [read(camera, conditions, jnp.array(point, jnp.float32)) for point in points]
+        return np.log(each)
+
+    return of_scenes
+
+
+@pytest.mark.parametrize(
+    ("settings", "distance", "time"),
+    [({}, 0.5, 60.0), ({"light_distance": 2.0, "light_time": 5.0}, 2.0, 5.0)],
+)
+def test_a_camera_meets_almost_the_same_light_nearby_and_another_far_away(
+    brightness, settings, distance, time
+):
+    camera = sensors.camera(CameraConfig(pixel_noise=0.0, exposure_error=0.1, **settings))
+    apart = [(0, 0, 0), (0, 0, 0.1), (distance, 0, 0), (0, distance, 0), (0, 0, time)]
+    apart += [(4 * distance, 0, 0), (0, 0, 4 * time)]
+    found = np.corrcoef(brightness(camera, *apart))[0]
+    nearby = np.exp(-((0.1 / time) ** 2) / 2)
+    expected = [1.0, nearby, *[np.exp(-0.5)] * 3, 0.0, 0.0]
+    np.testing.assert_allclose(found, expected, atol=0.03)
+    assert found[1] > 0.999
+
+
+def test_the_light_persists_while_the_noise_of_pixels_is_new():
+    light = sim.random_light(KEYS[0], has_conditions=True)
+    light = dataclasses.replace(light, point=jnp.zeros(3))
+    hits = Hit(jnp.ones(80), jnp.zeros(80, jnp.int32), (jnp.ones(80), jnp.zeros(80)))
+    for noise in (0.0, 0.01):
+        settings = {"exposure_error": 0.3, "colour_cast": 0.3, "low_light": 0.5, "shadow": 0.3}
+        camera = sensors.camera(CameraConfig(pixel_noise=noise, **settings))
+        first, second = (camera.read(key, hits, WHITE, light) for key in KEYS[1:3])
+        # The difference of two independent errors.
+        assert np.std(first - second) == pytest.approx(2**0.5 * noise, rel=0.15)
+
+
+def test_light_without_what_a_camera_needs_is_refused():
+    camera = sensors.camera(CameraConfig(shadow=0.3))
+    plain = sim.random_light(KEYS[0])
+    with pytest.raises(ValueError, match=r"^light\.conditions = None: must be drawn"):
+        camera.read(KEYS[0], ONE_RAY, WHITE, plain)
+    with pytest.raises(ValueError, match=r"^light\.point = None: must be set"):
+        camera.read(KEYS[0], ONE_RAY, WHITE, sim.random_light(KEYS[0], has_conditions=True))
+    assert camera.reads_conditions
+    assert not sensors.camera(CameraConfig()).reads_conditions
