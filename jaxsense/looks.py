@@ -2,7 +2,7 @@
 
 `Live` casts a scan in the environment's own MJX arena and runs the detector on it; `Bank` draws
 from stored features of such scans. Single looks have the same distribution in both; live looks at
-one scene share its light.
+one scene share its light, which drifts over positions.
 """
 
 import chex
