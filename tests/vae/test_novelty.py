@@ -59,7 +59,7 @@ def test_it_learns_that_a_repeated_look_says_nothing_and_a_distant_one_everythin
 
 
 def test_it_learns_the_share_that_is_new():
-    # Had both looks the same weight, two would be worth 2 / 1.5 = 1.33 looks; the first counts as 1.
+    # Of equal weight, two looks would be worth 2 / 1.5 = 1.33 looks; here the first counts as 1.
     first, second, moved, classes = _pairs(jax.random.key(1), 20_000, 0.5, 0.0)
     near, _ = jax.jit(novelty.fit)(first, second, moved, classes)
     assert 0.4 < near < 0.8
