@@ -25,7 +25,7 @@ from jaxsense.training.stages import stages
 
 _ROWS = ("survey",)
 """Stages whose inputs and output have independent rows, so that devices can share them."""
-_SAVED = ("best_jmvae", "class_beliefs", "fusion", "look_values")
+_SAVED = ("novelty", "best_jmvae", "class_beliefs", "fusion", "look_values")
 """Stages without chunks whose output a run saves; it saves that of every stage with chunks."""
 
 

@@ -323,6 +323,7 @@ def _named(models: Models, config: Config) -> dict[str, PyTree]:
     return {
         **{f"detector_{name}": detector for name, detector in detectors},
         "best_jmvae": models.jmvae,
+        "novelty": models.novelty,
         "fusion": models.fusion,
         "look_values": models.look_values,
         **{learner(config, name): q_network for name, q_network in q_networks},

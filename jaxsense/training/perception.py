@@ -220,8 +220,8 @@ def detect(
     )
 
 
-def novelty_stages(arena: Arena, config: Config) -> list[Stage]:
-    """Makes the stage that learns how much of a look is new, if there are pairs of looks.
+def novelty_stage(arena: Arena, config: Config) -> Stage:
+    """Makes the stage that learns how much of a look is new; all of it if there are no pairs.
 
     Args:
       arena: of the simulation.
@@ -229,7 +229,8 @@ def novelty_stages(arena: Arena, config: Config) -> list[Stage]:
     """
     number = config.detector.num_repeats
     if not number:
-        return []
+        num_modalities = len(config.modalities)
+        return Stage("novelty", lambda key, config: novelty.independent(num_modalities))
 
     def begin(key: Key, config: Config, *, trained: tuple[Detector, ...]) -> Novelty:
         world, exact = make_world(config, arena=arena), make_bayes(config)
@@ -248,7 +249,7 @@ def novelty_stages(arena: Arena, config: Config) -> list[Stage]:
         return Novelty(jnp.stack(near), jnp.stack(length))
 
     names = tuple(f"detector_{name}" for name in config.modalities)
-    return [Stage("novelty", begin, {"trained": names})]
+    return Stage("novelty", begin, {"trained": names})
 
 
 def jmvae_stages(config: Config) -> list[Stage]:

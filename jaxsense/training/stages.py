@@ -14,7 +14,6 @@ from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import agents, comparison, measures, perception
 from jaxsense.training.stage import Learned, Output, Stage, compose, key_of
-from jaxsense.vae import novelty
 
 
 def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
@@ -45,7 +44,7 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
         *(perception.detector_stage(m, name, config) for m, name in enumerate(detectors)),
         Stage("detections", perception.detect, {"surveys": "survey", "trained": detectors}),
         Stage("detector_metrics", measures.detector_metrics, detections),
-        *perception.novelty_stages(arena, config),
+        perception.novelty_stage(arena, config),
         *perception.jmvae_stages(config),
         Stage("class_beliefs", perception.class_beliefs, {**params, **detections}),
         *perception.fusion_stages(config),
@@ -100,7 +99,7 @@ def models(outputs: Mapping[str, Output], config: Config) -> Models:
         jmvae=outputs["best_jmvae"],
         fusion=outputs["fusion"],
         bayes=make_bayes(config),
-        novelty=outputs.get("novelty", novelty.independent(len(config.modalities))),
+        novelty=outputs["novelty"],
         look_values=outputs["look_values"],
         agent=make_agent(config),
         q_networks=tuple(outputs[agents.learner(config, name)] for name in config.modalities),
