@@ -180,7 +180,7 @@ def main(argv: list[str] | None = None) -> None:
             f"{np.mean(x > 0):.3f} at {d} m" for d, x in zip(_DISTANCES, of_sensor, strict=True)
         )
         print(f"{name}: single looks right {shares}")
-        near = float(models.novelty.weight(jnp.float32(0), m))
+        near = float(models.novelty.weight(jnp.zeros(1), m))
         fresh = float(models.novelty.fresh_distance(m))
         print(f"  a look from the same place counts {near:.2f}; {fresh:.2f} m away, a half")
         problem = Problem(of_sensor, near, fresh, float(config.team.travel.speed))

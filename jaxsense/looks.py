@@ -24,6 +24,7 @@ from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Detector
 
 _SCENES_AT_ONCE = 512
+_FARTHEST_MOVE = 2.0  # m
 
 
 @pytree
@@ -185,32 +186,40 @@ def surveys(
     return jax.tree.map(lambda x: x[:number], found)
 
 
-def pairs(
-    keys: Key, world: World, classes: Int[Array, "S N"], modality: int
-) -> tuple[Float[Array, "S F"], Float[Array, "S F"], Float[Array, " S"]]:
-    """Looks twice at the first PoI of many scenes, from places near each other.
+def repeats(
+    keys: Key, world: World, classes: Int[Array, "S N"], modality: int, number: int
+) -> tuple[Float[Array, "S {number} F"], Float[Array, "S {number} 2"]]:
+    """Looks several times at the first PoI of many scenes, from near the first look.
+
+    In half of the scenes all looks are from one place, in the others up to 2 m away from it.
 
     Args:
       keys: `[S]` random keys.
       world: the simulation.
       classes: `[S, N]` int32 classes of the PoIs.
       modality: index of the sensor; static.
+      number: T, looks in each scene; static.
 
     Returns:
-      `[S, F]` windows of the first look and of the second, and the `[S]` distances between their
-      places, in metres.
+      `[S, T, F]` windows, and `[S, T, 2]` positions of the looks, in metres.
     """
 
-    def look_twice(scene: tuple[Key, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def look(scene: tuple[Key, jax.Array]) -> tuple[jax.Array, jax.Array]:
         key, classes = scene
-        scene_key, first_key, second_key = jax.random.split(key, 3)
+        scene_key, move_key, first_key, *later_keys = jax.random.split(key, 2 + number)
+        farthest = jnp.where(jax.random.bernoulli(move_key), _FARTHEST_MOVE, 0.0)
         drawn, poi = worlds.random_scene(scene_key, world, classes), jnp.int32(0)
         first, seen = worlds.look(first_key, world, drawn, modality, poi)
-        second, moved = worlds.look_again(second_key, world, seen, modality, poi)
-        return first, second, moved
+        again = jax.vmap(lambda key: worlds.look_again(key, world, seen, modality, poi, farthest))
+        windows, positions = again(jnp.stack(later_keys))
+        place = seen.poses[modality, :2]
+        return (
+            jnp.concatenate([first[None], windows]),
+            jnp.concatenate([place[None], positions]),
+        )
 
     batch = min(_SCENES_AT_ONCE, len(keys))
-    return jax.lax.map(look_twice, (keys, classes), batch_size=batch)
+    return jax.lax.map(look, (keys, classes), batch_size=batch)
 
 
 def detect_all(

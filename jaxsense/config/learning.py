@@ -24,8 +24,8 @@ class DetectorConfig(Section, place="detector"):
     num_held_out: int = limited(8192, at_least=1)
     """Simulated scans that measure the accuracy."""
     num_repeats: int = limited(0, at_least=0, at_most=1_000_000)
-    """Pairs of looks at one PoI by each sensor, from which it is learned how much of a look from
-    near an earlier one is new, see `vae.novelty`. With 0, all of it counts."""
+    """Scenes in which each sensor looks at a PoI again and again, from which it is learned how much
+    of a look from near earlier ones is new, see `vae.novelty`. With 0, all of it counts."""
     steps: int = limited(4000, at_least=1)
     """Gradient steps."""
     batch: int = limited(512, at_least=1)
@@ -42,7 +42,7 @@ class DetectorConfig(Section, place="detector"):
         return {
             "hidden": _weights(sizes.window, *self.hidden, sizes.labels),
             "num_scans num_held_out": max(self.num_scans, self.num_held_out) * sizes.window,
-            "num_repeats": self.num_repeats * sizes.classes,
+            "num_repeats": 4 * self.num_repeats * sizes.window,
             "batch steps": self.batch * max(self.steps, sizes.window),
         }
 

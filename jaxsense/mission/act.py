@@ -264,8 +264,8 @@ def _look(
     features = models.features(modality, sensor, readings)
     is_confident = jnp.max(features) >= mission.config.mission.least_confidence
     old = jax.tree.map(lambda x: x[aim.poi], state.belief)
-    moved = state.moved(scene.poses[robot, :2][None], aim.poi, modality)[0]
-    weight = models.novelty.weight(moved, modality)
+    apart = state.apart(scene.poses[robot, :2][None], aim.poi, modality)[0]
+    weight = models.novelty.weight(apart, modality)
     return _Look(
         detects=shows & is_confident,
         belief=models.fusion.update(old, state.seen[aim.poi], features, modality, weight),

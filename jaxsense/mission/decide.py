@@ -207,7 +207,7 @@ def _times_to_new_places(
 
     def of_look(position: jax.Array, modality: jax.Array, poi: jax.Array) -> jax.Array:
         missing = models.novelty.fresh_distance(modality)
-        missing -= state.moved(position[None], poi, modality)[0]
+        missing -= jnp.min(state.apart(position[None], poi, modality))
         return jnp.maximum(missing, 0.0) / mission.config.team.travel.speed
 
     of_robot = jax.vmap(of_look, (None, None, 0))
@@ -239,8 +239,8 @@ def _best_view(
     length += jnp.where(_room(mission, state, robot, poi, positions, margin) > 0, 0.0, _DETOUR)
     position, modality = scene.poses[robot, :2], _modality(mission, robot)
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
-    moved = state.moved(jnp.concatenate([positions, position[None]]), poi, modality)
-    is_new = moved >= models.novelty.fresh_distance(modality)
+    apart = state.apart(jnp.concatenate([positions, position[None]]), poi, modality)
+    is_new = jnp.min(apart, axis=-1) >= models.novelty.fresh_distance(modality)
     cost = jnp.append(length, here) + jnp.where(is_new, 0.0, _REPEATED)
     excluded &= jnp.any(jnp.isfinite(cost) & ~excluded)
     cost = jnp.where(excluded, jnp.inf, cost)

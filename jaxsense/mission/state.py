@@ -133,10 +133,10 @@ class MissionState:
         """Which modalities have detected which PoI."""
         return self.times_seen > 0
 
-    def moved(
+    def apart(
         self, positions: Float[Array, "C 2"], poi: Int[Array, ""], modality: Index
-    ) -> Float[Array, " C"]:
-        """Distances from the nearest recent look by a sensor at a PoI, in metres.
+    ) -> Float[Array, "C K"]:
+        """Distances from the recent looks by a sensor at a PoI, in metres.
 
         Args:
           positions: `[C, 2]` places to look from.
@@ -144,8 +144,7 @@ class MissionState:
           modality: index of the sensor.
         """
         places = self.looked_from[poi, modality]
-        apart = jnp.linalg.norm(positions[:, None] - places[None], axis=-1)
-        return jnp.min(apart, axis=-1)
+        return jnp.linalg.norm(positions[:, None] - places[None], axis=-1)
 
     def robot(self, robot: Index) -> Robots:
         """State of one robot: the fields of `Robots` without their first axis."""

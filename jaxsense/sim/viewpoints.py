@@ -66,7 +66,7 @@ def moved_viewpoint(
     poi: Int[Array, ""],
     position: Float[Array, "2"],
     distance: Float[Array, ""],
-) -> tuple[Float[Array, "3"], Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """Draws another pose from which a robot looks at a PoI, at a given distance from a place.
 
     Args:
@@ -80,8 +80,8 @@ def moved_viewpoint(
       distance: between the place and the pose, in metres.
 
     Returns:
-      The pose and the believed bearing of the PoI as in `random_viewpoint`, and the distance: 0 if
-      no free pose at that distance is in range and shows the PoI.
+      The pose and the believed bearing of the PoI, as in `random_viewpoint`. The pose is at the
+      place itself if no free one at that distance is in range and shows the PoI.
     """
     chex.assert_shape(position, (2,), custom_message="position")
     chex.assert_rank([poi, distance], 0, custom_message="poi, distance")
@@ -92,11 +92,11 @@ def moved_viewpoint(
     to_poi = jnp.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
     is_free = free_room(x, y, config.clearance, arena, layout, others, poi) > 0
     is_free &= (to_poi >= config.min_distance) & (to_poi <= config.max_distance)
-    chosen, moves = jnp.argmax(is_free), jnp.any(is_free)
-    stand = jnp.where(moves, jnp.stack([x[chosen], y[chosen]]), position)
+    chosen = jnp.argmax(is_free)
+    stand = jnp.where(jnp.any(is_free), jnp.stack([x[chosen], y[chosen]]), position)
     bearing, believed = _bearings(draws[-2], draws[-1], config)
     yaw = jnp.arctan2(target[1] - stand[1], target[0] - stand[0]) - bearing
-    return jnp.append(stand, yaw), believed, jnp.where(moves, distance, 0.0)
+    return jnp.append(stand, yaw), believed
 
 
 def _bearings(

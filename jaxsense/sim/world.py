@@ -16,8 +16,6 @@ from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors, viewpoints, windows
 from jaxsense.sim.light import Light, random_light
 
-_FARTHEST_MOVE = 2.0  # m, between two looks
-
 
 @struct.dataclass
 class World:
@@ -139,8 +137,13 @@ def look(
 
 
 def look_again(
-    key: Key, world: World, scene: Scene, robot: int, poi: Int[Array, ""]
-) -> tuple[Float[Array, "F"], Float[Array, ""]]:
+    key: Key,
+    world: World,
+    scene: Scene,
+    robot: int,
+    poi: Int[Array, ""],
+    farthest: Float[Array, ""] | float,
+) -> tuple[Float[Array, "F"], Float[Array, "2"]]:
     """Moves a robot a random distance from its viewpoint of a PoI, often a short one, and scans.
 
     Args:
@@ -149,9 +152,10 @@ def look_again(
       scene: the scene after `look`.
       robot: index of the robot and of its modality; static.
       poi: index of the PoI.
+      farthest: longest distance, in metres.
 
     Returns:
-      The detector's input, and the distance that the robot has moved, in metres.
+      The detector's input, and the robot's position, in metres.
 
     Raises:
       ValueError: if there is no such PoI.
@@ -159,7 +163,7 @@ def look_again(
     chex.assert_rank(poi, 0, custom_message="poi")
     checks.require_index("poi", poi, world.arena.config.num_pois)
     distance_key, viewpoint_key, noise_key = jax.random.split(key, 3)
-    pose, bearing, moved = viewpoints.moved_viewpoint(
+    pose, bearing = viewpoints.moved_viewpoint(
         viewpoint_key,
         world.viewpoint,
         world.arena.config,
@@ -167,12 +171,12 @@ def look_again(
         jnp.delete(scene.poses, robot, axis=0)[:, :2],
         poi,
         scene.poses[robot, :2],
-        _FARTHEST_MOVE * jax.random.uniform(distance_key) ** 3,
+        farthest * jax.random.uniform(distance_key) ** 3,
     )
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
     data = arenas.place(world.arena, scene.layout, scene.poses)
     readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
-    return windows.as_window(world.sensors[robot], readings), moved
+    return windows.as_window(world.sensors[robot], readings), pose[:2]
 
 
 def scan_around(

@@ -23,6 +23,8 @@ from jaxsense.vae.filter import Filter
 from jaxsense.vae.fusion import InPlace
 from jaxsense.vae.novelty import Novelty
 
+_REPEATS = 4  # looks in a scene, from which novelty is learned
+
 Examples = tuple[Float[Array, "_ _"], Int[Array, "_"]]
 """`[L, F]` windows of a detector, and their `[L]` int32 labels."""
 
@@ -240,13 +242,13 @@ def novelty_stage(arena: Arena, config: Config) -> Stage:
         )
 
         def fit(m: int) -> tuple[jax.Array, jax.Array]:
-            first, second, moved = looks.pairs(jax.random.split(keys[m], number), world, classes, m)
+            scene_keys = jax.random.split(keys[m], number)
+            windows, places = looks.repeats(scene_keys, world, classes, m, _REPEATS)
             read = lambda x: exact.log_likelihoods(detectors.detect(trained[m], x), m)  # noqa: E731
-            found = jax.vmap(read)(first), jax.vmap(read)(second)
-            return novelty.fit(first=found[0], second=found[1], moved=moved, classes=classes[:, 0])
+            return novelty.fit(jax.vmap(jax.vmap(read))(windows), places, classes[:, 0])
 
-        near, length = zip(*map(fit, range(len(trained))), strict=True)
-        return Novelty(jnp.stack(near), jnp.stack(length))
+        strength, length = zip(*map(fit, range(len(trained))), strict=True)
+        return Novelty(jnp.stack(strength), jnp.stack(length))
 
     names = tuple(f"detector_{name}" for name in config.modalities)
     return Stage("novelty", begin, {"trained": names})

@@ -1,9 +1,13 @@
 """How much of a look is new evidence, after earlier looks from places nearby.
 
-Two looks at a PoI from one place share its light and the beams that graze an edge, so the second
-says little that the first has not said. Fusion weighs the log-likelihoods of a look by how far the
-sensor has moved, `1 - (1 - near) exp(-d^2 / (2 L^2))`: from `near` for a look from the same place
-to 1 far away. Both numbers are learned from pairs of looks.
+Looks at a PoI from one place share its light and the beams that graze an edge, so each says less
+than the one before. Fusion weighs the log-likelihoods of a look by
+
+    (1 + a sum_k exp(-d_k^2 / (2 L^2)))^-2
+
+with d_k the distances from earlier looks by the same sensor at the PoI. A mean of k measurements
+whose errors have a correlation r is worth `k / (1 + (k - 1) r)` independent ones; the weights
+follow its increments closely, with an `a` for each r. Both numbers are learned from repeated looks.
 """
 
 import chex
@@ -15,8 +19,12 @@ from jaxtyping import Array, Float, Int
 from jaxsense.core import checks
 from jaxsense.core.types import Index, pytree
 
-_NEAR = np.linspace(0.0, 1.0, 33, dtype=np.float32)
-_LENGTHS = np.geomspace(0.03, 3.0, 25, dtype=np.float32)  # m
+_STRENGTHS = np.append(0.0, np.geomspace(0.05, 20.0, 25)).astype(np.float32)
+_LENGTHS = np.geomspace(0.03, 3.0, 17).astype(np.float32)  # m
+_TOLERANCE = 0.005  # of mean confidence above accuracy
+_SAME_PLACE = 0.02  # m
+_PENALTY = 10.0  # nats, above any difference of likelihoods
+_HALF = np.sqrt(2.0) - 1  # a sum that halves the weight
 
 
 @pytree
@@ -24,35 +32,34 @@ class Novelty:
     """The share of a look that is new evidence, for each modality.
 
     Attributes:
-      near: `[M]` share of a look from the same place as an earlier one.
+      strength: `[M]` a, how much looks from one place have in common; 0 if nothing.
       length: `[M]` L, in metres; looks from places much farther apart are independent.
     """
 
-    near: Float[Array, " M"]
+    strength: Float[Array, " M"]
     length: Float[Array, " M"]
 
-    def weight(self, moved: Float[Array, "..."], modality: Index) -> Float[Array, "..."]:
+    def weight(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
         """The share of a look that is new evidence.
 
         Args:
-          moved: `[...]` distance from the nearest earlier look by this sensor at the PoI, in
-            metres; infinite if there is none.
+          apart: `[..., K]` distances from K earlier looks by this sensor at the PoI, in metres;
+            infinite for none.
           modality: index of the sensor.
 
         Returns:
-          `[...]` weights from `near` to 1.
+          `[...]` weights above 0 and up to 1.
         """
-        return _weight(moved, self.near[modality], self.length[modality])
+        return _weight(apart, self.strength[modality], self.length[modality])
 
     def fresh_distance(self, modality: Index) -> Float[Array, ""]:
-        """Distance from an earlier look beyond which most of a look is new, in metres.
+        """Distance from an earlier look beyond which at least half of a look is new, in metres.
 
         Args:
           modality: index of the sensor.
         """
-        near, length = self.near[modality], self.length[modality]
-        # 1 - (1 - near) exp(-d^2 / (2 L^2)) = 1 / 2.
-        return length * jnp.sqrt(2 * jnp.log(jnp.maximum(2 * (1 - near), 1.0)))
+        strength, length = self.strength[modality], self.length[modality]
+        return length * jnp.sqrt(2 * jnp.log(jnp.maximum(strength / _HALF, 1.0)))
 
 
 def independent(num_modalities: int) -> Novelty:
@@ -61,45 +68,53 @@ def independent(num_modalities: int) -> Novelty:
     Args:
       num_modalities: M.
     """
-    return Novelty(jnp.ones(num_modalities), jnp.ones(num_modalities))
+    return Novelty(jnp.zeros(num_modalities), jnp.ones(num_modalities))
 
 
 def fit(
-    first: Float[Array, "S C"],
-    second: Float[Array, "S C"],
-    moved: Float[Array, " S"],
-    classes: Int[Array, " S"],
+    found: Float[Array, "S T C"], positions: Float[Array, "S T 2"], classes: Int[Array, " S"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Learns the weight of a second look by one sensor from pairs of looks.
+    """Learns the weights of repeated looks by one sensor.
 
     Args:
-      first: `[S, C]` log-likelihoods of the classes given the first look.
-      second: `[S, C]` the same given the second look.
-      moved: `[S]` distance between the places of the two, in metres.
+      found: `[S, T, C]` log-likelihoods of the classes given each of T looks at a PoI.
+      positions: `[S, T, 2]` places of the looks, in metres.
       classes: `[S]` int32 true classes.
 
     Returns:
-      `[]` `near` and `[]` `length` of `Novelty`, on a grid, for which the true classes are most
-      likely.
+      `[]` `strength` and `[]` `length` of `Novelty`, on a grid. Of those for which the mean
+      confidence after two and more looks from one place exceeds the accuracy by at most .005, the
+      ones for which the true classes are most likely: likelihoods alone accept too much confidence
+      in looks that repeat an error.
 
     Raises:
-      ValueError: if a distance is negative or a class does not exist.
+      ValueError: if a class does not exist.
     """
-    chex.assert_equal_shape([first, second], custom_message="first, second")
-    chex.assert_shape([moved, classes], (len(first),), custom_message="moved, classes")
-    checks.require("moved", moved, lambda x: x >= 0, "must be at least 0")
-    checks.require_index("classes", classes, first.shape[1])
-    near, length = (jnp.asarray(x.reshape(-1)) for x in np.meshgrid(_NEAR, _LENGTHS))
+    chex.assert_rank(found, 3, custom_message="found")
+    chex.assert_shape(positions, (*found.shape[:2], 2), custom_message="positions")
+    checks.require_index("classes", classes, found.shape[2])
+    apart = jnp.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
+    is_earlier = np.tri(found.shape[1], k=-1, dtype=bool)
+    is_one_place = jnp.max(apart, axis=(1, 2)) < _SAME_PLACE
+    number = jnp.maximum(jnp.sum(is_one_place), 1) * (found.shape[1] - 1)
+    apart = jnp.where(is_earlier[None], apart, jnp.inf)
+    strength, length = (jnp.asarray(x.reshape(-1)) for x in np.meshgrid(_STRENGTHS, _LENGTHS))
 
-    def loss(of: tuple[jax.Array, jax.Array]) -> jax.Array:
-        near, length = of
-        found = first + _weight(moved, near, length)[:, None] * second
-        right = jnp.take_along_axis(jax.nn.log_softmax(found), classes[:, None], axis=1)
-        return -jnp.mean(right)
+    def loss(candidate: tuple[jax.Array, jax.Array]) -> jax.Array:
+        weights = _weight(apart, candidate[0], candidate[1])
+        log_posterior = jax.nn.log_softmax(jnp.cumsum(weights[..., None] * found, axis=1))
+        of_truth = jnp.take_along_axis(log_posterior, classes[:, None, None], axis=2)[:, 1:, 0]
+        # Classes that the sensor cannot tell apart are equally likely.
+        least = jnp.max(log_posterior[:, 1:], axis=-1, keepdims=True) - 1e-5
+        of_most_likely = jnp.where(log_posterior[:, 1:] >= least, jnp.exp(log_posterior[:, 1:]), 0)
+        surer = jnp.sum(of_most_likely, axis=-1) - (of_truth >= least[..., 0])
+        excess = jnp.sum(jnp.where(is_one_place[:, None], surer, 0.0)) / number
+        return _PENALTY * jnp.maximum(excess - _TOLERANCE, 0.0) - jnp.mean(of_truth)
 
-    best = jnp.argmin(jax.lax.map(loss, (near, length)))
-    return near[best], length[best]
+    best = jnp.argmin(jax.lax.map(loss, (strength, length)))
+    return strength[best], length[best]
 
 
-def _weight(moved: jax.Array, near: jax.Array, length: jax.Array) -> jax.Array:
-    return 1 - (1 - near) * jnp.exp(-0.5 * (moved / length) ** 2)
+def _weight(apart: jax.Array, strength: jax.Array, length: jax.Array) -> jax.Array:
+    near = jnp.sum(jnp.exp(-0.5 * (apart / length) ** 2), axis=-1)
+    return (1 + strength * near) ** -2

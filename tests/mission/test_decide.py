@@ -395,7 +395,8 @@ def test_of_what_was_given_up_nothing_is_left_to_learn(after_giving_up, other, e
     assert after_giving_up(2, [0.0, 0.0, other, 0.0]) == expected
 
 
-STAYS_OLD = Novelty(near=jnp.zeros(2), length=jnp.full(2, 0.5))  # half of a look is new at .59 m
+# Half of a look is new at .5 sqrt(2 ln(.83 / .414)) = .59 m.
+STAYS_OLD = Novelty(strength=jnp.full(2, 2 * (np.sqrt(2.0) - 1)), length=jnp.full(2, 0.5))
 
 
 def looked_from(place, poi=0, modality=0):

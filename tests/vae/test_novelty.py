@@ -8,71 +8,74 @@ import pytest
 from jaxsense.vae import novelty
 from jaxsense.vae.novelty import Novelty
 
-TWO = Novelty(near=jnp.array([0.2, 0.6]), length=jnp.array([0.5, 1.0]))
+TWO = Novelty(strength=jnp.array([1.0, 0.3]), length=jnp.array([0.5, 1.0]))
+NONE = np.inf
 
 
 def test_weights_by_hand():
-    # 1 - .8 exp(-.5) for a sensor that has moved L; .2 where it stands; 1 where nobody has looked.
-    found = TWO.weight(jnp.array([0.0, 0.5, jnp.inf]), 0)
-    np.testing.assert_allclose(found, [0.2, 1 - 0.8 * np.exp(-0.5), 1.0], rtol=1e-6)
-    np.testing.assert_allclose(TWO.weight(jnp.array(1.0), 1), 1 - 0.4 * np.exp(-0.5), rtol=1e-6)
+    # Nobody has looked: 1. One look from there: 1 / 2^2. Two: 1 / 3^2. One from .5 m, L, away:
+    # (1 + exp(-.5))^-2.
+    apart = jnp.array([[NONE, NONE], [0.0, NONE], [0.0, 0.0], [NONE, 0.5]])
+    expected = [1.0, 1 / 4, 1 / 9, (1 + np.exp(-0.5)) ** -2]
+    np.testing.assert_allclose(TWO.weight(apart, 0), expected, rtol=1e-6)
+    np.testing.assert_allclose(TWO.weight(jnp.zeros(1), 1), 1.3**-2, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("correlation", "strength"), [(0.2, 0.225), (0.5, 0.732), (0.9, 3.36)])
+def test_weights_follow_what_a_mean_of_correlated_measurements_is_worth(correlation, strength):
+    looks = np.arange(1, 5)
+    worth = looks / (1 + (looks - 1) * correlation)
+    each = Novelty(jnp.array([strength]), jnp.ones(1))
+    apart = jnp.where(np.tri(4, k=-1, dtype=bool), 0.0, NONE)
+    np.testing.assert_allclose(np.cumsum(each.weight(apart, 0)), worth, rtol=0.02)
 
 
 def test_half_of_a_look_is_new_at_the_fresh_distance():
     distance = TWO.fresh_distance(0)
-    # .5 sqrt(2 ln 1.6).
-    np.testing.assert_allclose(distance, 0.5 * np.sqrt(2 * np.log(1.6)), rtol=1e-6)
-    np.testing.assert_allclose(TWO.weight(distance, 0), 0.5, rtol=1e-6)
-    # More than half is new from anywhere.
+    np.testing.assert_allclose(TWO.weight(distance[None], 0), 0.5, rtol=1e-5)
+    # More than half is new from anywhere: 1.3^-2 = .59.
     assert TWO.fresh_distance(1) == 0
 
 
 def test_independent_looks_are_new_from_anywhere():
     found = novelty.independent(3)
-    assert [float(found.weight(jnp.array(d), 2)) for d in (0.0, 0.1, np.inf)] == [1, 1, 1]
+    assert [float(found.weight(jnp.array([d, d]), 2)) for d in (0.0, 0.1, NONE)] == [1, 1, 1]
     assert found.fresh_distance(2) == 0
 
 
-def _pairs(key, number, share, moved):
-    """Log-likelihoods of two classes in two looks whose noise has a `share` in common."""
+def _looks(key, number, share, apart):
+    """Log-likelihoods of two classes in four looks whose noise has a `share` in common."""
     class_key, common_key, own_key = jax.random.split(key, 3)
     classes = jax.random.bernoulli(class_key, 0.5, (number,)).astype(jnp.int32)
     common = jax.random.normal(common_key, (number, 1))
-    own = jax.random.normal(own_key, (number, 2))
+    own = jax.random.normal(own_key, (number, 4))
     noise = jnp.sqrt(share) * common + jnp.sqrt(1 - share) * own
     # A measurement of -1 or 1 with noise of 1: the log-likelihood ratio is 2 x.
     ratio = 2 * (2.0 * classes[:, None] - 1 + noise)
-    first, second = (jnp.stack([-x / 2, x / 2], axis=-1) for x in ratio.T)
-    return first, second, jnp.full(number, moved), classes
+    positions = apart * jnp.stack([jnp.arange(4.0), jnp.zeros(4)], axis=-1)
+    found = jnp.stack([-ratio / 2, ratio / 2], axis=-1)
+    return found, jnp.broadcast_to(positions, (number, 4, 2)), classes
 
 
-def test_it_learns_that_a_repeated_look_says_nothing_and_a_distant_one_everything():
+def test_it_learns_that_repeated_looks_say_nothing_and_distant_ones_everything():
     same_key, far_key = jax.random.split(jax.random.key(0))
-    # Half of the pairs from one place, with the same noise; half far apart.
-    near, far = _pairs(same_key, 4000, 1.0, 0.0), _pairs(far_key, 4000, 0.0, 3.0)
-    pairs = [jnp.concatenate([a, b]) for a, b in zip(near, far, strict=True)]
-    first, second, moved, classes = pairs
-    found, length = jax.jit(novelty.fit)(first, second, moved, classes)
-    assert found < 0.15
-    assert length < 3
-    assert novelty.Novelty(found[None], length[None]).weight(jnp.array(3.0), 0) > 0.9
+    near, far = _looks(same_key, 4000, 1.0, 0.0), _looks(far_key, 4000, 0.0, 3.0)
+    found, positions, classes = (jnp.concatenate(x) for x in zip(near, far, strict=True))
+    strength, length = jax.jit(novelty.fit)(found, positions, classes)
+    each = Novelty(strength[None], length[None])
+    assert each.weight(jnp.zeros(1), 0) < 0.1
+    assert each.weight(jnp.full(1, 3.0), 0) > 0.9
 
 
-def test_it_learns_the_share_that_is_new():
-    # Of equal weight, two looks would be worth 2 / 1.5 = 1.33 looks; here the first counts as 1.
-    first, second, moved, classes = _pairs(jax.random.key(1), 20_000, 0.5, 0.0)
-    near, _ = jax.jit(novelty.fit)(first, second, moved, classes)
-    assert 0.4 < near < 0.8
+def test_it_learns_the_share_that_looks_have_in_common():
+    # Four looks that share half of their noise are worth 4 / 2.5 = 1.6.
+    found, positions, classes = _looks(jax.random.key(1), 20_000, 0.5, 0.0)
+    strength, length = jax.jit(novelty.fit)(found, positions, classes)
+    apart = jnp.where(np.tri(4, k=-1, dtype=bool), 0.0, NONE)
+    worth = jnp.sum(Novelty(strength[None], length[None]).weight(apart, 0))
+    assert worth == pytest.approx(1.6, abs=0.3)
 
 
-@pytest.mark.parametrize(
-    ("moved", "classes", "expected"),
-    [
-        (-1.0, 0, "moved = -1.0: must be at least 0"),
-        (1.0, 2, "classes = 2: must be a whole number from 0 to 1"),
-    ],
-)
-def test_wrong_pairs_are_refused(moved, classes, expected):
-    look = jnp.zeros((1, 2))
-    with pytest.raises(ValueError, match=expected):
-        novelty.fit(look, look, jnp.array([moved]), jnp.array([classes]))
+def test_a_class_that_does_not_exist_is_refused():
+    with pytest.raises(ValueError, match="classes = 2: must be a whole number from 0 to 1"):
+        novelty.fit(jnp.zeros((1, 4, 2)), jnp.zeros((1, 4, 2)), jnp.array([2]))
