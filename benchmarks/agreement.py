@@ -52,7 +52,7 @@ def _results() -> dict[str, np.ndarray]:
     def run(keys: jax.Array):
         shape = _SCENES, config.arena.num_pois
         classes = jax.random.randint(jax.random.key(2), shape, 0, len(config.arena.classes))
-        _, windows = jax.vmap(lambda key, classes: sim.survey(key, team.world, classes))(
+        _, windows, _ = jax.vmap(lambda key, classes: sim.survey(key, team.world, classes))(
             keys, classes
         )
         of_each = jax.vmap(jax.vmap(detect, (None, 0)), (None, 0))

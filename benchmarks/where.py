@@ -65,7 +65,7 @@ def ratios_from(key: Key, config: Config, models: Models, distance: float) -> li
     def look(key: Key) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         class_key, survey_key = jax.random.split(key)
         classes = looks.balanced_classes(class_key, config, _SCENES)
-        _, windows = looks.surveys(jax.random.split(survey_key, _SCENES), world, classes)
+        _, windows, _ = looks.surveys(jax.random.split(survey_key, _SCENES), world, classes)
         return classes, looks.detect_all(models.detectors, windows)
 
     classes, features = look(key)

@@ -16,10 +16,6 @@ class Thermal(sim.Sensor):
         """Measures the surfaces that the rays hit, with an error of one degree."""
         return sim.choose(surfaces["temperature"], hits.geom) + random.normal(key, hits.geom.shape)
 
-    def shows(self, readings, distance, extent):
-        """Tells which rays may have hit a PoI: even a cold one is warmer than the walls."""
-        return readings > TEMPERATURE.elsewhere + 4
-
 
 def thermal(config: Config) -> sim.Sensor:
     """Makes the sensor: 64 rays over 60 degrees, 0.06 m above the floor."""

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsense
-from jaxsense import sim, vae
+from jaxsense import sim
 
 
 def check(config: jaxsense.Config, recorded: dict[str, np.ndarray]) -> None:
@@ -52,10 +52,15 @@ def read(config: jaxsense.Config, models: jaxsense.Models, recorded: dict[str, n
         print(f"PoI {n + 1}")
         belief, seen = fusion.prior, np.zeros(len(sensors), bool)
         for m, sensor in enumerate(sensors):
-            # The part of the scan around the PoI, and what the detector makes of it.
-            bearing = sim.bearing(recorded[f"{sensor.name}_poses"][n], place)
-            window = sim.cut_out(sensor, recorded[f"{sensor.name}_scans"][n], bearing)
-            features = vae.detect(models.detectors[m], window)
+            # What the look says of the PoI, which may be that there is nothing.
+            pose = recorded[f"{sensor.name}_poses"][n]
+            bearing, distance = sim.bearing(pose, place), np.linalg.norm(place - pose[:2])
+            scan = recorded[f"{sensor.name}_scans"][n]
+            detection = models.detect(m, sensor, scan, bearing, jnp.float32(distance))
+            if not detection.is_there:
+                print(f"  {sensor.name}: nothing there")
+                continue
+            features = detection.features
 
             # What it says alone, and with the looks of other sensors before it.
             alone = fusion.together({m: features})
@@ -66,7 +71,8 @@ def read(config: jaxsense.Config, models: jaxsense.Models, recorded: dict[str, n
             print(f"  {sensor.name}:", ", ".join(f"{label} {share:.2f}" for label, share in told))
             print(f"    alone:   mean {np.asarray(alone.mean)}, sigma {np.asarray(alone.std)}")
             print(f"    in map:  mean {np.asarray(belief.mean)}, sigma {np.asarray(belief.std)}")
-        print(f"  The map says: {config.arena.classes[fusion.most_likely_class(belief)]}")
+        told = config.arena.classes[fusion.most_likely_class(belief)] if seen.any() else "unseen"
+        print(f"  The map says: {told}")
 
 
 def simulate(config: jaxsense.Config) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ one scene share its light, which drifts over positions.
 import chex
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsense.config import Config
 from jaxsense.core import checks
@@ -162,25 +162,29 @@ def _require_fitting(config: Config, looks: Looks) -> None:
 
 
 def surveys(
-    keys: Key, world: World, classes: Int[Array, "S N"]
-) -> tuple[Scene, tuple[Float[Array, "S N _"], ...]]:
+    keys: Key,
+    world: World,
+    classes: Int[Array, "S N"],
+    is_empty: Bool[Array, " S"] | None = None,
+) -> tuple[Scene, tuple[Float[Array, "S N _"], ...], Float[Array, "S M N"]]:
     """Surveys many scenes, see `sim.survey`.
 
     Args:
       keys: `[S]` random keys.
       world: the simulation.
       classes: `[S, N]` int32 classes of the PoIs.
+      is_empty: `[S]` bool, in which scenes no look shows its PoI; in none by default.
 
     Returns:
-      `[S]` scenes, and for each modality `[S, N, F]` windows.
+      `[S]` scenes, for each modality `[S, N, F]` windows, and `[S, M, N]` expected distances.
     """
     number = len(keys)
     chunk = min(_SCENES_AT_ONCE, number)
     # A remainder would be compiled separately.
     rows = jnp.arange(-(-number // chunk) * chunk) % number
     found = jax.lax.map(
-        lambda scene: worlds.survey(scene[0], world, scene[1]),
-        (keys[rows], classes[rows]),
+        lambda scene: worlds.survey(scene[0], world, scene[1], scene[2]),
+        (keys[rows], classes[rows], None if is_empty is None else is_empty[rows]),
         batch_size=chunk,
     )
     return jax.tree.map(lambda x: x[:number], found)
@@ -297,7 +301,7 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
     def look(key: Key) -> Samples:
         class_key, survey_key = jax.random.split(key)
         classes = balanced_classes(class_key, config, number)
-        _, seen = surveys(jax.random.split(survey_key, number), world, classes)
+        _, seen, _ = surveys(jax.random.split(survey_key, number), world, classes)
         features = detect_all(models.detectors, seen)
         return tuple(by_class(x, classes, num_classes, samples) for x in features)
 

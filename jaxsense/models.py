@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsense.config import Config
@@ -17,7 +18,7 @@ from jaxsense.sim import sensors, windows
 from jaxsense.sim.sensors import Sensor
 from jaxsense.vae import detectors, filter, fusion, jmvae, latent, novelty, readout
 from jaxsense.vae.bayes import Bayes
-from jaxsense.vae.detectors import Detector
+from jaxsense.vae.detectors import Detection, Detector
 from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.novelty import Novelty
 
@@ -48,18 +49,52 @@ class Models:
     q_networks: tuple[Params, ...]
     tours: Params | None
 
-    def features(
-        self, modality: int, sensor: Sensor, readings: Float[Array, "W ..."]
-    ) -> Float[Array, " D_m"]:
-        """Features of a look, from the rays that the detector reads.
+    def detect(
+        self,
+        modality: int,
+        sensor: Sensor,
+        readings: Float[Array | np.ndarray, "B ..."],
+        bearing: Float[Array, ""],
+        distance: Float[Array, ""],
+    ) -> Detection:
+        """What a look says, from a whole scan.
+
+        It says that nothing is there if the window shows no PoI, if the bearing is outside the
+        field of view, or if a reading of the window is negative or NaN. An infinite reading counts
+        as `sensor.window_limit`, as for a beam without a return.
+
+        Args:
+          modality: index of the sensor; static.
+          sensor: the sensor.
+          readings: `[B, ...]` readings of all rays, see `sim.cut_out`.
+          bearing: bearing of the PoI in the robot's frame, in radians, positive to the left.
+          distance: distance at which the PoI's centre is expected, in metres.
+        """
+        of_window = windows.around(sensor, readings, bearing)
+        checked = jnp.where(of_window >= 0, of_window, jnp.nan)
+        return self.detect_in_window(modality, sensor, checked, bearing, distance)
+
+    def detect_in_window(
+        self,
+        modality: int,
+        sensor: Sensor,
+        readings: Float[Array, "W ..."],
+        bearing: Float[Array, ""],
+        distance: Float[Array, ""],
+    ) -> Detection:
+        """What a look says, from the rays that the detector reads.
 
         Args:
           modality: index of the sensor; static.
           sensor: the sensor.
           readings: `[window, ...]` of the rays around the PoI's bearing.
+          bearing: of the PoI, see `detect`.
+          distance: of the PoI, see `detect`.
         """
         window = windows.as_window(sensor, readings)
-        return detectors.detect(self.detectors[modality], window)
+        # What is out of view is expected nowhere.
+        expected = jnp.where(windows.is_in_view(sensor, bearing), distance, jnp.nan)
+        return detectors.answer(self.detectors[modality], window, expected)
 
     def plausible_classes(self, belief: Belief) -> Bool[Array, " C"]:
         """Classes that are plausible given a `[D]` belief, see `vae.plausible_classes`."""

@@ -5,15 +5,14 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxsense.config import Config
 from jaxsense.core.types import Belief
 from jaxsense.dqn.agents import observation
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.models import Models, make_jmvae
-from jaxsense.sim import sensors, windows
-from jaxsense.vae import detectors, jmvae, latent
+from jaxsense.sim import sensors
+from jaxsense.vae import jmvae, latent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Function:
 def functions(config: Config, models: Models) -> dict[str, Function]:
     """All functions, by name.
 
-    For each modality M `window_M`, `detect_M`, `write_M` and `decide_M`; for each encoder of the
+    For each modality M `detect_M`, `write_M` and `decide_M`; for each encoder of the
     JMVAE an `encode_M`, for example `encode_camera+lidar`; and `classify`.
 
     Args:
@@ -47,8 +46,7 @@ def functions(config: Config, models: Models) -> dict[str, Function]:
     found = {}
     for m, name in enumerate(model.modalities):
         found |= {
-            f"window_{name}": _window(config, m),
-            f"detect_{name}": _detect(models, m),
+            f"detect_{name}": _detect(config, models, m),
             f"write_{name}": _update(models, model, m),
             f"decide_{name}": _decide(config, models, m),
         }
@@ -57,28 +55,21 @@ def functions(config: Config, models: Models) -> dict[str, Function]:
     return {**found, "classify": _classify(models)}
 
 
-def _window(config: Config, m: int) -> Function:
+def _detect(config: Config, models: Models, m: int) -> Function:
     sensor = sensors.make(config)[m]
-    number = len(sensor.angles)
 
-    def apply(readings: jax.Array, bearing: jax.Array) -> dict[str, jax.Array]:
-        rays = windows.window_of(sensor, np.arange(number), bearing)
-        return {"window": windows.as_window(sensor, readings[rays])}
+    def apply(readings: jax.Array, bearing: jax.Array, distance: jax.Array) -> dict[str, jax.Array]:
+        found = models.detect(m, sensor, readings, bearing, distance)
+        return {"is_there": found.is_there, "features": found.features}
 
     channels = () if sensor.channels == 1 else (sensor.channels,)
-    inputs = {"readings": _floats(number, *channels), "bearing": _floats()}
-    return Function("what the detector reads of a whole scan", inputs, apply)
-
-
-def _detect(models: Models, m: int) -> Function:
-    detector = models.detectors[m]
-
-    def apply(window: jax.Array) -> dict[str, jax.Array]:
-        return {"features": detectors.detect(detector, window)}
-
-    return Function(
-        "probabilities of the labels", {"window": _floats(*detector.offset.shape)}, apply
-    )
+    inputs = {
+        "readings": _floats(len(sensor.angles), *channels),
+        "bearing": _floats(),
+        "distance": _floats(),
+    }
+    about = "whether a whole scan shows a PoI, and probabilities of its labels, equal if not"
+    return Function(about, inputs, apply)
 
 
 def _update(models: Models, model: jmvae.Jmvae, m: int) -> Function:

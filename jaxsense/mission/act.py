@@ -23,7 +23,7 @@ from jaxsense.mission.state import (
 )
 from jaxsense.models import Models
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import viewpoints, windows
+from jaxsense.sim import viewpoints
 from jaxsense.sim import world as worlds
 
 GOAL_ANGLE = 6.0  # degrees, maximum angle to the PoI at which a robot scans it
@@ -249,7 +249,7 @@ def _look(
     state: MissionState,
     aim: _Aim,
 ) -> _Look:
-    """Simulates a scan; it detects a PoI that it shows if the detector is confident enough."""
+    """Simulates a scan; it detects a PoI that is there if the detector is confident enough."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
     data = arenas.place(world.arena, scene.layout, scene.poses)
     time = mission.time(state)
@@ -258,18 +258,17 @@ def _look(
     )
     is_blind = time >= state.faults.blind_at[robot]
     readings = jnp.where(is_blind, sensor.blind, readings)
-    error = jnp.radians(mission.config.viewpoint.bearing_error)
-    arena = mission.config.arena
-    shows = windows.shows_poi(sensor, readings, aim.bearing, aim.distance, arena, error)
-    features = models.features(modality, sensor, readings)
-    is_confident = jnp.max(features) >= mission.config.mission.least_confidence
+    found = models.detect_in_window(modality, sensor, readings, aim.bearing, aim.distance)
+    is_confident = jnp.max(found.features) >= mission.config.mission.least_confidence
     old = jax.tree.map(lambda x: x[aim.poi], state.belief)
     apart = state.apart(scene.poses[robot, :2][None], aim.poi, modality)[0]
     weight = models.novelty.weight(apart, modality)
     return _Look(
-        detects=shows & is_confident,
-        belief=models.fusion.update(old, state.seen[aim.poi], features, modality, weight),
-        log_posterior=models.bayes.update(state.log_posterior[aim.poi], features, modality, weight),
+        detects=found.is_there & is_confident,
+        belief=models.fusion.update(old, state.seen[aim.poi], found.features, modality, weight),
+        log_posterior=models.bayes.update(
+            state.log_posterior[aim.poi], found.features, modality, weight
+        ),
     )
 
 

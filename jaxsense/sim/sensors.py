@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from mujoco import mjx
 
 from jaxsense.config import LIDAR_HEIGHT, CameraConfig, Config, ConfigError, LidarConfig
@@ -25,9 +25,6 @@ from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
 from jaxsense.sim.light import Light
 from jaxsense.sim.rays import Fan, Pinhole, Rays
 
-_MIN_CHROMA = 0.1  # difference of a pixel's channels; 0 on walls, on robots and in the dark
-_RANGE_TOLERANCE = 5.0  # standard deviations of the LiDAR's noise
-_MIN_RANGE_TOLERANCE = 0.001  # m, above the rounding error of a distance
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour outside the arena
 
 Surfaces = dict[str, jax.Array]
@@ -38,7 +35,7 @@ Surfaces = dict[str, jax.Array]
 class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
     """A scanline sensor on a robot, a frozen pytree.
 
-    A subclass defines `read`, and may define `shows`. It becomes a dataclass and a pytree without a
+    A subclass defines `read`. It becomes a dataclass and a pytree without a
     decorator; its own fields are leaves unless declared `flax.struct.field(pytree_node=False)`.
 
     Attributes:
@@ -50,7 +47,6 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
       stride: step between the rays that the detector reads; static.
       ray_bytes: size of one ray's reading in a ROS message, in bytes; static.
       window_limit: highest reading in the detector's input.
-      lost: mean share of rays with a wrong reading.
       blind: reading of every ray after the sensor has failed.
 
     Raises:
@@ -65,7 +61,6 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
     stride: int = struct.field(pytree_node=False, default=1)
     ray_bytes: int = struct.field(pytree_node=False, default=4)  # float32
     window_limit: float | jax.Array = np.inf
-    lost: float | jax.Array = 0.0
     blind: float | jax.Array = 0.0
 
     def __post_init__(self):
@@ -99,22 +94,6 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
         """
         rays = windows.reshape(*windows.shape[:-1], self.window, self.channels)
         return rays if self.angles[0] > self.angles[-1] else rays[..., ::-1, :]
-
-    def shows(
-        self, readings: Float[Array, "B *channels"], distance: Float[Array, ""], extent: float
-    ) -> Bool[Array, "B"]:
-        """Tells which rays may have hit a PoI; by default all.
-
-        Args:
-          readings: readings of some rays.
-          distance: expected distance of the PoI's centre, in metres.
-          extent: greatest distance from the PoI's centre to its surface, in metres.
-
-        Returns:
-          For each ray whether its reading is possible for such a PoI.
-        """
-        del distance, extent
-        return jnp.ones(len(readings), bool)
 
     @property
     def reads_conditions(self) -> bool:
@@ -163,14 +142,6 @@ class Lidar(Sensor):
         del surfaces, light
         return disturbances.measured_ranges(key, hits.distance, self.config)
 
-    def shows(
-        self, readings: Float[Array, "B *channels"], distance: Float[Array, ""], extent: float
-    ) -> Bool[Array, "B"]:
-        """See `Sensor.shows`: whether the range, up to noise, is that of the PoI."""
-        noise = self.config.range_noise + self.config.range_noise_growth * distance
-        tolerance = jnp.maximum(_RANGE_TOLERANCE * noise, _MIN_RANGE_TOLERANCE)
-        return jnp.abs(readings - (distance - extent / 2)) <= extent / 2 + tolerance
-
 
 class Camera(Sensor):
     """One line of a camera's pixels: linear RGB in [0, 1], from left to right.
@@ -206,13 +177,6 @@ class Camera(Sensor):
         inputs = surfaces["colour"].T, jnp.array(_BACKGROUND), noise, gain
         return jax.lax.map(channel, inputs).T
 
-    def shows(
-        self, readings: Float[Array, "B *channels"], distance: Float[Array, ""], extent: float
-    ) -> Bool[Array, "B"]:
-        """See `Sensor.shows`: whether the pixel is coloured, unlike walls, robots and darkness."""
-        del distance, extent
-        return readings.max(axis=-1) - readings.min(axis=-1) >= _MIN_CHROMA
-
     @property
     def reads_conditions(self) -> bool:
         """See `Sensor.reads_conditions`: whether the settings change the light."""
@@ -229,7 +193,6 @@ def lidar(config: LidarConfig) -> Lidar:
         window=config.window,
         stride=config.stride,
         window_limit=config.window_range,
-        lost=1 - (1 - config.dropout) * (1 - config.mixed_pixels),
         blind=config.max_range,
     )
 
@@ -245,8 +208,6 @@ def camera(config: CameraConfig) -> Camera:
         channels=3,
         stride=config.stride,
         window_limit=1.0,
-        # In dim light it cannot tell a PoI from what covers it.
-        lost=0.5 if disturbances.changes_light(config) else 0.0,
         ray_bytes=3,  # rgb8
     )
 
@@ -319,6 +280,7 @@ def scan(
     robot: Index,
     directions: Float[Array | np.ndarray, "2 B"],
     seconds: Float[Array, ""] | float = 0.0,
+    twin: Float[Array, "2"] | None = None,
 ) -> Float[Array, "B *channels"]:
     """Scans along some rays of one robot's sensor.
 
@@ -333,6 +295,7 @@ def scan(
         traced; a static index saves casting rays at that body.
       directions: unit vectors in the robot's frame; `sensor.directions` for a whole scan.
       seconds: time of the scan, over which the light changes.
+      twin: position of one more robot with the body of the one that scans, in metres.
 
     Returns:
       The readings of these rays.
@@ -344,7 +307,7 @@ def scan(
     chex.assert_shape(light.direction, (3,), custom_message="light.direction")
     check_layout(arena.config, layout)
     pose = robot_poses(data)[robot]
-    section = _section(arena, data, sensor.height, robot)
+    section = _section(arena, data, sensor.height, robot, twin)
     x, y = directions
     in_world = raycast.turned((x, y), pose[2])
     hits = raycast.cast_along(section, pose[:2], in_world)
@@ -352,11 +315,16 @@ def scan(
     return sensor.read(key, hits, surfaces(arena, layout), light)
 
 
-def _section(arena: Arena, data: mjx.Data, height: float, robot: Index) -> raycast.CrossSection:
-    """Cuts the scene at a height, without the robot that is looking."""
-    if is_static(robot):
+def _section(
+    arena: Arena, data: mjx.Data, height: float, robot: Index, twin: Float[Array, "2"] | None
+) -> raycast.CrossSection:
+    """Cuts the scene at a height, without the robot that is looking, or with it as its twin."""
+    if twin is None and is_static(robot):
         return raycast.cross_section(arena, data, height, int(robot))
-    # Rays never hit an outline of size 0.
     section = raycast.cross_section(arena, data, height, -1)
-    is_own = jnp.array(arena.robot_of_geom[list(section.geom)]) == robot
-    return dataclasses.replace(section, half=jnp.where(is_own[:, None], 0.0, section.half))
+    is_own = (jnp.array(arena.robot_of_geom[list(section.geom)]) == robot)[:, None]
+    if twin is None:
+        # Rays never hit an outline of size 0.
+        return dataclasses.replace(section, half=jnp.where(is_own, 0.0, section.half))
+    moved = section.centre + (twin - robot_poses(data)[robot, :2])[None]
+    return dataclasses.replace(section, centre=jnp.where(is_own, moved, section.centre))

@@ -6,11 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jaxsense.config import ArenaConfig
 from jaxsense.core import checks
 from jaxsense.sim.sensors import Sensor
-
-_SHARE_OF_WIDTH = 0.7  # of a PoI; rays within must hit it
 
 
 def window_of(
@@ -59,7 +56,7 @@ def cut_out(
       bearing: bearing of the PoI in the robot's frame, in radians, positive to the left.
 
     Returns:
-      The input of `vae.detect`.
+      The input of `vae.detect`. `Models.detect` also tells whether it shows a PoI.
 
     Raises:
       ValueError: if a reading is negative, not a number or not real, or the bearing is not within
@@ -76,46 +73,32 @@ def cut_out(
         raise ValueError(f"readings of dtype {dtype}: {reason}")
     at_least = "must be at least 0"
     checks.require(f"readings of {sensor.name}", readings, lambda x: x >= 0, at_least)
-    bearing = jnp.asarray(bearing, jnp.float32)
-    rays = _first_ray(sensor, bearing) + sensor.stride * jnp.arange(sensor.window)
-    return as_window(sensor, jnp.asarray(readings, jnp.float32)[rays])
+    return as_window(sensor, around(sensor, readings, jnp.asarray(bearing)))
 
 
-def shows_poi(
-    sensor: Sensor,
-    readings: Float[Array, "window *channels"],
-    bearing: Float[Array, ""],
-    distance: Float[Array, ""],
-    arena: ArenaConfig,
-    bearing_error: Float[Array, ""] | float = 0.0,
-) -> Bool[Array, ""]:
-    """Tells whether the readings of a window may show a PoI at its expected position.
-
-    Rays near the PoI's centre must hit it, rays near its edge may: at least one that may hit it has
-    to show it, and so has every ray that must, except for twice the share that the sensor loses on
-    average.
-
-    The LiDAR decides by distance. The camera tells a PoI from walls, robots and darkness by its
-    colour, but not from another PoI in front of it or behind it; good viewpoints have none there.
+def around(
+    sensor: Sensor, readings: Float[Array | np.ndarray, "B *channels"], bearing: Float[Array, ""]
+) -> Float[Array, "window *channels"]:
+    """Selects the readings of the rays that the detector reads, without any check.
 
     Args:
       sensor: the sensor.
-      readings: readings of the window around the bearing.
-      bearing: expected bearing of the PoI in the robot's frame, in radians.
-      distance: expected distance of the PoI's centre, in metres.
-      arena: the sizes of PoIs.
-      bearing_error: largest error of the bearing, in radians.
-
-    Returns:
-      False if the PoI is hidden or absent, or the sensor has failed. A camera whose light changes
-      can only recognise its own failure.
+      readings: readings of all rays.
+      bearing: bearing of the window's centre in the robot's frame, in radians; may be traced.
     """
-    angles = jnp.abs(window_of(sensor, sensor.angles, bearing) - bearing)
-    half_width = jnp.arcsin(jnp.minimum(arena.poi_half_width / distance, 1.0))
-    shows = sensor.shows(readings, distance, arena.poi_extent)
-    must = angles <= jnp.minimum(_SHARE_OF_WIDTH * half_width, half_width - bearing_error)
-    may = angles <= half_width + bearing_error
-    return jnp.any(may & shows) & (jnp.sum(must & ~shows) <= 2 * sensor.lost * jnp.sum(must))
+    start = _first_ray(sensor, jnp.asarray(bearing, jnp.float32))
+    rays = start + sensor.stride * jnp.arange(sensor.window)
+    return jnp.asarray(readings, jnp.float32)[rays]
+
+
+def is_in_view(sensor: Sensor, bearing: Float[Array, ""]) -> Bool[Array, ""]:
+    """Tells whether a bearing is between the outermost rays.
+
+    Args:
+      sensor: the sensor.
+      bearing: in the robot's frame, in radians.
+    """
+    return (bearing >= sensor.angles.min()) & (bearing <= sensor.angles.max())
 
 
 def as_window(sensor: Sensor, readings: Float[Array, "window *channels"]) -> Float[Array, "F"]:

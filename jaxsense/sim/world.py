@@ -6,14 +6,15 @@ import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
 from jaxsense.config import Config, ViewpointConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, others, pytree
+from jaxsense.sim import absence, sensors, viewpoints, windows
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import sensors, viewpoints, windows
+from jaxsense.sim.absence import View
 from jaxsense.sim.light import Light, random_light
 
 
@@ -188,6 +189,7 @@ def scan_around(
     bearing: Float[Array, ""],
     modality: int,
     seconds: Float[Array, ""] | float = 0.0,
+    twin: Float[Array, "2"] | None = None,
 ) -> Float[Array, "window *channels"]:
     """Scans around a bearing from a robot's current pose.
 
@@ -200,6 +202,7 @@ def scan_around(
       bearing: bearing of the window's centre in the robot's frame, in radians.
       modality: index of the robot's sensor; static, because sensors differ in shape.
       seconds: time of the scan, over which the light changes.
+      twin: position of one more robot, see `sensors.scan`.
 
     Returns:
       The readings of the rays that the detector reads.
@@ -207,49 +210,73 @@ def scan_around(
     sensor = world.sensors[modality]
     rays = windows.window_of(sensor, sensor.directions, bearing)
     layout, light = scene.layout, scene.light
-    return sensors.scan(key, sensor, world.arena, data, layout, light, robot, rays, seconds)
+    return sensors.scan(
+        key, sensor, world.arena, data, layout, light, robot, rays, seconds=seconds, twin=twin
+    )
 
 
 def survey(
-    key: Key, world: World, classes: Int[Array, "N"]
-) -> tuple[Scene, tuple[Float[Array, "N _"], ...]]:
+    key: Key, world: World, classes: Int[Array, "N"], is_empty: Bool[Array, ""] | None = None
+) -> tuple[Scene, tuple[Float[Array, "N _"], ...], Float[Array, "R N"]]:
     """Draws a scene in which each robot looks at each PoI, every time from a new viewpoint.
 
     Args:
       key: random key.
       world: the simulation.
       classes: index of each PoI's class in the settings of the arena.
+      is_empty: whether no look shows its PoI, see `absence.without_poi`; all do by default.
 
     Returns:
-      The scene, and for each robot the inputs of its detector, one per PoI.
+      The scene, for each robot the inputs of its detector, one per PoI, and the expected distances
+      of the PoIs, in metres.
     """
     scene_key, viewpoint_key, noise_key = jax.random.split(key, 3)
     scene = random_scene(scene_key, world, classes)
     robots, pois = jnp.arange(len(world.sensors)), jnp.arange(world.arena.config.num_pois)
     shape = (len(robots), len(pois))
 
-    def stand(key: Key, robot: jax.Array, poi: jax.Array):
+    def stand(key: Key, robot: jax.Array, poi: jax.Array) -> tuple[View, mjx.Data]:
         standing = others(scene.poses, robot)
         pose, bearing = _viewpoint(key, world, scene.layout, standing, poi)
-        poses = scene.poses.at[robot].set(pose)
-        return poses, bearing, arenas.place(world.arena, scene.layout, poses)
+        view = View(
+            positions=scene.layout.position,
+            poses=scene.poses.at[robot].set(pose),
+            twin=jnp.array(absence.outside(world.arena.config)),
+            bearing=bearing,
+            distance=jnp.linalg.norm(scene.layout.position[poi] - pose[:2]),
+        )
+        if is_empty is not None:
+            # Folded in: the viewpoints do not depend on it.
+            absent = absence.without_poi(
+                jax.random.fold_in(key, 1),
+                world.sensors,
+                world.arena.config,
+                world.viewpoint,
+                view,
+                robot,
+                poi,
+            )
+            view = jax.tree.map(lambda *x: jnp.where(jnp.asarray(is_empty), *x), absent, view)
+        layout = dataclasses.replace(scene.layout, position=view.positions)
+        return view, arenas.place(world.arena, layout, view.poses)
 
     of_pois = jax.vmap(stand, in_axes=(0, None, 0))
     each = jax.vmap(of_pois, in_axes=(0, 0, None))
-    poses, bearing, data = each(jax.random.split(viewpoint_key, shape), robots, pois)
+    views, data = each(jax.random.split(viewpoint_key, shape), robots, pois)
 
     noise_keys = jax.random.split(noise_key, shape)
 
     def read_all(robot: int) -> jax.Array:
-        def read(key: Key, poses: jax.Array, bearing: jax.Array, data: mjx.Data) -> jax.Array:
-            stood = dataclasses.replace(scene, poses=poses)
-            readings = scan_around(key, world, stood, data, robot, bearing, robot)
+        def read(key: Key, view: View, data: mjx.Data) -> jax.Array:
+            stood = dataclasses.replace(scene, poses=view.poses)
+            twin = None if is_empty is None else view.twin
+            readings = scan_around(key, world, stood, data, robot, view.bearing, robot, twin=twin)
             return windows.as_window(world.sensors[robot], readings)
 
-        of_robot = jax.tree.map(lambda x: x[robot], data)
-        return jax.vmap(read)(noise_keys[robot], poses[robot], bearing[robot], of_robot)
+        view, state = jax.tree.map(lambda x: x[robot], (views, data))
+        return jax.vmap(read)(noise_keys[robot], view, state)
 
-    return scene, tuple(map(read_all, range(len(world.sensors))))
+    return scene, tuple(map(read_all, range(len(world.sensors)))), views.distance
 
 
 def _viewpoint(key: Key, world: World, layout: arenas.Layout, others: jax.Array, poi: jax.Array):

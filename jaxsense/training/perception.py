@@ -8,16 +8,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsense import looks
-from jaxsense.config import Config
+from jaxsense.config import Config, DetectorConfig, ViewpointConfig
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, Samples, pytree
 from jaxsense.models import make_bayes, make_in_place, make_jmvae, make_prior
+from jaxsense.sim import sensors
 from jaxsense.sim.arena import Arena
+from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene, make_world
 from jaxsense.training.fits import fit_stage
 from jaxsense.training.stage import Output, Stage
 from jaxsense.vae import detectors, filter, jmvae, novelty
+from jaxsense.vae import gate as gates
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.filter import Filter
 from jaxsense.vae.fusion import InPlace
@@ -25,8 +28,29 @@ from jaxsense.vae.novelty import Novelty
 
 _REPEATS = 4  # looks in a scene, from which novelty is learned
 
-Examples = tuple[Float[Array, "_ _"], Int[Array, "_"]]
-"""`[L, F]` windows of a detector, and their `[L]` int32 labels."""
+_SHARE_OF_EMPTY = 8  # one empty scene for so many to train detectors with; rays take time
+_SPOILT_EACH = 2048  # windows of each kind that are spoilt by hand
+_ELSEWHERE = 0.65, 1.6  # of the distance, outside of which a PoI is not where it is expected
+_GATE_CHECKS = 8192  # looks that set a gate's threshold
+
+
+@pytree
+class Examples:
+    """What a detector and its gate are trained on.
+
+    Attributes:
+      windows: `[L, F]` windows of looks at PoIs.
+      labels: `[L]` int32 their labels.
+      distances: `[L]` expected distances of the PoIs, in metres.
+      nothing: looks that show no PoI, in random order.
+      checks: other looks at PoIs, for the gate's threshold.
+    """
+
+    windows: Float[Array, "L F"]
+    labels: Int[Array, " L"]
+    distances: Float[Array, " L"]
+    nothing: gates.Looks
+    checks: gates.Looks
 
 
 @pytree
@@ -37,11 +61,13 @@ class Surveys:
       classes: `[S, N]` int32 true classes.
       scenes: `[S]` scenes.
       windows: for each modality `[S, N, F]` inputs of its detector.
+      distances: `[S, M, N]` expected distances of the PoIs, in metres.
     """
 
     classes: Int[Array, "S N"]
     scenes: Scene
     windows: tuple[Float[Array, "S N F"], ...]
+    distances: Float[Array, "S M N"]
 
 
 @pytree
@@ -76,13 +102,14 @@ class Detections:
     windows: tuple[Float[Array, "C 1 F"], ...]
 
 
-def num_scenes(config: Config) -> tuple[int, int, int]:
-    """Numbers of scenes to train detectors with, for the bank, and to measure on."""
+def num_scenes(config: Config) -> tuple[int, int, int, int]:
+    """Numbers of scenes to train detectors with, for the bank, to measure on, and empty ones."""
     num_pois, num_classes = config.arena.num_pois, len(config.arena.classes)
     num_bank = -(-config.jmvae.samples_per_class * num_classes // num_pois)
     num_held_out = -(-_held_out_per_class(config) * num_classes // num_pois)
     num_train = -(-config.detector.num_scans // num_pois)
-    return num_train, max(num_bank, _num_starts(config)), num_held_out
+    num_empty = -(-num_train // _SHARE_OF_EMPTY)
+    return num_train, max(num_bank, _num_starts(config)), num_held_out, num_empty
 
 
 def _held_out_per_class(config: Config) -> int:
@@ -118,30 +145,78 @@ def survey_stage(arena: Arena) -> Stage:
     def survey(key: Key, config: Config, *, scenes: tuple[Key, jax.Array]) -> Surveys:
         del key
         keys, classes = scenes
-        seen, windows = looks.surveys(keys, make_world(config, arena=arena), classes)
-        return Surveys(classes, seen, windows)
+        is_empty = jnp.arange(len(classes)) >= sum(num_scenes(config)[:3])
+        world = make_world(config, arena=arena)
+        seen, windows, distances = looks.surveys(keys, world, classes, is_empty)
+        return Surveys(classes, seen, windows, distances)
 
     return Stage("survey", survey, {"scenes": "scenes"})
 
 
 def split_examples(key: Key, config: Config, *, surveys: Surveys) -> tuple[Examples, ...]:
-    """Labelled windows to train each detector on.
+    """What to train each detector and its gate on.
 
     Args:
-      key: not used.
+      key: random key of the windows that are spoilt by hand.
       config: all settings.
       surveys: of all scenes.
     """
-    del key
-    num_train = num_scenes(config)[0]
-    classes = surveys.classes[:num_train].reshape(-1)
-    return tuple(
-        (
-            windows[:num_train].reshape(-1, windows.shape[-1]),
-            jnp.array(config.label_of_class(name))[classes],
+    num_train, num_bank, _, num_empty = num_scenes(config)
+
+    def looks_of(m: int, part: slice) -> gates.Looks:
+        windows, distances = surveys.windows[m][part], surveys.distances[part, m]
+        return gates.Looks(windows.reshape(-1, windows.shape[-1]), distances.reshape(-1))
+
+    def of_modality(key: Key, m: int, name: str, sensor: Sensor) -> Examples:
+        shown = looks_of(m, slice(num_train))
+        classes = surveys.classes[:num_train].reshape(-1)
+        empty = looks_of(m, slice(-num_empty, None))
+        checks = looks_of(m, slice(num_train, num_train + num_bank))
+        return Examples(
+            windows=shown.windows,
+            labels=jnp.array(config.label_of_class(name))[classes],
+            distances=shown.distances,
+            nothing=_nothing(key, config.viewpoint, sensor, shown, empty),
+            checks=jax.tree.map(lambda x: x[:_GATE_CHECKS], checks),
         )
-        for name, windows in zip(config.modalities, surveys.windows, strict=True)
-    )
+
+    keys = jax.random.split(key, len(config.modalities))
+    names, made = config.modalities, sensors.make(config)
+    return tuple(of_modality(keys[m], m, names[m], made[m]) for m in range(len(names)))
+
+
+def _nothing(
+    key: Key, viewpoint: ViewpointConfig, sensor: Sensor, shown: gates.Looks, empty: gates.Looks
+) -> gates.Looks:
+    """Looks that show no PoI, in random order: empty ones, and others that are spoilt by hand.
+
+    A window of a PoI shows none if most of its rays are lost, if all of its readings are equal, or
+    if the PoI is expected at another distance.
+    """
+    shown = jax.tree.map(lambda x: x[:_SPOILT_EACH], shown)
+    lost_key, share_key, level_key, distance_key, order_key = jax.random.split(key, 5)
+    windows, distances = shown.windows, shown.distances
+    number = windows.shape[:1]
+    blind = jnp.minimum(sensor.blind, sensor.window_limit)
+    share = jax.random.uniform(share_key, (*number, 1), minval=0.4)
+    lost = jax.random.uniform(lost_key, windows.shape) < share
+    levels = jax.random.uniform(level_key, (*number, 1)) * jnp.max(windows)
+    is_zero, is_blind = (jnp.arange(number[0])[:, None] % 4 == i for i in (0, 1))
+    levels = jnp.where(is_zero, 0.0, jnp.where(is_blind, blind, levels))
+    near, far = viewpoint.min_distance, viewpoint.max_distance
+    expected = jax.random.uniform(distance_key, number, minval=near, maxval=far)
+    ratio = expected / distances
+    is_elsewhere = (ratio < _ELSEWHERE[0]) | (ratio > _ELSEWHERE[1])
+    parts = [
+        empty,
+        gates.Looks(jnp.where(lost, blind, windows), distances),
+        gates.Looks(jnp.broadcast_to(levels, windows.shape), distances),
+        # Where it is expected about right, an empty window instead.
+        gates.Looks(jnp.where(is_elsewhere[:, None], windows, blind), expected),
+    ]
+    together = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+    order = jax.random.permutation(order_key, len(together.windows))
+    return jax.tree.map(lambda x: x[order], together)
 
 
 def detector_stage(modality: int, name: str, config: Config) -> Stage:
@@ -153,30 +228,40 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
       config: all settings.
     """
 
-    def split(examples: tuple[Examples, ...]) -> tuple[Examples, Examples]:
-        """Examples to train on, and examples to calibrate with."""
-        windows, labels = examples[modality]
-        number = config.detector.num_training(len(labels))
-        return (windows[:number], labels[:number]), (windows[number:], labels[number:])
-
     def untrained(
         key: Key, config: Config, *, examples: tuple[Examples, ...]
-    ) -> tuple[Detector, Params]:
+    ) -> tuple[Detector, tuple[Params, Params]]:
         num_labels = len(config.labels(config.modalities[modality]))
-        detector = detectors.init(key, split(examples)[0][0], num_labels, config.detector)
-        return detector, detector.params
+        windows = examples[modality].windows[: _num_training(config, examples[modality])]
+        detector = detectors.init(key, windows, num_labels, config.detector)
+        return detector, (detector.params, detector.gate.params)
 
     def problem(
         config: Config, detector: Detector, *, examples: tuple[Examples, ...]
-    ) -> detectors.Fitting:
-        windows, labels = split(examples)[0]
-        return detectors.Fitting(config.detector, detector, windows, labels)
+    ) -> FittingBoth:
+        given = examples[modality]
+        number, num_checks = _num_training(config, given), _num_checks(given)
+        windows = given.windows[:number]
+        shown = gates.Looks(windows, given.distances[:number])
+        nothing = jax.tree.map(lambda x: x[num_checks:], given.nothing)
+        return FittingBoth(
+            detectors.Fitting(config.detector, detector, windows, given.labels[:number]),
+            gates.Fitting(config.detector, detector.offset, detector.scale, shown, nothing),
+        )
 
     def trained(
         config: Config, detector: Detector, fit: FitState, *, examples: tuple[Examples, ...]
     ) -> Detector:
-        found = dataclasses.replace(detector, params=fit.params)
-        windows, labels = split(examples)[1]
+        given = examples[modality]
+        number, num_checks = _num_training(config, given), _num_checks(given)
+        params, of_gate = fit.params
+        nothing = jax.tree.map(lambda x: x[:num_checks], given.nothing)
+        checks = gates.Fitting(
+            config.detector, detector.offset, detector.scale, given.checks, nothing
+        )
+        gate = gates.fitted(of_gate, checks)
+        found = dataclasses.replace(detector, params=params, gate=gate)
+        windows, labels = given.windows[number:], given.labels[number:]
         return detectors.calibrate(found, windows, labels) if len(labels) else found
 
     return fit_stage(
@@ -188,6 +273,61 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
         problem=problem,
         trained=trained,
     )
+
+
+def _num_training(config: Config, examples: Examples) -> int:
+    """How many examples train the detector; the others calibrate it."""
+    return config.detector.num_training(len(examples.labels))
+
+
+def _num_checks(examples: Examples) -> int:
+    """How many looks at nothing help to set the gate's threshold; the others train the gate."""
+    return min(len(examples.nothing.windows) // 4, _GATE_CHECKS)
+
+
+@pytree
+class FittingBoth:
+    """Problem of fitting a detector and its gate together, two networks that share nothing.
+
+    Attributes:
+      detector: problem of fitting the detector.
+      gate: problem of fitting the gate.
+    """
+
+    detector: detectors.Fitting
+    gate: gates.Fitting
+
+    @property
+    def config(self) -> DetectorConfig:
+        """Settings of the fit."""
+        return self.detector.config
+
+    def draw(self, key: Key, number: int) -> tuple[jax.Array, jax.Array]:
+        """Draws the rows of both, see `Problem.draw`.
+
+        Args:
+          key: random key.
+          number: of steps; static.
+        """
+        # Folded in: `key` draws the rows of the detector, with a gate or without.
+        gate_key = jax.random.fold_in(key, 1)
+        return self.detector.draw(key, number), self.gate.draw(gate_key, number)
+
+    def loss(
+        self,
+        params: tuple[Params, Params],
+        drawn: tuple[jax.Array, jax.Array],
+        step: Int[Array, ""],
+    ) -> Float[Array, ""]:
+        """Sum of both losses.
+
+        Args:
+          params: of the detector's network, and of the gate's.
+          drawn: rows for the detector, and for the gate.
+          step: of the fit.
+        """
+        of_detector = self.detector.loss(params[0], drawn[0], step)
+        return of_detector + self.gate.loss(params[1], drawn[1], step)
 
 
 def detect(
@@ -202,8 +342,8 @@ def detect(
       trained: one detector for each modality.
     """
     del key
-    num_train, num_bank, _ = num_scenes(config)
-    others = jax.tree.map(lambda x: x[num_train:], surveys)
+    num_train, num_bank, _, num_empty = num_scenes(config)
+    others = jax.tree.map(lambda x: x[num_train:-num_empty], surveys)
     features = looks.detect_all(trained, others.windows)
 
     def by_class(values: tuple[jax.Array, ...], part: slice, number: int) -> Samples:

@@ -3,7 +3,9 @@
 from jaxsense.core.types import Fusion as Fusion
 from jaxsense.vae.bayes import bayes_update as bayes_update
 from jaxsense.vae.bayes import product_of_experts as product_of_experts
+from jaxsense.vae.detectors import Detection as Detection
 from jaxsense.vae.detectors import Detector as Detector
+from jaxsense.vae.detectors import answer as answer
 from jaxsense.vae.detectors import detect as detect
 from jaxsense.vae.filter import Filter as Filter
 from jaxsense.vae.fusion import InPlace as InPlace

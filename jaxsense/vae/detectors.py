@@ -1,4 +1,4 @@
-"""The scanline detectors f_x and f_w: from one sensor's window to features."""
+"""The scanline detectors f_x and f_w: from one sensor's window to features, through a gate."""
 
 import dataclasses
 
@@ -7,12 +7,14 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import DetectorConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Key, pytree
+from jaxsense.vae import gate as gates
+from jaxsense.vae.gate import Gate
 
 _MAX_TEMPERATURE = 4.0
 
@@ -26,12 +28,14 @@ class Detector:
       offset: `[F]` mean of the windows for training.
       scale: `[]` overall standard deviation of these windows.
       hidden: sizes of the hidden layers.
+      gate: tells which windows show a PoI.
       num_labels: D_m, the number of labels.
     """
 
     params: Params
     offset: Float[Array, " F"]
     scale: Float[Array, ""]
+    gate: Gate
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
     num_labels: int = struct.field(pytree_node=False)
 
@@ -51,7 +55,22 @@ def init(
     params = networks.init(key, MLP(config.hidden, num_labels), windows.shape[1])
     offset = jnp.mean(windows, axis=0)
     scale = jnp.std(windows - offset[None]) + 1e-6
-    return Detector(params, offset, scale, config.hidden, num_labels)
+    # Folded in: `key` draws the network of the labels.
+    gate = gates.init(jax.random.fold_in(key, 1), windows.shape[1])
+    return Detector(params, offset, scale, gate, config.hidden, num_labels)
+
+
+@pytree
+class Detection:
+    """What a look says.
+
+    Attributes:
+      is_there: `[]` whether the window shows its PoI.
+      features: `[D_m]` probabilities of the labels, all equal if it does not.
+    """
+
+    is_there: Bool[Array, ""]
+    features: Float[Array, " D_m"]
 
 
 def logits(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
@@ -61,13 +80,11 @@ def logits(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m
       detector: of the sensor.
       window: `[F]`.
     """
-    chex.assert_shape(window, detector.offset.shape, custom_message="window")
-    standard = (window - detector.offset) / detector.scale
-    return networks.apply(_network(detector), detector.params, standard)
+    return networks.apply(_network(detector), detector.params, _standard(detector, window))
 
 
 def detect(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
-    """Features of one look.
+    """Features of a look that shows its PoI; `answer` also tells whether it does.
 
     Args:
       detector: of the sensor.
@@ -77,6 +94,25 @@ def detect(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m
       `[D_m]` probabilities of the labels, for example (red, green).
     """
     return jax.nn.softmax(logits(detector, window))
+
+
+def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array, ""]) -> Detection:
+    """What a look says, which may be that there is nothing.
+
+    Args:
+      detector: of the sensor.
+      window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
+      distance: expected distance of the PoI's centre, in metres.
+    """
+    is_there = gates.passes(detector.gate, _standard(detector, window), distance)
+    features = jnp.where(is_there, detect(detector, window), 1 / detector.num_labels)
+    return Detection(is_there, features)
+
+
+def _standard(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " F"]:
+    """A window standardised by those of the training."""
+    chex.assert_shape(window, detector.offset.shape, custom_message="window")
+    return (window - detector.offset) / detector.scale
 
 
 @pytree

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arenas import arena, known_layout, place, set_native  # noqa: F401
-from teams import CONFIG, NAIVE
+from teams import CONFIG, NAIVE, with_gates
 
 import jaxsense
 from jaxsense import mission
@@ -18,7 +18,7 @@ def team():
 
 @pytest.fixture(scope="session")
 def models():
-    return jaxsense.init(jax.random.key(0), CONFIG)
+    return with_gates(jaxsense.init(jax.random.key(0), CONFIG))
 
 
 @pytest.fixture(scope="session")

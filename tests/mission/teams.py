@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsense import dqn, mission
 from jaxsense.config import PRESETS
 from jaxsense.vae import readout
+from jaxsense.vae.gate import Gate
 
 # Untrained detectors are never sure; what they say is of no importance here. Robots follow values.
 _FOLLOWING = replace(PRESETS["smoke"].mission, least_confidence=0.0, auctions=False)
@@ -26,6 +28,40 @@ def with_class_beliefs(models, classes):
     """The same models with other joint posteriors of the classes."""
     fusion = replace(models.fusion, classes=classes, readout=readout.make(classes))
     return replace(models, fusion=fusion)
+
+
+def with_gates(models):
+    """Models whose gates read the middle of a window, without noise worth mention.
+
+    The camera's passes what is coloured there, and the LiDAR's what is there at most 0.24 m nearer
+    than the centre of the PoI.
+    """
+    camera, lidar = models.detectors
+    weights = np.zeros((242, 32), np.float32)
+    colours = weights[: 3 * 80].reshape(80, 3, 32)
+    colours[37:43, 0, 0] = colours[37:43, 1, 1] = 1 / 6  # red, green
+    colours[37:43, 2, :2] = -1 / 6  # less blue
+    of_camera = _gate(camera, weights, 0.0, np.array([1.0, 1.0]), -0.1)
+    weights = np.zeros((130, 32), np.float32)
+    weights[60:68, 0], weights[128, 0] = 1 / 8, -1.0  # the range less the distance
+    weights[:, 1] = -weights[:, 0]
+    of_lidar = _gate(lidar, weights, np.array([0.12, -0.12]), np.array([-1.0, -1.0]), 0.12)
+    return replace(models, detectors=(of_camera, of_lidar))
+
+
+def _gate(detector, first, bias, second, last):
+    """A detector whose gate adds up two units."""
+    params = jax.tree.map(np.zeros_like, detector.gate.params)
+    layers = params["params"]
+    # The window is standardised, the distance is not.
+    size = len(detector.offset)
+    layers["Dense_0"]["kernel"][:size] = first[:size] * detector.scale
+    layers["Dense_0"]["kernel"][size:] = first[size:]
+    layers["Dense_0"]["bias"][:2] = bias
+    layers["Dense_1"]["kernel"][[0, 1], [0, 1]] = 1.0
+    layers["Dense_2"]["kernel"][:2, 0] = second
+    layers["Dense_2"]["bias"][0] = last
+    return replace(detector, gate=Gate(params, np.float32(0.0)))
 
 
 def alone(function):

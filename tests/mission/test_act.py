@@ -11,7 +11,7 @@ from teams import CONFIG, alone, with_config
 from jaxsense.mission import act
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import windows, world
+from jaxsense.sim import world
 from jaxsense.sim.light import random_conditions
 from jaxsense.vae.novelty import Novelty
 
@@ -170,25 +170,28 @@ def test_the_light_of_a_scan_is_that_of_its_time(scan, models, facing):
 
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
-def test_a_poi_that_is_not_where_it_is_expected_is_not_shown(facing, robot, team):
+def test_a_poi_that_is_not_where_it_is_expected_is_not_there(facing, robot, team, models):
     sensor, scene = team.world.sensors[robot], facing(robot).scene
     gone = replace(
         scene, layout=replace(scene.layout, position=scene.layout.position.at[0, 1].set(1.0))
     )
-    bearing = jnp.float32(0)
 
     @jax.jit
-    def shows(scene, distance):
+    def is_there(scene, bearing, distance):
         data = arenas.place(team.world.arena, scene.layout, scene.poses)
         readings = world.scan_around(
-            jax.random.key(1), team.world, scene, data, robot, bearing, robot
+            jax.random.key(1), team.world, scene, data, robot, jnp.float32(0), robot
         )
-        return windows.shows_poi(sensor, readings, bearing, distance, CONFIG.arena)
+        return models.detect_in_window(robot, sensor, readings, bearing, distance).is_there
 
-    assert shows(scene, 0.8)
-    assert not shows(gone, 0.8)
-    # The LiDAR also tells that it is nearer than expected; the camera cannot.
-    assert shows(scene, 1.1) == (robot == CAMERA)
+    assert is_there(scene, 0.0, 0.8)
+    assert not is_there(gone, 0.0, 0.8)
+    # The LiDAR also tells that it is nearer than expected.
+    assert is_there(scene, 0.0, 1.1) == (robot == CAMERA)
+    # The camera sees 40 degrees to either side, the LiDAR 120.
+    limit = np.radians((40, 120)[robot])
+    for bearing in (limit + 0.01, -limit - 0.01, np.pi, np.nan):
+        assert not is_there(scene, bearing, 0.8)
 
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
@@ -199,16 +202,6 @@ def test_an_unsure_detector_writes_nothing(scan, models, facing, robot):
             jax.random.key(0), facing(robot), robot, sure(models, robot, confidence), strict
         )
         assert (after.robots.looks[robot], after.robots.detections[robot]) == (1, detections)
-
-
-@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
-def test_a_poi_is_seen_however_wrong_its_bearing_is_believed_to_be(scan, facing, robot):
-    # At .8 m it is 7.18 degrees to either side, .7 of which would reach beyond it if the bearing
-    # were 6 degrees off and nobody knew.
-    unsure = replace(CONFIG, viewpoint=replace(CONFIG.viewpoint, bearing_error=6.0))
-    state = facing(robot)
-    for key in jax.random.split(jax.random.key(0), 32):
-        assert scan(key, state, robot, config=unsure).robots.detections[robot] == 1
 
 
 @pytest.mark.parametrize(

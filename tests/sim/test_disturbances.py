@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.config import ArenaConfig, CameraConfig, LidarConfig
-from jaxsense.sim import disturbances, sensors, windows
+from jaxsense.config import CameraConfig, LidarConfig
+from jaxsense.sim import disturbances, sensors
 from jaxsense.sim.light import Light, random_conditions
 from jaxsense.sim.raycast import Hit
 
@@ -135,19 +135,3 @@ def test_a_shadow_leaves_the_ambient_light():
     is_lit = np.isclose(image, lit).all(axis=1)
     assert 0 < is_lit.sum() < 80
     np.testing.assert_allclose(image[~is_lit], np.broadcast_to(dark, (80 - is_lit.sum(), 3)))
-
-
-def test_a_scan_with_lost_beams_may_still_show_a_poi():
-    lidar = sensors.lidar(LidarConfig(range_noise=0.0, dropout=0.1))
-    arena = ArenaConfig()
-    bearing, distance = jnp.float32(0.0), jnp.float32(1.0)
-    angles = windows.window_of(lidar, lidar.angles, bearing)
-    # 23 beams lie within 0.7 of the half width, .1 rad; twice a tenth of them may be lost.
-    within = np.flatnonzero(np.abs(angles) <= 0.7 * np.arcsin(0.1))
-    assert len(within) == 23
-    readings = np.full(128, 0.9, np.float32)
-    for lost, expected in ((0, True), (4, True), (5, False)):
-        readings[within] = 0.9
-        readings[within[:lost]] = 5.0
-        shown = windows.shows_poi(lidar, jnp.array(readings), bearing, distance, arena)
-        assert bool(shown) is expected, lost

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig, CameraConfig, Config, LidarConfig
+from jaxsense.config import CameraConfig, Config, LidarConfig
 from jaxsense.sim import sensors, windows
 from jaxsense.sim.raycast import Hit
 
@@ -313,32 +313,6 @@ def test_palette_colours_pois_from_the_layout_and_the_rest_from_the_model(arena,
     np.testing.assert_allclose(colour["wall0"], WALL)
 
 
-@pytest.mark.parametrize(("noise", "deviation"), [(0.01, 0.01), (0.05, 0.05), (0.0, 0.0002)])
-def test_the_lidar_takes_for_a_poi_what_five_deviations_of_its_noise_allow(noise, deviation):
-    # A PoI of extent 0.14 m around 1 m is met from 0.86 m on, and not behind its centre. Without
-    # noise there is rounding, for which 1 mm is ample.
-    lidar = sensors.lidar(LidarConfig(range_noise=noise))
-    readings = jnp.array([0.86, 0.86, 1.0, 1.0]) + deviation * jnp.array([-5.5, -4.5, 4.5, 5.5])
-    shown = lidar.shows(readings, jnp.float32(1.0), 0.14)
-    np.testing.assert_array_equal(shown, [False, True, True, False])
-
-
-def test_the_tolerance_of_the_lidar_grows_as_its_noise_does():
-    # At 2 m the standard deviation is 0.01 + 0.02 * 2 = 0.05 m. A PoI of extent 0.14 m is hit from
-    # 1.86 m to 2 m, give or take five deviations.
-    lidar = sensors.lidar(LidarConfig(range_noise=0.01, range_noise_growth=0.02))
-    readings = jnp.array([1.60, 1.62, 2.24, 2.26])
-    shown = lidar.shows(readings, jnp.float32(2.0), 0.14)
-    np.testing.assert_array_equal(shown, [False, True, True, False])
-
-
-def test_rays_that_drop_out_and_rays_at_edges_are_lost():
-    # 0.9 of the beams return, and 0.8 of these hit one surface alone: 1 - 0.72 are lost.
-    lidar = sensors.lidar(LidarConfig(dropout=0.1, mixed_pixels=0.2))
-    assert lidar.lost == pytest.approx(0.28)
-    assert sensors.lidar(LidarConfig(mixed_pixels=0.2)).lost == pytest.approx(0.2)
-
-
 def test_sensors_of_traced_settings_are_inputs_of_a_program():
     @jax.jit
     def window(config, readings):
@@ -357,81 +331,3 @@ def test_sensors_of_traced_settings_are_inputs_of_a_program():
         expected = np.minimum(readings, np.float32(limit))
         np.testing.assert_array_equal(window(config, readings), expected)
         np.testing.assert_array_equal(given(sensors.make(config)[1], readings), expected)
-
-
-ERROR = np.radians(2.0)
-NO_NOISE = LidarConfig(range_noise=0.0)
-IN_ANY_LIGHT = CameraConfig(pixel_noise=0.0)
-IN_LITTLE_LIGHT = CameraConfig(pixel_noise=0.0, low_light=0.5)
-BEARING = 0.2
-
-
-def angles_from(sensor, bearing=BEARING):
-    """Angles between the rays of a window and the bearing that it is centred on."""
-    return np.abs(windows.window_of(sensor, sensor.angles, jnp.float32(bearing)) - bearing)
-
-
-def is_shown(sensor, shows, distance, error):
-    """Whether a scan shows a PoI, of which some rays can have met one and all others are blind."""
-    seen = {"lidar": distance, "camera": jnp.array([0.8, 0.1, 0.1])}[sensor.name]
-    mask = jnp.array(shows).reshape(-1, *[1] * (sensor.channels > 1))
-    readings = jnp.where(mask, seen, sensor.blind)
-    bearing, distance = jnp.float32(BEARING), jnp.float32(distance)
-    return bool(windows.shows_poi(sensor, readings, bearing, distance, ArenaConfig(), error))
-
-
-@pytest.mark.parametrize("sensor", [sensors.lidar(NO_NOISE), sensors.camera(IN_ANY_LIGHT)])
-def test_of_a_poi_too_far_away_for_any_ray_to_be_certain_one_ray_is_enough(sensor):
-    # Half of its width is asin(.1 / 3.5) = 1.64 degrees, and the bearing may be 2 degrees off: no
-    # ray must meet it, and those up to 3.64 degrees off may.
-    angles = angles_from(sensor)
-    assert not is_shown(sensor, np.zeros(len(angles), bool), 3.5, ERROR)
-    for ray, angle in enumerate(angles):
-        alone = np.arange(len(angles)) == ray
-        assert is_shown(sensor, alone, 3.5, ERROR) == (angle < np.radians(3.64))
-
-
-@pytest.mark.parametrize("sensor", [sensors.lidar(NO_NOISE), sensors.camera(IN_ANY_LIGHT)])
-def test_near_looks_are_judged_as_if_the_bearing_were_exact(sensor):
-    # At .8 m half of the width is asin(.125) = 7.18 degrees, of which .7, 5.03 degrees, must show
-    # it; up to 7.18 - 2 = 5.18 degrees they do so at any error.
-    angles = angles_from(sensor)
-    for ray, angle in enumerate(angles):
-        but_one = np.arange(len(angles)) != ray
-        for error in (0.0, ERROR):
-            assert is_shown(sensor, but_one, 0.8, error) == (angle > np.radians(5.026))
-
-
-@pytest.mark.parametrize("sensor", [sensors.lidar(NO_NOISE), sensors.camera(IN_ANY_LIGHT)])
-def test_the_farther_the_poi_the_fewer_rays_must_show_it(sensor):
-    # At 1.2 m half of the width is asin(1 / 12) = 4.78 degrees: .7 of it are 3.35, and 2.78 are
-    # left if the bearing is 2 degrees off.
-    angles = angles_from(sensor)
-    for error, must in ((0.0, 3.346), (ERROR, 2.780)):
-        for ray, angle in enumerate(angles):
-            but_one = np.arange(len(angles)) != ray
-            assert is_shown(sensor, but_one, 1.2, error) == (angle > np.radians(must))
-
-
-@pytest.mark.parametrize(
-    "sensor",
-    [
-        sensors.lidar(NO_NOISE),
-        sensors.lidar(LidarConfig(dropout=0.3, mixed_pixels=0.5)),
-        sensors.camera(IN_ANY_LIGHT),
-        sensors.camera(IN_LITTLE_LIGHT),
-    ],
-)
-def test_a_blind_sensor_never_shows_a_poi(sensor):
-    for distance in (0.4, 1.0, 3.5):
-        for error in (0.0, ERROR):
-            assert not is_shown(sensor, np.zeros(sensor.window, bool), distance, error)
-
-
-def test_a_camera_that_may_be_in_little_light_takes_a_dark_look_but_not_a_blind_one():
-    for config, is_enough in ((IN_ANY_LIGHT, False), (IN_LITTLE_LIGHT, True)):
-        camera = sensors.camera(config)
-        # One pixel has colour, all others are dark.
-        one = np.arange(camera.window) == np.argmin(angles_from(camera))
-        assert is_shown(camera, one, 0.8, ERROR) is is_enough
-        assert not is_shown(camera, np.zeros(camera.window, bool), 0.8, ERROR)

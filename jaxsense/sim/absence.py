@@ -1,0 +1,125 @@
+"""Looks that do not show their PoI: empty places, walls, covers, other robots, wrong bearings."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsense.config import ArenaConfig, ViewpointConfig
+from jaxsense.core.types import Index, Key, pytree
+from jaxsense.sim import amiro
+from jaxsense.sim.sensors import Sensor
+
+_SHARES = {"empty": 2, "wall": 3, "outside": 1, "off": 3, "covered": 2, "robot": 2}
+_MIN_DISTANCE = 0.12  # m, between the centres of two robots
+
+
+@pytree
+class View:
+    """What one look depends on: where everything stands, and where the robot expects the PoI.
+
+    Attributes:
+      positions: `[N, 2]` centres of the PoIs, in metres.
+      poses: `[R, 3]` x [m], y [m] and yaw [rad] of each robot.
+      twin: `[2]` position of one more robot that carries the same sensor, in metres; outside the
+        walls if there is none.
+      bearing: `[]` believed bearing of the PoI in the robot's frame, in radians.
+      distance: `[]` expected distance of the PoI's centre, in metres.
+    """
+
+    positions: Float[Array, "N 2"]
+    poses: Float[Array, "R 3"]
+    twin: Float[Array, "2"]
+    bearing: Float[Array, ""]
+    distance: Float[Array, ""]
+
+
+def outside(arena: ArenaConfig) -> Float[np.ndarray, "2"]:
+    """A position outside the walls, which no ray from inside reaches, in metres."""
+    return np.array([-10 * arena.side, 0.0], np.float32)
+
+
+def without_poi(
+    key: Key,
+    sensors: tuple[Sensor, ...],
+    arena: ArenaConfig,
+    viewpoint: ViewpointConfig,
+    view: View,
+    robot: Index,
+    poi: Index,
+) -> View:
+    """Changes a look so that it does not show its PoI.
+
+    It draws one of these situations: an empty place; a wall at any distance; nothing at all, as
+    outside the arena; a wrong bearing; or a robot before the PoI or in its place.
+
+    Args:
+      key: random key.
+      sensors: of all robots.
+      arena: the sizes of arena and PoIs.
+      viewpoint: the distances at which robots expect PoIs.
+      view: a look at the PoI from a free viewpoint.
+      robot: index of the robot, which may be traced.
+      poi: index of the PoI.
+    """
+    draws = jax.random.uniform(key, (10,))
+    limits = np.cumsum(list(_SHARES.values())) / sum(_SHARES.values())
+    drawn = jnp.searchsorted(jnp.array(limits, jnp.float32), draws[0], side="right")
+    kind = {name: drawn == i for i, name in enumerate(_SHARES)}
+    away, pose = jnp.array(outside(arena)), view.poses[robot]
+
+    # Where the robot stands, and where it expects a PoI.
+    play = arena.side / 2 - amiro.BODY_RADIUS
+    turn = jnp.pi * (2 * draws[3] - 1)
+    anywhere = jnp.stack([play * (2 * draws[1] - 1), play * (2 * draws[2] - 1), turn])
+    beyond = jnp.stack([-away[0], away[1], turn / 3])  # looks away from the arena
+    pose = jnp.where(kind["wall"], anywhere, jnp.where(kind["outside"], beyond, pose))
+    near, far = viewpoint.min_distance, viewpoint.max_distance
+    any_distance = near + (far - near) * draws[4]
+    is_there = kind["off"] | kind["covered"]
+    distance = jnp.where(is_there, view.distance, any_distance)
+    wrong = _wrong_bearing(draws[5], sensors, arena, view, robot)
+    bearing = jnp.where(kind["off"], wrong, view.bearing)
+
+    # The PoIs, and the twin.
+    direction = pose[2] + view.bearing
+    ahead = jnp.stack([jnp.cos(direction), jnp.sin(direction)])
+    left = jnp.stack([-ahead[1], ahead[0]])
+    keeps_others = (draws[6] < 0.5) & ~(kind["wall"] | kind["off"])
+    positions = jnp.where(keeps_others, view.positions, away[None])
+    positions = positions.at[poi].set(jnp.where(is_there, view.positions[poi], away))
+    half_width = jnp.array([_half_width(sensor) for sensor in sensors])[robot]
+    least = jnp.maximum(_MIN_DISTANCE / distance, 0.15)
+    share = jnp.where(kind["covered"], least + (0.7 - least) * draws[7], least + draws[7])
+    aside = 0.7 * half_width * (2 * draws[8] - 1)
+    twin = pose[:2] + share * distance * ahead + aside * left
+    has_twin = kind["covered"] | kind["robot"] | ((draws[9] < 0.25) & kind["wall"])
+    return View(
+        positions=positions,
+        poses=view.poses.at[robot].set(pose),
+        twin=jnp.where(has_twin, twin, away),
+        bearing=bearing,
+        distance=distance,
+    )
+
+
+def _wrong_bearing(
+    draw: Float[Array, ""],
+    sensors: tuple[Sensor, ...],
+    arena: ArenaConfig,
+    view: View,
+    robot: Index,
+) -> Float[Array, ""]:
+    """A bearing in the field of view, at which the PoI does not cover the window's centre."""
+    ends = jnp.array([[s.angles.min(), s.angles.max()] for s in sensors])[robot]
+    apart = jnp.arcsin(jnp.minimum(arena.poi_extent / view.distance, 1.0)) + jnp.radians(3.0)
+    right = jnp.maximum(view.bearing - apart - ends[0], 0.0)
+    left = jnp.maximum(ends[1] - view.bearing - apart, 0.0)
+    offset = draw * (right + left)
+    return jnp.where(offset < right, ends[0] + offset, ends[1] - (offset - right))
+
+
+def _half_width(sensor: Sensor) -> float:
+    """Half the width, at the sensor's height, of a robot that carries the same sensor."""
+    top = amiro.GROUND_CLEARANCE + amiro.BODY_HEIGHT
+    return amiro.BODY_RADIUS if sensor.height <= top else amiro.LIDAR_HALF_WIDTH
