@@ -53,7 +53,9 @@ import numpy as np
 contents, programs = example["load"](sys.argv[1])
 inputs, found = np.load(sys.argv[2]), {}
 for name, about in contents["programs"].items():
-    given = [inputs[f"{name}/{key}"] for key in about["inputs"]]
+    given = [inputs[f"{name}/{key}"] for key in about["inputs"] if f"{name}/{key}" in inputs]
+    if not given:
+        continue
     found |= {f"{name}/{key}": value for key, value in programs[name](*given).items()}
 np.savez(sys.argv[3], **found)
 """
@@ -125,12 +127,13 @@ def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
     name = CONFIG.modalities[m]
     sensor = sensors.make(CONFIG)[m]
 
-    def window(readings, bearing):
+    def detect(readings, bearing, distance):
         # The nearest window in the scan, ray by ray.
         centre = float(sensor.centre(bearing))
         first = round(centre - (sensor.window - 1) * sensor.stride / 2)
         rays = first + np.arange(sensor.window) * sensor.stride
-        return [np.minimum(readings[rays], sensor.window_limit).reshape(-1)]
+        window = np.minimum(readings[rays], sensor.window_limit).reshape(-1)
+        return True, detectors.detect(models.detectors[m], window)
 
     def write(mean, std, seen, features):
         belief = models.fusion.update(Belief(mean, std), seen, features, m)
@@ -141,11 +144,41 @@ def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
         values = network.apply(models.q_networks[m], observation(Belief(mean, std)))
         return np.argmax(values), values
 
-    check(results, f"window_{name}", window, "window")
-    detect = lambda window: [detectors.detect(models.detectors[m], window)]  # noqa: E731
-    check(results, f"detect_{name}", detect, "features")
+    check(results, f"detect_{name}", detect, "is_there", "features")
     check(results, f"write_{name}", write, "mean", "std")
     check(results, f"decide_{name}", decide, "action", "values")
+
+
+@pytest.mark.parametrize("m", [0, 1])
+def test_an_exported_detector_answers_what_is_not_there(models, file, tmp_path, m):
+    name = CONFIG.modalities[m]
+    inputs = functions(CONFIG, models)[f"detect_{name}"].inputs
+    scan = np.full(inputs["readings"].shape, 0.5, np.float32)
+    ahead = len(scan) // 2
+    at = {"bearing": 0.0, "distance": 1.0}
+    cases = [
+        (scan, at, True),
+        (np.where(scan > 0, np.nan, scan), at, False),
+        (scan.copy(), at, False),
+        (-scan, at, False),
+        (np.where(scan > 0, np.inf, scan), at, True),  # as if it were the window's limit
+        *((scan, {**at, "bearing": b}, False) for b in (np.radians(121.0), -np.pi, np.nan)),
+        *((scan, {**at, "distance": d}, False) for d in (0.0, -1.0, np.inf, np.nan)),
+    ]
+    cases[2][0][ahead : ahead + 4] = np.nan  # the camera reads every fourth pixel
+    given = {
+        f"detect_{name}/readings": np.stack([readings for readings, _, _ in cases]),
+        **{f"detect_{name}/{key}": np.float32([x[key] for _, x, _ in cases]) for key in at},
+    }
+    np.savez(tmp_path / "in.npz", **given)
+    done = run_alone(RUN_ALL, file, tmp_path / "in.npz", tmp_path / "out.npz")
+    assert done.returncode == 0, done.stderr
+    found = np.load(tmp_path / "out.npz")
+    expected = [is_there for _, _, is_there in cases]
+    np.testing.assert_array_equal(found[f"detect_{name}/is_there"], expected)
+    features = found[f"detect_{name}/features"]
+    assert np.isfinite(features).all()
+    np.testing.assert_allclose(features[~np.array(expected)], 0.5)
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from jaxsense.config import DetectorConfig, JmvaeConfig
 from jaxsense.core import supervised
 from jaxsense.sim.world import make_world
 from jaxsense.training import perception
-from jaxsense.training.perception import Detections, Surveys
-from jaxsense.vae import detectors, jmvae
+from jaxsense.training.perception import Detections, Examples, Surveys
+from jaxsense.vae import detectors, gate, jmvae
 
 
 def bank_of(bank) -> Detections:
@@ -24,16 +24,23 @@ def bank_of(bank) -> Detections:
     return Detections(bank, nothing, nothing, nothing)
 
 
+def examples_of(windows, labels) -> Examples:
+    """Examples whose looks at nothing are those at PoIs."""
+    looks = gate.Looks(windows, jnp.ones(len(windows)))
+    return Examples(windows, labels, looks.distances, looks, looks)
+
+
 @pytest.mark.parametrize(("share", "trained_on"), [(0.0, 10), (0.1, 9), (0.25, 7), (0.5, 5)])
 def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, monkeypatch):
     config = dataclasses.replace(TINY.detector, calibration=share)
     config = dataclasses.replace(TINY, detector=config)
     # Of .25 of ten looks, three calibrate.
     windows, labels = jnp.arange(20.0).reshape(10, 2), jnp.arange(10) % 2
-    examples, used = ((windows, labels),) * 2, {}
+    examples, used = (examples_of(windows, labels),) * 2, {}
 
     def fit(key, state, problem, number):
-        used["train"], used["labels"] = problem.windows, problem.labels
+        used["train"], used["labels"] = problem.detector.windows, problem.detector.labels
+        used["shown"] = problem.gate.shown.windows
         return state, jnp.zeros(number)
 
     def calibrate(detector, windows, labels):
@@ -49,6 +56,7 @@ def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, m
     found = stage.finish(config, state, examples=examples)
     np.testing.assert_allclose(state[0].offset, windows[:trained_on].mean(axis=0))
     np.testing.assert_array_equal(used["train"], windows[:trained_on])
+    np.testing.assert_array_equal(used["shown"], windows[:trained_on])
     np.testing.assert_array_equal(used["labels"], labels[:trained_on])
     if share:
         np.testing.assert_array_equal(used["calibrate"], windows[trained_on:])
@@ -59,7 +67,7 @@ def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, m
 
 def test_without_calibration_a_detector_is_what_was_trained():
     windows, labels = jax.random.normal(KEY, (48, 6)), jnp.arange(48) % 2
-    examples, config = ((windows, labels),) * 2, TINY.detector
+    examples, config = (examples_of(windows, labels),) * 2, TINY.detector
     assert config.calibration == 0
     stage = stage_of("detector_camera")
     state = stage.begin(KEY, TINY, examples=examples)
@@ -70,8 +78,12 @@ def test_without_calibration_a_detector_is_what_was_trained():
         state, _ = stage.advance(key, TINY, state, examples=examples)
         fit, _ = supervised.fit(key, fit, problem, 3)
     found = stage.finish(TINY, state, examples=examples)
-    expected = dataclasses.replace(detector, params=fit.params)
+    # Its gate, which learns in the same steps, leaves it as it is.
+    expected = dataclasses.replace(detector, params=fit.params, gate=found.gate)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
+    before, after = (jax.tree.leaves(x.gate.params)[1] for x in (detector, found))
+    assert np.abs(after - before).max() > 0
+    assert np.isfinite(found.gate.threshold)
 
 
 def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):
@@ -103,10 +115,13 @@ def test_the_restart_with_the_lowest_loss_is_kept():
 def surveys(monkeypatch) -> Surveys:
     """Surveys whose windows, and scenes, hold the key that the scene was simulated with."""
 
-    def survey(keys, world, classes):
+    def survey(keys, world, classes, is_empty):
         key = jax.random.key_data(keys)[:, -1].astype(jnp.uint32)
         windows = jnp.broadcast_to(key[:, None, None], (*classes.shape, 1))
-        return key, (windows, windows)
+        number, num_pois = classes.shape
+        # Expected at 2 m in empty scenes, and at 1 m in all others.
+        distances = jnp.broadcast_to(1.0 + is_empty[:, None, None], (number, 2, num_pois))
+        return key, (windows, windows), distances
 
     monkeypatch.setattr(looks, "surveys", survey)
     listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
@@ -131,7 +146,7 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
     trained_on = []
 
     def fit(key, state, problem, number):
-        trained_on.append(np.asarray(problem.windows))
+        trained_on.append(np.asarray(problem.detector.windows))
         return state, jnp.zeros(number)
 
     listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
@@ -145,13 +160,23 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
     found = detections(KEY, MEASURED, surveys=surveys, trained=(None, None))
 
     seen, bank, held_out = used(trained_on), used(found.bank), used(found.held_out)
-    starts, shown = used(found.starts.scenes), used(found.windows)
+    starts, plotted = used(found.starts.scenes), used(found.windows)
     assert seen.isdisjoint(bank)
     assert held_out.isdisjoint(seen | bank | starts)
     assert starts.isdisjoint(seen)
-    assert shown <= held_out
+    assert plotted <= held_out
     # All of them were looked at.
     assert len(seen) >= 31 / 3
+    # Gates learn from the same scenes, and from empty ones that nothing else uses.
+    shown, checks = used(examples[0].windows), used(examples[0].checks.windows)
+    assert shown == seen
+    assert checks <= bank | starts
+    assert set(examples[0].distances.tolist()) == {1.0}
+    is_empty = np.asarray(surveys.distances[:, 0, 0]) == 2
+    assert is_empty.sum() == perception.num_scenes(MEASURED)[3] == 2  # of 11 to train on
+    empty = used(surveys.scenes[is_empty])
+    assert empty.isdisjoint(seen | bank | held_out | starts)
+    assert used(np.float32(list(empty))) <= used(examples[0].nothing.windows)
     assert [x.shape[:2] for x in found.held_out] == [(3, 9), (3, 9)]
 
 

@@ -1,0 +1,130 @@
+"""Gates on windows whose answer is known."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense.config import DetectorConfig
+from jaxsense.core import supervised
+from jaxsense.vae import detectors, gate
+
+CONFIG = DetectorConfig(hidden=(8,), steps=300, batch=64, learning_rate=1e-2)
+RAYS = 6
+
+
+def looks(key, number, is_shown):
+    """Ranges of 3 m in which, at the distance of its PoI, the two rays of a PoI stand out."""
+    distance_key, noise_key = jax.random.split(key)
+    distances = jax.random.uniform(distance_key, (number,), minval=0.5, maxval=2.0)
+    of_poi = jnp.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])[None]
+    at = distances[:, None] if is_shown else jnp.roll(distances, 1)[:, None] + 0.5
+    windows = jnp.where(of_poi > 0, at, 3.0) + 0.02 * jax.random.normal(noise_key, (number, RAYS))
+    return gate.Looks(windows, distances)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    keys = jax.random.split(jax.random.key(0), 2)
+    shown, nothing = looks(keys[0], 500, True), looks(keys[1], 300, False)
+    offset = shown.windows.mean(axis=0)
+    return gate.Fitting(CONFIG, offset, jnp.float32(1.0), shown, nothing)
+
+
+@pytest.fixture(scope="module")
+def params(problem):
+    start = supervised.start(gate.init(jax.random.key(1), RAYS).params, CONFIG)
+    fit = jax.jit(lambda key, state: supervised.fit(key, state, problem, CONFIG.steps))
+    return fit(jax.random.key(2), start)[0].params
+
+
+passes = jax.jit(jax.vmap(gate.passes, (None, 0, 0)))
+
+
+def share(found, problem, looks):
+    return float(passes(found, looks.windows - problem.offset[None], looks.distances).mean())
+
+
+def test_a_trained_gate_passes_pois_where_they_are_expected(problem, params):
+    found = gate.fitted(params, problem)
+    keys = jax.random.split(jax.random.key(3), 2)
+    assert share(found, problem, looks(keys[0], 2000, True)) >= 0.97
+    assert share(found, problem, looks(keys[1], 2000, False)) <= 0.05
+
+
+def with_scores(monkeypatch):
+    """Looks whose score is their distance."""
+    monkeypatch.setattr(gate, "logits", lambda params, standard, distance: distance)
+    return lambda distances: gate.Looks(jnp.zeros((len(distances), RAYS)), jnp.array(distances))
+
+
+def test_a_threshold_loses_one_look_in_a_hundred_and_no_more_than_needed(monkeypatch, problem):
+    of = with_scores(monkeypatch)
+    scores = np.arange(1001.0)  # of looks at PoIs: 1 % of them are below 10
+    overlapping = replace(problem, shown=of(scores), nothing=of(scores + 5.0))
+    assert gate.fitted({}, overlapping).threshold == pytest.approx(10.0)
+    # 0.2 % of the looks at nothing are above 5.99 of 0 to 6.
+    apart = replace(problem, shown=of(scores), nothing=of(np.linspace(0.0, 6.0, 1001)))
+    assert gate.fitted({}, apart).threshold == pytest.approx(0.998 * 6.0)
+
+
+def test_a_window_at_the_threshold_passes(monkeypatch):
+    with_scores(monkeypatch)
+    found, window = gate.Gate({}, jnp.float32(0.8)), jnp.zeros(RAYS)
+    for distance, expected in ((0.79, False), (0.8, True), (0.9, True)):
+        assert bool(gate.passes(found, window, jnp.float32(distance))) is expected
+
+
+@pytest.mark.parametrize(
+    ("reading", "distance", "expected"),
+    [
+        (1.0, 1.0, True),
+        (np.nan, 1.0, False),
+        (np.inf, 1.0, False),
+        (-np.inf, 1.0, False),
+        (1.0, np.nan, False),
+        (1.0, np.inf, False),
+        (1.0, 0.0, False),
+        (1.0, -1.0, False),
+    ],
+)
+def test_an_untrained_gate_passes_what_is_valid(reading, distance, expected):
+    untrained = gate.init(jax.random.key(0), RAYS)
+    window = jnp.zeros(RAYS).at[2].set(reading)
+    found = passes(untrained, window[None], jnp.float32([distance]))[0]
+    assert bool(found) is expected
+
+
+def test_half_of_a_batch_is_drawn_from_either_kind(problem):
+    few = replace(problem, nothing=jax.tree.map(lambda x: x[:3], problem.nothing))
+    rows = np.asarray(few.draw(jax.random.key(0), 50))
+    assert rows.shape == (50, 2, 32)
+    assert set(rows[:, 1].ravel()) == {0, 1, 2}
+    assert rows[:, 0].max() > 400
+
+
+def test_the_loss_is_the_mean_cross_entropy(monkeypatch, problem):
+    of = with_scores(monkeypatch)
+    of_looks = replace(problem, shown=of([2.0, 0.0]), nothing=of([1.0, -1.0]))
+    drawn = jnp.array([[0, 1], [0, 0]])
+    # -log sigmoid(2) = .126928, -log sigmoid(0) = .693147; -log(1 - sigmoid(1)) = 1.313262 twice.
+    expected = (0.126928 + 0.693147 + 2 * 1.313262) / 4
+    assert of_looks.loss({}, drawn, jnp.int32(0)) == pytest.approx(expected, abs=1e-5)
+
+
+def test_what_does_not_pass_has_no_features_of_a_class():
+    windows = jax.random.normal(jax.random.key(0), (20, RAYS))
+    detector = detectors.init(jax.random.key(1), windows, 3, CONFIG)
+    distance = jnp.float32(1.0)
+    found = detectors.answer(detector, windows[0], distance)
+    assert found.is_there
+    np.testing.assert_allclose(found.features, detectors.detect(detector, windows[0]))
+    closed = replace(detector, gate=replace(detector.gate, threshold=jnp.float32(jnp.inf)))
+    for answer in (
+        detectors.answer(closed, windows[0], distance),
+        detectors.answer(detector, windows[0].at[1].set(jnp.nan), distance),
+    ):
+        assert not answer.is_there
+        np.testing.assert_allclose(answer.features, [1 / 3] * 3)
