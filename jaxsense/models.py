@@ -152,7 +152,9 @@ def init(key: Key, config: Config) -> Models:
     model, agent = make_jmvae(config), make_agent(config)
     keys = jax.random.split(detector_key, len(config.modalities))
     untrained = tuple(
-        detectors.init(k, jnp.zeros((2, s.window * s.channels)), size, config.detector)
+        detectors.init(
+            k, jnp.zeros((2, s.window * s.channels)), size, config.detector, s.measures_distance
+        )
         for k, s, size in zip(keys, sensors.make(config), model.feature_sizes, strict=True)
     )
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))

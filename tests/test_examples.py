@@ -118,11 +118,18 @@ def test_recorded_scans(recorded_scans, tmp_path, capsys):
     assert recorded["thermal_scans"].shape == (4, 64)
     assert told.count("The map says:") == 4
     assert told.rstrip().endswith("The map says: red cube hot")
-    # Another recording says something else.
-    changed = {**recorded, "thermal_scans": np.full((4, 64), 60.0)}
-    np.savez(tmp_path / "hot.npz", **changed)
-    recorded_scans(tmp_path / "hot.npz")
-    assert capsys.readouterr().out.count("thermal: cold 0.00, hot 1.00") == 4
+    # Another recording says something else: a PoI that is hot, and one that is not there.
+    cold, hot = recorded["thermal_scans"][[0, 3]]
+    poses = recorded["thermal_poses"][[0, 3, 0, 0]]
+    changed = {**recorded, "thermal_scans": np.stack([cold, hot, np.full(64, 20.0), cold])}
+    changed |= {"thermal_poses": poses, "places": recorded["places"][[0, 3, 0, 0]]}
+    changed["thermal_scans"][3, 32] = np.nan
+    np.savez(tmp_path / "changed.npz", **changed)
+    recorded_scans(tmp_path / "changed.npz")
+    told = re.findall(r"thermal: (.*)", capsys.readouterr().out)
+    assert re.match(r"cold (0.9|1.0)", told[0])
+    assert re.search(r"hot (0.9|1.0)", told[1])
+    assert told[2:] == ["nothing there"] * 2
 
 
 @pytest.mark.parametrize(

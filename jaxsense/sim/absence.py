@@ -10,7 +10,7 @@ from jaxsense.core.types import Index, Key, pytree
 from jaxsense.sim import amiro
 from jaxsense.sim.sensors import Sensor
 
-_SHARES = {"empty": 2, "wall": 3, "outside": 1, "off": 3, "covered": 2, "robot": 2}
+_SHARES = {"empty": 2, "wall": 3, "outside": 1, "off": 2, "covered": 2, "robot": 3}
 _MIN_DISTANCE = 0.12  # m, between the centres of two robots
 
 

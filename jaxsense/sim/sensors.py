@@ -47,6 +47,7 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
       stride: step between the rays that the detector reads; static.
       ray_bytes: size of one ray's reading in a ROS message, in bytes; static.
       window_limit: highest reading in the detector's input.
+      measures_distance: whether readings are distances in metres; static.
       blind: reading of every ray after the sensor has failed.
 
     Raises:
@@ -60,6 +61,7 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
     channels: int = struct.field(pytree_node=False, default=1)
     stride: int = struct.field(pytree_node=False, default=1)
     ray_bytes: int = struct.field(pytree_node=False, default=4)  # float32
+    measures_distance: bool = struct.field(pytree_node=False, default=False)
     window_limit: float | jax.Array = np.inf
     blind: float | jax.Array = 0.0
 
@@ -192,6 +194,7 @@ def lidar(config: LidarConfig) -> Lidar:
         rays=Fan(config.num_beams, config.field_of_view),
         window=config.window,
         stride=config.stride,
+        measures_distance=True,
         window_limit=config.window_range,
         blind=config.max_range,
     )

@@ -29,8 +29,8 @@ from jaxsense.vae.novelty import Novelty
 _REPEATS = 4  # looks in a scene, from which novelty is learned
 
 _SHARE_OF_EMPTY = 8  # one empty scene for so many to train detectors with; rays take time
-_SPOILT_EACH = 2048  # windows of each kind that are spoilt by hand
-_ELSEWHERE = 0.65, 1.6  # of the distance, outside of which a PoI is not where it is expected
+_SPOILT_EACH = 512  # windows of each kind that are spoilt by hand
+_ELSEWHERE = 0.5, 2.0  # of the distance, outside of which a PoI is not where it is expected
 _GATE_CHECKS = 8192  # looks that set a gate's threshold
 
 
@@ -198,7 +198,7 @@ def _nothing(
     windows, distances = shown.windows, shown.distances
     number = windows.shape[:1]
     blind = jnp.minimum(sensor.blind, sensor.window_limit)
-    share = jax.random.uniform(share_key, (*number, 1), minval=0.4)
+    share = jax.random.uniform(share_key, (*number, 1), minval=0.6)
     lost = jax.random.uniform(lost_key, windows.shape) < share
     levels = jax.random.uniform(level_key, (*number, 1)) * jnp.max(windows)
     is_zero, is_blind = (jnp.arange(number[0])[:, None] % 4 == i for i in (0, 1))
@@ -233,7 +233,8 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
     ) -> tuple[Detector, tuple[Params, Params]]:
         num_labels = len(config.labels(config.modalities[modality]))
         windows = examples[modality].windows[: _num_training(config, examples[modality])]
-        detector = detectors.init(key, windows, num_labels, config.detector)
+        is_range = sensors.make(config)[modality].measures_distance
+        detector = detectors.init(key, windows, num_labels, config.detector, is_range)
         return detector, (detector.params, detector.gate.params)
 
     def problem(
@@ -246,7 +247,7 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
         nothing = jax.tree.map(lambda x: x[num_checks:], given.nothing)
         return FittingBoth(
             detectors.Fitting(config.detector, detector, windows, given.labels[:number]),
-            gates.Fitting(config.detector, detector.offset, detector.scale, shown, nothing),
+            gates.Fitting(config.detector, detector.gate, shown, nothing),
         )
 
     def trained(
@@ -256,9 +257,7 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
         number, num_checks = _num_training(config, given), _num_checks(given)
         params, of_gate = fit.params
         nothing = jax.tree.map(lambda x: x[:num_checks], given.nothing)
-        checks = gates.Fitting(
-            config.detector, detector.offset, detector.scale, given.checks, nothing
-        )
+        checks = gates.Fitting(config.detector, detector.gate, given.checks, nothing)
         gate = gates.fitted(of_gate, checks)
         found = dataclasses.replace(detector, params=params, gate=gate)
         windows, labels = given.windows[number:], given.labels[number:]

@@ -41,7 +41,11 @@ class Detector:
 
 
 def init(
-    key: Key, windows: Float[Array, "S F"], num_labels: int, config: DetectorConfig
+    key: Key,
+    windows: Float[Array, "S F"],
+    num_labels: int,
+    config: DetectorConfig,
+    measures_distance: bool = False,
 ) -> Detector:
     """Untrained detector.
 
@@ -50,13 +54,14 @@ def init(
       windows: `[S, F]` windows for training, by which it standardises its input.
       num_labels: D_m.
       config: sizes of the network.
+      measures_distance: whether the readings are distances, see `Gate`.
     """
     chex.assert_rank(windows, 2, custom_message="windows")
     params = networks.init(key, MLP(config.hidden, num_labels), windows.shape[1])
     offset = jnp.mean(windows, axis=0)
     scale = jnp.std(windows - offset[None]) + 1e-6
     # Folded in: `key` draws the network of the labels.
-    gate = gates.init(jax.random.fold_in(key, 1), windows.shape[1])
+    gate = gates.init(jax.random.fold_in(key, 1), offset, scale, measures_distance)
     return Detector(params, offset, scale, gate, config.hidden, num_labels)
 
 
@@ -104,7 +109,7 @@ def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array
       window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
       distance: expected distance of the PoI's centre, in metres.
     """
-    is_there = gates.passes(detector.gate, _standard(detector, window), distance)
+    is_there = gates.passes(detector.gate, window, distance)
     features = jnp.where(is_there, detect(detector, window), 1 / detector.num_labels)
     return Detection(is_there, features)
 

@@ -1,8 +1,11 @@
 """The gate of a detector: whether a window shows its PoI at all."""
 
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import DetectorConfig
@@ -11,6 +14,8 @@ from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Key, pytree
 
 _NETWORK = MLP((32, 16), 1)
+_DEPTH = 0.2  # m, about the size of a PoI
+_MAX_DEPTHS = 2.5
 _MAX_LOST = 0.01  # share of the looks at PoIs
 _MAX_PASSED = 0.002  # share of the looks at nothing, if few looks at PoIs are lost for it
 
@@ -23,50 +28,66 @@ class Gate:
       params: of the network.
       threshold: `[]` minimum output of the network for a window to pass; minus infinity before the
         training, so that all valid windows pass.
+      offset: `[F]` mean of the windows for training.
+      scale: `[]` overall standard deviation of these windows.
+      measures_distance: whether the readings are distances in metres; the network then reads how
+        far they are from the expected distance.
     """
 
     params: Params
     threshold: Float[Array, ""]
+    offset: Float[Array, " F"]
+    scale: Float[Array, ""]
+    measures_distance: bool = struct.field(pytree_node=False)
 
 
-def init(key: Key, num_readings: int) -> Gate:
+def init(
+    key: Key, offset: Float[Array, " F"], scale: Float[Array, ""], measures_distance: bool
+) -> Gate:
     """Untrained gate, which every valid window passes.
 
     Args:
       key: random key.
-      num_readings: F, the size of a window.
+      offset: mean of the windows for training.
+      scale: overall standard deviation of these windows.
+      measures_distance: whether the readings are distances in metres.
     """
-    return Gate(networks.init(key, _NETWORK, num_readings + 2), jnp.float32(-jnp.inf))
+    params = networks.init(key, _NETWORK, len(offset) + 2)
+    return Gate(params, jnp.float32(-jnp.inf), offset, scale, measures_distance)
 
 
 def logits(
-    params: Params, standard: Float[Array, "F *B"], distance: Float[Array, "*B"]
+    gate: Gate, windows: Float[Array, "F *B"], distances: Float[Array, "*B"]
 ) -> Float[Array, "*B"]:
-    """Log-odds that windows show their PoIs.
+    """Log-odds that windows show their PoIs, if half of all windows did.
 
     Args:
-      params: of the network.
-      standard: `[F]` standardised window, or `[F, B]`.
-      distance: expected distances of the PoIs' centres, in metres.
+      gate: of the sensor.
+      windows: `[F]`, or `[F, B]`.
+      distances: expected distances of the PoIs' centres, in metres.
     """
-    expected = jnp.stack([distance, 1 / distance])
-    return networks.apply(_NETWORK, params, jnp.concatenate([standard, expected]))[0]
+    if gate.measures_distance:
+        read = jnp.clip((windows - distances) / _DEPTH, -_MAX_DEPTHS, _MAX_DEPTHS)
+    else:
+        read = (windows - gate.offset.reshape(-1, *[1] * distances.ndim)) / gate.scale
+    expected = jnp.stack([distances, 1 / distances])
+    return networks.apply(_NETWORK, gate.params, jnp.concatenate([read, expected]))[0]
 
 
-def passes(gate: Gate, standard: Float[Array, " F"], distance: Float[Array, ""]) -> Bool[Array, ""]:
+def passes(gate: Gate, window: Float[Array, " F"], distance: Float[Array, ""]) -> Bool[Array, ""]:
     """Tells whether a window shows its PoI.
 
     Args:
       gate: of the sensor.
-      standard: `[F]` standardised window.
+      window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
       distance: expected distance of the PoI's centre, in metres.
 
     Returns:
       False if it shows something else, or a number is not finite or the distance not above 0.
     """
     chex.assert_rank(distance, 0, custom_message="distance")
-    is_valid = jnp.isfinite(standard).all() & jnp.isfinite(distance) & (distance > 0)
-    return is_valid & (logits(gate.params, standard, distance) >= gate.threshold)
+    is_valid = jnp.isfinite(window).all() & jnp.isfinite(distance) & (distance > 0)
+    return is_valid & (logits(gate, window, distance) >= gate.threshold)
 
 
 @pytree
@@ -88,15 +109,13 @@ class Fitting:
 
     Attributes:
       config: batch, learning rate and steps.
-      offset: `[F]` mean of the windows, see `Detector`.
-      scale: `[]` their standard deviation.
+      gate: from `init`.
       shown: looks at PoIs.
       nothing: looks that show no PoI.
     """
 
     config: DetectorConfig
-    offset: Float[Array, " F"]
-    scale: Float[Array, ""]
+    gate: Gate
     shown: Looks
     nothing: Looks
 
@@ -125,8 +144,7 @@ class Fitting:
         shown = jax.tree.map(lambda x: x[drawn[0]], self.shown)
         nothing = jax.tree.map(lambda x: x[drawn[1]], self.nothing)
         both = jax.tree.map(lambda *x: jnp.concatenate(x), shown, nothing)
-        standard = (both.windows - self.offset[None]) / self.scale
-        found = logits(params, standard.T, both.distances)
+        found = logits(_with(self.gate, params), both.windows.T, both.distances)
         sign = jnp.repeat(jnp.array([-1.0, 1.0]), drawn.shape[1])
         return jax.nn.softplus(sign * found).mean()
 
@@ -138,11 +156,14 @@ def fitted(params: Params, problem: Fitting) -> Gate:
       params: of the trained network.
       problem: like that of the training, with looks that it was not trained on.
     """
+    gate = _with(problem.gate, params)
+    shown, nothing = (
+        logits(gate, looks.windows.T, looks.distances) for looks in (problem.shown, problem.nothing)
+    )
+    most, enough = jnp.quantile(shown, _MAX_LOST), jnp.quantile(nothing, 1 - _MAX_PASSED)
+    return dataclasses.replace(gate, threshold=jnp.minimum(most, enough))
 
-    def scores(looks: Looks) -> Float[Array, " S"]:
-        standard = (looks.windows - problem.offset[None]) / problem.scale
-        return logits(params, standard.T, looks.distances)
 
-    most = jnp.quantile(scores(problem.shown), _MAX_LOST)
-    enough = jnp.quantile(scores(problem.nothing), 1 - _MAX_PASSED)
-    return Gate(params, jnp.minimum(most, enough))
+def _with(gate: Gate, params: Params) -> Gate:
+    """The gate with other parameters."""
+    return dataclasses.replace(gate, params=params)

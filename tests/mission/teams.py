@@ -9,7 +9,6 @@ import numpy as np
 from jaxsense import dqn, mission
 from jaxsense.config import PRESETS
 from jaxsense.vae import readout
-from jaxsense.vae.gate import Gate
 
 # Untrained detectors are never sure; what they say is of no importance here. Robots follow values.
 _FOLLOWING = replace(PRESETS["smoke"].mission, least_confidence=0.0, auctions=False)
@@ -43,7 +42,7 @@ def with_gates(models):
     colours[37:43, 2, :2] = -1 / 6  # less blue
     of_camera = _gate(camera, weights, 0.0, np.array([1.0, 1.0]), -0.1)
     weights = np.zeros((130, 32), np.float32)
-    weights[60:68, 0], weights[128, 0] = 1 / 8, -1.0  # the range less the distance
+    weights[60:68, 0] = 0.2 / 8  # the range less the distance, of which it reads a fifth of a metre
     weights[:, 1] = -weights[:, 0]
     of_lidar = _gate(lidar, weights, np.array([0.12, -0.12]), np.array([-1.0, -1.0]), 0.12)
     return replace(models, detectors=(of_camera, of_lidar))
@@ -53,15 +52,15 @@ def _gate(detector, first, bias, second, last):
     """A detector whose gate adds up two units."""
     params = jax.tree.map(np.zeros_like, detector.gate.params)
     layers = params["params"]
-    # The window is standardised, the distance is not.
-    size = len(detector.offset)
-    layers["Dense_0"]["kernel"][:size] = first[:size] * detector.scale
-    layers["Dense_0"]["kernel"][size:] = first[size:]
+    # It reads distances as they are, and all else standardised.
+    scale = 1.0 if detector.gate.measures_distance else detector.scale
+    layers["Dense_0"]["kernel"][:] = first * scale
     layers["Dense_0"]["bias"][:2] = bias
     layers["Dense_1"]["kernel"][[0, 1], [0, 1]] = 1.0
     layers["Dense_2"]["kernel"][:2, 0] = second
     layers["Dense_2"]["bias"][0] = last
-    return replace(detector, gate=Gate(params, np.float32(0.0)))
+    gate = replace(detector.gate, params=params, threshold=np.float32(0.0))
+    return replace(detector, gate=gate)
 
 
 def alone(function):

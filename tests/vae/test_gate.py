@@ -29,13 +29,13 @@ def looks(key, number, is_shown):
 def problem():
     keys = jax.random.split(jax.random.key(0), 2)
     shown, nothing = looks(keys[0], 500, True), looks(keys[1], 300, False)
-    offset = shown.windows.mean(axis=0)
-    return gate.Fitting(CONFIG, offset, jnp.float32(1.0), shown, nothing)
+    untrained = gate.init(jax.random.key(1), shown.windows.mean(axis=0), jnp.float32(1.0), False)
+    return gate.Fitting(CONFIG, untrained, shown, nothing)
 
 
 @pytest.fixture(scope="module")
 def params(problem):
-    start = supervised.start(gate.init(jax.random.key(1), RAYS).params, CONFIG)
+    start = supervised.start(problem.gate.params, CONFIG)
     fit = jax.jit(lambda key, state: supervised.fit(key, state, problem, CONFIG.steps))
     return fit(jax.random.key(2), start)[0].params
 
@@ -43,20 +43,20 @@ def params(problem):
 passes = jax.jit(jax.vmap(gate.passes, (None, 0, 0)))
 
 
-def share(found, problem, looks):
-    return float(passes(found, looks.windows - problem.offset[None], looks.distances).mean())
+def share(found, looks):
+    return float(passes(found, looks.windows, looks.distances).mean())
 
 
 def test_a_trained_gate_passes_pois_where_they_are_expected(problem, params):
     found = gate.fitted(params, problem)
     keys = jax.random.split(jax.random.key(3), 2)
-    assert share(found, problem, looks(keys[0], 2000, True)) >= 0.97
-    assert share(found, problem, looks(keys[1], 2000, False)) <= 0.05
+    assert share(found, looks(keys[0], 2000, True)) >= 0.97
+    assert share(found, looks(keys[1], 2000, False)) <= 0.05
 
 
 def with_scores(monkeypatch):
     """Looks whose score is their distance."""
-    monkeypatch.setattr(gate, "logits", lambda params, standard, distance: distance)
+    monkeypatch.setattr(gate, "logits", lambda gate, windows, distances: distances)
     return lambda distances: gate.Looks(jnp.zeros((len(distances), RAYS)), jnp.array(distances))
 
 
@@ -70,9 +70,9 @@ def test_a_threshold_loses_one_look_in_a_hundred_and_no_more_than_needed(monkeyp
     assert gate.fitted({}, apart).threshold == pytest.approx(0.998 * 6.0)
 
 
-def test_a_window_at_the_threshold_passes(monkeypatch):
+def test_a_window_at_the_threshold_passes(monkeypatch, problem):
     with_scores(monkeypatch)
-    found, window = gate.Gate({}, jnp.float32(0.8)), jnp.zeros(RAYS)
+    found, window = replace(problem.gate, threshold=jnp.float32(0.8)), jnp.zeros(RAYS)
     for distance, expected in ((0.79, False), (0.8, True), (0.9, True)):
         assert bool(gate.passes(found, window, jnp.float32(distance))) is expected
 
@@ -90,11 +90,24 @@ def test_a_window_at_the_threshold_passes(monkeypatch):
         (1.0, -1.0, False),
     ],
 )
-def test_an_untrained_gate_passes_what_is_valid(reading, distance, expected):
-    untrained = gate.init(jax.random.key(0), RAYS)
+def test_an_untrained_gate_passes_what_is_valid(problem, reading, distance, expected):
     window = jnp.zeros(RAYS).at[2].set(reading)
-    found = passes(untrained, window[None], jnp.float32([distance]))[0]
+    found = passes(problem.gate, window[None], jnp.float32([distance]))[0]
     assert bool(found) is expected
+
+
+def test_a_gate_of_distances_reads_how_far_they_are_from_the_poi(problem):
+    ranging = replace(problem.gate, measures_distance=True)
+    window = jnp.linspace(0.9, 1.1, RAYS)
+    expected = gate.logits(ranging, window, jnp.float32(1.0))
+    # Half a metre farther, at a PoI expected half a metre farther: only the distance differs.
+    weights = jax.tree.map(np.array, ranging.params)
+    weights["params"]["Dense_0"]["kernel"][RAYS:] = 0.0
+    of_range = replace(ranging, params=weights)
+    near = gate.logits(of_range, window, jnp.float32(1.0))
+    assert gate.logits(of_range, window + 0.5, jnp.float32(1.5)) == pytest.approx(near, abs=1e-5)
+    assert gate.logits(of_range, window + 0.1, jnp.float32(1.0)) != pytest.approx(near, abs=1e-3)
+    assert expected != pytest.approx(near, abs=1e-3)
 
 
 def test_half_of_a_batch_is_drawn_from_either_kind(problem):

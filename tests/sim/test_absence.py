@@ -1,0 +1,127 @@
+"""Looks that do not show their PoI, by what their rays hit."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import sim
+from jaxsense.config import Config
+from jaxsense.sim import absence, windows, world
+from jaxsense.sim import arena as arenas
+
+CONFIG = Config()
+NUM_LOOKS = 400
+CAMERA, LIDAR = 0, 1
+
+
+@pytest.fixture(scope="module")
+def looks():
+    """Changed looks at the first PoI, and of the rays of each window hits and angles."""
+    simulation = world.make_world(CONFIG)
+
+    def look(key, robot):
+        scene_key, look_key, change_key = jax.random.split(key, 3)
+        scene = world.random_scene(scene_key, simulation, jnp.array([0, 1, 2]))
+        _, scene = world.look(look_key, simulation, scene, robot, jnp.int32(0))
+        pose, place = scene.poses[robot], scene.layout.position[0]
+        before = absence.View(
+            positions=scene.layout.position,
+            poses=scene.poses,
+            twin=jnp.array(absence.outside(CONFIG.arena)),
+            bearing=sim.bearing(pose, place),
+            distance=jnp.linalg.norm(place - pose[:2]),
+        )
+        arena, sensors = CONFIG.arena, simulation.sensors
+        poi = jnp.int32(0)
+        view = absence.without_poi(change_key, sensors, arena, CONFIG.viewpoint, before, robot, poi)
+        layout = dataclasses.replace(scene.layout, position=view.positions)
+        data = arenas.place(simulation.arena, layout, view.poses)
+        sensor = sensors[robot]
+        section = sim.cross_section(simulation.arena, data, sensor.height, robot)
+        angles = windows.window_of(sensor, sensor.angles, view.bearing)
+        hits = sim.cast(section, view.poses[robot, :2], view.poses[robot, 2] + angles)
+        poi_of_geom = jnp.array(simulation.arena.poi_of_geom)
+        is_poi = (hits.geom >= 0) & (poi_of_geom[hits.geom] == 0)
+        return before, view, is_poi, angles
+
+    keys = jax.random.split(jax.random.key(0), NUM_LOOKS)
+    return [
+        jax.device_get(jax.jit(jax.vmap(lambda key, r=r: look(key, r)))(keys)) for r in range(2)
+    ]
+
+
+@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
+def test_no_changed_look_shows_its_poi_in_the_middle_of_the_window(looks, robot):
+    _, view, is_poi, angles = looks[robot]
+    away = absence.outside(CONFIG.arena)
+    has_twin = np.any(view.twin != away, axis=-1)
+    is_middle = np.abs(angles - view.bearing[:, None]) < np.radians(1.0)
+    shows = (is_poi & is_middle).any(axis=1)
+    # Only where another robot, which these rays ignore, stands in between.
+    assert not shows[~has_twin].any()
+    assert shows[has_twin].any()
+
+
+@pytest.mark.parametrize(("robot", "half_width"), [(CAMERA, 0.0495), (LIDAR, 0.025)])
+def test_a_robot_in_between_covers_the_middle_of_the_poi(looks, robot, half_width):
+    before, view, is_poi, _ = looks[robot]
+    covers = np.any(view.twin != absence.outside(CONFIG.arena), axis=-1) & is_poi.any(axis=1)
+    assert covers.sum() > NUM_LOOKS / 20
+    line = before.positions[:, 0] - before.poses[:, robot, :2]
+    to_twin = view.twin - before.poses[:, robot, :2]
+    length = np.linalg.norm(line, axis=1)
+    along = np.sum(to_twin * line, axis=1) / length
+    aside = np.abs(line[:, 0] * to_twin[:, 1] - line[:, 1] * to_twin[:, 0]) / length
+    assert (along < 0.75 * length)[covers].all()
+    assert (aside < half_width)[covers].all()
+
+
+@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
+def test_every_situation_is_drawn(looks, robot):
+    before, view, _, _ = looks[robot]
+    away = absence.outside(CONFIG.arena)
+    inside = np.abs(view.poses[:, robot, :2]).max(axis=-1) < CONFIG.arena.side / 2
+    moved = np.any(view.poses[:, robot] != before.poses[:, robot], axis=-1)
+    gone = np.all(view.positions[:, 0] == away, axis=-1)
+    # Of 13 parts: 2 empty, 3 walls, 1 outside, 3 off, 2 covered, 2 robots.
+    for found, parts in (
+        (~inside, 1),
+        (inside & moved, 3),
+        (view.bearing != before.bearing, 3),
+        (gone & ~moved, 4),
+    ):
+        assert found.mean() == pytest.approx(parts / 13, abs=0.06)
+    # It draws the distance anew where there is no PoI.
+    near, far = CONFIG.viewpoint.min_distance, CONFIG.viewpoint.max_distance
+    assert (view.distance[gone] >= near).all()
+    assert (view.distance[gone] <= far).all()
+    assert (view.distance == before.distance)[~gone].all()
+    assert (np.abs(view.bearing) <= np.radians((40.0, 120.0)[robot])).all()
+
+
+def test_the_twin_of_a_robot_is_seen_and_its_own_body_is_not():
+    simulation = world.make_world(CONFIG)
+    scene = jax.jit(lambda key: world.random_scene(key, simulation, jnp.array([0, 1, 2])))
+    scene = scene(jax.random.key(0))
+    layout = dataclasses.replace(
+        scene.layout, position=jnp.tile(absence.outside(CONFIG.arena), (3, 1))
+    )
+    poses = jnp.array([[-1.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
+    lidar = dataclasses.replace(
+        simulation.sensors[LIDAR],
+        config=dataclasses.replace(CONFIG.lidar, range_noise=0.0),
+    )
+
+    @jax.jit
+    def scan(twin):
+        data = arenas.place(simulation.arena, layout, poses)
+        given = simulation.arena, data, layout, scene.light, LIDAR, jnp.array([[1.0], [0.0]])
+        return sim.scan(jax.random.key(0), lidar, *given, twin)
+
+    # Half a metre ahead, less half of the LiDAR's 50 mm; else the wall.
+    np.testing.assert_allclose(scan(jnp.array([0.5, 0.0])), [0.475], atol=1e-5)
+    np.testing.assert_allclose(scan(jnp.array([0.0, 0.5])), [1.5], atol=1e-5)
+    np.testing.assert_allclose(scan(jnp.array(absence.outside(CONFIG.arena))), [1.5], atol=1e-5)
