@@ -67,7 +67,7 @@ def logits(
       distances: expected distances of the PoIs' centres, in metres.
     """
     if gate.measures_distance:
-        read = jnp.clip((windows - distances) / _DEPTH, -_MAX_DEPTHS, _MAX_DEPTHS)
+        read = jnp.clip((windows - distances[None]) / _DEPTH, -_MAX_DEPTHS, _MAX_DEPTHS)
     else:
         read = (windows - gate.offset.reshape(-1, *[1] * distances.ndim)) / gate.scale
     expected = jnp.stack([distances, 1 / distances])
