@@ -99,15 +99,19 @@ def test_an_untrained_gate_passes_what_is_valid(problem, reading, distance, expe
 def test_a_gate_of_distances_reads_how_far_they_are_from_the_poi(problem):
     ranging = replace(problem.gate, measures_distance=True)
     window = jnp.linspace(0.9, 1.1, RAYS)
-    expected = gate.logits(ranging, window, jnp.float32(1.0))
-    # Half a metre farther, at a PoI expected half a metre farther: only the distance differs.
+    # Without what reads the expected distance itself.
     weights = jax.tree.map(np.array, ranging.params)
     weights["params"]["Dense_0"]["kernel"][RAYS:] = 0.0
     of_range = replace(ranging, params=weights)
-    near = gate.logits(of_range, window, jnp.float32(1.0))
-    assert gate.logits(of_range, window + 0.5, jnp.float32(1.5)) == pytest.approx(near, abs=1e-5)
-    assert gate.logits(of_range, window + 0.1, jnp.float32(1.0)) != pytest.approx(near, abs=1e-3)
-    assert expected != pytest.approx(near, abs=1e-3)
+
+    def score(window, distance):
+        return float(gate.logits(of_range, window, jnp.float32(distance)))
+
+    near = score(window, 1.0)
+    assert score(window + 0.5, 1.5) == pytest.approx(near, abs=1e-5)
+    assert score(window + 0.1, 1.0) != pytest.approx(near, abs=1e-3)
+    # Beyond half a metre it makes no difference how far.
+    assert score(window + 2.0, 1.0) == pytest.approx(score(window + 3.0, 1.0), abs=1e-5)
 
 
 def test_half_of_a_batch_is_drawn_from_either_kind(problem):
