@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsense import looks
-from jaxsense.config import Config, DetectorConfig, ViewpointConfig
+from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, Samples, pytree
@@ -17,7 +17,9 @@ from jaxsense.sim import sensors
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene, make_world
+from jaxsense.training import gating
 from jaxsense.training.fits import fit_stage
+from jaxsense.training.gating import Examples
 from jaxsense.training.stage import Output, Stage
 from jaxsense.vae import detectors, filter, jmvae, novelty
 from jaxsense.vae import gate as gates
@@ -29,28 +31,7 @@ from jaxsense.vae.novelty import Novelty
 _REPEATS = 4  # looks in a scene, from which novelty is learned
 
 _SHARE_OF_EMPTY = 8  # one empty scene for so many to train detectors with; rays take time
-_SPOILT_EACH = 512  # windows of each kind that are spoilt by hand
-_ELSEWHERE = 0.5, 2.0  # of the distance, outside of which a PoI is not where it is expected
 _GATE_CHECKS = 8192  # looks that set a gate's threshold
-
-
-@pytree
-class Examples:
-    """What a detector and its gate are trained on.
-
-    Attributes:
-      windows: `[L, F]` windows of looks at PoIs.
-      labels: `[L]` int32 their labels.
-      distances: `[L]` expected distances of the PoIs, in metres.
-      nothing: looks that show no PoI, in random order.
-      checks: other looks at PoIs, for the gate's threshold.
-    """
-
-    windows: Float[Array, "L F"]
-    labels: Int[Array, " L"]
-    distances: Float[Array, " L"]
-    nothing: gates.Looks
-    checks: gates.Looks
 
 
 @pytree
@@ -176,47 +157,13 @@ def split_examples(key: Key, config: Config, *, surveys: Surveys) -> tuple[Examp
             windows=shown.windows,
             labels=jnp.array(config.label_of_class(name))[classes],
             distances=shown.distances,
-            nothing=_nothing(key, config.viewpoint, sensor, shown, empty),
+            nothing=gating.nothing(key, config.viewpoint, sensor, shown, empty),
             checks=jax.tree.map(lambda x: x[:_GATE_CHECKS], checks),
         )
 
     keys = jax.random.split(key, len(config.modalities))
     names, made = config.modalities, sensors.make(config)
     return tuple(of_modality(keys[m], m, names[m], made[m]) for m in range(len(names)))
-
-
-def _nothing(
-    key: Key, viewpoint: ViewpointConfig, sensor: Sensor, shown: gates.Looks, empty: gates.Looks
-) -> gates.Looks:
-    """Looks that show no PoI, in random order: empty ones, and others that are spoilt by hand.
-
-    A window of a PoI shows none if most of its rays are lost, if all of its readings are equal, or
-    if the PoI is expected at another distance.
-    """
-    shown = jax.tree.map(lambda x: x[:_SPOILT_EACH], shown)
-    lost_key, share_key, level_key, distance_key, order_key = jax.random.split(key, 5)
-    windows, distances = shown.windows, shown.distances
-    number = windows.shape[:1]
-    blind = jnp.minimum(sensor.blind, sensor.window_limit)
-    share = jax.random.uniform(share_key, (*number, 1), minval=0.6)
-    lost = jax.random.uniform(lost_key, windows.shape) < share
-    levels = jax.random.uniform(level_key, (*number, 1)) * jnp.max(windows)
-    is_zero, is_blind = (jnp.arange(number[0])[:, None] % 4 == i for i in (0, 1))
-    levels = jnp.where(is_zero, 0.0, jnp.where(is_blind, blind, levels))
-    near, far = viewpoint.min_distance, viewpoint.max_distance
-    expected = jax.random.uniform(distance_key, number, minval=near, maxval=far)
-    ratio = expected / distances
-    is_elsewhere = (ratio < _ELSEWHERE[0]) | (ratio > _ELSEWHERE[1])
-    parts = [
-        empty,
-        gates.Looks(jnp.where(lost, blind, windows), distances),
-        gates.Looks(jnp.broadcast_to(levels, windows.shape), distances),
-        # Where it is expected about right, an empty window instead.
-        gates.Looks(jnp.where(is_elsewhere[:, None], windows, blind), expected),
-    ]
-    together = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
-    order = jax.random.permutation(order_key, len(together.windows))
-    return jax.tree.map(lambda x: x[order], together)
 
 
 def detector_stage(modality: int, name: str, config: Config) -> Stage:
@@ -239,13 +186,13 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
 
     def problem(
         config: Config, detector: Detector, *, examples: tuple[Examples, ...]
-    ) -> FittingBoth:
+    ) -> gating.FittingBoth:
         given = examples[modality]
         number, num_checks = _num_training(config, given), _num_checks(given)
         windows = given.windows[:number]
         shown = gates.Looks(windows, given.distances[:number])
         nothing = jax.tree.map(lambda x: x[num_checks:], given.nothing)
-        return FittingBoth(
+        return gating.FittingBoth(
             detectors.Fitting(config.detector, detector, windows, given.labels[:number]),
             gates.Fitting(config.detector, detector.gate, shown, nothing),
         )
@@ -282,51 +229,6 @@ def _num_training(config: Config, examples: Examples) -> int:
 def _num_checks(examples: Examples) -> int:
     """How many looks at nothing help to set the gate's threshold; the others train the gate."""
     return min(len(examples.nothing.windows) // 4, _GATE_CHECKS)
-
-
-@pytree
-class FittingBoth:
-    """Problem of fitting a detector and its gate together, two networks that share nothing.
-
-    Attributes:
-      detector: problem of fitting the detector.
-      gate: problem of fitting the gate.
-    """
-
-    detector: detectors.Fitting
-    gate: gates.Fitting
-
-    @property
-    def config(self) -> DetectorConfig:
-        """Settings of the fit."""
-        return self.detector.config
-
-    def draw(self, key: Key, number: int) -> tuple[jax.Array, jax.Array]:
-        """Draws the rows of both, see `Problem.draw`.
-
-        Args:
-          key: random key.
-          number: of steps; static.
-        """
-        # Folded in: `key` draws the rows of the detector, with a gate or without.
-        gate_key = jax.random.fold_in(key, 1)
-        return self.detector.draw(key, number), self.gate.draw(gate_key, number)
-
-    def loss(
-        self,
-        params: tuple[Params, Params],
-        drawn: tuple[jax.Array, jax.Array],
-        step: Int[Array, ""],
-    ) -> Float[Array, ""]:
-        """Sum of both losses.
-
-        Args:
-          params: of the detector's network, and of the gate's.
-          drawn: rows for the detector, and for the gate.
-          step: of the fit.
-        """
-        of_detector = self.detector.loss(params[0], drawn[0], step)
-        return of_detector + self.gate.loss(params[1], drawn[1], step)
 
 
 def detect(

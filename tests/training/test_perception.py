@@ -14,7 +14,8 @@ from jaxsense.config import DetectorConfig, JmvaeConfig
 from jaxsense.core import supervised
 from jaxsense.sim.world import make_world
 from jaxsense.training import perception
-from jaxsense.training.perception import Detections, Examples, Surveys
+from jaxsense.training.gating import Examples
+from jaxsense.training.perception import Detections, Surveys
 from jaxsense.vae import detectors, gate, jmvae
 
 

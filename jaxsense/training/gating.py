@@ -1,0 +1,120 @@
+"""What a detector and its gate are trained on, and the problem of fitting both together."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxsense.config import DetectorConfig, ViewpointConfig
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Key, pytree
+from jaxsense.sim.sensors import Sensor
+from jaxsense.vae import detectors
+from jaxsense.vae import gate as gates
+
+_SPOILT_EACH = 512  # windows of each kind that are spoilt by hand
+_ELSEWHERE = 0.5, 2.0  # of the distance, outside of which a PoI is not where it is expected
+
+
+@pytree
+class Examples:
+    """What a detector and its gate are trained on.
+
+    Attributes:
+      windows: `[L, F]` windows of looks at PoIs.
+      labels: `[L]` int32 their labels.
+      distances: `[L]` expected distances of the PoIs, in metres.
+      nothing: looks that show no PoI, in random order.
+      checks: other looks at PoIs, for the gate's threshold.
+    """
+
+    windows: Float[Array, "L F"]
+    labels: Int[Array, " L"]
+    distances: Float[Array, " L"]
+    nothing: gates.Looks
+    checks: gates.Looks
+
+
+def nothing(
+    key: Key, viewpoint: ViewpointConfig, sensor: Sensor, shown: gates.Looks, empty: gates.Looks
+) -> gates.Looks:
+    """Looks that show no PoI, in random order: empty ones, and others that are spoilt by hand.
+
+    A window of a PoI shows none if most of its rays are lost, if all of its readings are equal, or
+    if the PoI is expected at another distance.
+
+    Args:
+      key: random key.
+      viewpoint: the distances at which robots expect PoIs.
+      sensor: the sensor.
+      shown: looks at PoIs.
+      empty: looks at nothing.
+    """
+    shown = jax.tree.map(lambda x: x[:_SPOILT_EACH], shown)
+    lost_key, share_key, level_key, distance_key, order_key = jax.random.split(key, 5)
+    windows, distances = shown.windows, shown.distances
+    number = windows.shape[:1]
+    blind = jnp.minimum(sensor.blind, sensor.window_limit)
+    share = jax.random.uniform(share_key, (*number, 1), minval=0.6)
+    lost = jax.random.uniform(lost_key, windows.shape) < share
+    levels = jax.random.uniform(level_key, (*number, 1)) * jnp.max(windows)
+    is_zero, is_blind = (jnp.arange(number[0])[:, None] % 4 == i for i in (0, 1))
+    levels = jnp.where(is_zero, 0.0, jnp.where(is_blind, blind, levels))
+    near, far = viewpoint.min_distance, viewpoint.max_distance
+    expected = jax.random.uniform(distance_key, number, minval=near, maxval=far)
+    ratio = expected / distances
+    is_elsewhere = (ratio < _ELSEWHERE[0]) | (ratio > _ELSEWHERE[1])
+    parts = [
+        empty,
+        gates.Looks(jnp.where(lost, blind, windows), distances),
+        gates.Looks(jnp.broadcast_to(levels, windows.shape), distances),
+        # Where it is expected about right, an empty window instead.
+        gates.Looks(jnp.where(is_elsewhere[:, None], windows, blind), expected),
+    ]
+    together = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+    order = jax.random.permutation(order_key, len(together.windows))
+    return jax.tree.map(lambda x: x[order], together)
+
+
+@pytree
+class FittingBoth:
+    """Problem of fitting a detector and its gate together, two networks that share nothing.
+
+    Attributes:
+      detector: problem of fitting the detector.
+      gate: problem of fitting the gate.
+    """
+
+    detector: detectors.Fitting
+    gate: gates.Fitting
+
+    @property
+    def config(self) -> DetectorConfig:
+        """Settings of the fit."""
+        return self.detector.config
+
+    def draw(self, key: Key, number: int) -> tuple[jax.Array, jax.Array]:
+        """Draws the rows of both, see `Problem.draw`.
+
+        Args:
+          key: random key.
+          number: of steps; static.
+        """
+        # Folded in: `key` draws the rows of the detector, with a gate or without.
+        gate_key = jax.random.fold_in(key, 1)
+        return self.detector.draw(key, number), self.gate.draw(gate_key, number)
+
+    def loss(
+        self,
+        params: tuple[Params, Params],
+        drawn: tuple[jax.Array, jax.Array],
+        step: Int[Array, ""],
+    ) -> Float[Array, ""]:
+        """Sum of both losses.
+
+        Args:
+          params: of the detector's network, and of the gate's.
+          drawn: rows for the detector, and for the gate.
+          step: of the fit.
+        """
+        of_detector = self.detector.loss(params[0], drawn[0], step)
+        return of_detector + self.gate.loss(params[1], drawn[1], step)
