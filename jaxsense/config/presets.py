@@ -1,5 +1,6 @@
 """Presets: settings to start a run from."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Literal
 
@@ -15,6 +16,7 @@ from jaxsense.config.learning import (
     TravelConfig,
 )
 from jaxsense.config.mission import MissionConfig, NavigationConfig
+from jaxsense.config.objects import COLOURS, SHAPES, Shape
 from jaxsense.config.scene import ArenaConfig, CameraConfig, LidarConfig, ViewpointConfig
 from jaxsense.config.whole import Config
 
@@ -124,13 +126,45 @@ _TEAM = Config(
     ),
 )
 
-PresetName = Literal["default", "paper", "noisy", "team", "smoke"]
+_FOUR_SHAPES = {
+    **SHAPES,
+    # From its broad side like a cube, from its narrow side like a post.
+    "slab": Shape("box", half_sides=(1.0, 0.5)),
+    "post": Shape("box", half_sides=(0.5, 0.5)),
+}
+
+_MANY = dataclasses.replace(
+    _NOISY,
+    robots=("camera", "camera", "lidar", "lidar"),
+    arena=ArenaConfig(
+        side=8.0,
+        num_pois=8,
+        classes=tuple(f"{colour} {shape}" for colour in COLOURS for shape in _FOUR_SHAPES),
+        shapes=_FOUR_SHAPES,
+    ),
+    jmvae=dataclasses.replace(_NOISY.jmvae, latent_size=6, samples_per_class=4000, restarts=2),
+    dqn=_TEAM.dqn,
+    # Reading sixteen classes takes long.
+    team=dataclasses.replace(_NOISY.team, tours=ToursConfig(states=8192, steps=1600)),
+    evaluation=dataclasses.replace(_NOISY.evaluation, num_repeats=8, num_states=512),
+    mission=dataclasses.replace(_NOISY.mission, time_limit=300.0),
+)
+
+PresetName = Literal["default", "paper", "noisy", "many", "team", "smoke"]
 """The names of `PRESETS`."""
 
 PRESETS: Mapping[str, Config] = FrozenDict(
-    {"default": Config(), "paper": _PAPER, "noisy": _NOISY, "team": _TEAM, "smoke": _SMOKE}
+    {
+        "default": Config(),
+        "paper": _PAPER,
+        "noisy": _NOISY,
+        "many": _MANY,
+        "team": _TEAM,
+        "smoke": _SMOKE,
+    }
 )
 """`default`: the best settings we know. `paper`: the paper's where it states them, otherwise
 chosen to reproduce its figures, see `docs/differences.md`. `noisy`: sensors that are often
-uncertain, and beliefs that accumulate looks. `team`: one policy for any number of PoIs and robots
+uncertain, and beliefs that accumulate looks. `many`: sixteen classes of four colours and four
+shapes, with sensors such as those of `noisy` and a team. `team`: one policy for any number of PoIs and robots
 that takes travel time into account. `smoke`: the whole pipeline in seconds, for tests."""

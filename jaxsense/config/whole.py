@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from jaxsense.config.checks import ConfigError, limited, require
 from jaxsense.config.frozen import FrozenDict
 from jaxsense.config.learning import (
@@ -71,7 +69,7 @@ class Config(Section):
         self._check_memory()
 
     def _check_modalities(self) -> None:
-        """Modalities must be known, and custom sensors must read an attribute."""
+        """Modalities must be known; custom sensors must read an attribute, and all be read."""
         require_words(self.sensors, "sensors")
         attributes = ("colour", "shape", *self.arena.attributes)
         for name, sensor in self.sensors.items():
@@ -80,6 +78,9 @@ class Config(Section):
             if sensor.attribute not in attributes:
                 expected = f"must be one of {', '.join(attributes)}"
                 raise ConfigError(f"sensors.{name}.attribute", sensor.attribute, expected)
+        for name in self.arena.attributes:
+            if name not in (sensor.attribute for sensor in self.sensors.values()):
+                raise ConfigError("arena.attributes", name, "must be read by one of sensors")
         known = [*MODALITIES, *self.sensors]
         is_known = set(self.modalities) <= set(known)
         require(is_known, self, "modalities", f"must be among {', '.join(known)}")
@@ -110,18 +111,25 @@ class Config(Section):
 
     def _check_learning(self) -> None:
         """Beliefs must hold all labels, and calibration must leave scans to train on."""
-        classes = self.arena.classes
-        of_labels = [np.eye(len(classes))[list(self.label_of_class(m))] for m in self.modalities]
-        # Two moments of each dimension; the probabilities have a sum of 1.
-        free = int(np.linalg.matrix_rank(np.concatenate(of_labels, axis=1))) - 1
-        least = -(-free // 2)
-        expected = f"must be at least {least}, so that beliefs can hold {len(classes)} classes"
+        least = self._least_latent_size()
+        expected = f"must be at least {least}, so that beliefs can hold {len(self.arena.classes)} classes"
         require(self.jmvae.latent_size >= least, self.jmvae, "latent_size", expected)
         # Scans come in whole scenes.
         scans = -(-self.detector.num_scans // self.arena.num_pois) * self.arena.num_pois
         leaves_some = self.detector.num_training(scans) > 0
         expected = f"leaves none of {scans} scans to train on; lower it"
         require(leaves_some, self.detector, "calibration", expected)
+
+    def _least_latent_size(self) -> int:
+        """Minimum size that gives the labels of each attribute dimensions of their own.
+
+        A dimension has two moments and so holds three labels. Few classes need no axes: it also
+        holds any three classes.
+        """
+        of_labels = {self.attribute(m): len(self.labels(m)) for m in self.modalities}
+        apart = sum(number // 2 for number in of_labels.values())
+        distinct = len(set(zip(*map(self.label_of_class, self.modalities), strict=True)))
+        return max(1, min(apart, distinct // 2))
 
     def _check_task(self) -> None:
         """What is learned must fit the task, and states that are partly seen a number."""

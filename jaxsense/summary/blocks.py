@@ -71,6 +71,9 @@ class Jmvae(TypedDict):
     moment_matching_error: Annotated[
         float, "error of moments", "Distance from the best Gaussian over the possible classes."
     ]
+    readout_error: Annotated[
+        float, "error of the readout", "Nats lost in writing and reading exact probabilities."
+    ]
     fusion: Fusion
 
 

@@ -11,10 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Fusion, Key, Reliability, Samples, call, pytree
 from jaxsense.models import make_bayes
+from jaxsense.training import histories
 from jaxsense.training.perception import Detections
 from jaxsense.vae import calibration, latent
-
-_LOOKS = 6  # in a random history
 
 
 def detector_metrics(
@@ -75,6 +74,8 @@ class LatentSpace:
       consistent: for `joint` and each modality `[C]` share of looks after which exactly the classes
         are plausible that the sensor cannot distinguish from the true one.
       moment_matching_error: `[]` mean of `latent.moment_matching_error`.
+      readout_error: `[]` nats lost between writing a belief and reading it, see
+        `histories.readout_error`.
       fusion: `accuracy`, `mean_error` and `std_error` of beliefs after a look by one modality and
         then by another, `[]` each; None with a single modality.
     """
@@ -84,6 +85,7 @@ class LatentSpace:
     unambiguous: dict[str, Float[Array, " C"]]
     consistent: dict[str, Float[Array, " C"]]
     moment_matching_error: Float[Array, ""]
+    readout_error: Float[Array, ""]
     fusion: dict[str, Float[Array, ""] | None]
 
 
@@ -96,7 +98,7 @@ def latent_space(
     parameters and features raise no error: check the beliefs.
 
     Args:
-      key: not used.
+      key: random key.
       config: all settings.
       fusion: how looks update the map.
       detections: of all sensors.
@@ -104,7 +106,6 @@ def latent_space(
     Returns:
       `[C, S, D]` beliefs for `joint` and for each modality alone, and the metrics.
     """
-    del key
     bank, class_means = detections.held_out, fusion.classes.mean
     joint = _beliefs(fusion, bank, range(len(bank)))
     alone = [_beliefs(fusion, bank, [m]) for m in range(len(bank))]
@@ -128,6 +129,9 @@ def latent_space(
         unambiguous={n: share(x, same) for n, x in open_classes.items()},
         consistent={n: share(x, consistent[n]) for n, x in open_classes.items()},
         moment_matching_error=_moment_matching_error(joint, alone, config),
+        readout_error=histories.readout_error(
+            key, config, bank, fusion.classes, fusion.class_probabilities
+        ),
         fusion=_fusion_metrics(fusion, bank, alone),
     )
 
@@ -210,14 +214,8 @@ def beliefs(
         return (belief, log_posterior, seen), (found, log_posterior, jnp.linalg.norm(belief.std))
 
     def history(key: Key, true_class: jax.Array):
-        modality_key, *row_keys = jax.random.split(key, 1 + len(bank))
-        modalities = jax.random.randint(modality_key, (_LOOKS,), 0, len(bank))
-        looks = tuple(
-            x[true_class, jax.random.randint(k, (_LOOKS,), 0, x.shape[1])]
-            for x, k in zip(bank, row_keys, strict=True)
-        )
         start = fusion.prior, exact.prior, jnp.zeros(len(bank), bool)
-        return jax.lax.scan(look, start, (modalities, looks))[1]
+        return jax.lax.scan(look, start, histories.draw(key, bank, true_class))[1]
 
     truth = jnp.arange(num_histories) % number
     found, log_posterior, norms = jax.vmap(history)(jax.random.split(key, num_histories), truth)
@@ -230,7 +228,7 @@ def beliefs(
 
     (nll, accuracy), (bayes_nll, bayes_accuracy) = measured(found), measured(log_posterior)
     return {
-        "looks": 1 + jnp.arange(_LOOKS),
+        "looks": 1 + jnp.arange(histories.LOOKS),
         "nll": nll,
         "bayes_nll": bayes_nll,
         "accuracy": accuracy,

@@ -50,6 +50,19 @@ def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
     return Belief(mean, jnp.sqrt(_dot(probabilities, spread)))
 
 
+def divergence(held: Float[Array, " C"], read: Float[Array, " C"]) -> Float[Array, ""]:
+    """Kullback-Leibler divergence of the class probabilities read from a belief.
+
+    Args:
+      held: `[C]` probabilities that were to be held.
+      read: `[C]` probabilities that are read, at least about `MIN_PROBABILITY`.
+
+    Returns:
+      `[]` in nats; 0 if the readout is exact.
+    """
+    return jnp.sum(held * (jnp.log(jnp.maximum(held, MIN_PROBABILITY)) - jnp.log(read)))
+
+
 @pytree
 class Readout:
     """Reads class probabilities from beliefs, see `make`.

@@ -12,6 +12,7 @@ from tiny import KEY, SMOKE, TINY, stage_of
 from jaxsense import looks, models, training
 from jaxsense.config import DetectorConfig, JmvaeConfig
 from jaxsense.core import supervised
+from jaxsense.core.types import Belief
 from jaxsense.sim.world import make_world
 from jaxsense.training import perception
 from jaxsense.training.gating import Examples
@@ -100,16 +101,35 @@ def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):
     assert seen[-1] == 40.5  # of 40 and 41
 
 
-def test_the_restart_with_the_lowest_loss_is_kept():
-    stage = stage_of("best_jmvae")
+# The camera tells class 0 from the others, the LiDAR class 2. Classes in the same place cannot be
+# read from a belief.
+CORNER = Belief(jnp.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]]), jnp.full((3, 2), 0.3))
+PLACE = Belief(jnp.ones((3, 2)), jnp.full((3, 2), 0.3))
 
-    def best(*losses):
-        restarts = tuple((jnp.int32(i), x) for i, x in enumerate(losses))
-        return int(stage.begin(KEY, TINY, restarts=restarts))
 
-    assert best(jnp.float32(1), jnp.float32(0.5), jnp.float32(0.9)) == 1
-    assert best(jnp.float32(1), jnp.float32(jnp.nan), jnp.float32(0.9)) == 2
-    assert best(jnp.float32(jnp.nan), jnp.float32(jnp.inf)) == 0
+def best_of(monkeypatch, losses, classes):
+    """The restart that is kept, by losses and beliefs of the classes."""
+    together = jax.tree.map(lambda *x: jnp.stack(x), *classes)
+    of_restart = lambda *_, params, detections: jax.tree.map(lambda x: x[params], together)  # noqa: E731
+    monkeypatch.setattr(perception, "class_beliefs", of_restart)
+    restarts = tuple((jnp.int32(i), jnp.float32(x)) for i, x in enumerate(losses))
+    camera, lidar = (jnp.array(x)[:, None] for x in ([[0.1, 0.9], [0.9, 0.1], [0.9, 0.1]],) * 2)
+    detections = bank_of((camera, lidar[::-1]))
+    return int(stage_of("best_jmvae").begin(KEY, TINY, restarts=restarts, detections=detections))
+
+
+def test_the_exact_restart_with_the_lowest_loss_is_kept(monkeypatch):
+    nan, inf = jnp.nan, jnp.inf
+    for losses, expected in {(1, 0.5, 0.9): 1, (1, nan, 0.9): 2, (nan, inf): 0, (nan,): 0}.items():
+        assert best_of(monkeypatch, losses, [CORNER] * len(losses)) == expected
+    # From equal places no class can be read, whatever the loss.
+    assert best_of(monkeypatch, (1, 0.5, 0.9), [CORNER, PLACE, CORNER]) == 2
+    assert best_of(monkeypatch, (nan, 0.5, 0.9), [CORNER, PLACE, PLACE]) == 1
+
+
+def test_of_inexact_restarts_the_most_exact_is_kept(monkeypatch):
+    line = Belief(jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0]]), jnp.full((3, 2), 0.3))
+    assert best_of(monkeypatch, (0.5, 0.9, 0.5), [PLACE, line, PLACE]) == 1
 
 
 @pytest.fixture

@@ -99,6 +99,18 @@ WORLDS = {
         [[a for a, _ in GRID], [b for _, b in GRID]],
         [[*SQUARE[a], *SQUARE[b]] for a, b in GRID],
     ),
+    "2x2x2": (
+        [[c >> m & 1 for c in range(8)] for m in range(3)],
+        [[0.9 * (2 * (c >> m & 1) - 1) for m in range(3)] for c in range(8)],
+    ),
+    "3x3": (
+        [[c // 3 for c in range(9)], [c % 3 for c in range(9)]],
+        [[1.1 * (c // 3 - 1), 0.8 * (c % 3 - 1)] for c in range(9)],
+    ),
+    "11 of 4x4": (
+        [[a for a, _ in GRID[2:13]], [b for _, b in GRID[2:13]]],
+        [[*SQUARE[a], *SQUARE[b]] for a, b in GRID[2:13]],
+    ),
     "one sensor": ([[0, 1, 2]], [[-1.0, 0.0], [1.0, 0.2], [0.1, 1.0]]),
 }
 
@@ -120,3 +132,10 @@ def test_a_prototype_that_is_slightly_off_is_read_as_its_class():
     for c in range(4):
         off = Belief(grid[c] + 0.01, classes.std[c] + 0.01)
         assert read.class_probabilities(off, PRIOR)[c] > 0.99
+
+
+def test_a_divergence_as_worked_by_hand():
+    # .75 ln(.75 / .5) + .25 ln(.25 / .5)
+    expected = 0.75 * np.log(1.5) - 0.25 * np.log(2.0)
+    found = readout.divergence(jnp.array([0.75, 0.25, 0.0]), jnp.array([0.5, 0.5, 1e-6]))
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
