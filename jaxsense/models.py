@@ -21,6 +21,7 @@ from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.detectors import Detection, Detector
 from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.novelty import Novelty
+from jaxsense.vae.readout import Readout
 
 
 @pytree
@@ -129,6 +130,16 @@ def make_agent(config: Config) -> Agent:
     return kinds[dqn.task]()
 
 
+def make_readout(config: Config, classes: Belief) -> Readout:
+    """Readout of class probabilities, see `vae.readout`.
+
+    Args:
+      config: all settings.
+      classes: `[C, D]` mean joint posterior of each class.
+    """
+    return readout.make(classes, readout.directions(make_jmvae(config).feature_sizes))
+
+
 def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InPlace:
     """Fusion in place, see `vae.InPlace`.
 
@@ -137,8 +148,8 @@ def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InP
       params: of the JMVAE.
       classes: `[C, D]` mean joint posterior of each class.
     """
-    read = readout.make(classes)
-    return fusion.InPlace(params, classes, make_prior(config), read, make_jmvae(config))
+    model, read = make_jmvae(config), make_readout(config, classes)
+    return fusion.InPlace(params, classes, make_prior(config), read, model)
 
 
 def init(key: Key, config: Config) -> Models:

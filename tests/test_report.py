@@ -93,16 +93,25 @@ def test_plots_of_sixteen_classes_have_room_for_all(recwarn):
     config = replace(CONFIG, arena=arena, jmvae=replace(CONFIG.jmvae, latent_size=8))
     sizes = {sensor.name: (16, sensor.window, sensor.channels) for sensor in sensors.make(config)}
     windows = {name: np.full(size, 0.5) for name, size in sizes.items()}
-    belief = Belief(np.random.default_rng(0).normal(size=(16, 9, 8)), np.full((16, 9, 8), 0.1))
-    of_all = dict.fromkeys(("joint", "camera", "lidar"), belief)
-    for figure in (plots.scanlines(config, windows), plots.latent_space(config, of_all)):
+    # The fourth dimension shows the colour and the seventh the shape; a sensor knows one of them.
+    noise = 0.01 * np.random.default_rng(0).normal(size=(16, 9, 8))
+    colour, shape = np.zeros((16, 1, 8)), np.zeros((16, 1, 8))
+    colour[:, 0, 3], shape[:, 0, 6] = np.arange(16) // 4, np.arange(16) % 4
+    means = {"joint": colour + shape, "camera": colour, "lidar": shape}
+    of_all = {n: Belief(mean + noise, np.full((16, 9, 8), 0.3)) for n, mean in means.items()}
+    first = plots.scanlines(config, windows)
+    for figure in (first, plots.latent_space(config, of_all)):
         figure.draw_without_rendering()
         width, height = figure.get_size_inches()
         assert width < 16
         for ax in figure.axes:
             box = ax.get_position()
-            assert box.width * width > 0.1
-            assert box.height * height > 0.3
+            is_bar = ax.get_label() == "<colorbar>"
+            assert box.width * width > (0.1 if is_bar else 2.0)
+            assert box.height * height > (0.3 if figure is first else 2.0)
+    names = [{text.get_text() for text in ax.texts} for ax in figure.axes[:3]]
+    assert names == [{f"({c + 1})" for c in range(16)}, set(paints), set(shapes)]
+    assert [ax.get_xlabel() for ax in figure.axes[3:6]] == ["$\\mu_{4}$"] * 3
     assert not recwarn.list
 
 

@@ -1,5 +1,6 @@
 """The colours of classes and robots in plots and animations."""
 
+import itertools
 import math
 
 import numpy as np
@@ -17,6 +18,7 @@ _POLICY_COLOURS = {
     "random": "0.75",
 }  # fmt: skip
 _APART = 0.25  # in RGB, which the eye distinguishes at a glance
+_TOGETHER = 0.05  # latent distance of classes that a picture cannot separate
 _DARKEST, _LIGHTEST = -0.75, 0.6
 
 
@@ -76,7 +78,26 @@ def as_srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def in_plane(values: ArrayLike) -> np.ndarray:
-    """`[..., D]` as `[..., 2]`: the first two latent dimensions, or zero."""
-    values = np.asarray(values)
+def plane(means: np.ndarray) -> list[int]:
+    """The two latent dimensions that show `[C, D]` classes farthest apart; the only one if D is 1.
+
+    Distances count by their logarithms, so that all pairs of classes matter.
+    """
+    apart = means[:, None] - means[None]
+
+    def distance(shown: tuple[int, ...]) -> float:
+        return float(np.mean(np.log(np.linalg.norm(apart[..., shown], axis=-1) + _TOGETHER)))
+
+    number = means.shape[1]
+    return list(max(itertools.combinations(range(number), min(number, 2)), key=distance))
+
+
+def in_plane(values: ArrayLike, shown: list[int]) -> np.ndarray:
+    """`[..., D]` as `[..., 2]`: the latent dimensions of `plane`, or zero.
+
+    Args:
+      values: `[..., D]`.
+      shown: one or two dimensions.
+    """
+    values = np.asarray(values)[..., shown]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, 1)])[..., :2]

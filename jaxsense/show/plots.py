@@ -17,7 +17,15 @@ from matplotlib.patheffects import withStroke
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Reliability
 from jaxsense.show import mission_plots
-from jaxsense.show.colours import MARKERS, RGB, as_srgb, class_colour, in_plane, policy_colour
+from jaxsense.show.colours import (
+    MARKERS,
+    RGB,
+    as_srgb,
+    class_colour,
+    in_plane,
+    plane,
+    policy_colour,
+)
 from jaxsense.summary.blocks import AGENTS, Agent, Beliefs, Results
 from jaxsense.summary.compare import bounds
 from jaxsense.summary.metrics import mean
@@ -32,6 +40,8 @@ _MAX_ELLIPSES = 40
 _COLUMNS = 4  # of pictures of classes
 _SMOOTHING = 20  # epochs
 _MIN_LOOKS = 20  # in a bin of the calibration
+_MANY_CLASSES = 9
+_MANY_TOGETHER = 2  # classes in one place, above which their numbers take too much room
 _FAR = 0.2  # sigma from the median of its class, beyond which a detection is an outlier
 
 
@@ -82,8 +92,8 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     """The paper's Fig. 4: posteriors of held-out detections as 1-sigma ellipses.
 
     Colours show classes above and `||sigma||` below. The first column shows detections by all
-    modalities together, the others by each alone, in the first two latent dimensions. Crosses mark
-    detections far from the others of their class.
+    modalities together, the others by each alone, in the two latent dimensions that show classes
+    farthest apart. Crosses mark detections far from the others of their class.
 
     Args:
       config: all settings.
@@ -99,45 +109,52 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     sigma_map = colormaps["viridis"]
     classes = config.arena.classes
     colours = [class_colour(config.arena, label) for label in classes]
+    dimensions = plane(np.mean(posteriors["joint"].mean, axis=1))
+    flat = {n: jax.tree.map(lambda x: in_plane(x, dimensions), b) for n, b in shown.items()}
     num_far = 0
-    for column, (name, belief) in zip(axes.T, shown.items(), strict=True):
+    for column, (name, belief) in zip(axes.T, flat.items(), strict=True):
         column[0].set_title(titles.get(name, f"{name} alone"))
-        num_far += _beliefs(column, belief, colours, sigma_map(scale(norms[name])))
+        num_far += _beliefs(column, belief, classes, colours, sigma_map(scale(norms[name])))
     for c, (colour, label) in enumerate(zip(colours, classes, strict=True)):
         axes[0, 0].plot([], [], "o", color=colour, label=f"({c + 1}) {label}")
     if num_far:
         total = sum(norm.size for norm in norms.values())
         label = f"{num_far} of {total} detections, far from most of their class"
         axes[0, 0].plot([], [], "x", color="0.3", label=label)
-    axes[0, 0].set_ylabel("class\n$\\mu_2$")
-    axes[1, 0].set_ylabel("uncertainty\n$\\mu_2$")
-    _fit(axes, [*shown.values()])
+    first, second = (f"$\\mu_{{{d + 1}}}$" for d in (*dimensions, 1)[:2])
+    axes[0, 0].set_ylabel(f"class\n{second}")
+    axes[1, 0].set_ylabel(f"uncertainty\n{second}")
+    for ax in axes[1]:
+        ax.set_xlabel(first)
+    _fit(axes, [*flat.values()])
     mappable = cm.ScalarMappable(scale, sigma_map)
     figure.colorbar(mappable, ax=axes[1, :], label="$\\|\\sigma\\|_2$")
-    columns = min(len(classes) + bool(num_far), 4)
+    columns = min(len(classes) + bool(num_far), _COLUMNS)
     figure.legend(loc="outside upper center", ncols=columns, frameon=False)
     return figure
 
 
 def _beliefs(
-    axes: Sequence[Axes], belief: Belief, by_class: list[RGB], by_sigma: np.ndarray
+    axes: Sequence[Axes],
+    belief: Belief,
+    classes: Sequence[str],
+    by_class: list[RGB],
+    by_sigma: np.ndarray,
 ) -> int:
-    """Draws `[C, S]` beliefs on two axes; returns how many lie far from their class."""
-    mean, std = in_plane(belief.mean), in_plane(belief.std)
+    """Draws `[C, S, 2]` beliefs on two axes; returns how many lie far from their class."""
+    mean, std = belief.mean, belief.std
     centre, spread = np.median(mean, axis=1), np.median(std, axis=1)
     is_far = _apart(mean, centre[:, None], spread[:, None]) > _FAR
     for c, colour in enumerate(by_class):
         _ellipses(axes[0], mean[c], std[c], np.tile(colour, (mean.shape[1], 1)), is_far[c])
         _ellipses(axes[1], mean[c], std[c], by_sigma[c], is_far[c])
-    _name_classes(axes[0], centre, spread)
-    axes[1].set_xlabel("$\\mu_1$")
+    _name_classes(axes[0], centre, spread, classes)
     return int(is_far.sum())
 
 
 def _fit(axes: np.ndarray, beliefs: list[Belief]) -> None:
     """Limits the axes to a square around all ellipses, with room for the names of classes."""
-    means = [in_plane(belief.mean) for belief in beliefs]
-    radii = [in_plane(belief.std) for belief in beliefs]
+    means, radii = [belief.mean for belief in beliefs], [belief.std for belief in beliefs]
     low = np.min(np.subtract(means, radii), axis=(0, 1, 2))
     high = np.max(np.add(means, radii), axis=(0, 1, 2))
     half = 0.63 * np.max(high - low)
@@ -167,24 +184,39 @@ def _ellipses(
         axes.scatter(*mean[chosen].T, s=25, marker=marker, c=colours[chosen])
 
 
-def _name_classes(axes: Axes, centre: np.ndarray, spread: np.ndarray) -> None:
+def _name_classes(
+    axes: Axes, centre: np.ndarray, spread: np.ndarray, classes: Sequence[str]
+) -> None:
     """Writes the numbers of classes, `[C, 2]`, above their ellipses; joins those in one place."""
+    size = 10 if len(classes) <= _MANY_CLASSES else 8
     waiting = list(range(len(centre)))
     while waiting:
         first = waiting[0]
         apart = _apart(centre[waiting], centre[first], spread[first])
         together = [c for c, distance in zip(waiting, apart, strict=True) if distance < _FAR]
         waiting = [c for c in waiting if c not in together]
-        axes.annotate(
-            " & ".join(f"({c + 1})" for c in together),
+        name = axes.annotate(
+            _name(together, classes),
             (centre[first, 0], centre[first, 1] + max(spread[c, 1] for c in together)),
             (0, 4),
             textcoords="offset points",
             ha="center",
             va="bottom",
             weight="bold",
+            fontsize=size,
             path_effects=[withStroke(linewidth=3, foreground="white")],
         )
+        # Room for a long name would leave none for the axes.
+        name.set_in_layout(False)
+
+
+def _name(together: list[int], classes: Sequence[str]) -> str:
+    """Numbers of classes, or of many what they have in common."""
+    if len(together) <= _MANY_TOGETHER:
+        return " & ".join(f"({c + 1})" for c in together)
+    first, *others = (classes[c].split(" ") for c in together)
+    shared = [word for word in first if all(word in other for other in others)]
+    return " ".join(shared) or f"{len(together)} classes"
 
 
 def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:

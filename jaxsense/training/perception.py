@@ -12,7 +12,7 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, Samples, pytree
-from jaxsense.models import make_bayes, make_in_place, make_jmvae, make_prior
+from jaxsense.models import make_bayes, make_in_place, make_jmvae, make_prior, make_readout
 from jaxsense.sim import sensors
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
@@ -21,7 +21,7 @@ from jaxsense.training import gating, histories
 from jaxsense.training.fits import fit_stage
 from jaxsense.training.gating import Examples
 from jaxsense.training.stage import Output, Stage
-from jaxsense.vae import detectors, filter, jmvae, novelty, readout
+from jaxsense.vae import detectors, filter, jmvae, novelty
 from jaxsense.vae import gate as gates
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.filter import Filter
@@ -348,7 +348,7 @@ def _best_jmvae(
 
     def error(params: Params) -> jax.Array:
         classes = class_beliefs(key, config, params=params, detections=detections)
-        read, prior = readout.make(classes), make_prior(config)
+        read, prior = make_readout(config, classes), make_prior(config)
         of_belief = lambda belief: read.class_probabilities(belief, prior)  # noqa: E731
         return histories.readout_error(key, config, detections.bank, classes, of_belief)
 

@@ -142,7 +142,7 @@ def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterC
     chex.assert_shape(classes.std, classes.mean.shape, custom_message="classes.std")
     chex.assert_shape(prior.mean, (model.latent_size,), custom_message="prior.mean")
     chex.assert_shape(prior.std, (model.latent_size,), custom_message="prior.std")
-    read = readout.make(classes)
+    read = readout.make(classes, readout.directions(model.feature_sizes))
     network = MLP(config.hidden, read.of_classes.shape[1])
     keys = jax.random.split(key, len(model.modalities))
     of_each = zip(keys, model.modalities, model.feature_sizes, strict=True)

@@ -9,6 +9,7 @@ latent directions of their own.
 """
 
 import functools
+from collections.abc import Sequence
 
 import chex
 import jax
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsense.core import checks
-from jaxsense.core.types import Belief, pytree
+from jaxsense.core.types import Belief, Index, pytree
 
 MIN_PROBABILITY = 1e-6
 """Smallest probability of a class that is read; float32 moments hold no smaller ones."""
@@ -27,6 +28,7 @@ _dot = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 _STEPS = 25  # of Newton's method
 _LONGEST = 2.0  # step, in whitened coordinates; with longer ones it diverges near certainty
 _DAMPING = 1e-5
+_MAX_UNROLLED = 4  # eliminations; a program with many takes minutes to compile
 _THRESHOLD = 0.05  # of the largest singular value; moments that differ less differ by error
 
 
@@ -115,11 +117,14 @@ class Readout:
         return jax.nn.softmax(_dot(self.of_classes, theta))
 
 
-def make(classes: Belief) -> Readout:
+def make(classes: Belief, most: int | None = None) -> Readout:
     """The readout of beliefs in some classes.
 
     Args:
       classes: `[C, D]` joint posterior of each class.
+      most: maximum of K. Log-posteriors that depend on the labels of sensors alone have one
+        direction less than each sensor has labels, see `directions`; by default, all that the
+        moments have.
     """
     chex.assert_rank(classes.mean, 2, custom_message="classes.mean")
     moments = _moments(classes)
@@ -127,11 +132,17 @@ def make(classes: Belief) -> Readout:
     _, singular, axes = jnp.linalg.svd(moments - offset[None], full_matrices=False)
     # The moments less their mean span one direction less than there are classes.
     rank = min(len(moments) - 1, moments.shape[1])
+    rank = rank if most is None else max(1, min(rank, most))
     singular, axes = singular[:rank], axes[:rank]
     is_kept = singular > _THRESHOLD * singular[0]
     length = jnp.where(is_kept, jnp.sqrt(len(moments)) / jnp.where(is_kept, singular, 1.0), 0.0)
     whitening = axes.T * length[None]
     return Readout(_dot(moments - offset[None], whitening), offset, whitening)
+
+
+def directions(numbers: Sequence[int]) -> int:
+    """Directions of log-posteriors, for the number of labels of each sensor."""
+    return sum(number - 1 for number in numbers)
 
 
 def _moments(belief: Belief) -> Float[Array, "... K"]:
@@ -144,9 +155,16 @@ def _solve(matrix: Float[Array, "K K"], vector: Float[Array, " K"]) -> Float[Arr
 
     `jnp.linalg.solve` calls a library for each of a batch of small systems.
     """
-    for k in range(len(vector)):
+
+    def eliminate(k: Index, system: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        matrix, vector = system
         factor = matrix[:, k] / matrix[k, k]
         factor = factor.at[k].set(1 - 1 / matrix[k, k])
-        matrix = matrix - factor[:, None] * matrix[k][None, :]
-        vector = vector - factor * vector[k]
-    return vector
+        return matrix - factor[:, None] * matrix[k][None, :], vector - factor * vector[k]
+
+    system = matrix, vector
+    if len(vector) > _MAX_UNROLLED:
+        return jax.lax.fori_loop(0, len(vector), eliminate, system)[1]
+    for k in range(len(vector)):
+        system = eliminate(k, system)
+    return system[1]

@@ -11,7 +11,7 @@ from jaxsense.core.types import Belief
 from jaxsense.mission import MissionState, Record
 from jaxsense.mission.state import ENDED, FACING
 from jaxsense.show.animation.svg import Timeline, add
-from jaxsense.show.colours import as_hex, class_colour, in_plane, modality_colour
+from jaxsense.show.colours import as_hex, class_colour, modality_colour, plane
 
 SIZE = 340  # px, of a view
 _FLASH = 6  # frames that a look is shown for
@@ -146,7 +146,8 @@ class MapView:
 
     def __init__(self, config: Config, end: MissionState, class_beliefs: Belief):
         self._config, self._end = config, end
-        self._means, self._stds = in_plane(class_beliefs.mean), in_plane(class_beliefs.std)
+        self._plane = plane(np.asarray(class_beliefs.mean))
+        self._means, self._stds = map(self._in_plane, (class_beliefs.mean, class_beliefs.std))
         self._scale = SIZE / 2 / (1.0 + float(np.max(np.abs(self._means) + self._stds)))
 
     def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
@@ -167,9 +168,9 @@ class MapView:
         # Before the first look each is wider than the view, a little less so than the one before.
         step = min(4.0, SIZE / 4 / num_pois)
         for n in range(num_pois):
-            mean = self._place(_smooth(in_plane(record.belief.mean[:, n])))
+            mean = self._place(_smooth(self._in_plane(record.belief.mean[:, n])))
             widest = SIZE / 2 - 5 - step * n
-            std = self._scale * in_plane(record.belief.std[:, n])
+            std = self._scale * self._in_plane(record.belief.std[:, n])
             radii = _smooth(np.minimum(std, widest))
             colour = colours[int(self._end.classes[n])]
             ellipse = add(parent, "ellipse", fill=colour, stroke=colour)
