@@ -61,7 +61,6 @@ class Config(Section):
     def check(self) -> None:
         """Checks relations between sections; raises `ConfigError`."""
         self._check_modalities()
-        self._check_classes()
         self._check_robots()
         self._check_learning()
         self._check_task()
@@ -80,7 +79,7 @@ class Config(Section):
                 raise ConfigError(f"sensors.{name}.attribute", sensor.attribute, expected)
         for name in self.arena.attributes:
             if name not in (sensor.attribute for sensor in self.sensors.values()):
-                raise ConfigError("arena.attributes", name, "must be read by one of sensors")
+                raise ConfigError("arena.attributes", name, "no sensor reads it; add one to sensors")
         known = [*MODALITIES, *self.sensors]
         is_known = set(self.modalities) <= set(known)
         require(is_known, self, "modalities", f"must be among {', '.join(known)}")
@@ -90,15 +89,6 @@ class Config(Section):
         expected = f"must have one value for each of modalities = {self.modalities}"
         has_one_each = len(weights) == len(self.modalities)
         require(has_one_each, self.jmvae, "reconstruction_weights", expected)
-
-    def _check_classes(self) -> None:
-        """A sensor, carried or not, must distinguish any two classes."""
-        of_sensors = zip(*map(self.label_of_class, [*MODALITIES, *self.sensors]), strict=True)
-        seen: dict[tuple[int, ...], str] = {}
-        for name, labels in zip(self.arena.classes, of_sensors, strict=True):
-            twin = seen.setdefault(labels, name)
-            expected = f"must not have both {twin!r} and {name!r}, which no sensor can distinguish"
-            require(twin == name, self.arena, "classes", expected)
 
     def _check_robots(self) -> None:
         """Robots must carry trained sensors, which together distinguish some classes."""

@@ -233,6 +233,15 @@ def test_plain_settings_are_refused_or_used(stored):
 TWINS = {**COLOURS, "crimson": COLOURS["red"]}
 TURNED = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "board": Shape("box", (0.5, 1.0))}
 SIX = tuple(f"{colour} {shape}" for colour in ("red", "green", "blue") for shape in SHAPES)
+REDS = "red cylinder", "red cube"
+POSTS = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "post": Shape("box", (0.5, 0.5))}
+SIXTEEN = tuple(f"{colour} {shape}" for colour in COLOURS for shape in POSTS)
+EIGHT = tuple(
+    f"{colour} {shape} {heat}"
+    for colour in ("red", "green")
+    for shape in SHAPES
+    for heat in ("hot", "cold")
+)
 CHANGES = [
     ({"modalities": 5}, "modalities = 5: must be a list of texts"),
     ({"modalities": ("lidar", "lidar")}, "must name no modality twice"),
@@ -241,7 +250,11 @@ CHANGES = [
             "arena.attributes": {"heat": Attribute({"hot": 1.0, "cold": 0.0})},
             "arena.classes": ("red cube hot", "red cube cold"),
         },
-        "must not have both 'red cube hot' and 'red cube cold', which no sensor can distinguish",
+        "arena.attributes = 'heat': no sensor reads it; add one to sensors",
+    ),
+    (
+        {"modalities": ("camera",), "jmvae.reconstruction_weights": (1.0,), "arena.classes": REDS},
+        "robots = ('camera',): must distinguish some of red cylinder, red cube",
     ),
     ({"modalities": ("lidar", "")}, "must be among camera, lidar"),
     ({"modalities": ("lidar\n",)}, "must be among camera, lidar"),
@@ -328,6 +341,24 @@ CHANGES = [
         {"jmvae.fusion": "filter", "jmvae.latent_size": 1, "arena.classes": SIX},
         "jmvae.latent_size = 1: must be at least 2, so that beliefs can hold 6 classes",
     ),
+    (
+        {"jmvae.latent_size": 1, "arena.classes": [name for name in SIX if "blue" not in name]},
+        "jmvae.latent_size = 1: must be at least 2, so that beliefs can hold 4 classes",
+    ),
+    (
+        {"jmvae.latent_size": 3, "arena.shapes": POSTS, "arena.classes": SIXTEEN},
+        "jmvae.latent_size = 3: must be at least 4, so that beliefs can hold 16 classes",
+    ),
+    (
+        {
+            "modalities": ("camera", "lidar", "thermal"),
+            "sensors": {"thermal": SensorConfig("a:b", "heat")},
+            "arena.attributes": {"heat": Attribute({"hot": 1.0, "cold": 0.0})},
+            "arena.classes": EIGHT,
+            "jmvae.reconstruction_weights": (1.0, 1.0, 1.0),
+        },
+        "jmvae.latent_size = 2: must be at least 3, so that beliefs can hold 8 classes",
+    ),
     ({"jmvae.samples_per_class": 10**9}, "jmvae.samples_per_class = 1000000000: takes"),
     ({"jmvae.steps": 10**9}, "jmvae.steps = 1000000000: takes"),
     ({"jmvae.batch": 10**9}, "jmvae.batch = 1000000000: takes"),
@@ -365,7 +396,7 @@ CHANGES = [
     ({"robots": {"camera"}}, "robots = {'camera'}: must be a list of texts or None"),
     ({"robots": ("camera", "sonar")}, "must each be one of modalities: camera, lidar"),
     (
-        {"robots": ("camera", "camera"), "arena.classes": ("red cylinder", "red cube")},
+        {"robots": ("camera", "camera"), "arena.classes": REDS},
         "robots = ('camera', 'camera'): must distinguish some of red cylinder, red cube",
     ),
     ({"mdp.partly_seen_starts": 1}, "mdp.partly_seen_starts = 1: must be True or False"),
