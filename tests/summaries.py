@@ -30,6 +30,7 @@ SUMMARY = {
         "active_units": 2,
         "fusion": {"accuracy": 0.9996, "mean_error": 0.021, "std_error": 0.03},
         "moment_matching_error": 0.0067,
+        "readout_error": 0.0001,
         "sigma_norm": {name: [0.5, 1.25, 1.5] for name in UNAMBIGUOUS},
         "unambiguous": UNAMBIGUOUS,
         "consistent": {name: [0.995, 1.0, 0.5] for name in UNAMBIGUOUS},

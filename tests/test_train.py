@@ -56,8 +56,10 @@ def test_summary_keeps_its_contract(smoke_run):
     assert -1 <= belief["doubt_correlation"] <= 1
     latent = summary["jmvae"]
     assert set(latent) == {
-        "active_units", "sigma_norm", "unambiguous", "consistent", "moment_matching_error", "fusion"
+        "active_units", "sigma_norm", "unambiguous", "consistent", "moment_matching_error",
+        "readout_error", "fusion",
     }  # fmt: skip
+    assert 0 <= latent["readout_error"] <= 0.01
     for block, kind in (("sigma_norm", float), ("unambiguous", bool), ("consistent", float)):
         assert set(latent[block]) == {"joint", "camera", "lidar"}
         for values in latent[block].values():
@@ -167,7 +169,7 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
     [
         (
             ["--preset", "best"],
-            "preset = 'best': must be one of default, paper, noisy, team, smoke",
+            "preset = 'best': must be one of default, paper, noisy, many, team, smoke",
         ),
         (["--taste", "sweet"], "train: unknown option --taste; see --help-all"),
         (["--jmvae.hiden", "3"], "unknown option --jmvae.hiden; did you mean --jmvae.hidden?"),
@@ -312,7 +314,7 @@ def test_every_setting_has_a_sentence_of_help():
 
 
 def test_presets_are_configurations():
-    assert set(PRESETS) == {"default", "paper", "noisy", "team", "smoke"}
+    assert set(PRESETS) == {"default", "paper", "noisy", "many", "team", "smoke"}
     assert all(isinstance(preset, Config) for preset in PRESETS.values())
     assert PRESETS["default"].dqn.observe == "live"
     assert PRESETS["paper"].dqn.observe == "bank"

@@ -70,7 +70,8 @@ class JmvaeConfig(Section, place="jmvae"):
     """How a look updates a belief. `in_place`, as in the paper, replaces it. `filter` accumulates
     looks, see the section filter."""
     restarts: int = limited(3, at_least=1, at_most=1000)
-    """Trainings from different random parameters; the one with the lowest loss is kept."""
+    """Trainings from different random parameters; the one with the lowest loss is kept, of those
+    from whose beliefs class probabilities are read exactly."""
     samples_per_class: int = limited(10000, at_least=1)
     """Detections per class and modality in the training set."""
     steps: int = limited(3000, at_least=1)

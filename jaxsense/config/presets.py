@@ -90,7 +90,7 @@ _NOISY = Config(
         num_held_out=32768,
         num_repeats=4096,
     ),
-    jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000, restarts=1),
+    jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000),
     mdp=MdpConfig(reward="nats", look_cost=0.1),
     dqn=DqnConfig(observe="bank", discount=0.2),
     team=TeamConfig(travel=TravelConfig(view_distance=3.5), sides=(4.0, 9.0)),
@@ -142,7 +142,7 @@ _MANY = dataclasses.replace(
         classes=tuple(f"{colour} {shape}" for colour in COLOURS for shape in _FOUR_SHAPES),
         shapes=_FOUR_SHAPES,
     ),
-    jmvae=dataclasses.replace(_NOISY.jmvae, latent_size=6, samples_per_class=4000, restarts=2),
+    jmvae=dataclasses.replace(_NOISY.jmvae, latent_size=6, samples_per_class=4000),
     dqn=_TEAM.dqn,
     # Reading sixteen classes takes long.
     team=dataclasses.replace(_NOISY.team, tours=ToursConfig(states=8192, steps=1600)),
