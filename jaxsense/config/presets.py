@@ -166,5 +166,6 @@ PRESETS: Mapping[str, Config] = FrozenDict(
 """`default`: the best settings we know. `paper`: the paper's where it states them, otherwise
 chosen to reproduce its figures, see `docs/differences.md`. `noisy`: sensors that are often
 uncertain, and beliefs that accumulate looks. `many`: sixteen classes of four colours and four
-shapes, with sensors such as those of `noisy` and a team. `team`: one policy for any number of PoIs and robots
-that takes travel time into account. `smoke`: the whole pipeline in seconds, for tests."""
+shapes, with sensors such as those of `noisy` and a team. `team`: one policy for any number of PoIs
+and robots that takes travel time into account. `smoke`: the whole pipeline in seconds, for
+tests."""

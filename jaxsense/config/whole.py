@@ -79,7 +79,9 @@ class Config(Section):
                 raise ConfigError(f"sensors.{name}.attribute", sensor.attribute, expected)
         for name in self.arena.attributes:
             if name not in (sensor.attribute for sensor in self.sensors.values()):
-                raise ConfigError("arena.attributes", name, "no sensor reads it; add one to sensors")
+                raise ConfigError(
+                    "arena.attributes", name, "no sensor reads it; add one to sensors"
+                )
         known = [*MODALITIES, *self.sensors]
         is_known = set(self.modalities) <= set(known)
         require(is_known, self, "modalities", f"must be among {', '.join(known)}")
@@ -102,7 +104,9 @@ class Config(Section):
     def _check_learning(self) -> None:
         """Beliefs must hold all labels, and calibration must leave scans to train on."""
         least = self._least_latent_size()
-        expected = f"must be at least {least}, so that beliefs can hold {len(self.arena.classes)} classes"
+        expected = (
+            f"must be at least {least}, so that beliefs can hold {len(self.arena.classes)} classes"
+        )
         require(self.jmvae.latent_size >= least, self.jmvae, "latent_size", expected)
         # Scans come in whole scenes.
         scans = -(-self.detector.num_scans // self.arena.num_pois) * self.arena.num_pois

@@ -122,7 +122,8 @@ def unsound(block: Beliefs) -> str | None:
     after = f"{looks} looks" if looks > 1 else "1 look"
     return (
         f"The map loses information: its NLL after {after} is {nll:.2f}, that of exact Bayes "
-        f"{bayes:.2f}. Try jmvae.fusion = filter, a larger jmvae.latent_size, or more jmvae.restarts."
+        f"{bayes:.2f}. Try jmvae.fusion = filter, a larger jmvae.latent_size, or more "
+        "jmvae.restarts."
     )
 
 

@@ -150,6 +150,10 @@ class MapView:
         self._means, self._stds = map(self._in_plane, (class_beliefs.mean, class_beliefs.std))
         self._scale = SIZE / 2 / (1.0 + float(np.max(np.abs(self._means) + self._stds)))
 
+    def _in_plane(self, values: ArrayLike) -> np.ndarray:
+        """`[..., D]` as `[..., 2]`, in the dimensions that are shown."""
+        return in_plane(values, self._plane)
+
     def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
         """Adds the view.
 
