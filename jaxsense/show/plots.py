@@ -142,7 +142,7 @@ def _beliefs(
     by_sigma: np.ndarray,
 ) -> int:
     """Draws `[C, S, 2]` beliefs on two axes; returns how many lie far from their class."""
-    mean, std = belief.mean, belief.std
+    mean, std = np.asarray(belief.mean), np.asarray(belief.std)
     centre, spread = np.median(mean, axis=1), np.median(std, axis=1)
     is_far = _apart(mean, centre[:, None], spread[:, None]) > _FAR
     for c, colour in enumerate(by_class):
