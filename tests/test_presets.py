@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from jaxsense import summary
@@ -151,6 +152,20 @@ def test_noisy_preset(tmp_path, summary_of):
         assert 0.98 <= block["fraction_of_optimal"] <= 1.01
     assert noisy["mission"]["latent"]["accuracy"] >= 0.97
     assert all(block["ece"] <= 0.02 for block in noisy["detectors"].values())
+
+
+def test_many_preset(tmp_path, summary_of):
+    many = summary_of("many", 0, tmp_path / "many")
+    belief = many["belief"]
+    assert np.max(np.subtract(belief["nll"], belief["bayes_nll"])) <= 0.03
+    assert np.min(np.subtract(belief["accuracy"], belief["bayes_accuracy"])) >= -0.005
+    assert belief["doubt_correlation"] >= 0.95
+    assert many["jmvae"]["readout_error"] <= 0.003
+    for block in many["dqn"].values():
+        assert 0.97 <= block["fraction_of_optimal"] <= 1.01
+    latent = many["mission"]["latent"]
+    assert latent["accuracy"] >= 0.95
+    assert latent["of_naive"]["observations_per_poi"] <= 0.65
 
 
 def test_a_team_with_noisy_sensors(tmp_path, summary_of):

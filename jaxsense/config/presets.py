@@ -145,9 +145,23 @@ _MANY = dataclasses.replace(
     jmvae=dataclasses.replace(_NOISY.jmvae, latent_size=6, samples_per_class=4000),
     dqn=_TEAM.dqn,
     # Reading sixteen classes takes long.
-    team=dataclasses.replace(_NOISY.team, tours=ToursConfig(states=8192, steps=1600)),
+    team=dataclasses.replace(_NOISY.team, tours=ToursConfig(states=4096, steps=1600)),
     evaluation=dataclasses.replace(_NOISY.evaluation, num_repeats=8, num_states=512),
-    mission=dataclasses.replace(_NOISY.mission, time_limit=300.0),
+    mission=dataclasses.replace(
+        _NOISY.mission,
+        policies=(
+            "latent",
+            "greedy",
+            "nearest",
+            "auction",
+            "naive",
+            "naive_2",
+            "naive_3",
+            "random",
+        ),
+        episodes=32,
+        time_limit=300.0,
+    ),
 )
 
 PresetName = Literal["default", "paper", "noisy", "many", "team", "smoke"]
