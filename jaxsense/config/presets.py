@@ -139,10 +139,13 @@ _MANY = dataclasses.replace(
     arena=ArenaConfig(
         side=8.0,
         num_pois=8,
+        # Four shapes need more beams than two.
+        poi_radius=0.15,
         classes=tuple(f"{colour} {shape}" for colour in COLOURS for shape in _FOUR_SHAPES),
         shapes=_FOUR_SHAPES,
     ),
     jmvae=dataclasses.replace(_NOISY.jmvae, latent_size=6, samples_per_class=4000),
+    mdp=MdpConfig(reward="nats", look_cost=0.05),
     dqn=_TEAM.dqn,
     # Reading sixteen classes takes long.
     team=dataclasses.replace(_NOISY.team, tours=ToursConfig(states=4096, steps=1600)),

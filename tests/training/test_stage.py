@@ -138,7 +138,7 @@ def test_every_stage_is_called_as_it_is_in_the_list():
         assert set(stage.sources) <= set(names[:i])
     restarts = [stage.name for stage in stages if stage.is_optional]
     assert restarts == ["jmvae_1", "jmvae_2"]
-    assert stage_of("best_jmvae").sources == ("jmvae_1", "jmvae_2")
+    assert stage_of("best_jmvae").sources == ("jmvae_1", "jmvae_2", "detections")
     assert names == [
         "scenes", "survey", "examples", "detector_camera", "detector_lidar", "detections",
         "detector_metrics", "jmvae_1", "jmvae_2", "best_jmvae", "class_beliefs", "fusion",
