@@ -12,7 +12,7 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, Samples, pytree
-from jaxsense.models import make_bayes, make_in_place, make_jmvae, make_prior, make_readout
+from jaxsense.models import make_in_place, make_jmvae, make_prior, make_readout
 from jaxsense.sim import sensors
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
@@ -21,14 +21,12 @@ from jaxsense.training import gating, histories
 from jaxsense.training.fits import fit_stage
 from jaxsense.training.gating import Examples
 from jaxsense.training.stage import Output, Stage
-from jaxsense.vae import detectors, filter, jmvae, novelty
+from jaxsense.vae import detectors, filter, jmvae
 from jaxsense.vae import gate as gates
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.filter import Filter
 from jaxsense.vae.fusion import InPlace
-from jaxsense.vae.novelty import Novelty
 
-_REPEATS = 4  # looks in a scene, from which novelty is learned
 _EXACT = 0.003  # nats that a readout may lose, a third of what a sound map may
 _SHARE_OF_EMPTY = 8  # one empty scene for so many to train detectors with; rays take time
 _GATE_CHECKS = 8192  # looks that set a gate's threshold
@@ -261,38 +259,6 @@ def detect(
         starts=jax.tree.map(lambda x: x[: _num_starts(config)], starts),
         windows=by_class(others.windows, for_measuring, 1),
     )
-
-
-def novelty_stage(arena: Arena, config: Config) -> Stage:
-    """Makes the stage that learns how much of a look is new; all of it if there are no pairs.
-
-    Args:
-      arena: of the simulation.
-      config: all settings.
-    """
-    number = config.detector.num_repeats
-    if not number:
-        num_modalities = len(config.modalities)
-        return Stage("novelty", lambda key, config: novelty.independent(num_modalities))
-
-    def begin(key: Key, config: Config, *, trained: tuple[Detector, ...]) -> Novelty:
-        world, exact = make_world(config, arena=arena), make_bayes(config)
-        class_key, *keys = jax.random.split(key, 1 + len(trained))
-        classes = jax.random.randint(
-            class_key, (number, config.arena.num_pois), 0, len(config.arena.classes)
-        )
-
-        def fit(m: int) -> tuple[jax.Array, jax.Array]:
-            scene_keys = jax.random.split(keys[m], number)
-            windows, places = looks.repeats(scene_keys, world, classes, m, _REPEATS)
-            read = lambda x: exact.log_likelihoods(detectors.detect(trained[m], x), m)  # noqa: E731
-            return novelty.fit(jax.vmap(jax.vmap(read))(windows), places, classes[:, 0])
-
-        strength, length = zip(*map(fit, range(len(trained))), strict=True)
-        return Novelty(jnp.stack(strength), jnp.stack(length))
-
-    names = tuple(f"detector_{name}" for name in config.modalities)
-    return Stage("novelty", begin, {"trained": names})
 
 
 def jmvae_stages(config: Config) -> list[Stage]:

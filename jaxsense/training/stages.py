@@ -12,7 +12,7 @@ from jaxsense.core.types import Key
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
-from jaxsense.training import agents, comparison, measures, perception
+from jaxsense.training import agents, comparison, measures, perception, repeats
 from jaxsense.training.stage import Learned, Output, Stage, compose, key_of
 
 
@@ -44,7 +44,7 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
         *(perception.detector_stage(m, name, config) for m, name in enumerate(detectors)),
         Stage("detections", perception.detect, {"surveys": "survey", "trained": detectors}),
         Stage("detector_metrics", measures.detector_metrics, detections),
-        perception.novelty_stage(arena, config),
+        repeats.novelty_stage(arena, config),
         *perception.jmvae_stages(config),
         Stage("class_beliefs", perception.class_beliefs, {**params, **detections}),
         *perception.fusion_stages(config),

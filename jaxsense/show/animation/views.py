@@ -11,7 +11,7 @@ from jaxsense.core.types import Belief
 from jaxsense.mission import MissionState, Record
 from jaxsense.mission.state import ENDED, FACING
 from jaxsense.show.animation.svg import Timeline, add
-from jaxsense.show.colours import as_hex, class_colour, modality_colour, plane
+from jaxsense.show.colours import as_hex, class_colour, in_plane, modality_colour, plane
 
 SIZE = 340  # px, of a view
 _FLASH = 6  # frames that a look is shown for
