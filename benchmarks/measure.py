@@ -118,9 +118,6 @@ def make_row(
     ratio = None
     if theirs is not None:
         ratio = theirs / ours if unit == "s" else ours / theirs
-    versions = {"python": platform.python_version()}
-    for package in (*_PACKAGES, *(packages if theirs is not None else ())):
-        versions[package] = importlib.metadata.version(package)
     kind = jax.devices()[0].device_kind
     return Row(
         row=name,
@@ -132,9 +129,15 @@ def make_row(
         compile_s=compile_s,
         device=kind if num_devices == 1 else f"{num_devices} x {kind}",
         batch=batch,
-        versions=versions,
+        versions=versions(packages if theirs is not None else ()),
         is_bound=is_bound,
     )
+
+
+def versions(packages: tuple[str, ...] = ()) -> dict[str, str]:
+    """Versions of Python, of the packages that all rows need, and of `packages`."""
+    found = {package: importlib.metadata.version(package) for package in (*_PACKAGES, *packages)}
+    return {"python": platform.python_version(), **found}
 
 
 def compiled(
