@@ -13,7 +13,7 @@ import rich.console
 import rich.table
 
 from benchmarks import ROWS
-from benchmarks.measure import Options, Row
+from benchmarks.measure import Options, Row, reserve
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
 from jaxsense.run import cli
@@ -46,7 +46,7 @@ def main(argv: list[str] | None = None) -> None:
         if name not in ROWS:
             cli.fail(PROGRAM, f"name = {name!r}: must be one of {', '.join(ROWS)}")
     if arguments.json is not None:
-        _reserve(arguments.json)
+        reserve(PROGRAM, "json", arguments.json)
     # A device for each core. Called from another program, the devices may be fixed already.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", os.cpu_count())
@@ -65,17 +65,6 @@ def main(argv: list[str] | None = None) -> None:
                 json.dumps([row.as_json() for row in rows], indent=2) + "\n", encoding="utf-8"
             )
     _print_table(console, rows)
-
-
-def _reserve(path: Path) -> None:
-    """Makes an empty list of rows, or ends the program, before anything is measured."""
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write("[]\n")
-    except FileExistsError:
-        cli.fail(PROGRAM, f"json = {str(path)!r}: exists already; must be new")
-    except OSError as error:
-        cli.fail(PROGRAM, f"json = {str(path)!r}: cannot be written: {error.strerror}")
 
 
 def _print_table(console: rich.console.Console, rows: list[Row]) -> None:

@@ -6,12 +6,13 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 from jax.sharding import NamedSharding, PartitionSpec
 
-from jaxsense.run import devices
+from jaxsense.run import cli, devices
 from jaxsense.run.devices import Workers
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
@@ -218,6 +219,23 @@ def seconds(run: Callable[[], Any]) -> float:
     begin = time.perf_counter()
     run()
     return time.perf_counter() - begin
+
+
+def reserve(program: str, option: str, path: Path) -> None:
+    """Makes an empty list of results, or ends the program, before anything is measured.
+
+    Args:
+      program: module that runs.
+      option: that names the file.
+      path: of the file; must be new.
+    """
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write("[]\n")
+    except FileExistsError:
+        cli.fail(program, f"{option} = {str(path)!r}: exists already; must be new")
+    except OSError as error:
+        cli.fail(program, f"{option} = {str(path)!r}: cannot be written: {error.strerror}")
 
 
 def _fastest(sides: Sequence[Side]) -> Side:

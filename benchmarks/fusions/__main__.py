@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -9,9 +10,9 @@ from pathlib import Path
 
 import rich.console
 
-from benchmarks.fusions.study import Study, settings, sizes
+from benchmarks.fusions.study import Each, Study, settings, sizes
 from benchmarks.fusions.table import Figures, as_markdown, means, summarise
-from benchmarks.measure import versions
+from benchmarks.measure import reserve, versions
 from jaxsense.config import ConfigError, PresetName
 from jaxsense.config.checks import check_fields, limited
 from jaxsense.run import cli, devices
@@ -39,32 +40,32 @@ class Arguments:
     @property
     def range(self) -> range:
         """The seeds."""
-        first, _, last = self.seeds.partition("-")
-        if first.isdecimal() and (last or first).isdecimal() and int(first) <= int(last or first):
-            return range(int(first), int(last or first) + 1)
-        raise ConfigError("seeds", self.seeds, "must be as 100-109, or one seed")
+        found = re.fullmatch(r"(\d+)(?:-(\d+))?", self.seeds, re.ASCII)
+        if found is None or not (seeds := range(int(found[1]), int(found[2] or found[1]) + 1)):
+            raise ConfigError("seeds", self.seeds, "must be as 100-109, or one seed")
+        return seeds
 
 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    if arguments.out is not None and arguments.out.exists():
-        cli.fail(PROGRAM, f"out = {str(arguments.out)!r}: exists already; must be new")
+    if arguments.out is not None:
+        reserve(PROGRAM, "out", arguments.out)
     workers = devices.start(None)
     console = rich.console.Console(stderr=True)
     config = settings(arguments.preset)
     study = Study(config, arguments.missions)
     first, *others = arguments.range
 
-    def measure(seed: int) -> dict[str, Figures]:
+    def measure(seed: int, each: Each = map) -> dict[str, Figures]:
         begin = time.perf_counter()
-        found = study.measure(seed)
+        found = study.measure(seed, each)
         console.print(f"seed {seed}: {time.perf_counter() - begin:.0f} s")
         return found
 
-    # Alone, so that each program is compiled once.
-    found = {first: measure(first)}
     with ThreadPoolExecutor(workers.threads) as executor:
+        # The first seed alone, so that each program is compiled once, the fusions side by side.
+        found = {first: measure(first, executor.map)}
         found |= zip(others, executor.map(measure, others), strict=True)
     fusions, optimal = summarise(found, sizes(config)), means(found, "optimal")
     if arguments.out is not None:

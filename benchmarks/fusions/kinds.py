@@ -72,8 +72,9 @@ class LogOdds:
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
         """Probability of each class, each at least about `readout.MIN_PROBABILITY`."""
-        found = jax.nn.softmax(jnp.append(belief.mean, 0.0))
-        return jnp.maximum(found, MIN_PROBABILITY) / jnp.sum(jnp.maximum(found, MIN_PROBABILITY))
+        exact = jax.nn.softmax(jnp.append(belief.mean, 0.0))
+        found = jnp.maximum(exact, MIN_PROBABILITY)
+        return found / jnp.sum(found)
 
     def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
         """Most likely class, int32."""
@@ -191,8 +192,7 @@ class Audited:
     @property
     def classes(self) -> Belief:
         """Each class with certainty."""
-        number = self.bayes.labels.shape[1]
-        certain = jnp.log(jnp.maximum(jnp.eye(number), MIN_PROBABILITY))
+        certain = jnp.log(jnp.maximum(jnp.eye(self._num_classes), MIN_PROBABILITY))
         return jax.vmap(self._joined)(self.fusion.classes, certain)
 
     @property
@@ -211,11 +211,10 @@ class Audited:
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
         """
-        mean, std = jnp.split(belief.mean[: -2 * self.bayes.labels.shape[1]], 2)
+        mean, std = jnp.split(belief.mean[: -2 * self._num_classes], 2)
         after = self.fusion.update(Belief(mean, std), seen, features, modality)
-        return self._joined(
-            after, self.bayes.update(self.log_posterior(belief), features, modality)
-        )
+        exact = self.bayes.update(self.log_posterior(belief), features, modality)
+        return self._joined(after, exact)
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """Belief after looks by several sensors, `[D_m]` features by modality."""
@@ -223,8 +222,7 @@ class Audited:
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
         """Probability of each class according to the other fusion."""
-        number = self.bayes.labels.shape[1]
-        return belief.mean[-2 * number : -number]
+        return belief.mean[-2 * self._num_classes : -self._num_classes]
 
     def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
         """Most likely class according to the other fusion, int32."""
@@ -232,12 +230,15 @@ class Audited:
 
     def log_posterior(self, belief: Belief) -> Float[Array, " C"]:
         """Logarithms of the exact posterior."""
-        return belief.mean[-self.bayes.labels.shape[1] :]
+        return belief.mean[-self._num_classes :]
+
+    @property
+    def _num_classes(self) -> int:
+        return self.bayes.labels.shape[1]
 
     def _joined(self, belief: Belief, log_posterior: Float[Array, " C"]) -> Belief:
         probabilities = self.fusion.class_probabilities(belief)
-        parts = belief.mean, belief.std, probabilities, log_posterior
-        mean = jnp.concatenate(parts)
+        mean = jnp.concatenate([belief.mean, belief.std, probabilities, log_posterior])
         return Belief(mean, jnp.ones_like(mean))
 
 

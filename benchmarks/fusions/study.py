@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,9 @@ from jaxsense.training import measures
 from jaxsense.training.stage import Outputs, key_of
 from jaxsense.vae import InPlace
 from jaxsense.vae.bayes import Bayes
+
+Each = Callable[[Callable[["Kind"], Figures], Iterable["Kind"]], Iterator[Figures]]
+"""Like `map`."""
 
 _HISTORIES = 12288  # of looks, for the NLL
 _EPISODES = 4096  # of the map MDP, for the return
@@ -108,21 +111,28 @@ class Study:
         self._judge = jax.jit(functools.partial(_judge, config))
         self._play = jax.jit(functools.partial(_play, team, missions), compiler_options=quick)
 
-    def measure(self, seed: int) -> dict[str, Figures]:
+    def measure(self, seed: int, each: Each = map) -> dict[str, Figures]:
         """Figures of each fusion, and of `optimal`, whose only figures are returns.
 
         Args:
           seed: of everything.
+          each: measures the fusions one after another, or side by side.
         """
         key = jax.random.key(seed)
         outputs = self._learn(key)
-        found = {"optimal": self._optimal(key, outputs)}
-        for name, kind in KINDS.items():
+
+        def of_kind(kind: Kind) -> Figures:
             fusion = kind.make(self.config, outputs)
             figures, q_networks = self._judge(key, fusion, outputs)
             models = _models(self.config, fusion, outputs, q_networks)
-            found[name] = figures | self._play(key, models)
-        return {n: {f: float(x) for f, x in figures.items()} for n, figures in found.items()}
+            return _as_floats(figures | self._play(key, models))
+
+        found = dict(zip(KINDS, each(of_kind, KINDS.values()), strict=True))
+        return {"optimal": _as_floats(self._optimal(key, outputs)), **found}
+
+
+def _as_floats(figures: Mapping[str, jax.Array]) -> Figures:
+    return {name: float(x) for name, x in figures.items()}
 
 
 def _learned(config: Config, key: Key) -> Outputs:
