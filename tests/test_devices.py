@@ -89,6 +89,18 @@ def test_options_that_the_compiler_does_not_know_are_left_out():
     jax.jit(lambda x: x).lower(1.0).compile(compiler_options=known)
 
 
+def test_an_accelerator_tunes_only_what_runs_long(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(devices, "_is_known", lambda name, value: True)
+    jax.config.update("jax_disable_most_optimizations", False)
+    try:
+        short, long = (devices.compiler_options(runs_long=long) for long in (False, True))
+    finally:
+        jax.config.update("jax_disable_most_optimizations", True)
+    assert short == {"xla_backend_optimization_level": 1, "xla_gpu_autotune_level": 0}
+    assert long == {}
+
+
 TRAIN = [sys.executable, "-m", "jaxsense.train", "--quiet", "--cache", "None"]
 
 

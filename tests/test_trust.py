@@ -46,6 +46,7 @@ READERS = {
     "load": jaxsense.load,
     "read_settings": lambda run, **trust: rundir.read_settings(run / "config.json", **trust),
     "resume": rundir.resumable,
+    "open": lambda run, **trust: RunDirectory.resume(run, **trust).__enter__(),
 }
 
 

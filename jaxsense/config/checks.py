@@ -97,7 +97,14 @@ def limited(
       min_items: minimum length of a tuple.
       max_items: maximum length of a tuple; needs `min_items`.
     """
-    limits = Limits(above, at_least, below, at_most, min_items, max_items)
+    limits = Limits(
+        above=above,
+        at_least=at_least,
+        below=below,
+        at_most=at_most,
+        min_items=min_items,
+        max_items=max_items,
+    )
     return cast(T, dataclasses.field(default=default, metadata={"limits": limits}))
 
 

@@ -63,8 +63,7 @@ class MapVectorEnv(VectorEnv):
         self._states: MapState | None = None
         self._ended = np.zeros(num_envs, bool)
         self._key = jax.random.key(0)
-        self._step = jax.jit(functools.partial(_step, mdp, modality))
-        self._start = jax.jit(functools.partial(_start, mdp, starts, num_envs))
+        self._mdp, self._modality, self._starts = mdp, modality, starts
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -112,8 +111,8 @@ class MapVectorEnv(VectorEnv):
         actions = np.asarray(actions)
         self._check_step(actions)
         mode, ended = self.metadata["autoreset_mode"], self._ended
-        self._key, observations, self._states, outcome = self._step(
-            self._key, self._states, actions.astype(np.int32)
+        self._key, observations, self._states, outcome = _step(
+            self._key, self._mdp, self._states, actions.astype(np.int32), self._modality
         )
         observations = np.array(observations)
         rewards = np.array(outcome.reward, np.float64)
@@ -142,7 +141,9 @@ class MapVectorEnv(VectorEnv):
 
     def _restarted(self, mask: np.ndarray) -> np.ndarray:
         """Observations after new starts where the mask is True."""
-        self._key, observations, self._states = self._start(self._key, self._states, mask)
+        self._key, observations, self._states = _start(
+            self._key, self._mdp, self._starts, self._states, mask
+        )
         self._ended = self._ended & ~mask
         return np.array(observations)
 
@@ -155,8 +156,10 @@ def _final(observations: np.ndarray, ended: np.ndarray) -> dict[str, Any]:
     return {"final_obs": final, "_final_obs": ended, "final_info": {}, "_final_info": ended}
 
 
+# Static, so that only one sensor is compiled.
+@functools.partial(jax.jit, static_argnames="modality")
 def _step(
-    mdp: MapMdp, modality: int, key: Key, states: MapState, actions: jax.Array
+    key: Key, mdp: MapMdp, states: MapState, actions: jax.Array, modality: int
 ) -> tuple[Key, jax.Array, MapState, Outcome]:
     """Next key, `[E, N * 2D]` observations, `[E]` states and `[E]` outcomes."""
     next_key, key = jax.random.split(key)
@@ -165,17 +168,17 @@ def _step(
     return next_key, jax.vmap(observation)(states.belief), states, outcome
 
 
+@jax.jit
 def _start(
+    key: Key,
     mdp: MapMdp,
     starts: MapState | None,
-    num_envs: int,
-    key: Key,
     states: MapState | None,
     mask: jax.Array,
 ) -> tuple[Key, jax.Array, MapState]:
     """Next key, observations and states, with new starts where `mask` is True or all are new."""
     next_key, key = jax.random.split(key)
-    keys = jax.random.split(key, num_envs)
+    keys = jax.random.split(key, len(mask))
     fresh = jax.vmap(lambda key: common.start(key, mdp, starts))(keys)
 
     def pick(new: jax.Array, old: jax.Array) -> jax.Array:

@@ -55,6 +55,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         self.observation_spaces = dict.fromkeys(self.agents, observation)
         self.action_spaces = dict.fromkeys(self.agents, action)
 
+    # jaxmarl makes the environment static, here as in its `step`, and with it the MDP.
     @functools.partial(jax.jit, static_argnums=0)
     def reset(self, key: Key) -> tuple[dict[str, jax.Array], TeamEnvState]:
         """Starts an episode."""

@@ -1,6 +1,5 @@
 """The team MDP as environments of PettingZoo: `pip install 'jaxsense[pettingzoo]'`."""
 
-import functools
 from typing import Any
 
 import jax
@@ -43,8 +42,7 @@ class _Team:
         self.action_spaces = dict.fromkeys(self.possible_agents, action)
         self._state: TeamState | None = None
         self._key: Key | None = None
-        self._start = jax.jit(functools.partial(_start, mdp, config))
-        self._step = jax.jit(functools.partial(_step, mdp))
+        self._mdp, self._config = mdp, config
 
     def observation_space(self, agent: str) -> Any:
         """Space of what a robot knows, `[F * N]`."""
@@ -59,7 +57,7 @@ class _Team:
         if seed is not None or self._key is None:
             (word,) = np.random.SeedSequence(seed).generate_state(1)
             self._key = jax.random.key(int(word))
-        self._key, self._state, observations, available = self._start(self._key)
+        self._key, self._state, observations, available = _start(self._key, self._mdp, self._config)
         self.agents = list(self.possible_agents)
         return self._named(observations), self._infos(0.0, available)
 
@@ -68,8 +66,8 @@ class _Team:
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
         """Takes the action of the robot whose turn it is; results by the names of `agents`."""
         chosen = np.full(len(self.possible_agents), action, np.int32)
-        self._key, self._state, observations, outcome, available = self._step(
-            self._key, self._state, chosen
+        self._key, self._state, observations, outcome, available = _step(
+            self._key, self._mdp, self._state, chosen
         )
         return (
             self._named(observations),
@@ -206,15 +204,17 @@ class TeamParallelEnv(_Team, ParallelEnv):
         return result
 
 
-def _start(mdp: TeamMdp, config: Config, key: Key) -> tuple[Key, TeamState, jax.Array, jax.Array]:
+@jax.jit
+def _start(key: Key, mdp: TeamMdp, config: Config) -> tuple[Key, TeamState, jax.Array, jax.Array]:
     """Next key, state, `[R, F * N]` observations and `[R, N + 1]` actions that robots have."""
     next_key, key = jax.random.split(key)
     state = team.start(key, mdp, config)
     return next_key, state, team.observations(mdp, state), team.available(state)
 
 
+@jax.jit
 def _step(
-    mdp: TeamMdp, key: Key, state: TeamState, actions: jax.Array
+    key: Key, mdp: TeamMdp, state: TeamState, actions: jax.Array
 ) -> tuple[Key, TeamState, jax.Array, TeamOutcome, jax.Array]:
     """Next key, state, observations, outcome and actions that robots have."""
     next_key, key = jax.random.split(key)

@@ -181,7 +181,7 @@ def _ellipses(
                 patches, facecolors="none", edgecolors=colours[chosen], alpha=0.5, linestyles=line
             )
         )
-        axes.scatter(*mean[chosen].T, s=25, marker=marker, c=colours[chosen])
+        axes.scatter(mean[chosen, 0], mean[chosen, 1], s=25, marker=marker, c=colours[chosen])
 
 
 def _name_classes(

@@ -4,6 +4,7 @@ The page, the plots, the terminal and the docs read this table. Of several seeds
 stands in place of each number.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from typing import Annotated, NotRequired, TypedDict, cast, get_args, get_origin, get_type_hints
 from typing import is_typeddict as is_block
@@ -18,34 +19,39 @@ PerClass = dict[str, list[float]]
 class StageTiming(TypedDict):
     """`timing.stages.STAGE`; stages of one program share an entry."""
 
-    compile_s: Annotated[float, "compile [s]", "", 2]
-    run_s: Annotated[float, "run [s]", "", 2]
+    compile_s: Annotated[float, Metric("compile [s]", digits=2)]
+    run_s: Annotated[float, Metric("run [s]", digits=2)]
 
 
 class Timing(TypedDict):
     """`timing`."""
 
-    total_s: Annotated[float, "total time [s]", "The whole command; its stages overlap.", 1]
+    total_s: Annotated[float, Metric("total time [s]", "The whole command; its stages overlap.", 1)]
     stages: dict[str, StageTiming]
 
 
 class Detector(TypedDict):
     """`detectors.MODALITY`."""
 
-    accuracy: Annotated[float, "accuracy", "Share of right labels in held-out scenes.", 4]
-    ece: Annotated[float, "calibration error", "Mean gap between confidence and accuracy.", 4]
-    nll: Annotated[float, "NLL", "Mean -log p of the right label, in nats.", 4]
+    accuracy: Annotated[float, Metric("accuracy", "Share of right labels in held-out scenes.", 4)]
+    ece: Annotated[
+        float, Metric("calibration error", "Mean gap between confidence and accuracy.", 4)
+    ]
+    nll: Annotated[float, Metric("NLL", "Mean -log p of the right label, in nats.", 4)]
 
 
 class Fusion(TypedDict):
     """`jmvae.fusion`: beliefs after one sensor's look and then another's; null with one sensor."""
 
     accuracy: Annotated[
-        float | None, "fusion: right", "Share of beliefs whose likeliest class is the true one.", 4
+        float | None,
+        Metric("fusion: right", "Share of beliefs whose likeliest class is the true one.", 4),
     ]
-    mean_error: Annotated[float | None, "fusion: error", "Distance from the joint belief in sigma."]
+    mean_error: Annotated[
+        float | None, Metric("fusion: error", "Distance from the joint belief in sigma.")
+    ]
     std_error: Annotated[
-        float | None, "fusion: error of sigma", "Mean |log(ratio)| to the joint's."
+        float | None, Metric("fusion: error of sigma", "Mean |log(ratio)| to the joint's.")
     ]
 
 
@@ -54,22 +60,30 @@ class Jmvae(TypedDict):
 
     active_units: Annotated[
         int,
-        "dimensions in use",
-        "Latent dimensions that vary between classes; one in the paper.",
+        Metric(
+            "dimensions in use", "Latent dimensions that vary between classes; one in the paper."
+        ),
     ]
-    sigma_norm: Annotated[PerClass, "sigma norm", "Mean of each class, `joint` and by sensor."]
+    sigma_norm: Annotated[
+        PerClass, Metric("sigma norm", "Mean of each class, `joint` and by sensor.")
+    ]
     unambiguous: Annotated[
         dict[str, list[bool]],
-        "unambiguous",
-        "Whether over 90% of its looks leave a class plausible and no other (Table I).",
+        Metric(
+            "unambiguous",
+            "Whether over 90% of its looks leave a class plausible and no other (Table I).",
+        ),
     ]
     consistent: Annotated[
         PerClass,
-        "consistent",
-        "Share of looks that leave exactly the classes that the sensor cannot tell apart.",
+        Metric(
+            "consistent",
+            "Share of looks that leave exactly the classes that the sensor cannot tell apart.",
+        ),
     ]
     moment_matching_error: Annotated[
-        float, "error of moments", "Distance from the best Gaussian over the possible classes."
+        float,
+        Metric("error of moments", "Distance from the best Gaussian over the possible classes."),
     ]
     readout_error: Annotated[
         float, "error of the readout", "Nats lost in writing and reading exact probabilities."
@@ -80,25 +94,35 @@ class Jmvae(TypedDict):
 class Beliefs(TypedDict):
     """`belief`: the map after random looks at one PoI, compared with exact Bayes on them."""
 
-    looks: Annotated[list[int], "looks", "1 to 6."]
-    nll: Annotated[list[float], "NLL of the map", "Mean -log p of the true class."]
-    bayes_nll: Annotated[list[float], "NLL of exact Bayes"]
-    accuracy: Annotated[list[float], "accuracy of the map", "Share of right likeliest classes."]
-    bayes_accuracy: Annotated[list[float], "accuracy of exact Bayes"]
+    looks: Annotated[list[int], Metric("looks", "1 to 6.")]
+    nll: Annotated[list[float], Metric("NLL of the map", "Mean -log p of the true class.")]
+    bayes_nll: Annotated[list[float], Metric("NLL of exact Bayes")]
+    accuracy: Annotated[
+        list[float], Metric("accuracy of the map", "Share of right likeliest classes.")
+    ]
+    bayes_accuracy: Annotated[list[float], Metric("accuracy of exact Bayes")]
     doubt_correlation: Annotated[
-        float, "sigma and uncertainty", "Correlation of ||sigma|| with the exact entropy."
+        float, Metric("sigma and uncertainty", "Correlation of ||sigma|| with the exact entropy.")
     ]
 
 
 Returns = TypedDict(
     "Returns",
     {
-        "return": Annotated[float, "Q-network", "Reward of an episode without exploration."],
-        "optimal": Annotated[float | None, "optimal", "The optimal policy; see concepts."],
-        "greedy": Annotated[float, "greedy", "Takes the look with the highest expected gain."],
-        "naive": Annotated[float, "naive", "Looks at each PoI once, whatever the map holds."],
-        "random": Annotated[float, "random"],
-        "fraction_of_optimal": Annotated[float | None, "of optimal", "Q-network over optimal."],
+        "return": Annotated[
+            float, Metric("Q-network", "Reward of an episode without exploration.")
+        ],
+        "optimal": Annotated[float | None, Metric("optimal", "The optimal policy; see concepts.")],
+        "greedy": Annotated[
+            float, Metric("greedy", "Takes the look with the highest expected gain.")
+        ],
+        "naive": Annotated[
+            float, Metric("naive", "Looks at each PoI once, whatever the map holds.")
+        ],
+        "random": Annotated[float, Metric("random")],
+        "fraction_of_optimal": Annotated[
+            float | None, Metric("of optimal", "Q-network over optimal.")
+        ],
     },
 )
 """Mean rewards of episodes on the map, from random starts."""
@@ -107,9 +131,9 @@ Returns = TypedDict(
 class OneStep(TypedDict):
     """`dqn.MODALITY.one_step`: the reward of the first step, as in the authors' code."""
 
-    policy: Annotated[float, "one step: Q-network"]
-    optimal: Annotated[float | None, "one step: optimal"]
-    random: Annotated[float, "one step: random"]
+    policy: Annotated[float, Metric("one step: Q-network")]
+    optimal: Annotated[float | None, Metric("one step: optimal")]
+    random: Annotated[float, Metric("one step: random")]
 
 
 class Agent(Returns):
@@ -117,68 +141,83 @@ class Agent(Returns):
 
     one_step: OneStep
     optimal_states: Annotated[
-        int | None, "optimal in", "States with a reward within 0.01 of optimal.", 1
+        int | None, Metric("optimal in", "States with a reward within 0.01 of optimal.", 1)
     ]
     num_states: Annotated[
-        int, "states", "Combinations of classes and looks, or a sample of them.", 0
+        int, Metric("states", "Combinations of classes and looks, or a sample of them.", 0)
     ]
-    optimal_permutations: Annotated[int | None, "optimal permutations", "", 1]
-    num_permutations: Annotated[int, "permutations", "States in which all classes differ.", 0]
+    optimal_permutations: Annotated[int | None, Metric("optimal permutations", digits=1)]
+    num_permutations: Annotated[
+        int, Metric("permutations", "States in which all classes differ.", 0)
+    ]
     other_numbers: NotRequired[
-        Annotated[dict[str, Returns], "other numbers", "Rewards with `evaluation.num_pois` PoIs."]
+        Annotated[
+            dict[str, Returns], Metric("other numbers", "Rewards with `evaluation.num_pois` PoIs.")
+        ]
     ]
-    env_steps: Annotated[int, "steps of training", "In all environments together.", 0]
+    env_steps: Annotated[int, Metric("steps of training", "In all environments together.", 0)]
     env_steps_per_s: Annotated[
-        float, "steps per second", "Environment steps per second of training.", 0
+        float, Metric("steps per second", "Environment steps per second of training.", 0)
     ]
 
 
 class Differences(TypedDict):
     """`mission.POLICY.intervals`: from the latent policy, arena by arena, with 95% intervals."""
 
-    accuracy: Annotated[Interval, "right, difference", "From `latent`, with 95% interval."]
-    observations_per_poi: Annotated[Interval, "looks, difference", "From `latent`.", 2]
-    time_s: Annotated[Interval, "mean time, difference [s]", "From `latent`.", 1]
+    accuracy: Annotated[Interval, Metric("right, difference", "From `latent`, with 95% interval.")]
+    observations_per_poi: Annotated[Interval, Metric("looks, difference", "From `latent`.", 2)]
+    time_s: Annotated[Interval, Metric("mean time, difference [s]", "From `latent`.", 1)]
 
 
 class OfNaive(TypedDict):
     """`mission.POLICY.of_naive`: ratios to naive exploration, see `compare.of_naive`."""
 
     observations_per_poi: Annotated[
-        float, "looks, of naive", "Ratio to naive exploration of the same accuracy.", 2
+        float, Metric("looks, of naive", "Ratio to naive exploration of the same accuracy.", 2)
     ]
-    time_s: Annotated[float, "time, of naive", "", 2]
-    mean_time_s: Annotated[float, "mean time, of naive", "", 2]
+    time_s: Annotated[float, Metric("time, of naive", digits=2)]
+    mean_time_s: Annotated[float, Metric("mean time, of naive", digits=2)]
 
 
 class Calibration(TypedDict):
     """`mission.POLICY.calibration`: maps at the end of missions, PoIs that were detected."""
 
     confidence: Annotated[
-        float | None, "confidence", "Mean probability of the likeliest class; as it is right."
+        float | None,
+        Metric(
+            "confidence", "Mean probability of the likeliest class; if calibrated, the share right."
+        ),
     ]
-    accuracy: Annotated[float | None, "right, of detected", "Share of PoIs that were detected."]
-    nll: Annotated[float | None, "NLL of the maps", "Mean -log p of the true class."]
+    accuracy: Annotated[
+        float | None, Metric("right, of detected", "Share of PoIs that were detected.")
+    ]
+    nll: Annotated[float | None, Metric("NLL of the maps", "Mean -log p of the true class.")]
 
 
 class Case(TypedDict):
     """`mission.POLICY`: missions of one policy, or with a robot that fails."""
 
-    accuracy: Annotated[float, "right", "Share of PoIs whose likeliest class is right."]
-    observations_per_poi: Annotated[float, "looks per PoI", "", 2]
-    time_s: Annotated[float, "time [s]", "Median time until all robots are done.", 1]
-    mean_time_s: Annotated[float, "mean time [s]", "Long missions lift it above the median.", 1]
-    collisions: Annotated[int, "collisions", "Control periods with contact.", 0]
-    goals_reached_fraction: Annotated[float | None, "goals reached", "Share of chosen viewpoints."]
-    information: Annotated[float, "information", "Sum of 1 / sigma norm over the map.", 2]
-    calibration: Calibration
-    episodes: Annotated[int, "missions", "", 0]
-    ended: Annotated[dict[str, int], "ends", "Number of missions by how they ended."]
-    told: NotRequired[Annotated[float, "right labels", "A robot alone: share of PoIs."]]
-    ambiguous_reported: NotRequired[
-        Annotated[float | None, "reported as ambiguous", "Of the PoIs that it cannot tell apart."]
+    accuracy: Annotated[float, Metric("right", "Share of PoIs whose likeliest class is right.")]
+    observations_per_poi: Annotated[float, Metric("looks per PoI", digits=2)]
+    time_s: Annotated[float, Metric("time [s]", "Median time until all robots are done.", 1)]
+    mean_time_s: Annotated[
+        float, Metric("mean time [s]", "Long missions lift it above the median.", 1)
     ]
-    seed: NotRequired[Annotated[int, "seed", "Of the arenas of an evaluation."]]
+    collisions: Annotated[int, Metric("collisions", "Control periods with contact.", 0)]
+    goals_reached_fraction: Annotated[
+        float | None, Metric("goals reached", "Share of chosen viewpoints.")
+    ]
+    information: Annotated[float, Metric("information", "Sum of 1 / sigma norm over the map.", 2)]
+    calibration: Calibration
+    episodes: Annotated[int, Metric("missions", digits=0)]
+    ended: Annotated[dict[str, int], Metric("ends", "Number of missions by how they ended.")]
+    told: NotRequired[Annotated[float, Metric("right labels", "A robot alone: share of PoIs.")]]
+    ambiguous_reported: NotRequired[
+        Annotated[
+            float | None, Metric("reported as ambiguous", "Of the PoIs that it cannot tell apart.")
+        ]
+    ]
+    seed: NotRequired[Annotated[int, Metric("seed", "Of the arenas of an evaluation.")]]
     intervals: NotRequired[Differences]
     of_naive: NotRequired[OfNaive]
 
@@ -186,9 +225,11 @@ class Case(TypedDict):
 class Traffic(TypedDict):
     """`mission.bytes_per_detection`."""
 
-    latent: Annotated[float, "bytes in the map", "Size of a belief.", 0]
-    features: Annotated[float, "bytes of features", "Mean size of a detection's features.", 0]
-    raw: Annotated[float, "bytes of a scan", "Mean size of a detection's scan.", 0]
+    latent: Annotated[float, Metric("bytes in the map", "Size of a belief.", 0)]
+    features: Annotated[
+        float, Metric("bytes of features", "Mean size of a detection's features.", 0)
+    ]
+    raw: Annotated[float, Metric("bytes of a scan", "Mean size of a detection's scan.", 0)]
 
 
 _TRAFFIC = "bytes_per_detection"
@@ -209,21 +250,23 @@ class Results(TypedDict):
 class Evaluation(TypedDict):
     """Missions of `evaluate` in the same arenas: `RUN/evaluations/NAME.json`."""
 
-    num_pois: Annotated[int, "PoIs", "Points of interest of an evaluation.", 0]
-    side: Annotated[float, "side [m]", "Of its arena.", 2]
-    robots: Annotated[list[str], "robots", "The sensor of each."]
+    num_pois: Annotated[int, Metric("PoIs", "Points of interest of an evaluation.", 0)]
+    side: Annotated[float, Metric("side [m]", "Of its arena.", 2)]
+    robots: Annotated[list[str], Metric("robots", "The sensor of each.")]
     mission: Missions
 
 
 class Header(TypedDict):
     """The keys of a summary about the run itself."""
 
-    preset: Annotated[str, "preset", "Origin of the settings."]
-    seed: Annotated[int, "seed", "Of all randomness; of several, the first."]
-    versions: Annotated[dict[str, str], "versions", "Of Python and of libraries."]
-    devices: Annotated[list[str], "devices", "The kind of each accelerator, or `cpu`."]
-    seeds: NotRequired[Annotated[dict[str, Results], "seeds", "The results of each of several."]]
-    failed: NotRequired[Annotated[dict[str, str], "failed", "Seeds that failed, and why."]]
+    preset: Annotated[str, Metric("preset", "Origin of the settings.")]
+    seed: Annotated[int, Metric("seed", "Of all randomness; of several, the first.")]
+    versions: Annotated[dict[str, str], Metric("versions", "Of Python and of libraries.")]
+    devices: Annotated[list[str], Metric("devices", "The kind of each accelerator, or `cpu`.")]
+    seeds: NotRequired[
+        Annotated[dict[str, Results], Metric("seeds", "The results of each of several.")]
+    ]
+    failed: NotRequired[Annotated[dict[str, str], Metric("failed", "Seeds that failed, and why.")]]
 
 
 class Summary(Header, Results):
@@ -253,7 +296,8 @@ def _metrics(block: type, prefix: str = "") -> Iterator[Metric]:
         if is_block(inner):
             yield from _metrics(inner, f"{prefix}{name}.")
         elif get_origin(inner) is Annotated:
-            yield Metric(f"{prefix}{name}", *inner.__metadata__)
+            metric: Metric = inner.__metadata__[0]
+            yield dataclasses.replace(metric, key=f"{prefix}{name}")
 
 
 def _table(block: type) -> dict[str, Metric]:

@@ -22,16 +22,16 @@ class Metric:
     """One value of a block.
 
     Attributes:
-      key: its place in the block; a dot leads into an inner block.
       label: its name.
       meaning: what it measures; empty if the label is enough.
       digits: after the point.
+      key: its place in the block, which names it; a dot leads into an inner block.
     """
 
-    key: str
     label: str
     meaning: str = ""
     digits: int = 3
+    key: str = ""
 
     def value(self, block: Mapping[str, object]) -> object:
         """Its value in a block; None if there is none."""

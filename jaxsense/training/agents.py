@@ -234,7 +234,17 @@ def tour_stages(config: Config) -> list[Stage]:
         return state[0].params
 
     inputs = {"look_values": "look_values", "fusion": "fusion", "detections": "detections"}
-    return [Stage("tours", begin, inputs, advance, finish, settings.steps, chunks)]
+    return [
+        Stage(
+            "tours",
+            begin,
+            inputs,
+            advance=advance,
+            finish=finish,
+            steps=settings.steps,
+            chunks=chunks,
+        )
+    ]
 
 
 def _auction(config: Config, fusion: Fusion, look_values: tuple[LookValues, ...]) -> tours.Policy:

@@ -52,5 +52,13 @@ def fit_stage(
         model, fit = state
         return trained(config, model, fit, **inputs)
 
-    chunks = num_chunks(steps)
-    return Stage(name, begin, inputs, advance, finish, steps, chunks, is_optional)
+    return Stage(
+        name,
+        begin,
+        inputs,
+        advance=advance,
+        finish=finish,
+        steps=steps,
+        chunks=num_chunks(steps),
+        is_optional=is_optional,
+    )

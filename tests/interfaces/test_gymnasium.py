@@ -1,5 +1,7 @@
 """The vector environment: the MDP's own functions, and Gymnasium's rules of what follows an end."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from jaxsense.dqn import map_mdp, observation
+from jaxsense.interfaces import gymnasium as ours
 from jaxsense.interfaces import prepared_starts
 from jaxsense.interfaces.gymnasium import MapVectorEnv
 
@@ -124,6 +127,20 @@ def test_without_autoreset_only_the_masked_environments_start_again(starts):
         env.reset(options={"reset_mask": np.ones(2, bool)})
     with pytest.raises(ValueError, match=r"reset_mask = \[1, 0, 1\]: must hold 3 booleans"):
         env.reset(options={"reset_mask": [1, 0, 1]})
+
+
+def test_the_mdp_is_an_input_of_the_programs(starts):
+    mdp = small.small_mdp()
+    # The classes swap their detections.
+    bank = jax.tree.map(lambda features: features[::-1], mdp.looks)
+    seen, programs = [], []
+    for each in (mdp, dataclasses.replace(mdp, looks=bank)):
+        env = MapVectorEnv(each, LIDAR, 4, starts)
+        env.reset(seed=3)
+        seen.append(env.step(np.zeros(4, int))[0])
+        programs.append((ours._start._cache_size(), ours._step._cache_size()))
+    assert programs[0] == programs[1]
+    assert np.any(seen[0] != seen[1])
 
 
 def test_a_mask_may_be_a_list(starts):

@@ -130,3 +130,9 @@ def test_a_map_that_loses_information_is_told(nll, expected):
     block = {"looks": [1, 2], "nll": nll, "bayes_nll": [0.5, 0.1]}
     told = compare.unsound(block)
     assert told is None if expected is None else expected in told
+
+
+def test_the_largest_loss_of_information_is_told():
+    # .7 - .5 = .2 after one look, and .5 - .1 = .4 after two, where the NLL itself is lower.
+    told = compare.unsound({"looks": [1, 2], "nll": [0.7, 0.5], "bayes_nll": [0.5, 0.1]})
+    assert "NLL after 2 looks is 0.50, that of exact Bayes 0.10." in told

@@ -85,6 +85,14 @@ def test_figures_of_policies_as_worked_by_hand():
         for block in (found, found["other_numbers"]["9"]):
             assert (block["optimal"] is None) is is_null
         assert (found["optimal_states"] is None) is is_null
+    # Of other numbers of PoIs alone: only theirs has no optimum then.
+    better = {**rewards, "greedy": (total[1] + 0.03, total[1])}
+    found = make.agent(SMALL, rewards, different, [1.0], {9: better})
+    assert found["optimal"] == pytest.approx(1.1)
+    assert found["other_numbers"]["9"]["optimal"] is None
+    # .010 more without an error is within a share of .01 of 1.1.
+    better = {**rewards, "greedy": (total[1] + 0.010, total[1])}
+    assert make.agent(SMALL, better, different, [1.0], {})["optimal"] == pytest.approx(1.1)
     none = dict.fromkeys(names, (np.zeros(19), np.zeros(19)))
     nothing = make.agent(SMALL, none, permutations(SMALL), [1.0], {})
     assert "other_numbers" not in nothing
