@@ -11,11 +11,9 @@ from types import ModuleType
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
-from sphinx.util.docutils import SphinxDirective
 from sphinx.writers.html5 import HTML5Translator
 
 import jaxsense
-from jaxsense import summary
 
 project = "jaxsense"
 author = "the jaxsense authors"
@@ -134,20 +132,17 @@ def block_math(translator: HTML5Translator, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
-class MetricsTable(SphinxDirective):
-    """The table of metrics that the terminal and the report page show as well."""
+# A module or a package of jaxsense, as pages link to it for readers on GitHub.
+SOURCE = re.compile(r"\]\(\.\./(jaxsense(?:/\w+)*)(?:\.py)?\)")
 
-    def run(self) -> list[nodes.Node]:
-        """Writes one row for each metric."""
-        rows = ["| key | name | meaning |", "| --- | --- | --- |"]
-        for place, block in summary.BLOCKS.items():
-            for metric in block.values():
-                rows.append(f"| `{place}{metric.key}` | {metric.label} | {metric.meaning} |")
-        return self.parse_text_to_nodes("\n".join(rows))
+
+def link_to_reference(app: Sphinx, name: str, source: list[str]) -> None:
+    """Links to the API reference where a page links to a source file."""
+    source[0] = SOURCE.sub(lambda found: f"](#{found[1].replace('/', '.')})", source[0])
 
 
 def setup(app: Sphinx) -> None:
     """Registers what this file adds to Sphinx."""
-    app.add_directive("metrics", MetricsTable)
+    app.connect("source-read", link_to_reference)
     app.connect("autodoc-process-docstring", keep_colons, priority=400)
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))

@@ -51,7 +51,8 @@ class Fusion(TypedDict):
         float | None, Metric("fusion: error", "Distance from the joint belief in sigma.")
     ]
     std_error: Annotated[
-        float | None, Metric("fusion: error of sigma", "Mean |log(ratio)| to the joint's.")
+        float | None,
+        Metric("fusion: error of sigma", "Mean absolute log-ratio to the joint sigma."),
     ]
 
 
@@ -102,7 +103,8 @@ class Beliefs(TypedDict):
     ]
     bayes_accuracy: Annotated[list[float], Metric("accuracy of exact Bayes")]
     doubt_correlation: Annotated[
-        float, Metric("sigma and uncertainty", "Correlation of ||sigma|| with the exact entropy.")
+        float,
+        Metric("sigma and uncertainty", "Correlation of the sigma norm with the exact entropy."),
     ]
 
 

@@ -46,8 +46,13 @@ def test_every_rare_key_is_somewhere():
 
 
 def test_the_page_about_runs_shows_this_table():
-    # Which `docs/conf.py` makes of it.
-    assert "```{metrics}" in (DOCS / "getting-started.md").read_text(encoding="utf-8")
+    rows = ["| key | name | meaning |", "| --- | --- | --- |"]
+    for place, block in BLOCKS.items():
+        for metric in block.values():
+            meaning = metric.meaning and f" {metric.meaning}"
+            rows.append(f"| `{place}{metric.key}` | {metric.label} |{meaning} |")
+    page = (DOCS / "getting-started.md").read_text(encoding="utf-8")
+    assert "\n\n" + "\n".join(rows) + "\n\n" in page
 
 
 @pytest.mark.parametrize(
