@@ -44,7 +44,7 @@ def main(argv: list[str]) -> None:
 def _results() -> dict[str, np.ndarray]:
     """Scans, beliefs and motion in random scenes, on the default device."""
     config = PRESETS["default"]
-    team = mission.make_mission(config)
+    scenario = mission.make_mission(config)
     models, model = init(jax.random.key(0), config), make_jmvae(config)
     keys = jax.random.split(jax.random.key(1), _SCENES)
 
@@ -52,15 +52,17 @@ def _results() -> dict[str, np.ndarray]:
     def run(keys: jax.Array):
         shape = _SCENES, config.arena.num_pois
         classes = jax.random.randint(jax.random.key(2), shape, 0, len(config.arena.classes))
-        _, windows, _ = jax.vmap(lambda key, classes: sim.survey(key, team.world, classes))(
+        _, windows, _ = jax.vmap(lambda key, classes: sim.survey(key, scenario.world, classes))(
             keys, classes
         )
         of_each = jax.vmap(jax.vmap(detect, (None, 0)), (None, 0))
         features = [of_each(d, w) for d, w in zip(models.detectors, windows, strict=True)]
         encode = jax.vmap(jax.vmap(lambda *f: posterior(models.jmvae, model, f)))
-        states = jax.vmap(lambda key: mission.reset(key, team, models, team.policy("naive")))(keys)
+        states = jax.vmap(
+            lambda key: mission.reset(key, scenario, models, scenario.policy("naive"))
+        )(keys)
         periods = round(_SECONDS / config.mission.control_period)
-        states, _ = mission.rollout_batch(keys, team, models, states, periods, every=_SCENES)
+        states, _ = mission.rollout_batch(keys, scenario, models, states, periods, every=_SCENES)
         found = dict(zip(config.modalities, windows, strict=True))
         return found, encode(*features), states.scene.poses
 

@@ -168,7 +168,7 @@ class Curves:
         """Missions of E arenas, with a program that is compiled once."""
         own = {f"naive_{k}": Policy(policies.naive(k), is_unordered=True) for k in (4, NAIVE)}
         own |= {f"oracle_{share}": oracle(share) for share in ORACLE}
-        self.team = mission.make_mission(config, own)
+        self.scenario = mission.make_mission(config, own)
         self._keys = jax.random.split(key, episodes)
         self._begin = jax.jit(jax.vmap(self._start, in_axes=(0, None, None)))
         self._go_on = jax.jit(self._play_on)
@@ -176,8 +176,8 @@ class Curves:
 
     def _start(self, key: Key, models: Models, policy: jax.Array) -> MissionState:
         """A mission in which the policies `oracle` read the true classes."""
-        state = mission.reset(key, self.team, models, policy)
-        names = [*self.team.policies]
+        state = mission.reset(key, self.scenario, models, policy)
+        names = [*self.scenario.policies]
         knows = jnp.array([name.startswith("oracle") for name in names])[policy]
         of_class = jax.nn.one_hot(state.classes, state.log_posterior.shape[1])
         truth = jax.nn.log_softmax(100 * of_class)
@@ -187,10 +187,10 @@ class Curves:
 
     def _play_on(self, keys: Key, models: Models, states: MissionState) -> MissionState:
         each = len(self._keys)
-        return mission.rollout_batch(keys, self.team, models, states, _CHUNK, each)[0]
+        return mission.rollout_batch(keys, self.scenario, models, states, _CHUNK, each)[0]
 
     def _result(self, models: Models, state: MissionState) -> dict[str, jax.Array]:
-        found = mission.measure(self.team, models, state)
+        found = mission.measure(self.scenario, models, state)
         return {
             "accuracy": jnp.mean(found["is_right"].astype(jnp.float32)),
             "looks": found["observations_per_poi"],
@@ -204,7 +204,7 @@ class Curves:
           models: trained models.
           policy: its name.
         """
-        states = self._begin(self._keys, models, jnp.int32(self.team.policy(policy)))
+        states = self._begin(self._keys, models, jnp.int32(self.scenario.policy(policy)))
         for chunk in itertools.count(1):
             keys = jax.vmap(lambda key: jax.random.fold_in(key, chunk))(self._keys)  # noqa: B023
             states = self._go_on(keys, models, states)

@@ -73,11 +73,11 @@ def physics(options: Options) -> Row:
 def physics_contacts(options: Options) -> Row:
     """As in the mission, where the contact solver runs only while a robot is near something."""
     batches, periods = _mission_sizes(options)
-    team, states = _mid_mission(batches[-1], periods)
-    ours = [_move_side(team, _first(states, batch)) for batch in batches]
+    scenario, states = _mid_mission(batches[-1], periods)
+    ours = [_move_side(scenario, _first(states, batch)) for batch in batches]
     theirs = []
     if options.peers:
-        theirs = _native_sides(team.world.arena, _as_drives(states))
+        theirs = _native_sides(scenario.world.arena, _as_drives(states))
         _check(devices.joined(ours[-1].run()), theirs[0].run(), _CONTACT_TOLERANCE, share=0.99)
     return measure.compare("physics_contacts", _UNIT, ours, theirs, options, **_PEER)
 
@@ -125,16 +125,16 @@ def _random_drives(key: jax.Array, config: Config, batch: int, steps: int) -> Dr
 @functools.cache
 def _mid_mission(batch: int, periods: int) -> tuple[Mission, MissionState]:
     """`[B, P]` states that the physics was given in P successive periods of naive missions."""
-    team = mission.make_mission(_UNTRAINED)
-    networks = init(jax.random.key(0), team.config)
+    scenario = mission.make_mission(_UNTRAINED)
+    networks = init(jax.random.key(0), scenario.config)
 
     def play(keys: jax.Array) -> MissionState:
         reset_keys, play_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-        naive = team.policy("naive")
-        states = jax.vmap(lambda key: mission.reset(key, team, networks, naive))(reset_keys)
+        naive = scenario.policy("naive")
+        states = jax.vmap(lambda key: mission.reset(key, scenario, networks, naive))(reset_keys)
 
         def step(states: MissionState, keys: jax.Array):
-            after, _ = mission_step(keys, team, networks, states)
+            after, _ = mission_step(keys, scenario, networks, states)
             # What the robots decided in this period, from where they stood before it.
             robots = dataclasses.replace(states.robots, wanted=after.robots.wanted)
             return after, dataclasses.replace(states, robots=robots)
@@ -152,7 +152,7 @@ def _mid_mission(batch: int, periods: int) -> tuple[Mission, MissionState]:
     record = jax.jit(play, compiler_options=fast_to_compile)
     played = record(jax.random.split(jax.random.key(1), min(batch, _MOST_PLAYED)))
     rows = jnp.arange(batch) % min(batch, _MOST_PLAYED)
-    return team, jax.tree.map(lambda x: x[rows], played)
+    return scenario, jax.tree.map(lambda x: x[rows], played)
 
 
 def _as_drives(states: MissionState) -> Drives:
@@ -201,17 +201,17 @@ def _drive_side(arena: Arena, drives: Drives) -> Side:
     )
 
 
-def _move_side(team: Mission, states: MissionState) -> Side:
+def _move_side(scenario: Mission, states: MissionState) -> Side:
     """Our physics as the mission calls it, one period after the other, on all devices."""
 
     def periods(states: MissionState) -> tuple[jax.Array, jax.Array]:
         by_period = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), states)
-        moved = jax.lax.map(lambda states: move(team, states)[0], by_period)
+        moved = jax.lax.map(lambda states: move(scenario, states)[0], by_period)
         poses, velocity = moved.scene.poses, moved.velocity
         return tuple(jnp.swapaxes(x, 0, 1) for x in (poses, velocity))  # pyright: ignore
 
     batch, number = states.steps.shape
-    substeps = round(team.config.mission.control_period / arenas.TIMESTEP)
+    substeps = round(scenario.config.mission.control_period / arenas.TIMESTEP)
     work = batch * number * substeps
     workers = devices.start(None)
     return measure.compiled(periods, states, work=work, batch=batch, workers=workers)

@@ -45,15 +45,15 @@ def main(argv: list[str]) -> None:
 
 def trips(config: Config, models: Models) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Trips from a decision to a look: `[W, 3]` first poses, `[W, 2]` PoIs and `[W]` seconds."""
-    team = mission.make_mission(config)
+    scenario = mission.make_mission(config)
     period = config.mission.control_period
     steps = int(config.mission.time_limit / period)
-    naive = team.policy("naive")
+    naive = scenario.policy("naive")
 
     @jax.jit
     def play(keys: jax.Array):
-        states = jax.vmap(lambda key: mission.reset(key, team, models, naive))(keys)
-        _, records = mission.rollout_batch(keys, team, models, states, steps, 1)
+        states = jax.vmap(lambda key: mission.reset(key, scenario, models, naive))(keys)
+        _, records = mission.rollout_batch(keys, scenario, models, states, steps, 1)
         return states.scene.poses, states.scene.layout.position, records
 
     first, positions, record = jax.tree.map(

@@ -35,6 +35,6 @@ if __name__ == "__main__":
     for look in range(3):
         state, outcome = step(jax.random.key(look), mdp, state, jnp.int32(0), jnp.int32(look % 2))
         print(f"sigma {state.belief.std[0]} after look {look + 1}, reward {outcome.reward:.2f}")
-    team = mission.make_mission(config)
-    play = jax.jit(lambda k: mission.rollout(k, team, models, mission.reset(k, team, models), 50))
-    print(f"looks in a mission:\n{play(key)[0].times_seen}")
+    scenario = mission.make_mission(config)
+    play = jax.jit(lambda k, m: mission.rollout(k, scenario, m, mission.reset(k, scenario, m), 50))
+    print(f"looks in a mission:\n{play(key, models)[0].times_seen}")

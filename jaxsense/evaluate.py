@@ -97,8 +97,8 @@ def main(
         workers = devices.start(arguments.devices)
         trained, models = rundir.load(arguments.run, arguments.trust)
         config = _elsewhere(arguments, trained, models.agent.plays)
-        team = mission.make_mission(config, policies)
-        played = _cases(arguments, team)
+        scenario = mission.make_mission(config, policies)
+        played = _cases(arguments, scenario)
         # If these files cannot be written, fail now rather than after minutes of work.
         with files.locked(arguments.run, on_wait=say):
             _report(arguments.run, trained)
@@ -112,7 +112,7 @@ def main(
     key = jax.random.key(arguments.seed)
     with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
         number = arguments.episodes * len(played)
-        player = missions.Player(team, compiler, missions.batch_of(number), workers)
+        player = missions.Player(scenario, compiler, missions.batch_of(number), workers)
         player.wait()
         begin = time.perf_counter()
         try:
@@ -121,7 +121,7 @@ def main(
             cli.fail(PROGRAM, str(error))
         seconds = time.perf_counter() - begin
         compiling = compiler.monitor.seconds["mission"]["compile_s"]
-    block = summary.missions(team, found.metrics)
+    block = summary.missions(scenario, found.metrics)
     draw = functools.partial(
         animation.draw,
         config,
@@ -232,12 +232,12 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
     return dataclasses.replace(config, arena=arena, robots=robots, mdp=mdp)
 
 
-def _cases(arguments: Arguments, team: mission.Mission) -> dict[str, mission.Case]:
+def _cases(arguments: Arguments, scenario: mission.Mission) -> dict[str, mission.Case]:
     """The cases to play; raises `ConfigError` for an unknown policy or too many episodes."""
     # Checked like the number of a run's own missions.
-    settings = dataclasses.replace(team.config.mission, episodes=arguments.episodes)
-    dataclasses.replace(team.config, mission=settings)
-    cases = mission.cases(team.config, team.policies)
+    settings = dataclasses.replace(scenario.config.mission, episodes=arguments.episodes)
+    dataclasses.replace(scenario.config, mission=settings)
+    cases = mission.cases(scenario.config, scenario.policies)
     if arguments.policy == "all":
         return cases
     if arguments.policy == "policies":

@@ -248,8 +248,8 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
         devices.start(None),
     )
     with Compiler(Monitor(), kept) as compiler:
-        team, batch = mission.make_mission(config), missions.batch_of(11)
-        player = missions.Player(team, compiler, batch, workers)
+        scenario, batch = mission.make_mission(config), missions.batch_of(11)
+        player = missions.Player(scenario, compiler, batch, workers)
         played = player.play(jax.random.key(0), models, {"latent": case}, 1)
     found, recording = played.metrics["latent"], played.recording
     np.testing.assert_array_equal(found["detections"][0], recording.records.detected.sum(axis=0))

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import html
+import inspect
 import json
 import re
 import shlex
@@ -10,12 +11,14 @@ import shutil
 import subprocess
 from html.parser import HTMLParser
 
+import jax
 import pytest
 from matplotlib.figure import Figure
 from recordings import CONFIG, FIELDS_OF_VIEW, FUSION, recording
 from summaries import CASE, EVALUATION, SUMMARY
 
-from jaxsense import summary
+import jaxsense
+from jaxsense import mission, summary
 from jaxsense.show import animation, page
 from jaxsense.summary import statistics
 
@@ -128,6 +131,29 @@ def test_another_task_is_not_compared_with_the_papers(tmp_path, change):
     agent = {**SUMMARY["dqn"]["camera"], **change}
     content = {**SUMMARY, "dqn": {"camera": agent, "lidar": agent}}
     assert "0.426*" not in page.render(write_run(tmp_path), CONFIG, content)
+
+
+def test_the_program_of_the_page_runs(run, monkeypatch, capsys):
+    played = recording()
+
+    def reset(key, mission, models):
+        return played.end
+
+    def rollout(key, mission, models, state, steps):
+        assert (mission.config, models, steps) == (CONFIG, "models", 300)
+        return state, played.records
+
+    for stub in (reset, rollout):
+        own = inspect.signature(getattr(mission, stub.__name__)).parameters
+        assert [*inspect.signature(stub).parameters] == [*own][: stub.__code__.co_argcount]
+        monkeypatch.setattr(mission, stub.__name__, stub)
+    monkeypatch.setattr(jax, "jit", lambda function, static_argnames: function)
+    monkeypatch.setattr(jaxsense, "load", lambda path: (CONFIG, "models"))
+    (program,) = re.findall(
+        r"<code>(import jax.*?)</code>", (run / "report.html").read_text(), re.S
+    )
+    exec(html.unescape(program), {})
+    assert capsys.readouterr().out == f"{played.records.belief.mean[-1]} {played.end.classes}\n"
 
 
 def test_what_was_run_is_told_and_escaped(run, read):

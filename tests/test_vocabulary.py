@@ -104,6 +104,13 @@ def test_the_report_avoids_what_contributing_lists():
     assert not hits(prose_of_template(path.read_text(encoding="utf-8")))
 
 
+@pytest.mark.parametrize("path", [*SOURCES, *SCRIPTS], ids=lambda path: path.stem)
+def test_a_mission_is_not_called_a_team(path):
+    text = path.read_text(encoding="utf-8")
+    assert not re.search(r"\b(team|played): (mission\.)?Mission\b", text)
+    assert not re.search(r"\b(team|played) = (mission\.)?(make_mission|with_numbers)\(", text)
+
+
 def test_prose_is_told_from_names():
     source = '''"""Robots are
 unsure of `lidar`, likewise dqn_lidar and --lidar.range."""

@@ -153,7 +153,11 @@ def check_fields(section: object, bits: int = 31) -> None:
 
 
 def require_32_bits() -> None:
-    """Raises `ConfigError` if JAX computes in 64 bits, which jaxsense does not support."""
+    """Checks that JAX computes in 32 bits.
+
+    Raises:
+      ConfigError: if it computes in 64 bits, which jaxsense does not support.
+    """
     if jax.config.read("jax_enable_x64"):
         raise ConfigError("JAX_ENABLE_X64", True, "must be off, as jaxsense computes in 32 bits")
 

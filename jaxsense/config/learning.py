@@ -281,8 +281,8 @@ class EvaluationConfig(Section, place="evaluation"):
     num_starts: int = limited(512, at_least=1)
     """Start states of the episodes."""
     num_repeats: Traced[int] = limited(96, at_least=1)
-    """Episodes per start state, to average over the noise of detections; an eighth as many for the
-    naive and the random policy."""
+    """Episodes per start state, to average over the noise of detections; an eighth as many for all
+    policies but the learned and the optimal one."""
     num_histories: int = limited(8190, at_least=1, at_most=10_000_000)
     """Random sequences of looks at a PoI, after which the map is compared with exact Bayes."""
     num_pois: tuple[int, ...] = limited((), at_least=1, at_most=64)

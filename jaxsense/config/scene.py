@@ -47,7 +47,11 @@ class ArenaConfig(Section, place="arena"):
     """Attributes besides colour and shape, for custom sensors."""
 
     def check(self) -> None:
-        """Checks names, classes and room for the PoIs; raises `ConfigError`."""
+        """Checks names, classes and room for the PoIs.
+
+        Raises:
+          ConfigError: if one of them is wrong.
+        """
         for field, names in (("colours", self.colours), ("shapes", self.shapes)):
             require_words(names, f"arena.{field}")
             require(len(names) > 0, self, field, "must name one or more")

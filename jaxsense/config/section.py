@@ -57,7 +57,11 @@ class Checked:
         self.check()
 
     def check(self) -> None:
-        """Checks relations between fields; raises `ConfigError`."""
+        """Checks relations between fields.
+
+        Raises:
+          ConfigError: if one does not hold.
+        """
 
 
 class Section(Checked):

@@ -51,7 +51,11 @@ def _without_twins(fields: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def require_trust(config: Config) -> None:
-    """Raises `ConfigError` if settings name code of custom sensors, which would run."""
+    """Checks that making the sensors would run no code that the settings name.
+
+    Raises:
+      ConfigError: if there are custom sensors.
+    """
     for name, sensor in config.sensors.items():
         reason = "names code that would be run; pass --trust (trust=True) if you trust it"
         raise ConfigError(f"sensors.{name}.make", sensor.make, reason)

@@ -132,10 +132,10 @@ class Player:
             policies: jax.Array,
             faults: Faults,
         ):
-            team = with_numbers(config)
+            scenario = with_numbers(config)
 
             def begin_one(episode: jax.Array, policy: jax.Array, faults: Faults):
-                return reset(keys_of_episode(key, episode)[0], team, models, policy, faults)
+                return reset(keys_of_episode(key, episode)[0], scenario, models, policy, faults)
 
             return jax.vmap(begin_one)(episode, policies, faults)
 
@@ -147,11 +147,11 @@ class Player:
             number: jax.Array,
             state: MissionState,
         ):
-            team = with_numbers(config)
+            scenario = with_numbers(config)
             keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(episode)
             keys = jax.vmap(jax.random.fold_in)(keys, number)
-            state, records = rollout_batch(keys, team, models, state, chunk, share, parts)
-            return state, jax.vmap(lambda s: measure(team, models, s))(state), records
+            state, records = rollout_batch(keys, scenario, models, state, chunk, share, parts)
+            return state, jax.vmap(lambda s: measure(scenario, models, s))(state), records
 
         key, numbers = jax.random.key(0), jax.ShapeDtypeStruct((batch,), jnp.int32)
         faults = jax.tree.map(

@@ -199,8 +199,8 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
 def _trace_missions(programs: Programs, compiler: Compiler) -> None:
     config = programs.config
     batch = missions.batch_of(len(config.mission.policies) * config.mission.episodes)
-    team = mission.make_mission(config, programs.policies)
-    programs.player.set_result(missions.Player(team, compiler, batch, programs.workers))
+    scenario = mission.make_mission(config, programs.policies)
+    programs.player.set_result(missions.Player(scenario, compiler, batch, programs.workers))
 
 
 def _trace_stage(programs: Programs, stage: Stage) -> None:

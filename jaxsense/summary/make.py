@@ -177,7 +177,7 @@ def case(config: Config, name: str, found: Measured) -> Case:
 
 
 def calibration(found: Measured) -> Calibration:
-    """Whether maps are as sure of the PoIs that were detected as they are right.
+    """Whether the confidence of maps matches their accuracy, at PoIs that were detected.
 
     Args:
       found: metrics of missions.

@@ -238,10 +238,10 @@ def test_a_robot_alone_is_measured_by_the_labels_of_its_sensor():
 @pytest.mark.slow  # traces two missions
 def test_the_program_of_a_mission_does_not_grow_with_its_robots(models):
     def lines(pairs):
-        team = mission.make_mission(replace(CONFIG, robots=("camera", "lidar") * pairs))
-        play = jax.jit(lambda key, state: mission.rollout(key, team, models, state, 4))
+        scenario = mission.make_mission(replace(CONFIG, robots=("camera", "lidar") * pairs))
+        play = jax.jit(lambda key, state: mission.rollout(key, scenario, models, state, 4))
         key = jax.random.key(0)
-        state = jax.eval_shape(lambda key: mission.reset(key, team, models, NAIVE), key)
+        state = jax.eval_shape(lambda key: mission.reset(key, scenario, models, NAIVE), key)
         return str(play.trace(key, state).jaxpr).count("\n")
 
     assert lines(4) <= 1.3 * lines(1)
