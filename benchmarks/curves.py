@@ -225,7 +225,7 @@ def play_all(curves: Curves, costs: tuple[float, ...], priced: Models, free: Mod
     each = [jax.tree.map(lambda x: x[i], priced) for i in range(len(costs))]  # noqa: B023
     for name in _BY_COST:
         yield name, {"look_cost": costs}, _stacked([curves.play(m, name) for m in each])
-    names = [name for name in curves.team.policies if name.startswith("naive")]
+    names = [name for name in curves.scenario.policies if name.startswith("naive")]
     yield "naive", {"looks": tuple(range(1, NAIVE + 1))}, _of(curves, free, names)
     names = [f"oracle_{share}" for share in ORACLE]
     yield "oracle", {"probability": ORACLE}, _of(curves, free, names)

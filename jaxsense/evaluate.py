@@ -128,7 +128,7 @@ def main(
         found.recording.records,
         found.recording.end,
         models.fusion,
-        {sensor.name: sensor.field_of_view for sensor in team.world.sensors},
+        {sensor.name: sensor.field_of_view for sensor in scenario.world.sensors},
     )
     try:
         written = _write(arguments, trained, config, block, draw)
@@ -203,7 +203,7 @@ def _evaluation(config: Config, missions: summary.Missions) -> summary.Evaluatio
 
 
 def _place(config: Config) -> str:
-    """Name of an arena and a team, also for files, whose names are short."""
+    """Short name of an arena and its robots, for file names."""
     numbers = {modality: config.carried.count(modality) for modality in config.carried}
     robots = "-".join(f"{number}-{modality}" for modality, number in numbers.items())
     return f"{config.arena.num_pois}-points-{config.arena.side:g}-m-{robots}"
@@ -241,7 +241,7 @@ def _cases(arguments: Arguments, scenario: mission.Mission) -> dict[str, mission
     if arguments.policy == "all":
         return cases
     if arguments.policy == "policies":
-        return {name: cases[name] for name in team.policies}
+        return {name: cases[name] for name in scenario.policies}
     if arguments.policy not in cases:
         known = ", ".join(["all", "policies", *cases])
         raise ConfigError("policy", arguments.policy, f"must be one of {known}")

@@ -73,7 +73,7 @@ def archive(config: Config, models: Models) -> bytes:
 
 
 def _description(config: Config, models: Models) -> dict[str, object]:
-    """What a reader of the file needs besides the programs."""
+    """Everything a reader of the file needs except the programs."""
     arena = config.arena
     versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib")}
     prior = models.fusion.prior
@@ -124,7 +124,7 @@ def main(argv: list[str] | None = None) -> None:
         with files.new(path) as file:
             file.write(content := archive(config, models))
     except FileExistsError:
-        cli.fail(PROGRAM, str(ConfigError("out", str(path), "exists already; must be a new file")))
+        cli.fail(PROGRAM, str(ConfigError("out", str(path), "already exists; must be a new file")))
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:

@@ -175,7 +175,7 @@ def _fields(cls: type) -> list[tuple[str, object, Limits | None]]:
 
 
 def _parts(place: str, value: object) -> Iterator[tuple[str, object]]:
-    """The items of a dictionary and their places, or the value itself."""
+    """Each item of a dictionary with its place, or the value alone."""
     if isinstance(value, FrozenDict):
         yield from ((f"{place}.{name}", each) for name, each in value.items())
     else:

@@ -120,7 +120,7 @@ class MdpConfig(Section, place="mdp"):
     unseen_variance: Traced[float] = limited(20.0, above=0, at_most=_MAX_WEIGHT)
     """Variance of each latent dimension of the prior, the belief before any look."""
     reward: Literal["paper", "nats"] = "paper"
-    """What a look is rewarded for. `paper`: the gain of 1 / ||sigma||, or -1, see `min_increase`.
+    """Reward of a look. `paper`: the gain of 1 / ||sigma||, or -1, see `min_increase`.
     `nats`: the information gained about the class, minus `look_cost`."""
     look_cost: Traced[float] = limited(0.05, at_least=0, at_most=_MAX_WEIGHT)
     """Cost of a look with the reward `nats`."""

@@ -277,7 +277,7 @@ class _Formatter(argparse.HelpFormatter):
 
 
 def _metavar(option: _Option) -> str:
-    """What the help shows in place of each word of a value."""
+    """Placeholder in the help for each word of a value."""
     kind, _ = option.words
     if get_origin(kind) is Literal:
         return f"{{{','.join(get_args(kind))}}}"

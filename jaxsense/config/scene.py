@@ -158,7 +158,7 @@ class LidarConfig(Section, place="lidar"):
     """Growth of that standard deviation with the distance, in metres per metre."""
     mixed_pixels: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam returns a distance between its surface and its neighbour's; at an
-    edge, nothing is there."""
+    edge, it has no return."""
     dropout: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam has no return."""
     window: int = limited(128, at_least=1)
@@ -191,7 +191,7 @@ class CameraConfig(Section, place="camera"):
     colour_cast: float = limited(0.0, at_least=0, at_most=10)
     """Standard deviation of the natural logarithm of each channel's brightness in an image."""
     low_light: float = limited(0.0, at_least=0, at_most=1)
-    """Largest share of the light that may be missing in an image; the share is uniform."""
+    """Maximum share of the light that an image may lack, drawn uniformly from 0."""
     shadow: float = limited(0.0, at_least=0, at_most=1)
     """Probability of a shadow: on one side of a random pixel, only ambient light remains."""
     light_distance: Traced[float] = limited(0.5, above=0)

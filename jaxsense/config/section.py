@@ -67,7 +67,7 @@ class Checked:
 class Section(Checked):
     """Base of the sections: a pytree whose leaves are the fields declared `Traced`, and sections.
 
-    Arrays and JAX's placeholders have no values to check: sections that hold them are not checked.
+    Sections that hold arrays or JAX's placeholders are not checked: these have no values yet.
     """
 
     _LEAVES: ClassVar[tuple[str, ...]] = ()

@@ -46,7 +46,7 @@ def _without_twins(fields: list[tuple[str, object]]) -> dict[str, object]:
     if len(found) < len(fields):
         names = [name for name, _ in fields]
         twin = next(name for name in found if names.count(name) > 1)
-        raise ValueError(f"{twin!r} is given twice")
+        raise ValueError(f"{twin!r} appears twice")
     return found
 
 

@@ -28,7 +28,7 @@ class FitConfig(Protocol):
 
 
 class Problem(Protocol, Generic[D]):
-    """A loss to minimise, and what it is computed from."""
+    """A loss to minimise, with its data."""
 
     @property
     def config(self) -> FitConfig:
@@ -36,7 +36,7 @@ class Problem(Protocol, Generic[D]):
         ...
 
     def draw(self, key: Key, number: int) -> D:
-        """Draws everything random in some steps, which is much cheaper than drawing in the loop.
+        """Draws the random values of all steps together, much cheaper than step by step.
 
         Args:
           key: random key.

@@ -260,7 +260,7 @@ class TeamAgent:
 
         Args:
           belief: `[N, D]` the map.
-          team: where everybody is.
+          team: robots and PoIs at this moment.
           robot: `[]` int32, the robot that chooses.
         """
         travel, number = self.config.travel, self.num_modalities
@@ -309,7 +309,7 @@ class TeamAgent:
           tour_params: of the network of `tours`, or None.
           classes: not used.
           belief: `[N, D]` the map.
-          team: where everybody is.
+          team: robots and PoIs at this moment.
           robot: `[]` int32, the robot that chooses.
         """
         del classes
@@ -337,7 +337,7 @@ class TeamAgent:
           params: of the Q-network.
           classes: not used.
           belief: `[N, D]` the map.
-          team: where everybody is.
+          team: robots and PoIs at this moment.
           robot: `[]` int32, the robot that chooses.
         """
         values = self.decide(params, None, classes, belief, team, robot)

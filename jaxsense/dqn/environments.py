@@ -74,11 +74,11 @@ class Agent(Protocol):
         ...
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
-        """What the network of a robot reads.
+        """Input of a robot's network.
 
         Args:
           belief: `[N, D]` the map.
-          team: where everybody is.
+          team: robots and PoIs at this moment.
           robot: `[]` int32, the robot that chooses.
         """
         ...
@@ -123,7 +123,7 @@ class Agent(Protocol):
           tour_params: of the network of `tours`, if there is one.
           classes: `[C, D]` joint posterior of each class.
           belief: `[N, D]` the map.
-          team: where everybody is; PoIs that are not present are never chosen.
+          team: robots and PoIs at this moment; PoIs that are not present are never chosen.
           robot: `[]` int32, the robot that chooses.
         """
         ...
@@ -136,13 +136,13 @@ class Agent(Protocol):
         team: Team,
         robot: Int[Array, ""],
     ) -> Float[Array, " N"]:
-        """What a look at each PoI is worth, `[N]`: its value, less NOP's, if no other is left.
+        """What a look at each PoI is worth, `[N]`: its value minus NOP's, if no other is left.
 
         Args:
           params: of the robot's Q-network.
           classes: `[C, D]` joint posterior of each class.
           belief: `[N, D]` the map.
-          team: where everybody is.
+          team: robots and PoIs at this moment.
           robot: `[]` int32, the robot that chooses.
         """
         ...
@@ -152,14 +152,14 @@ class Environment(Protocol, Generic[S]):
     """An environment of one learner; a frozen pytree.
 
     Attributes:
-      agent: what learns.
+      agent: the learner.
       mdp: the MDP.
       num_actions: A; the last action is NOP.
     """
 
     @property
     def agent(self) -> Agent:
-        """What learns."""
+        """The learner."""
         ...
 
     @property
@@ -181,7 +181,7 @@ class Environment(Protocol, Generic[S]):
         ...
 
     def observe(self, state: S) -> Float[Array, " S"]:
-        """`[S]` what the agent's network reads."""
+        """Input of the agent's network, `[S]`."""
         ...
 
     def step(
@@ -206,7 +206,7 @@ class MapEnvironment:
     """The map MDP of one agent.
 
     Attributes:
-      agent: what learns.
+      agent: the learner.
       mdp: the MDP.
       modality: index of the agent's own sensor, see `map_mdp.step`.
       discount: `[]` discount factor of a step.
@@ -255,7 +255,7 @@ class MapEnvironment:
 
 @pytree
 class SmdpState:
-    """The state of a team, and what each robot observed and chose when it last set out.
+    """State of a team, with each robot's observation and choice when it last set out.
 
     Attributes:
       now: the state.
@@ -273,7 +273,7 @@ class TeamEnvironment:
     """The team MDP, whose robots share one agent.
 
     Attributes:
-      agent: what learns.
+      agent: the learner.
       mdp: the MDP.
     """
 
@@ -294,11 +294,11 @@ class TeamEnvironment:
         return SmdpState(now, nothing, jnp.full(num_robots, num_pois))
 
     def action_mask(self, state: SmdpState) -> Bool[Array, " A"]:
-        """`[A]` bool, PoIs that are present, and NOP."""
+        """Mask `[A]` of the PoIs that are present, and NOP."""
         return jnp.append(state.now.team.present, True)
 
     def observe(self, state: SmdpState) -> Float[Array, " S"]:
-        """`[F * N]` what the robot that chooses knows."""
+        """Observation `[F * N]` of the robot that chooses."""
         now = state.now
         return self.agent.observe(now.map.belief, now.team, now.agent)
 

@@ -65,7 +65,7 @@ class MapMdp:
     Attributes:
       looks: how it looks at a scene.
       fusion: how a look updates a belief.
-      reward: what a look is rewarded for.
+      reward: of a look.
       config: length and starts of episodes.
       num_pois: N.
     """
@@ -178,7 +178,7 @@ def reset_with_looks(
     classes: Int[Array, " N"] | None = None,
     seen: Bool[Array, "N M"] | None = None,
 ) -> tuple[MapState, tuple[jax.Array, ...]]:
-    """Starts an episode, see `reset`, and returns what it drew.
+    """Starts an episode as `reset` does, and also returns the features of its looks.
 
     Args:
       key: random key.
@@ -187,8 +187,8 @@ def reset_with_looks(
       seen: see `reset`.
 
     Returns:
-      The state, and for each modality `[N, D_m]` features of a look at each PoI, of which those
-      that `seen` marks are in the map.
+      The state, and for each modality `[N, D_m]` features of a look at each PoI; those that `seen`
+      marks have updated the map.
 
     Raises:
       ValueError: if a class does not exist.

@@ -31,7 +31,7 @@ class Known:
       belief: `[N, D]` the map.
       looks: `[N, M]` int32, looks of each modality at each PoI.
       log_posterior: `[N, C]` logarithms of the classes' probabilities by exact Bayes.
-      team: where everybody is; PoIs that the robot has given up are not present.
+      team: robots and PoIs at this moment; PoIs that the robot has given up are not present.
       times: `[R, N]` seconds until each robot has looked at each PoI, by the travel model.
       robot: `[]` int32, the robot that chooses.
     """
@@ -50,7 +50,7 @@ class Known:
 
     @property
     def is_seen(self) -> jax.Array:
-        """`[N]` bool, PoIs that somebody has looked at."""
+        """Mask `[N]` of the PoIs that any robot has looked at."""
         return jnp.any(self.looks > 0, axis=-1)
 
 
@@ -97,8 +97,8 @@ class Policy:
         needs to order looks.
       is_unordered: whether looks that pay may be taken in any order, so that missions choose one,
         see `mission.auctions` in the settings.
-      worth: `(key, models, known) -> [N]`, which looks pay: those above 0. By default, values less
-        that of NOP.
+      worth: `(key, models, known) -> [N]`, which looks pay: those above 0. By default, values
+        minus NOP's.
     """
 
     values: Values

@@ -50,8 +50,8 @@ def has_optimum(fusion: Fusion, values: LookValues, is_sound: bool) -> bool:
     Args:
       fusion: of the MDP.
       values: of the agent's own sensor.
-      is_sound: whether class probabilities of the map are about those of exact Bayes. Only rewards
-        that do not read them, in a map that does not accumulate looks, have an optimum without.
+      is_sound: whether the map's class probabilities roughly match exact Bayes; if not, only
+        rewards that do not read them, on a map that does not accumulate, have an optimum.
     """
     if not is_sound and (fusion.accumulates or values.labels is not None):
         return False

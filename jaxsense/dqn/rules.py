@@ -27,7 +27,7 @@ def nearest(
     Args:
       gains: `[R, N]` expected reward of each robot's look.
       times: `[R, N]` seconds until each robot has looked.
-      team: where everybody is; PoIs that other robots head for come last.
+      team: robots and PoIs at this moment; PoIs that other robots head for come last.
       agent: `[]` int32, the robot that chooses.
     """
     cost = times[agent] + _TAKEN * _is_taken(team, agent)

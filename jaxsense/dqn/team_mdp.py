@@ -56,7 +56,7 @@ class TeamState:
 
     Attributes:
       map: the map, and the scene that it describes.
-      team: where everybody is.
+      team: robots and PoIs at this moment.
       asks: `[R]` bool, robots that have yet to choose at this moment; at first all.
       agent: `[]` int32, the robot that chooses.
       looked: `[R]` seconds that each robot has been looking.
@@ -116,7 +116,7 @@ def travel_times(config: TravelConfig, team: Team) -> Float[Array, "R N"]:
 
     Args:
       config: the travel model.
-      team: where everybody is.
+      team: robots and PoIs at this moment.
 
     Returns:
       `[R, N]` seconds.
@@ -186,7 +186,7 @@ def observation(
     Args:
       config: the travel model.
       belief: `[N, D]` the map.
-      team: where everybody is.
+      team: robots and PoIs at this moment.
       agent: `[]` int32, the robot that chooses.
       num_modalities: M.
 

@@ -26,7 +26,7 @@ from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import TIME_SCALE, TeamMdp, TeamState
 
 Policy = Callable[[TeamState], jax.Array]
-"""`[N + 1]` values of actions, the highest of which is taken, NOP's last."""
+"""Values of actions, `[N + 1]`, NOP's last; robots take the action of the highest."""
 
 _NEAR = 5.0  # s; each further one makes a trial e times as rare
 _ERROR = 3.0  # s, above which an error counts linearly
@@ -55,7 +55,7 @@ def try_choices(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, num
     Args:
       key: random key.
       mdp: the MDP.
-      policy: what all robots follow before and after the choice.
+      policy: of all robots, before and after the choice.
       config: how many choices are tried, and how far from a start.
       number: B, of states.
 
@@ -201,7 +201,7 @@ class Fitting:
     latent_size: int = struct.field(pytree_node=False)
 
     def draw(self, key: Key, number: int) -> Int[Array, "T B"]:
-        """Draws states in which something was tried, see `supervised.Problem.draw`.
+        """Draws states in which choices were tried, see `supervised.Problem.draw`.
 
         Args:
           key: random key.

@@ -1,4 +1,4 @@
-"""What interfaces share: spaces, and the map MDP of one agent."""
+"""Spaces and the map MDP of one agent, shared by the interfaces."""
 
 from typing import Any
 

@@ -82,7 +82,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         Returns:
           Observations, state, rewards, dones and infos. A robot is done after NOP, and all are at
           the limit; `__all__` is whether the episode is over. `seconds`, `[R]` and the same for
-          all, are those that passed.
+          all, is the duration of the step.
 
         Raises:
           ValueError: if an action is no integer, or does not exist and is not traced.
@@ -97,7 +97,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         return self.get_obs(state), state, self._named(outcome.rewards), of_each, infos
 
     def get_obs(self, state: TeamEnvState) -> dict[str, jax.Array]:  # pyright: ignore
-        """What each robot knows, `[F * N]`, see `team_mdp.observation`."""
+        """Observation of each robot, `[F * N]`, see `team_mdp.observation`."""
         return self._named(team.observations(self.mdp, state.team))
 
     @functools.partial(jax.jit, static_argnums=0)

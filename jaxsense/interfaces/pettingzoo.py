@@ -20,7 +20,7 @@ Infos = dict[str, dict[str, Any]]
 
 
 class _Team:
-    """An episode of a team, one robot at a time, with what both environments share."""
+    """An episode of a team, one robot at a time: the base of both environments."""
 
     def __init__(self, mdp: TeamMdp, config: Config):
         """Makes the environment; `reset` must be called before the first step.
@@ -45,7 +45,7 @@ class _Team:
         self._mdp, self._config = mdp, config
 
     def observation_space(self, agent: str) -> Any:
-        """Space of what a robot knows, `[F * N]`."""
+        """Space of a robot's observations, `[F * N]`."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
@@ -105,7 +105,7 @@ class TeamAECEnv(_Team, AECEnv):
     """The team MDP, in which agents take turns: each robot of `Config.robots` is an agent.
 
     `agent_selection` is the robot that chooses; it earns the reward of its look before its next
-    turn. The methods are PettingZoo's. `seconds` in the infos are those that the last action took,
+    turn. The methods are PettingZoo's. `seconds` in the infos is the duration of the last action,
     and `action_mask`, `[N + 1]` int8, is 1 for the actions that the robot has.
     """
 
@@ -126,7 +126,7 @@ class TeamAECEnv(_Team, AECEnv):
         self.agent_selection = self._turn()
 
     def observe(self, agent: str) -> np.ndarray:
-        """What a robot knows, `[F * N]` float32."""
+        """A robot's observation, `[F * N]` float32."""
         return self._observations[agent].copy()
 
     def step(self, action: Any) -> None:

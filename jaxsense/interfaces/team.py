@@ -1,4 +1,4 @@
-"""What the interfaces for several agents share: the team MDP, in which each robot is an agent.
+"""The team MDP with each robot as an agent, shared by the interfaces for several agents.
 
 Robots take turns. In each step one robot chooses, and the actions of the others are ignored. Action
 n < N heads for PoI n, and action N is NOP, after which the robot is done. If nobody else has to

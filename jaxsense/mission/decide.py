@@ -29,7 +29,7 @@ _REPEATED = 1e3  # m, above any path, so that places from which a look tells lit
 
 
 def is_due(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, ""]:
-    """Whether a robot has to decide: it has nothing to do, or the map has changed.
+    """Whether a robot must decide because it is idle or the map has changed.
 
     Args:
       mission: the mission.
@@ -153,7 +153,7 @@ def _values(
 def _gains(
     key: Key, mission: Mission, models: Models, known: Known, policy: Int[Array, ""]
 ) -> Float[Array, "R N"]:
-    """What a policy expects of each robot's look at each PoI: above 0 if it pays."""
+    """Expected gain of each robot's look at each PoI, by its policy: above 0 if it pays."""
 
     def of_robot(robot: Int[Array, ""]) -> jax.Array:
         there = dataclasses.replace(known, robot=robot)
@@ -179,7 +179,7 @@ def _known_to(
     robot: Index,
     given_up: Bool[Array, " N"],
 ) -> Known:
-    """What a robot that has given up some PoIs knows when it chooses."""
+    """Knowledge of a robot that chooses, without the PoIs it has given up."""
     phase = state.robots.phase
     team = Team(
         positions=state.scene.layout.position,
@@ -267,7 +267,7 @@ def is_taken(
 def sees(
     mission: Mission, state: MissionState, robot: Index, poi: Int[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether a PoI is in range of a robot, and nothing that stands still covers it.
+    """Whether a PoI is in range of a robot and no static object occludes it.
 
     Args:
       mission: the mission.

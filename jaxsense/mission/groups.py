@@ -27,7 +27,7 @@ def where_due(
     Args:
       due: `[B]` bool.
       function: takes one row of `inputs`, and returns one row.
-      before: `[B, ...]` rows to keep where nothing is due.
+      before: `[B, ...]` rows to keep where no work is due.
       inputs: `[B, ...]` arrays.
       parts: how many equal parts of the batch form groups of their own; with one part on each
         device, no row moves to another.

@@ -17,9 +17,9 @@ REASONS = (
     "robot failed",
     "no robot left",
 )
-"""Ends of a mission, by their codes. `unreachable`: a robot gave up a PoI that it could not get to,
-also when it retried; `undetected`: it gave one up after looks that showed nothing; `robot failed`:
-the others finished."""
+"""Reasons why a mission ends, by code. `unreachable`: a robot gave up a PoI that it could not get
+to even when it retried; `undetected`: it gave one up after looks that showed nothing;
+`robot failed`: the others finished."""
 
 
 def reason(state: MissionState) -> Int[Array, ""]:

@@ -21,7 +21,7 @@ from jaxsense.sim.arena import Layout
 
 _LEEWAY = 0.035  # m, within which of a node the next one stays in view
 _MARGIN = 0.02  # m, extra distance of paths between nodes from PoIs
-_SLACK = 1e-3  # m, a path may cut an obstacle: nodes touch their own circle
+_SLACK = 1e-3  # m that a path may cut into an obstacle, because nodes touch their obstacle's circle
 
 
 @pytree
@@ -224,7 +224,7 @@ def _straight(
 
 
 def _shortest(edges: Float[Array, "A K"]) -> Float[Array, "A K"]:
-    """Lengths of shortest paths over any number of nodes, from those of single edges.
+    """Lengths of the shortest paths over any number of nodes, given the lengths of edges.
 
     The first K of the A starts are the nodes. The method of Floyd (1962) and Warshall, with the
     nodes of one PoI at a time, which passes over the memory a tenth as often.

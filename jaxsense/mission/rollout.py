@@ -102,7 +102,7 @@ def step(
     before = states
     num_robots = mission.world.arena.num_robots
     robot_keys = jax.vmap(lambda key: jax.random.split(key, num_robots), out_axes=1)(keys)
-    # One after the other, so that no robot scans what another has just made certain.
+    # One after the other, so that no robot scans what another has just identified.
     states, _ = jax.lax.scan(
         lambda states, robot: (_act(robot[1], mission, models, states, robot[0], parts), None),
         states,

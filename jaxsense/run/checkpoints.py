@@ -44,7 +44,7 @@ class Unfinished(NamedTuple):
 
 
 class Checkpoints:
-    """The checkpoints of a run in a directory; without one, nothing is saved or found.
+    """Checkpoints of a run in a directory; without one, saves and finds none.
 
     A damaged checkpoint is set aside and its content is trained again, with the same result, since
     seed and settings determine a run.

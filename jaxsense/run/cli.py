@@ -73,7 +73,7 @@ def run(main: Callable[[], None]) -> None:
 
 
 def _exit(status: int) -> NoReturn:
-    """Ends the process at once: any other exit would wait for threads that compile."""
+    """Ends the process immediately: any other exit would wait for compiling threads."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError):
             stream.flush()
@@ -154,7 +154,7 @@ def keep_programs(
       The programs with these settings; None with custom sensors or policies, whose code may
       change, and, with a warning, if the directory cannot be used.
     """
-    # Several processes can load a program only together.
+    # All processes of a run must load a program together.
     if directory is None or jax.process_count() > 1:
         return None
     try:

@@ -390,5 +390,5 @@ def _surroundings() -> list[object]:
 
 
 def _sets_cache(option: str) -> bool:
-    """Whether an option concerns JAX's cache alone, so that it changes no program."""
+    """Whether an option only concerns JAX's cache and leaves programs unchanged."""
     return "cache" in option.lower()

@@ -174,7 +174,7 @@ def join(
       coordinator: `HOST:PORT` of the first process, which listens at this address only.
       number: of processes.
       index: of this process, from 0.
-      begins: called once the arguments are found to be right, before waiting for the others.
+      begins: called after the arguments are validated, before waiting for the others.
 
     Raises:
       ConfigError: if only some arguments are given, if a value is wrong, or if the others do not
@@ -312,7 +312,7 @@ def spread(
 
     Args:
       function: of pytrees of arrays, whose first axis is a batch of independent rows.
-      mesh: from `make_mesh`; its size must divide the batch. Without one nothing is split.
+      mesh: from `make_mesh`; its size must divide the batch. Without a mesh, the batch stays whole.
       whole: positions of arguments that every device gets undivided.
 
     Returns:

@@ -46,8 +46,8 @@ def train(
       config: all settings; its `Traced` fields are inputs of the programs.
       programs: of the stages.
       monitor: receives time and progress.
-      checkpoints: where to save, if anywhere; what is there, from the same key and settings, is not
-        trained again.
+      checkpoints: where to save, if anywhere; stages found there are not trained again. They must
+        come from the same key and settings.
 
     Raises:
       StageError: if a loss, parameter or result is not finite; trainings under way are saved as
@@ -60,7 +60,7 @@ def train(
         try:
             return loop.run()
         except Stopped:
-            # The user reads that all is saved, and must learn if it is not.
+            # The user was told that all is saved; raise if it is not.
             loop.wait_for_saving()
             raise
 
@@ -260,7 +260,7 @@ def run_chunks(
             try:
                 checkpoints.save_unfinished(stage, Unfinished(chunk, state, curves))
             except OSError as lost:
-                raise StageError(f"{error}; what was sound cannot be saved ({lost})") from error
+                raise StageError(f"{error}; cannot save the last finite state ({lost})") from error
             raise
         state = after
         for name, values in metrics.items():

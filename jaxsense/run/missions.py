@@ -261,7 +261,7 @@ def _check_choices(mission: Mission, states: MissionState) -> None:
 
 
 def _set_row(target: PyTree, row: int, source: PyTree, from_row: int) -> None:
-    """Copies a row of every array of one tree into those of another."""
+    """Copies one row of each array of a tree into another tree."""
 
     def copy(target: np.ndarray, source: np.ndarray) -> None:
         target[row] = source[from_row]

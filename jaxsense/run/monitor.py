@@ -17,7 +17,7 @@ class StageError(RuntimeError):
 
 
 class Stopped(Exception):  # noqa: N818 (nothing is wrong)
-    """A run that was asked to stop, after all its training was saved."""
+    """The run was asked to stop; all its training is saved."""
 
 
 def is_finite(values: PyTree) -> bool:

@@ -55,7 +55,7 @@ class RunResult:
 
 
 def check(config: Config, policies: Mapping[str, Values | Policy] | None = None) -> None:
-    """Checks what only making the parts of a run shows, see `mission.require_playable`."""
+    """Checks what can only be checked by building the parts of a run."""
     mission.require_playable(config, policies)
 
 

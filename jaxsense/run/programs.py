@@ -60,11 +60,11 @@ def _program_name(stage: Stage) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Shapes:
-    """Shapes and dtypes of what a stage's programs return.
+    """Shapes and dtypes of the outputs of a stage's programs.
 
     Attributes:
       output: of the stage.
-      metrics: names of what a chunk reports.
+      metrics: names of the metrics that a chunk reports.
     """
 
     output: Output
@@ -90,15 +90,15 @@ class StagePrograms:
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """The programs of runs whose settings differ in their leaves at most.
+    """Compiled programs of runs whose settings differ only in their leaves.
 
     Attributes:
       config: all settings.
       stages: of the training.
       of_stages: their programs, by name.
       player: of the missions.
-      workers: what shares rows and missions.
-      trainings: those side by side.
+      workers: threads or devices that share rows and missions.
+      trainings: how many run side by side.
       policies: of missions, by name, in addition to `dqn.POLICIES`.
     """
 

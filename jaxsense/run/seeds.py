@@ -18,7 +18,7 @@ _MOST = 10_000
 
 
 def check_range(seed: int, number: int) -> None:
-    """Checks the first seed and how many there are.
+    """Checks the first seed and the number of seeds.
 
     Args:
       seed: the first seed.
@@ -58,7 +58,7 @@ def check(run: RunDirectory) -> None:
 
 
 def open_run(run: RunDirectory, seed: int, path: Path) -> AbstractContextManager[RunDirectory]:
-    """Opens the run directory of one seed, which is as if that seed were trained alone.
+    """Opens the run directory of one seed, the same as if that seed were trained alone.
 
     Args:
       run: the run of all seeds.

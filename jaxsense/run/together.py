@@ -129,7 +129,7 @@ class SharedProgram:
             return calls
 
     def _run(self, calls: list[_Call]) -> None:
-        """Makes some calls together; the first one fills the places of missing ones."""
+        """Makes several calls as one, padded with copies of the first."""
         rows = [args for args, _ in calls]
         rows += rows[:1] * (self._trainings.number - len(rows))
         stacked = [

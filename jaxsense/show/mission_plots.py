@@ -14,10 +14,10 @@ from jaxsense.summary.metrics import Number, mean
 
 
 def policies(block: Missions) -> Figure:
-    """Looks and time of every policy, the slowest below, with 95% intervals.
+    """Looks and time of every policy, the slowest last, with 95% intervals.
 
-    The intervals are those of the differences from the latent policy, arena by arena; of several
-    seeds, those of the means.
+    The intervals are of the paired differences from the latent policy; with several seeds, of the
+    means.
 
     Args:
       block: `mission` of the summary.

@@ -68,14 +68,13 @@ def render(
         changed=_changed(config, summary["preset"]),
         config=json.dumps(as_plain(config), indent=2),
         plot=lambda name: _data(run / f"{name}.png"),
-        # A browser runs no script of an image and loads nothing that it names, so that a film may
-        # come from anywhere.
+        # In an image, a browser runs no scripts and loads no other files, so any film is safe.
         films={path.stem: _data(path) for path in sorted(run.glob("mission*.svg"), key=stem)},
     )
 
 
 def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:
-    """What the page shows of missions in the same arenas."""
+    """Section of the page about missions in the same arenas."""
     played = cases(missions)
     number = max(mean(case["episodes"]) for case in played.values())
     caption = f"{number:,.0f} missions of each policy, in the same arenas"

@@ -42,7 +42,7 @@ _SMOOTHING = 20  # epochs
 _MIN_LOOKS = 20  # in a bin of the calibration
 _MANY_CLASSES = 9
 _MANY_TOGETHER = 2  # classes in one place, above which their numbers take too much room
-_FAR = 0.2  # sigma from the median of its class, beyond which a detection is an outlier
+_FAR = 0.2  # from the median of its class, in sigma; detections further away are outliers
 
 
 def of_run(
@@ -52,7 +52,7 @@ def of_run(
     windows: Arrays,
     reliability: Mapping[str, Reliability],
 ) -> dict[str, bytes]:
-    """Draws what only a run of one seed has, as PNG files by their names.
+    """Draws the plots that only a run of one seed has, as PNG files by name.
 
     Args:
       config: all settings.
@@ -69,7 +69,7 @@ def of_run(
 
 
 def of_seeds(curves: Curves, results: Results) -> dict[str, bytes]:
-    """Draws what a run and several seeds have, as PNG files by their names.
+    """Draws the plots that a run and several seeds share, as PNG files by name.
 
     Args:
       curves: see `rewards`.
@@ -231,7 +231,7 @@ def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:
         if name in agents:
             panels.append((f"{name}: a robot alone on the map", of_network, agents[name]))
             continue
-        # Episodes of a team are another task than those of a robot that is alone on the map.
+        # Rewards of a team's episodes cannot be compared with those of a single robot on the map.
         alone, agent = next(iter(agents.items()))
         evaluation = {"evaluation": of_network["evaluation"]}
         panels.append((f"episodes of the whole {name}", {"reward": of_network["reward"]}, None))

@@ -169,7 +169,7 @@ def _percent(value: Number, reference: Number) -> str:
 
 
 def cards(results: Results) -> list[tuple[str, str, str]]:
-    """The main results: a number, what it is, and what to compare it with."""
+    """The main results: a number, its meaning, and figures to compare it with."""
     found, played = [], cases(results["mission"])
     if latent := played.get("latent"):
         for key, what, others in (

@@ -95,7 +95,7 @@ class Display:
             left=left,
             metrics=text,
         )
-        # Stages that only compile or examine never report an end.
+        # Stages without a total never report that they end.
         for other in self._progress.tasks:
             if other.total is None and other.description != stage:
                 self._progress.update(other.id, visible=False)
@@ -134,7 +134,7 @@ def say(text: str) -> None:
 
 
 def print_table(console: rich.console.Console, table: Table) -> None:
-    """Prints a table; its texts may hold anything.
+    """Prints a table; markup in cells is not interpreted.
 
     Args:
       console: to print it on.

@@ -28,7 +28,7 @@ class Conditions:
 
     def at(self, point: Float[Array, "3"]) -> Float[Array, "8"]:
         """Values at a point: x, y and time, each in units over which the values change."""
-        # No matrix products, which accelerators round.
+        # Without matrix products, which accelerators round.
         phase = jnp.sum(self.frequencies * point[None], axis=-1)
         waves = jnp.concatenate([jnp.cos(phase), jnp.sin(phase)])
         return jnp.sum(self.weights * waves[None], axis=-1) / len(phase) ** 0.5
@@ -42,7 +42,7 @@ class Light:
       direction: `[3]` unit vector towards the light.
       diffuse: `[]` strength of the distant light.
       ambient: `[]` strength of the ambient light.
-      conditions: what changes the light; None if no sensor reads it.
+      conditions: exposure, colour and shadow, which drift; None if no sensor reads them.
       point: `[3]` where and when a sensor looks: x [m], y [m] and time [s]; None until
         `sensors.scan` sets it.
     """
@@ -74,7 +74,7 @@ class Light:
                 "world.reads_conditions), because the settings of a sensor change the light"
             )
         if self.point is None:
-            raise ValueError("light.point = None: must be set, as by sim.scan")
+            raise ValueError("light.point = None: must be set, as sim.scan does")
         return self.conditions.at(self.point / jnp.stack([distance, distance, time]))
 
 

@@ -1,4 +1,4 @@
-"""Sensors: rays at one height above the floor, and the readings that they make of hits.
+"""Sensors: rays at one height above the floor, and readings computed from their hits.
 
 A sensor is a value with methods. `Lidar` and `Camera` are built in. Your own sensor is another
 subclass of `Sensor`, made by a function that `Config.sensors` names; the rest of the package treats

@@ -20,7 +20,7 @@ from jaxsense.sim.light import Light, random_light
 
 @struct.dataclass
 class World:
-    """What all scenes of a simulation share.
+    """The parts that all scenes of a simulation share.
 
     Attributes:
       arena: the compiled arena; static.

@@ -278,12 +278,12 @@ class Summary(Header, Results):
 
 
 def cases(missions: Missions) -> dict[str, Case]:
-    """The cases of a block `mission`, by their names."""
+    """The cases of a block `mission`, by name."""
     return {name: cast(Case, case) for name, case in missions.items() if name != _TRAFFIC}
 
 
 def policies(missions: Missions) -> dict[str, Case]:
-    """The cases of a block `mission` in which no robot fails, by their policies."""
+    """The cases of a block `mission` in which no robot fails, by policy."""
     return {name: case for name, case in cases(missions).items() if not is_fault(name)}
 
 
@@ -320,5 +320,5 @@ BLOCKS = {
     f"mission.{_TRAFFIC}.": _table(Traffic),
     "evaluations.NAME.": _table(Evaluation),
 }
-"""All metrics, by the beginning of their keys in `summary.json` and by the rest; evaluations have
-their own files, `evaluations/NAME.json`, each with a block `mission` too."""
+"""All metrics, by the prefix of their key in `summary.json` and then by the rest of it. Evaluations
+have files `evaluations/NAME.json`, each with its own block `mission`."""

@@ -94,7 +94,7 @@ def of_naive(played: dict[str, Case], name: str) -> OfNaive | None:
 
 
 def compared(missions: Missions) -> Missions:
-    """Missions in the same arenas, with the ratios `of_naive` computed anew."""
+    """Recomputes the ratios `of_naive` of missions in the same arenas."""
     found, played = missions.copy(), cases(missions)
     for name, case in played.items():
         ratios, kept = of_naive(played, name), case.copy()
@@ -104,7 +104,7 @@ def compared(missions: Missions) -> Missions:
 
 
 def unsound(block: Beliefs) -> str | None:
-    """Says so if the map knows much less than exact Bayes on the same looks.
+    """Returns a warning if the map knows much less than exact Bayes after the same looks.
 
     Args:
       block: `belief` of a summary.

@@ -21,8 +21,8 @@ from jaxsense.summary.blocks import (
 )
 from jaxsense.summary.compare import REFERENCE, Measured, compared, differences
 
-_UNAMBIGUOUS = 0.9  # share of looks in a single class, above which the class counts as one
-_AS_GOOD = 0.01  # reward by which a policy may miss the optimum
+_UNAMBIGUOUS = 0.9  # share of looks that leave only the class; above, the class is unambiguous
+_AS_GOOD = 0.01  # tolerance of the reward below the optimum
 _ERROR = 0.01  # of the optimum, as a share of it
 _FLOAT_BYTES = 4
 

@@ -58,7 +58,7 @@ def _read(run: Path, file: Path, kind: type) -> object:
     try:
         content = parse_json(file.read_text(encoding="utf-8"))
         json.dumps(content, allow_nan=False)
-        # Of several seeds, only what each of them wrote is of this type.
+        # With several seeds, only the summary of each seed has this type.
         values = content
         if isinstance(content, dict) and "seeds" in content:
             values, kind = content["seeds"], dict[str, Results]

@@ -11,12 +11,12 @@ from jaxsense.summary.read import RESULTS
 
 
 def timing(total: float, stages: dict[str, dict[str, float]], number: int) -> Timing:
-    """Shares the time of runs side by side among them.
+    """Divides the time of concurrent runs equally among them.
 
     Args:
-      total: seconds of all.
+      total: seconds of all runs together.
       stages: seconds of each stage, `compile_s` and `run_s`.
-      number: of the runs.
+      number: of runs.
 
     Returns:
       The block `timing` of each.

@@ -51,7 +51,7 @@ def init(
 
     Args:
       key: random key.
-      windows: `[S, F]` windows for training, by which it standardises its input.
+      windows: `[S, F]` windows for training, whose statistics standardise its input.
       num_labels: D_m.
       config: sizes of the network.
       measures_distance: whether the readings are distances, see `Gate`.

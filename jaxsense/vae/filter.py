@@ -129,7 +129,7 @@ class Filter:
 
 
 def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterConfig) -> Filter:
-    """Untrained filter, to which looks say nothing.
+    """Untrained filter, which looks do not update.
 
     Args:
       key: random key.

@@ -69,7 +69,7 @@ def nearest_class(belief: Belief, class_means: Float[Array, "C D"]) -> Int[Array
 
 
 def _check_belief(belief: Belief, class_means: jax.Array) -> None:
-    """Raises an error if shapes do not fit or values are not those of Gaussians."""
+    """Raises an error unless shapes fit and values describe Gaussians."""
     chex.assert_rank(belief.mean, 1, custom_message="belief.mean")
     chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
     chex.assert_shape(class_means, (None, *belief.mean.shape), custom_message="class_means")

@@ -20,7 +20,7 @@ from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, pytree
 
 MIN_PROBABILITY = 1e-6
-"""Smallest probability of a class that is read; float32 moments hold no smaller ones."""
+"""Minimum class probability that can be read; float32 moments hold no smaller ones."""
 
 # In full precision, so that an accelerator agrees with a CPU.
 _dot = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
@@ -29,7 +29,7 @@ _STEPS = 25  # of Newton's method
 _LONGEST = 2.0  # step, in whitened coordinates; with longer ones it diverges near certainty
 _DAMPING = 1e-5
 _MAX_UNROLLED = 4  # eliminations; a program with many takes minutes to compile
-_THRESHOLD = 0.05  # of the largest singular value; moments that differ less differ by error
+_THRESHOLD = 0.05  # of the largest singular value; smaller differences of moments are noise
 
 
 def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
@@ -72,7 +72,7 @@ class Readout:
     Attributes:
       of_classes: `[C, K]` whitened moments of the classes.
       offset: `[2D]` mean of the classes' moments.
-      whitening: `[2D, K]` from moments less `offset` to whitened ones.
+      whitening: `[2D, K]` from moments minus `offset` to whitened ones.
     """
 
     of_classes: Float[Array, "C K"]
@@ -130,7 +130,7 @@ def make(classes: Belief, most: int | None = None) -> Readout:
     moments = _moments(classes)
     offset = jnp.mean(moments, axis=0)
     _, singular, axes = jnp.linalg.svd(moments - offset[None], full_matrices=False)
-    # The moments less their mean span one direction less than there are classes.
+    # Centred moments span one direction fewer than there are classes.
     rank = min(len(moments) - 1, moments.shape[1])
     rank = rank if most is None else max(1, min(rank, most))
     singular, axes = singular[:rank], axes[:rank]

@@ -1,4 +1,4 @@
-"""The whole picture: both views, what each robot does, and the time."""
+"""The whole picture: both views, the activity of each robot, and the time."""
 
 from collections.abc import Mapping
 from xml.etree import ElementTree

@@ -35,8 +35,8 @@ class Timeline:
 
     Attributes:
       moments: `[F]` as shares of the duration, increasing from 0; the last frame stays to the end.
-      duration: of the animation, in seconds; then it begins again.
-      moves: whether it plays; else there is only the last frame.
+      duration: of the animation, in seconds; it then repeats.
+      moves: whether the animation plays; otherwise it shows only the last frame.
     """
 
     moments: np.ndarray
@@ -46,7 +46,7 @@ class Timeline:
     def animate(
         self, element: Element, attribute: str, values: ArrayLike, *, jumps: bool = False
     ) -> None:
-        """Lets an attribute run through its values; where nothing plays, it has the last.
+        """Animates an attribute through its values; without animation, sets the last.
 
         Args:
           element: whose attribute changes.
@@ -84,7 +84,7 @@ class Timeline:
 
 
 def _turning_points(values: list[str], *, both_ends: bool) -> list[int]:
-    """Frames that are needed: where the value is new, and, if asked, where it was the last time."""
+    """Frames in which the value changes and, with `both_ends`, those before a change."""
     last = len(values) - 1
     return [
         i

@@ -102,7 +102,7 @@ class ArenaView:
             timeline.animate(mark, "opacity", record.seen[:, n, m], jumps=True)
 
     def _draw_looks(self, parent: Element, timeline: Timeline, record: Record, r: int) -> None:
-        """A line from the robot to what it scans."""
+        """Line from the robot to the PoI that it scans."""
         for i in np.flatnonzero(record.scanned[:, r]):
             target = int(record.target[max(i - 1, 0), r])
             if target >= self._config.arena.num_pois:
@@ -169,7 +169,7 @@ class MapView:
             add(parent, "circle", cx=x, cy=y, r=3, fill=colour)
         numbers = add(parent, "g")
         num_pois = self._config.arena.num_pois
-        # Before the first look each is wider than the view, a little less so than the one before.
+        # Before the first look, ellipses exceed the view; each is slightly smaller than the last.
         step = min(4.0, SIZE / 4 / num_pois)
         for n in range(num_pois):
             mean = self._place(_smooth(self._in_plane(record.belief.mean[:, n])))
