@@ -16,7 +16,7 @@ class Product(vae.InPlace):
 
     accumulates = True  # looks add up
 
-    def update(self, belief, seen, features, modality):
+    def update(self, belief, seen, features, modality, weight=1.0):
         """The belief after one more look, whichever sensors have `seen` the PoI."""
         return vae.product_of_experts(belief, self.together({modality: features}), self.prior)
 

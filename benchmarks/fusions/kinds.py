@@ -21,6 +21,7 @@ from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.readout import MIN_PROBABILITY
 
 _Seen = Bool[Array | np.ndarray, " M"]
+_Weight = Float[Array, ""] | float
 
 
 @pytree
@@ -52,7 +53,12 @@ class LogOdds:
         return _of_log_odds(jnp.zeros(self.bayes.labels.shape[1] - 1))
 
     def update(
-        self, belief: Belief, seen: _Seen, features: Float[Array, " D_m"], modality: int
+        self,
+        belief: Belief,
+        seen: _Seen,
+        features: Float[Array, " D_m"],
+        modality: int,
+        weight: _Weight = 1.0,
     ) -> Belief:
         """Belief after one more look.
 
@@ -61,10 +67,11 @@ class LogOdds:
           seen: not used.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
+          weight: see `Fusion.update`.
         """
         del seen
         found = self.bayes.log_likelihoods(features, modality)
-        return _of_log_odds(belief.mean + found[:-1] - found[-1])
+        return _of_log_odds(belief.mean + weight * (found[:-1] - found[-1]))
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """Belief after looks by several sensors, `[D_m]` features by modality."""
@@ -95,7 +102,12 @@ class Product(vae.InPlace):
         return True
 
     def update(
-        self, belief: Belief, seen: _Seen, features: Float[Array, " D_m"], modality: int
+        self,
+        belief: Belief,
+        seen: _Seen,
+        features: Float[Array, " D_m"],
+        modality: int,
+        weight: _Weight = 1.0,
     ) -> Belief:
         """Belief after one more look, see `vae.product_of_experts`.
 
@@ -104,8 +116,9 @@ class Product(vae.InPlace):
           seen: not used.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
+          weight: not used.
         """
-        del seen
+        del seen, weight
         return vae.product_of_experts(belief, self.together({modality: features}), self.prior)
 
 
@@ -138,7 +151,12 @@ class Mixture:
         return _counted(self.experts.prior, 0.0)
 
     def update(
-        self, belief: Belief, seen: _Seen, features: Float[Array, " D_m"], modality: int
+        self,
+        belief: Belief,
+        seen: _Seen,
+        features: Float[Array, " D_m"],
+        modality: int,
+        weight: _Weight = 1.0,
     ) -> Belief:
         """Belief after one more look.
 
@@ -147,8 +165,9 @@ class Mixture:
           seen: not used.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
+          weight: not used.
         """
-        del seen
+        del seen, weight
         old, new = _uncounted(belief), self.experts.together({modality: features})
         count = belief.mean[-1] + 1
         mean = old.mean + (new.mean - old.mean) / count
@@ -201,7 +220,12 @@ class Audited:
         return self._joined(self.fusion.prior, self.bayes.prior)
 
     def update(
-        self, belief: Belief, seen: _Seen, features: Float[Array, " D_m"], modality: int
+        self,
+        belief: Belief,
+        seen: _Seen,
+        features: Float[Array, " D_m"],
+        modality: int,
+        weight: _Weight = 1.0,
     ) -> Belief:
         """Belief after one more look, of both.
 
@@ -210,10 +234,11 @@ class Audited:
           seen: `[M]` bool, which modalities have looked before.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
+          weight: see `Fusion.update`.
         """
         mean, std = jnp.split(belief.mean[: -2 * self._num_classes], 2)
-        after = self.fusion.update(Belief(mean, std), seen, features, modality)
-        exact = self.bayes.update(self.log_posterior(belief), features, modality)
+        after = self.fusion.update(Belief(mean, std), seen, features, modality, weight)
+        exact = self.bayes.update(self.log_posterior(belief), features, modality, weight)
         return self._joined(after, exact)
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:

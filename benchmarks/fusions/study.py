@@ -138,7 +138,7 @@ def _as_floats(figures: Mapping[str, jax.Array]) -> Figures:
 def _learned(config: Config, key: Key) -> Outputs:
     """What fusions share: detectors, detections, JMVAE, classes, filter and values of looks."""
     shared = [*(f"detector_{name}" for name in config.modalities), "detections", "best_jmvae"]
-    shared += ["class_beliefs", "fusion", "look_values"]
+    shared += ["novelty", "class_beliefs", "fusion", "look_values"]
     outputs = learn(key, config, until="look_values").outputs
     return {name: outputs[name] for name in shared}
 
@@ -151,6 +151,7 @@ def _models(
         jmvae=outputs["best_jmvae"],
         fusion=fusion,
         bayes=make_bayes(config),
+        novelty=outputs["novelty"],
         look_values=outputs["look_values"],
         agent=_agent(config, fusion),
         q_networks=q_networks,
