@@ -14,7 +14,7 @@ from jaxsense.run.rundir import RunDirectory, _named
 SMOKE = ("--preset", "smoke", "--seed", "5", "--quiet")
 MISSION_KEYS = {
     "accuracy", "observations_per_poi", "time_s", "mean_time_s", "collisions",
-    "goals_reached_fraction", "information", "episodes", "ended",
+    "goals_reached_fraction", "information", "calibration", "episodes", "ended",
 }  # fmt: skip
 
 
