@@ -233,7 +233,7 @@ def reserve(program: str, option: str, path: Path) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write("[]\n")
     except FileExistsError:
-        cli.fail(program, f"{option} = {str(path)!r}: exists already; must be new")
+        cli.fail(program, f"{option} = {str(path)!r}: already exists; must be new")
     except OSError as error:
         cli.fail(program, f"{option} = {str(path)!r}: cannot be written: {error.strerror}")
 

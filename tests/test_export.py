@@ -293,7 +293,7 @@ def test_bad_input_is_one_line_and_overwrites_nothing(run, tmp_path, capsys, pro
     existing.write_text("precious")
     argv, expected = {
         "run": ([str(tmp_path / "no_run")], "no_run is not a run directory: it has no config.json"),
-        "out": ([str(run), "--out", str(existing)], "out = .*exists already; must be a new file"),
+        "out": ([str(run), "--out", str(existing)], "out = .*already exists; must be a new file"),
         "folder": ([str(run), "--out", str(tmp_path / "no" / "x.zip")], "out = .*cannot be writ"),
     }[problem]
     with pytest.raises(SystemExit) as stop:
@@ -316,7 +316,7 @@ def test_a_file_that_appears_meanwhile_is_not_replaced(run, tmp_path, monkeypatc
 
     monkeypatch.setattr(export, "archive", meanwhile)
     line = error_line([str(run), "--out", str(path)], capsys, export)
-    assert "x.zip': exists already; must be a new file" in line
+    assert "x.zip': already exists; must be a new file" in line
     assert [*tmp_path.iterdir()] == [path]
     assert path.read_text(encoding="utf-8") == "of another process"
 

@@ -102,14 +102,14 @@ class Study:
 
     def __init__(self, config: Config, missions: int):
         """Prepares the programs; `missions` of each fusion and seed."""
-        team = mission.make_mission(config)
-        team = dataclasses.replace(team, policies={"latent": policies.POLICIES["latent"]})
+        scenario = mission.make_mission(config)
+        scenario = dataclasses.replace(scenario, policies={"latent": policies.POLICIES["latent"]})
         quick = devices.compiler_options()  # compiling takes longer than playing
         self.config = config
         self._learn = jax.jit(functools.partial(_learned, config))
         self._optimal = jax.jit(functools.partial(_optimal, config))
         self._judge = jax.jit(functools.partial(_judge, config))
-        self._play = jax.jit(functools.partial(_play, team, missions), compiler_options=quick)
+        self._play = jax.jit(functools.partial(_play, scenario, missions), compiler_options=quick)
 
     def measure(self, seed: int, each: Each = map) -> dict[str, Figures]:
         """Figures of each fusion, and of `optimal`, whose only figures are returns.
@@ -234,21 +234,21 @@ def _by_modality(config: Config, returns: jax.Array) -> dict[str, jax.Array]:
     return {f"return {name}": x for name, x in zip(config.modalities, returns, strict=True)}
 
 
-def _play(team: Mission, number: int, key: Key, models: Models) -> dict[str, jax.Array]:
+def _play(scenario: Mission, number: int, key: Key, models: Models) -> dict[str, jax.Array]:
     """Figures of missions, whose arenas depend on the key alone."""
     arena_key, play_key = jax.random.split(key_of(key, "mission"))
     keys = jax.random.split(arena_key, number)
-    states = jax.vmap(lambda key: mission.reset(key, team, models))(keys)
+    states = jax.vmap(lambda key: mission.reset(key, scenario, models))(keys)
 
     def go_on(carry: tuple[jax.Array, MissionState]) -> tuple[jax.Array, MissionState]:
         chunk, states = carry
         keys = jax.random.split(jax.random.fold_in(play_key, chunk), number)
-        return chunk + 1, mission.rollout_batch(keys, team, models, states, _CHUNK, number)[0]
+        return chunk + 1, mission.rollout_batch(keys, scenario, models, states, _CHUNK, number)[0]
 
     _, states = jax.lax.while_loop(
         lambda carry: ~jnp.all(carry[1].done), go_on, (jnp.int32(0), states)
     )
-    found = jax.vmap(lambda state: mission.measure(team, models, state))(states)
+    found = jax.vmap(lambda state: mission.measure(scenario, models, state))(states)
     return {
         "accuracy": jnp.mean(found["is_right"]),
         "looks": jnp.mean(found["observations_per_poi"]),

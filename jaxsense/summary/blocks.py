@@ -87,7 +87,8 @@ class Jmvae(TypedDict):
         Metric("error of moments", "Distance from the best Gaussian over the possible classes."),
     ]
     readout_error: Annotated[
-        float, "error of the readout", "Nats lost in writing and reading exact probabilities."
+        float,
+        Metric("error of the readout", "Nats lost in writing and reading exact probabilities."),
     ]
     fusion: Fusion
 

@@ -144,7 +144,7 @@ def test_an_existing_file_is_not_overwritten(tmp_path, capsys):
     with pytest.raises(SystemExit):
         __main__.main(["--json", str(path)])
     assert path.read_text() == "precious"
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
 
 
 def test_a_ratio_is_how_many_times_faster_we_are():

@@ -206,7 +206,7 @@ def test_an_existing_file_is_not_overwritten(tmp_path, capsys):
     with pytest.raises(SystemExit):
         __main__.main(["--out", str(path)])
     assert path.read_text() == "precious"
-    assert "exists already; must be new" in capsys.readouterr().err
+    assert "already exists; must be new" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # compiles trainings and missions of five fusions
