@@ -83,7 +83,7 @@ LIMITS = {
     Limits(at_least=0, at_most=10): "camera.exposure_error camera.colour_cast "
     "viewpoint.bearing_error",
     Limits(at_least=0, at_most=10_000): "team.tours.walk",
-    Limits(at_least=0, at_most=1_000_000): "jmvae.alpha mdp.look_cost",
+    Limits(at_least=0, at_most=1_000_000): "jmvae.alpha mdp.look_cost detector.num_repeats",
     Limits(at_least=0, at_most=1_000_000, min_items=1): "jmvae.reconstruction_weights",
     Limits(at_least=0, at_most=30): "viewpoint.max_bearing",
     Limits(at_least=0, below=1): "mission.least_confidence",
@@ -185,6 +185,7 @@ ZERO = {
     "mission.least_confidence", "lidar.range_noise_growth", "lidar.mixed_pixels", "lidar.dropout",
     "camera.exposure_error", "camera.colour_cast", "camera.low_light", "camera.shadow",
     "detector.calibration", "mdp.look_cost", "team.alone", "team.partly_seen", "team.second_cost",
+    "detector.num_repeats",
     "team.tours.walk",
     "team.travel.view_distance",
 }  # fmt: skip
