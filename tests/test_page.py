@@ -101,7 +101,7 @@ def test_figures_stand_in_tables(read):
     assert ("camera", "0.9995", "0.0100", "0.0200") in rows
     agent = ("1.234", "1.250", "1.240", "1.000", "-1.500", "0.988", "1,700", "1,728")
     assert ("lidar", *agent) in rows
-    assert ("here", "2", "0.007", "0.9996", "0.021", "0.030", "0.938") in rows
+    assert ("here", "2", "0.007", "0.0001", "0.9996", "0.021", "0.030", "0.938") in rows
     # Camera, LiDAR and both; the paper's LiDAR cannot tell a red cylinder. In brackets the looks
     # after which just the right classes are plausible, and the norm of sigma.
     red = ["no / no (100.0%, 1.25)", "yes / no (100.0%, 1.25)", "yes / yes (100.0%, 1.25)"]

@@ -94,7 +94,7 @@ def test_a_stopped_run_says_how_to_go_on(stops):
         (lambda path: (path / "summary.json").write_text("{}"), "is finished"),
         (
             lambda path: edit(path, "versions", {"jaxsense": "0.2.0"}),
-            "was written by jaxsense 0.2.0; this is 0.3.",
+            "was written by jaxsense 0.2.0; this is 0.4.",
         ),
         (lambda path: edit(path, "versions", None), "was written by an older jaxsense"),
         (lambda path: edit(path, "seed", 7), "config.json has changed since the run began"),

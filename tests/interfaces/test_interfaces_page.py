@@ -5,6 +5,7 @@ import importlib.util
 import re
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 import jaxsense
 from jaxsense import export
 from jaxsense.models import init
+from jaxsense.vae import gate
 from jaxsense.vae.detectors import Detector
 
 PAGE = Path(__file__).parent.parent.parent / "docs" / "interfaces.md"
@@ -34,7 +36,9 @@ def colour_detector():
     kernel = np.zeros((80, 3, 2), np.float32)
     kernel[:, 0, 0] = kernel[:, 1, 1] = 1.0
     params = {"params": {"Dense_0": {"kernel": kernel.reshape(-1, 2), "bias": np.zeros(2)}}}
-    return Detector(params, jnp.zeros(240), jnp.float32(1.0), hidden=(), num_labels=2)
+    offset, scale = jnp.zeros(240), jnp.float32(1.0)
+    passes_all = gate.init(jax.random.key(0), offset, scale, measures_distance=False)
+    return Detector(params, offset, scale, passes_all, hidden=(), num_labels=2)
 
 
 @pytest.fixture(scope="module")

@@ -91,7 +91,7 @@ def test_every_policy_of_the_table_is_played(own, models, arena_of):
     state = arena_of(POSITIONS, POSES)
     state = replace(state, times_seen=jnp.array([[1, 0], [0, 1], [0, 0]], jnp.int32))
     key, given_up = jax.random.key(1), jnp.zeros(3, bool)
-    known = decide._known_to(own, state, 0, given_up)
+    known = decide._known_to(own, models, state, 0, given_up)
     values_of = jax.jit(lambda policy: decide._values(key, own, models, known, policy))
     assert [*own.policies] == [*POLICIES, *OWN]
     for name in POLICIES:

@@ -222,6 +222,8 @@ def test_a_robot_alone_is_measured_by_the_labels_of_its_sensor():
         "classes": np.array([[0, 1, 2]]),
         "is_right": np.ones((1, 3), bool),
         "ambiguous": np.array([[False, True, False]]),
+        **{name: np.ones((1, 3)) for name in ("confidence", "nll")},
+        "seen": np.ones((1, 3), bool),
         "told": {"camera": np.array([0.25]), "lidar": np.array([0.75])},
         **{name: np.ones(1) for name in (
             "observations_per_poi", "time_s", "collisions", "goals", "goals_reached", "information",

@@ -32,7 +32,7 @@ def moved():
 
 def test_second_viewpoints_are_at_the_distance_in_range_and_face_the_poi(moved):
     poses, believed = moved(0.4, [[1.4, -1.4]])
-    np.testing.assert_allclose(np.hypot(*(poses[:, :2] - PLACE).T), 0.4, rtol=1e-5)
+    np.testing.assert_allclose(np.hypot(*(poses[:, :2] - PLACE[None]).T), 0.4, rtol=1e-5)
     to_poi = np.hypot(*poses[:, :2].T)
     assert np.all((to_poi >= 0.3) & (to_poi <= 1.2))
     assert np.ptp(np.arctan2(poses[:, 1], poses[:, 0] - 0.6)) > 1
