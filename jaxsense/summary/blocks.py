@@ -88,7 +88,11 @@ class Jmvae(TypedDict):
     ]
     readout_error: Annotated[
         float,
-        Metric("error of the readout", "Nats lost in writing and reading exact probabilities."),
+        Metric(
+            "error of the readout",
+            "Nats lost in writing and reading exact probabilities.",
+            digits=4,
+        ),
     ]
     fusion: Fusion
 
