@@ -11,7 +11,7 @@ from jaxsense.config import DetectorConfig
 from jaxsense.core import supervised
 from jaxsense.vae import detectors, gate
 
-CONFIG = DetectorConfig(hidden=(8,), steps=300, batch=64, learning_rate=1e-2)
+CONFIG = DetectorConfig(hidden=(8,), steps=300, batch=256, learning_rate=1e-2)
 RAYS = 6
 
 
@@ -114,7 +114,7 @@ def test_a_gate_of_distances_reads_how_far_they_are_from_the_poi(problem):
     assert score(window + 2.0, 1.0) == pytest.approx(score(window + 3.0, 1.0), abs=1e-5)
 
 
-def test_half_of_a_batch_is_drawn_from_either_kind(problem):
+def test_as_many_are_drawn_of_either_kind(problem):
     few = replace(problem, nothing=jax.tree.map(lambda x: x[:3], problem.nothing))
     rows = np.asarray(few.draw(jax.random.key(0), 50))
     assert rows.shape == (50, 2, 32)
