@@ -22,7 +22,7 @@ from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
 from jaxsense.core.types import Key
 from jaxsense.run import cli, rundir
-from jaxsense.sim.world import make_world
+from jaxsense.sim.world import World, make_world
 
 PROGRAM = "benchmarks.where"
 _DISTANCES = (0.5, 0.9, 1.5, 2.5, 3.5)  # m
@@ -62,13 +62,13 @@ def ratios_from(key: Key, config: Config, models: Models, distance: float) -> li
     world = dataclasses.replace(make_world(config), viewpoint=viewpoint)
 
     @jax.jit
-    def look(key: Key) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def look(key: Key, world: World, models: Models) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         class_key, survey_key = jax.random.split(key)
         classes = looks.balanced_classes(class_key, config, _SCENES)
         _, windows, _ = looks.surveys(jax.random.split(survey_key, _SCENES), world, classes)
         return classes, looks.detect_all(models.detectors, windows)
 
-    classes, features = look(key)
+    classes, features = look(key, world, models)
     found = []
     for name, of_modality in zip(config.modalities, features, strict=True):
         labels = np.array(config.label_of_class(name))

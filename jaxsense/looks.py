@@ -298,11 +298,11 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
     number = -(-samples * num_classes // config.arena.num_pois)
 
     @jax.jit
-    def look(key: Key) -> Samples:
+    def look(key: Key, world: World, models: Models) -> Samples:
         class_key, survey_key = jax.random.split(key)
         classes = balanced_classes(class_key, config, number)
         _, seen, _ = surveys(jax.random.split(survey_key, number), world, classes)
         features = detect_all(models.detectors, seen)
         return tuple(by_class(x, classes, num_classes, samples) for x in features)
 
-    return look(key)
+    return look(key, world, models)
