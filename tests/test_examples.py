@@ -90,6 +90,7 @@ def test_new_modality(example, tmp_path):
     assert set(summary["dqn"]) == {"lidar", "thermal"}
 
 
+@pytest.mark.slow
 def test_the_thermal_camera_tells_what_is_hot(learned):
     _, outputs = learned
     assert outputs["detector_metrics"]["thermal"]["accuracy"] >= 0.95
@@ -106,6 +107,7 @@ def recorded_scans(example, runs):
     return lambda *argv: main([str(runs / "thermal"), *map(str, argv), "--trust"])
 
 
+@pytest.mark.slow
 def test_recorded_scans(recorded_scans, tmp_path, capsys):
     recording = tmp_path / "recorded"  # without an ending
     recorded_scans(recording, "--simulate")

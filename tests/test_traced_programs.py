@@ -69,6 +69,7 @@ def test_no_number_is_a_constant_of_a_program():
     assert constants[0] == constants[1]
 
 
+@pytest.mark.slow
 def test_a_size_changes_only_what_depends_on_it():
     config = PRESETS["smoke"]
     other = dataclasses.replace(config, jmvae=dataclasses.replace(config.jmvae, hidden=(32,)))

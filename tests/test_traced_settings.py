@@ -123,6 +123,7 @@ def test_each_setting_changes_its_training_and_no_other(together, name):
         assert max(differ.values()) < 1e-6
 
 
+@pytest.mark.slow
 def test_the_cost_of_a_look_may_be_traced():
     with_filter = dataclasses.replace(CONFIG.jmvae, fusion="filter")
     model, keys = make_jmvae(CONFIG), jax.random.split(jax.random.key(0), 4)

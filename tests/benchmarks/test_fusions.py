@@ -119,6 +119,7 @@ def test_an_audited_map_holds_what_it_reads_and_the_exact_posterior():
     np.testing.assert_allclose(information, np.sum(weights * np.log(weights)), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_rewards_are_nats_of_the_exact_posterior_whatever_the_map_says():
     bank = tuple(jnp.tile(features, (3, 1, 1)) for _, features in (GREEN, CUBE))
     config = MdpConfig(reward="nats", look_cost=0.1)

@@ -366,6 +366,7 @@ def played():
     return play
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("is_convex", "cost", "unseen"),
     [

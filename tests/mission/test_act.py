@@ -149,6 +149,7 @@ def test_the_lidar_looks_over_a_robot_without_one(scan, facing):
     assert after.robots.detections[LIDAR] == 1
 
 
+@pytest.mark.slow
 def test_the_light_of_a_scan_is_that_of_its_time(scan, models, facing):
     # An untrained detector divides by almost nothing, and is always certain.
     detector = replace(models.detectors[CAMERA], scale=jnp.float32(1.0))

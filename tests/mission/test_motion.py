@@ -81,6 +81,7 @@ def test_contacts_hold_a_robot_back_where_there_are_any(move, pushing):
     assert np.all(ends["contacts"] < 0.01)
 
 
+@pytest.mark.slow
 def test_a_batch_moves_like_its_members(move, pushing):
     gaps = 0.002, 0.5, 0.03
     together, clearance = move(pushing(*gaps))

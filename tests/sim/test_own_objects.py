@@ -121,6 +121,7 @@ class Clock(sim.Sensor):
         return light.point
 
 
+@pytest.mark.slow
 def test_a_scan_tells_the_sensor_where_and_when_it_looks(view):
     arena, data = view
     clock = Clock(height=0.05, rays=ThreeRays(), window=3)

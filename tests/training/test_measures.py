@@ -275,6 +275,7 @@ def test_values_that_are_not_numbers_give_totals_that_are_none():
     assert all(np.isfinite(x).all() for pair in found.values() for x in pair)
 
 
+@pytest.mark.slow
 def test_where_looks_add_up_the_optimum_is_by_the_total_of_the_own_sensors_looks():
     model, prior, classes = make_jmvae(CONFIG), make_prior(CONFIG), in_place().classes
     fusion = filter.init(KEY, model, classes, prior, FilterConfig(hidden=(1,)))

@@ -67,6 +67,7 @@ def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, m
         assert "calibrate" not in used
 
 
+@pytest.mark.slow
 def test_without_calibration_a_detector_is_what_was_trained():
     windows, labels = jax.random.normal(KEY, (48, 6)), jnp.arange(48) % 2
     examples, config = (examples_of(windows, labels),) * 2, TINY.detector
@@ -201,6 +202,7 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
     assert [x.shape[:2] for x in found.held_out] == [(3, 9), (3, 9)]
 
 
+@pytest.mark.slow
 def test_a_scene_is_the_same_whoever_works_it_out():
     listed = {stage.name: stage for stage in training.stages.stages(TINY, make_world(TINY).arena)}
     keys, classes = listed["scenes"].begin(KEY, TINY)

@@ -43,6 +43,7 @@ def test_confident_looks_in_place_tell_what_exact_bayes_knows(world):
     assert compare.unsound(belief) is None
 
 
+@pytest.mark.slow
 def test_four_classes_are_told_apart_by_small_networks():
     small = {"hidden": (16,), "restarts": 1, "steps": 800, "batch": 128, "samples_per_class": 500}
     latent, belief, lacking = figures("2x2", **small)
