@@ -108,7 +108,7 @@ def simulate(
     scene = dataclasses.replace(scene, layout=layout, poses=view.poses)
     data = arenas.place(world.arena, layout, view.poses)
     readings = worlds.scan_around(
-        noise_key, world, scene, data, robot, view.bearing, robot, view.twin
+        noise_key, world, scene, data, robot, view.bearing, robot, twin=view.twin
     )
     if name == "failed":
         readings = jnp.full_like(readings, world.sensors[robot].blind)
@@ -131,12 +131,18 @@ def answered(
     for robot, modality in enumerate(config.modalities):
 
         def share(key: jax.Array, name: str, robot: int = robot) -> float:
-            def one(key: jax.Array) -> jax.Array:
-                look = simulate(key, world, robot, name)
-                return models.detect_in_window(robot, world.sensors[robot], *look).is_there
+            @jax.jit
+            def answers(keys: jax.Array, models: jaxsense.Models) -> jax.Array:
+                def one(key: jax.Array) -> jax.Array:
+                    readings, bearing, distance = simulate(key, world, robot, name)
+                    sensor = world.sensors[robot]
+                    return models.detect_in_window(
+                        robot, sensor, readings, bearing, distance
+                    ).is_there
 
-            many = jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=_AT_ONCE))
-            return float(jnp.mean(many(jax.random.split(key, number))))
+                return jax.lax.map(one, keys, batch_size=_AT_ONCE)
+
+            return float(jnp.mean(answers(jax.random.split(key, number), models)))
 
         key = jax.random.fold_in(jax.random.key(_SEED), robot)
         found[modality] = {name: share(key, name) for name in SITUATIONS}
