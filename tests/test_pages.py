@@ -1,11 +1,15 @@
 """Pages read well on GitHub: their links lead somewhere, and nothing needs Sphinx to be seen."""
 
+import os
 import re
 from pathlib import Path
 
 import pytest
 
+import jaxsense
+
 ROOT = Path(__file__).parent.parent
+PACKAGE = Path(jaxsense.__file__).parent  # which may be installed elsewhere
 PAGES = [
     *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
     *sorted((ROOT / "docs").glob("*.md")),
@@ -24,13 +28,20 @@ def anchors(text):
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
+def linked(path, name):
+    """The file that a link of a page leads to."""
+    file = Path(os.path.normpath(path.parent / name)) if name else path
+    source = ROOT / "jaxsense"
+    return PACKAGE / file.relative_to(source) if file.is_relative_to(source) else file
+
+
 def dead_links(path, text):
     """Texts and targets of the links of a page that have no text or lead nowhere."""
     for words, target in re.findall(r"\[([^\[\]]*)\]\(([^()\s]*)\)", without_code(text)):
         if re.match(r"https?:", target):
             continue
         name, _, anchor = target.partition("#")
-        file = path.parent / name if name else path
+        file = linked(path, name)
         found = file.exists()
         if found and anchor:
             content = text if file == path else file.read_text(encoding="utf-8")
