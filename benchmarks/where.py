@@ -1,11 +1,12 @@
 """`python -m benchmarks.where RUN`: what it is worth to choose from where to look.
 
 One robot, one PoI in view. By the rule of missions, the robot looks at once from where it stands,
-and again from the nearest place near the PoI from which a look is new. The alternative chooses
-before each look: from here, or from another side or distance, after the drive there. Dynamic
-programming over the posterior of the sensor's label, the distance and whether the robot has looked
-from its place yields the least mean of time plus the price of an error, and so the shortest mean
-time for each accuracy. Looks are those of the run's detector from several distances.
+and again from there if at least half of a second look is new, or else from the nearest such place
+near the PoI. The alternative chooses before each look: from here, or from another side or distance,
+after the drive there. Dynamic programming over the posterior of the label, the distance and the
+number of looks there yields the least mean of time plus the price of an error, and so the
+shortest mean time for each accuracy. Looks are those of the run's detector from several distances,
+and looks from one place count as fusion weighs them.
 """
 
 import dataclasses
@@ -29,7 +30,9 @@ _DISTANCES = (0.5, 0.9, 1.5, 2.5, 3.5)  # m
 _NEAR = 1  # of the distances, to which the rule drives
 _SCENES = 2048
 _POINTS = 401  # of the posterior
-_HORIZON = 12  # looks
+_HORIZON = 8  # looks
+_LOOKS_FROM_ONE_PLACE = 4
+_SLIGHTLY = 0.026  # of common strength, with which a look counts .95
 _PRICES = np.geomspace(20, 4000, 25)  # s, of an error
 _ACCURACIES = (0.95, 0.98, 0.99)
 
@@ -82,18 +85,34 @@ def ratios_from(key: Key, config: Config, models: Models, distance: float) -> li
 class Problem:
     """One PoI, one sensor: what a look from each place does to the posterior.
 
-    A state is a point of the posterior, a distance, and whether the robot has looked from there.
+    A state is a point of the posterior, a distance, and the number of looks from there.
     """
 
-    def __init__(self, ratios: list[np.ndarray], near: float, fresh: float, speed: float):
-        """Looks from each of the distances; `near` is the weight of a look from the same place."""
+    def __init__(
+        self,
+        ratios: list[np.ndarray],
+        weights: np.ndarray,
+        apart: float,
+        speed: float,
+        stays: bool,
+    ):
+        """Looks from each of the distances.
+
+        Args:
+          ratios: for each distance, log-likelihood ratios of looks towards the true label.
+          weights: `[K]` of the first to the K-th look from one place, which says nothing more.
+          apart: distance between places whose looks are independent, in metres.
+          speed: of the robot, in metres per second.
+          stays: whether the rule looks again from the same place.
+        """
         self.logits = np.linspace(-12, 12, _POINTS)
         self.right = 1 / (1 + np.exp(-self.logits))  # probability of label 1
         self.after = np.stack(
-            [np.stack([self._moved(weight * ratio) for ratio in ratios]) for weight in (1.0, near)]
+            [np.stack([self._moved(weight * ratio) for ratio in ratios]) for weight in weights]
         )
-        apart = np.abs(np.subtract.outer(_DISTANCES, _DISTANCES))
-        self.seconds = np.maximum(apart, fresh) / speed
+        distance = np.abs(np.subtract.outer(_DISTANCES, _DISTANCES))
+        self.seconds = np.maximum(distance, apart) / speed
+        self.stays = stays
 
     def _moved(self, ratios: np.ndarray) -> np.ndarray:
         """`[P, P]` chances of the posteriors after a look from those before it."""
@@ -109,23 +128,21 @@ class Problem:
             np.add.at(chances, (rows, low + 1), share[:, None] * (place - low) / 64)
         return chances
 
-    def actions(
-        self, distance: int, has_looked: bool, by_rule: bool
-    ) -> list[tuple[int, float, int]]:
-        """Distance to look from, seconds until the look, and 1 for a place looked from before.
+    def actions(self, distance: int, looks: int, by_rule: bool) -> list[tuple[int, float, int]]:
+        """Distance to look from, seconds until the look, and the number of looks from there.
 
         Args:
           distance: index of the present one.
-          has_looked: whether the robot has looked from its place.
+          looks: number of looks from the robot's place.
           by_rule: whether it follows the rule of missions.
         """
         look = 0.1
+        here = [(distance, look, looks)] if looks < len(self.after) else []
         if by_rule:
-            away = (_NEAR, self.seconds[distance, _NEAR] + look, 0)
-            return [away if has_looked else (distance, look, 0)]
-        here = (distance, look, int(has_looked))
+            away = [(_NEAR, self.seconds[distance, _NEAR] + look, 0)]
+            return here if here and (self.stays or not looks) else away
         others = range(len(_DISTANCES))
-        return [here, *((d, self.seconds[distance, d] + look, 0) for d in others)]
+        return [*here, *((d, self.seconds[distance, d] + look, 0) for d in others)]
 
     def solve(self, price: float, by_rule: bool) -> tuple[float, float]:
         """Mean time and accuracy of the best policy, from equal odds and a random far distance.
@@ -135,23 +152,23 @@ class Problem:
           by_rule: whether the robot follows the rule of missions, and only chooses when to stop.
         """
         wrong = np.minimum(self.right, 1 - self.right)
-        shape = len(_DISTANCES), 2, _POINTS
+        shape = len(_DISTANCES), len(self.after) + 1, _POINTS
         cost = np.broadcast_to(price * wrong, shape).copy()
         time, error = np.zeros(shape), np.broadcast_to(wrong, shape).copy()
         for _ in range(_HORIZON):
             new = [x.copy() for x in (cost, time, error)]
             new[0][:], new[1][:], new[2][:] = price * wrong, 0.0, wrong
-            for d in range(len(_DISTANCES)):
-                for has_looked in (False, True):
-                    for to, seconds, again in self.actions(d, has_looked, by_rule):
-                        chances = self.after[again, to]
-                        total = seconds + chances @ cost[to, 1]
-                        better = total < new[0][d, int(has_looked)]
-                        of_look = total, seconds + chances @ time[to, 1], chances @ error[to, 1]
-                        for old, found in zip(new, of_look, strict=True):
-                            old[d, int(has_looked)] = np.where(
-                                better, found, old[d, int(has_looked)]
-                            )
+            for d, taken in np.ndindex(shape[:2]):
+                for to, seconds, number in self.actions(d, taken, by_rule):
+                    chances, then = self.after[number, to], (to, number + 1)
+                    of_look = (
+                        seconds + chances @ cost[then],
+                        seconds + chances @ time[then],
+                        chances @ error[then],
+                    )
+                    better = of_look[0] < new[0][d, taken]
+                    for old, found in zip(new, of_look, strict=True):
+                        old[d, taken] = np.where(better, found, old[d, taken])
             cost, time, error = new
         start = _POINTS // 2
         return float(time[2:, 0, start].mean()), 1 - float(error[2:, 0, start].mean())
@@ -180,10 +197,16 @@ def main(argv: list[str] | None = None) -> None:
             f"{np.mean(x > 0):.3f} at {d} m" for d, x in zip(_DISTANCES, of_sensor, strict=True)
         )
         print(f"{name}: single looks right {shares}")
-        near = float(models.novelty.weight(jnp.zeros(1), m))
         fresh = float(models.novelty.fresh_distance(m))
-        print(f"  a look from the same place counts {near:.2f}; {fresh:.2f} m away, a half")
-        problem = Problem(of_sensor, near, fresh, float(config.team.travel.speed))
+        weights = np.array(
+            [float(models.novelty.weight(jnp.zeros(k), m)) for k in range(_LOOKS_FROM_ONE_PLACE)]
+        )
+        strength, length = float(models.novelty.strength[m]), float(models.novelty.length[m])
+        apart = length * np.sqrt(2 * np.log(max(strength / _SLIGHTLY, 1.0)))
+        print(f"  looks from one place count {', '.join(f'{w:.2f}' for w in weights)}")
+        print(f"  looks {apart:.2f} m apart are nearly independent")
+        speed = float(config.team.travel.speed)
+        problem = Problem(of_sensor, weights, apart, speed, stays=fresh == 0)
         curves = [[problem.solve(p, by_rule) for p in _PRICES] for by_rule in (True, False)]
         for accuracy in _ACCURACIES:
             rule, best = (at(accuracy, curve) for curve in curves)
