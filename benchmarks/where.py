@@ -6,7 +6,8 @@ near the PoI. The alternative chooses before each look: from here, or from anoth
 after the drive there. Dynamic programming over the posterior of the label, the distance and the
 number of looks there yields the least mean of time plus the price of an error, and so the
 shortest mean time for each accuracy. Looks are those of the run's detector from several distances,
-and looks from one place count as fusion weighs them.
+and looks from one place count as fusion weighs them, but are drawn anew each time: that flatters
+them, since looks from one place repeat their errors.
 """
 
 import dataclasses
