@@ -131,6 +131,7 @@ importlib.reload(jaxsense.core.types)
 """
 
 
+@pytest.mark.slow
 def test_nothing_is_registered_with_jax_so_modules_can_be_reloaded():
     command = [sys.executable, "-c", REGISTERED]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -134,6 +134,7 @@ def test_recorded_scans(recorded_scans, tmp_path, capsys):
     assert told[2:] == ["nothing there"] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [

@@ -110,6 +110,7 @@ def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, number):
         pass
 
 
+@pytest.mark.slow
 def test_a_system_without_fcntl_can_lock():
     program = """
 import sys, tempfile

@@ -156,6 +156,7 @@ def test_look_is_centred_on_the_poi(looks):
     assert depth.max() < 0.1415 + 0.03
 
 
+@pytest.mark.slow
 def test_surveys_equal_single_ones(simulation, monkeypatch):
     monkeypatch.setattr(jaxsense.looks, "_SCENES_AT_ONCE", 2)  # of five
     keys = jax.random.split(jax.random.key(0), 5)
