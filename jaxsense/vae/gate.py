@@ -120,14 +120,14 @@ class Fitting:
     nothing: Looks
 
     def draw(self, key: Key, number: int) -> Int[Array, "{number} 2 B"]:
-        """Draws rows of looks at PoIs and of looks at nothing, a quarter of a batch of each.
+        """Draws rows of looks at PoIs and of looks at nothing, half a batch of each.
 
         Args:
           key: random key.
           number: of steps; static.
         """
         rows = jnp.array([len(self.shown.windows), len(self.nothing.windows)])
-        shape = number, 2, -(-self.config.batch // 4)
+        shape = number, 2, -(-self.config.batch // 2)
         return jax.random.randint(key, shape, 0, rows[None, :, None])
 
     def loss(

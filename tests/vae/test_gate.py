@@ -11,7 +11,7 @@ from jaxsense.config import DetectorConfig
 from jaxsense.core import supervised
 from jaxsense.vae import detectors, gate
 
-CONFIG = DetectorConfig(hidden=(8,), steps=300, batch=128, learning_rate=1e-2)
+CONFIG = DetectorConfig(hidden=(8,), steps=300, batch=64, learning_rate=1e-2)
 RAYS = 6
 
 
