@@ -277,7 +277,7 @@ def _write(
 ) -> MissionState:
     """Records a scan, and updates the map if it detects the PoI."""
     poi, detects = aim.poi, aim.scans & look.detects
-    modality = jnp.array(mission.config.modality_of_robot)[robot]
+    modality = mission.modalities[robot]
     own = state.robot(robot)
     failure = _fail(own, aim.scans & ~detects, mission.config.mission.attempts)
     state = state.with_robot(

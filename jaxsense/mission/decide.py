@@ -167,11 +167,6 @@ def _gains(
     return jax.vmap(of_robot)(jnp.arange(len(mission.config.carried)))
 
 
-def _modality(mission: Mission, robot: Index) -> Int[Array, ""]:
-    """Index of a robot's sensor."""
-    return jnp.array(mission.config.modality_of_robot)[robot]
-
-
 def _known_to(
     mission: Mission,
     models: Models,
@@ -185,7 +180,7 @@ def _known_to(
         positions=state.scene.layout.position,
         present=~given_up,
         poses=state.scene.poses,
-        modality=jnp.array(mission.config.modality_of_robot),
+        modality=mission.modalities,
         works=(phase != ENDED) & (phase != FAILED),
         target=state.robots.target,
     )
@@ -213,7 +208,7 @@ def _times_to_new_places(
     of_robot = jax.vmap(of_look, (None, None, 0))
     return jax.vmap(of_robot, (0, 0, None))(
         state.scene.poses[:, :2],
-        jnp.array(mission.config.modality_of_robot),
+        mission.modalities,
         jnp.arange(mission.config.arena.num_pois),
     )
 
@@ -237,7 +232,7 @@ def _best_view(
     length = roadmap.lengths(config, scene.layout, state.roadmap, scene.poses[robot, :2], poi)
     positions, margin = state.roadmap.viewpoints[poi], config.navigation.margin
     length += jnp.where(_room(mission, state, robot, poi, positions, margin) > 0, 0.0, _DETOUR)
-    position, modality = scene.poses[robot, :2], _modality(mission, robot)
+    position, modality = scene.poses[robot, :2], mission.modalities[robot]
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
     apart = state.apart(jnp.concatenate([positions, position[None]]), poi, modality)
     is_new = jnp.min(apart, axis=-1) >= models.novelty.fresh_distance(modality)

@@ -224,6 +224,11 @@ class Mission:
             raise ConfigError("policy", name, f"must be one of {', '.join(self.policies)}")
         return [*self.policies].index(name)
 
+    @property
+    def modalities(self) -> Int[Array, " R"]:
+        """Index of each robot's sensor, int32."""
+        return jnp.array(self.config.modality_of_robot)
+
     def time(self, state: MissionState) -> Float[Array, "..."]:
         """Seconds since the start."""
         return state.steps * self.config.mission.control_period
