@@ -21,10 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxsense import Config, Models, looks, mission
+from jaxsense import Config, Key, Models, detections, mission
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
-from jaxsense.core.types import Key
 from jaxsense.dqn import policies
 from jaxsense.dqn.policies import Known, Policy, Trained
 from jaxsense.mission import MissionState
@@ -124,8 +123,8 @@ def of_costs(key: Key, config: Config, models: Models, costs: jax.Array) -> Mode
     """
     world = make_world(config)
     bank_key, held_out_key, train_key = jax.random.split(key, 3)
-    bank = looks.detections(bank_key, config, models, _SAMPLES)
-    held_out = looks.detections(held_out_key, config, models, _SAMPLES)
+    bank = detections(bank_key, config, models, _SAMPLES)
+    held_out = detections(held_out_key, config, models, _SAMPLES)
     none = jnp.zeros((0, config.arena.num_pois), jnp.int32)
     found = Detections(
         bank=bank,

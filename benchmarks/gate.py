@@ -10,7 +10,6 @@ import rich.console
 import rich.table
 
 import jaxsense
-from jaxsense.core.types import others
 from jaxsense.sim import absence, amiro, viewpoints
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import world as worlds
@@ -40,7 +39,7 @@ def view_of(key: jax.Array, world: World, scene: Scene, robot: int, name: str) -
     config, poi, limits = world.arena.config, jnp.int32(0), world.viewpoint
     key, viewpoint_key = jax.random.split(key)
     draw = jax.random.uniform(key, (6,))
-    others_at = others(scene.poses[:, :2], robot)
+    others_at = jnp.delete(scene.poses[:, :2], robot, axis=0)
     pose, bearing = viewpoints.random_viewpoint(
         viewpoint_key, limits, config, scene.layout, others_at, poi
     )

@@ -19,17 +19,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense import Config, Models, looks
+from jaxsense import Config, Key, Live, Models
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
-from jaxsense.core.types import Key
 from jaxsense.run import cli, rundir
-from jaxsense.sim.world import World, make_world
+from jaxsense.sim.world import make_world
 
 PROGRAM = "benchmarks.where"
 _DISTANCES = (0.5, 0.9, 1.5, 2.5, 3.5)  # m
 _NEAR = 1  # of the distances, to which the rule drives
-_SCENES = 2048
+_SCENES = 4096
+_AT_ONCE = 512
 _POINTS = 401  # of the posterior
 _HORIZON = 8  # looks
 _LOOKS_FROM_ONE_PLACE = 4
@@ -64,21 +64,29 @@ def ratios_from(key: Key, config: Config, models: Models, distance: float) -> li
     near, far = distance - 0.02, distance + 0.02
     viewpoint = dataclasses.replace(config.viewpoint, min_distance=near, max_distance=far)
     world = dataclasses.replace(make_world(config), viewpoint=viewpoint)
+    class_key, look_key = jax.random.split(key)
+    num_classes, num_pois = len(config.arena.classes), config.arena.num_pois
+    classes = jax.random.randint(class_key, (_SCENES, num_pois), 0, num_classes)
 
     @jax.jit
-    def look(key: Key, world: World, models: Models) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        class_key, survey_key = jax.random.split(key)
-        classes = looks.balanced_classes(class_key, config, _SCENES)
-        _, windows, _ = looks.surveys(jax.random.split(survey_key, _SCENES), world, classes)
-        return classes, looks.detect_all(models.detectors, windows)
+    def look(live: Live, keys: Key, classes: jax.Array) -> tuple[jax.Array, ...]:
+        """Features of looks at the first PoI of each scene, `[S, D_m]` for each modality."""
 
-    classes, features = look(key, world, models)
+        def at_scene(scene: tuple[Key, jax.Array]) -> tuple[jax.Array, ...]:
+            scene_key, *look_keys = jax.random.split(scene[0], 1 + live.num_modalities)
+            drawn, poi = live.scene(scene_key, scene[1]), jnp.int32(0)
+            return tuple(live.observe(k, drawn, poi, m)[0] for m, k in enumerate(look_keys))
+
+        return jax.lax.map(at_scene, (keys, classes), batch_size=_AT_ONCE)
+
+    keys = jax.random.split(look_key, _SCENES)
+    features = look(Live(world, models.detectors), keys, classes)
     found = []
     for name, of_modality in zip(config.modalities, features, strict=True):
         labels = np.array(config.label_of_class(name))
         share = np.bincount(labels) / len(labels)
         ratio = np.log(np.clip(np.asarray(of_modality), 1e-6, 1)) - np.log(share)
-        sign = np.where(labels[np.asarray(classes)] == 1, 1.0, -1.0)
+        sign = np.where(labels[np.asarray(classes[:, 0])] == 1, 1.0, -1.0)
         found.append((sign * (ratio[..., 1] - ratio[..., 0])).reshape(-1))
     return found
 

@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxsense
-from jaxsense import dqn, mission, vae
-from jaxsense.core.types import pytree
+from jaxsense import dqn, mission, pytree, vae
 
 
 @pytree

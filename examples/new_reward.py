@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxsense
-from jaxsense import dqn
-from jaxsense.core.types import Belief, pytree
+from jaxsense import Belief, dqn, pytree
 
 
 @pytree

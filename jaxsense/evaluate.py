@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -18,10 +18,10 @@ from jaxsense.config import TIMESTEP, Config, ConfigError
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Name
-from jaxsense.dqn.policies import Policy, Values
 from jaxsense.run import cli, devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError
+from jaxsense.run.programs import OwnPolicies
 from jaxsense.show import animation, mission_plots, page, plots, tables
 from jaxsense.show.terminal import Display, print_table, say
 from jaxsense.summary import compare
@@ -82,9 +82,7 @@ class Arguments:
         cli.require_directory("cache", self.cache)
 
 
-def main(
-    argv: list[str] | None = None, policies: Mapping[str, Values | Policy] | None = None
-) -> None:
+def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> None:
     """Runs the program.
 
     Args:

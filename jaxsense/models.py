@@ -37,7 +37,7 @@ class Models:
       look_values: for each modality, the values of looks by dynamic programming.
       agent: how the Q-networks are used.
       q_networks: for each modality, parameters of the Q-network; the same for all in a team.
-      tours: parameters of the network that orders a team's looks, see `dqn.tours`, or None.
+      tours: parameters of each network that orders looks, see `dqn.tours`.
     """
 
     detectors: tuple[Detector, ...]
@@ -48,7 +48,7 @@ class Models:
     look_values: tuple[LookValues, ...]
     agent: Agent
     q_networks: tuple[Params, ...]
-    tours: Params | None
+    tours: tuple[Params, ...]
 
     def detect(
         self,

@@ -22,13 +22,12 @@ from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, read_some
-from jaxsense.dqn.policies import Policy, Values
 from jaxsense.run import cli, devices, files, pipeline, rundir, seeds
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.pipeline import RunResult
-from jaxsense.run.programs import Programs
+from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.show import animation, page, plots, tables, tensorboard
 from jaxsense.show.terminal import Display, print_table, say
@@ -99,7 +98,7 @@ class Arguments:
 def main(
     argv: list[str] | None = None,
     change: Callable[[Config], Config] = lambda config: config,
-    policies: Mapping[str, Values | Policy] | None = None,
+    policies: OwnPolicies | None = None,
 ) -> None:
     """Runs the program.
 
@@ -151,7 +150,7 @@ def main(
 def parse(
     argv: list[str],
     change: Callable[[Config], Config] = lambda config: config,
-    policies: Mapping[str, Values | Policy] | None = None,
+    policies: OwnPolicies | None = None,
 ) -> Arguments:
     """Reads the command line; ends the program with status 2 and one line if it is wrong.
 
@@ -234,7 +233,7 @@ def _train(
     run: RunDirectory,
     workers: Workers,
     console: rich.console.Console,
-    policies: Mapping[str, Values | Policy] | None,
+    policies: OwnPolicies | None,
 ) -> None:
     """Trains all seeds with the same programs, and writes their results."""
     settings, failed = run.settings, dict[int, str]()

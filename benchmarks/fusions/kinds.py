@@ -10,10 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense import vae
-from jaxsense.core import networks
-from jaxsense.core.networks import MLP, Params
-from jaxsense.core.types import Belief, Fusion, Key, pytree
+from jaxsense import Belief, Fusion, pytree, vae
 from jaxsense.dqn import rewards
 from jaxsense.dqn.agents import MapAgent
 from jaxsense.dqn.team_mdp import Team
@@ -295,10 +292,10 @@ class ProbabilityAgent(MapAgent):
 
     fusion: Fusion
 
-    def init(self, key: Key) -> Params:
-        """Random parameters of the Q-network."""
-        size = self.num_pois * len(self.fusion.classes.mean)
-        return networks.init(key, MLP(self.hidden, self.num_pois + 1), size)
+    @property
+    def num_inputs(self) -> int:
+        """N * C."""
+        return self.num_pois * len(self.fusion.classes.mean)
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
         """Class probabilities of all PoIs, `[N * C]`.

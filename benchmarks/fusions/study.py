@@ -6,19 +6,28 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from benchmarks.fusions.kinds import Audited, ExactNats, LogOdds, Mixture, ProbabilityAgent, Product
 from benchmarks.fusions.table import Figures
-from jaxsense import PRESETS, Bank, Config, Models, learn, mission
+from jaxsense import (
+    PRESETS,
+    Bank,
+    Config,
+    Fusion,
+    Key,
+    Models,
+    learn,
+    make_bayes,
+    make_in_place,
+    mission,
+)
 from jaxsense.config import PresetName
-from jaxsense.core.networks import Params
-from jaxsense.core.types import Fusion, Key, Samples
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.policies import Known
 from jaxsense.mission import Mission, MissionState
-from jaxsense.models import make_bayes, make_in_place
 from jaxsense.run import devices
 from jaxsense.training import measures
 from jaxsense.training.stage import Outputs, key_of
@@ -144,7 +153,7 @@ def _learned(config: Config, key: Key) -> Outputs:
 
 
 def _models(
-    config: Config, fusion: Fusion, outputs: Outputs, q_networks: tuple[Params, ...]
+    config: Config, fusion: Fusion, outputs: Outputs, q_networks: tuple[PyTree, ...]
 ) -> Models:
     return Models(
         detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
@@ -155,7 +164,7 @@ def _models(
         look_values=outputs["look_values"],
         agent=_agent(config, fusion),
         q_networks=q_networks,
-        tours=None,
+        tours=(),
     )
 
 
@@ -164,7 +173,7 @@ def _agent(config: Config, fusion: Fusion) -> ProbabilityAgent:
     return ProbabilityAgent(config.dqn.discount, number, latent_size, config.dqn.hidden, fusion)
 
 
-def _mdp(config: Config, fusion: Audited, features: Samples) -> MapMdp:
+def _mdp(config: Config, fusion: Audited, features: tuple[jax.Array, ...]) -> MapMdp:
     """The map MDP with the reward in nats of the exact posterior."""
     reward = ExactNats(config.mdp.look_cost)
     return MapMdp(Bank(features), fusion, reward, config.mdp, config.arena.num_pois)
@@ -172,7 +181,7 @@ def _mdp(config: Config, fusion: Audited, features: Samples) -> MapMdp:
 
 def _judge(
     config: Config, key: Key, fusion: Fusion, outputs: Outputs
-) -> tuple[dict[str, jax.Array], tuple[Params, ...]]:
+) -> tuple[dict[str, jax.Array], tuple[PyTree, ...]]:
     """NLLs and returns of a fusion, and the Q-networks that learned with it."""
     detections = outputs["detections"]
     found = measures.beliefs(key_of(key, "nll"), config, fusion=fusion, detections=detections)
@@ -181,7 +190,7 @@ def _judge(
     agent = _agent(config, audited)
     mdp, held_out = (_mdp(config, audited, x) for x in (detections.bank, detections.held_out))
 
-    def train(modality: jax.Array) -> tuple[jax.Array, Params]:
+    def train(modality: jax.Array) -> tuple[jax.Array, PyTree]:
         environment = agent.environment(mdp, modality)
         q_network = dqn.train(key_of(key, "dqn"), environment, config.dqn)[0].params
 

@@ -4,9 +4,7 @@ from collections.abc import Mapping
 from typing import TypedDict
 
 import numpy as np
-
-from jaxsense.summary import compare
-from jaxsense.summary.metrics import Interval
+from scipy import stats
 
 REFERENCE = "filter"
 """The fusion that the others are compared with."""
@@ -15,6 +13,14 @@ Figures = Mapping[str, float]
 """What is measured of one fusion and one seed, by name."""
 
 _DIGITS = {"looks": 2, "seconds": 1}
+
+
+class Interval(TypedDict):
+    """A mean over seeds and its 95% interval, which one seed does not have."""
+
+    mean: float
+    low: float | None
+    high: float | None
 
 
 class OfFusion(TypedDict):
@@ -38,7 +44,10 @@ def means(
 
     def of(figure: str) -> Interval:
         values = [x[name][figure] - (x[less][figure] if less else 0.0) for x in found.values()]
-        return compare.interval(np.array(values))
+        low = high = None
+        if len(values) > 1:
+            low, high = map(float, stats.ttest_1samp(values, 0.0).confidence_interval(0.95))
+        return {"mean": float(np.mean(values)), "low": low, "high": high}
 
     return {figure: of(figure) for figure in next(iter(found.values()))[name]}
 

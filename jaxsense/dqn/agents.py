@@ -48,8 +48,9 @@ class MapAgent:
         return False
 
     @property
-    def tour_network(self) -> None:
+    def tour_networks(self) -> tuple[()]:
         """None: without travel time there is no order to learn."""
+        return ()
 
     def learner(self, modality: str) -> str:
         """The name of what learns for robots of a modality: the modality."""
@@ -79,12 +80,29 @@ class MapAgent:
         """
         return MapEnvironment(self, mdp, modality, self.discount)
 
+    @property
+    def num_inputs(self) -> int:
+        """S, the size of what `observe` returns."""
+        return 2 * self.num_pois * self.latent_size
+
     def init(self, key: Key) -> Params:
         """Random parameters of the Q-network."""
-        return networks.init(key, self._network, 2 * self.num_pois * self.latent_size)
+        return networks.init(key, self._network, self.num_inputs)
 
-    def init_tours(self, key: Key) -> None:
-        """None: without travel time there is no order to learn."""
+    def init_tours(self, key: Key) -> tuple[()]:
+        """None, see `tour_networks`."""
+        del key
+        return ()
+
+    def team_inputs(self, num_pois: int, num_robots: int) -> dict[str, jax.ShapeDtypeStruct]:
+        """None: the map says everything.
+
+        Args:
+          num_pois: not used.
+          num_robots: not used.
+        """
+        del num_pois, num_robots
+        return {}
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
         """The map, see `observation`.
@@ -118,7 +136,7 @@ class MapAgent:
     def decide(
         self,
         params: Params,
-        tour_params: Params | None,
+        tour_params: tuple[Params, ...],
         classes: Belief,
         belief: Belief,
         team: Team,
@@ -173,7 +191,7 @@ class MapAgent:
         def of_poi(poi: Int[Array, ""]) -> jax.Array:
             only = team.present & (jnp.arange(self.num_pois) == poi)
             alone = dataclasses.replace(team, present=only)
-            values = self.decide(params, None, classes, belief, alone, robot)
+            values = self.decide(params, (), classes, belief, alone, robot)
             return values[poi] - values[-1]
 
         return jax.vmap(of_poi)(jnp.arange(self.num_pois))
@@ -213,9 +231,9 @@ class TeamAgent:
         return PoolingNetwork(self.hidden, features)
 
     @property
-    def tour_network(self) -> PoolingNetwork:
+    def tour_networks(self) -> tuple[PoolingNetwork]:
         """The network that orders looks."""
-        return self.network
+        return (self.network,)
 
     def learner(self, modality: str) -> str:
         """The name of what learns for robots of a modality: all robots share one network."""
@@ -251,9 +269,27 @@ class TeamAgent:
         """Random parameters of the Q-network."""
         return networks.init(key, self.network, self.network.features * self.config.num_pois[1])
 
-    def init_tours(self, key: Key) -> Params:
+    def init_tours(self, key: Key) -> tuple[Params]:
         """Random parameters of the network that orders looks, see `tours`."""
-        return self.init(key)
+        return (self.init(key),)
+
+    def team_inputs(self, num_pois: int, num_robots: int) -> dict[str, jax.ShapeDtypeStruct]:
+        """All fields of `Team`, and the index of the robot that chooses.
+
+        Args:
+          num_pois: N.
+          num_robots: R.
+        """
+        struct_of = jax.ShapeDtypeStruct
+        return {
+            "positions": struct_of((num_pois, 2), jnp.float32),
+            "present": struct_of((num_pois,), bool),
+            "poses": struct_of((num_robots, 3), jnp.float32),
+            "modality": struct_of((num_robots,), jnp.int32),
+            "works": struct_of((num_robots,), bool),
+            "target": struct_of((num_robots,), jnp.int32),
+            "robot": struct_of((), jnp.int32),
+        }
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
         """What a robot knows of each PoI, see `team_mdp.observation`.
@@ -292,7 +328,7 @@ class TeamAgent:
     def decide(
         self,
         params: Params,
-        tour_params: Params | None,
+        tour_params: tuple[Params, ...],
         classes: Belief,
         belief: Belief,
         team: Team,
@@ -306,7 +342,7 @@ class TeamAgent:
 
         Args:
           params: of the Q-network.
-          tour_params: of the network of `tours`, or None.
+          tour_params: of the network of `tours`, or none.
           classes: not used.
           belief: `[N, D]` the map.
           team: robots and PoIs at this moment.
@@ -314,11 +350,11 @@ class TeamAgent:
         """
         del classes
         seen = self.observe(belief, team, robot)
-        if tour_params is None:
+        if not tour_params:
             return self.values(params, seen)
         after = self.q(params, seen)[:-1]
         is_worth_it = after > self.config.second_cost * self._own_seconds(seen)
-        seconds = tours.seconds(self.network, tour_params, seen, self.latent_size)
+        seconds = tours.seconds(self.network, tour_params[0], seen, self.latent_size)
         of_pois = jnp.where(is_worth_it, -seconds, 2 * _NOT_WORTH_IT)
         # Comparisons with NaN are false; propagate it instead.
         return jnp.append(jnp.where(jnp.isnan(after), after, of_pois), _NOT_WORTH_IT)
@@ -340,7 +376,8 @@ class TeamAgent:
           team: robots and PoIs at this moment.
           robot: `[]` int32, the robot that chooses.
         """
-        values = self.decide(params, None, classes, belief, team, robot)
+        del classes
+        values = self.values(params, self.observe(belief, team, robot))
         return values[:-1] - values[-1]
 
     def _own_seconds(self, observed: jax.Array) -> jax.Array:

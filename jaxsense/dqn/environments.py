@@ -32,8 +32,8 @@ class Agent(Protocol):
         ...
 
     @property
-    def tour_network(self) -> PoolingNetwork | None:
-        """The network that orders looks; None if the agent has none."""
+    def tour_networks(self) -> tuple[PoolingNetwork, ...]:
+        """The networks that order looks; none if looks take no time."""
         ...
 
     def learner(self, modality: str) -> str:
@@ -69,8 +69,17 @@ class Agent(Protocol):
         """Random parameters of the Q-network."""
         ...
 
-    def init_tours(self, key: Key) -> Params | None:
-        """Random parameters of the network that orders looks; None if the agent has none."""
+    def init_tours(self, key: Key) -> tuple[Params, ...]:
+        """Random parameters of each of `tour_networks`."""
+        ...
+
+    def team_inputs(self, num_pois: int, num_robots: int) -> dict[str, jax.ShapeDtypeStruct]:
+        """Shapes of what `decide` reads besides the map: fields of `Team`, and the robot.
+
+        Args:
+          num_pois: N.
+          num_robots: R.
+        """
         ...
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
@@ -110,7 +119,7 @@ class Agent(Protocol):
     def decide(
         self,
         params: Params,
-        tour_params: Params | None,
+        tour_params: tuple[Params, ...],
         classes: Belief,
         belief: Belief,
         team: Team,
@@ -120,7 +129,7 @@ class Agent(Protocol):
 
         Args:
           params: of the robot's Q-network.
-          tour_params: of the network of `tours`, if there is one.
+          tour_params: of each of `tour_networks`, or none.
           classes: `[C, D]` joint posterior of each class.
           belief: `[N, D]` the map.
           team: robots and PoIs at this moment; PoIs that are not present are never chosen.

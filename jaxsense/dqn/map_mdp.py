@@ -82,6 +82,11 @@ class MapMdp:
         return self
 
     @property
+    def modalities(self) -> tuple[str, ...]:
+        """None: robots and their sensors are those of a `TeamMdp`."""
+        return ()
+
+    @property
     def num_modalities(self) -> int:
         """M, the number of sensors."""
         return self.looks.num_modalities

@@ -78,8 +78,8 @@ class Trained(Protocol):
         ...
 
     @property
-    def tours(self) -> Params | None:
-        """Parameters of the network that orders looks."""
+    def tours(self) -> tuple[Params, ...]:
+        """Parameters of each network that orders looks."""
         ...
 
 

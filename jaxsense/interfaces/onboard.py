@@ -8,7 +8,6 @@ import jax.numpy as jnp
 
 from jaxsense.config import Config
 from jaxsense.core.types import Belief
-from jaxsense.dqn.agents import observation
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.models import Models, make_jmvae
 from jaxsense.sim import sensors
@@ -96,55 +95,37 @@ def _encode(models: Models, model: jmvae.Jmvae, subset: tuple[int, ...]) -> Func
 
 
 def _decide(config: Config, models: Models, m: int) -> Function:
-    if models.agent.counts_time:
-        return _decide_in_team(config, models, m)
-
-    def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
-        values = models.agent.values(models.q_networks[m], observation(Belief(mean, std)))
-        return _decision(values)
-
-    about = "the PoI to look at next, N for NOP, and the value of each"
-    return Function(about, _map_inputs(config), apply)
-
-
-def _decide_in_team(config: Config, models: Models, m: int) -> Function:
-    num_pois, num_robots = config.arena.num_pois, len(config.carried)
+    num_pois = config.arena.num_pois
+    of_team = models.agent.team_inputs(num_pois, len(config.carried))
+    alone = {
+        "positions": jnp.zeros((num_pois, 2)),
+        "present": jnp.ones(num_pois, bool),
+        "poses": jnp.zeros((1, 3)),
+        "modality": jnp.array([m]),
+        "works": jnp.array([True]),
+        "target": jnp.array([num_pois]),
+        "robot": jnp.int32(0),
+    }
 
     def apply(mean: jax.Array, std: jax.Array, *known: jax.Array) -> dict[str, jax.Array]:
-        of_team = dict(zip(team, known, strict=True))
-        robot = of_team.pop("robot")
+        given = {**alone, **dict(zip(of_team, known, strict=True))}
+        robot = given.pop("robot")
         values = models.agent.decide(
             models.q_networks[m],
             models.tours,
             models.fusion.classes,
             Belief(mean, std),
-            Team(**of_team),
+            Team(**given),
             robot,
         )
-        return _decision(values)
+        return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
 
-    team = {
-        "positions": _floats(num_pois, 2),
-        "present": jax.ShapeDtypeStruct((num_pois,), bool),
-        "poses": _floats(num_robots, 3),
-        "modality": jax.ShapeDtypeStruct((num_robots,), jnp.int32),
-        "works": jax.ShapeDtypeStruct((num_robots,), bool),
-        "target": jax.ShapeDtypeStruct((num_robots,), jnp.int32),
-        "robot": jax.ShapeDtypeStruct((), jnp.int32),
-    }
-    about = "the PoI to look at next, N for NOP, and the value of each; the same for targets"
+    of_map = _floats(num_pois, config.jmvae.latent_size)
     of_pois = dict.fromkeys(("mean", "std", "positions", "present"), "points, ...")
     of_robots = dict.fromkeys(("poses", "modality", "works", "target"), "robots, ...")
-    return Function(about, {**_map_inputs(config), **team}, apply, {**of_pois, **of_robots})
-
-
-def _map_inputs(config: Config) -> dict[str, jax.ShapeDtypeStruct]:
-    of_map = _floats(config.arena.num_pois, config.jmvae.latent_size)
-    return {"mean": of_map, "std": of_map}
-
-
-def _decision(values: jax.Array) -> dict[str, jax.Array]:
-    return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
+    any_number = {**of_pois, **of_robots} if of_team else {}
+    about = "the PoI to look at next, N for NOP, and the value of each; the same for targets"
+    return Function(about, {"mean": of_map, "std": of_map, **of_team}, apply, any_number)
 
 
 def _classify(models: Models) -> Function:

@@ -18,6 +18,7 @@ from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.dqn import team_mdp
+from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import common
 
@@ -39,7 +40,7 @@ class TeamOutcome:
     seconds: Float[Array, ""]
 
 
-def check_team(mdp: TeamMdp, config: Config) -> None:
+def check_team(mdp: MapMdp | TeamMdp, config: Config) -> None:
     """Checks that an MDP is that of a team with the sensors of the settings.
 
     Args:
@@ -49,11 +50,11 @@ def check_team(mdp: TeamMdp, config: Config) -> None:
     Raises:
       ValueError: if it is not.
     """
-    found = getattr(mdp, "modalities", None)
-    if found != config.modalities:
+    if mdp.modalities != config.modalities:
         reason = f"must be a TeamMdp with {config.modalities}, as config.modalities are"
         made = "from jaxsense.make_mdp with dqn.task = 'team'"
-        raise ValueError(f"mdp = {type(mdp).__name__} with modalities {found}: {reason}, {made}")
+        found = f"{type(mdp).__name__} with modalities {mdp.modalities}"
+        raise ValueError(f"mdp = {found}: {reason}, {made}")
 
 
 def team_spaces(spaces: Any, mdp: TeamMdp) -> tuple[Any, Any]:

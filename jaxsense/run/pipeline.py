@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import jax
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from jaxsense import mission, summary
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Key, Reliability
-from jaxsense.dqn.policies import Policy, Values
 from jaxsense.dqn.reference import has_optimum
 from jaxsense.models import Models
 from jaxsense.run import missions
@@ -19,7 +18,7 @@ from jaxsense.run.compilation import Compiler, Kept
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
-from jaxsense.run.programs import Programs, compile_programs
+from jaxsense.run.programs import OwnPolicies, Programs, compile_programs
 from jaxsense.summary import compare
 from jaxsense.training.agents import learner
 from jaxsense.training.comparison import permutations
@@ -54,7 +53,7 @@ class RunResult:
     results: summary.Results
 
 
-def check(config: Config, policies: Mapping[str, Values | Policy] | None = None) -> None:
+def check(config: Config, policies: OwnPolicies | None = None) -> None:
     """Checks what can only be checked by building the parts of a run."""
     mission.require_playable(config, policies)
 
@@ -66,7 +65,7 @@ def compiled(
     workers: Workers = ALONE,
     kept: Kept | None = None,
     num_seeds: int = 1,
-    policies: Mapping[str, Values | Policy] | None = None,
+    policies: OwnPolicies | None = None,
 ) -> Iterator[Programs]:
     """The programs of runs with the same settings, compiled in the background.
 

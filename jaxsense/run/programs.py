@@ -23,12 +23,12 @@ from jaxsense.run.together import SharedProgram, Trainings
 from jaxsense.training.stage import Output, Stage
 from jaxsense.training.stages import stages
 
+OwnPolicies = Mapping[str, Values | Policy]
+"""Policies of a user, by name, see `dqn.policies.table`."""
 _ROWS = ("survey",)
 """Stages whose inputs and output have independent rows, so that devices can share them."""
 _SAVED = ("novelty", "best_jmvae", "class_beliefs", "fusion", "look_values")
 """Stages without chunks whose output a run saves; it saves that of every stage with chunks."""
-
-
 _SHARED = ("jmvae", "dqn", "policies", "numbers")
 """First words of the names of stages that have the same functions, and so the same programs."""
 
@@ -108,7 +108,7 @@ class Programs:
     player: Future[missions.Player]
     workers: Workers
     trainings: Trainings
-    policies: Mapping[str, Values | Policy] | None = None
+    policies: OwnPolicies | None = None
 
     def of(self, stage: Stage) -> StagePrograms:
         """The programs of a stage."""
@@ -129,7 +129,7 @@ def compile_programs(
     compiler: Compiler,
     workers: Workers = ALONE,
     num_seeds: int = 1,
-    policies: Mapping[str, Values | Policy] | None = None,
+    policies: OwnPolicies | None = None,
 ) -> Programs:
     """Starts to trace and compile the programs of a run in the background.
 

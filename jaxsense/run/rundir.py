@@ -29,7 +29,7 @@ from jaxsense.run import files
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.version import __version__, commit, versions
 from jaxsense.training import stages
-from jaxsense.training.agents import learner
+from jaxsense.training.agents import learner, tour_stages
 
 Json: TypeAlias = dict[str, object]
 _METRICS = "metrics.jsonl"
@@ -320,6 +320,7 @@ def _named(models: Models, config: Config) -> dict[str, PyTree]:
     """The parts of the models, by the names of their stages and checkpoints."""
     detectors = zip(config.modalities, models.detectors, strict=True)
     q_networks = zip(config.modalities, models.q_networks, strict=True)
+    orders = zip(tour_stages(config), models.tours, strict=True)
     return {
         **{f"detector_{name}": detector for name, detector in detectors},
         "best_jmvae": models.jmvae,
@@ -327,7 +328,7 @@ def _named(models: Models, config: Config) -> dict[str, PyTree]:
         "fusion": models.fusion,
         "look_values": models.look_values,
         **{learner(config, name): q_network for name, q_network in q_networks},
-        **({} if models.tours is None else {"tours": models.tours}),
+        **{stage.name: params for stage, params in orders},
     }
 
 

@@ -21,6 +21,7 @@ from jaxsense.dqn.environments import Environment
 from jaxsense.dqn.map_mdp import Looks, MapMdp, MapState
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import expected_gains
+from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.dqn.tours import Trials
 from jaxsense.looks import Bank, Live
@@ -195,16 +196,17 @@ def _surveyed_starts(key: Key, mdp: MapMdp, starts: Starts, number: int) -> MapS
 
 
 def tour_stages(config: Config) -> list[Stage]:
-    """Makes the stage that trains the network of `tours`, if the agent has one."""
-    agent, settings = make_agent(config), config.team.tours
-    network = agent.tour_network
-    if network is None:
-        return []
+    """Makes the stage of each network that orders looks, see `tours`."""
+    return [_tour_stage(config, network) for network in make_agent(config).tour_networks]
+
+
+def _tour_stage(config: Config, network: PoolingNetwork) -> Stage:
+    settings = config.team.tours
     size, chunks = chunk_size(settings.steps), num_chunks(settings.steps)
     number = -(-settings.states // chunks)  # of states in each chunk, in which choices are tried
 
     def begin(key: Key, config: Config, **_: Output) -> tuple[FitState, Trials]:
-        fit = supervised.start(agent.init_tours(key), config.team.tours)
+        fit = supervised.start(make_agent(config).init_tours(key)[0], config.team.tours)
         no_trials = tours.no_trials(network.features, config.team.num_pois[1], chunks * number)
         return fit, no_trials
 
@@ -234,17 +236,7 @@ def tour_stages(config: Config) -> list[Stage]:
         return state[0].params
 
     inputs = {"look_values": "look_values", "fusion": "fusion", "detections": "detections"}
-    return [
-        Stage(
-            "tours",
-            begin,
-            inputs,
-            advance=advance,
-            finish=finish,
-            steps=settings.steps,
-            chunks=chunks,
-        )
-    ]
+    return Stage("tours", begin, inputs, advance, finish, steps=settings.steps, chunks=chunks)
 
 
 def _auction(config: Config, fusion: Fusion, look_values: tuple[LookValues, ...]) -> tours.Policy:

@@ -50,7 +50,7 @@ def learned_return(
     def act(key: Key, known: Known) -> jax.Array:
         del key
         classes = mdp.fusion.classes
-        values = agent.decide(q_network, None, classes, known.belief, known.team, known.robot)
+        values = agent.decide(q_network, (), classes, known.belief, known.team, known.robot)
         return policies.best(values)
 
     def episode(key: Key) -> jax.Array:

@@ -37,7 +37,7 @@ def models_of(
         look_values=look_values,
         agent=make_agent(config),
         q_networks=q_networks,
-        tours=None,
+        tours=(),
     )
 
 

@@ -103,7 +103,7 @@ def models(outputs: Mapping[str, Output], config: Config) -> Models:
         look_values=outputs["look_values"],
         agent=make_agent(config),
         q_networks=tuple(outputs[agents.learner(config, name)] for name in config.modalities),
-        tours=outputs.get("tours"),
+        tours=tuple(outputs[stage.name] for stage in agents.tour_stages(config)),
     )
 
 

@@ -178,12 +178,12 @@ def decided(monkeypatch, after, cost):
     monkeypatch.setattr(TeamAgent, "q", lambda *given: jnp.array([*after, 0.0]))
     monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
     agent = replace(AGENT, config=TeamConfig(travel=TRAVEL, second_cost=cost))
-    return jax.jit(lambda: agent.decide({}, {}, classes=None, **AT_ORIGIN))()
+    return jax.jit(lambda: agent.decide({}, ({},), classes=None, **AT_ORIGIN))()
 
 
 def test_without_tours_the_values_are_those_of_setting_out(monkeypatch):
     monkeypatch.setattr(TeamAgent, "q", lambda *given: jnp.array([8.0, 3.0, 16.0, 0.0]))
-    values = AGENT.decide({}, None, classes=None, **AT_ORIGIN)
+    values = AGENT.decide({}, (), classes=None, **AT_ORIGIN)
     # 6, 16 and, an eighth of a turn and 12.73 - .9 m away, 60.9 s, each of which halves a value.
     seconds = np.array([6, 16, math.pi / 4 + (9 * math.sqrt(2) - 0.9) / 0.2 + 1])
     expected = [*np.array([8.0, 3.0, 16.0]) * 0.5**seconds, 0.0]
