@@ -12,8 +12,9 @@ import dataclasses
 import itertools
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, cast
 
 import jax
@@ -46,7 +47,7 @@ _DRAWS = 1000  # of the bootstrap
 _MOST_POIS = 6  # whose orders the oracle tries
 
 Points = dict[str, np.ndarray]
-"""`accuracy`, `looks` and `time` of K points of a curve in E arenas, `[K, E]` each."""
+"""`accuracy`, `confidence`, `looks`, `time` of K points of a curve in E arenas, `[K, E]` each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,10 +164,21 @@ def of_costs(key: Key, config: Config, models: Models, costs: jax.Array) -> Mode
 class Curves:
     """Plays missions of policies in the same arenas."""
 
-    def __init__(self, key: Key, config: Config, episodes: int):
-        """Missions of E arenas, with a program that is compiled once."""
-        own = {f"naive_{k}": Policy(policies.naive(k), is_unordered=True) for k in (4, NAIVE)}
-        own |= {f"oracle_{share}": oracle(share) for share in ORACLE}
+    def __init__(
+        self,
+        key: Key,
+        config: Config,
+        episodes: int,
+        own: Mapping[str, Policy] = MappingProxyType({}),
+    ):
+        """Missions of E arenas, with a program that is compiled once.
+
+        Args:
+          key: random key.
+          config: all settings.
+          episodes: E.
+          own: more policies than those of the settings, by name.
+        """
         self.scenario = mission.make_mission(config, own)
         self._keys = jax.random.split(key, episodes)
         self._begin = jax.jit(jax.vmap(self._start, in_axes=(0, None, None)))
@@ -192,12 +204,13 @@ class Curves:
         found = mission.measure(self.scenario, models, state)
         return {
             "accuracy": jnp.mean(found["is_right"].astype(jnp.float32)),
+            "confidence": jnp.mean(found["confidence"]),
             "looks": found["observations_per_poi"],
             "time": found["time_s"],
         }
 
     def play(self, models: Models, policy: str) -> dict[str, np.ndarray]:
-        """`accuracy`, `looks` per PoI and `time` of a policy, `[E]` each.
+        """`accuracy`, `confidence`, `looks` per PoI and `time` of a policy, `[E]` each.
 
         Args:
           models: trained models.
@@ -365,7 +378,9 @@ def main(argv: list[str] | None = None) -> None:
         cli.fail(PROGRAM, f"num_pois = {config.arena.num_pois}: must be at most {_MOST_POIS}")
     train_key, play_key = jax.random.split(jax.random.key(arguments.seed))
     priced = of_costs(train_key, config, models, jnp.array(arguments.costs))
-    curves = Curves(play_key, config, arguments.episodes)
+    own = {f"naive_{k}": Policy(policies.naive(k), is_unordered=True) for k in (4, NAIVE)}
+    own |= {f"oracle_{share}": oracle(share) for share in ORACLE}
+    curves = Curves(play_key, config, arguments.episodes, own)
     blocks = []
     for name, varies, points in play_all(curves, arguments.costs, priced, models):
         blocks.append(as_block(name, varies, points))

@@ -1,16 +1,14 @@
 """`python -m benchmarks.where RUN`: what it is worth to choose from where to look.
 
-One robot, one PoI in view. By the rule of missions, the robot looks at once from where it stands,
-and again from there if at least half of a second look is new, or else from the nearest such place
-near the PoI. The alternative chooses before each look: from here, or from another side or distance,
-after the drive there. Dynamic programming over the posterior of the label, the distance and the
-number of looks there yields the least mean of time plus the price of an error, and so the
-shortest mean time for each accuracy. Looks are those of the run's detector from several distances,
-and looks from one place count as fusion weighs them, but are drawn anew each time: that flatters
-them, since looks from one place repeat their errors.
+In missions a robot looks again from the nearest place where at least half of a look is new
+evidence, and from as far away as `navigation.view_range`. This trial plays the same arenas with
+other shares, from 0, where robots stay as long as looks pay, to .9, and with shorter ranges. Looks
+from one place share their light and the beams that graze an edge, as in any mission, so a policy
+that takes them for new pays with accuracy and with confidence that is too high.
 """
 
 import dataclasses
+import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -18,211 +16,136 @@ from typing import Annotated
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy import stats
 
-from jaxsense import Config, Key, Live, Models
-from jaxsense.config.checks import check_fields
+from benchmarks.curves import Curves
+from jaxsense import Config, Models, pytree
+from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
 from jaxsense.run import cli, rundir
-from jaxsense.sim.world import make_world
+from jaxsense.run.version import commit, versions
+from jaxsense.vae.novelty import Novelty
 
 PROGRAM = "benchmarks.where"
-_DISTANCES = (0.5, 0.9, 1.5, 2.5, 3.5)  # m
-_NEAR = 1  # of the distances, to which the rule drives
-_SCENES = 4096
-_AT_ONCE = 512
-_POINTS = 401  # of the posterior
-_HORIZON = 8  # looks
-_LOOKS_FROM_ONE_PLACE = 4
-_SLIGHTLY = 0.026  # of common strength, with which a look counts .95
-_PRICES = np.geomspace(20, 4000, 25)  # s, of an error
-_ACCURACIES = (0.95, 0.98, 0.99)
+SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9)
+USUAL = 0.5
+_KEYS = ("accuracy", "confidence", "looks", "time")
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Compare the rule from where robots look with the best choice."""
+    """Play missions in which robots look from other places."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, or `latest`."""
+    episodes: int = 256
+    """Missions of each policy with each rule."""
+    seed: int = 0
+    """Seed of the arenas."""
+    policies: tuple[str, ...] = ("latent", "auction")
+    """The policies that play."""
+    ranges: tuple[float, ...] = (1.0, 2.0, 3.0)
+    """Distances in metres up to which a robot looks at once, to compare with the run's."""
+    json: Path | None = None
+    """File to write the figures to."""
 
     def __post_init__(self):
-        check_fields(self)
+        check_fields(self, bits=64)
+        require(self.episodes >= 2, self, "episodes", "must be at least 2")
 
 
-def ratios_from(key: Key, config: Config, models: Models, distance: float) -> list[np.ndarray]:
-    """Log-likelihood ratios of looks from a distance, signed towards the true label.
+@pytree
+class FromWhere(Novelty):
+    """Weights of looks as learned, and robots that ask another share of a look to be new.
+
+    Attributes:
+      share: `[]` of a look that must be new where a robot looks again, up to 1.
+    """
+
+    share: Float[Array, ""]
+
+    def fresh_distance(self, modality: Int[Array, ""] | int) -> Float[Array, ""]:
+        """Distance from an earlier look beyond which this share of a look is new, in metres.
+
+        Args:
+          modality: index of the sensor.
+        """
+        strength, length = self.strength[modality], self.length[modality]
+        most = jnp.maximum(self.share, 1e-9) ** -0.5 - 1
+        return length * jnp.sqrt(2 * jnp.log(jnp.maximum(strength / most, 1.0)))
+
+
+def with_share(models: Models, share: float) -> Models:
+    """Models whose robots look again only where this share of a look is new.
 
     Args:
-      key: random key.
-      config: all settings.
       models: of a finished run.
-      distance: from the PoI, in metres.
+      share: see `FromWhere`.
+    """
+    learned = models.novelty
+    changed = FromWhere(learned.strength, learned.length, jnp.float32(share))
+    return dataclasses.replace(models, novelty=changed)
+
+
+def within(config: Config, farthest: float) -> Config:
+    """Settings with another `navigation.view_range`.
+
+    Args:
+      config: all settings.
+      farthest: distance in metres.
+
+    Raises:
+      ConfigError: if a robot cannot look from there.
+    """
+    nearer = tuple(d for d in config.navigation.view_distances if d <= farthest)
+    navigation = dataclasses.replace(
+        config.navigation, view_range=farthest, view_distances=nearer or (farthest,)
+    )
+    return dataclasses.replace(config, navigation=navigation)
+
+
+def compare(found: dict[str, np.ndarray], usual: dict[str, np.ndarray]) -> dict[str, list[float]]:
+    """Means, and differences from the usual rule in the same arenas with their 95% half-widths.
+
+    Args:
+      found: `[E]` figures of missions.
+      usual: the same of the usual rule.
 
     Returns:
-      For each modality with two labels, one number for each look.
-    """
-    near, far = distance - 0.02, distance + 0.02
-    viewpoint = dataclasses.replace(config.viewpoint, min_distance=near, max_distance=far)
-    world = dataclasses.replace(make_world(config), viewpoint=viewpoint)
-    class_key, look_key = jax.random.split(key)
-    num_classes, num_pois = len(config.arena.classes), config.arena.num_pois
-    classes = jax.random.randint(class_key, (_SCENES, num_pois), 0, num_classes)
-
-    @jax.jit
-    def look(live: Live, keys: Key, classes: jax.Array) -> tuple[jax.Array, ...]:
-        """Features of looks at the first PoI of each scene, `[S, D_m]` for each modality."""
-
-        def at_scene(scene: tuple[Key, jax.Array]) -> tuple[jax.Array, ...]:
-            scene_key, *look_keys = jax.random.split(scene[0], 1 + live.num_modalities)
-            drawn, poi = live.scene(scene_key, scene[1]), jnp.int32(0)
-            return tuple(live.observe(k, drawn, poi, m)[0] for m, k in enumerate(look_keys))
-
-        return jax.lax.map(at_scene, (keys, classes), batch_size=_AT_ONCE)
-
-    keys = jax.random.split(look_key, _SCENES)
-    features = look(Live(world, models.detectors), keys, classes)
-    found = []
-    for name, of_modality in zip(config.modalities, features, strict=True):
-        labels = np.array(config.label_of_class(name))
-        share = np.bincount(labels) / len(labels)
-        ratio = np.log(np.clip(np.asarray(of_modality), 1e-6, 1)) - np.log(share)
-        sign = np.where(labels[np.asarray(classes[:, 0])] == 1, 1.0, -1.0)
-        found.append((sign * (ratio[..., 1] - ratio[..., 0])).reshape(-1))
-    return found
-
-
-class Problem:
-    """One PoI, one sensor: what a look from each place does to the posterior.
-
-    A state is a point of the posterior, a distance, and the number of looks from there.
+      By figure its mean, the mean difference and its half-width.
     """
 
-    def __init__(
-        self,
-        ratios: list[np.ndarray],
-        weights: np.ndarray,
-        apart: float,
-        speed: float,
-        stays: bool,
-    ):
-        """Looks from each of the distances.
+    def of(key: str) -> list[float]:
+        less = found[key] - usual[key]
+        width = stats.sem(less) * stats.t.ppf(0.975, len(less) - 1)
+        return [float(found[key].mean()), float(less.mean()), float(width)]
 
-        Args:
-          ratios: for each distance, log-likelihood ratios of looks towards the true label.
-          weights: `[K]` of the first to the K-th look from one place, which says nothing more.
-          apart: distance between places whose looks are independent, in metres.
-          speed: of the robot, in metres per second.
-          stays: whether the rule looks again from the same place.
-        """
-        self.logits = np.linspace(-12, 12, _POINTS)
-        self.right = 1 / (1 + np.exp(-self.logits))  # probability of label 1
-        self.after = np.stack(
-            [np.stack([self._moved(weight * ratio) for ratio in ratios]) for weight in weights]
-        )
-        distance = np.abs(np.subtract.outer(_DISTANCES, _DISTANCES))
-        self.seconds = np.maximum(distance, apart) / speed
-        self.stays = stays
-
-    def _moved(self, ratios: np.ndarray) -> np.ndarray:
-        """`[P, P]` chances of the posteriors after a look from those before it."""
-        draws = np.quantile(ratios, (np.arange(64) + 0.5) / 64)
-        chances = np.zeros((_POINTS, _POINTS))
-        step = self.logits[1] - self.logits[0]
-        for sign, share in ((1, self.right), (-1, 1 - self.right)):
-            ends = np.clip(self.logits[:, None] + sign * draws, self.logits[0], self.logits[-1])
-            place = (ends - self.logits[0]) / step
-            low = np.minimum(place.astype(int), _POINTS - 2)
-            rows = np.arange(_POINTS)[:, None]
-            np.add.at(chances, (rows, low), share[:, None] * (1 - place + low) / 64)
-            np.add.at(chances, (rows, low + 1), share[:, None] * (place - low) / 64)
-        return chances
-
-    def actions(self, distance: int, looks: int, by_rule: bool) -> list[tuple[int, float, int]]:
-        """Distance to look from, seconds until the look, and the number of looks from there.
-
-        Args:
-          distance: index of the present one.
-          looks: number of looks from the robot's place.
-          by_rule: whether it follows the rule of missions.
-        """
-        look = 0.1
-        here = [(distance, look, looks)] if looks < len(self.after) else []
-        if by_rule:
-            away = [(_NEAR, self.seconds[distance, _NEAR] + look, 0)]
-            return here if here and (self.stays or not looks) else away
-        others = range(len(_DISTANCES))
-        return [*here, *((d, self.seconds[distance, d] + look, 0) for d in others)]
-
-    def solve(self, price: float, by_rule: bool) -> tuple[float, float]:
-        """Mean time and accuracy of the best policy, from equal odds and a random far distance.
-
-        Args:
-          price: of an error, in seconds.
-          by_rule: whether the robot follows the rule of missions, and only chooses when to stop.
-        """
-        wrong = np.minimum(self.right, 1 - self.right)
-        shape = len(_DISTANCES), len(self.after) + 1, _POINTS
-        cost = np.broadcast_to(price * wrong, shape).copy()
-        time, error = np.zeros(shape), np.broadcast_to(wrong, shape).copy()
-        for _ in range(_HORIZON):
-            new = [x.copy() for x in (cost, time, error)]
-            new[0][:], new[1][:], new[2][:] = price * wrong, 0.0, wrong
-            for d, taken in np.ndindex(shape[:2]):
-                for to, seconds, number in self.actions(d, taken, by_rule):
-                    chances, then = self.after[number, to], (to, number + 1)
-                    of_look = (
-                        seconds + chances @ cost[then],
-                        seconds + chances @ time[then],
-                        chances @ error[then],
-                    )
-                    better = of_look[0] < new[0][d, taken]
-                    for old, found in zip(new, of_look, strict=True):
-                        old[d, taken] = np.where(better, found, old[d, taken])
-            cost, time, error = new
-        start = _POINTS // 2
-        return float(time[2:, 0, start].mean()), 1 - float(error[2:, 0, start].mean())
-
-
-def at(accuracy: float, points: list[tuple[float, float]]) -> float:
-    """Mean time for an accuracy, interpolated between points of (time, accuracy).
-
-    Args:
-      accuracy: to reach.
-      points: of a curve.
-    """
-    times, accuracies = zip(*sorted(points), strict=True)
-    return float(np.interp(accuracy, accuracies, times, right=np.nan))
+    return {key: of(key) for key in _KEYS}
 
 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     config, models = rundir.load(cli.find_run(arguments.run))
-    key = jax.random.key(0)
-    ratios = [ratios_from(key, config, models, distance) for distance in _DISTANCES]
-    for m, name in enumerate(config.modalities):
-        of_sensor = [each[m] for each in ratios]
-        shares = ", ".join(
-            f"{np.mean(x > 0):.3f} at {d} m" for d, x in zip(_DISTANCES, of_sensor, strict=True)
-        )
-        print(f"{name}: single looks right {shares}")
-        fresh = float(models.novelty.fresh_distance(m))
-        weights = np.array(
-            [float(models.novelty.weight(jnp.zeros(k), m)) for k in range(_LOOKS_FROM_ONE_PLACE)]
-        )
-        strength, length = float(models.novelty.strength[m]), float(models.novelty.length[m])
-        apart = length * np.sqrt(2 * np.log(max(strength / _SLIGHTLY, 1.0)))
-        print(f"  looks from one place count {', '.join(f'{w:.2f}' for w in weights)}")
-        print(f"  looks {apart:.2f} m apart are nearly independent")
-        speed = float(config.team.travel.speed)
-        problem = Problem(of_sensor, weights, apart, speed, stays=fresh == 0)
-        curves = [[problem.solve(p, by_rule) for p in _PRICES] for by_rule in (True, False)]
-        for accuracy in _ACCURACIES:
-            rule, best = (at(accuracy, curve) for curve in curves)
-            print(
-                f"  accuracy {accuracy}: rule {rule:.2f} s, best choice {best:.2f} s, "
-                f"{100 * (1 - best / rule):.1f} % less"
-            )
+    key = jax.random.key(arguments.seed)
+    own = Curves(key, config, arguments.episodes)
+    rules = [(f"share {share:g}", own, share) for share in SHARES]
+    for farthest in arguments.ranges:
+        nearer = Curves(key, within(config, farthest), arguments.episodes)
+        rules.append((f"range {farthest:g} m", nearer, USUAL))
+    rows = []
+    for policy in arguments.policies:
+        usual = own.play(with_share(models, USUAL), policy)
+        for rule, curves, share in rules:
+            found = compare(curves.play(with_share(models, share), policy), usual)
+            rows.append({"policy": policy, "rule": rule, **found})
+            cells = [f"{found[k][0]:.3f} {found[k][1]:+.3f} ± {found[k][2]:.3f}" for k in _KEYS]
+            print(f"| `{policy}` | {rule} | {' | '.join(cells)} |", flush=True)
+    if arguments.json is not None:
+        whole = {"commit": commit(), "versions": versions(), "episodes": arguments.episodes}
+        text = json.dumps({**whole, "seed": arguments.seed, "rows": rows}, indent=1)
+        arguments.json.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

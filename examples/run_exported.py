@@ -68,6 +68,7 @@ def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) ->
         "works": np.ones(len(robots), bool),
         "target": np.full(len(robots), num_pois, np.int32),
     }
+    places: dict[tuple[str, int], list[np.ndarray]] = {}  # of looks by each sensor at each PoI
     lines = []
     while known["works"].any() and len(lines) < 20 * num_pois:
         for robot in np.flatnonzero(known["works"]):
@@ -83,11 +84,16 @@ def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) ->
             labels = contents["labels"][name]
             features = np.eye(len(labels), dtype=np.float32)[label]
             poi = slice(action, action + 1)
-            belief = programs[f"write_{name}"](mean[poi], std[poi], seen[poi], features[None])
+            # It arrives at once, and looks at the PoI from 0.9 m.
+            place = known["poses"][robot, :2] = 0.55 * known["positions"][action]
+            earlier = places.setdefault((name, action), [np.float32([np.inf, np.inf])])
+            apart = np.linalg.norm(place - np.stack(earlier[-4:]), axis=1)
+            weight = programs[f"weigh_{name}"](apart[None])["weight"]
+            earlier.append(place)
+            look = mean[poi], std[poi], seen[poi], features[None], weight
+            belief = programs[f"write_{name}"](*look)
             mean[poi], std[poi] = belief["mean"], belief["std"]
             seen[action, modalities.index(name)] = True
-            # It arrives at once, and looks at the PoI from 0.9 m.
-            known["poses"][robot, :2] = 0.55 * known["positions"][action]
             told = ", ".join(np.array(contents["classes"])[plausible(programs, mean, std)[action]])
             lines.append(f"{name} looks at PoI {action}: {labels[label]}; it may be: {told}")
     for poi, told in enumerate(plausible(programs, mean, std)):

@@ -29,6 +29,7 @@ from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.vae import detectors, jmvae, latent
+from jaxsense.vae.novelty import Novelty
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "run_exported.py"
 CONFIG = dataclasses.replace(
@@ -75,7 +76,11 @@ def with_classes(models, config):
     """The models, with classes at random places in the latent space."""
     means = jax.random.normal(jax.random.key(1), models.fusion.classes.mean.shape)
     classes = Belief(means, jnp.ones_like(means))
-    return dataclasses.replace(models, fusion=make_in_place(config, models.jmvae, classes))
+    return dataclasses.replace(
+        models,
+        fusion=make_in_place(config, models.jmvae, classes),
+        novelty=Novelty(jnp.array([0.5, 2.0]), jnp.array([0.3, 0.6])),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -135,8 +140,8 @@ def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
         window = np.minimum(readings[rays], sensor.window_limit).reshape(-1)
         return True, detectors.detect(models.detectors[m], window)
 
-    def write(mean, std, seen, features):
-        belief = models.fusion.update(Belief(mean, std), seen, features, m)
+    def write(mean, std, seen, features, weight):
+        belief = models.fusion.update(Belief(mean, std), seen, features, m, weight)
         return belief.mean, belief.std
 
     def decide(mean, std):
@@ -145,6 +150,7 @@ def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
         return np.argmax(values), values
 
     check(results, f"detect_{name}", detect, "is_there", "features")
+    check(results, f"weigh_{name}", lambda apart: [models.novelty.weight(apart, m)], "weight")
     check(results, f"write_{name}", write, "mean", "std")
     check(results, f"decide_{name}", decide, "action", "values")
 
@@ -250,9 +256,13 @@ def test_contents_describe_what_is_there(results, file):
         contents = json.loads(files.read("contents.json"))
         names = {name.removesuffix(".bin") for name in files.namelist()} - {"contents.json"}
     assert set(contents["programs"]) == names
+    sizes = {"looks": 4}
     for given, end in zip(results, ("inputs", "outputs"), strict=True):
         described = {
-            f"{name}/{key}": ([BATCH, *about["shape"][1:]], about["dtype"])
+            f"{name}/{key}": (
+                [BATCH, *(sizes.get(n, n) for n in about["shape"][1:])],
+                about["dtype"],
+            )
             for name, program in contents["programs"].items()
             for key, about in program[end].items()
         }

@@ -34,7 +34,7 @@ class Function:
 def functions(config: Config, models: Models) -> dict[str, Function]:
     """All functions, by name.
 
-    For each modality M `detect_M`, `write_M` and `decide_M`; for each encoder of the
+    For each modality M `detect_M`, `weigh_M`, `write_M` and `decide_M`; for each encoder of the
     JMVAE an `encode_M`, for example `encode_camera+lidar`; and `classify`.
 
     Args:
@@ -46,6 +46,7 @@ def functions(config: Config, models: Models) -> dict[str, Function]:
     for m, name in enumerate(model.modalities):
         found |= {
             f"detect_{name}": _detect(config, models, m),
+            f"weigh_{name}": _weigh(models, m),
             f"write_{name}": _update(models, model, m),
             f"decide_{name}": _decide(config, models, m),
         }
@@ -71,17 +72,30 @@ def _detect(config: Config, models: Models, m: int) -> Function:
     return Function(about, inputs, apply)
 
 
+def _weigh(models: Models, m: int) -> Function:
+    def apply(apart: jax.Array) -> dict[str, jax.Array]:
+        return {"weight": models.novelty.weight(apart, m)}
+
+    about = (
+        "the share of a look that is new evidence, by the distances from earlier ones at the PoI"
+    )
+    return Function(about, {"apart": _floats(4)}, apply, {"apart": "looks"})
+
+
 def _update(models: Models, model: jmvae.Jmvae, m: int) -> Function:
-    def apply(mean: jax.Array, std: jax.Array, seen: jax.Array, features: jax.Array):
-        return _named(models.fusion.update(Belief(mean, std), seen, features, m))
+    def apply(
+        mean: jax.Array, std: jax.Array, seen: jax.Array, features: jax.Array, weight: jax.Array
+    ) -> dict[str, jax.Array]:
+        return _named(models.fusion.update(Belief(mean, std), seen, features, m, weight))
 
     inputs = {
         "mean": _floats(model.latent_size),
         "std": _floats(model.latent_size),
         "seen": jax.ShapeDtypeStruct((len(model.modalities),), bool),
         "features": _floats(model.feature_sizes[m]),
+        "weight": _floats(),
     }
-    return Function("the belief about a PoI after a look", inputs, apply)
+    return Function("the belief about a PoI after a look of that weight", inputs, apply)
 
 
 def _encode(models: Models, model: jmvae.Jmvae, subset: tuple[int, ...]) -> Function:
