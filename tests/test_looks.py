@@ -308,3 +308,9 @@ def test_live_and_bank_features_have_the_same_distribution(features):
         # And the means, within four standard errors.
         spread = np.std(values) + 1e-6
         np.testing.assert_allclose(here.mean(), there.mean(), atol=4 * spread * scale)
+
+
+@pytest.mark.parametrize("samples", [0, -1, 2.5])
+def test_a_number_of_looks_that_is_none_is_refused(models, samples):
+    with pytest.raises(ValueError, match="samples"):
+        looks.detections(jax.random.key(0), CONFIG, models, samples)
