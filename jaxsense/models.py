@@ -11,9 +11,10 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
 from jaxsense.dqn import optimum, rewards
-from jaxsense.dqn.agents import MapAgent, TeamAgent
 from jaxsense.dqn.environments import Agent
+from jaxsense.dqn.map_agent import MapAgent
 from jaxsense.dqn.optimum import LookValues
+from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.sim import sensors, windows
 from jaxsense.sim.sensors import Sensor
 from jaxsense.vae import detectors, filter, fusion, jmvae, latent, novelty, readout

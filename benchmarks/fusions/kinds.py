@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense import Belief, Fusion, pytree, vae
 from jaxsense.dqn import rewards
-from jaxsense.dqn.agents import MapAgent
+from jaxsense.dqn.map_agent import MapAgent
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.readout import MIN_PROBABILITY

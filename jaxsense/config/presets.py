@@ -146,7 +146,7 @@ _MANY = dataclasses.replace(
     ),
     jmvae=dataclasses.replace(_NOISY.jmvae, latent_size=6, samples_per_class=4000),
     mdp=MdpConfig(reward="nats", look_cost=0.05),
-    dqn=_TEAM.dqn,
+    dqn=dataclasses.replace(_TEAM.dqn, hidden=(64, 64), updates=32),
     # Reading sixteen classes takes long.
     team=dataclasses.replace(_NOISY.team, tours=ToursConfig(states=4096, steps=1600)),
     evaluation=dataclasses.replace(_NOISY.evaluation, num_repeats=8, num_states=512),

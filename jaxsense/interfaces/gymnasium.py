@@ -10,7 +10,7 @@ import numpy as np
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.dqn import map_mdp
-from jaxsense.dqn.agents import observation
+from jaxsense.dqn.map_agent import observation
 from jaxsense.dqn.map_mdp import MapMdp, MapState, Outcome
 from jaxsense.interfaces import common
 from jaxsense.interfaces.extras import extra

@@ -8,7 +8,7 @@ from flax import struct
 
 from jaxsense.core.types import Key
 from jaxsense.dqn import map_mdp
-from jaxsense.dqn.agents import observation
+from jaxsense.dqn.map_agent import observation
 from jaxsense.dqn.map_mdp import MapMdp, MapState
 from jaxsense.interfaces import common
 from jaxsense.interfaces.extras import extra

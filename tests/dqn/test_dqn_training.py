@@ -12,7 +12,7 @@ from toys import paying_once_mdp
 
 from jaxsense.config import DqnConfig
 from jaxsense.dqn import map_mdp, replay, team_mdp, training
-from jaxsense.dqn.agents import MapAgent
+from jaxsense.dqn.map_agent import MapAgent
 
 # Every episode is cut after one action: no value could be learnt beyond it, were a cut an end.
 MDP = paying_once_mdp(num_pois=2, max_steps=1)

@@ -11,7 +11,7 @@ from toys import Certain, Ignorant, Toy, classes_mdp, known_of, paying_once_mdp,
 from jaxsense.config import DqnConfig
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import episodes, map_mdp, training
-from jaxsense.dqn.agents import MapAgent
+from jaxsense.dqn.map_agent import MapAgent
 from jaxsense.dqn.optimum import LookValues
 
 MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)

@@ -8,7 +8,7 @@ from toys import known_of, policy
 
 from jaxsense.config import ConfigError
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn import agents, optimum, policies
+from jaxsense.dqn import map_agent, optimum, policies
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Policy
 
@@ -115,7 +115,7 @@ def test_random_takes_every_action_equally_often():
 
 
 def test_latent_takes_the_action_that_the_own_q_network_values_most():
-    agent = agents.MapAgent(0.5, 3, 2, (4,))
+    agent = map_agent.MapAgent(0.5, 3, 2, (4,))
     layers = agent.init(KEY)["params"]
 
     def biased(best):
@@ -134,7 +134,7 @@ def test_latent_takes_the_action_that_the_own_q_network_values_most():
 
 
 @pytree
-class Widths(agents.MapAgent):
+class Widths(map_agent.MapAgent):
     """Values of looks at all PoIs are the sum of all widths, and that of NOP is 1."""
 
     def values(self, params, observed):

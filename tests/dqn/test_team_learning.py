@@ -10,7 +10,7 @@ from toys import SENSORS, Fixed, classes_mdp, known_of, paying_once_mdp, policy
 
 from jaxsense.config import DqnConfig, TeamConfig, TravelConfig
 from jaxsense.dqn import losses, map_mdp, team_mdp, training
-from jaxsense.dqn.agents import TeamAgent
+from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.dqn.team_mdp import TeamMdp
 
 TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)

@@ -14,7 +14,7 @@ from jaxsense.config import TeamConfig, ToursConfig, TravelConfig
 from jaxsense.core import networks, supervised
 from jaxsense.core.types import Belief
 from jaxsense.dqn import team_mdp, tours
-from jaxsense.dqn.agents import TeamAgent
+from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.dqn.team_mdp import Team, TeamMdp
 from jaxsense.dqn.tours import Trials
 
@@ -27,6 +27,7 @@ IN_ORDER = (5 + 1) + (10 + 1)
 BACKWARDS = (15 + 1) + (math.pi + 1 + 1)
 AGENT = TeamAgent(TeamConfig(travel=TRAVEL), 0.5, 2, 2, (8,))
 NETWORK = AGENT.network
+CLASSES = Belief(np.float32([[1.0, 0.0], [-1.0, 0.5]]), np.full((2, 2), 0.2, np.float32))
 AT_ORIGIN = {
     "belief": Belief(np.zeros((3, 2), np.float32), np.ones((3, 2), np.float32)),
     "team": Team(
@@ -175,15 +176,35 @@ def test_nan_of_the_q_network_stays_visible(monkeypatch):
 
 def decided(monkeypatch, after, cost):
     """Values in a mission, where the networks say what follows looks, and 20, 30 and 10 s."""
-    monkeypatch.setattr(TeamAgent, "q", lambda *given: jnp.array([*after, 0.0]))
+    of_each = jnp.array([*after, 0.0])[:, None]
+    monkeypatch.setattr(TeamAgent, "q", lambda self, params, x: jnp.tile(of_each, x.shape[1:]))
     monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
     agent = replace(AGENT, config=TeamConfig(travel=TRAVEL, second_cost=cost))
-    return jax.jit(lambda: agent.decide({}, ({},), classes=None, **AT_ORIGIN))()
+    return jax.jit(lambda: agent.decide({}, ({},), classes=CLASSES, **AT_ORIGIN))()
+
+
+def test_what_is_left_to_learn_elsewhere_makes_no_look_worth_its_way(monkeypatch):
+    """A network that adds up sigmas: of the PoI less .5, and half of the others'."""
+
+    def q(self, params, observed):
+        sigma = observed.reshape(self.network.features, 3, *observed.shape[1:])[2]
+        elsewhere = 0.5 * (jnp.sum(sigma, axis=0, keepdims=True) - sigma)
+        return jnp.concatenate([sigma - 0.5 + elsewhere, jnp.zeros_like(sigma[:1])])
+
+    monkeypatch.setattr(TeamAgent, "q", q)
+    agent = replace(AGENT, discount=1.0)
+    belief = Belief(jnp.zeros((3, 2)), jnp.array([[0.1, 1.0], [1.5, 1.0], [0.1, 1.0]]))
+    given = {**AT_ORIGIN, "belief": belief}
+    # The two others of a pair are known, with a sigma of .2.
+    worth = agent.worth({}, CLASSES, **given)
+    np.testing.assert_allclose(
+        worth, [0.1 - 0.5 + 0.2, 1.5 - 0.5 + 0.2, 0.1 - 0.5 + 0.2], rtol=1e-5
+    )
 
 
 def test_without_tours_the_values_are_those_of_setting_out(monkeypatch):
     monkeypatch.setattr(TeamAgent, "q", lambda *given: jnp.array([8.0, 3.0, 16.0, 0.0]))
-    values = AGENT.decide({}, (), classes=None, **AT_ORIGIN)
+    values = AGENT.decide({}, (), classes=CLASSES, **AT_ORIGIN)
     # 6, 16 and, an eighth of a turn and 12.73 - .9 m away, 60.9 s, each of which halves a value.
     seconds = np.array([6, 16, math.pi / 4 + (9 * math.sqrt(2) - 0.9) / 0.2 + 1])
     expected = [*np.array([8.0, 3.0, 16.0]) * 0.5**seconds, 0.0]

@@ -1,0 +1,231 @@
+"""The agent of a team: one network for any number of PoIs and robots."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from jaxsense.config import TeamConfig
+from jaxsense.core import networks
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Belief, Index, Key, pytree
+from jaxsense.dqn import team_mdp, tours
+from jaxsense.dqn.environments import TeamEnvironment
+from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn.places import Places
+from jaxsense.dqn.pooling import PoolingNetwork
+from jaxsense.dqn.team_mdp import Names, Team, TeamMdp
+
+_NOT_WORTH_IT = -1e6  # s, below minus any tour
+
+
+@pytree
+class TeamAgent:
+    """An agent of the team MDP: one network for any number of PoIs and robots.
+
+    Attributes:
+      config: the travel model and the price of time.
+      discount: `[]` discount factor of a second.
+      latent_size: D.
+      num_modalities: M.
+      hidden: sizes of the hidden layers.
+    """
+
+    config: TeamConfig
+    discount: jax.Array | float
+    latent_size: int = struct.field(pytree_node=False)
+    num_modalities: int = struct.field(pytree_node=False)
+    hidden: tuple[int, ...] = struct.field(pytree_node=False)
+
+    @property
+    def counts_time(self) -> bool:
+        """True: driving takes time in the team MDP."""
+        return True
+
+    @property
+    def network(self) -> PoolingNetwork:
+        """The network of Q-values and of tours."""
+        features = team_mdp.num_features(self.latent_size, self.num_modalities)
+        return PoolingNetwork(self.hidden, features)
+
+    @property
+    def tour_networks(self) -> tuple[PoolingNetwork]:
+        """The network that orders looks."""
+        return (self.network,)
+
+    def learner(self, modality: str) -> str:
+        """The name of what learns for robots of a modality: all robots share one network."""
+        del modality
+        return "team"
+
+    def plays(self, num_pois: int) -> bool:
+        """True: the Q-network is for any number of PoIs."""
+        del num_pois
+        return True
+
+    def mdp(self, of_number: Callable[[int], MapMdp], places: Places, names: Names) -> TeamMdp:
+        """The team MDP.
+
+        Args:
+          of_number: number of PoIs to the map MDP.
+          places: draws positions of PoIs and robots.
+          names: of the sensors.
+        """
+        return TeamMdp(self.config, of_number(self.config.num_pois[1]), places, names)
+
+    def environment(self, mdp: TeamMdp, modality: Index) -> TeamEnvironment:
+        """What the agent learns in.
+
+        Args:
+          mdp: from `mdp`.
+          modality: not used.
+        """
+        del modality
+        return TeamEnvironment(self, mdp)
+
+    def init(self, key: Key) -> Params:
+        """Random parameters of the Q-network."""
+        return networks.init(key, self.network, self.network.features * self.config.num_pois[1])
+
+    def init_tours(self, key: Key) -> tuple[Params]:
+        """Random parameters of the network that orders looks, see `tours`."""
+        return (self.init(key),)
+
+    def team_inputs(self, num_pois: int, num_robots: int) -> dict[str, jax.ShapeDtypeStruct]:
+        """All fields of `Team`, and the index of the robot that chooses.
+
+        Args:
+          num_pois: N.
+          num_robots: R.
+        """
+        struct_of = jax.ShapeDtypeStruct
+        return {
+            "positions": struct_of((num_pois, 2), jnp.float32),
+            "present": struct_of((num_pois,), bool),
+            "poses": struct_of((num_robots, 3), jnp.float32),
+            "modality": struct_of((num_robots,), jnp.int32),
+            "works": struct_of((num_robots,), bool),
+            "target": struct_of((num_robots,), jnp.int32),
+            "robot": struct_of((), jnp.int32),
+        }
+
+    def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
+        """What a robot knows of each PoI, see `team_mdp.observation`.
+
+        Args:
+          belief: `[N, D]` the map.
+          team: robots and PoIs at this moment.
+          robot: `[]` int32, the robot that chooses.
+        """
+        travel, number = self.config.travel, self.num_modalities
+        return team_mdp.observation(travel, belief, team, robot, number).reshape(-1)
+
+    def q(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """Values once the robot has arrived, see `Agent.q`.
+
+        Args:
+          params: of the Q-network.
+          observed: `[F * N]`, or `[F * N, B]`.
+        """
+        return networks.apply(self.network, params, observed)
+
+    def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """Discounts values on arrival to the time of departure.
+
+        `discount^t q - second_cost t`, with `t` the seconds until the look. NOP takes none.
+
+        Args:
+          params: of the Q-network.
+          observed: `[F * N]`, or `[F * N, B]`.
+        """
+        after = self.q(params, observed)
+        seconds = self._own_seconds(observed)
+        of_pois = self.discount**seconds * after[:-1] - self.config.second_cost * seconds
+        return jnp.concatenate([of_pois, after[-1:]])
+
+    def decide(
+        self,
+        params: Params,
+        tour_params: tuple[Params, ...],
+        classes: Belief,
+        belief: Belief,
+        team: Team,
+        robot: Int[Array, ""],
+    ) -> Float[Array, " A"]:
+        """Values of a robot's actions that rank PoIs by predicted completion time.
+
+        A look is worthwhile if its Q-value, were it the only one left, exceeds the price of the
+        travel time. Its value is then minus the predicted seconds of `tours`; that of NOP is lower,
+        and those of other looks are lowest. Without `tour_params`, the values are those of
+        `values`.
+
+        Args:
+          params: of the Q-network.
+          tour_params: of the network of `tours`, or none.
+          classes: `[C, D]` joint posterior of each class.
+          belief: `[N, D]` the map.
+          team: robots and PoIs at this moment.
+          robot: `[]` int32, the robot that chooses.
+        """
+        seen = self.observe(belief, team, robot)
+        if not tour_params:
+            return self.values(params, seen)
+        after = self._q_alone(params, classes, belief, team, robot)
+        is_worth_it = after > self.config.second_cost * self._own_seconds(seen)
+        seconds = tours.seconds(self.network, tour_params[0], seen, self.latent_size)
+        of_pois = jnp.where(is_worth_it, -seconds, 2 * _NOT_WORTH_IT)
+        # Comparisons with NaN are false; propagate it instead.
+        return jnp.append(jnp.where(jnp.isnan(after), after, of_pois), _NOT_WORTH_IT)
+
+    def worth(
+        self,
+        params: Params,
+        classes: Belief,
+        belief: Belief,
+        team: Team,
+        robot: Int[Array, ""],
+    ) -> Float[Array, " N"]:
+        """What a look at each PoI is worth, see `Agent.worth`.
+
+        Args:
+          params: of the Q-network.
+          classes: `[C, D]` joint posterior of each class.
+          belief: `[N, D]` the map.
+          team: robots and PoIs at this moment.
+          robot: `[]` int32, the robot that chooses.
+        """
+        seconds = self._own_seconds(self.observe(belief, team, robot))
+        after = self._q_alone(params, classes, belief, team, robot)
+        return self.discount**seconds * after - self.config.second_cost * seconds
+
+    def _q_alone(
+        self,
+        params: Params,
+        classes: Belief,
+        belief: Belief,
+        team: Team,
+        robot: Int[Array, ""],
+    ) -> Float[Array, " N"]:
+        """Q-value of a look at each PoI if nothing were left to learn about the others.
+
+        The Q-value of a useless look holds what the robot can still learn elsewhere. So all other
+        PoIs are shown to the network as known: as of the class that is nearest to their beliefs.
+        """
+        apart = jnp.sum((belief.mean[:, None] - classes.mean[None]) ** 2, axis=-1)
+        nearest = jnp.argmin(apart, axis=-1)
+        known = Belief(jnp.asarray(classes.mean)[nearest], jnp.asarray(classes.std)[nearest])
+        pois = jnp.arange(len(belief.mean))
+
+        def observe(poi: Int[Array, ""]) -> jax.Array:
+            is_other = (pois != poi)[:, None]
+            only = jax.tree.map(lambda x, y: jnp.where(is_other, x, y), known, belief)
+            return self.observe(only, team, robot)
+
+        return jnp.diagonal(self.q(params, jax.vmap(observe, out_axes=-1)(pois))[:-1])
+
+    def _own_seconds(self, observed: jax.Array) -> jax.Array:
+        """The robot's own time to look at each PoI, `[N, ...]`."""
+        features = observed.reshape(self.network.features, -1, *observed.shape[1:])
+        return team_mdp.own_seconds(features, self.latent_size)
