@@ -216,7 +216,7 @@ class TeamAgent:
         apart = jnp.sum((belief.mean[:, None] - classes.mean[None]) ** 2, axis=-1)
         nearest = jnp.argmin(apart, axis=-1)
         known = Belief(jnp.asarray(classes.mean)[nearest], jnp.asarray(classes.std)[nearest])
-        pois = jnp.arange(len(belief.mean))
+        pois = jnp.arange(belief.mean.shape[0])
 
         def observe(poi: Int[Array, ""]) -> jax.Array:
             is_other = (pois != poi)[:, None]
