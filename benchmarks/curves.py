@@ -44,7 +44,7 @@ _BY_COST = ("latent", "greedy", "bayes", "optimal", "nearest", "auction", "rollo
 _SAMPLES = 4000  # detections of each class by each sensor
 _CHUNK = 25  # control periods
 _DRAWS = 1000  # of the bootstrap
-_MOST_POIS = 6  # whose orders the oracle tries
+_MOST_POIS = 6  # whose orders the oracle tries; it does not play with more
 
 Points = dict[str, np.ndarray]
 """`accuracy`, `confidence`, `looks`, `time` of K points of a curve in E arenas, `[K, E]` each."""
@@ -65,7 +65,7 @@ class Arguments:
     json: Path | None = None
     """File to write the curves to."""
     plot: Path | None = None
-    """Picture to write, for example `policies.png`."""
+    """Picture to write, for example `curves.png`."""
 
     def __post_init__(self):
         check_fields(self, bits=64)
@@ -239,8 +239,9 @@ def play_all(curves: Curves, costs: tuple[float, ...], priced: Models, free: Mod
         yield name, {"look_cost": costs}, _stacked([curves.play(m, name) for m in each])
     names = [name for name in curves.scenario.policies if name.startswith("naive")]
     yield "naive", {"looks": tuple(range(1, NAIVE + 1))}, _of(curves, free, names)
-    names = [f"oracle_{share}" for share in ORACLE]
-    yield "oracle", {"probability": ORACLE}, _of(curves, free, names)
+    names = [name for name in curves.scenario.policies if name.startswith("oracle")]
+    if names:
+        yield "oracle", {"probability": ORACLE}, _of(curves, free, names)
     yield "random", {"look_cost": (None,)}, _of(curves, free, ["random"])
 
 
@@ -252,7 +253,11 @@ def _stacked(points: list[dict[str, np.ndarray]]) -> Points:
     return {key: np.stack([point[key] for point in points]) for key in points[0]}
 
 
-def at_accuracy(points: Points, accuracy: float, key: str) -> dict[str, float] | None:
+Need = dict[str, float | None]
+"""`mean` with `low` and `high`, of which the last is None if the policy may never get there."""
+
+
+def at_accuracy(points: Points, accuracy: float, key: str) -> Need | None:
     """What a policy needs for an accuracy, with a 95% interval; None if it never gets there.
 
     Args:
@@ -271,8 +276,9 @@ def at_accuracy(points: Points, accuracy: float, key: str) -> dict[str, float] |
         )
         for rows in draws
     ]
-    low, high = np.quantile(again, (0.025, 0.975), method="inverted_cdf")
-    return {"mean": float(middle), "low": float(low), "high": float(high)}
+    ends = np.quantile(again, (0.025, 0.975), method="inverted_cdf")
+    low, high = (float(end) if np.isfinite(end) else None for end in ends)
+    return {"mean": float(middle), "low": low, "high": high}
 
 
 def _needed(accuracies: np.ndarray, needs: np.ndarray, accuracy: float) -> float:
@@ -320,10 +326,14 @@ def as_table(blocks: list[dict]) -> str:
       blocks: of `as_block`.
     """
 
-    def text(need: dict[str, float] | None, digits: int) -> str:
+    def text(need: Need | None, digits: int) -> str:
         if need is None:
             return "-"
-        return f"{need['mean']:.{digits}f} ({need['low']:.{digits}f} to {need['high']:.{digits}f})"
+        mean, low, high = (
+            "?" if need[key] is None else f"{need[key]:.{digits}f}"
+            for key in ("mean", "low", "high")
+        )
+        return f"{mean} ({low} to {high})"
 
     heads = [f"{key} at {a:g}" for key in ("looks", "time [s]") for a in ACCURACIES]
     rows = [f"| policy | {' | '.join(heads)} |", "| --- |" + " --- |" * len(heads)]
@@ -374,12 +384,11 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     config, models = rundir.load(cli.find_run(arguments.run))
-    if config.arena.num_pois > _MOST_POIS:
-        cli.fail(PROGRAM, f"num_pois = {config.arena.num_pois}: must be at most {_MOST_POIS}")
     train_key, play_key = jax.random.split(jax.random.key(arguments.seed))
     priced = of_costs(train_key, config, models, jnp.array(arguments.costs))
     own = {f"naive_{k}": Policy(policies.naive(k), is_unordered=True) for k in (4, NAIVE)}
-    own |= {f"oracle_{share}": oracle(share) for share in ORACLE}
+    if config.arena.num_pois <= _MOST_POIS:
+        own |= {f"oracle_{share}": oracle(share) for share in ORACLE}
     curves = Curves(play_key, config, arguments.episodes, own)
     blocks = []
     for name, varies, points in play_all(curves, arguments.costs, priced, models):

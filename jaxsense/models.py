@@ -62,8 +62,8 @@ class Models:
         """What a look says, from a whole scan.
 
         It says that nothing is there if the window shows no PoI, if the bearing is outside the
-        field of view, or if a reading of the window is negative or NaN. An infinite reading counts
-        as `sensor.window_limit`, as for a beam without a return.
+        field of view, or if a reading of the window is negative, NaN or an infinite brightness. An
+        infinite distance counts as `sensor.window_limit`, as for a beam without a return.
 
         Args:
           modality: index of the sensor; static.
@@ -73,8 +73,7 @@ class Models:
           distance: distance at which the PoI's centre is expected, in metres.
         """
         of_window = windows.around(sensor, readings, bearing)
-        checked = jnp.where(of_window >= 0, of_window, jnp.nan)
-        return self.detect_in_window(modality, sensor, checked, bearing, distance)
+        return self.detect_in_window(modality, sensor, of_window, bearing, distance)
 
     def detect_in_window(
         self,
@@ -84,7 +83,7 @@ class Models:
         bearing: Float[Array, ""],
         distance: Float[Array, ""],
     ) -> Detection:
-        """What a look says, from the rays that the detector reads.
+        """What a look says, from the rays that the detector reads, see `detect`.
 
         Args:
           modality: index of the sensor; static.
@@ -93,7 +92,9 @@ class Models:
           bearing: of the PoI, see `detect`.
           distance: of the PoI, see `detect`.
         """
-        window = windows.as_window(sensor, readings)
+        most = jnp.inf if sensor.measures_distance else jnp.finfo(readings.dtype).max
+        is_valid = (readings >= 0) & (readings <= most)
+        window = windows.as_window(sensor, jnp.where(is_valid, readings, jnp.nan))
         # What is out of view is expected nowhere.
         expected = jnp.where(windows.is_in_view(sensor, bearing), distance, jnp.nan)
         return detectors.answer(self.detectors[modality], window, expected)
@@ -125,7 +126,12 @@ def make_agent(config: Config) -> Agent:
     kinds: dict[str, Callable[[], Agent]] = {
         "map": lambda: MapAgent(dqn.discount, config.arena.num_pois, latent_size, dqn.hidden),
         "team": lambda: TeamAgent(
-            config.team, dqn.discount, latent_size, len(config.modalities), dqn.hidden
+            config.team,
+            dqn.discount,
+            latent_size,
+            len(config.modalities),
+            dqn.hidden,
+            config.team.tours.steps > 0,
         ),
     }
     return kinds[dqn.task]()

@@ -154,8 +154,9 @@ class ToursConfig(Section, place="team.tours"):
     """Choices tried in each state."""
     walk: Traced[int] = limited(8, at_least=0, at_most=10_000)
     """Maximum number of choices before the state in which alternatives are tried."""
-    steps: int = limited(3200, at_least=1)
-    """Gradient steps."""
+    steps: int = limited(3200, at_least=0)
+    """Gradient steps. With 0 no order is learned: an auction orders the looks that pay, as it does
+    for `task` = map."""
     batch: int = limited(1024, at_least=1)
     """States per gradient step."""
     learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)

@@ -91,14 +91,14 @@ class MapAgent:
         return ()
 
     def team_inputs(self, num_pois: int, num_robots: int) -> dict[str, jax.ShapeDtypeStruct]:
-        """None: the map says everything.
+        """The PoIs that are left: the others are shown as known.
 
         Args:
-          num_pois: not used.
+          num_pois: N.
           num_robots: not used.
         """
-        del num_pois, num_robots
-        return {}
+        del num_robots
+        return {"present": jax.ShapeDtypeStruct((num_pois,), bool)}
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
         """The map, see `observation`.
@@ -161,7 +161,8 @@ class MapAgent:
             )
             return self.values(params, self.observe(seen, team, robot))
 
-        return jnp.mean(jax.vmap(values_if)(classes), axis=0)
+        values = jnp.mean(jax.vmap(values_if)(classes), axis=0)
+        return jnp.where(jnp.append(team.present, True), values, -jnp.inf)
 
     def worth(
         self,

@@ -31,6 +31,7 @@ class TeamAgent:
       latent_size: D.
       num_modalities: M.
       hidden: sizes of the hidden layers.
+      orders: whether a network orders looks, see `tours`.
     """
 
     config: TeamConfig
@@ -38,11 +39,12 @@ class TeamAgent:
     latent_size: int = struct.field(pytree_node=False)
     num_modalities: int = struct.field(pytree_node=False)
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
+    orders: bool = struct.field(pytree_node=False)
 
     @property
     def counts_time(self) -> bool:
-        """True: driving takes time in the team MDP."""
-        return True
+        """Whether it orders looks: then no other rule needs to."""
+        return self.orders
 
     @property
     def network(self) -> PoolingNetwork:
@@ -51,9 +53,9 @@ class TeamAgent:
         return PoolingNetwork(self.hidden, features)
 
     @property
-    def tour_networks(self) -> tuple[PoolingNetwork]:
-        """The network that orders looks."""
-        return (self.network,)
+    def tour_networks(self) -> tuple[PoolingNetwork, ...]:
+        """The network that orders looks, if any does."""
+        return (self.network,) * self.orders
 
     def learner(self, modality: str) -> str:
         """The name of what learns for robots of a modality: all robots share one network."""
@@ -89,9 +91,9 @@ class TeamAgent:
         """Random parameters of the Q-network."""
         return networks.init(key, self.network, self.network.features * self.config.num_pois[1])
 
-    def init_tours(self, key: Key) -> tuple[Params]:
-        """Random parameters of the network that orders looks, see `tours`."""
-        return (self.init(key),)
+    def init_tours(self, key: Key) -> tuple[Params, ...]:
+        """Random parameters of each of `tour_networks`."""
+        return (self.init(key),) * self.orders
 
     def team_inputs(self, num_pois: int, num_robots: int) -> dict[str, jax.ShapeDtypeStruct]:
         """All fields of `Team`, and the index of the robot that chooses.

@@ -137,7 +137,7 @@ def _decide(config: Config, models: Models, m: int) -> Function:
     of_map = _floats(num_pois, config.jmvae.latent_size)
     of_pois = dict.fromkeys(("mean", "std", "positions", "present"), "points, ...")
     of_robots = dict.fromkeys(("poses", "modality", "works", "target"), "robots, ...")
-    any_number = {**of_pois, **of_robots} if of_team else {}
+    any_number = {**of_pois, **of_robots} if models.agent.plays(num_pois + 1) else {}
     about = "the PoI to look at next, N for NOP, and the value of each; the same for targets"
     return Function(about, {"mean": of_map, "std": of_map, **of_team}, apply, any_number)
 
@@ -148,7 +148,7 @@ def _classify(models: Models) -> Function:
     def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
         belief = Belief(mean, std)
         return {
-            "nearest": models.fusion.most_likely_class(belief).astype(jnp.int32),
+            "most_likely": models.fusion.most_likely_class(belief).astype(jnp.int32),
             "plausible": latent.plausible_classes(belief, means),
         }
 

@@ -161,7 +161,7 @@ def _fusion_metrics(
 ) -> dict[str, Float[Array, ""] | None]:
     """Quality of beliefs after a look by one modality and then by another."""
     is_right, distances, widths = [], [], []
-    shown = jax.vmap(jax.vmap(fusion.most_likely_class))
+    shown = jax.vmap(jax.vmap(lambda b: latent.nearest_class(b, fusion.classes.mean)))
     for first, second in itertools.permutations(range(len(bank)), 2):
         seen = jnp.arange(len(bank)) == first
         update = lambda old, new: fusion.update(old, seen, new, second)  # noqa: B023, E731

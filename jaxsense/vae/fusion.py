@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Features, pytree
-from jaxsense.vae import jmvae, latent
+from jaxsense.vae import jmvae
 from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.readout import Readout
 
@@ -84,8 +84,8 @@ class InPlace:
         return self.readout.class_probabilities(belief, self.prior)
 
     def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
-        """Class whose joint posterior is nearest to a `[D]` belief, int32."""
-        return latent.nearest_class(belief, self.classes.mean)
+        """Most likely class according to a `[D]` belief, int32."""
+        return jnp.argmax(self.class_probabilities(belief))
 
 
 def fuse(

@@ -75,7 +75,7 @@ LIMITS = {
     Limits(above=0.0495): "navigation.robot_radius",
     Limits(above=0.152, at_most=10): "arena.poi_height",
     Limits(at_least=0): "lidar.range_noise viewpoint.clearance mdp.min_increase dqn.epsilon_min "
-    "team.travel.view_distance team.second_cost navigation.inflation mission.equal_values",
+    "team.travel.view_distance team.tours.steps team.second_cost navigation.inflation mission.equal_values",
     Limits(at_least=0, at_most=0.5): "detector.calibration",
     Limits(at_least=0, at_most=1): "arena.colours lidar.range_noise_growth lidar.mixed_pixels "
     "lidar.dropout camera.pixel_noise camera.low_light camera.shadow jmvae.annealing team.alone "
@@ -90,7 +90,7 @@ LIMITS = {
     Limits(at_least=0.5, at_most=1): "shape.half_sides",
     Limits(at_least=1): "lidar.window lidar.stride camera.window camera.stride detector.num_scans "
     "detector.num_held_out detector.steps detector.batch jmvae.samples_per_class jmvae.steps "
-    "jmvae.batch filter.steps filter.batch team.tours.states team.tours.steps team.tours.batch "
+    "jmvae.batch filter.steps filter.batch team.tours.states team.tours.batch "
     "dqn.num_envs dqn.epochs dqn.updates dqn.batch dqn.replay_capacity dqn.target_period "
     "dqn.num_starts dqn.chunk evaluation.num_starts evaluation.num_repeats mission.attempts",
     Limits(at_least=1, at_most=100): "filter.looks",
@@ -186,6 +186,7 @@ ZERO = {
     "camera.exposure_error", "camera.colour_cast", "camera.low_light", "camera.shadow",
     "detector.calibration", "mdp.look_cost", "team.alone", "team.partly_seen", "team.second_cost",
     "detector.num_repeats",
+    "team.tours.steps",
     "team.tours.walk",
     "team.travel.view_distance",
 }  # fmt: skip

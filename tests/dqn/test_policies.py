@@ -150,10 +150,10 @@ def test_a_look_is_worth_what_it_is_worth_alone():
     team = known_of(UNKNOWN, np.zeros((3, 2))).team
     found = agent.worth(None, classes, belief, team, jnp.int32(0))
     np.testing.assert_allclose(found, [2 + 1 - 1, 4 + 1 - 1, 8 + 1 - 1])
-    # One that was given up is worth what a known one is.
+    # One that was given up is never worth a look.
     there = team.replace(present=jnp.array([True, False, True]))
     found = agent.worth(None, classes, belief, there, jnp.int32(0))
-    np.testing.assert_allclose(found, [2, 1.5 - 1, 8])
+    np.testing.assert_allclose(found, [2, -np.inf, 8])
 
 
 def test_a_policy_of_ones_own_is_one_more_entry():

@@ -25,7 +25,7 @@ PLACES = jnp.array([[1.9, 0.0], [3.9, 0.0], [9.0, 9.0]])
 IN_ORDER = (5 + 1) + (10 + 1)
 # 3 m to the second, a half turn and .2 m back to the first.
 BACKWARDS = (15 + 1) + (math.pi + 1 + 1)
-AGENT = TeamAgent(TeamConfig(travel=TRAVEL), 0.5, 2, 2, (8,))
+AGENT = TeamAgent(TeamConfig(travel=TRAVEL), 0.5, 2, 2, (8,), True)
 NETWORK = AGENT.network
 CLASSES = Belief(np.float32([[1.0, 0.0], [-1.0, 0.5]]), np.full((2, 2), 0.2, np.float32))
 AT_ORIGIN = {
