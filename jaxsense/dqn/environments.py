@@ -74,7 +74,7 @@ class Agent(Protocol):
         ...
 
     def team_inputs(self, num_pois: int, num_robots: int) -> dict[str, jax.ShapeDtypeStruct]:
-        """Shapes of what `decide` reads besides the map: fields of `Team`, and the robot if it matters.
+        """Shapes of what `decide` reads besides the map: fields of `Team`, and `robot`.
 
         Args:
           num_pois: N.

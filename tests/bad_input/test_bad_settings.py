@@ -75,7 +75,8 @@ LIMITS = {
     Limits(above=0.0495): "navigation.robot_radius",
     Limits(above=0.152, at_most=10): "arena.poi_height",
     Limits(at_least=0): "lidar.range_noise viewpoint.clearance mdp.min_increase dqn.epsilon_min "
-    "team.travel.view_distance team.tours.steps team.second_cost navigation.inflation mission.equal_values",
+    "team.travel.view_distance team.tours.steps team.second_cost navigation.inflation "
+    "mission.equal_values",
     Limits(at_least=0, at_most=0.5): "detector.calibration",
     Limits(at_least=0, at_most=1): "arena.colours lidar.range_noise_growth lidar.mixed_pixels "
     "lidar.dropout camera.pixel_noise camera.low_light camera.shadow jmvae.annealing team.alone "
