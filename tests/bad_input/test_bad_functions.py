@@ -120,6 +120,19 @@ FUNCTIONS = {
         ),
         "scene.poses = nan: must be finite",
     ),
+    "scan layout": (
+        lambda w: sim.scan(
+            w.key,
+            w.lidar,
+            w.world.arena,
+            w.world.arena.data,
+            dataclasses.replace(w.scene.layout, yaw=jnp.zeros(2)),
+            w.scene.light,
+            1,
+            jnp.array(w.lidar.directions),
+        ),
+        "layout.yaw",
+    ),
     "place": (lambda w: sim.place(w.world.arena, w.scene.layout, jnp.zeros(3)), "poses"),
     "drive": (
         lambda w: sim.drive(w.world.arena, w.world.arena.data, jnp.zeros((3, 2))),
