@@ -88,7 +88,7 @@ _NOISY = Config(
         num_scans=131072,
         calibration=0.1,
         num_held_out=32768,
-        num_repeats=4096,
+        num_repeats=12288,
     ),
     jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000),
     mdp=MdpConfig(reward="nats", look_cost=0.1),

@@ -21,6 +21,7 @@ _CONFIDENCE = 0.95
 _NAIVE = ("naive", "naive_2", "naive_3")
 _MOST_TIMES, _MOST_NATS = 1.2, 0.01  # NLL of a sound map, of that of exact Bayes
 _AS_ACCURATE = 0.005  # difference of accuracies that does not matter
+_AS_FAST = 0.005  # share of a time that does not matter
 
 
 def bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,7 +151,7 @@ def verdict(played: dict[str, Case]) -> str | None:
         for name, case in played.items()
         if not is_fault(name)
         and not name.startswith("naive")
-        and mean(case["time_s"]) < mean(own["time_s"])
+        and mean(case["time_s"]) < (1 - _AS_FAST) * mean(own["time_s"])
         and mean(case["accuracy"]) > mean(own["accuracy"]) - _AS_ACCURATE
     }
     if faster:

@@ -21,7 +21,7 @@ from jaxsense.core.types import Index, pytree
 
 _STRENGTHS = np.append(0.0, np.geomspace(0.05, 20.0, 25)).astype(np.float32)
 _LENGTHS = np.geomspace(0.03, 3.0, 17).astype(np.float32)  # m
-_TOLERANCE = 0.005  # of mean confidence above accuracy
+_TOLERANCE = 0.0025  # of mean confidence above accuracy
 _SAME_PLACE = 0.02  # m
 _PENALTY = 10.0  # nats, above any difference of likelihoods
 _HALF = np.sqrt(2.0) - 1  # a sum that halves the weight
@@ -83,7 +83,7 @@ def fit(
 
     Returns:
       `[]` `strength` and `[]` `length` of `Novelty`, on a grid. Of those for which the mean
-      confidence after two and more looks from one place exceeds the accuracy by at most .005, the
+      confidence after two and more looks from one place exceeds the accuracy by at most .0025, the
       ones for which the true classes are most likely: likelihoods alone accept too much confidence
       in looks that repeat an error.
 
