@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense import looks
 from jaxsense.config import Config
@@ -101,7 +101,7 @@ def _num_starts(config: Config) -> int:
     return config.dqn.num_starts if config.dqn.observe == "live" else 0
 
 
-def draw_scenes(key: Key, config: Config) -> tuple[Key, Int[Array, "S N"]]:
+def draw_scenes(key: Key, config: Config) -> tuple[Key, Int[Array, "S N"], Bool[Array, " S"]]:
     """Draws keys and classes of all scenes.
 
     Args:
@@ -109,22 +109,26 @@ def draw_scenes(key: Key, config: Config) -> tuple[Key, Int[Array, "S N"]]:
       config: all settings.
 
     Returns:
-      `[S]` keys of the scenes, and `[S, N]` int32 classes of their PoIs.
+      `[S]` keys of the scenes, `[S, N]` int32 classes of their PoIs, and `[S]` bool, in which
+      scenes no look shows its PoI.
     """
     class_key, scene_key = jax.random.split(key)
     numbers = num_scenes(config)
     keys = jax.random.split(class_key, len(numbers))
     parts = [looks.balanced_classes(k, config, n) for k, n in zip(keys, numbers, strict=True)]
-    return jax.random.split(scene_key, sum(numbers)), jnp.concatenate(parts)
+    is_empty = jnp.arange(sum(numbers)) >= sum(numbers[:3])
+    return jax.random.split(scene_key, sum(numbers)), jnp.concatenate(parts), is_empty
 
 
 def survey_stage(arena: Arena) -> Stage:
-    """Makes the stage that surveys all scenes together: compiling takes longer than running."""
+    """Makes the stage that surveys all scenes together: compiling takes longer than running.
 
-    def survey(key: Key, config: Config, *, scenes: tuple[Key, jax.Array]) -> Surveys:
+    It may get a part of the scenes, and knows nothing of their number.
+    """
+
+    def survey(key: Key, config: Config, *, scenes: tuple[Key, jax.Array, jax.Array]) -> Surveys:
         del key
-        keys, classes = scenes
-        is_empty = jnp.arange(len(classes)) >= sum(num_scenes(config)[:3])
+        keys, classes, is_empty = scenes
         world = make_world(config, arena=arena)
         seen, windows, distances = looks.surveys(keys, world, classes, is_empty)
         return Surveys(classes, seen, windows, distances)

@@ -151,6 +151,21 @@ def surveys(monkeypatch) -> Surveys:
     return listed["survey"].begin(KEY, MEASURED, scenes=scenes)
 
 
+def test_scenes_are_as_empty_whoever_works_them_out(surveys):
+    """Threads and devices share the rows of a survey."""
+    listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
+    scenes = listed["scenes"].begin(KEY, MEASURED)
+    half = len(scenes[0]) // 2
+    parts = [
+        listed["survey"].begin(KEY, MEASURED, scenes=tuple(x[part] for x in scenes))
+        for part in (slice(half), slice(half, None))
+    ]
+    together = np.concatenate([part.distances for part in parts])
+    np.testing.assert_array_equal(together, surveys.distances)
+    assert (together[:half] == 1).all()
+    assert (together == 2).any()
+
+
 MEASURED = dataclasses.replace(
     SMOKE,
     detector=DetectorConfig(num_scans=31, num_held_out=25, steps=1),
@@ -205,11 +220,9 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
 @pytest.mark.slow
 def test_a_scene_is_the_same_whoever_works_it_out():
     listed = {stage.name: stage for stage in training.stages.stages(TINY, make_world(TINY).arena)}
-    keys, classes = listed["scenes"].begin(KEY, TINY)
+    scenes = listed["scenes"].begin(KEY, TINY)
     survey = jax.jit(listed["survey"].begin)
-    first, second = (
-        survey(KEY, TINY, scenes=(keys[i : i + 4], classes[i : i + 4])) for i in (0, 2)
-    )
+    first, second = (survey(KEY, TINY, scenes=tuple(x[i : i + 4] for x in scenes)) for i in (0, 2))
     same = jax.tree.map(lambda x, y: np.abs(x[2:] - y[:2]).max(), first.scenes, second.scenes)
     assert max(jax.tree.leaves(same)) < 1e-6
     assert np.abs(first.scenes.poses[0] - first.scenes.poses[1]).max() > 0.01
