@@ -143,8 +143,7 @@ class TeamAgent:
           observed: `[F * N]`, or `[F * N, B]`.
         """
         after = self.q(params, observed)
-        seconds = self._own_seconds(observed)
-        of_pois = self.discount**seconds * after[:-1] - self.config.second_cost * seconds
+        of_pois = self._on_departure(after[:-1], self._own_seconds(observed))
         return jnp.concatenate([of_pois, after[-1:]])
 
     def decide(
@@ -200,6 +199,10 @@ class TeamAgent:
         """
         seconds = self._own_seconds(self.observe(belief, team, robot))
         after = self._q_alone(params, classes, belief, team, robot)
+        return self._on_departure(after, seconds)
+
+    def _on_departure(self, after: jax.Array, seconds: jax.Array) -> jax.Array:
+        """Values on arrival, discounted to the time of departure, minus the price of the way."""
         return self.discount**seconds * after - self.config.second_cost * seconds
 
     def _q_alone(
