@@ -16,7 +16,7 @@ from typing import Annotated
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 from scipy import stats
 
 from benchmarks.curves import Curves
@@ -65,15 +65,10 @@ class FromWhere(Novelty):
 
     share: Float[Array, ""]
 
-    def fresh_distance(self, modality: Int[Array, ""] | int) -> Float[Array, ""]:
-        """Distance from an earlier look beyond which this share of a look is new, in metres.
-
-        Args:
-          modality: index of the sensor.
-        """
-        strength, length = self.strength[modality], self.length[modality]
-        most = jnp.maximum(self.share, 1e-9) ** -0.5 - 1
-        return length * jnp.sqrt(2 * jnp.log(jnp.maximum(strength / most, 1.0)))
+    @property
+    def most_near(self) -> Float[Array, ""]:
+        """The term `a sum_k ...` of the weight of a look of which just this share is new."""
+        return jnp.maximum(self.share, 1e-9) ** -0.5 - 1
 
 
 def with_share(models: Models, share: float) -> Models:

@@ -125,7 +125,9 @@ def test_memory_stays_below_four_gibibytes(default):
 
 def test_missions_with_the_default_preset(default, default_run, run_program):
     options = str(default_run), "--episodes", "1024"
-    mission = run_program("evaluate", default_run, *options)["mission"]
+    run_program("evaluate", default_run, *options)
+    (evaluation,) = summary.read_evaluations(default_run).values()
+    mission = evaluation["mission"]
     latent, naive = mission["latent"], mission["naive"]
     assert latent["accuracy"] >= max(0.99, naive["accuracy"])
     assert latent["observations_per_poi"] <= 1.75

@@ -122,7 +122,7 @@ def test_a_finished_run_is_loaded_with_its_settings(smoke_run):
 @pytest.mark.slow  # compiles a whole run of its own; before a release
 def test_a_run_with_a_filter_trains_plays_and_is_loaded(tmp_path, cache):
     path = tmp_path / "run"
-    options = "--jmvae.fusion", "filter", "--mdp.reward", "nats"
+    options = "--jmvae.fusion", "filter", "--mdp.reward", "nats", "--mission.episodes", "16"
     train.main([*SMOKE, *cache, *options, "--out", str(path)])
     summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
     # The filter is hardly trained, but adds up what the looks show.

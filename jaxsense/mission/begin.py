@@ -145,6 +145,7 @@ def _idle_robots(num_robots: int, num_pois: int, num_views: int) -> Robots:
         backs_off_until=seconds,
         unreachable=jnp.zeros((num_robots, num_pois), bool),
         undetected=jnp.zeros((num_robots, num_pois), bool),
+        exhausted=jnp.zeros((num_robots, num_pois), bool),
         tried_again=jnp.zeros(num_robots, bool),
         goals=number,
         reached=number,

@@ -25,7 +25,7 @@ from jaxsense.sim import viewpoints
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
-_REPEATED = 1e3  # m, above any path, so that places from which a look tells little come last
+_REPEATED = 1e3  # m, above any path, for places from which a look tells little
 
 
 def is_due(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, ""]:
@@ -66,8 +66,9 @@ def decide(
     # Failures belong to one target.
     excluded = jnp.where(is_new, False, own.excluded)
     view, length, excluded = _best_view(mission, models, state, robot, action, excluded)
-    has_path = jnp.isfinite(length)
-    sets_out_now, gives_up = sets_out & has_path, sets_out & ~has_path
+    has_path, is_exhausted = jnp.isfinite(length), length >= _REPEATED
+    sets_out_now, gives_up = sets_out & ~is_exhausted, sets_out & ~has_path
+    exhausts = sets_out & has_path & is_exhausted
     poi = jnp.minimum(action, config.arena.num_pois - 1)
     nothing_left = decides & (action == config.arena.num_pois)
     # Obstacles may have moved: before it ends, a robot retries the PoIs where it was stuck.
@@ -83,7 +84,7 @@ def decide(
     return state.with_robot(
         robot,
         phase=jnp.select(
-            [action < 0, ends, sets_out_now, gives_up | tries_again],
+            [action < 0, ends, sets_out_now, gives_up | exhausts | tries_again],
             [FAILED, ENDED, DRIVING, IDLE],
             own.phase,
         ),
@@ -93,6 +94,7 @@ def decide(
         excluded=excluded,
         attempts=jnp.where(is_new, 0, own.attempts),
         unreachable=jnp.where(gives_up, given_up.at[poi].set(True), given_up),
+        exhausted=own.exhausted.at[poi].set(own.exhausted[poi] | exhausts),
         tried_again=own.tried_again | tries_again,
         path_left=jnp.where(sets_out_now, length, own.path_left),
         progress_at=jnp.where(sets_out_now, mission.time(state), own.progress_at),
@@ -106,7 +108,7 @@ def _choose(
     """PoI that a robot's policy chooses, N for NOP, or -1 if any value is NaN."""
     config, robots = mission.config, state.robots
     settings, num_pois = config.mission, config.arena.num_pois
-    given_up = robots.unreachable[robot] | robots.undetected[robot]
+    given_up = robots.unreachable[robot] | robots.undetected[robot] | robots.exhausted[robot]
     known = _known_to(mission, models, state, robot, given_up)
     values = _values(key, mission, models, known, state.policy)
     # Values that include travel time need no order.
@@ -201,9 +203,8 @@ def _times_to_new_places(
     """Seconds until each robot is where a look at each PoI is new, which travel times leave out."""
 
     def of_look(position: jax.Array, modality: jax.Array, poi: jax.Array) -> jax.Array:
-        missing = models.novelty.fresh_distance(modality)
-        missing -= jnp.min(state.apart(position[None], poi, modality))
-        return jnp.maximum(missing, 0.0) / mission.config.team.travel.speed
+        apart = state.apart(position[None], poi, modality)[0]
+        return models.novelty.to_go(apart, modality) / mission.config.team.travel.speed
 
     of_robot = jax.vmap(of_look, (None, None, 0))
     return jax.vmap(of_robot, (0, 0, None))(
@@ -224,8 +225,8 @@ def _best_view(
     """Nearest viewpoint of a PoI from which a look is new, V for the robot's current position.
 
     Returns:
-      The viewpoint, the length of the path in metres, and the excluded ones of W = V + 1: none
-      if all that can be reached have been.
+      The viewpoint, the length of the path in metres, `_REPEATED` and more if no look is new, and
+      the excluded ones of W = V + 1: none if all that can be reached have been.
     """
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
@@ -235,7 +236,7 @@ def _best_view(
     position, modality = scene.poses[robot, :2], mission.modalities[robot]
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
     apart = state.apart(jnp.concatenate([positions, position[None]]), poi, modality)
-    is_new = jnp.min(apart, axis=-1) >= models.novelty.fresh_distance(modality)
+    is_new = models.novelty.to_go(apart, modality) <= 0
     cost = jnp.append(length, here) + jnp.where(is_new, 0.0, _REPEATED)
     excluded &= jnp.any(jnp.isfinite(cost) & ~excluded)
     cost = jnp.where(excluded, jnp.inf, cost)

@@ -16,7 +16,7 @@ from jaxsense.sim import world as worlds
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import Scene, World
 
-RECENT_LOOKS = 4
+RECENT_LOOKS = 32
 """Looks by a sensor at a PoI whose places are remembered."""
 
 IDLE, DRIVING, FACING, BACKING, ENDED, FAILED = range(6)
@@ -56,6 +56,7 @@ class Robots:
       unreachable: `[R, N]` bool, PoIs given up because no path leads there, or because the robot
         was stuck on the last attempt.
       undetected: `[R, N]` bool, PoIs given up after a last look that showed nothing.
+      exhausted: `[R, N]` bool, PoIs at which no look of the robot's would be new.
       tried_again: bool, the robot has already retried the PoIs it had given up.
       goals: int32 viewpoints that the robot set out for and unreachable PoIs, except goals that a
         new decision or another robot made obsolete.
@@ -77,6 +78,7 @@ class Robots:
     backs_off_until: Float[Array, " R"]
     unreachable: Bool[Array, "R N"]
     undetected: Bool[Array, "R N"]
+    exhausted: Bool[Array, "R N"]
     tried_again: Bool[Array, " R"]
     goals: Int[Array, " R"]
     reached: Int[Array, " R"]

@@ -24,7 +24,8 @@ _LENGTHS = np.geomspace(0.03, 3.0, 17).astype(np.float32)  # m
 _TOLERANCE = 0.0025  # of mean confidence above accuracy
 _SAME_PLACE = 0.02  # m
 _PENALTY = 10.0  # nats, above any difference of likelihoods
-_HALF = np.sqrt(2.0) - 1  # a sum that halves the weight
+_HALF = float(np.sqrt(2.0)) - 1
+_FAR = 1e3  # m, where no look has been
 
 
 @pytree
@@ -52,14 +53,29 @@ class Novelty:
         """
         return _weight(apart, self.strength[modality], self.length[modality])
 
-    def fresh_distance(self, modality: Index) -> Float[Array, ""]:
-        """Distance from an earlier look beyond which at least half of a look is new, in metres.
+    @property
+    def most_near(self) -> float | Float[Array, ""]:
+        """The term `a sum_k ...` of the weight of a look of which just half is new."""
+        return _HALF
+
+    def to_go(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
+        """Way from a place to where at least half of a look is new.
 
         Args:
+          apart: `[..., K]` distances from K earlier looks by this sensor at the PoI, in metres;
+            infinite for none.
           modality: index of the sensor.
+
+        Returns:
+          `[...]` metres away from the nearest earlier look, as if all that count were there; 0
+          where half of a look is new already.
         """
         strength, length = self.strength[modality], self.length[modality]
-        return length * jnp.sqrt(2 * jnp.log(jnp.maximum(strength / _HALF, 1.0)))
+        apart = jnp.minimum(apart, _FAR)
+        nearest = jnp.min(apart, axis=-1)
+        number = jnp.sum(jnp.exp(0.5 * (nearest[..., None] ** 2 - apart**2) / length**2), axis=-1)
+        reach = length * jnp.sqrt(2 * jnp.log(jnp.maximum(strength * number / self.most_near, 1.0)))
+        return jnp.maximum(reach - nearest, 0.0)
 
 
 def independent(num_modalities: int) -> Novelty:

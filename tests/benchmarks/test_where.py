@@ -20,23 +20,23 @@ def novelty(share):
 @pytest.mark.parametrize("share", [0.1, 0.25, 0.5, 0.75])
 def test_at_the_distance_just_the_share_is_new(share):
     found = novelty(share)
-    distance = found.fresh_distance(0)
-    if distance > 0:
-        assert found.weight(distance[None], 0) == pytest.approx(share, abs=1e-5)
+    way = found.to_go(jnp.zeros(1), 0)
+    if way > 0:
+        assert found.weight(way[None], 0) == pytest.approx(share, abs=1e-5)
     else:
         assert found.weight(jnp.zeros(1), 0) >= share
     # Of a look by the other sensor, .83 is new even from the same place.
-    assert found.fresh_distance(1) == pytest.approx(0.0)
+    assert found.to_go(jnp.zeros(1), 1) == pytest.approx(0.0)
 
 
 def test_half_is_the_rule_of_missions():
     for modality in range(2):
-        usual = LEARNED.fresh_distance(modality)
-        assert novelty(where.USUAL).fresh_distance(modality) == pytest.approx(usual)
+        usual = LEARNED.to_go(jnp.zeros(2), modality)
+        assert novelty(where.USUAL).to_go(jnp.zeros(2), modality) == pytest.approx(usual)
 
 
 def test_without_a_share_robots_stay():
-    assert novelty(0.0).fresh_distance(0) == 0
+    assert novelty(0.0).to_go(jnp.zeros(2), 0) == 0
 
 
 def test_the_share_changes_choices_and_not_the_weights():

@@ -9,7 +9,15 @@ import pytest
 from teams import CONFIG, alone, with_config
 
 from jaxsense.mission import act
-from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE, Faults
+from jaxsense.mission.state import (
+    BACKING,
+    DRIVING,
+    ENDED,
+    FACING,
+    IDLE,
+    RECENT_LOOKS,
+    Faults,
+)
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import world
 from jaxsense.sim.light import random_conditions
@@ -91,16 +99,18 @@ def test_a_look_from_near_an_earlier_one_counts_in_part(scan, models, facing, ro
     before = facing(robot)
     whole = scan(jax.random.key(0), before, robot, trained)
     np.testing.assert_allclose(whole.looked_from[0, robot, 0], [0.0, 0.0], atol=1e-6)
-    assert np.all(np.isinf(np.delete(whole.looked_from.reshape(-1, 2), 4 * robot, axis=0)))
+    assert np.all(
+        np.isinf(np.delete(whole.looked_from.reshape(-1, 2), RECENT_LOOKS * robot, axis=0))
+    )
     # Another look from the same place adds half of what the first one has said.
     again = replace(before, looked_from=whole.looked_from, times_seen=whole.times_seen)
     after = scan(jax.random.key(0), again, robot, replace(trained, novelty=half))
     said = whole.log_posterior[0] - before.log_posterior[0]
     expected = jax.nn.log_softmax(before.log_posterior[0] + said / 2)
     np.testing.assert_allclose(after.log_posterior[0], expected, atol=1e-5)
-    # The fifth look takes the place of the first.
-    fifth = replace(again, times_seen=again.times_seen.at[0, robot].set(4))
-    moved = replace(fifth, looked_from=fifth.looked_from.at[0, robot].set(7.0))
+    # Where all places are taken, the next look takes that of the first.
+    last = replace(again, times_seen=again.times_seen.at[0, robot].set(RECENT_LOOKS))
+    moved = replace(last, looked_from=last.looked_from.at[0, robot].set(7.0))
     after = scan(jax.random.key(0), moved, robot, trained)
     np.testing.assert_allclose(after.looked_from[0, robot, 0], [0.0, 0.0], atol=1e-6)
     np.testing.assert_array_equal(after.looked_from[0, robot, 1:], 7.0)

@@ -422,6 +422,24 @@ def test_a_robot_looks_again_from_where_the_look_is_new(decides, models, arena_o
         assert decides(replace(values, novelty=STAYS_OLD), there).robots.view[0] == here
 
 
+def test_a_robot_leaves_a_poi_at_which_no_look_is_new(decides, models, arena_of):
+    values = with_values(models, [1.0, 0.0, 0.5, 0.0], [0.0] * 4)
+    # No place is as far as 50 m from where the sensor has looked at PoI 0.
+    far = Novelty(strength=jnp.full(2, 100.0), length=jnp.full(2, 15.0))
+    values = replace(values, novelty=far)
+    state = arena_of(POSITIONS, POSES, policy=LATENT)
+    assert decides(values, state).robots.target[0] == 0
+    after = decides(values, looked_from([0.1, 0.0])(state))
+    assert (after.robots.phase[0], after.robots.goals[0]) == (IDLE, 0)
+    np.testing.assert_array_equal(after.robots.exhausted[0], [True, False, False])
+    assert not after.robots.exhausted[1:].any()
+    assert not after.robots.unreachable.any()
+    # It takes the next best, and nothing if no look there is new either.
+    assert decides(values, after).robots.target[0] == 2
+    nowhere = decides(values, looked_from([0.1, 0.0], poi=2)(after))
+    assert decides(values, nowhere).robots.phase[0] == ENDED
+
+
 def test_an_auction_counts_the_way_to_where_a_look_is_new(decides, models, arena_of):
     values = replace(with_values(models, [1.0, 1.0, 0.0, 0.0], [0.0] * 4), novelty=STAYS_OLD)
     state = arena_of(POSITIONS, POSES, policy=LATENT)

@@ -30,17 +30,31 @@ def test_weights_follow_what_a_mean_of_correlated_measurements_is_worth(correlat
     np.testing.assert_allclose(np.cumsum(each.weight(apart, 0)), worth, rtol=0.02)
 
 
-def test_half_of_a_look_is_new_at_the_fresh_distance():
-    distance = TWO.fresh_distance(0)
-    np.testing.assert_allclose(TWO.weight(distance[None], 0), 0.5, rtol=1e-5)
-    # More than half is new from anywhere: 1.3^-2 = .59.
-    assert TWO.fresh_distance(1) == 0
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_half_of_a_look_is_new_at_the_end_of_the_way(number):
+    there = jnp.where(jnp.arange(5) < number, 0.0, NONE)
+    way = TWO.to_go(there, 0)
+    np.testing.assert_allclose(TWO.weight(there + way, 0), 0.5, rtol=1e-5)
+    # It is as much shorter as the robot has gone already.
+    np.testing.assert_allclose(TWO.to_go(there + 0.2, 0), way - 0.2, rtol=1e-5)
+    assert TWO.to_go(there + way + 1e-3, 0) == 0
+
+
+def test_a_few_looks_from_one_place_are_new():
+    # 1.3^-2 = .59 of the second look is new, 1.6^-2 = .39 of the third.
+    assert TWO.to_go(jnp.array([0.0, NONE]), 1) == 0
+    # sqrt(2 ln(.6 / .414)) = .86 m
+    np.testing.assert_allclose(TWO.to_go(jnp.zeros(2), 1), 0.861, atol=1e-3)
+
+
+def test_nobody_goes_far_where_nobody_has_looked():
+    assert TWO.to_go(jnp.full(3, NONE), 0) == 0
 
 
 def test_independent_looks_are_new_from_anywhere():
     found = novelty.independent(3)
     assert [float(found.weight(jnp.array([d, d]), 2)) for d in (0.0, 0.1, NONE)] == [1, 1, 1]
-    assert found.fresh_distance(2) == 0
+    assert found.to_go(jnp.zeros(3), 2) == 0
 
 
 def _looks(key, number, share, apart):
