@@ -165,9 +165,15 @@ def test_many_preset(tmp_path, summary_of):
     assert many["jmvae"]["readout_error"] <= 0.003
     for block in many["dqn"].values():
         assert 0.97 <= block["fraction_of_optimal"] <= 1.01
-    latent = many["mission"]["latent"]
+    latent, naive = many["mission"]["latent"], many["mission"]["naive_3"]
     assert latent["accuracy"] >= 0.95
-    assert latent["of_naive"]["observations_per_poi"] <= 0.65
+    # Three looks of each robot at each PoI tell far less than as many where they are needed; how
+    # many naive exploration needs for the same accuracy, `benchmarks.curves` measures.
+    assert latent["accuracy"] >= naive["accuracy"] + 0.08
+    assert latent["observations_per_poi"] <= 20
+    assert "time limit" not in latent["ended"]
+    calibration = latent["calibration"]
+    assert abs(calibration["confidence"] - calibration["accuracy"]) <= 0.02
 
 
 def test_a_team_with_noisy_sensors(tmp_path, summary_of):
