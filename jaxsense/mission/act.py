@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Belief, Index, Key, call, others, pytree
 from jaxsense.mission import navigation, roadmap
-from jaxsense.mission.decide import is_taken, sees
+from jaxsense.mission.decide import AT_VIEWPOINT, is_taken, sees
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.state import (
     BACKING,
@@ -29,18 +29,21 @@ from jaxsense.sim import world as worlds
 GOAL_ANGLE = 6.0  # degrees, maximum angle to the PoI at which a robot scans it
 STUCK_TIME = 6.0  # s without progress, then a robot backs off and tries another viewpoint
 RECOVERY_TIME = 1.0  # s that a robot backs off
-_GOAL_DISTANCE = 0.2  # m, at which a viewpoint counts as reached if the PoI is in view
+_GOAL_DISTANCE = 0.2  # m, at which a viewpoint counts as reached if a look from there is new
 _PROGRESS = 0.02  # m, minimum shortening of a path that counts as progress
 _PATIENCE = 2.0  # s without progress of another robot, then one that has ended makes room
 _NEARBY = 1.0  # m, between the centres of two robots
 _TURNS_SLOWLY = 0.35  # rad/s, fastest turn at which a robot scans
 
 
-def approach(mission: Mission, state: MissionState, robot: Index) -> MissionState:
+def approach(mission: Mission, models: Models, state: MissionState, robot: Index) -> MissionState:
     """Drives to the viewpoint, turns to the PoI, and backs off without progress.
+
+    A robot need not get to the viewpoint itself if a look from nearby is new.
 
     Args:
       mission: the mission.
+      models: trained models.
       state: the current state.
       robot: index of the robot.
     """
@@ -53,7 +56,10 @@ def approach(mission: Mission, state: MissionState, robot: Index) -> MissionStat
     )
     to_goal = jnp.linalg.norm(state.roadmap.viewpoints[poi, view] - position)
     is_here = own.view == num_views
-    is_there = is_here | ((to_goal <= _GOAL_DISTANCE) & sees(mission, state, robot, poi))
+    modality = mission.modalities[robot]
+    to_go = models.novelty.to_go(state.apart(position[None], poi, modality)[0], modality)
+    is_near = to_goal <= jnp.where(to_go > 0, AT_VIEWPOINT, _GOAL_DISTANCE)
+    is_there = is_here | (is_near & sees(mission, state, robot, poi))
 
     time, is_driving = mission.time(state), own.phase == DRIVING
     arrives = is_driving & is_there

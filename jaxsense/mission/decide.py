@@ -25,6 +25,7 @@ from jaxsense.sim import viewpoints
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
+AT_VIEWPOINT = 0.05  # m, from a viewpoint within which a robot is there
 _REPEATED = 1e3  # m, above any path, for places from which a look tells little
 
 
@@ -237,6 +238,9 @@ def _best_view(
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
     apart = state.apart(jnp.concatenate([positions, position[None]]), poi, modality)
     is_new = models.novelty.to_go(apart, modality) <= 0
+    # A robot at a viewpoint would look from where it stands.
+    is_away = jnp.linalg.norm(positions - position[None], axis=-1) > AT_VIEWPOINT
+    is_new &= jnp.append(is_away, True) | is_new[-1]
     cost = jnp.append(length, here) + jnp.where(is_new, 0.0, _REPEATED)
     excluded &= jnp.any(jnp.isfinite(cost) & ~excluded)
     cost = jnp.where(excluded, jnp.inf, cost)

@@ -152,7 +152,7 @@ def _act(
     inputs = choice_keys, states
     robots = where_due(due & ~states.done, choose, states.robots, inputs, parts)
     states = dataclasses.replace(states, robots=robots)
-    states = jax.vmap(lambda state: act.approach(mission, state, robot))(states)
+    states = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
     return act.scan(scan_keys, mission, models, states, robot, parts)
 
 

@@ -251,8 +251,8 @@ def test_after_some_failures_the_poi_is_given_up(scan, facing, set_robot):
 
 
 @pytest.fixture(scope="module")
-def approach(team):
-    return jax.jit(lambda state, robot: act.approach(team, state, robot))
+def approach(team, models):
+    return jax.jit(lambda state, robot: act.approach(team, models, state, robot))
 
 
 def driving(state, set_robot, view, seconds, progress_at, path_left=0.1):
@@ -293,6 +293,25 @@ def test_only_a_viewpoint_counts_as_a_goal_reached(approach, facing, set_robot):
     for state, view, reached in ((at_viewpoint, 0, 1), (here, len(viewpoints), 0)):
         robots = approach(driving(state, set_robot, view, 1.0, 0.9), CAMERA).robots
         assert (robots.phase[CAMERA], robots.reached[CAMERA]) == (FACING, reached)
+
+
+def test_near_a_viewpoint_a_robot_stops_only_where_a_look_is_new(team, models, facing, set_robot):
+    learned = Novelty(strength=jnp.full(2, 1.0), length=jnp.full(2, 0.03))
+    approach = jax.jit(
+        lambda state: act.approach(team, replace(models, novelty=learned), state, CAMERA)
+    )
+
+    def phase(apart, looked):
+        """After coming so near to a viewpoint, with a look before from the same place or none."""
+        view = facing(CAMERA).roadmap.viewpoints[0, 0]
+        state = facing(CAMERA, pose=(view[0] + apart, view[1], 0.0))
+        places = state.looked_from.at[0, CAMERA, 0].set(state.scene.poses[CAMERA, :2])
+        state = replace(state, looked_from=places) if looked else state
+        return approach(driving(state, set_robot, 0, 1.0, 0.9)).robots.phase[CAMERA]
+
+    assert phase(0.15, False) == FACING
+    assert phase(0.15, True) == DRIVING
+    assert phase(0.04, True) == FACING
 
 
 def test_a_robot_that_is_stuck_in_its_last_attempt_gives_the_poi_up(approach, facing, set_robot):

@@ -422,6 +422,23 @@ def test_a_robot_looks_again_from_where_the_look_is_new(decides, models, arena_o
         assert decides(replace(values, novelty=STAYS_OLD), there).robots.view[0] == here
 
 
+def test_a_viewpoint_where_a_robot_stands_is_as_new_as_its_place(decides, models, arena_of):
+    close = Novelty(strength=jnp.full(2, 1.0), length=jnp.full(2, 0.01))
+    values = replace(with_values(models, [1.0, 0.0, 0.0, 0.0], [0.0] * 4), novelty=close)
+    state = arena_of(POSITIONS, POSES, policy=LATENT)
+
+    def view_from(place):
+        """The viewpoint that a robot chooses which has looked from where it stands."""
+        poses = state.scene.poses.at[0, :2].set(place)
+        there = replace(state, scene=replace(state.scene, poses=poses))
+        return int(decides(values, looked_from(place)(there)).robots.view[0])
+
+    nearest = view_from(POSES[0][:2])
+    place = state.roadmap.viewpoints[0, nearest]
+    assert view_from(place + jnp.array([0.0, 0.06])) == nearest
+    assert view_from(place + jnp.array([0.0, 0.04])) != nearest
+
+
 def test_a_robot_leaves_a_poi_at_which_no_look_is_new(decides, models, arena_of):
     values = with_values(models, [1.0, 0.0, 0.5, 0.0], [0.0] * 4)
     # No place is as far as 50 m from where the sensor has looked at PoI 0.
