@@ -67,8 +67,8 @@ class Novelty:
           modality: index of the sensor.
 
         Returns:
-          `[...]` metres away from the nearest earlier look, as if all that count were there; 0
-          where half of a look is new already.
+          `[...]` metres straight away from the earlier looks, as if all that count were at the
+          nearest one; 0 where half of a look is new already.
         """
         strength, length = self.strength[modality], self.length[modality]
         apart = jnp.minimum(apart, _FAR)

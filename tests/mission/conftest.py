@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arenas import arena, known_layout, place, set_native  # noqa: F401
-from teams import CONFIG, NAIVE, with_gates
+from teams import CONFIG, NAIVE, with_config, with_gates
 
 import jaxsense
 from jaxsense import mission
+from jaxsense.mission import decide
 
 
 @pytest.fixture(scope="session")
@@ -57,3 +58,20 @@ def set_robot():
 @pytest.fixture(scope="session")
 def as_numpy():
     return lambda tree: jax.tree.map(np.asarray, tree)
+
+
+_RULES = {"auctions": False, "nearest_first": True, "redecides": True, "avoids_targets": True}
+
+
+@pytest.fixture(scope="session")
+def decides(team):
+    """The state after a decision of robot 0, by models and by rules of coordination."""
+
+    def choose(key, models, state, rules):
+        changed = replace(CONFIG, mission=replace(CONFIG.mission, **rules))
+        return decide.decide(key, with_config(team, changed), models, state, 0)
+
+    jitted = jax.jit(choose)
+    return lambda models, state, **rules: jitted(
+        jax.random.key(0), models, state, {**_RULES, **rules}
+    )

@@ -15,6 +15,9 @@ _FOLLOWING = replace(PRESETS["smoke"].mission, least_confidence=0.0, auctions=Fa
 CONFIG = replace(PRESETS["smoke"], mission=_FOLLOWING)
 POLICIES = tuple(dqn.POLICIES)
 LATENT, NAIVE = POLICIES.index("latent"), POLICIES.index("naive")
+# The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
+POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
+POSES = [[0.0, 0.0, 0.0], [1.2, 1.2, 0.0]]
 
 
 def with_config(team, config):

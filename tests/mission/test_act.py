@@ -116,6 +116,17 @@ def test_a_look_from_near_an_earlier_one_counts_in_part(scan, models, facing, ro
     np.testing.assert_array_equal(after.looked_from[0, robot, 1:], 7.0)
 
 
+def test_places_of_many_looks_are_remembered(scan, models, facing):
+    # The PoI stays ahead within 4 degrees.
+    places = [[0.0, y] for y in np.linspace(-0.05, 0.05, 6)]
+    state = facing(LIDAR)
+    for i, place in enumerate(places):
+        moved = facing(LIDAR, pose=(*place, 0.0))
+        known = {"looked_from": state.looked_from, "times_seen": state.times_seen}
+        state = scan(jax.random.key(i), replace(moved, **known), LIDAR, sure(models, LIDAR, 0.8))
+    np.testing.assert_allclose(state.looked_from[0, LIDAR, :6], places, atol=1e-6)
+
+
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
 def test_what_is_seen_is_written_into_the_map(scan, facing, robot):
     before = facing(robot)
@@ -293,25 +304,6 @@ def test_only_a_viewpoint_counts_as_a_goal_reached(approach, facing, set_robot):
     for state, view, reached in ((at_viewpoint, 0, 1), (here, len(viewpoints), 0)):
         robots = approach(driving(state, set_robot, view, 1.0, 0.9), CAMERA).robots
         assert (robots.phase[CAMERA], robots.reached[CAMERA]) == (FACING, reached)
-
-
-def test_near_a_viewpoint_a_robot_stops_only_where_a_look_is_new(team, models, facing, set_robot):
-    learned = Novelty(strength=jnp.full(2, 1.0), length=jnp.full(2, 0.03))
-    approach = jax.jit(
-        lambda state: act.approach(team, replace(models, novelty=learned), state, CAMERA)
-    )
-
-    def phase(apart, looked):
-        """After coming so near to a viewpoint, with a look before from the same place or none."""
-        view = facing(CAMERA).roadmap.viewpoints[0, 0]
-        state = facing(CAMERA, pose=(view[0] + apart, view[1], 0.0))
-        places = state.looked_from.at[0, CAMERA, 0].set(state.scene.poses[CAMERA, :2])
-        state = replace(state, looked_from=places) if looked else state
-        return approach(driving(state, set_robot, 0, 1.0, 0.9)).robots.phase[CAMERA]
-
-    assert phase(0.15, False) == FACING
-    assert phase(0.15, True) == DRIVING
-    assert phase(0.04, True) == FACING
 
 
 def test_a_robot_that_is_stuck_in_its_last_attempt_gives_the_poi_up(approach, facing, set_robot):

@@ -6,7 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, LATENT, NAIVE, POLICIES, with_class_beliefs, with_config, with_values
+from teams import (
+    LATENT,
+    NAIVE,
+    POLICIES,
+    POSES,
+    POSITIONS,
+    with_class_beliefs,
+    with_values,
+)
 
 from jaxsense.core.types import Belief
 from jaxsense.dqn import optimum
@@ -14,25 +22,8 @@ from jaxsense.dqn.optimum import LookValues
 from jaxsense.mission import decide
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE
 from jaxsense.vae import readout
-from jaxsense.vae.novelty import Novelty
 
-# The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
-POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
-POSES = [[0.0, 0.0, 0.0], [1.2, 1.2, 0.0]]
 SURE = Belief(jnp.array([[3.0, 0.0], [-2.0, 0.0], [0.0, 2.0]]), jnp.full((3, 2), 0.25))
-RULES = {"auctions": False, "nearest_first": True, "redecides": True, "avoids_targets": True}
-
-
-@pytest.fixture(scope="module")
-def decides(team):
-    def choose(key, models, state, rules):
-        changed = replace(CONFIG, mission=replace(CONFIG.mission, **rules))
-        return decide.decide(key, with_config(team, changed), models, state, 0)
-
-    jitted = jax.jit(choose)
-    return lambda models, state, **rules: jitted(
-        jax.random.key(0), models, state, {**RULES, **rules}
-    )
 
 
 @pytest.fixture(scope="module")
@@ -393,75 +384,3 @@ def test_what_was_given_up_is_of_every_class_alike(after_giving_up, turn, other,
 def test_of_what_was_given_up_nothing_is_left_to_learn(after_giving_up, other, expected):
     # Its standard deviation is 0.25, that of what is known, not 4.5, that of what nobody has seen.
     assert after_giving_up(2, [0.0, 0.0, other, 0.0]) == expected
-
-
-# Half of a look is new at .5 sqrt(2 ln(.83 / .414)) = .59 m.
-STAYS_OLD = Novelty(strength=jnp.full(2, 2 * (np.sqrt(2.0) - 1)), length=jnp.full(2, 0.5))
-
-
-def looked_from(place, poi=0, modality=0):
-    """A sensor has looked at a PoI from a place."""
-    return lambda state: replace(
-        state, looked_from=state.looked_from.at[poi, modality, 2].set(jnp.array(place))
-    )
-
-
-def test_a_robot_looks_again_from_where_the_look_is_new(decides, models, arena_of):
-    values = with_values(models, [1.0, 0.0, 0.0, 0.0], [0.0] * 4)
-    state = looked_from([0.1, 0.0])(arena_of(POSITIONS, POSES, policy=LATENT))
-    here = state.roadmap.viewpoints.shape[1]
-    # All of a look counts from anywhere: it stays.
-    assert decides(values, state).robots.view[0] == here
-    found = decides(replace(values, novelty=STAYS_OLD), state)
-    assert found.robots.phase[0] == DRIVING
-    chosen = state.roadmap.viewpoints[0, found.robots.view[0]]
-    assert np.hypot(chosen[0] - 0.1, chosen[1]) >= 0.588
-    # What another sensor has looked at, or the own one elsewhere, does not count.
-    for other in (looked_from([0.1, 0.0], modality=1), looked_from([0.1, 0.0], poi=1)):
-        there = other(arena_of(POSITIONS, POSES, policy=LATENT))
-        assert decides(replace(values, novelty=STAYS_OLD), there).robots.view[0] == here
-
-
-def test_a_viewpoint_where_a_robot_stands_is_as_new_as_its_place(decides, models, arena_of):
-    close = Novelty(strength=jnp.full(2, 1.0), length=jnp.full(2, 0.01))
-    values = replace(with_values(models, [1.0, 0.0, 0.0, 0.0], [0.0] * 4), novelty=close)
-    state = arena_of(POSITIONS, POSES, policy=LATENT)
-
-    def view_from(place):
-        """The viewpoint that a robot chooses which has looked from where it stands."""
-        poses = state.scene.poses.at[0, :2].set(place)
-        there = replace(state, scene=replace(state.scene, poses=poses))
-        return int(decides(values, looked_from(place)(there)).robots.view[0])
-
-    nearest = view_from(POSES[0][:2])
-    place = state.roadmap.viewpoints[0, nearest]
-    assert view_from(place + jnp.array([0.0, 0.06])) == nearest
-    assert view_from(place + jnp.array([0.0, 0.04])) != nearest
-
-
-def test_a_robot_leaves_a_poi_at_which_no_look_is_new(decides, models, arena_of):
-    values = with_values(models, [1.0, 0.0, 0.5, 0.0], [0.0] * 4)
-    # No place is as far as 50 m from where the sensor has looked at PoI 0.
-    far = Novelty(strength=jnp.full(2, 100.0), length=jnp.full(2, 15.0))
-    values = replace(values, novelty=far)
-    state = arena_of(POSITIONS, POSES, policy=LATENT)
-    assert decides(values, state).robots.target[0] == 0
-    after = decides(values, looked_from([0.1, 0.0])(state))
-    assert (after.robots.phase[0], after.robots.goals[0]) == (IDLE, 0)
-    np.testing.assert_array_equal(after.robots.exhausted[0], [True, False, False])
-    assert not after.robots.exhausted[1:].any()
-    assert not after.robots.unreachable.any()
-    # It takes the next best, and nothing if no look there is new either.
-    assert decides(values, after).robots.target[0] == 2
-    nowhere = decides(values, looked_from([0.1, 0.0], poi=2)(after))
-    assert decides(values, nowhere).robots.phase[0] == ENDED
-
-
-def test_an_auction_counts_the_way_to_where_a_look_is_new(decides, models, arena_of):
-    values = replace(with_values(models, [1.0, 1.0, 0.0, 0.0], [0.0] * 4), novelty=STAYS_OLD)
-    state = arena_of(POSITIONS, POSES, policy=LATENT)
-    # PoI 0 is straight ahead, PoI 1 a quarter turn away: 1.3 s.
-    assert decides(values, state, auctions=True).robots.target[0] == 0
-    # .59 m of driving, 2.9 s, before a look at PoI 0 is new.
-    again = looked_from([0.0, 0.0])(state)
-    assert decides(values, again, auctions=True).robots.target[0] == 1

@@ -1,0 +1,105 @@
+"""From where a robot looks again: only a place from which much of a look is new."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from teams import LATENT, POSES, POSITIONS, with_values
+
+from jaxsense.mission import act
+from jaxsense.mission.state import DRIVING, ENDED, FACING, IDLE
+from jaxsense.vae.novelty import Novelty
+
+# Half of a look is new at .5 sqrt(2 ln(.83 / .414)) = .59 m.
+STAYS_OLD = Novelty(strength=jnp.full(2, 2 * (np.sqrt(2.0) - 1)), length=jnp.full(2, 0.5))
+
+
+def looked_from(place, poi=0, modality=0):
+    """A sensor has looked at a PoI from a place."""
+    return lambda state: replace(
+        state, looked_from=state.looked_from.at[poi, modality, 2].set(jnp.array(place))
+    )
+
+
+def test_a_robot_looks_again_from_where_the_look_is_new(decides, models, arena_of):
+    values = with_values(models, [1.0, 0.0, 0.0, 0.0], [0.0] * 4)
+    state = looked_from([0.1, 0.0])(arena_of(POSITIONS, POSES, policy=LATENT))
+    here = state.roadmap.viewpoints.shape[1]
+    # All of a look counts from anywhere: it stays.
+    assert decides(values, state).robots.view[0] == here
+    found = decides(replace(values, novelty=STAYS_OLD), state)
+    assert found.robots.phase[0] == DRIVING
+    chosen = state.roadmap.viewpoints[0, found.robots.view[0]]
+    assert np.hypot(chosen[0] - 0.1, chosen[1]) >= 0.588
+    # What another sensor has looked at, or the own one elsewhere, does not count.
+    for other in (looked_from([0.1, 0.0], modality=1), looked_from([0.1, 0.0], poi=1)):
+        there = other(arena_of(POSITIONS, POSES, policy=LATENT))
+        assert decides(replace(values, novelty=STAYS_OLD), there).robots.view[0] == here
+
+
+def test_a_viewpoint_where_a_robot_stands_is_as_new_as_its_place(decides, models, arena_of):
+    close = Novelty(strength=jnp.full(2, 1.0), length=jnp.full(2, 0.01))
+    values = replace(with_values(models, [1.0, 0.0, 0.0, 0.0], [0.0] * 4), novelty=close)
+    state = arena_of(POSITIONS, POSES, policy=LATENT)
+
+    def view_from(place):
+        """The viewpoint that a robot chooses which has looked from where it stands."""
+        poses = state.scene.poses.at[0, :2].set(place)
+        there = replace(state, scene=replace(state.scene, poses=poses))
+        return int(decides(values, looked_from(place)(there)).robots.view[0])
+
+    nearest = view_from(POSES[0][:2])
+    place = state.roadmap.viewpoints[0, nearest]
+    assert view_from(place + jnp.array([0.0, 0.06])) == nearest
+    assert view_from(place + jnp.array([0.0, 0.04])) != nearest
+
+
+def test_a_robot_leaves_a_poi_at_which_no_look_is_new(decides, models, arena_of):
+    values = with_values(models, [1.0, 0.0, 0.5, 0.0], [0.0] * 4)
+    # No place is as far as 50 m from where the sensor has looked at PoI 0.
+    far = Novelty(strength=jnp.full(2, 100.0), length=jnp.full(2, 15.0))
+    values = replace(values, novelty=far)
+    state = arena_of(POSITIONS, POSES, policy=LATENT)
+    assert decides(values, state).robots.target[0] == 0
+    after = decides(values, looked_from([0.1, 0.0])(state))
+    assert (after.robots.phase[0], after.robots.goals[0]) == (IDLE, 0)
+    np.testing.assert_array_equal(after.robots.exhausted[0], [True, False, False])
+    assert not after.robots.exhausted[1:].any()
+    assert not after.robots.unreachable.any()
+    # It takes the next best, and nothing if no look there is new either.
+    assert decides(values, after).robots.target[0] == 2
+    nowhere = decides(values, looked_from([0.1, 0.0], poi=2)(after))
+    assert decides(values, nowhere).robots.phase[0] == ENDED
+
+
+def test_an_auction_counts_the_way_to_where_a_look_is_new(decides, models, arena_of):
+    values = replace(with_values(models, [1.0, 1.0, 0.0, 0.0], [0.0] * 4), novelty=STAYS_OLD)
+    state = arena_of(POSITIONS, POSES, policy=LATENT)
+    # PoI 0 is straight ahead, PoI 1 a quarter turn away: 1.3 s.
+    assert decides(values, state, auctions=True).robots.target[0] == 0
+    # .59 m of driving, 2.9 s, before a look at PoI 0 is new.
+    again = looked_from([0.0, 0.0])(state)
+    assert decides(values, again, auctions=True).robots.target[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("apart", "looked", "phase"),
+    [(0.15, False, FACING), (0.15, True, DRIVING), (0.04, True, FACING)],
+)
+def test_near_a_viewpoint_a_robot_stops_only_where_a_look_is_new(
+    team, models, arena_of, set_robot, apart, looked, phase
+):
+    learned = Novelty(strength=jnp.full(2, 1.0), length=jnp.full(2, 0.03))
+    roadmap = arena_of(POSITIONS, POSES).roadmap
+    view = int(np.argmax(roadmap.is_free[0]))
+    viewpoint = roadmap.viewpoints[0, view]
+    to_poi = jnp.array(POSITIONS[0]) - viewpoint
+    place = viewpoint + apart * to_poi / jnp.linalg.norm(to_poi)
+    state = arena_of(POSITIONS, [[*place, 0.0], [-1.2, 0.2, 0.0]])
+    state = looked_from(place)(state) if looked else state
+    under_way = set_robot(state, 0, phase=DRIVING, target=0, view=view, path_left=0.2)
+    approach = jax.jit(lambda models, state: act.approach(team, models, state, 0))
+    after = approach(replace(models, novelty=learned), under_way)
+    assert after.robots.phase[0] == phase
