@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import re
-from pathlib import Path
 
 import jax
 import pytest
@@ -35,18 +34,18 @@ NUMBERS = {
 }
 
 
-@pytest.mark.slow  # a run of its own; `test_traced_settings` is the fast companion
-def test_other_numbers_need_no_other_program(smoke_run, cache, tmp_path):
-    traced = Path(cache[1]) / "traced"
-    before = {path.name for path in traced.iterdir()}
+@pytest.mark.slow  # two runs and a cache; `test_traced_settings` is the fast companion
+def test_other_numbers_need_no_other_program(tmp_path):
     options = [word for name, text in NUMBERS.items() for word in (f"--{name}", *text.split())]
-    train.main([*SMOKE, *cache, *options, "--out", str(tmp_path / "run")])
-    assert {path.name for path in traced.iterdir()} == before
-    first, second = (
-        json.loads((path / "summary.json").read_text()) for path in (smoke_run, tmp_path / "run")
-    )
+    summaries, programs_of = [], []
+    for name, some in (("first", []), ("second", options)):
+        out = tmp_path / name
+        train.main([*SMOKE, "--cache", str(tmp_path / "cache"), *some, "--out", str(out)])
+        summaries.append(json.loads((out / "summary.json").read_text()))
+        programs_of.append({path.name for path in (tmp_path / "cache" / "traced").iterdir()})
+    assert programs_of[0] == programs_of[1]
     for block in ("detectors", "jmvae", "dqn", "mission"):
-        assert first[block] != second[block]
+        assert summaries[0][block] != summaries[1][block]
 
 
 @pytest.mark.slow  # traces everything twice

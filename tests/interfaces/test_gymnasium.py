@@ -61,7 +61,7 @@ def test_every_step_equals_the_mdps(starts):
     step = jax.jit(jax.vmap(lambda k, s, a: map_mdp.step(k, mdp, s, a, LIDAR)))
     for actions in ([0, 1, 2, 0], [1, 1, 0, 2], [2, 0, NOP, NOP]):
         expected = jax.vmap(observation)(states.belief)
-        np.testing.assert_allclose(observations, expected, rtol=1e-6)
+        np.testing.assert_allclose(observations, expected, rtol=1e-6, atol=1e-6)
         observations, rewards, terminations, truncations, _ = env.step(np.array(actions))
         key, step_key = jax.random.split(key)
         states, outcome = step(jax.random.split(step_key, 4), states, jnp.array(actions))
