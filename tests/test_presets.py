@@ -177,11 +177,15 @@ def test_many_preset(tmp_path, summary_of):
 
 
 def test_a_team_with_noisy_sensors(tmp_path, summary_of):
-    policies = "--mission.policies", "latent", "naive", "--mission.episodes", "64"
+    names = "latent", "naive", "naive_3"
+    policies = "--mission.policies", *names, "--mission.episodes", "64"
     found = summary_of("noisy", 0, tmp_path / "team", "--dqn.task", "team", *policies)["mission"]
-    latent, naive = found["latent"], found["naive"]
-    assert latent["accuracy"] >= naive["accuracy"] + 0.02
-    assert latent["mean_time_s"] <= naive["mean_time_s"]
+    latent, once, thrice = (found[name] for name in names)
+    assert latent["accuracy"] >= once["accuracy"] + 0.02
+    # Exploration comes near this accuracy with three looks by each sensor.
+    assert latent["accuracy"] >= thrice["accuracy"] - 0.01
+    assert latent["mean_time_s"] <= 0.9 * thrice["mean_time_s"]
+    assert latent["observations_per_poi"] <= 0.65 * thrice["observations_per_poi"]
     # With one robot of each modality and the map policies, one in a hundred missions is late.
     assert latent["ended"].get("time limit", 0) <= 2
 
