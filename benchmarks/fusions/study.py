@@ -19,7 +19,6 @@ from jaxsense import (
     Models,
     learn,
     make_bayes,
-    make_in_place,
     mission,
 )
 from jaxsense.config import PresetName
@@ -29,7 +28,7 @@ from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.policies import Known
 from jaxsense.mission import Mission, MissionState
 from jaxsense.run import devices
-from jaxsense.training import measures
+from jaxsense.training import fusions, measures
 from jaxsense.training.stage import Outputs, key_of
 from jaxsense.vae import InPlace
 from jaxsense.vae.bayes import Bayes
@@ -56,7 +55,8 @@ class Kind:
 
 
 def _in_place(config: Config, outputs: Outputs) -> InPlace:
-    return make_in_place(config, outputs["best_jmvae"], outputs["class_beliefs"])
+    del config
+    return outputs["in_place"]
 
 
 def _product(config: Config, outputs: Outputs) -> Product:
@@ -145,11 +145,18 @@ def _as_floats(figures: Mapping[str, jax.Array]) -> Figures:
 
 
 def _learned(config: Config, key: Key) -> Outputs:
-    """What fusions share: detectors, detections, JMVAE, classes, filter and values of looks."""
+    """What fusions share: detectors, detections, JMVAE, classes, two fusions, values of looks."""
     shared = [*(f"detector_{name}" for name in config.modalities), "detections", "best_jmvae"]
     shared += ["novelty", "class_beliefs", "fusion", "look_values"]
     outputs = learn(key, config, until="look_values").outputs
-    return {name: outputs[name] for name in shared}
+    in_place = fusions.fit_in_place(
+        key_of(key, "in_place"),
+        config,
+        params=outputs["best_jmvae"],
+        classes=outputs["class_beliefs"],
+        detections=outputs["detections"],
+    )
+    return {"in_place": in_place, **{name: outputs[name] for name in shared}}
 
 
 def _models(

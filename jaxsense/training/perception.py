@@ -1,7 +1,6 @@
 """Stages of perception: scenes, detectors, the JMVAE and fusion."""
 
 import dataclasses
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, Samples, pytree
-from jaxsense.models import make_in_place, make_jmvae, make_prior, make_readout
+from jaxsense.models import make_jmvae, make_prior, make_readout
 from jaxsense.sim import sensors
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
@@ -20,12 +19,10 @@ from jaxsense.sim.world import Scene, make_world
 from jaxsense.training import gating, histories
 from jaxsense.training.fits import fit_stage
 from jaxsense.training.gating import Examples
-from jaxsense.training.stage import Output, Stage
-from jaxsense.vae import detectors, filter, jmvae
+from jaxsense.training.stage import Stage
+from jaxsense.vae import detectors, jmvae
 from jaxsense.vae import gate as gates
 from jaxsense.vae.detectors import Detector
-from jaxsense.vae.filter import Filter
-from jaxsense.vae.fusion import InPlace
 
 _EXACT = 0.003  # nats that a readout may lose, a third of what a sound map may
 _SHARE_OF_EMPTY = 8  # one empty scene for so many to train detectors with; rays take time
@@ -343,54 +340,3 @@ def class_beliefs(key: Key, config: Config, *, params: Params, detections: Detec
     model = make_jmvae(config)
     encode = jax.vmap(jax.vmap(lambda features: jmvae.posterior(params, model, features)))
     return jax.tree.map(lambda x: x.mean(axis=1), encode(detections.bank))
-
-
-def fusion_stages(config: Config) -> list[Stage]:
-    """Makes the stages of `config.jmvae.fusion`, the last of which is called `fusion`."""
-    kinds: dict[str, Callable[[Config], list[Stage]]] = {
-        "in_place": _in_place_stages,
-        "filter": _filter_stages,
-    }
-    return kinds[config.jmvae.fusion](config)
-
-
-def _in_place_stages(config: Config) -> list[Stage]:
-    """The stage that makes the fusion in place, which needs no training."""
-    del config
-
-    def begin(key: Key, config: Config, *, params: Params, classes: Belief) -> InPlace:
-        del key
-        return make_in_place(config, params, classes)
-
-    return [Stage("fusion", begin, {"params": "best_jmvae", "classes": "class_beliefs"})]
-
-
-def _filter_stages(config: Config) -> list[Stage]:
-    """The training of the filter, and the stage that returns it as the fusion."""
-
-    def untrained(
-        key: Key, config: Config, *, classes: Belief, detections: Detections
-    ) -> tuple[Filter, Params]:
-        found = filter.init(key, make_jmvae(config), classes, make_prior(config), config.filter)
-        return found, found.networks
-
-    def problem(
-        config: Config, fitted: Filter, *, classes: Belief, detections: Detections
-    ) -> filter.Fitting:
-        del classes
-        return filter.Fitting(config.filter, fitted, detections.bank)
-
-    def trained(config: Config, fitted: Filter, fit: FitState, **_: Output) -> Filter:
-        return dataclasses.replace(fitted, networks=fit.params)
-
-    training = fit_stage(
-        "filter",
-        {"classes": "class_beliefs", "detections": "detections"},
-        config,
-        settings=lambda config: config.filter,
-        untrained=untrained,
-        problem=problem,
-        trained=trained,
-    )
-    # The key of a training depends on the name of its stage.
-    return [training, Stage("fusion", lambda key, config, *, fusion: fusion, {"fusion": "filter"})]

@@ -12,7 +12,7 @@ from jaxsense.core.types import Key
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
-from jaxsense.training import agents, comparison, measures, perception, repeats
+from jaxsense.training import agents, comparison, fusions, measures, perception, repeats
 from jaxsense.training.stage import Learned, Output, Stage, compose, key_of
 
 
@@ -47,7 +47,7 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
         repeats.novelty_stage(arena, config),
         *perception.jmvae_stages(config),
         Stage("class_beliefs", perception.class_beliefs, {**params, **detections}),
-        *perception.fusion_stages(config),
+        *fusions.make_stages(config),
         Stage("latent_space", measures.latent_space, {**fusion, **detections}),
         Stage("look_values", agents.look_values, {**classes, **detections}),
         Stage("beliefs", measures.beliefs, {**fusion, **detections}),

@@ -14,9 +14,10 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.core import checks
+from jaxsense.config import JmvaeConfig
+from jaxsense.core import checks, supervised
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Belief, Features, pytree
+from jaxsense.core.types import Belief, Features, Key, Samples, pytree
 from jaxsense.vae import jmvae
 from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.readout import Readout
@@ -130,6 +131,77 @@ def fuse(
         if new is not None:
             checks.require_probabilities(f"features of {name}", new)
     return fused
+
+
+@pytree
+class Decoding:
+    """Problem of fitting the decoders to what fusion in place decodes: means of posteriors.
+
+    The JMVAE decodes draws from `q(z|all)`, few of which lie near the mean of `q(z|s)` for a subset
+    s of the modalities. The encoders stay as they are.
+
+    Attributes:
+      config: weights, batch, learning rate and steps.
+      params: of the JMVAE.
+      bank: features to draw from.
+      model: shape of the JMVAE.
+    """
+
+    config: JmvaeConfig
+    params: Params
+    bank: Samples
+    model: Jmvae = struct.field(pytree_node=False)
+
+    def draw(self, key: Key, number: int) -> jmvae.Drawn:
+        """Draws features from the bank, see `jmvae.Fitting`.
+
+        Args:
+          key: random key.
+          number: of steps; static.
+        """
+        return jmvae.Fitting(self.config, self.bank, self.model).draw(key, number)
+
+    def loss(self, params: Params, drawn: jmvae.Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
+        """Mean of `sum_s sum_{m in s} w_m |x_m - decode_m(E q(z|s))|^2 / 2` over a batch.
+
+        Args:
+          params: of the decoders, by modality.
+          drawn: one step of `draw`.
+          step: not used.
+        """
+        del step
+        _, features = drawn
+        whole, weights = {**self.params, "decoders": params}, self.config.reconstruction_weights
+        total = jnp.float32(0.0)
+        for subset in self.model.subsets:
+            given = tuple(x if m in subset else None for m, x in enumerate(features))
+            decoded = jax.vmap(self._decoded, (None, -1), -1)(whole, given)
+            for m in subset:
+                squares = jnp.sum((features[m] - decoded[m]) ** 2, axis=0)
+                total += weights[m] * 0.5 * jnp.mean(squares)
+        return total
+
+    def _decoded(self, params: Params, features: Features) -> tuple[Array, ...]:
+        """`[D_m]` features decoded from the mean of the posterior of some."""
+        mean, _ = jmvae.encode(params, self.model, features)
+        return jmvae.decode(params, self.model, mean)
+
+
+def train_decoders(
+    key: Key, params: Params, model: Jmvae, bank: Samples, config: JmvaeConfig
+) -> Params:
+    """Parameters of a JMVAE whose decoders have learned what fusion in place decodes.
+
+    Args:
+      key: random key.
+      params: of the JMVAE.
+      model: its shape.
+      bank: for each modality `[C, S, D_m]` features of looks at every class.
+      config: weights, batch, learning rate and number of steps.
+    """
+    state = supervised.start(params["decoders"], config)
+    state, _ = supervised.fit(key, state, Decoding(config, params, bank, model), config.steps)
+    return {**params, "decoders": state.params}
 
 
 def prior(model: Jmvae, variance: float) -> Belief:

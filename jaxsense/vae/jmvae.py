@@ -1,8 +1,9 @@
 """The joint multi-modal VAE (JMVAE) for any tuple of modalities.
 
 Suzuki, Nakayama and Matsuo 2017, as used in Korthals et al. 2018, Sec. II. Every non-empty subset
-of the modalities has an encoder; with two, these are the joint encoder and the two uni-modal ones
-of the paper. A Kullback-Leibler divergence draws every other encoder to that of the full set.
+of the modalities has an encoder. The encoder of the full set is the joint encoder; a
+Kullback-Leibler divergence draws every other encoder to it. With two modalities these are the joint
+encoder and the two uni-modal encoders of the paper.
 """
 
 import dataclasses
@@ -141,12 +142,15 @@ def _check_features(model: Jmvae, features: Features) -> None:
 
 
 def decode(params: Params, model: Jmvae, z: Float[Array, " D"]) -> tuple[Float[Array, "_"], ...]:
-    """Mean of `p(features | z)` for every modality, `[D_m]` each.
+    """Mean of `p(features | z)` for every modality.
 
     Args:
       params: from `init` or `train`.
       model: the shape.
       z: `[D]` latents.
+
+    Returns:
+      For each modality `[D_m]`.
     """
     chex.assert_shape(z, (model.latent_size,), custom_message="z")
     return _decode(params, model, z)
@@ -270,32 +274,6 @@ def losses(
     return reconstruction + beta * prior + alpha * subsets, parts
 
 
-def decoding_losses(
-    params: Params,
-    model: Jmvae,
-    features: tuple[Float[Array, "_ B"], ...],
-    weights: tuple[float, ...],
-) -> Float[Array, " B"]:
-    """Errors of features decoded from the mean of their posterior, as fusion in place does.
-
-    `sum_s sum_{m in s} w_m |x_m - decode_m(E q(z|s))|^2 / 2` for every subset s. `losses` decodes
-    draws from `q(z|all)`, few of them near such a mean. Encoders learn nothing from this term.
-
-    Args:
-      params: from `init`.
-      model: the shape.
-      features: `[D_m, B]` of every modality.
-      weights: w_m, of each modality's reconstruction.
-    """
-    total = jnp.zeros(features[0].shape[-1])
-    for subset in model.subsets:
-        mean, _ = _encode(params, model, subset, features)
-        decoded = _decode(params, model, jax.lax.stop_gradient(mean))
-        for m in subset:
-            total += weights[m] * 0.5 * jnp.sum((features[m] - decoded[m]) ** 2, axis=0)
-    return total
-
-
 @pytree
 class Fitting:
     """Problem of fitting a JMVAE to features.
@@ -331,7 +309,7 @@ class Fitting:
         return noise, tuple(features)
 
     def loss(self, params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Mean of the `losses`, and at the last beta `decoding_losses` of a quarter of the batch.
+        """Mean of the `losses` of a batch.
 
         Args:
           params: of the JMVAE.
@@ -339,7 +317,6 @@ class Fitting:
           step: `[]` int32, which determines beta.
         """
         noise, features = drawn
-        weights = self.config.reconstruction_weights
         total, _ = losses(
             noise,
             params,
@@ -347,16 +324,9 @@ class Fitting:
             features,
             alpha=self.config.alpha,
             beta=annealed_beta(step, self.config),
-            reconstruction_weights=weights,
+            reconstruction_weights=self.config.reconstruction_weights,
         )
-        some = tuple(x[:, : -(-self.config.batch // 4)] for x in features)
-        # Earlier, decoders of means would change which classes come apart.
-        decoding = jax.lax.cond(
-            step >= self.config.annealing * self.config.steps,
-            lambda: jnp.mean(decoding_losses(params, self.model, some, weights)),
-            lambda: 0.0,
-        )
-        return jnp.mean(total) + decoding
+        return jnp.mean(total)
 
 
 def train(
@@ -388,13 +358,15 @@ def train(
 def annealed_beta(step: Int[Array, ""], config: JmvaeConfig) -> Float[Array, ""]:
     """Beta at a gradient step: it falls from `initial_beta` to `beta` exponentially, then stays.
 
-    Falling from a high value, it lets a latent dimension come into use once it explains enough.
-    With a low beta from the start, all classes may end on one line, a local optimum.
+    A beta that falls from a high value lets each latent dimension come into use once it explains
+    enough of the features. With a low beta from the start, all classes may end up on one line, a
+    local optimum that leaves the other dimensions empty.
 
     Args:
       step: `[]` int32.
       config: `beta`, `initial_beta`, `annealing` and `steps`.
     """
+    # With `annealing` = 0, beta is constant.
     annealing_steps = jnp.maximum(config.annealing * config.steps, 1e-6)
     remaining = jnp.where(config.annealing > 0, jnp.maximum(1.0 - step / annealing_steps, 0.0), 0.0)
     return config.beta * (config.initial_beta / config.beta) ** remaining

@@ -16,7 +16,7 @@ from jaxsense.config import (
     SensorConfig,
     Shape,
 )
-from jaxsense.training import measures, perception
+from jaxsense.training import fusions, measures, perception
 from jaxsense.training.perception import Detections
 from jaxsense.training.stage import Stage, compose
 
@@ -119,7 +119,7 @@ def learn(key, config, detections):
         Stage("detections", lambda key, config: detections),
         *perception.jmvae_stages(config),
         Stage("class_beliefs", perception.class_beliefs, {"params": "best_jmvae", **given}),
-        *perception.fusion_stages(config),
+        *fusions.make_stages(config),
         Stage("latent_space", measures.latent_space, {**fusion, **given}),
         Stage("beliefs", measures.beliefs, {**fusion, **given}),
     ]

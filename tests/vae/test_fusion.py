@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.config import FilterConfig
+from jaxsense.config import FilterConfig, JmvaeConfig
 from jaxsense.core.types import Belief, Fusion
 from jaxsense.vae import filter, fusion, jmvae, readout
 from jaxsense.vae.jmvae import Jmvae
@@ -116,6 +116,33 @@ def test_a_batch_of_updates_equals_a_loop_of_singles_in_any_order():
     order = np.array([3, 5, 0, 1, 4, 2])
     permuted = update(Belief(old.mean[order], old.std[order]), seen[order], new[order])
     np.testing.assert_allclose(permuted.mean, batch.mean[order], rtol=1e-5, atol=1e-6)
+
+
+def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
+    params, looks = jmvae.init(jax.random.key(0), TWO), (look(TWO, 0), look(TWO, 1))
+    config = JmvaeConfig(reconstruction_weights=(2.0, 0.5))
+    problem = fusion.Decoding(config, params, tuple(x[None, None] for x in looks), TWO)
+    drawn = jnp.zeros((2, 1)), tuple(x[:, None] for x in looks)
+    found = problem.loss(params["decoders"], drawn, jnp.int32(0))
+    expected = 0.0
+    for given in ((looks[0], None), (None, looks[1]), looks):
+        decoded = jmvae.decode(params, TWO, jmvae.encode(params, TWO, given)[0])
+        for weight, shown, read in zip((2.0, 0.5), given, decoded, strict=True):
+            expected += 0.0 if shown is None else 0.5 * weight * np.sum((shown - read) ** 2)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_trained_decoders_tell_what_a_sensor_alone_has_seen():
+    """A camera that knows the row of four classes, and a LiDAR that knows the column."""
+    row, column = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
+    bank = tuple(jnp.eye(2)[x][:, None] for x in (row, column))
+    params = jmvae.init(jax.random.key(0), TWO)
+    config = JmvaeConfig(batch=16, steps=300, learning_rate=0.02, reconstruction_weights=(1.0, 1.0))
+    trained = fusion.train_decoders(jax.random.key(1), params, TWO, bank, config)
+    jax.tree.map(np.testing.assert_array_equal, trained["encoders"], params["encoders"])
+    for m, given in ((0, (bank[0][0, 0], None)), (1, (None, bank[1][1, 0]))):
+        read = jmvae.decode(trained, TWO, jmvae.encode(trained, TWO, given)[0])[m]
+        np.testing.assert_allclose(read, given[m], atol=0.05)
 
 
 def test_a_prior_has_mean_zero_and_the_given_variance():

@@ -212,41 +212,6 @@ def test_loss_is_that_of_encode_and_decode_with_the_keys_draw():
     np.testing.assert_allclose(total, expected, rtol=1e-5)
 
 
-def test_decoding_losses_are_the_errors_at_the_mean_of_every_posterior():
-    params, features = init(jax.random.key(0), TWO), some_features(TWO)
-    columns = tuple(x[:, None] for x in features)
-    (found,) = jmvae.decoding_losses(params, TWO, columns, (2.0, 0.5))
-    (camera, lidar), expected = features, 0.0
-    for given in ((camera, None), (None, lidar), (camera, lidar)):
-        decoded = decode(params, TWO, encode(params, TWO, given)[0])
-        for weight, shown, read in zip((2.0, 0.5), given, decoded, strict=True):
-            expected += 0.0 if shown is None else 0.5 * weight * jnp.sum((shown - read) ** 2)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-
-
-def test_decoding_losses_train_the_decoders_alone():
-    params, columns = init(jax.random.key(0), TWO), tuple(x[:, None] for x in some_features(TWO))
-    gradient = jax.grad(lambda p: jmvae.decoding_losses(p, TWO, columns, (1.0, 1.0))[0])(params)
-    assert all(np.all(x == 0) for x in jax.tree.leaves(gradient["encoders"]))
-    assert all(np.any(x != 0) for x in jax.tree.leaves(gradient["decoders"]))
-
-
-def test_decoders_learn_of_means_once_beta_has_its_last_value():
-    params, columns = init(jax.random.key(0), TWO), tuple(x[:, None] for x in some_features(TWO))
-    columns = tuple(jnp.tile(x, (1, 4)) for x in columns)
-    config = JmvaeConfig(batch=4, steps=4, annealing=0.5)
-    fitting = jmvae.Fitting(config, columns, TWO)
-    drawn = jnp.zeros((TWO.latent_size, 4)), columns
-    (decoding,) = jmvae.decoding_losses(params, TWO, tuple(x[:, :1] for x in columns), (10.0, 10.0))
-    for step, more in ((1, 0.0), (2, decoding)):
-        options = {"alpha": config.alpha, "beta": jmvae.annealed_beta(jnp.int32(step), config)}
-        weights = {"reconstruction_weights": config.reconstruction_weights}
-        total, _ = jmvae.losses(drawn[0], params, TWO, columns, **options, **weights)
-        found = fitting.loss(params, drawn, jnp.int32(step))
-        np.testing.assert_allclose(found, total[0] + more, rtol=1e-5)
-    assert decoding > 1e-3
-
-
 def test_every_step_of_a_training_draws_anew():
     config = JmvaeConfig(hidden=(8,), steps=20, batch=4, learning_rate=1e-12)
     bank = tuple(jax.random.uniform(k, (3, 50, 2)) for k in jax.random.split(jax.random.key(1)))
