@@ -45,7 +45,7 @@ def killed(runs: Runs, name: str, arguments: list[str], seed: int) -> None:
     path, moment = runs.path(name), random.Random(seed).uniform(0.0, runs.seconds(*arguments))
     while True:
         process = runs.start(*arguments, "--out", str(path))
-        wait_for(path / "config.json")
+        wait_for(path / "config.json", process)
         time.sleep(moment)
         process.kill()
         is_killed = process.finish().returncode == -signal.SIGKILL

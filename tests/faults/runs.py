@@ -63,7 +63,7 @@ class Runs:
             if name not in self._seconds:
                 paths = [self.path(f"timed {name} {i}") for i in range(2)]
                 both = [self.start(*arguments, "--out", str(path)) for path in paths]
-                wait_for(paths[0] / "config.json")
+                wait_for(paths[0] / "config.json", both[0])
                 begin = time.monotonic()
                 for process in both:
                     require(process.finish().returncode == 0, "a plain run")
@@ -105,6 +105,10 @@ class Process:
             **options,
         )
 
+    def has_ended(self) -> bool:
+        """Whether it no longer runs."""
+        return self._process.poll() is not None
+
     def kill(self) -> None:
         """As `kill -9`."""
         self._process.send_signal(signal.SIGKILL)
@@ -115,10 +119,13 @@ class Process:
         return subprocess.CompletedProcess(self._command, self._process.returncode, output, errors)
 
 
-def wait_for(path: Path) -> None:
-    """Waits until there is a file."""
+def wait_for(path: Path, process: Process) -> None:
+    """Waits until a process has written a file."""
     end = time.monotonic() + 120.0
     while not path.exists():
+        if process.has_ended():
+            ended = process.finish()
+            require(path.exists(), f"{path.name}: status {ended.returncode}, {ended.stderr}")
         require(time.monotonic() < end, f"{path} does not come")
         time.sleep(0.01)
 
