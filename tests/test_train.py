@@ -74,8 +74,13 @@ def test_summary_keeps_its_contract(smoke_run):
         assert set(block["one_step"]) == {"policy", "optimal", "random"}
         assert block["num_states"] == 384
         assert block["env_steps"] == 60 * 32  # epochs x environments of the smoke preset
-        # With so little training the map loses information.
-        assert block["optimal"] is block["fraction_of_optimal"] is block["optimal_states"] is None
+        # With so little training there may be no optimum, and the policies are far from it.
+        names = "optimal", "fraction_of_optimal", "optimal_states"
+        if any(block[name] is None for name in names):
+            assert all(block[name] is None for name in names)
+        else:
+            assert block["fraction_of_optimal"] == pytest.approx(block["return"] / block["optimal"])
+            assert block["optimal_states"] < 384
     assert set(summary["mission"]) == {"latent", "naive", "random", "bytes_per_detection"}
     for policy in ("latent", "naive", "random"):
         block = summary["mission"][policy]
