@@ -236,7 +236,7 @@ def play_all(curves: Curves, costs: tuple[float, ...], priced: Models, free: Mod
     """
     each = [jax.tree.map(lambda x: x[i], priced) for i in range(len(costs))]  # noqa: B023
     for name in _BY_COST:
-        yield name, {"look_cost": costs}, _stacked([curves.play(m, name) for m in each])
+        yield name, {"look_cost": costs}, stacked([curves.play(m, name) for m in each])
     names = [name for name in curves.scenario.policies if name.startswith("naive")]
     yield "naive", {"looks": tuple(range(1, NAIVE + 1))}, _of(curves, free, names)
     names = [name for name in curves.scenario.policies if name.startswith("oracle")]
@@ -246,10 +246,15 @@ def play_all(curves: Curves, costs: tuple[float, ...], priced: Models, free: Mod
 
 
 def _of(curves: Curves, models: Models, names: list[str]) -> Points:
-    return _stacked([curves.play(models, name) for name in names])
+    return stacked([curves.play(models, name) for name in names])
 
 
-def _stacked(points: list[dict[str, np.ndarray]]) -> Points:
+def stacked(points: list[dict[str, np.ndarray]]) -> Points:
+    """A curve from its points.
+
+    Args:
+      points: figures of `Curves.play`, of K points.
+    """
     return {key: np.stack([point[key] for point in points]) for key in points[0]}
 
 

@@ -4,12 +4,15 @@ In missions a robot looks again from the nearest place where at least half of a 
 evidence, and from as far away as `navigation.view_range`. This trial plays the same arenas with
 other shares, from 0, where robots stay as long as looks pay, to .9, and with shorter ranges. Looks
 from one place share their light and the beams that graze an edge, as in any mission, so a policy
-that takes them for new pays with accuracy and with confidence that is too high.
+that takes them for new pays with accuracy and with confidence that is too high. A second table
+compares, with several costs of a look, the time that robots which stay and robots which drive need
+for the same accuracy.
 """
 
 import dataclasses
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -19,8 +22,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import stats
 
-from benchmarks.curves import Curves
-from jaxsense import Config, Models, pytree
+from benchmarks.curves import Curves, as_block, as_table, of_costs, stacked
+from jaxsense import Config, Key, Models, pytree
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
 from jaxsense.run import cli, rundir
@@ -47,6 +50,8 @@ class Arguments:
     """The policies that play."""
     ranges: tuple[float, ...] = (1.0, 2.0, 3.0)
     """Distances in metres up to which a robot looks at once, to compare with the run's."""
+    costs: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)
+    """Costs of a look with which robots that stay and robots that drive are compared."""
     json: Path | None = None
     """File to write the figures to."""
 
@@ -119,28 +124,69 @@ def compare(found: dict[str, np.ndarray], usual: dict[str, np.ndarray]) -> dict[
     return {key: of(key) for key in _KEYS}
 
 
-def main(argv: list[str] | None = None) -> None:
-    """The program."""
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    config, models = rundir.load(cli.find_run(arguments.run))
-    key = jax.random.key(arguments.seed)
-    own = Curves(key, config, arguments.episodes)
+def by_rule(
+    key: Key, config: Config, models: Models, own: Curves, arguments: Arguments
+) -> Iterator[dict]:
+    """Figures of each policy by each rule of where to look from.
+
+    Args:
+      key: random key of the arenas.
+      config: all settings.
+      models: of a finished run.
+      own: plays missions with these settings.
+      arguments: of the program.
+    """
     rules = [(f"share {share:g}", own, share) for share in SHARES]
     for farthest in arguments.ranges:
         nearer = Curves(key, within(config, farthest), arguments.episodes)
         rules.append((f"range {farthest:g} m", nearer, USUAL))
-    rows = []
     for policy in arguments.policies:
         usual = own.play(with_share(models, USUAL), policy)
         for rule, curves, share in rules:
             found = compare(curves.play(with_share(models, share), policy), usual)
-            rows.append({"policy": policy, "rule": rule, **found})
-            cells = [f"{found[k][0]:.3f} {found[k][1]:+.3f} ± {found[k][2]:.3f}" for k in _KEYS]
-            print(f"| `{policy}` | {rule} | {' | '.join(cells)} |", flush=True)
+            yield {"policy": policy, "rule": rule, **found}
+
+
+def by_cost(
+    key: Key, config: Config, models: Models, own: Curves, arguments: Arguments
+) -> Iterator[dict]:
+    """The curve of each policy if robots stay, and if they drive before they look again.
+
+    Args:
+      key: random key of the trainings.
+      config: all settings.
+      models: of a finished run.
+      own: plays missions with these settings.
+      arguments: of the program.
+    """
+    priced = of_costs(key, config, models, jnp.array(arguments.costs))
+    each = [jax.tree.map(lambda x: x[k], priced) for k in range(len(arguments.costs))]  # noqa: B023
+    for policy in arguments.policies:
+        for share in (SHARES[0], USUAL):
+            points = stacked([own.play(with_share(model, share), policy) for model in each])
+            name = f"{policy}, share {share:g}"
+            yield as_block(name, {"look_cost": arguments.costs}, points)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    config, models = rundir.load(cli.find_run(arguments.run))
+    play_key, train_key = jax.random.split(jax.random.key(arguments.seed))
+    own = Curves(play_key, config, arguments.episodes)
+    rows, curves = [], []
+    for row in by_rule(play_key, config, models, own, arguments):
+        rows.append(row)
+        cells = [f"{row[k][0]:.3f} {row[k][1]:+.3f} ± {row[k][2]:.3f}" for k in _KEYS]
+        print(f"| `{row['policy']}` | {row['rule']} | {' | '.join(cells)} |", flush=True)
+    for block in by_cost(train_key, config, models, own, arguments):
+        curves.append(block)
+        print(as_table([block]).splitlines()[-1], flush=True)
+    print(as_table(curves))
     if arguments.json is not None:
         whole = {"commit": commit(), "versions": versions(), "episodes": arguments.episodes}
-        text = json.dumps({**whole, "seed": arguments.seed, "rows": rows}, indent=1)
-        arguments.json.write_text(text + "\n", encoding="utf-8")
+        whole |= {"seed": arguments.seed, "rows": rows, "curves": curves}
+        arguments.json.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

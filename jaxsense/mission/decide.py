@@ -227,7 +227,7 @@ def _best_view(
 
     Returns:
       The viewpoint, the length of the path in metres, `_REPEATED` and more if no look is new, and
-      the excluded ones of W = V + 1: none if all that can be reached have been.
+      the excluded ones of W = V + 1: none if all from which a look is new have been.
     """
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
@@ -242,7 +242,8 @@ def _best_view(
     is_away = jnp.linalg.norm(positions - position[None], axis=-1) > AT_VIEWPOINT
     is_new &= jnp.append(is_away, True) | is_new[-1]
     cost = jnp.append(length, here) + jnp.where(is_new, 0.0, _REPEATED)
-    excluded &= jnp.any(jnp.isfinite(cost) & ~excluded)
+    # A PoI is exhausted where no look is new, not while the new ones are excluded.
+    excluded &= jnp.any((cost < _REPEATED) & ~excluded)
     cost = jnp.where(excluded, jnp.inf, cost)
     view = jnp.argmin(cost)
     return view, cost[view], excluded

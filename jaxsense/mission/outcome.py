@@ -14,11 +14,13 @@ REASONS = (
     "time limit",
     "unreachable",
     "undetected",
+    "exhausted",
     "robot failed",
     "no robot left",
 )
 """Reasons why a mission ends, by code. `unreachable`: a robot gave up a PoI that it could not get
 to even when it retried; `undetected`: it gave one up after looks that showed nothing;
+`exhausted`: it left one at which looks paid, but none from anywhere would have been new;
 `robot failed`: the others finished."""
 
 
@@ -32,6 +34,7 @@ def reason(state: MissionState) -> Int[Array, ""]:
         (jnp.any(working & (robots.phase != ENDED)), "time limit"),
         (jnp.any(robots.unreachable), "unreachable"),
         (jnp.any(robots.undetected), "undetected"),
+        (jnp.any(robots.exhausted), "exhausted"),
         (jnp.any(~working), "robot failed"),
     ]
     code = jnp.int32(REASONS.index("finished"))

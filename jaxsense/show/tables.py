@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from jaxsense.mission import is_fault
 from jaxsense.summary import Case, Metric, Missions, Results, Timing, cases
 from jaxsense.summary.blocks import AGENTS, BELIEF, DETECTORS, JMVAE, MISSIONS, STAGES, policies
+from jaxsense.summary.compare import AS_ACCURATE
 from jaxsense.summary.metrics import Number, mean, text
 
 # Table I of Korthals et al. 2018: the classes that a sensor alone identifies.
@@ -23,7 +24,6 @@ _PAPER = {
     "env_steps": "2,000 epochs",
 }
 _YES_OR_NO = {0.0: "no", 1.0: "yes"}
-_AS_ACCURATE = 0.02  # below the most accurate policy, for one whose other values may be the best
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +140,7 @@ def _missions(played: Mapping[str, Case], caption: str) -> Table:
     table = _table(caption, played, [MISSIONS[key] for key in keys])
     values = [[mean(case[key]) for key in keys[:3]] for case in played.values()]
     most = max((accuracy for accuracy, *_ in values), default=0.0)
-    able = [row for row in values if row[0] >= most - _AS_ACCURATE and len(values) > 1]
+    able = [row for row in values if row[0] >= most - AS_ACCURATE and len(values) > 1]
     best = {(r, c) for r, row in enumerate(values) for c in range(1, 3) if row in able
             and row[c] == min(each[c] for each in able)}  # fmt: skip
     best |= {(r, 0) for r, row in enumerate(values) if able and row[0] == most}

@@ -14,13 +14,15 @@ from jaxsense.summary.metrics import Interval, mean
 REFERENCE = "latent"
 """The policy that the others are compared with."""
 
+AS_ACCURATE = 0.005
+"""Difference of accuracies that does not matter when times and looks are compared."""
+
 Measured = Mapping[str, PyTree[np.ndarray]]
 """`[E, ...]` metrics of the missions of a case, see `mission.measure`."""
 
 _CONFIDENCE = 0.95
 _NAIVE = ("naive", "naive_2", "naive_3")
 _MOST_TIMES, _MOST_NATS = 1.2, 0.01  # NLL of a sound map, of that of exact Bayes
-_AS_ACCURATE = 0.005  # difference of accuracies that does not matter
 _AS_FAST = 0.005  # share of a time that does not matter
 
 
@@ -152,7 +154,7 @@ def verdict(played: dict[str, Case]) -> str | None:
         if not is_fault(name)
         and not name.startswith("naive")
         and mean(case["time_s"]) < (1 - _AS_FAST) * mean(own["time_s"])
-        and mean(case["accuracy"]) > mean(own["accuracy"]) - _AS_ACCURATE
+        and mean(case["accuracy"]) > mean(own["accuracy"]) - AS_ACCURATE
     }
     if faster:
         best = min(faster, key=lambda name: faster[name])

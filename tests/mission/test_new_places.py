@@ -74,6 +74,30 @@ def test_a_robot_leaves_a_poi_at_which_no_look_is_new(decides, models, arena_of)
     assert decides(values, nowhere).robots.phase[0] == ENDED
 
 
+def test_a_poi_is_not_exhausted_while_new_viewpoints_are_merely_excluded(
+    decides, models, arena_of, set_robot
+):
+    values = with_values(models, [1.0, 0.0, 0.0, 0.0], [0.0] * 4)
+    values = replace(values, novelty=STAYS_OLD)
+    state = looked_from([0.1, 0.0])(arena_of(POSITIONS, POSES, policy=LATENT))
+    first = decides(values, state).robots.view[0]
+    apart = jnp.hypot(*(state.roadmap.viewpoints[0] - jnp.array([0.1, 0.0])).T)
+    is_new = jnp.append(apart >= 0.6, False)
+    assert is_new[first]
+
+    def decided(excluded):
+        there = set_robot(state, 0, target=0, excluded=excluded)
+        return decides(values, there).robots
+
+    # Of the new ones one is left, then none: it tries again.
+    others = is_new.at[first].set(False)
+    assert decided(others).view[0] == first
+    again = decided(is_new)
+    assert (again.phase[0], again.view[0]) == (DRIVING, first)
+    assert not again.exhausted.any()
+    assert not again.excluded[0].any()
+
+
 def test_an_auction_counts_the_way_to_where_a_look_is_new(decides, models, arena_of):
     values = replace(with_values(models, [1.0, 1.0, 0.0, 0.0], [0.0] * 4), novelty=STAYS_OLD)
     state = arena_of(POSITIONS, POSES, policy=LATENT)

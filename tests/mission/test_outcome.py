@@ -75,6 +75,8 @@ def one(flag_of, robot, poi):
         ("robot failed", lambda s: _phases(s, FAILED, ENDED)),
         ("unreachable", lambda s: _flags(s, "unreachable")),
         ("undetected", lambda s: _flags(s, "undetected")),
+        ("exhausted", lambda s: _flags(s, "exhausted")),
+        ("undetected", lambda s: _flags(_flags(s, "exhausted"), "undetected")),
         ("unreachable", lambda s: _flags(_flags(s, "undetected"), "unreachable")),
     ],
 )
