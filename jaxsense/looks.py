@@ -24,7 +24,7 @@ from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Detector
 
 _SCENES_AT_ONCE = 512
-_FARTHEST_MOVE = 2.0  # m
+_FARTHEST_MOVE = 1.0  # m, about as far as a robot that looks again drives
 
 
 @pytree
@@ -195,7 +195,7 @@ def repeats(
 ) -> tuple[Float[Array, "S {number} F"], Float[Array, "S {number} 2"]]:
     """Looks several times at the first PoI of many scenes, from near the first look.
 
-    In half of the scenes all looks are from one place, in the others up to 2 m away from it.
+    In half of the scenes all looks are from one place, in the others up to 1 m away from it.
 
     Args:
       keys: `[S]` random keys.

@@ -128,6 +128,7 @@ def make_agent(config: Config) -> Agent:
         "team": lambda: TeamAgent(
             config.team,
             dqn.discount,
+            rewards.make(config.mdp).of_gain(jnp.float32(0)),
             latent_size,
             len(config.modalities),
             dqn.hidden,

@@ -1,5 +1,6 @@
 """The agent of a team: one network for any number of PoIs and robots."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -28,6 +29,7 @@ class TeamAgent:
     Attributes:
       config: the travel model and the price of time.
       discount: `[]` discount factor of a second.
+      useless: `[]` reward of a look that tells nothing.
       latent_size: D.
       num_modalities: M.
       hidden: sizes of the hidden layers.
@@ -36,6 +38,7 @@ class TeamAgent:
 
     config: TeamConfig
     discount: jax.Array | float
+    useless: jax.Array | float
     latent_size: int = struct.field(pytree_node=False)
     num_modalities: int = struct.field(pytree_node=False)
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
@@ -143,8 +146,8 @@ class TeamAgent:
           observed: `[F * N]`, or `[F * N, B]`.
         """
         after = self.q(params, observed)
-        of_pois = self._on_departure(after[:-1], self._own_seconds(observed))
-        return jnp.concatenate([of_pois, after[-1:]])
+        of_pois = self.discount ** self._own_seconds(observed) * after[:-1]
+        return jnp.concatenate([self._less_way(of_pois, observed), after[-1:]])
 
     def decide(
         self,
@@ -174,7 +177,7 @@ class TeamAgent:
         if not tour_params:
             return self.values(params, seen)
         after = self._q_alone(params, classes, belief, team, robot)
-        is_worth_it = after > self.config.second_cost * self._own_seconds(seen)
+        is_worth_it = self._less_way(after, seen) > 0
         seconds = tours.seconds(self.network, tour_params[0], seen, self.latent_size)
         of_pois = jnp.where(is_worth_it, -seconds, 2 * _NOT_WORTH_IT)
         # Comparisons with NaN are false; propagate it instead.
@@ -188,7 +191,9 @@ class TeamAgent:
         team: Team,
         robot: Int[Array, ""],
     ) -> Float[Array, " N"]:
-        """What a look at each PoI is worth, see `Agent.worth`.
+        """What a look at each PoI is worth, see `Agent.worth`, were no other robot at work.
+
+        Who looks is for others to say: the network would leave a PoI to a robot that is nearer.
 
         Args:
           params: of the Q-network.
@@ -197,13 +202,14 @@ class TeamAgent:
           team: robots and PoIs at this moment.
           robot: `[]` int32, the robot that chooses.
         """
-        seconds = self._own_seconds(self.observe(belief, team, robot))
-        after = self._q_alone(params, classes, belief, team, robot)
-        return self._on_departure(after, seconds)
+        alone = team_mdp.alone(len(team.present), team.modality[robot])
+        alone = dataclasses.replace(alone, present=team.present)
+        after = self._q_alone(params, classes, belief, alone, jnp.int32(0))
+        return self._less_way(after, self.observe(belief, team, robot))
 
-    def _on_departure(self, after: jax.Array, seconds: jax.Array) -> jax.Array:
-        """Values on arrival, discounted to the time of departure, minus the price of the way."""
-        return self.discount**seconds * after - self.config.second_cost * seconds
+    def _less_way(self, after: jax.Array, observed: jax.Array) -> jax.Array:
+        """Values on arrival less the price of the way there, `[N, ...]`."""
+        return after - self.config.second_cost * self._own_seconds(observed)
 
     def _q_alone(
         self,
@@ -217,6 +223,7 @@ class TeamAgent:
 
         The Q-value of a useless look holds what the robot can still learn elsewhere. So all other
         PoIs are shown to the network as known: as of the class that is nearest to their beliefs.
+        What it then still finds in a look at a known PoI is an error, and taken off.
         """
         apart = jnp.sum((belief.mean[:, None] - classes.mean[None]) ** 2, axis=-1)
         nearest = jnp.argmin(apart, axis=-1)
@@ -228,7 +235,10 @@ class TeamAgent:
             only = jax.tree.map(lambda x, y: jnp.where(is_other, x, y), known, belief)
             return self.observe(only, team, robot)
 
-        return jnp.diagonal(self.q(params, jax.vmap(observe, out_axes=-1)(pois))[:-1])
+        of_look = jnp.diagonal(self.q(params, jax.vmap(observe, out_axes=-1)(pois))[:-1])
+        of_known = self.q(params, self.observe(known, team, robot))[:-1]
+        # Where there is no PoI both are far below any reward.
+        return jnp.where(team.present, of_look - of_known + self.useless, of_look)
 
     def _own_seconds(self, observed: jax.Array) -> jax.Array:
         """The robot's own time to look at each PoI, `[N, ...]`."""

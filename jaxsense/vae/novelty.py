@@ -99,9 +99,9 @@ def fit(
 
     Returns:
       `[]` `strength` and `[]` `length` of `Novelty`, on a grid. Of those for which the mean
-      confidence after two and more looks from one place exceeds the accuracy by at most .0025, the
-      ones for which the true classes are most likely: likelihoods alone accept too much confidence
-      in looks that repeat an error.
+      confidence after two and more looks exceeds the accuracy by at most .0025, both from one place
+      and from several, the ones for which the true classes are most likely: likelihoods alone
+      accept too much confidence in looks that repeat an error.
 
     Raises:
       ValueError: if a class does not exist.
@@ -112,7 +112,8 @@ def fit(
     apart = jnp.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
     is_earlier = np.tri(found.shape[1], k=-1, dtype=bool)
     is_one_place = jnp.max(apart, axis=(1, 2)) < _SAME_PLACE
-    number = jnp.maximum(jnp.sum(is_one_place), 1) * (found.shape[1] - 1)
+    groups = jnp.stack([is_one_place, ~is_one_place])
+    numbers = jnp.maximum(jnp.sum(groups, axis=1), 1) * (found.shape[1] - 1)
     apart = jnp.where(is_earlier[None], apart, jnp.inf)
     strength, length = (jnp.asarray(x.reshape(-1)) for x in np.meshgrid(_STRENGTHS, _LENGTHS))
 
@@ -124,8 +125,8 @@ def fit(
         least = jnp.max(log_posterior[:, 1:], axis=-1, keepdims=True) - 1e-5
         of_most_likely = jnp.where(log_posterior[:, 1:] >= least, jnp.exp(log_posterior[:, 1:]), 0)
         surer = jnp.sum(of_most_likely, axis=-1) - (of_truth >= least[..., 0])
-        excess = jnp.sum(jnp.where(is_one_place[:, None], surer, 0.0)) / number
-        return _PENALTY * jnp.maximum(excess - _TOLERANCE, 0.0) - jnp.mean(of_truth)
+        excess = jnp.sum(groups * jnp.sum(surer, axis=1)[None], axis=1) / numbers
+        return _PENALTY * jnp.sum(jnp.maximum(excess - _TOLERANCE, 0.0)) - jnp.mean(of_truth)
 
     best = jnp.argmin(jax.lax.map(loss, (strength, length)))
     return strength[best], length[best]

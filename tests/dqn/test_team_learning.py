@@ -27,7 +27,9 @@ def team_of(mapped, poses, places, **config):
 
 
 def learning_in(mdp, config=SMALL):
-    agent = TeamAgent(mdp.config, config.discount, 2, mdp.map.num_modalities, config.hidden, True)
+    agent = TeamAgent(
+        mdp.config, config.discount, -1.0, 2, mdp.map.num_modalities, config.hidden, True
+    )
     return agent.environment(mdp, 0)
 
 
@@ -45,7 +47,7 @@ def test_values_of_setting_out_as_worked_by_hand(monkeypatch):
     seen = jnp.zeros((9, 3)).at[2].set(jnp.array([0.2, 0.0, 0.4])).reshape(-1)
     after = jnp.array([8.0, 3.0, 16.0, 0.0])
     monkeypatch.setattr(TeamAgent, "q", lambda agent, params, observed: params)
-    agent = TeamAgent(TeamConfig(second_cost=0.1), 0.5, 1, 1, (8,), True)
+    agent = TeamAgent(TeamConfig(second_cost=0.1), 0.5, -1.0, 1, 1, (8,), True)
     # 2 s: 8/4 - .2; at once; 4 s: 16/16 - .4; NOP.
     np.testing.assert_allclose(agent.values(after, seen), [1.8, 3.0, 0.6, 0.0], rtol=1e-6)
     # The same for a batch in the last axis.

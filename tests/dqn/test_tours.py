@@ -25,7 +25,7 @@ PLACES = jnp.array([[1.9, 0.0], [3.9, 0.0], [9.0, 9.0]])
 IN_ORDER = (5 + 1) + (10 + 1)
 # 3 m to the second, a half turn and .2 m back to the first.
 BACKWARDS = (15 + 1) + (math.pi + 1 + 1)
-AGENT = TeamAgent(TeamConfig(travel=TRAVEL), 0.5, 2, 2, (8,), True)
+AGENT = TeamAgent(TeamConfig(travel=TRAVEL), 0.5, -1.0, 2, 2, (8,), True)
 NETWORK = AGENT.network
 CLASSES = Belief(np.float32([[1.0, 0.0], [-1.0, 0.5]]), np.full((2, 2), 0.2, np.float32))
 AT_ORIGIN = {
@@ -174,10 +174,22 @@ def test_nan_of_the_q_network_stays_visible(monkeypatch):
     np.testing.assert_array_equal(np.isnan(values), [True, False, False, False])
 
 
+def sigmas(observed, features):
+    """Of the three PoIs, along the first latent dimension."""
+    return observed.reshape(features, 3, *observed.shape[1:])[2]
+
+
 def decided(monkeypatch, after, cost):
     """Values in a mission, where the networks say what follows looks, and 20, 30 and 10 s."""
-    of_each = jnp.array([*after, 0.0])[:, None]
-    monkeypatch.setattr(TeamAgent, "q", lambda self, params, x: jnp.tile(of_each, x.shape[1:]))
+
+    def q(self, params, observed):
+        sigma = sigmas(observed, self.network.features)
+        of_each = jnp.array(after).reshape(3, *[1] * (sigma.ndim - 1))
+        # At a PoI that is known, with a sigma of .2, the network takes a useless look for -.7.
+        values = jnp.where(sigma > 0.3, of_each - self.useless - 0.7, -0.7)
+        return jnp.concatenate([values, jnp.zeros_like(values[:1])])
+
+    monkeypatch.setattr(TeamAgent, "q", q)
     monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
     agent = replace(AGENT, config=TeamConfig(travel=TRAVEL, second_cost=cost))
     return jax.jit(lambda: agent.decide({}, ({},), classes=CLASSES, **AT_ORIGIN))()
@@ -187,7 +199,7 @@ def test_what_is_left_to_learn_elsewhere_makes_no_look_worth_its_way(monkeypatch
     """A network that adds up sigmas: of the PoI less .5, and half of the others'."""
 
     def q(self, params, observed):
-        sigma = observed.reshape(self.network.features, 3, *observed.shape[1:])[2]
+        sigma = sigmas(observed, self.network.features)
         elsewhere = 0.5 * (jnp.sum(sigma, axis=0, keepdims=True) - sigma)
         return jnp.concatenate([sigma - 0.5 + elsewhere, jnp.zeros_like(sigma[:1])])
 
@@ -195,11 +207,28 @@ def test_what_is_left_to_learn_elsewhere_makes_no_look_worth_its_way(monkeypatch
     agent = replace(AGENT, discount=1.0)
     belief = Belief(jnp.zeros((3, 2)), jnp.array([[0.1, 1.0], [1.5, 1.0], [0.1, 1.0]]))
     given = {**AT_ORIGIN, "belief": belief}
-    # The two others of a pair are known, with a sigma of .2.
+    # Were all three known, with sigmas of .2, it would say .2 - .5 + .2 of a look that earns -1.
     worth = agent.worth({}, CLASSES, **given)
-    np.testing.assert_allclose(
-        worth, [0.1 - 0.5 + 0.2, 1.5 - 0.5 + 0.2, 0.1 - 0.5 + 0.2], rtol=1e-5
-    )
+    np.testing.assert_allclose(worth, [0.1 - 0.2 - 1, 1.5 - 0.2 - 1, 0.1 - 0.2 - 1], rtol=1e-5)
+
+
+def test_what_a_look_is_worth_does_not_depend_on_who_else_is_near(monkeypatch):
+    def q(self, params, observed):
+        features = self.network.features
+        surroundings = observed.reshape(features, 3, *observed.shape[1:])[5:]
+        values = sigmas(observed, features) * (1 + jnp.sum(surroundings, axis=0))
+        return jnp.concatenate([values, jnp.zeros_like(values[:1])])
+
+    monkeypatch.setattr(TeamAgent, "q", q)
+    team = AT_ORIGIN["team"]
+    poses, heads = np.array([[0, 0, 0], [*PLACES[0], 0]], np.float32), np.array([3, 0])
+    near = replace(team, poses=poses, target=heads)
+    worth, same = (AGENT.worth({}, CLASSES, **{**AT_ORIGIN, "team": each}) for each in (team, near))
+    np.testing.assert_array_equal(worth, same)
+    # A PoI that the robot has given up is never worth a look.
+    gone = replace(team, present=np.array([True, False, True]))
+    left = AGENT.worth({}, CLASSES, **{**AT_ORIGIN, "team": gone})
+    assert left[1] <= 0
 
 
 def test_without_tours_the_values_are_those_of_setting_out(monkeypatch):

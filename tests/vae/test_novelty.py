@@ -90,6 +90,20 @@ def test_it_learns_the_share_that_looks_have_in_common():
     assert worth == pytest.approx(1.6, abs=0.3)
 
 
+def test_maps_are_no_surer_than_right_of_looks_from_several_places():
+    """Likelihoods gain more from three scenes in ten, than they lose by errors in the others."""
+    shared_key, own_key = jax.random.split(jax.random.key(2))
+    shared, own = _looks(shared_key, 7000, 1.0, 0.1), _looks(own_key, 3000, 0.0, 0.1)
+    found, positions, classes = (jnp.concatenate(x) for x in zip(shared, own, strict=True))
+    strength, length = jax.jit(novelty.fit)(found, positions, classes)
+    apart = 0.1 * jnp.abs(jnp.arange(4.0)[:, None] - jnp.arange(4.0)[None])
+    apart = jnp.where(np.tri(4, k=-1, dtype=bool), apart, NONE)
+    weights = Novelty(strength[None], length[None]).weight(apart, 0)
+    fused = jax.nn.softmax(jnp.cumsum(weights[None, :, None] * found, axis=1)[:, 1:])
+    surer = jnp.max(fused, axis=-1) - (jnp.argmax(fused, axis=-1) == classes[:, None])
+    assert jnp.mean(surer) <= 0.003
+
+
 def test_a_class_that_does_not_exist_is_refused():
     with pytest.raises(ValueError, match="classes = 2: must be a whole number from 0 to 1"):
         novelty.fit(jnp.zeros((1, 4, 2)), jnp.zeros((1, 4, 2)), jnp.array([2]))
