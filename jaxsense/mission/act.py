@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Belief, Index, Key, call, others, pytree
 from jaxsense.mission import navigation, roadmap
-from jaxsense.mission.decide import AT_VIEWPOINT, is_taken, sees
+from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, is_taken, sees
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.state import (
     BACKING,
@@ -28,7 +28,6 @@ from jaxsense.sim import world as worlds
 
 GOAL_ANGLE = 6.0  # degrees, maximum angle to the PoI at which a robot scans it
 STUCK_TIME = 6.0  # s without progress, then a robot backs off and tries another viewpoint
-RECOVERY_TIME = 1.0  # s that a robot backs off
 _GOAL_DISTANCE = 0.2  # m, at which a viewpoint counts as reached if a look from there is new
 _PROGRESS = 0.02  # m, minimum shortening of a path that counts as progress
 _PATIENCE = 2.0  # s without progress of another robot, then one that has ended makes room

@@ -12,6 +12,7 @@ from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission import roadmap
 from jaxsense.mission.state import (
+    BACKING,
     DRIVING,
     ENDED,
     FACING,
@@ -25,6 +26,7 @@ from jaxsense.sim import viewpoints
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
+RECOVERY_TIME = 1.0  # s that a robot backs off
 AT_VIEWPOINT = 0.05  # m, from a viewpoint within which a robot is there
 _REPEATED = 1e3  # m, above any path, for places from which a look tells little
 
@@ -65,11 +67,16 @@ def decide(
     sets_out = decides & (is_idle | is_new) & is_poi
 
     # Failures belong to one target.
-    excluded = jnp.where(is_new, False, own.excluded)
-    view, length, excluded = _best_view(mission, models, state, robot, action, excluded)
+    excluded, attempts = jnp.where(is_new, False, own.excluded), jnp.where(is_new, 0, own.attempts)
+    view, length, is_blocked = _best_view(mission, models, state, robot, action, excluded)
     has_path, is_exhausted = jnp.isfinite(length), length >= _REPEATED
-    sets_out_now, gives_up = sets_out & ~is_exhausted, sets_out & ~has_path
     exhausts = sets_out & has_path & is_exhausted
+    # Robots that wait for each other make room.
+    backs_off, time = sets_out & is_blocked, mission.time(state)
+    attempts += backs_off
+    gives_up = sets_out & ~has_path
+    gives_up |= backs_off & (attempts >= config.mission.attempts)
+    sets_out_now = sets_out & ~is_exhausted & ~is_blocked
     poi = jnp.minimum(action, config.arena.num_pois - 1)
     nothing_left = decides & (action == config.arena.num_pois)
     # Obstacles may have moved: before it ends, a robot retries the PoIs where it was stuck.
@@ -85,20 +92,21 @@ def decide(
     return state.with_robot(
         robot,
         phase=jnp.select(
-            [action < 0, ends, sets_out_now, gives_up | exhausts | tries_again],
-            [FAILED, ENDED, DRIVING, IDLE],
+            [action < 0, ends, sets_out_now, gives_up | exhausts | tries_again, backs_off],
+            [FAILED, ENDED, DRIVING, IDLE, BACKING],
             own.phase,
         ),
         target=action,
         view=jnp.where(sets_out_now, view, own.view),
         decided_on=jnp.where(decides, state.version, own.decided_on),
-        excluded=excluded,
-        attempts=jnp.where(is_new, 0, own.attempts),
+        excluded=jnp.where(is_blocked, False, excluded),
+        attempts=attempts,
+        backs_off_until=jnp.where(backs_off, time + RECOVERY_TIME, own.backs_off_until),
         unreachable=jnp.where(gives_up, given_up.at[poi].set(True), given_up),
         exhausted=own.exhausted.at[poi].set(own.exhausted[poi] | exhausts),
         tried_again=own.tried_again | tries_again,
         path_left=jnp.where(sets_out_now, length, own.path_left),
-        progress_at=jnp.where(sets_out_now, mission.time(state), own.progress_at),
+        progress_at=jnp.where(sets_out_now, time, own.progress_at),
         goals=own.goals + is_goal - was_needless,
     )
 
@@ -222,12 +230,12 @@ def _best_view(
     robot: Index,
     target: Int[Array, ""],
     excluded: Bool[Array, " W"],
-) -> tuple[Int[Array, ""], Float[Array, ""], Bool[Array, " W"]]:
+) -> tuple[Int[Array, ""], Float[Array, ""], Bool[Array, ""]]:
     """Nearest viewpoint of a PoI from which a look is new, V for the robot's current position.
 
     Returns:
       The viewpoint, the length of the path in metres, `_REPEATED` and more if no look is new, and
-      the excluded ones of W = V + 1: none if all from which a look is new have been.
+      whether all from which one is new are among the `[V + 1]` excluded ones.
     """
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
@@ -242,11 +250,9 @@ def _best_view(
     is_away = jnp.linalg.norm(positions - position[None], axis=-1) > AT_VIEWPOINT
     is_new &= jnp.append(is_away, True) | is_new[-1]
     cost = jnp.append(length, here) + jnp.where(is_new, 0.0, _REPEATED)
-    # A PoI is exhausted where no look is new, not while the new ones are excluded.
-    excluded &= jnp.any((cost < _REPEATED) & ~excluded)
-    cost = jnp.where(excluded, jnp.inf, cost)
-    view = jnp.argmin(cost)
-    return view, cost[view], excluded
+    is_blocked = jnp.any(cost < _REPEATED) & jnp.all((cost >= _REPEATED) | excluded)
+    view = jnp.argmin(jnp.where(excluded & ~is_blocked, jnp.inf, cost))
+    return view, cost[view], is_blocked
 
 
 def is_taken(

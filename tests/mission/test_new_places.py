@@ -9,7 +9,8 @@ import pytest
 from teams import LATENT, POSES, POSITIONS, with_values
 
 from jaxsense.mission import act
-from jaxsense.mission.state import DRIVING, ENDED, FACING, IDLE
+from jaxsense.mission.decide import RECOVERY_TIME
+from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE
 from jaxsense.vae.novelty import Novelty
 
 # Half of a look is new at .5 sqrt(2 ln(.83 / .414)) = .59 m.
@@ -74,28 +75,34 @@ def test_a_robot_leaves_a_poi_at_which_no_look_is_new(decides, models, arena_of)
     assert decides(values, nowhere).robots.phase[0] == ENDED
 
 
-def test_a_poi_is_not_exhausted_while_new_viewpoints_are_merely_excluded(
+def test_where_all_new_viewpoints_are_taken_a_robot_makes_room_and_tries_again(
     decides, models, arena_of, set_robot
 ):
     values = with_values(models, [1.0, 0.0, 0.0, 0.0], [0.0] * 4)
     values = replace(values, novelty=STAYS_OLD)
     state = looked_from([0.1, 0.0])(arena_of(POSITIONS, POSES, policy=LATENT))
     first = decides(values, state).robots.view[0]
-    apart = jnp.hypot(*(state.roadmap.viewpoints[0] - jnp.array([0.1, 0.0])).T)
+    apart = np.hypot(*(np.asarray(state.roadmap.viewpoints[0]) - [0.1, 0.0]).T)
     is_new = jnp.append(apart >= 0.6, False)
     assert is_new[first]
 
-    def decided(excluded):
-        there = set_robot(state, 0, target=0, excluded=excluded)
+    def decided(excluded, attempts=0):
+        there = set_robot(state, 0, target=0, excluded=excluded, attempts=attempts)
         return decides(values, there).robots
 
-    # Of the new ones one is left, then none: it tries again.
-    others = is_new.at[first].set(False)
-    assert decided(others).view[0] == first
-    again = decided(is_new)
-    assert (again.phase[0], again.view[0]) == (DRIVING, first)
-    assert not again.exhausted.any()
-    assert not again.excluded[0].any()
+    # Of the new ones one is left, then none.
+    assert decided(is_new.at[first].set(False)).view[0] == first
+    waits = decided(is_new)
+    assert (waits.phase[0], waits.attempts[0]) == (BACKING, 1)
+    np.testing.assert_allclose(waits.backs_off_until[0], RECOVERY_TIME)
+    for robots in (waits, decided(is_new, 2)):
+        assert not robots.exhausted.any()
+        assert not robots.excluded[0].any()
+    assert not waits.unreachable.any()
+    # After three failures it gives the PoI up, and may try once more in the end.
+    left = decided(is_new, 2)
+    assert (left.phase[0], left.goals[0]) == (IDLE, 1)
+    np.testing.assert_array_equal(left.unreachable[0], [True, False, False])
 
 
 def test_an_auction_counts_the_way_to_where_a_look_is_new(decides, models, arena_of):
