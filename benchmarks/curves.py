@@ -28,6 +28,7 @@ from jaxsense.config.options import Name
 from jaxsense.dqn import policies
 from jaxsense.dqn.policies import Known, Policy, Trained
 from jaxsense.mission import MissionState
+from jaxsense.models import make_agent
 from jaxsense.run import cli, rundir
 from jaxsense.run.version import commit, versions
 from jaxsense.show.colours import policy_colour, policy_marker
@@ -156,7 +157,12 @@ def of_costs(key: Key, config: Config, models: Models, costs: jax.Array) -> Mode
         priced = dataclasses.replace(config, mdp=dataclasses.replace(config.mdp, look_cost=cost))
         outputs = compose(train_key, priced, stages).outputs
         learned = tuple(outputs[agents.learner(config, name)] for name in config.modalities)
-        return dataclasses.replace(models, look_values=outputs["look_values"], q_networks=learned)
+        return dataclasses.replace(
+            models,
+            look_values=outputs["look_values"],
+            agent=make_agent(priced),
+            q_networks=learned,
+        )
 
     return jax.tree.map(lambda *x: jnp.stack(x), *map(train, costs))
 

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from jaxsense.config import ConfigError
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
 from jaxsense.run import cli, rundir
@@ -57,7 +58,7 @@ class Sensor:
     """One sensor at one PoI.
 
     Attributes:
-      accuracy: share of single looks that show the right one of two labels.
+      accuracy: share of single looks that show the right one of two labels, above 1/2, below 1.
       strength: how much looks from one place have in common, see `vae.Novelty`.
       look: seconds of a look.
       drive: seconds to another place.
@@ -67,6 +68,9 @@ class Sensor:
     strength: float
     look: float
     drive: float
+
+    def __post_init__(self):
+        require(0.5 < self.accuracy < 1, self, "accuracy", "must be above 0.5 and below 1")
 
     @functools.cached_property
     def after_each(self) -> Float[np.ndarray, "K L L"]:
@@ -150,9 +154,13 @@ def main(argv: list[str] | None = None) -> None:
     config, models = rundir.load(directory)
     detectors = read(directory)["detectors"]
     rows = []
-    print(f"| sensor, drive | {' | '.join(f'{e:.0%} wrong' for e in ERRORS)} |")
+    print(f"| sensor, drive | {' | '.join(f'{e:.1%} wrong' for e in ERRORS)} |")
     print("| --- |" + " --- |" * len(ERRORS))
     for m, name in enumerate(config.modalities):
+        if len(config.labels(name)) > 2:
+            raise ConfigError(
+                "run", arguments.run, f"must tell two labels apart by {name}, not more"
+            )
         for drive in arguments.drives:
             sensor = Sensor(
                 accuracy=mean(detectors[name]["accuracy"]),

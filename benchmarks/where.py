@@ -172,7 +172,8 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     config, models = rundir.load(cli.find_run(arguments.run))
-    play_key, train_key = jax.random.split(jax.random.key(arguments.seed))
+    play_key = jax.random.key(arguments.seed)
+    train_key = jax.random.fold_in(play_key, 1)
     own = Curves(play_key, config, arguments.episodes)
     rows, curves = [], []
     for row in by_rule(play_key, config, models, own, arguments):

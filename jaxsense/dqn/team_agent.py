@@ -161,9 +161,9 @@ class TeamAgent:
         """Values of a robot's actions that rank PoIs by predicted completion time.
 
         A look is worthwhile if its Q-value, were it the only one left, exceeds the price of the
-        travel time. Its value is then minus the predicted seconds of `tours`; that of NOP is lower,
-        and those of other looks are lowest. Without `tour_params`, the values are those of
-        `values`.
+        travel time, see `worth`. Its value is then minus the predicted seconds of `tours`; that of
+        NOP is lower, and those of other looks are lowest. Without `tour_params`, the values are
+        those of `values`, and lowest for looks that are worth nothing.
 
         Args:
           params: of the Q-network.
@@ -175,7 +175,9 @@ class TeamAgent:
         """
         seen = self.observe(belief, team, robot)
         if not tour_params:
-            return self.values(params, seen)
+            values = self.values(params, seen)
+            is_useless = self.worth(params, classes, belief, team, robot) <= 0
+            return jnp.append(jnp.where(is_useless, _NOT_WORTH_IT, values[:-1]), values[-1])
         after = self._q_alone(params, classes, belief, team, robot)
         is_worth_it = self._less_way(after, seen) > 0
         seconds = tours.seconds(self.network, tour_params[0], seen, self.latent_size)

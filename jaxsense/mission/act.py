@@ -129,11 +129,12 @@ def _bearing(mission: Mission, state: MissionState, robot: Index) -> Float[Array
 
 
 def _is_in_the_way(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, ""]:
-    """Whether another robot nearby drives without progress."""
+    """Whether another robot nearby drives without progress, or backs off."""
     robots, poses = state.robots, state.scene.poses
     waits = mission.time(state) - robots.progress_at > _PATIENCE
+    needs_room = (robots.phase == BACKING) | ((robots.phase == DRIVING) & waits)
     is_near = jnp.linalg.norm(poses[:, :2] - poses[robot][None, :2], axis=-1) < _NEARBY
-    return jnp.any(others((robots.phase == DRIVING) & waits & is_near, robot))
+    return jnp.any(others(needs_room & is_near, robot))
 
 
 @pytree

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.core.types import Index, Key, others
+from jaxsense.core.types import Index, Key, others, pytree
 from jaxsense.dqn import rules, team_mdp
 from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team
@@ -68,15 +68,16 @@ def decide(
 
     # Failures belong to one target.
     excluded, attempts = jnp.where(is_new, False, own.excluded), jnp.where(is_new, 0, own.attempts)
-    view, length, is_blocked = _best_view(mission, models, state, robot, action, excluded)
+    found = _best_view(mission, models, state, robot, action, excluded)
+    view, length = found.view, found.length
     has_path, is_exhausted = jnp.isfinite(length), length >= _REPEATED
     exhausts = sets_out & has_path & is_exhausted
     # Robots that wait for each other make room.
-    backs_off, time = sets_out & is_blocked, mission.time(state)
+    backs_off, time = sets_out & found.waits, mission.time(state)
     attempts += backs_off
     gives_up = sets_out & ~has_path
     gives_up |= backs_off & (attempts >= config.mission.attempts)
-    sets_out_now = sets_out & ~is_exhausted & ~is_blocked
+    sets_out_now = sets_out & ~is_exhausted & ~found.waits
     poi = jnp.minimum(action, config.arena.num_pois - 1)
     nothing_left = decides & (action == config.arena.num_pois)
     # Obstacles may have moved: before it ends, a robot retries the PoIs where it was stuck.
@@ -99,7 +100,7 @@ def decide(
         target=action,
         view=jnp.where(sets_out_now, view, own.view),
         decided_on=jnp.where(decides, state.version, own.decided_on),
-        excluded=jnp.where(is_blocked, False, excluded),
+        excluded=found.excluded,
         attempts=attempts,
         backs_off_until=jnp.where(backs_off, time + RECOVERY_TIME, own.backs_off_until),
         unreachable=jnp.where(gives_up, given_up.at[poi].set(True), given_up),
@@ -223,6 +224,23 @@ def _times_to_new_places(
     )
 
 
+@pytree
+class _View:
+    """A viewpoint to look at a PoI from.
+
+    Attributes:
+      view: `[]` int32, V for the robot's current position.
+      length: `[]` metres of the path there, `_REPEATED` and more if no look from anywhere is new.
+      excluded: `[V + 1]` bool, none if all from which a look is new have been.
+      waits: `[]` bool, whether all of these have been, and robots still occupy some of them.
+    """
+
+    view: Int[Array, ""]
+    length: Float[Array, ""]
+    excluded: Bool[Array, " W"]
+    waits: Bool[Array, ""]
+
+
 def _best_view(
     mission: Mission,
     models: Models,
@@ -230,18 +248,14 @@ def _best_view(
     robot: Index,
     target: Int[Array, ""],
     excluded: Bool[Array, " W"],
-) -> tuple[Int[Array, ""], Float[Array, ""], Bool[Array, ""]]:
-    """Nearest viewpoint of a PoI from which a look is new, V for the robot's current position.
-
-    Returns:
-      The viewpoint, the length of the path in metres, `_REPEATED` and more if no look is new, and
-      whether all from which one is new are among the `[V + 1]` excluded ones.
-    """
+) -> _View:
+    """Nearest viewpoint of a PoI from which a look is new."""
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
     length = roadmap.lengths(config, scene.layout, state.roadmap, scene.poses[robot, :2], poi)
     positions, margin = state.roadmap.viewpoints[poi], config.navigation.margin
-    length += jnp.where(_room(mission, state, robot, poi, positions, margin) > 0, 0.0, _DETOUR)
+    is_free = _room(mission, state, robot, poi, positions, margin) > 0
+    length += jnp.where(is_free, 0.0, _DETOUR)
     position, modality = scene.poses[robot, :2], mission.modalities[robot]
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
     apart = state.apart(jnp.concatenate([positions, position[None]]), poi, modality)
@@ -250,9 +264,13 @@ def _best_view(
     is_away = jnp.linalg.norm(positions - position[None], axis=-1) > AT_VIEWPOINT
     is_new &= jnp.append(is_away, True) | is_new[-1]
     cost = jnp.append(length, here) + jnp.where(is_new, 0.0, _REPEATED)
-    is_blocked = jnp.any(cost < _REPEATED) & jnp.all((cost >= _REPEATED) | excluded)
-    view = jnp.argmin(jnp.where(excluded & ~is_blocked, jnp.inf, cost))
-    return view, cost[view], is_blocked
+    # A PoI is exhausted where no look is new, not while the new ones are excluded.
+    left = (cost < _REPEATED) & ~excluded
+    excluded &= jnp.any(left)
+    is_taken_new = (cost[:-1] < _REPEATED) & ~is_free
+    cost = jnp.where(excluded, jnp.inf, cost)
+    view = jnp.argmin(cost)
+    return _View(view, cost[view], excluded, waits=~jnp.any(left) & jnp.any(is_taken_new))
 
 
 def is_taken(

@@ -231,10 +231,30 @@ def test_what_a_look_is_worth_does_not_depend_on_who_else_is_near(monkeypatch):
     assert left[1] <= 0
 
 
+def of_sigmas(monkeypatch, after):
+    """Q-values of PoIs with a sigma of 1; 0 of those that are known."""
+
+    def q(self, params, observed):
+        sigma = sigmas(observed, self.network.features)
+        of_each = jnp.array(after).reshape(3, *[1] * (sigma.ndim - 1))
+        values = jnp.where(sigma > 0.3, of_each, 0.0)
+        return jnp.concatenate([values, jnp.zeros_like(values[:1])])
+
+    monkeypatch.setattr(TeamAgent, "q", q)
+
+
 def test_without_tours_the_values_are_those_of_setting_out(monkeypatch):
-    monkeypatch.setattr(TeamAgent, "q", lambda *given: jnp.array([8.0, 3.0, 16.0, 0.0]))
+    of_sigmas(monkeypatch, [8.0, 3.0, 16.0])
     values = AGENT.decide({}, (), classes=CLASSES, **AT_ORIGIN)
     # 6, 16 and, an eighth of a turn and 12.73 - .9 m away, 60.9 s, each of which halves a value.
     seconds = np.array([6, 16, math.pi / 4 + (9 * math.sqrt(2) - 0.9) / 0.2 + 1])
     expected = [*np.array([8.0, 3.0, 16.0]) * 0.5**seconds, 0.0]
     np.testing.assert_allclose(values, expected, rtol=1e-4)
+
+
+def test_without_tours_a_look_no_better_than_one_at_a_known_poi_comes_last(monkeypatch):
+    # A useless look earns -1, the network says 0: .9 is not enough.
+    of_sigmas(monkeypatch, [8.0, 0.9, jnp.nan])
+    values = AGENT.decide({}, (), classes=CLASSES, **AT_ORIGIN)
+    assert values[0] > values[3] == 0 > values[1]
+    assert jnp.isnan(values[2])

@@ -86,23 +86,28 @@ def test_where_all_new_viewpoints_are_taken_a_robot_makes_room_and_tries_again(
     is_new = jnp.append(apart >= 0.6, False)
     assert is_new[first]
 
-    def decided(excluded, attempts=0):
+    def decided(excluded, attempts=0, other=POSES[1]):
         there = set_robot(state, 0, target=0, excluded=excluded, attempts=attempts)
-        return decides(values, there).robots
+        poses = there.scene.poses.at[1].set(jnp.array(other))
+        return decides(values, replace(there, scene=replace(there.scene, poses=poses))).robots
 
-    # Of the new ones one is left, then none.
+    # Of the new ones one is left; then none, but no robot is there: looks have shown nothing.
     assert decided(is_new.at[first].set(False)).view[0] == first
-    waits = decided(is_new)
+    again = decided(is_new, 1)
+    assert (again.phase[0], again.view[0], again.attempts[0]) == (DRIVING, first, 1)
+    assert not again.excluded[0].any()
+    occupied = [*np.asarray(state.roadmap.viewpoints[0, first]), 0.0]
+    waits = decided(is_new, other=occupied)
     assert (waits.phase[0], waits.attempts[0]) == (BACKING, 1)
     np.testing.assert_allclose(waits.backs_off_until[0], RECOVERY_TIME)
-    for robots in (waits, decided(is_new, 2)):
-        assert not robots.exhausted.any()
-        assert not robots.excluded[0].any()
     assert not waits.unreachable.any()
     # After three failures it gives the PoI up, and may try once more in the end.
-    left = decided(is_new, 2)
+    left = decided(is_new, 2, occupied)
     assert (left.phase[0], left.goals[0]) == (IDLE, 1)
     np.testing.assert_array_equal(left.unreachable[0], [True, False, False])
+    for robots in (again, waits, left):
+        assert not robots.exhausted.any()
+        assert not robots.excluded[0].any()
 
 
 def test_an_auction_counts_the_way_to_where_a_look_is_new(decides, models, arena_of):
