@@ -48,13 +48,13 @@ class Robots:
       command: `[R, 2]` current speeds, see `navigation`.
       wanted: `[R, 2]` target speeds.
       decided_on: int32 version of the map at the last decision.
-      excluded: `[R, V + 1]` bool, viewpoints of the target that have failed.
+      excluded: `[R, V + 1]` bool, viewpoints of the target that have failed or were occupied.
       attempts: int32 failures at the target.
       path_left: metres left to the viewpoint at the last progress.
       progress_at: seconds, time of the last progress.
       backs_off_until: seconds.
       unreachable: `[R, N]` bool, PoIs given up because no path leads there, or because the robot
-        was stuck on the last attempt.
+        was stuck on the last attempt or found all viewpoints occupied.
       undetected: `[R, N]` bool, PoIs given up after a last look that showed nothing.
       exhausted: `[R, N]` bool, PoIs at which no look of the robot's would be new.
       tried_again: bool, the robot has already retried the PoIs it had given up.
