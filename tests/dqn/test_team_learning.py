@@ -66,8 +66,9 @@ def team_params():
 
 
 def latent(params):
-    """The policy of the trained network alone."""
-    models = {"agent": AGENT, "q_networks": (params,) * 2, "tours": None, "fusion": TWO.map.fusion}
+    """The policy of the trained network alone, if every look pays."""
+    agent = replace(AGENT, useless=1e3)
+    models = {"agent": agent, "q_networks": (params,) * 2, "tours": None, "fusion": TWO.map.fusion}
     return jax.jit(policy("latent", **models))
 
 
