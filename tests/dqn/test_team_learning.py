@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from toys import SENSORS, Fixed, classes_mdp, known_of, paying_once_mdp, policy
 
-from jaxsense.config import DqnConfig, TeamConfig, TravelConfig
+from jaxsense.config import PRESETS, DqnConfig, TeamConfig, TravelConfig
 from jaxsense.dqn import losses, map_mdp, team_mdp, training
 from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.models import make_agent
 
 TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
 FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
@@ -215,3 +216,10 @@ def test_a_robot_alone_learns_the_values_worked_by_hand():
         return agent.q(state.params, x)
 
     np.testing.assert_allclose(learned(SEEN), Q, atol=0.1)
+
+
+@pytest.mark.parametrize(("preset", "reward"), [("many", -0.05), ("team", -1.0)])
+def test_a_look_that_tells_nothing_earns_what_the_settings_say(preset, reward):
+    agent = make_agent(PRESETS[preset])
+    assert isinstance(agent, TeamAgent)
+    np.testing.assert_allclose(agent.useless, reward, rtol=1e-6)

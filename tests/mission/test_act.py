@@ -339,6 +339,8 @@ def test_a_robot_that_has_ended_makes_room_for_one_that_is_stuck(approach, facin
     state = set_robot(state, LIDAR, phase=ENDED, target=3)
     state = driving(state, set_robot, 0, 3.0, 0.0)
     assert np.any(approach(state, LIDAR).robots.wanted[LIDAR] != 0)
+    backs_off = set_robot(state, CAMERA, phase=BACKING, progress_at=2.5, backs_off_until=9.0)
+    assert np.any(approach(backs_off, LIDAR).robots.wanted[LIDAR] != 0)
     # But not for one that gets on, nor for one that is far away.
     gets_on = set_robot(state, CAMERA, progress_at=2.5)
     np.testing.assert_array_equal(approach(gets_on, LIDAR).robots.wanted[LIDAR], 0.0)
