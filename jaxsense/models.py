@@ -121,7 +121,7 @@ def make_bayes(config: Config) -> Bayes:
 
 
 def make_agent(config: Config) -> Agent:
-    """Agent of `config.dqn.task`."""
+    """Agent of `config.dqn.task`; a team's reads the reward of a useless look from the settings."""
     dqn, latent_size = config.dqn, config.jmvae.latent_size
     kinds: dict[str, Callable[[], Agent]] = {
         "map": lambda: MapAgent(dqn.discount, config.arena.num_pois, latent_size, dqn.hidden),
