@@ -13,8 +13,8 @@ from jaxsense.mission.decide import RECOVERY_TIME
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE
 from jaxsense.vae.novelty import Novelty
 
-# A quarter of a look is new at .5 sqrt(2 ln 2) = .59 m.
-STAYS_OLD = Novelty(strength=jnp.full(2, 2.0), length=jnp.full(2, 0.5))
+# Half of a look is new at .5 sqrt(2 ln(.83 / .414)) = .59 m.
+STAYS_OLD = Novelty(strength=jnp.full(2, 2 * (np.sqrt(2.0) - 1)), length=jnp.full(2, 0.5))
 
 
 def looked_from(place, poi=0, modality=0):
@@ -41,7 +41,7 @@ def test_a_robot_looks_again_from_where_the_look_is_new(decides, models, arena_o
 
 
 def test_a_viewpoint_where_a_robot_stands_is_as_new_as_its_place(decides, models, arena_of):
-    close = Novelty(strength=jnp.full(2, 2.0), length=jnp.full(2, 0.01))
+    close = Novelty(strength=jnp.full(2, 1.0), length=jnp.full(2, 0.01))
     values = replace(with_values(models, [1.0, 0.0, 0.0, 0.0], [0.0] * 4), novelty=close)
     state = arena_of(POSITIONS, POSES, policy=LATENT)
 
@@ -127,7 +127,7 @@ def test_an_auction_counts_the_way_to_where_a_look_is_new(decides, models, arena
 def test_near_a_viewpoint_a_robot_stops_only_where_a_look_is_new(
     team, models, arena_of, set_robot, apart, looked, phase
 ):
-    learned = Novelty(strength=jnp.full(2, 2.0), length=jnp.full(2, 0.03))
+    learned = Novelty(strength=jnp.full(2, 1.0), length=jnp.full(2, 0.03))
     roadmap = arena_of(POSITIONS, POSES).roadmap
     view = int(np.argmax(roadmap.is_free[0]))
     viewpoint = roadmap.viewpoints[0, view]
