@@ -1,10 +1,11 @@
-"""`python -m benchmarks.place RUN`: what a robot gains that may look on from where it stands.
+"""`python -m benchmarks.place RUN`: what a robot gains that chooses from where to look again.
 
 Dynamic programming on one PoI with two equally likely labels. A robot looks from where it stands,
 where a look says less with each one before it, drives for some seconds to a place where a look is
-new, or stops. It pays a second for each second and a price for a wrong label. The time is compared,
-at the same share of errors, with that of a robot that always drives before it looks again, as in
-missions. Weights of looks from one place and the detectors' accuracies are those of the run.
+new, or stops. It pays a second for each second and a price for a wrong label. The best such robot
+is compared, at the same share of errors, with robots that look on from one place while at least
+some share of a look is new, and otherwise drive, as in missions.
+Weights of looks from one place and the detectors' accuracies are those of the run.
 
 The log-odds of a look of weight w are Gaussian with mean `+-w m` and variance `2 w m`, which makes
 them exact evidence; m gives a single look the detector's accuracy.
@@ -28,9 +29,12 @@ from jaxsense.run import cli, rundir
 from jaxsense.run.version import commit, versions
 from jaxsense.summary import read
 from jaxsense.summary.metrics import mean
+from jaxsense.vae.novelty import LEAST_NEW
 
 PROGRAM = "benchmarks.place"
 ERRORS = (0.02, 0.01, 0.005)
+RULES = {f"share {share:g}": share for share in (LEAST_NEW, 0.25, 0.1)}
+"""Shares of a look that must be new where robots look again, by the names of the rules."""
 _PRICES = np.geomspace(20.0, 2e4, 60)  # s for an error
 _MOST = 8  # looks from one place whose weights differ
 _CHANGE = 1e-6  # s, of values between the last two rounds
@@ -39,11 +43,11 @@ _LOG_ODDS = np.linspace(-15.0, 15.0, 301)
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Compare robots that may look on from one place with robots that must drive."""
+    """Compare the best choice of where to look again with rules."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, or `latest`."""
-    drives: tuple[float, ...] = (0.5, 2.0, 5.0)
+    drives: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0)
     """Seconds of driving to a place where a look is new."""
     json: Path | None = None
     """File to write the figures to."""
@@ -72,13 +76,18 @@ class Sensor:
     def __post_init__(self):
         require(0.5 < self.accuracy < 1, self, "accuracy", "must be above 0.5 and below 1")
 
+    @property
+    def weights(self) -> Float[np.ndarray, " K"]:
+        """What a look from one place is worth, by earlier looks from there."""
+        return (1 + self.strength * np.arange(_MOST)) ** -2.0
+
     @functools.cached_property
     def after_each(self) -> Float[np.ndarray, "K L L"]:
         """Probabilities of the log-odds after a look, for each before it, and by earlier looks."""
-        return np.stack([self._after(number) for number in range(_MOST)])
+        return np.stack([self._after(weight) for weight in self.weights])
 
-    def _after(self, number: int) -> np.ndarray:
-        gain = (1 + self.strength * number) ** -2 * 2 * stats.norm.ppf(self.accuracy) ** 2
+    def _after(self, weight: float) -> np.ndarray:
+        gain = weight * 2 * stats.norm.ppf(self.accuracy) ** 2
         edges = np.append((_LOG_ODDS[1:] + _LOG_ODDS[:-1]) / 2, np.inf)
         found = np.zeros((len(_LOG_ODDS), len(_LOG_ODDS)))
         for sign in (1, -1):
@@ -92,13 +101,14 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
     return 1 / (1 + np.exp(-x))
 
 
-def best(sensor: Sensor, price: float, *, stays: bool) -> tuple[float, float]:
-    """Expected seconds and share of errors of the best robot.
+def best(sensor: Sensor, price: float, least_new: float | None = None) -> tuple[float, float]:
+    """Expected seconds and share of errors of the robot that decides best when to stop.
 
     Args:
       sensor: of the robot, which stands where it can look at once.
       price: seconds that an error costs.
-      stays: whether the robot may look twice from one place.
+      least_new: share of a look that must be new for it to look again from where it stands, and
+        while this is so, it does not drive; it chooses freely by default.
     """
     after = sensor.after_each
     later = np.minimum(np.arange(_MOST) + 1, _MOST - 1)
@@ -111,8 +121,9 @@ def best(sensor: Sensor, price: float, *, stays: bool) -> tuple[float, float]:
 
     seconds = np.array([sensor.look, sensor.look + sensor.drive])[:, None, None]
     forbidden = np.zeros((2, _MOST, 1))
-    if not stays:
-        forbidden[0, 1:] = np.inf
+    if least_new is not None:
+        stays = sensor.weights[:, None] >= least_new
+        forbidden = np.where([~stays, stays], np.inf, 0.0)
     value = np.broadcast_to(price * errors, (_MOST, len(errors)))
     while True:
         looks = ahead(value) + seconds + forbidden
@@ -133,14 +144,14 @@ def best(sensor: Sensor, price: float, *, stays: bool) -> tuple[float, float]:
             return float(time[0, middle]), float(wrong[0, middle])
 
 
-def seconds_at(sensor: Sensor, *, stays: bool) -> list[float]:
-    """Seconds of the best robot at each share of errors of `ERRORS`.
+def seconds_at(sensor: Sensor, least_new: float | None = None) -> list[float]:
+    """Seconds that a robot needs for each share of errors of `ERRORS`.
 
     Args:
       sensor: see `best`.
-      stays: see `best`.
+      least_new: see `best`.
     """
-    found = [best(sensor, price, stays=stays) for price in _PRICES]
+    found = [best(sensor, price, least_new) for price in _PRICES]
     time, wrong = np.array(found).T
     order = np.argsort(wrong)
     # Between two prices a robot may choose at random which one it pays.
@@ -154,8 +165,7 @@ def main(argv: list[str] | None = None) -> None:
     config, models = rundir.load(directory)
     detectors = read(directory)["detectors"]
     rows = []
-    print(f"| sensor, drive | {' | '.join(f'{e:.1%} wrong' for e in ERRORS)} |")
-    print("| --- |" + " --- |" * len(ERRORS))
+    print(f"| sensor, drive | wrong | best | {' | '.join(RULES)} |\n{'| --- ' * (3 + len(RULES))}|")
     for m, name in enumerate(config.modalities):
         if len(config.labels(name)) > 2:
             raise ConfigError(
@@ -168,10 +178,13 @@ def main(argv: list[str] | None = None) -> None:
                 look=float(config.team.travel.look_seconds),
                 drive=drive,
             )
-            may, must = (seconds_at(sensor, stays=stays) for stays in (True, False))
-            rows.append({"sensor": name, "drive": drive, "stays": may, "drives": must})
-            cells = [f"{a:.2f} s, {a / b - 1:+.1%}" for a, b in zip(may, must, strict=True)]
-            print(f"| {name}, {drive:g} s | {' | '.join(cells)} |", flush=True)
+            least = seconds_at(sensor)
+            by_rule = {rule: seconds_at(sensor, share) for rule, share in RULES.items()}
+            rows.append({"sensor": name, "drive": drive, "best": least, **by_rule})
+            for i, error in enumerate(ERRORS):
+                cells = [f"{seconds[i] / least[i] - 1:+.1%}" for seconds in by_rule.values()]
+                row = [f"{name}, {drive:g} s", f"{error:.1%}", f"{least[i]:.2f} s", *cells]
+                print(f"| {' | '.join(row)} |", flush=True)
     if arguments.json is not None:
         whole = {"commit": commit(), "versions": versions(), "rows": rows}
         arguments.json.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")

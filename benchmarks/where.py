@@ -6,7 +6,7 @@ other shares, from 0, where robots stay as long as looks pay, to .9, and with sh
 from one place share their light and the beams that graze an edge, as in any mission, so a policy
 that takes them for new pays with accuracy and with confidence that is too high. A second table
 compares, with several costs of a look, the time that robots which mostly stay and robots which
-drive need for the same accuracy.
+mostly drive need for the same accuracy.
 """
 
 import dataclasses
@@ -28,14 +28,13 @@ from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
 from jaxsense.run import cli, rundir
 from jaxsense.run.version import commit, versions
-from jaxsense.vae.novelty import Novelty
+from jaxsense.vae.novelty import LEAST_NEW, Novelty
 
 PROGRAM = "benchmarks.where"
 SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9)
-USUAL = 0.5
-STAYS = 0.1
-"""A share with which robots mostly look on from where they stand; with 0 some would do so for ever,
-since the values of looks take each look for a new one."""
+CURVES = (0.1, 0.25, LEAST_NEW)
+"""Shares that are compared at the same accuracy. With 0 some robots would look on from one place
+for ever, since the values of looks take each look for a new one."""
 _KEYS = ("accuracy", "confidence", "looks", "time")
 
 
@@ -54,7 +53,7 @@ class Arguments:
     ranges: tuple[float, ...] = (1.0, 2.0, 3.0)
     """Distances in metres up to which a robot looks at once, to compare with the run's."""
     costs: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)
-    """Costs of a look with which robots that stay and robots that drive are compared."""
+    """Costs of a look with which robots are compared at the same accuracy."""
     json: Path | None = None
     """File to write the figures to."""
 
@@ -142,9 +141,9 @@ def by_rule(
     rules = [(f"share {share:g}", own, share) for share in SHARES]
     for farthest in arguments.ranges:
         nearer = Curves(key, within(config, farthest), arguments.episodes)
-        rules.append((f"range {farthest:g} m", nearer, USUAL))
+        rules.append((f"range {farthest:g} m", nearer, LEAST_NEW))
     for policy in arguments.policies:
-        usual = own.play(with_share(models, USUAL), policy)
+        usual = own.play(with_share(models, LEAST_NEW), policy)
         for rule, curves, share in rules:
             found = compare(curves.play(with_share(models, share), policy), usual)
             yield {"policy": policy, "rule": rule, **found}
@@ -153,7 +152,7 @@ def by_rule(
 def by_cost(
     key: Key, config: Config, models: Models, own: Curves, arguments: Arguments
 ) -> Iterator[dict]:
-    """The curve of each policy if robots stay, and if they drive before they look again.
+    """The curve of each policy with each of the shares `CURVES`.
 
     Args:
       key: random key of the trainings.
@@ -165,7 +164,7 @@ def by_cost(
     priced = of_costs(key, config, models, jnp.array(arguments.costs))
     each = [jax.tree.map(lambda x: x[k], priced) for k in range(len(arguments.costs))]  # noqa: B023
     for policy in arguments.policies:
-        for share in (STAYS, USUAL):
+        for share in CURVES:
             points = stacked([own.play(with_share(model, share), policy) for model in each])
             name = f"{policy}, share {share:g}"
             yield as_block(name, {"look_cost": arguments.costs}, points)

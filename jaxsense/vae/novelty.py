@@ -19,12 +19,13 @@ from jaxtyping import Array, Float, Int
 from jaxsense.core import checks
 from jaxsense.core.types import Index, pytree
 
+LEAST_NEW = 0.5
+"""The share of a look that must be new evidence where a robot looks again."""
 _STRENGTHS = np.append(0.0, np.geomspace(0.05, 20.0, 25)).astype(np.float32)
 _LENGTHS = np.geomspace(0.03, 3.0, 17).astype(np.float32)  # m
 _TOLERANCE = 0.0025  # of mean confidence above accuracy
 _SAME_PLACE = 0.02  # m
 _PENALTY = 10.0  # nats, above any difference of likelihoods
-_HALF = float(np.sqrt(2.0)) - 1
 _FAR = 1e3  # m, where no look has been
 
 
@@ -55,11 +56,11 @@ class Novelty:
 
     @property
     def most_near(self) -> float | Float[Array, ""]:
-        """The term `a sum_k ...` of the weight of a look of which just half is new."""
-        return _HALF
+        """The term `a sum_k ...` of the weight of a look of which just `LEAST_NEW` is new."""
+        return LEAST_NEW**-0.5 - 1
 
     def to_go(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
-        """Way from a place to where at least half of a look is new.
+        """Way from a place to where at least `LEAST_NEW` of a look is new.
 
         Args:
           apart: `[..., K]` distances from K earlier looks by this sensor at the PoI, in metres;
@@ -68,7 +69,7 @@ class Novelty:
 
         Returns:
           `[...]` metres straight away from the earlier looks, as if all that count were at the
-          nearest one; 0 where half of a look is new already.
+          nearest one; 0 where as much of a look is new already.
         """
         strength, length = self.strength[modality], self.length[modality]
         apart = jnp.minimum(apart, _FAR)

@@ -28,28 +28,42 @@ def test_evidence_is_exact():
 
 
 def test_who_pays_little_looks_once_or_never():
-    assert place.best(NOISY, 0.5, stays=True) == pytest.approx((0.0, 0.5), abs=1e-4)
+    assert place.best(NOISY, 0.5) == pytest.approx((0.0, 0.5), abs=1e-4)
     # A second look would save at most half of an error, 4 s.
-    far = dataclasses.replace(NOISY, drive=4.0)
-    assert place.best(far, 8.0, stays=False) == pytest.approx((1.0, 0.1), abs=2e-3)
+    far = dataclasses.replace(NOISY, strength=1e9, drive=4.0)
+    assert place.best(far, 8.0, 1.0) == pytest.approx((1.0, 0.1), abs=2e-3)
 
 
 def test_where_a_look_is_as_new_as_elsewhere_nobody_drives():
+    far = dataclasses.replace(NOISY, drive=50.0)
     for price in (50.0, 500.0):
-        time, wrong = place.best(NOISY, price, stays=True)
-        must_drive, as_wrong = place.best(NOISY, price, stays=False)
-        assert time < must_drive
-        # If repeated looks tell nothing, a robot that may stay does as one that must drive.
-        alike, as_right = place.best(
-            Sensor(accuracy=0.9, strength=1e9, look=1.0, drive=2.0), price, stays=True
-        )
-        assert (alike, as_right) == pytest.approx((must_drive, as_wrong), abs=1e-4)
-        assert wrong < as_wrong
+        assert place.best(far, price) == pytest.approx(place.best(NOISY, price), abs=1e-4)
+        assert place.best(NOISY, price, 1.0) == pytest.approx(place.best(NOISY, price), abs=1e-4)
 
 
-def test_where_staying_tells_nothing_it_saves_nothing():
+def test_where_staying_tells_nothing_everybody_drives():
     repeats = Sensor(accuracy=0.9, strength=1e9, look=1.0, drive=2.0)
-    stays, drives = (place.seconds_at(repeats, stays=stays) for stays in (True, False))
-    np.testing.assert_allclose(stays, drives, rtol=1e-3)
-    fresh, drives = (place.seconds_at(NOISY, stays=stays) for stays in (True, False))
-    assert np.all(np.array(fresh) < 0.75 * np.array(drives))
+    for price in (50.0, 500.0):
+        free = place.best(repeats, price)
+        assert place.best(repeats, price, 1.0) == pytest.approx(free, abs=1e-4)
+        # One that stays wherever anything is new never drives, and errs as after one look.
+        stays = place.best(repeats, price, 0.0)
+        assert stays == pytest.approx((1.0, 0.1), abs=2e-3)
+
+
+def test_a_rule_stays_while_its_share_is_new_and_then_drives():
+    # Weights of looks from one place: 1, 1/4, 1/9.
+    sensor = Sensor(accuracy=0.9, strength=1.0, look=1.0, drive=0.5)
+    assert sensor.weights[:3] == pytest.approx([1, 1 / 4, 1 / 9])
+    for price in (50.0, 500.0):
+        free = place.best(sensor, price)
+        costs = {share: time + price * wrong for share, (time, wrong) in _rules(sensor, price)}
+        assert costs[0.3] == pytest.approx(costs[1.0])
+        assert costs[0.2] == costs[0.25]
+        assert min(costs.values()) >= free[0] + price * free[1] - 1e-4
+        # Driving for half a second pays when a second look from here is a quarter of one.
+        assert costs[1.0] < costs[0.0]
+
+
+def _rules(sensor, price):
+    return [(share, place.best(sensor, price, share)) for share in (1.0, 0.3, 0.25, 0.2, 0.0)]

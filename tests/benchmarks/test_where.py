@@ -32,7 +32,7 @@ def test_at_the_distance_just_the_share_is_new(share):
 def test_half_is_the_rule_of_missions():
     for modality in range(2):
         usual = LEARNED.to_go(jnp.zeros(2), modality)
-        assert novelty(where.USUAL).to_go(jnp.zeros(2), modality) == pytest.approx(usual)
+        assert novelty(0.5).to_go(jnp.zeros(2), modality) == pytest.approx(usual)
 
 
 def test_without_a_share_robots_stay():
