@@ -155,7 +155,7 @@ def _require_fitting(config: Config, looks: Looks) -> None:
     if isinstance(looks, Live):
         checks.require_one_each("detectors", looks.detectors, config.modalities)
         for sensor, detector in zip(looks.world.sensors, looks.detectors, strict=True):
-            size, found = sensor.window * sensor.channels, detector.offset.size
+            size, found = sensor.window * sensor.channels, len(detector.gate.offset)
             if found != size:
                 reason = f"reads windows of {found} numbers; must be of {size}, as config's are"
                 raise ValueError(f"models.detectors of {sensor.name}: {reason}")
@@ -166,6 +166,7 @@ def surveys(
     world: World,
     classes: Int[Array, "S N"],
     is_empty: Bool[Array, " S"] | None = None,
+    places: Key | None = None,
 ) -> tuple[Scene, tuple[Float[Array, "S N _"], ...], Float[Array, "S M N"]]:
     """Surveys many scenes, see `sim.survey`.
 
@@ -174,6 +175,8 @@ def surveys(
       world: the simulation.
       classes: `[S, N]` int32 classes of the PoIs.
       is_empty: `[S]` bool, in which scenes no look shows its PoI; in none by default.
+      places: `[S]` random keys, scenes with the same of which show the same PoIs in another light;
+        different ones by default.
 
     Returns:
       `[S]` scenes, for each modality `[S, N, F]` windows, and `[S, M, N]` expected distances.
@@ -183,8 +186,8 @@ def surveys(
     # A remainder would be compiled separately.
     rows = jnp.arange(-(-number // chunk) * chunk) % number
     found = jax.lax.map(
-        lambda scene: worlds.survey(scene[0], world, scene[1], scene[2]),
-        (keys[rows], classes[rows], None if is_empty is None else is_empty[rows]),
+        lambda scene: worlds.survey(scene[0], world, *scene[1:]),
+        jax.tree.map(lambda x: x[rows], (keys, classes, is_empty, places)),
         batch_size=chunk,
     )
     return jax.tree.map(lambda x: x[:number], found)
@@ -264,7 +267,7 @@ def by_class(
     """Sorts looks by class.
 
     Args:
-      values: `[S, N, ...]` with at least `number` looks at each class.
+      values: `[S, N, ...]`, of which looks are taken again where a class has fewer than `number`.
       classes: `[S, N]` int32.
       num_classes: C; static.
       number: looks to keep at each class; static.
@@ -273,8 +276,13 @@ def by_class(
       `[C, number, ...]`.
     """
     flat, classes = values.reshape(-1, *values.shape[2:]), classes.reshape(-1)
-    rows = [jnp.nonzero(classes == c, size=number)[0] for c in range(num_classes)]
-    return flat[jnp.stack(rows)]
+
+    def rows_of(c: int) -> jax.Array:
+        found = jnp.nonzero(classes == c, size=number)[0]
+        # If there are fewer, from the first again.
+        return found[jnp.arange(number) % jnp.maximum(jnp.sum(classes == c), 1)]
+
+    return flat[jnp.stack([rows_of(c) for c in range(num_classes)])]
 
 
 def detections(key: Key, config: Config, models: Models, samples: int) -> Samples:

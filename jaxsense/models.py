@@ -17,10 +17,23 @@ from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.sim import sensors, windows
 from jaxsense.sim.sensors import Sensor
-from jaxsense.vae import detectors, filter, fusion, jmvae, latent, novelty, readout
+from jaxsense.vae import (
+    detectors,
+    filter,
+    frames,
+    fusion,
+    gate,
+    jmvae,
+    latent,
+    leave_one_out,
+    novelty,
+    readout,
+)
 from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.detectors import Detection, Detector
+from jaxsense.vae.frames import Frame, Scaling
 from jaxsense.vae.jmvae import Jmvae
+from jaxsense.vae.leave_one_out import Encoder, Shape
 from jaxsense.vae.novelty import Novelty
 from jaxsense.vae.readout import Readout
 
@@ -110,6 +123,25 @@ def make_jmvae(config: Config) -> Jmvae:
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
 
+def make_frame(sensor: Sensor) -> Frame:
+    """How a network that learns from scans sees the windows of a sensor."""
+    span = (sensor.window - 1) * sensor.stride
+    start = (len(sensor.angles) - 1 - span) // 2
+    angles = sensor.angles[start : start + span + 1 : sensor.stride]
+    return frames.make(angles, sensor.channels, sensor.measures_distance)
+
+
+def make_shape(config: Config) -> Shape:
+    """Sizes of the networks of a JMVAE that learns from scans."""
+
+    def size(sensor: Sensor) -> int:
+        window = jax.ShapeDtypeStruct((sensor.window * sensor.channels,), jnp.float32)
+        return jax.eval_shape(make_frame(sensor), window).shape[0]
+
+    inputs = tuple(map(size, sensors.make(config)))
+    return Shape(config.modalities, inputs, config.jmvae.latent_size, config.jmvae.hidden)
+
+
 def make_prior(config: Config) -> Belief:
     """Belief before any look, `[D]`."""
     return fusion.prior(make_jmvae(config), config.mdp.unseen_variance)
@@ -169,16 +201,11 @@ def init(key: Key, config: Config) -> Models:
     """
     detector_key, jmvae_key, dqn_key = jax.random.split(key, 3)
     model, agent = make_jmvae(config), make_agent(config)
-    keys = jax.random.split(detector_key, len(config.modalities))
-    untrained = tuple(
-        detectors.init(
-            k, jnp.zeros((2, s.window * s.channels)), size, config.detector, s.measures_distance
-        )
-        for k, s, size in zip(keys, sensors.make(config), model.feature_sizes, strict=True)
-    )
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
     shape = len(config.arena.classes), model.latent_size
-    params, classes = jmvae.init(jmvae_key, model), Belief(jnp.zeros(shape), jnp.ones(shape))
+    classes = Belief(jnp.zeros(shape), jnp.ones(shape))
+    learners = {"detections": _classifiers, "scans": _encoders}
+    untrained, params = learners[config.jmvae.learns_from](detector_key, jmvae_key, config, classes)
     filter_key = jax.random.fold_in(jmvae_key, 1)
     fusions: dict[str, Callable[[], Fusion]] = {
         "in_place": lambda: make_in_place(config, params, classes),
@@ -197,6 +224,45 @@ def init(key: Key, config: Config) -> Models:
         q_networks=tuple(agent.init(k) for k in dqn_keys),
         tours=agent.init_tours(jax.random.fold_in(dqn_key, 1)),
     )
+
+
+def _classifiers(
+    key: Key, jmvae_key: Key, config: Config, classes: Belief
+) -> tuple[tuple[Detector, ...], Params]:
+    """Detectors that learn from labels, and the JMVAE of their features."""
+    model = make_jmvae(config)
+    keys = jax.random.split(key, len(config.modalities))
+    untrained = tuple(
+        detectors.init(
+            k, jnp.zeros((2, s.window * s.channels)), size, config.detector, s.measures_distance
+        )
+        for k, s, size in zip(keys, sensors.make(config), model.feature_sizes, strict=True)
+    )
+    return untrained, jmvae.init(jmvae_key, model)
+
+
+def _encoders(
+    key: Key, jmvae_key: Key, config: Config, classes: Belief
+) -> tuple[tuple[Detector, ...], Params]:
+    """Encoders of a JMVAE of scans, and all of its networks."""
+    shape = make_shape(config)
+    params, keys = leave_one_out.init(jmvae_key, shape), jax.random.split(key, len(shape.inputs))
+
+    def untrained(key: Key, sensor: Sensor, size: int) -> Encoder:
+        offset = jnp.zeros(sensor.window * sensor.channels)
+        return Encoder(
+            params=params["encoders"][sensor.name],
+            scaling=Scaling(make_frame(sensor), jnp.zeros(size), jnp.float32(1.0)),
+            gate=gate.init(key, offset, jnp.float32(1.0), sensor.measures_distance),
+            classes=classes,
+            readout=make_readout(config, classes),
+            prior=make_prior(config),
+            sharpness=jnp.float32(1.0),
+            shape=shape,
+            label_of_class=config.label_of_class(sensor.name),
+        )
+
+    return tuple(map(untrained, keys, sensors.make(config), shape.inputs)), params
 
 
 def _no_values(config: Config, modality: str) -> LookValues:

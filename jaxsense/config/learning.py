@@ -50,12 +50,18 @@ class DetectorConfig(Section, place="detector"):
 class JmvaeConfig(Section, place="jmvae"):
     """The joint multi-modal VAE."""
 
+    learns_from: Literal["detections", "scans"] = "detections"
+    """What the JMVAE learns from. `scans` needs neither detectors nor labels: looks are grouped by
+    the PoI that they show, and the encoders serve as detectors, see `jaxsense.vae.leave_one_out`.
+    The setting fusion must then be `filter`."""
     latent_size: int = limited(2, at_least=1, at_most=256)
     """Dimensions of the latent space, D_z."""
     hidden: tuple[int, ...] = limited((64, 64), at_least=1, min_items=1)
     """Sizes of the hidden layers of every encoder and decoder."""
     alpha: Traced[float] = limited(0.1, at_least=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to each subset's."""
+    alpha_start: Traced[float] = limited(0.0, at_least=0, at_most=1)
+    """Share of the training after which alpha sets in; only if the JMVAE learns from scans."""
     beta: Traced[float] = limited(0.001, above=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to the prior."""
     initial_beta: Traced[float] = limited(0.7, above=0, at_most=_MAX_WEIGHT)
@@ -72,14 +78,27 @@ class JmvaeConfig(Section, place="jmvae"):
     restarts: int = limited(3, at_least=1, at_most=1000)
     """Trainings from different random parameters; the one with the lowest loss is kept, of those
     from whose beliefs class probabilities are read exactly."""
+    looks: int = limited(4, at_least=2, at_most=100)
+    """Looks by each sensor at a PoI, if the JMVAE learns from scans."""
     samples_per_class: int = limited(10000, at_least=1)
     """Detections per class and modality in the training set."""
     steps: int = limited(3000, at_least=1)
     """Gradient steps."""
     batch: int = limited(256, at_least=1)
-    """Sets of detections, one of each modality, per gradient step."""
+    """Sets of detections, one of each modality, per gradient step; PoIs if it learns from scans."""
     learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
     """Initial learning rate of Adam; decays to zero along a cosine."""
+
+    def check(self) -> None:
+        """Checks that the fusion fits what is learned; raises `ConfigError`."""
+        fits = self.learns_from != "scans" or self.fusion == "filter"
+        expected = f"must be filter, because learns_from = {self.learns_from}"
+        require(fits, self, "fusion", expected)
+
+    @property
+    def num_together(self) -> int:
+        """Looks by each sensor at a PoI in one training example."""
+        return self.looks if self.learns_from == "scans" else 1
 
     def arrays(self, sizes: Sizes) -> dict[str, int]:
         """How many numbers each large array holds."""

@@ -107,6 +107,23 @@ _NOISY = Config(
     ),
 )
 
+_RAW = Config(
+    jmvae=JmvaeConfig(
+        learns_from="scans",
+        hidden=(128, 128),
+        alpha=3.0,
+        alpha_start=0.4,
+        beta=1.0,
+        initial_beta=0.01,
+        annealing=0.3,
+        reconstruction_weights=(60.0, 60.0),
+        fusion="filter",
+        restarts=1,
+        steps=4000,
+        batch=128,
+    ),
+)
+
 _TEAM = Config(
     arena=ArenaConfig(side=4.0, num_pois=8),
     dqn=DqnConfig(
@@ -167,7 +184,7 @@ _MANY = dataclasses.replace(
     ),
 )
 
-PresetName = Literal["default", "paper", "noisy", "many", "team", "smoke"]
+PresetName = Literal["default", "paper", "noisy", "many", "raw", "team", "smoke"]
 """The names of `PRESETS`."""
 
 PRESETS: Mapping[str, Config] = FrozenDict(
@@ -176,6 +193,7 @@ PRESETS: Mapping[str, Config] = FrozenDict(
         "paper": _PAPER,
         "noisy": _NOISY,
         "many": _MANY,
+        "raw": _RAW,
         "team": _TEAM,
         "smoke": _SMOKE,
     }
@@ -183,6 +201,7 @@ PRESETS: Mapping[str, Config] = FrozenDict(
 """`default`: the best settings we know. `paper`: the paper's where it states them, otherwise
 chosen to reproduce its figures, see `docs/differences.md`. `noisy`: sensors that are often
 uncertain, and beliefs that accumulate looks. `many`: sixteen classes of four colours and four
-shapes, with sensors such as those of `noisy` and a team. `team`: one policy for any number of PoIs
+shapes, with sensors such as those of `noisy` and a team. `raw`: as `default`, but the JMVAE learns
+from scans themselves, without detectors or labels. `team`: one policy for any number of PoIs
 and robots that takes travel time into account. `smoke`: the whole pipeline in seconds, for
 tests."""

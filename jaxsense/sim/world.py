@@ -82,19 +82,24 @@ def make_world(
     return World(arena, sensors.make(config), config.viewpoint)
 
 
-def random_scene(key: Key, world: World, classes: Int[Array, "N"]) -> Scene:
+def random_scene(
+    key: Key, world: World, classes: Int[Array, "N"], places: Key | None = None
+) -> Scene:
     """Draws a scene with PoIs of given classes at random positions under random light.
 
     Args:
       key: random key.
       world: the simulation.
       classes: index of each PoI's class in the settings of the arena.
+      places: random key of the PoIs' positions and directions, with which several scenes show the
+        same PoIs; part of `key` by default.
 
     Returns:
       The scene. Each robot stands at a random viewpoint of a random PoI.
     """
     layout_key, light_key, poi_key, *robot_keys = jax.random.split(key, 3 + len(world.sensors))
-    layout = arenas.random_layout(layout_key, world.arena.config, classes)
+    place_key = layout_key if places is None else places
+    layout = arenas.random_layout(place_key, world.arena.config, classes)
     pois = jax.random.randint(poi_key, (len(robot_keys),), 0, world.arena.config.num_pois)
     poses = jnp.zeros((0, 3))
     for robot_key, poi in zip(robot_keys, pois, strict=True):
@@ -216,7 +221,11 @@ def scan_around(
 
 
 def survey(
-    key: Key, world: World, classes: Int[Array, "N"], is_empty: Bool[Array, ""] | None = None
+    key: Key,
+    world: World,
+    classes: Int[Array, "N"],
+    is_empty: Bool[Array, ""] | None = None,
+    places: Key | None = None,
 ) -> tuple[Scene, tuple[Float[Array, "N _"], ...], Float[Array, "R N"]]:
     """Draws a scene in which each robot looks at each PoI, every time from a new viewpoint.
 
@@ -225,13 +234,14 @@ def survey(
       world: the simulation.
       classes: index of each PoI's class in the settings of the arena.
       is_empty: whether no look shows its PoI, see `absence.without_poi`; all do by default.
+      places: see `random_scene`.
 
     Returns:
       The scene, for each robot the inputs of its detector, one per PoI, and the expected distances
       of the PoIs, in metres.
     """
     scene_key, viewpoint_key, noise_key = jax.random.split(key, 3)
-    scene = random_scene(scene_key, world, classes)
+    scene = random_scene(scene_key, world, classes, places)
     robots, pois = jnp.arange(len(world.sensors)), jnp.arange(world.arena.config.num_pois)
     shape = (len(robots), len(pois))
 

@@ -10,7 +10,10 @@ from jaxsense.core.types import Key, pytree
 from jaxsense.sim.sensors import Sensor
 from jaxsense.vae import detectors
 from jaxsense.vae import gate as gates
+from jaxsense.vae.gate import Gate
 
+NUM_CHECKS = 8192
+"""The most looks of each kind that set a gate's threshold."""
 _SPOILT_EACH = 512  # windows of each kind that are spoilt by hand
 _ELSEWHERE = 0.5, 2.0  # of the distance, outside of which a PoI is not where it is expected
 
@@ -73,6 +76,36 @@ def nothing(
     together = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
     order = jax.random.permutation(order_key, len(together.windows))
     return jax.tree.map(lambda x: x[order], together)
+
+
+def of_gate(config: DetectorConfig, gate: Gate, examples: Examples) -> gates.Fitting:
+    """Problem of fitting a gate, without the looks of `checks_of`.
+
+    Args:
+      config: of the fit.
+      gate: untrained.
+      examples: of one modality.
+    """
+    shown = gates.Looks(examples.windows, examples.distances)
+    nothing = jax.tree.map(lambda x: x[_num_checks(examples) :], examples.nothing)
+    return gates.Fitting(config, gate, shown, nothing)
+
+
+def checks_of(config: DetectorConfig, gate: Gate, examples: Examples) -> gates.Fitting:
+    """The like problem with looks that set the gate's threshold, see `gates.fitted`.
+
+    Args:
+      config: of the fit.
+      gate: untrained.
+      examples: of one modality.
+    """
+    nothing = jax.tree.map(lambda x: x[: _num_checks(examples)], examples.nothing)
+    return gates.Fitting(config, gate, examples.checks, nothing)
+
+
+def _num_checks(examples: Examples) -> int:
+    """How many looks at nothing help to set the gate's threshold; the others train the gate."""
+    return min(len(examples.nothing.windows) // 4, NUM_CHECKS)
 
 
 @pytree

@@ -22,11 +22,10 @@ from jaxsense.training.gating import Examples
 from jaxsense.training.stage import Stage
 from jaxsense.vae import detectors, jmvae
 from jaxsense.vae import gate as gates
-from jaxsense.vae.detectors import Detector
+from jaxsense.vae.detectors import Classifier, Detector
 
 _EXACT = 0.003  # nats that a readout may lose, a third of what a sound map may
 _SHARE_OF_EMPTY = 8  # one empty scene for so many to train detectors with; rays take time
-_GATE_CHECKS = 8192  # looks that set a gate's threshold
 
 
 @pytree
@@ -85,7 +84,14 @@ def num_scenes(config: Config) -> tuple[int, int, int, int]:
     num_held_out = -(-_held_out_per_class(config) * num_classes // num_pois)
     num_train = -(-config.detector.num_scans // num_pois)
     num_empty = -(-num_train // _SHARE_OF_EMPTY)
-    return num_train, max(num_bank, _num_starts(config)), num_held_out, num_empty
+    parts = num_train, max(num_bank, _num_starts(config)), num_held_out
+    num_train, num_bank, num_held_out = (_whole(number, config) for number in parts)
+    return num_train, num_bank, num_held_out, num_empty
+
+
+def _whole(number: int, config: Config) -> int:
+    """A number of scenes in whole groups that show the same PoIs."""
+    return -(-number // config.jmvae.num_together) * config.jmvae.num_together
 
 
 def _held_out_per_class(config: Config) -> int:
@@ -98,7 +104,11 @@ def _num_starts(config: Config) -> int:
     return config.dqn.num_starts if config.dqn.observe == "live" else 0
 
 
-def draw_scenes(key: Key, config: Config) -> tuple[Key, Int[Array, "S N"], Bool[Array, " S"]]:
+Scenes = tuple[Key, Int[Array, "S N"], Bool[Array, " S"], Key | None]
+"""Keys, classes, which are empty, and keys of the PoIs' places, see `draw_scenes`."""
+
+
+def draw_scenes(key: Key, config: Config) -> Scenes:
     """Draws keys and classes of all scenes.
 
     Args:
@@ -106,15 +116,24 @@ def draw_scenes(key: Key, config: Config) -> tuple[Key, Int[Array, "S N"], Bool[
       config: all settings.
 
     Returns:
-      `[S]` keys of the scenes, `[S, N]` int32 classes of their PoIs, and `[S]` bool, in which
-      scenes no look shows its PoI.
+      `[S]` keys of the scenes, `[S, N]` int32 classes of their PoIs, `[S]` bool, in which scenes
+      no look shows its PoI, and `[S]` keys of the PoIs' places, of which `jmvae.looks` in a row are
+      the same if the JMVAE learns from groups of looks; otherwise None.
     """
     class_key, scene_key = jax.random.split(key)
     numbers = num_scenes(config)
     keys = jax.random.split(class_key, len(numbers))
-    parts = [looks.balanced_classes(k, config, n) for k, n in zip(keys, numbers, strict=True)]
-    is_empty = jnp.arange(sum(numbers)) >= sum(numbers[:3])
-    return jax.random.split(scene_key, sum(numbers)), jnp.concatenate(parts), is_empty
+    total, each = sum(numbers), config.jmvae.num_together
+    parts = [
+        looks.balanced_classes(k, config, -(-n // each)) for k, n in zip(keys, numbers, strict=True)
+    ]
+    classes = jnp.repeat(jnp.concatenate(parts), each, axis=0)[:total]
+    is_empty = jnp.arange(total) >= sum(numbers[:3])
+    places = None
+    if each > 1:
+        place_keys = jax.random.split(jax.random.fold_in(key, 1), -(-total // each))
+        places = jnp.repeat(place_keys, each)[:total]
+    return jax.random.split(scene_key, total), classes, is_empty, places
 
 
 def survey_stage(arena: Arena) -> Stage:
@@ -123,11 +142,11 @@ def survey_stage(arena: Arena) -> Stage:
     It may get a part of the scenes, and knows nothing of their number.
     """
 
-    def survey(key: Key, config: Config, *, scenes: tuple[Key, jax.Array, jax.Array]) -> Surveys:
+    def survey(key: Key, config: Config, *, scenes: Scenes) -> Surveys:
         del key
-        keys, classes, is_empty = scenes
+        keys, classes, is_empty, places = scenes
         world = make_world(config, arena=arena)
-        seen, windows, distances = looks.surveys(keys, world, classes, is_empty)
+        seen, windows, distances = looks.surveys(keys, world, classes, is_empty, places)
         return Surveys(classes, seen, windows, distances)
 
     return Stage("survey", survey, {"scenes": "scenes"})
@@ -157,7 +176,7 @@ def split_examples(key: Key, config: Config, *, surveys: Surveys) -> tuple[Examp
             labels=jnp.array(config.label_of_class(name))[classes],
             distances=shown.distances,
             nothing=gating.nothing(key, config.viewpoint, sensor, shown, empty),
-            checks=jax.tree.map(lambda x: x[:_GATE_CHECKS], checks),
+            checks=jax.tree.map(lambda x: x[: gating.NUM_CHECKS], checks),
         )
 
     keys = jax.random.split(key, len(config.modalities))
@@ -176,7 +195,7 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
 
     def untrained(
         key: Key, config: Config, *, examples: tuple[Examples, ...]
-    ) -> tuple[Detector, tuple[Params, Params]]:
+    ) -> tuple[Classifier, tuple[Params, Params]]:
         num_labels = len(config.labels(config.modalities[modality]))
         windows = examples[modality].windows[: _num_training(config, examples[modality])]
         is_range = sensors.make(config)[modality].measures_distance
@@ -184,27 +203,21 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
         return detector, (detector.params, detector.gate.params)
 
     def problem(
-        config: Config, detector: Detector, *, examples: tuple[Examples, ...]
+        config: Config, detector: Classifier, *, examples: tuple[Examples, ...]
     ) -> gating.FittingBoth:
-        given = examples[modality]
-        number, num_checks = _num_training(config, given), _num_checks(given)
-        windows = given.windows[:number]
-        shown = gates.Looks(windows, given.distances[:number])
-        nothing = jax.tree.map(lambda x: x[num_checks:], given.nothing)
+        given = _for_training(config, examples[modality])
         return gating.FittingBoth(
-            detectors.Fitting(config.detector, detector, windows, given.labels[:number]),
-            gates.Fitting(config.detector, detector.gate, shown, nothing),
+            detectors.Fitting(config.detector, detector, given.windows, given.labels),
+            gating.of_gate(config.detector, detector.gate, given),
         )
 
     def trained(
-        config: Config, detector: Detector, fit: FitState, *, examples: tuple[Examples, ...]
-    ) -> Detector:
+        config: Config, detector: Classifier, fit: FitState, *, examples: tuple[Examples, ...]
+    ) -> Classifier:
         given = examples[modality]
-        number, num_checks = _num_training(config, given), _num_checks(given)
+        number = _num_training(config, given)
         params, of_gate = fit.params
-        nothing = jax.tree.map(lambda x: x[:num_checks], given.nothing)
-        checks = gates.Fitting(config.detector, detector.gate, given.checks, nothing)
-        gate = gates.fitted(of_gate, checks)
+        gate = gates.fitted(of_gate, gating.checks_of(config.detector, detector.gate, given))
         found = dataclasses.replace(detector, params=params, gate=gate)
         windows, labels = given.windows[number:], given.labels[number:]
         return detectors.calibrate(found, windows, labels) if len(labels) else found
@@ -225,13 +238,24 @@ def _num_training(config: Config, examples: Examples) -> int:
     return config.detector.num_training(len(examples.labels))
 
 
-def _num_checks(examples: Examples) -> int:
-    """How many looks at nothing help to set the gate's threshold; the others train the gate."""
-    return min(len(examples.nothing.windows) // 4, _GATE_CHECKS)
+def _for_training(config: Config, examples: Examples) -> Examples:
+    """The examples without those that calibrate the detector."""
+    number = _num_training(config, examples)
+    return dataclasses.replace(
+        examples,
+        windows=examples.windows[:number],
+        labels=examples.labels[:number],
+        distances=examples.distances[:number],
+    )
 
 
 def detect(
-    key: Key, config: Config, *, surveys: Surveys, trained: tuple[Detector, ...]
+    key: Key,
+    config: Config,
+    *,
+    surveys: Surveys,
+    trained: tuple[Detector, ...],
+    taken_for: Int[Array, "S N"] | None = None,
 ) -> Detections:
     """Applies the detectors to the surveys that they were not trained on.
 
@@ -240,26 +264,46 @@ def detect(
       config: all settings.
       surveys: of all scenes.
       trained: one detector for each modality.
+      taken_for: `[S, N]` int32 classes by which looks for training are sorted; by default the true
+        ones.
     """
     del key
     num_train, num_bank, _, num_empty = num_scenes(config)
     others = jax.tree.map(lambda x: x[num_train:-num_empty], surveys)
     features = looks.detect_all(trained, others.windows)
 
-    def by_class(values: tuple[jax.Array, ...], part: slice, number: int) -> Samples:
+    def by_class(
+        values: tuple[jax.Array, ...], part: slice, classes: jax.Array, number: int
+    ) -> Samples:
         num_classes = len(config.arena.classes)
-        return tuple(
-            looks.by_class(x[part], others.classes[part], num_classes, number) for x in values
-        )
+        return tuple(looks.by_class(x[part], classes, num_classes, number) for x in values)
 
     for_bank, for_measuring = slice(None, num_bank), slice(num_bank, None)
+    of_bank = others.classes[for_bank] if taken_for is None else taken_for
+    of_measuring = others.classes[for_measuring]
     starts = Starts(others.classes, others.scenes, features)
     return Detections(
-        bank=by_class(features, for_bank, config.jmvae.samples_per_class),
-        held_out=by_class(features, for_measuring, _held_out_per_class(config)),
+        bank=by_class(features, for_bank, of_bank, config.jmvae.samples_per_class),
+        held_out=by_class(features, for_measuring, of_measuring, _held_out_per_class(config)),
         starts=jax.tree.map(lambda x: x[: _num_starts(config)], starts),
-        windows=by_class(others.windows, for_measuring, 1),
+        windows=by_class(others.windows, for_measuring, of_measuring, 1),
     )
+
+
+def make_stages(config: Config) -> list[Stage]:
+    """Makes the stages from surveys to detections and class beliefs, with detectors.
+
+    Args:
+      config: all settings.
+    """
+    names = tuple(f"detector_{name}" for name in config.modalities)
+    given = {"params": "best_jmvae", "detections": "detections"}
+    return [
+        *(detector_stage(m, name, config) for m, name in enumerate(names)),
+        Stage("detections", detect, {"surveys": "survey", "trained": names}),
+        *jmvae_stages(config),
+        Stage("class_beliefs", class_beliefs, given),
+    ]
 
 
 def jmvae_stages(config: Config) -> list[Stage]:

@@ -12,8 +12,10 @@ from jaxsense.core.types import Key
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
-from jaxsense.training import agents, comparison, fusions, measures, perception, repeats
+from jaxsense.training import agents, comparison, fusions, measures, perception, repeats, scans
 from jaxsense.training.stage import Learned, Output, Stage, compose, key_of
+
+_LEARNS_FROM = {"detections": perception.make_stages, "scans": scans.make_stages}
 
 
 def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
@@ -24,9 +26,8 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
       arena: from `sim.make_world(config)`; compiled anew by default.
     """
     arena = make_world(config).arena if arena is None else arena
-    detectors = tuple(f"detector_{name}" for name in config.modalities)
     detections, fusion = {"detections": "detections"}, {"fusion": "fusion"}
-    classes, params = {"classes": "class_beliefs"}, {"params": "best_jmvae"}
+    classes = {"classes": "class_beliefs"}
     policies = {
         name: {
             "modality": m,
@@ -41,12 +42,9 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
         Stage("scenes", perception.draw_scenes),
         perception.survey_stage(arena),
         Stage("examples", perception.split_examples, {"surveys": "survey"}),
-        *(perception.detector_stage(m, name, config) for m, name in enumerate(detectors)),
-        Stage("detections", perception.detect, {"surveys": "survey", "trained": detectors}),
+        *_LEARNS_FROM[config.jmvae.learns_from](config),
         Stage("detector_metrics", measures.detector_metrics, detections),
         repeats.novelty_stage(arena, config),
-        *perception.jmvae_stages(config),
-        Stage("class_beliefs", perception.class_beliefs, {**params, **detections}),
         *fusions.make_stages(config),
         Stage("latent_space", measures.latent_space, {**fusion, **detections}),
         Stage("look_values", agents.look_values, {**classes, **detections}),

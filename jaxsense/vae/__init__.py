@@ -3,6 +3,7 @@
 from jaxsense.core.types import Fusion as Fusion
 from jaxsense.vae.bayes import bayes_update as bayes_update
 from jaxsense.vae.bayes import product_of_experts as product_of_experts
+from jaxsense.vae.detectors import Classifier as Classifier
 from jaxsense.vae.detectors import Detection as Detection
 from jaxsense.vae.detectors import Detector as Detector
 from jaxsense.vae.detectors import answer as answer

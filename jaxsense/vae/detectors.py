@@ -1,6 +1,7 @@
 """The scanline detectors f_x and f_w: from one sensor's window to features, through a gate."""
 
 import dataclasses
+from typing import Protocol
 
 import chex
 import jax
@@ -19,9 +20,31 @@ from jaxsense.vae.gate import Gate
 _MAX_TEMPERATURE = 4.0
 
 
+class Detector(Protocol):
+    """A detector of one sensor: from a window to features; a frozen pytree."""
+
+    @property
+    def gate(self) -> Gate:
+        """Tells which windows show a PoI."""
+        ...
+
+    @property
+    def num_labels(self) -> int:
+        """D_m, the number of labels."""
+        ...
+
+    def features(self, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
+        """Probabilities of the labels, for a window that shows its PoI.
+
+        Args:
+          window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
+        """
+        ...
+
+
 @pytree
-class Detector:
-    """A detector of one sensor.
+class Classifier:
+    """A detector that learns from labelled windows.
 
     Attributes:
       params: of its network.
@@ -39,6 +62,10 @@ class Detector:
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
     num_labels: int = struct.field(pytree_node=False)
 
+    def features(self, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
+        """See `Detector.features`."""
+        return jax.nn.softmax(logits(self, window))
+
 
 def init(
     key: Key,
@@ -46,7 +73,7 @@ def init(
     num_labels: int,
     config: DetectorConfig,
     measures_distance: bool = False,
-) -> Detector:
+) -> Classifier:
     """Untrained detector.
 
     Args:
@@ -62,7 +89,7 @@ def init(
     scale = jnp.std(windows - offset[None]) + 1e-6
     # Folded in: `key` draws the network of the labels.
     gate = gates.init(jax.random.fold_in(key, 1), offset, scale, measures_distance)
-    return Detector(params, offset, scale, gate, config.hidden, num_labels)
+    return Classifier(params, offset, scale, gate, config.hidden, num_labels)
 
 
 @pytree
@@ -78,7 +105,7 @@ class Detection:
     features: Float[Array, " D_m"]
 
 
-def logits(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
+def logits(detector: Classifier, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
     """Unnormalised log-probabilities of the labels.
 
     Args:
@@ -98,7 +125,7 @@ def detect(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m
     Returns:
       `[D_m]` probabilities of the labels, for example (red, green).
     """
-    return jax.nn.softmax(logits(detector, window))
+    return detector.features(window)
 
 
 def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array, ""]) -> Detection:
@@ -114,7 +141,7 @@ def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array
     return Detection(is_there, features)
 
 
-def _standard(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " F"]:
+def _standard(detector: Classifier, window: Float[Array, " F"]) -> Float[Array, " F"]:
     """A window standardised by those of the training."""
     chex.assert_shape(window, detector.offset.shape, custom_message="window")
     return (window - detector.offset) / detector.scale
@@ -132,7 +159,7 @@ class Fitting:
     """
 
     config: DetectorConfig
-    detector: Detector
+    detector: Classifier
     windows: Float[Array, "S F"]
     labels: Int[Array, " S"]
 
@@ -165,8 +192,8 @@ class Fitting:
 
 
 def calibrate(
-    detector: Detector, windows: Float[Array, "S F"], labels: Int[Array, " S"]
-) -> Detector:
+    detector: Classifier, windows: Float[Array, "S F"], labels: Int[Array, " S"]
+) -> Classifier:
     """Divides logits by the best temperature for other looks (Guo et al. 2017, Sec. 4.2).
 
     Args:
@@ -191,6 +218,6 @@ def calibrate(
     return dataclasses.replace(detector, params=params)
 
 
-def _network(detector: Detector) -> MLP:
+def _network(detector: Classifier) -> MLP:
     """The network of a detector."""
     return MLP(detector.hidden, detector.num_labels)

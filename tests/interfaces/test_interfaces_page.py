@@ -14,7 +14,7 @@ import jaxsense
 from jaxsense import export
 from jaxsense.models import init
 from jaxsense.vae import gate
-from jaxsense.vae.detectors import Detector
+from jaxsense.vae.detectors import Classifier
 
 PAGE = Path(__file__).parent.parent.parent / "docs" / "interfaces.md"
 FIRST, *OTHERS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
@@ -38,7 +38,7 @@ def colour_detector():
     params = {"params": {"Dense_0": {"kernel": kernel.reshape(-1, 2), "bias": np.zeros(2)}}}
     offset, scale = jnp.zeros(240), jnp.float32(1.0)
     passes_all = gate.init(jax.random.key(0), offset, scale, measures_distance=False)
-    return Detector(params, offset, scale, passes_all, hidden=(), num_labels=2)
+    return Classifier(params, offset, scale, passes_all, hidden=(), num_labels=2)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,296 @@
+"""Stages of a JMVAE that learns from scans themselves, and whose encoders serve as detectors.
+
+Looks are grouped by the PoI that they show; no label enters the training. Clusters of the joint
+posteriors are the classes. The labels of the training scenes only name them: each class is the
+cluster that holds most of its PoIs.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsense.config import Config
+from jaxsense.core.networks import Params
+from jaxsense.core.supervised import FitState
+from jaxsense.core.types import Belief, Key, pytree
+from jaxsense.models import make_frame, make_prior, make_readout, make_shape
+from jaxsense.sim import sensors
+from jaxsense.training import gating, perception
+from jaxsense.training.fits import fit_stage
+from jaxsense.training.gating import Examples
+from jaxsense.training.perception import Detections, Surveys
+from jaxsense.training.stage import Stage
+from jaxsense.vae import clusters, frames, leave_one_out
+from jaxsense.vae import gate as gates
+from jaxsense.vae.frames import Scaling
+from jaxsense.vae.gate import Gate
+from jaxsense.vae.leave_one_out import Encoder, Groups
+
+_POSTERIORS_AT_ONCE = 4096
+_CLUSTERED = 8192  # PoIs
+_CALIBRATING = 8192  # PoIs
+
+
+@pytree
+class Views:
+    """What a JMVAE learns from.
+
+    Attributes:
+      groups: looks at the PoIs of the training scenes, each sensor's in its frame.
+      scalings: by modality, how it comes to this frame.
+    """
+
+    groups: Groups
+    scalings: tuple[Scaling, ...]
+
+
+def make_stages(config: Config) -> list[Stage]:
+    """Makes the stages from surveys to detections; see `perception.make_stages`."""
+    detectors = tuple(f"detector_{name}" for name in config.modalities)
+    learned = {"params": "best_jmvae", "views": "views"}
+    restarts = _jmvae_stages(config)
+    best = {"restarts": tuple(stage.name for stage in restarts)}
+    clustered = {**learned, "surveys": "survey", "classes": "class_beliefs"}
+    return [
+        Stage("views", views, {"surveys": "survey"}),
+        *restarts,
+        Stage("best_jmvae", _best, best),
+        Stage("class_beliefs", class_beliefs, {**learned, "surveys": "survey"}),
+        *(_encoder_stage(m, name, config) for m, name in enumerate(detectors)),
+        Stage("detections", detect, {**clustered, "trained": detectors}),
+        Stage("scan_metrics", accuracies, clustered),
+    ]
+
+
+def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
+    """Looks at the PoIs of the training scenes, in the frames of their sensors.
+
+    Args:
+      key: not used.
+      config: all settings.
+      surveys: of all scenes.
+    """
+    del key
+    number = perception.num_scenes(config)[0]
+    found, scalings = [], []
+    for sensor, windows in zip(sensors.make(config), surveys.windows, strict=True):
+        groups = _grouped(windows[:number], config)
+        flat = groups.reshape(-1, groups.shape[-1])
+        scaling, seen = frames.scaled(make_frame(sensor), flat)
+        found.append(seen.reshape(*groups.shape[:2], -1))
+        scalings.append(scaling)
+    return Views(tuple(found), tuple(scalings))
+
+
+def _grouped(windows: Float[Array, "S N F"], config: Config) -> Float[Array, "P K F"]:
+    """Looks grouped by PoI; K scenes in a row show the same PoIs."""
+    looks, (_, num_pois, size) = config.jmvae.num_together, windows.shape
+    return jnp.swapaxes(windows.reshape(-1, looks, num_pois, size), 1, 2).reshape(-1, looks, size)
+
+
+def _jmvae_stages(config: Config) -> list[Stage]:
+    """Trainings from different random parameters."""
+
+    def untrained(key: Key, config: Config, *, views: Views) -> tuple[tuple[()], Params]:
+        del views
+        return (), leave_one_out.init(key, make_shape(config))
+
+    def problem(config: Config, fitted: tuple[()], *, views: Views) -> leave_one_out.Fitting:
+        return leave_one_out.Fitting(config.jmvae, views.groups, make_shape(config))
+
+    def trained(
+        config: Config, fitted: tuple[()], fit: FitState, *, views: Views
+    ) -> tuple[Params, jax.Array]:
+        return fit.params, fit.loss
+
+    stage = fit_stage(
+        "jmvae",
+        {"views": "views"},
+        config,
+        settings=lambda config: config.jmvae,
+        untrained=untrained,
+        problem=problem,
+        trained=trained,
+        is_optional=config.jmvae.restarts > 1,
+    )
+    return [dataclasses.replace(stage, name=f"jmvae_{i + 1}") for i in range(config.jmvae.restarts)]
+
+
+def _best(key: Key, config: Config, *, restarts: tuple[tuple[Params, jax.Array], ...]) -> Params:
+    """Parameters of the restart with the lowest finite loss; of the first if none is finite."""
+    losses = jnp.stack([loss for _, loss in restarts])
+    best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
+    params = jax.tree.map(lambda *x: jnp.stack(x), *(params for params, _ in restarts))
+    return jax.tree.map(lambda x: x[best], params)
+
+
+def _posteriors(params: Params, config: Config, groups: Groups) -> Belief:
+    """`[P, D]` posteriors of all looks at each PoI."""
+    shape = make_shape(config)
+    batch = min(_POSTERIORS_AT_ONCE, len(groups[0]))
+    of_group = lambda looks: leave_one_out.posterior(params, shape, looks)  # noqa: E731
+    return jax.lax.map(of_group, groups, batch_size=batch)
+
+
+def class_beliefs(
+    key: Key, config: Config, *, params: Params, views: Views, surveys: Surveys
+) -> Belief:
+    """Mean joint posterior of each class, `[C, D]`, from clusters that labels only name.
+
+    Args:
+      key: random key of the clusters.
+      config: all settings.
+      params: of the JMVAE.
+      views: what it has learned from.
+      surveys: of all scenes, for the labels.
+    """
+    number, num_classes = perception.num_scenes(config)[0], len(config.arena.classes)
+    found = _posteriors(params, config, views.groups)
+    truth = surveys.classes[: number : config.jmvae.num_together].reshape(-1)
+    centres = clusters.centres(key, found.mean[:_CLUSTERED], num_classes)
+    members = clusters.nearest(found.mean, centres)
+    of_class = clusters.named(members, truth, num_classes)
+    is_member = (members[None] == of_class[:, None]).astype(jnp.float32)
+    share = is_member / jnp.maximum(jnp.sum(is_member, axis=1, keepdims=True), 1)
+    return jax.tree.map(lambda x: jnp.sum(share[..., None] * x[None], axis=1), found)
+
+
+def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
+    """The stage that makes a detector of the encoder of one modality, and trains its gate."""
+
+    def untrained(
+        key: Key, config: Config, *, examples: tuple[Examples, ...], **_: object
+    ) -> tuple[Gate, Params]:
+        windows = examples[modality].windows
+        offset = jnp.mean(windows, axis=0)
+        scale = jnp.std(windows - offset[None]) + 1e-6
+        is_range = sensors.make(config)[modality].measures_distance
+        gate = gates.init(key, offset, scale, is_range)
+        return gate, gate.params
+
+    def problem(
+        config: Config, gate: Gate, *, examples: tuple[Examples, ...], **_: object
+    ) -> gates.Fitting:
+        return gating.of_gate(config.detector, gate, examples[modality])
+
+    def trained(
+        config: Config,
+        gate: Gate,
+        fit: FitState,
+        *,
+        examples: tuple[Examples, ...],
+        params: Params,
+        views: Views,
+        classes: Belief,
+    ) -> Encoder:
+        sensor, given = config.modalities[modality], examples[modality]
+        encoder = Encoder(
+            params=params["encoders"][sensor],
+            scaling=views.scalings[modality],
+            gate=gates.fitted(fit.params, gating.checks_of(config.detector, gate, given)),
+            classes=classes,
+            readout=make_readout(config, classes),
+            prior=make_prior(config),
+            sharpness=jnp.float32(1.0),
+            shape=make_shape(config),
+            label_of_class=config.label_of_class(sensor),
+        )
+        some = tuple(x[:_CALIBRATING] for x in views.groups)
+        shown = clusters.nearest(_posteriors(params, config, some).mean, classes.mean)
+        looks = _grouped(given.windows.reshape(-1, config.arena.num_pois, len(gate.offset)), config)
+        return leave_one_out.calibrate(encoder, looks[:_CALIBRATING, 0], shown)
+
+    return fit_stage(
+        name,
+        {
+            "examples": "examples",
+            "params": "best_jmvae",
+            "views": "views",
+            "classes": "class_beliefs",
+        },
+        config,
+        settings=lambda config: config.detector,
+        untrained=untrained,
+        problem=problem,
+        trained=trained,
+    )
+
+
+def detect(
+    key: Key,
+    config: Config,
+    *,
+    surveys: Surveys,
+    trained: tuple[Encoder, ...],
+    params: Params,
+    views: Views,
+    classes: Belief,
+) -> Detections:
+    """Applies the encoders to the surveys that nothing was trained on.
+
+    Looks for training are sorted by the class that all looks at the PoI show, not by its label;
+    held-out looks by their labels.
+
+    Args:
+      key: not used.
+      config: all settings.
+      surveys: of all scenes.
+      trained: one encoder for each modality.
+      params: of the JMVAE.
+      views: for the frames of the sensors.
+      classes: `[C, D]` mean joint posterior of each class.
+    """
+    num_train, num_bank, _, _ = perception.num_scenes(config)
+    part = slice(num_train, num_train + num_bank)
+    shown = _shown(config, params, views, classes, surveys, part)
+    num_pois, looks = surveys.classes.shape[1], config.jmvae.num_together
+    of_scenes = jnp.repeat(shown.reshape(-1, num_pois), looks, axis=0)
+    return perception.detect(key, config, surveys=surveys, trained=trained, taken_for=of_scenes)
+
+
+def _shown(
+    config: Config,
+    params: Params,
+    views: Views,
+    classes: Belief,
+    surveys: Surveys,
+    part: slice,
+    first: int | None = None,
+) -> jax.Array:
+    """`[P]` int32 classes that the first looks by each sensor, or all, show together."""
+    groups = tuple(
+        jax.lax.map(jax.vmap(scaling), _grouped(x[part], config)[:, :first], batch_size=512)
+        for scaling, x in zip(views.scalings, surveys.windows, strict=True)
+    )
+    return clusters.nearest(_posteriors(params, config, groups).mean, classes.mean)
+
+
+def accuracies(
+    key: Key, config: Config, *, surveys: Surveys, params: Params, views: Views, classes: Belief
+) -> dict[str, Float[Array, ""]]:
+    """Share of held-out PoIs whose joint posterior is nearest to the true class.
+
+    Args:
+      key: not used.
+      config: all settings.
+      surveys: of all scenes.
+      params: of the JMVAE.
+      views: for the frames of the sensors.
+      classes: `[C, D]` mean joint posterior of each class.
+
+    Returns:
+      `pair` after one look by each sensor, and `all_looks` after `jmvae.looks` by each.
+    """
+    del key
+    num_train, num_bank, num_held_out, _ = perception.num_scenes(config)
+    start = num_train + num_bank
+    part = slice(start, start + num_held_out)
+    truth = surveys.classes[part][:: config.jmvae.num_together].reshape(-1)
+
+    def share(first: int | None) -> jax.Array:
+        shown = _shown(config, params, views, classes, surveys, part, first)
+        return jnp.mean(shown == truth)
+
+    return {"pair": share(1), "all_looks": share(None)}

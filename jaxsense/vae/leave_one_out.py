@@ -1,0 +1,339 @@
+"""The JMVAE on scans themselves, without detectors or labels: leave-one-out reconstruction.
+
+A training example is one PoI at which every sensor has looked several times. Each look is decoded
+from a latent that only the other looks have been encoded to, so the latent holds what the looks
+share: what the PoI is. What they do not share, from where and in which light each was taken, is
+left to the variance of the decoders. As in the JMVAE (Suzuki et al. 2017, Sec. 3.3), divergences
+draw the posteriors of fewer looks to the posterior of all: of every single look, and of sets of one
+look by each sensor. The posterior of several looks reads the means of what a network finds in each,
+so it takes any number of looks by each sensor in any order.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from jaxsense.config import JmvaeConfig
+from jaxsense.core import networks
+from jaxsense.core.networks import MLP, Params
+from jaxsense.core.types import Belief, Key, pytree
+from jaxsense.vae import gaussian
+from jaxsense.vae.frames import Scaling
+from jaxsense.vae.gate import Gate
+from jaxsense.vae.jmvae import annealed_beta
+from jaxsense.vae.readout import Readout
+
+_EMBEDDING = 64  # numbers that a network finds in a look
+_FIRST_ALPHA = 0.1  # before alpha sets in, single encoders follow the joint one and do not draw it
+_ALPHA_RAMP = 0.2  # of the training
+_LOG_VARIANCES = -10.0, 6.0
+_MOST_SHARPNESS = 4.0
+
+Drawn = tuple[jax.Array, jax.Array]
+"""Rows `[steps, B]`, and noise `[steps, M, D, B, K]`."""
+
+Groups = tuple[Float[Array, "P K _"], ...]
+"""For each modality `[P, K, F_m]`: K looks at each of P PoIs, in the frame of the sensor."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """Sizes of the networks; hashable, static under `jit`.
+
+    Attributes:
+      modalities: names.
+      inputs: F_m of each modality.
+      latent_size: D.
+      hidden: sizes of the hidden layers of the encoders and decoders.
+    """
+
+    modalities: tuple[str, ...]
+    inputs: tuple[int, ...]
+    latent_size: int
+    hidden: tuple[int, ...]
+
+    @property
+    def encoder(self) -> MLP:
+        """The network from one look to the mean and log-variance of its posterior."""
+        return MLP(self.hidden, 2 * self.latent_size)
+
+    @property
+    def embedding(self) -> MLP:
+        """The network from one look to what the posterior of several looks reads of it."""
+        return MLP(self.hidden[:1], _EMBEDDING)
+
+    @property
+    def joint(self) -> MLP:
+        """The network from the means of these to the posterior of all looks."""
+        return MLP(self.hidden[-1:], 2 * self.latent_size)
+
+    def decoder(self, modality: int) -> MLP:
+        """The network from a latent to one look."""
+        return MLP(self.hidden, self.inputs[modality])
+
+
+def init(key: Key, shape: Shape) -> Params:
+    """Random parameters, `{"encoders": {NAME: ...}, "embeddings", "decoders", "joint"}`.
+
+    Args:
+      key: random key.
+      shape: sizes of the networks.
+    """
+    joint_key, *keys = jax.random.split(key, 1 + 3 * len(shape.inputs))
+    each = list(zip(shape.modalities, shape.inputs, strict=True))
+    parts = {"encoders": shape.encoder, "embeddings": shape.embedding}
+    rows = iter(keys)
+    params: dict[str, Params] = {
+        part: {name: networks.init(next(rows), network, size) for name, size in each}
+        for part, network in parts.items()
+    }
+    params["decoders"] = {
+        name: networks.init(next(rows), shape.decoder(m), shape.latent_size)
+        for m, name in enumerate(shape.modalities)
+    }
+    params["joint"] = networks.init(joint_key, shape.joint, _EMBEDDING * len(each))
+    return params
+
+
+def posterior(params: Params, shape: Shape, looks: tuple[Float[Array, "K _"], ...]) -> Belief:
+    """Posterior `q(z | all looks)` at one PoI.
+
+    Args:
+      params: from `init` or a training.
+      shape: sizes of the networks.
+      looks: for each modality `[K, F_m]` one look or more, in the frame of the sensor.
+    """
+    means = [
+        jnp.mean(_embed(params, shape, m, x.T), axis=1, keepdims=True) for m, x in enumerate(looks)
+    ]
+    mean, log_variance = _joint(params, shape, means)
+    return Belief(mean[:, 0], jnp.exp(0.5 * log_variance[:, 0]))
+
+
+def losses(
+    noise: Float[Array, "M D B K"],
+    params: Params,
+    shape: Shape,
+    looks: Groups,
+    *,
+    alpha: Float[Array, ""] | float,
+    beta: Float[Array, ""] | float,
+    has_begun: Float[Array, ""] | float,
+    reconstruction_weights: tuple[float, ...],
+) -> Float[Array, " B"]:
+    """Losses of a batch of PoIs, to minimise.
+
+    For each PoI with looks `x_mk`, `sum_mk -w_m / F_m log p(x_mk | z_mk)`, with `z_mk` drawn from
+    `q(z | all looks but x_mk)` and p a Gaussian of the variance at which these looks are likeliest;
+    plus `beta` times the divergences of these posteriors, and of that of all looks, from the prior;
+    plus `alpha` times the divergences of the posterior of all looks from those of single looks and
+    of sets of one by each sensor.
+
+    Args:
+      noise: `[M, D, B, K]` standard normal draws.
+      params: from `init`.
+      shape: sizes of the networks.
+      looks: K looks by each sensor at each of B PoIs.
+      alpha: weight of the divergences to the posteriors of fewer looks.
+      beta: weight of the divergences from the prior.
+      has_begun: from 0, where these posteriors follow that of all looks without drawing it, to 1.
+      reconstruction_weights: w_m.
+    """
+    number = looks[0].shape[1]
+    columns = [jnp.moveaxis(x, -1, 0) for x in looks]  # [F, B, K]
+    found = [_embed(params, shape, m, x) for m, x in enumerate(columns)]
+    means = [x.mean(axis=-1) for x in found]
+    mean, log_variance = _joint(params, shape, means)
+    total = beta * _divergence(mean, log_variance, 0.0, 0.0)
+    fixed = jax.lax.stop_gradient((mean, log_variance))
+
+    def draws(mean_of_few: jax.Array, log_variance_of_few: jax.Array) -> jax.Array:
+        few = mean_of_few, log_variance_of_few
+        drawn = _divergence(mean[..., None], log_variance[..., None], *few)
+        follows = _divergence(fixed[0][..., None], fixed[1][..., None], *few)
+        weighted = has_begun * alpha * drawn + (1 - has_begun) * _FIRST_ALPHA * follows
+        return jnp.sum(weighted, axis=-1)
+
+    for m, x in enumerate(columns):
+        # Of the others, at least one.
+        left = (means[m][..., None] * number - found[m]) / max(number - 1, 1)
+        others = [left if i == m else _each(means[i], number) for i in range(len(columns))]
+        mean_of_others, log_variance_of_others = _joint(params, shape, others)
+        total += beta * jnp.mean(
+            _divergence(mean_of_others, log_variance_of_others, 0.0, 0.0), axis=-1
+        )
+        z = gaussian.sample(noise[m], mean_of_others, log_variance_of_others)
+        decoder = params["decoders"][shape.modalities[m]]
+        error = jnp.sum((x - _columns(shape.decoder(m), decoder, z)) ** 2, axis=0)
+        variance = jax.lax.stop_gradient(jnp.mean(error) / len(x))
+        weight = reconstruction_weights[m] / len(x)
+        total += 0.5 * weight * jnp.sum(error, axis=-1) / variance
+        total += draws(*_alone(params, shape, m, x))
+    return total + draws(*_joint(params, shape, found))
+
+
+@pytree
+class Fitting:
+    """Problem of fitting the JMVAE to groups of looks.
+
+    Attributes:
+      config: weights, batch, learning rate and steps.
+      groups: looks at PoIs, each sensor's in its frame.
+      shape: sizes of the networks.
+    """
+
+    config: JmvaeConfig
+    groups: Groups
+    shape: Shape = struct.field(pytree_node=False)
+
+    def draw(self, key: Key, number: int) -> Drawn:
+        """Draws PoIs and noise.
+
+        Args:
+          key: random key.
+          number: of steps; static.
+        """
+        row_key, noise_key = jax.random.split(key)
+        batch, looks = self.config.batch, self.groups[0].shape[1]
+        rows = jax.random.randint(row_key, (number, batch), 0, len(self.groups[0]))
+        size = (number, len(self.groups), self.shape.latent_size, batch, looks)
+        return rows, jax.random.normal(noise_key, size)
+
+    def loss(self, params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
+        """Mean of the `losses` of a batch.
+
+        Args:
+          params: of the networks.
+          drawn: one step of `draw`.
+          step: `[]` int32, which determines alpha and beta.
+        """
+        rows, noise = drawn
+        share = step / self.config.steps
+        has_begun = jnp.clip((share - self.config.alpha_start) / _ALPHA_RAMP, 0.0, 1.0)
+        of_each = losses(
+            noise,
+            params,
+            self.shape,
+            tuple(x[rows] for x in self.groups),
+            alpha=self.config.alpha,
+            beta=annealed_beta(step, self.config),
+            has_begun=has_begun,
+            reconstruction_weights=self.config.reconstruction_weights,
+        )
+        return jnp.mean(of_each)
+
+
+@pytree
+class Encoder:
+    """A detector that has learned without labels: the encoder of single looks.
+
+    Attributes:
+      params: of the encoder.
+      scaling: the frame in which it sees windows.
+      gate: tells which windows show a PoI.
+      classes: `[C, D]` mean joint posterior of each class.
+      readout: reads class probabilities from posteriors.
+      prior: `[D]` belief before any look.
+      sharpness: `[]` factor on the log-probabilities of the labels, see `calibrate`.
+      shape: sizes of the networks.
+      label_of_class: label of each class, which names what it has learned.
+    """
+
+    params: Params
+    scaling: Scaling
+    gate: Gate
+    classes: Belief
+    readout: Readout
+    prior: Belief
+    sharpness: Float[Array, ""]
+    shape: Shape = struct.field(pytree_node=False)
+    label_of_class: tuple[int, ...] = struct.field(pytree_node=False)
+
+    @property
+    def num_labels(self) -> int:
+        """D_m, the number of labels."""
+        return max(self.label_of_class) + 1
+
+    def posterior(self, window: Float[Array, " F"]) -> Belief:
+        """Posterior `q(z | one look)`.
+
+        Args:
+          window: `[F]` readings around the PoI's bearing.
+        """
+        output = networks.apply(self.shape.encoder, self.params, self.scaling(window))
+        mean, log_variance = _split(output)
+        return Belief(mean, jnp.exp(0.5 * log_variance))
+
+    def features(self, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
+        """Probabilities of the labels, read from the posterior of the look.
+
+        Args:
+          window: `[F]` readings around the PoI's bearing.
+        """
+        return jax.nn.softmax(self.sharpness * self._log_probabilities(window))
+
+    def _log_probabilities(self, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
+        of_class = self.readout.class_probabilities(self.posterior(window), self.prior)
+        has_label = jnp.array(self.label_of_class)[:, None] == jnp.arange(self.num_labels)[None]
+        return jnp.log(jnp.sum(jnp.where(has_label, of_class[:, None], 0.0), axis=0))
+
+
+def calibrate(encoder: Encoder, windows: Float[Array, "S F"], classes: Int[Array, " S"]) -> Encoder:
+    """An encoder whose sharpness makes what all looks at the PoIs show most likely.
+
+    A posterior is learned, so its moments are slightly off, and with them small probabilities.
+
+    Args:
+      encoder: trained.
+      windows: `[S, F]` single looks.
+      classes: `[S]` int32 what all looks at their PoIs show together.
+    """
+    found = jax.vmap(encoder._log_probabilities)(windows)
+    labels = jnp.array(encoder.label_of_class)[classes]
+
+    def loss(sharpness: jax.Array) -> jax.Array:
+        losses = optax.softmax_cross_entropy_with_integer_labels(sharpness * found, labels)
+        return jnp.mean(losses)
+
+    each = jnp.geomspace(1 / _MOST_SHARPNESS, _MOST_SHARPNESS, 257)
+    return dataclasses.replace(encoder, sharpness=each[jnp.argmin(jax.lax.map(loss, each))])
+
+
+def _columns(network: MLP, params: Params, x: jax.Array) -> jax.Array:
+    """Applies a network to `[F, ...]` with any number of examples."""
+    found = networks.apply(network, params, x.reshape(len(x), -1))
+    return found.reshape(-1, *x.shape[1:])
+
+
+def _split(output: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean and log-variance, `[D, ...]` each."""
+    mean, log_variance = jnp.split(output, 2)
+    return mean, jnp.clip(log_variance, *_LOG_VARIANCES)
+
+
+def _embed(params: Params, shape: Shape, m: int, x: jax.Array) -> jax.Array:
+    return jax.nn.relu(_columns(shape.embedding, params["embeddings"][shape.modalities[m]], x))
+
+
+def _alone(params: Params, shape: Shape, m: int, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return _split(_columns(shape.encoder, params["encoders"][shape.modalities[m]], x))
+
+
+def _joint(params: Params, shape: Shape, means: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
+    return _split(_columns(shape.joint, params["joint"], jnp.concatenate(means)))
+
+
+def _each(x: jax.Array, number: int) -> jax.Array:
+    """`[..., K]` copies."""
+    return jnp.broadcast_to(x[..., None], (*x.shape, number))
+
+
+def _divergence(mean, log_variance, mean_2, log_variance_2) -> jax.Array:
+    """Divergence of Gaussians whose dimensions are the first axis."""
+    ratio = jnp.exp(log_variance - log_variance_2)
+    distance = (mean - mean_2) ** 2 * jnp.exp(-jnp.asarray(log_variance_2))
+    return 0.5 * jnp.sum(ratio + distance - 1.0 - log_variance + log_variance_2, axis=0)
