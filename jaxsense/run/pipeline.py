@@ -137,12 +137,18 @@ def run(
             "detectors": jax.tree.map(
                 lambda x: np.asarray(x).tolist(), trained.outputs["detector_metrics"]
             ),
-            "jmvae": summary.jmvae(vars(latent)),
+            "jmvae": summary.jmvae(vars(latent) | _grouped(trained)),
             "belief": beliefs,
             "dqn": {name: _agent(config, name, trained, is_sound) for name in config.modalities},
             "mission": summary.missions(player.mission, found.metrics),
         },
     )
+
+
+def _grouped(trained: Trained) -> dict[str, object]:
+    """What is measured of a JMVAE that learns from scans, and of no other."""
+    found = trained.outputs.get("grouped")
+    return {} if found is None else {"grouped": found}
 
 
 def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> summary.Agent:

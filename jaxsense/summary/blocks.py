@@ -56,6 +56,17 @@ class Fusion(TypedDict):
     ]
 
 
+class Grouped(TypedDict):
+    """`jmvae.grouped`: joint posteriors of a JMVAE that learns from scans, at held-out PoIs."""
+
+    pair: Annotated[
+        float, Metric("right, of one look each", "Share nearest to the true class, by cluster.", 4)
+    ]
+    all_looks: Annotated[
+        float, Metric("right, of all looks", "The same after `jmvae.looks` by each sensor.", 4)
+    ]
+
+
 class Jmvae(TypedDict):
     """`jmvae`: the latent space."""
 
@@ -95,6 +106,7 @@ class Jmvae(TypedDict):
         ),
     ]
     fusion: Fusion
+    grouped: NotRequired[Grouped]
 
 
 class Beliefs(TypedDict):

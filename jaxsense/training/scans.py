@@ -60,7 +60,7 @@ def make_stages(config: Config) -> list[Stage]:
         Stage("class_beliefs", class_beliefs, {**learned, "surveys": "survey"}),
         *(_encoder_stage(m, name, config) for m, name in enumerate(detectors)),
         Stage("detections", detect, {**clustered, "trained": detectors}),
-        Stage("scan_metrics", accuracies, clustered),
+        Stage("grouped", accuracies, clustered),
     ]
 
 

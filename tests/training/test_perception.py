@@ -137,7 +137,7 @@ def test_of_inexact_restarts_the_most_exact_is_kept(monkeypatch):
 def surveys(monkeypatch) -> Surveys:
     """Surveys whose windows, and scenes, hold the key that the scene was simulated with."""
 
-    def survey(keys, world, classes, is_empty):
+    def survey(keys, world, classes, is_empty, places):
         key = jax.random.key_data(keys)[:, -1].astype(jnp.uint32)
         windows = jnp.broadcast_to(key[:, None, None], (*classes.shape, 1))
         number, num_pois = classes.shape
