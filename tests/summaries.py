@@ -45,6 +45,8 @@ OF_SEEDS = {
     "failed": {"90211": "jmvae: loss at step 1 of 2 is not finite"},
 }
 OF_A_TEAM = {**SUMMARY, "dqn": {"camera": {**AGENT, "other_numbers": {"8": RETURNS}}}}
+GROUPED = {"pair": 0.9995, "all_looks": 1.0}
+OF_SCANS = {**SUMMARY, "jmvae": {**SUMMARY["jmvae"], "grouped": GROUPED}}
 EVALUATION = {
     "num_pois": 16,
     "side": 6.0,

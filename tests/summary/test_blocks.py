@@ -4,13 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
-from summaries import BYTES, CASE, EVALUATION, OF_A_TEAM, OF_SEEDS, SUMMARY
+from summaries import BYTES, CASE, EVALUATION, OF_A_TEAM, OF_SCANS, OF_SEEDS, SUMMARY
 
 from jaxsense.summary import BLOCKS, metrics
 
 KEYS = {place + key for place, block in BLOCKS.items() for key in block}
-# Only in some runs: of several seeds, of a team, or of one robot alone.
+# Only in some runs: of several seeds, of a team, from scans, or of one robot alone.
 RARE = {"seeds", "failed", "dqn.MODALITY.other_numbers", "mission.POLICY.seed"}
+RARE |= {"jmvae.grouped.pair", "jmvae.grouped.all_looks"}
 RARE |= {f"mission.POLICY.{key}" for key in ("told", "ambiguous_reported")}
 RARE |= {f"evaluations.NAME.{key}" for key in ("num_pois", "side", "robots")}
 OF_ALL_NAIVE = {key for key in KEYS if ".of_naive." in key}
@@ -40,7 +41,7 @@ def test_every_rare_key_is_somewhere():
     of_naive = dict.fromkeys(("observations_per_poi", "time_s", "mean_time_s"), 0.5)
     alone = {**CASE, "seed": 7, "of_naive": of_naive, "told": 1.0, "ambiguous_reported": None}
     evaluation = {**EVALUATION, "mission": {"camera_alone": alone, "bytes_per_detection": BYTES}}
-    found = keys(OF_SEEDS) | keys(OF_A_TEAM)
+    found = keys(OF_SEEDS) | keys(OF_A_TEAM) | keys(OF_SCANS)
     found |= {key if key in KEYS else f"evaluations.NAME.{key}" for key in keys(evaluation)}
     assert RARE | OF_ALL_NAIVE <= found <= KEYS
 

@@ -156,10 +156,12 @@ def test_scenes_are_as_empty_whoever_works_them_out(surveys):
     listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
     scenes = listed["scenes"].begin(KEY, MEASURED)
     half = len(scenes[0]) // 2
-    parts = [
-        listed["survey"].begin(KEY, MEASURED, scenes=tuple(x[part] for x in scenes))
-        for part in (slice(half), slice(half, None))
-    ]
+
+    def survey(part):
+        rows = jax.tree.map(lambda x: x[part], scenes)
+        return listed["survey"].begin(KEY, MEASURED, scenes=rows)
+
+    parts = [survey(slice(half)), survey(slice(half, None))]
     together = np.concatenate([part.distances for part in parts])
     np.testing.assert_array_equal(together, surveys.distances)
     assert (together[:half] == 1).all()

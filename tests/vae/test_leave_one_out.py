@@ -1,0 +1,167 @@
+"""The JMVAE of scans: its loss against a plain one in NumPy, and what its encoders know."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense.config import JmvaeConfig
+from jaxsense.core.types import Belief
+from jaxsense.vae import frames, leave_one_out, readout
+from jaxsense.vae import gate as gates
+from jaxsense.vae.leave_one_out import Encoder, Shape
+
+SHAPE = Shape(("camera", "lidar"), (3, 5), latent_size=2, hidden=(4,))
+NUMBER, POIS = 3, 2
+KEY = jax.random.key(0)
+PARAMS = leave_one_out.init(KEY, SHAPE)
+LOOKS = tuple(
+    jax.random.normal(jax.random.fold_in(KEY, m), (POIS, NUMBER, size))
+    for m, size in enumerate(SHAPE.inputs)
+)
+NOISE = jax.random.normal(jax.random.fold_in(KEY, 9), (2, 2, POIS, NUMBER))
+WEIGHTS = 6.0, 15.0
+
+
+def dense(params, x, has_relu=True):
+    """A network of `core.networks`, in NumPy."""
+    layers = list(params["params"].values())
+    for i, layer in enumerate(layers):
+        x = np.asarray(layer["kernel"]).T @ x + np.asarray(layer["bias"])
+        if i < len(layers) - 1:
+            x = np.maximum(x, 0)
+    return x
+
+
+def joint(looks):
+    """Mean and log-variance from a list of looks by each sensor."""
+    means = []
+    for name, given in zip(SHAPE.modalities, looks, strict=True):
+        found = [np.maximum(dense(PARAMS["embeddings"][name], x), 0) for x in given]
+        means.append(np.mean(found, axis=0))
+    return np.split(dense(PARAMS["joint"], np.concatenate(means)), 2)
+
+
+def divergence(p, q):
+    (mean, log_var), (mean_2, log_var_2) = p, q
+    ratio = np.exp(log_var - log_var_2)
+    return 0.5 * np.sum(ratio + (mean - mean_2) ** 2 / np.exp(log_var_2) - 1 - log_var + log_var_2)
+
+
+def plain_losses(alpha, beta):
+    """The loss of each PoI as its docstring has it, one look after the other."""
+    x = [np.asarray(of_sensor) for of_sensor in LOOKS]
+    normal = np.zeros(2), np.zeros(2)
+    errors, losses = np.zeros((2, POIS, NUMBER)), np.zeros(POIS)
+    for b in range(POIS):
+        every = joint([x[0][b], x[1][b]])
+        losses[b] += beta * divergence(every, normal)
+        for m, name in enumerate(SHAPE.modalities):
+            for k in range(NUMBER):
+                others = [list(x[0][b]), list(x[1][b])]
+                del others[m][k]
+                of_others = joint(others)
+                losses[b] += beta * divergence(of_others, normal) / NUMBER
+                z = of_others[0] + np.exp(0.5 * of_others[1]) * np.asarray(NOISE[m, :, b, k])
+                decoded = dense(PARAMS["decoders"][name], z)
+                errors[m, b, k] = np.sum((x[m][b, k] - decoded) ** 2)
+                alone = np.split(dense(PARAMS["encoders"][name], x[m][b, k]), 2)
+                losses[b] += alpha * divergence(every, alone)
+        for k in range(NUMBER):
+            pair = joint([[x[0][b, k]], [x[1][b, k]]])
+            losses[b] += alpha * divergence(every, pair)
+    for m, size in enumerate(SHAPE.inputs):
+        variance = np.mean(errors[m]) / size
+        losses += 0.5 * WEIGHTS[m] / size * errors[m].sum(axis=1) / variance
+    return losses
+
+
+def losses_of(params, **changed):
+    given = {"alpha": 0.7, "beta": 0.3, "has_begun": 1.0, "reconstruction_weights": WEIGHTS}
+    return leave_one_out.losses(NOISE, params, SHAPE, LOOKS, **{**given, **changed})
+
+
+@pytest.mark.parametrize(("alpha", "beta"), [(0.0, 0.0), (0.7, 0.3)])
+def test_the_loss_is_the_plain_one(alpha, beta):
+    found = losses_of(PARAMS, alpha=alpha, beta=beta)
+    np.testing.assert_allclose(found, plain_losses(alpha, beta), rtol=2e-5)
+
+
+def test_before_alpha_sets_in_the_joint_encoder_does_not_feel_the_others():
+    def of_joint(**changed):
+        gradient = jax.grad(lambda params: jnp.sum(losses_of(params, **changed)))(PARAMS)
+        return jax.tree.leaves((gradient["joint"], gradient["embeddings"]))
+
+    without = of_joint(alpha=0.0)
+    for gradient, expected in zip(of_joint(alpha=5.0, has_begun=0.0), without, strict=True):
+        # Sets of one look by each sensor are encoded by the same network, and follow.
+        assert gradient.shape == expected.shape
+    alone = jax.grad(lambda params: jnp.sum(losses_of(params, has_begun=0.0)))(PARAMS)["encoders"]
+    assert all(np.abs(x).max() > 0 for x in jax.tree.leaves(alone))
+
+
+def test_the_posterior_takes_any_number_of_looks_in_any_order():
+    looks = tuple(x[0] for x in LOOKS)
+    found = leave_one_out.posterior(PARAMS, SHAPE, looks)
+    mean, log_var = joint(looks)
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found.std, np.exp(0.5 * log_var), rtol=1e-5)
+    turned = leave_one_out.posterior(PARAMS, SHAPE, (looks[0][::-1], looks[1][jnp.array([1, 0])]))
+    fewer = leave_one_out.posterior(PARAMS, SHAPE, (looks[0], looks[1][:2]))
+    np.testing.assert_allclose(turned.mean, fewer.mean, rtol=1e-5, atol=1e-6)
+
+
+def test_fitting_draws_rows_and_lowers_the_loss():
+    config = JmvaeConfig(
+        learns_from="scans", fusion="filter", hidden=(4,), steps=200, batch=16, alpha_start=0.5
+    )
+    problem = leave_one_out.Fitting(config, LOOKS, SHAPE)
+    rows, noise = problem.draw(KEY, 5)
+    assert rows.shape == (5, 16)
+    assert noise.shape == (5, 2, 2, 16, NUMBER)
+    assert set(np.unique(rows)) == {0, 1}
+    before, after = (problem.loss(PARAMS, (rows[0], noise[0]), jnp.int32(s)) for s in (99, 140))
+    # Alpha has set in at 0.7 of the training.
+    assert before != after
+
+
+# Two labels on each axis of the latent space; the encoder reads the first number of a window.
+CLASSES = Belief(jnp.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]]), jnp.full((3, 2), 0.3))
+
+
+def encoder_of(sharpness=1.0) -> Encoder:
+    shape = Shape(("camera",), (1,), latent_size=2, hidden=())
+    kernel = jnp.array([[1.0, 0.0, 0.0, 0.0]])
+    # q(z | x): first latent known, second that of either class.
+    bias = jnp.array([0.0, 0.0, 2 * np.log(0.3), 2 * np.log(np.sqrt(1 + 0.09))])
+    params = {"params": {"Dense_0": {"kernel": kernel, "bias": bias}}}
+    prior = Belief(jnp.zeros(2), jnp.full(2, np.sqrt(20.0)))
+    gate = gates.init(KEY, jnp.zeros(1), jnp.float32(1.0), measures_distance=False)
+    scaling = frames.Scaling(frames.Plain(), jnp.zeros(1), jnp.float32(1.0))
+    return Encoder(
+        params, scaling, gate, CLASSES, readout.make(CLASSES, 2), prior,
+        jnp.float32(sharpness), shape, label_of_class=(0, 0, 1),
+    )  # fmt: skip
+
+
+def test_features_are_probabilities_of_labels_read_from_the_posterior():
+    encoder = encoder_of()
+    assert encoder.num_labels == 2
+    left = encoder.features(jnp.array([-1.0]))
+    np.testing.assert_allclose(left.sum(), 1.0, rtol=1e-6)
+    assert left[0] > 0.99
+    sharper = encoder_of(2.0).features(jnp.array([-0.6]))
+    found = encoder.features(jnp.array([-0.6]))
+    np.testing.assert_allclose(sharper, found**2 / np.sum(np.asarray(found) ** 2), rtol=1e-4)
+
+
+def test_calibration_finds_how_sharp_labels_are():
+    encoder = encoder_of()
+    windows = jnp.concatenate([jnp.full((90, 1), -0.4), jnp.full((10, 1), -0.4)])
+    classes = jnp.repeat(jnp.array([0, 2]), jnp.array([90, 10]))
+    found = leave_one_out.calibrate(encoder, windows, classes)
+    # Nine of ten looks like this one show the first label.
+    np.testing.assert_allclose(found.features(windows[0])[0], 0.9, atol=0.01)
+    assert dataclasses.replace(found, sharpness=encoder.sharpness).features is not None
