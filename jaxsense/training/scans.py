@@ -76,7 +76,7 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
     number = perception.num_scenes(config)[0]
     found, scalings = [], []
     for sensor, windows in zip(sensors.make(config), surveys.windows, strict=True):
-        groups = _grouped(windows[:number], config)
+        groups = grouped(windows[:number], config)
         flat = groups.reshape(-1, groups.shape[-1])
         scaling, seen = frames.scaled(make_frame(sensor), flat)
         found.append(seen.reshape(*groups.shape[:2], -1))
@@ -84,8 +84,13 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
     return Views(tuple(found), tuple(scalings))
 
 
-def _grouped(windows: Float[Array, "S N F"], config: Config) -> Float[Array, "P K F"]:
-    """Looks grouped by PoI; K scenes in a row show the same PoIs."""
+def grouped(windows: Float[Array, "S N F"], config: Config) -> Float[Array, "P K F"]:
+    """Looks grouped by PoI.
+
+    Args:
+      windows: `[S, N, F]` of scenes of which K in a row show the same PoIs.
+      config: all settings.
+    """
     looks, (_, num_pois, size) = config.jmvae.num_together, windows.shape
     return jnp.swapaxes(windows.reshape(-1, looks, num_pois, size), 1, 2).reshape(-1, looks, size)
 
@@ -199,7 +204,7 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
         )
         some = tuple(x[:_CALIBRATING] for x in views.groups)
         shown = clusters.nearest(_posteriors(params, config, some).mean, classes.mean)
-        looks = _grouped(given.windows.reshape(-1, config.arena.num_pois, len(gate.offset)), config)
+        looks = grouped(given.windows.reshape(-1, config.arena.num_pois, len(gate.offset)), config)
         return leave_one_out.calibrate(encoder, looks[:_CALIBRATING, 0], shown)
 
     return fit_stage(
@@ -261,7 +266,7 @@ def _shown(
 ) -> jax.Array:
     """`[P]` int32 classes that the first looks by each sensor, or all, show together."""
     groups = tuple(
-        jax.lax.map(jax.vmap(scaling), _grouped(x[part], config)[:, :first], batch_size=512)
+        jax.lax.map(jax.vmap(scaling), grouped(x[part], config)[:, :first], batch_size=512)
         for scaling, x in zip(views.scalings, surveys.windows, strict=True)
     )
     return clusters.nearest(_posteriors(params, config, groups).mean, classes.mean)

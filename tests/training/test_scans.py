@@ -76,7 +76,7 @@ def test_the_same_pois_stand_in_another_light():
 def test_groups_hold_all_looks_at_one_poi():
     # 6 scenes, 2 groups of 3 looks; 4 PoIs, windows of 2 numbers.
     windows = jnp.arange(6 * 4 * 2.0).reshape(6, 4, 2)
-    found = scans._grouped(windows, TINY)
+    found = scans.grouped(windows, TINY)
     assert found.shape == (8, 3, 2)
     np.testing.assert_array_equal(found[5], windows[3:6, 1])
 
