@@ -10,8 +10,10 @@ Your own recording can come from anywhere. It must hold, for C PoIs:
     places      [C, 2]       their positions, in metres
     NAME_poses  [C, 3]       from where the sensor NAME looked: x, y in metres and yaw in radians
     NAME_scans  [C, B, ...]  what all its B rays read
+    NAME_angles [B]          their directions in radians, if they are not those of the run
 
-A run with custom sensors needs `--trust`, because their functions are imported.
+A sensor may be missing. Scans along other rays are resampled; `laser_logs.py` makes some of real
+ones. A run with custom sensors needs `--trust`, because their functions are imported.
 """
 
 import argparse
@@ -24,39 +26,24 @@ import numpy as np
 
 import jaxsense
 from jaxsense import sim
+from jaxsense.run import recordings
+from jaxsense.run.recordings import RecordedLooks
 
 
-def check(config: jaxsense.Config, recorded: dict[str, np.ndarray]) -> None:
-    """Raises `ValueError` if a recording lacks something or has another shape."""
-    shapes = {"places": (2,)}
-    for sensor in sim.sensors.make(config):
-        channels = () if sensor.channels == 1 else (sensor.channels,)
-        shapes[f"{sensor.name}_poses"] = (3,)
-        shapes[f"{sensor.name}_scans"] = (len(sensor.angles), *channels)
-    for name, shape in shapes.items():
-        if name not in recorded:
-            raise ValueError(f"{name} is missing; a recording holds {', '.join(shapes)}")
-        found, expected = recorded[name], ", ".join(("C", *map(str, shape)))
-        if found.dtype.kind not in "fiu":
-            raise ValueError(f"{name} must hold numbers, not {found.dtype}")
-        if found.shape != (*recorded["places"].shape[:1], *shape):
-            raise ValueError(
-                f"{name} has the shape {found.shape}; must be ({expected}) for C places"
-            )
-
-
-def read(config: jaxsense.Config, models: jaxsense.Models, recorded: dict[str, np.ndarray]) -> None:
-    """Prints what the map makes of a recording."""
+def read(config: jaxsense.Config, models: jaxsense.Models, looks: RecordedLooks) -> None:
+    """Prints what the map makes of recorded looks."""
     fusion, sensors = models.fusion, sim.sensors.make(config)
-    for n, place in enumerate(recorded["places"]):
+    views = {name: looks.seen_from(name) for name in looks.scans}
+    for n in range(len(looks.positions)):
         print(f"PoI {n + 1}")
         belief, seen = fusion.prior, np.zeros(len(sensors), bool)
         for m, sensor in enumerate(sensors):
+            if sensor.name not in views:
+                continue
             # What the look says of the PoI, which may be that there is nothing.
-            pose = recorded[f"{sensor.name}_poses"][n]
-            bearing, distance = sim.bearing(pose, place), np.linalg.norm(place - pose[:2])
-            scan = recorded[f"{sensor.name}_scans"][n]
-            detection = models.detect(m, sensor, scan, bearing, jnp.float32(distance))
+            bearing, distance = (jnp.float32(values[n]) for values in views[sensor.name])
+            scan = looks.scans[sensor.name][n]
+            detection = models.detect(m, sensor, scan, bearing, distance)
             if not detection.is_there:
                 print(f"  {sensor.name}: nothing there")
                 continue
@@ -125,10 +112,7 @@ def main(argv: list[str] | None = None) -> None:
             with arguments.recording.open("xb") as file:
                 np.savez(file, **found)
             return
-        with np.load(arguments.recording, allow_pickle=False) as recorded:
-            arrays = dict(recorded)
-        check(config, arrays)
-        read(config, models, arrays)
+        read(config, models, recordings.read(config, arguments.recording))
     except (OSError, ValueError) as error:
         sys.exit(f"recorded_scans: {error}")
 

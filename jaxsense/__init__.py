@@ -35,4 +35,5 @@ from jaxsense.models import make_in_place as make_in_place
 from jaxsense.models import make_jmvae as make_jmvae
 from jaxsense.run.rundir import load as load
 from jaxsense.run.version import __version__ as __version__
+from jaxsense.show.scans import compare_scans as compare_scans
 from jaxsense.training import learn as learn

@@ -322,7 +322,7 @@ def test_every_setting_has_a_sentence_of_help():
 
 
 def test_presets_are_configurations():
-    assert set(PRESETS) == {"default", "paper", "noisy", "many", "team", "smoke"}
+    assert set(PRESETS) == {"default", "paper", "noisy", "many", "team", "recorded", "smoke"}
     assert all(isinstance(preset, Config) for preset in PRESETS.values())
     assert PRESETS["default"].dqn.observe == "live"
     assert PRESETS["paper"].dqn.observe == "bank"

@@ -184,7 +184,14 @@ _MANY = dataclasses.replace(
     ),
 )
 
-PresetName = Literal["default", "paper", "noisy", "many", "raw", "team", "smoke"]
+# `sim.recorded.fit_noise` of 704 laser scans, see `docs/recorded.md`.
+_RECORDED = Config(
+    lidar=LidarConfig(
+        range_noise=0.0048, range_noise_growth=0.0005, mixed_pixels=0.2, dropout=0.00024
+    )
+)
+
+PresetName = Literal["default", "paper", "noisy", "many", "raw", "team", "recorded", "smoke"]
 """The names of `PRESETS`."""
 
 PRESETS: Mapping[str, Config] = FrozenDict(
@@ -195,6 +202,7 @@ PRESETS: Mapping[str, Config] = FrozenDict(
         "many": _MANY,
         "raw": _RAW,
         "team": _TEAM,
+        "recorded": _RECORDED,
         "smoke": _SMOKE,
     }
 )
@@ -202,6 +210,6 @@ PRESETS: Mapping[str, Config] = FrozenDict(
 chosen to reproduce its figures, see `docs/differences.md`. `noisy`: sensors that are often
 uncertain, and beliefs that accumulate looks. `many`: sixteen classes of four colours and four
 shapes, with sensors such as those of `noisy` and a team. `raw`: as `default`, but the JMVAE learns
-from scans themselves, without detectors or labels. `team`: one policy for any number of PoIs
-and robots that takes travel time into account. `smoke`: the whole pipeline in seconds, for
-tests."""
+from scans themselves, without detectors or labels. `team`: one policy for any number of PoIs and
+robots that takes travel time into account. `recorded`: `default` with the noise of a real laser
+scanner. `smoke`: the whole pipeline in seconds, for tests."""

@@ -8,6 +8,7 @@ from jaxsense.vae.detectors import Detection as Detection
 from jaxsense.vae.detectors import Detector as Detector
 from jaxsense.vae.detectors import answer as answer
 from jaxsense.vae.detectors import detect as detect
+from jaxsense.vae.detectors import retrain as retrain
 from jaxsense.vae.filter import Filter as Filter
 from jaxsense.vae.fusion import InPlace as InPlace
 from jaxsense.vae.fusion import fuse as fuse

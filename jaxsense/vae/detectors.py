@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import DetectorConfig
-from jaxsense.core import networks
+from jaxsense.core import networks, supervised
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Key, pytree
 from jaxsense.vae import gate as gates
@@ -189,6 +189,35 @@ class Fitting:
         predicted = networks.apply(_network(detector), params, standard.T)
         cross_entropy = optax.softmax_cross_entropy_with_integer_labels
         return cross_entropy(predicted, self.labels[drawn], 0).mean()
+
+
+RETRAINING = DetectorConfig(steps=200, batch=64, learning_rate=1e-4)
+"""Settings of `retrain`: short and slow, so that few windows do not replace what was learned."""
+
+
+def retrain(
+    key: Key,
+    detector: Detector,
+    windows: Float[Array, "S F"],
+    labels: Int[Array, " S"],
+    config: DetectorConfig = RETRAINING,
+) -> Detector:
+    """Continues the training of a detector with other windows, for example 200 recorded ones.
+
+    Args:
+      key: random key.
+      detector: a trained detector.
+      windows: `[S, F]` windows that show PoIs, see `sim.cut_out`.
+      labels: `[S]` int32 their labels.
+      config: batch, learning rate and steps; static.
+
+    Returns:
+      The detector with other parameters; its gate is the same.
+    """
+    chex.assert_equal_shape_prefix([windows, labels], 1)
+    problem = Fitting(config, detector, windows, labels)
+    fit, _ = supervised.fit(key, supervised.start(detector.params, config), problem, config.steps)
+    return dataclasses.replace(detector, params=fit.params)
 
 
 def calibrate(

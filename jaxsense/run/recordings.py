@@ -1,0 +1,109 @@
+"""Recordings: looks of real sensors in one file, checked against the sensors of a run."""
+
+import dataclasses
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsense.config import Config
+from jaxsense.sim import recorded, sensors
+from jaxsense.sim.sensors import Sensor
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedLooks:
+    """Looks at C PoIs by some or all sensors of a run.
+
+    Attributes:
+      positions: `[C, 2]` of the PoIs, in metres.
+      poses: for each sensor `[C, 3]` from where it looked: x [m], y [m] and yaw [rad].
+      scans: for each sensor `[C, B, ...]` readings of its rays, NaN where none was recorded.
+    """
+
+    positions: Float[np.ndarray, "C 2"]
+    poses: Mapping[str, Float[np.ndarray, "C 3"]]
+    scans: Mapping[str, Float[np.ndarray, "C B *channels"]]
+
+    def seen_from(self, name: str) -> tuple[Float[np.ndarray, " C"], Float[np.ndarray, " C"]]:
+        """Bearing, in radians, and distance, in metres, of each PoI from a sensor.
+
+        Args:
+          name: of the sensor.
+        """
+        x, y = (self.positions - self.poses[name][:, :2]).T
+        turned = np.arctan2(y, x) - self.poses[name][:, 2]
+        bearing = (turned + np.pi) % (2 * np.pi) - np.pi
+        return bearing.astype(np.float32), np.hypot(x, y).astype(np.float32)
+
+
+def read(config: Config, file: Path | str) -> RecordedLooks:
+    """Reads a recording, a file of NumPy's format `.npz`.
+
+    For C PoIs it holds:
+
+        places       [C, 2]       their positions, in metres
+        NAME_poses   [C, 3]       from where the sensor NAME looked: x, y in metres, yaw in radians
+        NAME_scans   [C, A, ...]  what all its A rays read
+        NAME_angles  [A]          their directions in radians, if they are not those of the run
+
+    A sensor may be missing, but not all. Scans along other rays are resampled, see
+    `sim.recorded.resample`.
+
+    Args:
+      config: settings of the run.
+      file: the recording.
+
+    Raises:
+      OSError: if the file cannot be read.
+      ValueError: if it lacks something or has another shape, or its rays do not suffice.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as content:
+            found = dict(content)
+    except (zipfile.BadZipFile, TypeError, EOFError):
+        raise ValueError(f"{file} is not a whole file of NumPy's format .npz") from None
+    made = sensors.make(config)
+    parts = [f"{sensor.name}_{part}" for sensor in made for part in ("poses", "scans")]
+    some = [s for s in made if {f"{s.name}_poses", f"{s.name}_scans"} & {*found}] or made
+    needed = [f"{sensor.name}_{part}" for sensor in some for part in ("poses", "scans")]
+    for name in ("places", *needed):
+        if name not in found:
+            raise ValueError(f"{name} is missing; a recording holds places, {', '.join(parts)}")
+    _require_shape(found, "places", ("C", 2))
+    scans = {sensor.name: _scans(found, sensor) for sensor in some}
+    poses = {sensor.name: found[f"{sensor.name}_poses"] for sensor in some}
+    return RecordedLooks(found["places"], poses, scans)
+
+
+def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
+    """Checks the looks of one sensor; returns its scans along the sensor's rays."""
+    _require_shape(found, f"{sensor.name}_poses", ("C", 3))
+    name, angles = f"{sensor.name}_scans", f"{sensor.name}_angles"
+    channels = () if sensor.channels == 1 else (sensor.channels,)
+    if angles not in found:
+        others = f"; of other rays, {angles} must hold the angles, in radians"
+        _require_shape(found, name, ("C", len(sensor.angles), *channels), others)
+        return found[name]
+    _require_shape(found, angles, ("A",))
+    _require_shape(found, name, ("C", len(found[angles]), *channels))
+    return recorded.resample(sensor, found[angles], found[name])
+
+
+def _require_shape(
+    found: Mapping[str, np.ndarray], name: str, shape: tuple[int | str, ...], others: str = ""
+) -> None:
+    """Raises `ValueError` unless an array holds numbers in a shape, for C places or A rays."""
+    array = found[name]
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name} must hold numbers, not {array.dtype}")
+    sizes: dict[int | str, int | None] = {
+        "C": next(iter(found["places"].shape), None),
+        "A": array.size,
+    }
+    if array.shape != tuple(sizes.get(size, size) for size in shape):
+        text = f"({', '.join(map(str, shape))})".replace("(A)", "(A,)")
+        of_places = " for C places" if "C" in shape else ""
+        raise ValueError(f"{name} has the shape {array.shape}; must be {text}{of_places}{others}")

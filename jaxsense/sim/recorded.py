@@ -1,0 +1,286 @@
+"""Recorded scans: other rays than the simulated sensor's, the noise of a LiDAR, PoIs cast in.
+
+`insert` can be traced; the other functions read recordings on the host.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsense.config import ArenaConfig, LidarConfig, Shape, ViewpointConfig
+from jaxsense.core import checks
+from jaxsense.core.types import Key, pytree
+from jaxsense.sim import raycast
+from jaxsense.sim.sensors import Sensor
+
+_MAX_STEPS = 3.0  # of the sensor's rays, between two recorded ones
+_SURFACE = 0.1  # m; neighbouring beams that differ by more hit two surfaces
+_BEAMS = 15  # of a piece of wall
+_MIN_FACING = 0.5  # cosine of the angle at which a beam meets a wall
+_MIN_PIECES = 20  # in a bin of distances
+_EDGE = 0.5  # m between the surfaces of an edge
+_MARGIN = 0.15  # m between a mixed pixel and both surfaces
+
+
+def resample(
+    sensor: Sensor,
+    angles: Float[np.ndarray, " A"],
+    readings: Float[np.ndarray, "S A *channels"],
+) -> Float[np.ndarray, "S B *channels"]:
+    """Turns scans along other rays into scans along the rays of a sensor.
+
+    Between two recorded rays, readings are interpolated; distances only on one surface, otherwise
+    the nearest ray counts.
+
+    Args:
+      sensor: the sensor.
+      angles: directions of the recorded rays in the robot's frame, in radians, in any order.
+      readings: `[S, A, ...]` recorded scans, in the units of the sensor.
+
+    Returns:
+      `[S, B, ...]` readings, NaN outside the recorded field of view: `Models.detect` then says
+      that nothing is there.
+
+    Raises:
+      ValueError: if the recorded rays are too few or too far apart, or their field of view is
+        narrower than a window; it names what would fit.
+    """
+    angles = np.asarray(angles, np.float64)
+    checks.require_finite(f"angles of {sensor.name}", angles)
+    if readings.shape[1:2] != angles.shape:
+        expected = f"must be {readings.shape[1:2]}, one for each ray of the scans"
+        raise ValueError(f"angles of {sensor.name} have the shape {angles.shape}: {expected}")
+    turned, order = np.unique((angles + np.pi) % (2 * np.pi) - np.pi, return_index=True)
+    scans = np.asarray(readings, np.float32)[:, order]
+    step, window = _require_dense(sensor, turned)
+    targets = sensor.angles.astype(np.float64)
+    left = np.clip(np.searchsorted(turned, targets, side="right") - 1, 0, len(turned) - 2)
+    gap = turned[left + 1] - turned[left]
+    share = np.clip((targets - turned[left]) / gap, 0.0, 1.0)
+    is_recorded = (targets > turned[0] - step / 2) & (targets < turned[-1] + step / 2)
+    is_recorded &= gap < _MAX_STEPS * step
+    if _longest(is_recorded) < window:
+        width = np.degrees(np.abs(targets[window - 1] - targets[0]))
+        expected = f"must be at least {width:.1f}, as wide as the window of its detector"
+        found = np.degrees(np.ptp(turned))
+        raise ValueError(f"field of view of {sensor.name} = {found:.1f} degrees: {expected}")
+    share = share.reshape(-1, *[1] * (scans.ndim - 2))
+    before, after = scans[:, left], scans[:, left + 1]
+    with np.errstate(invalid="ignore"):  # a beam without a return is infinitely long
+        between = before + share * (after - before)
+        is_same = np.abs(after - before) < _SURFACE if sensor.measures_distance else True
+    nearest = np.where(share < 0.5, before, after)
+    found = np.where(is_same, between, nearest).astype(np.float32)
+    found[:, ~is_recorded] = np.nan
+    return found
+
+
+def _require_dense(sensor: Sensor, turned: Float[np.ndarray, " A"]) -> tuple[float, int]:
+    """Median step between recorded rays, and the sensor's rays that a window spans.
+
+    Raises `ValueError` if there are too few rays, or they are too far apart.
+    """
+    own = np.abs(np.diff(sensor.angles)).max() * sensor.stride
+    most = np.degrees(_MAX_STEPS * own)
+    step = np.median(np.diff(turned)) if len(turned) > 1 else np.inf
+    if step > _MAX_STEPS * own:
+        expected = f"must be at most {most:.2f} degrees"
+        raise ValueError(
+            f"step between the rays of {sensor.name} = {np.degrees(step):.2f} degrees: {expected}"
+        )
+    return step, (sensor.window - 1) * sensor.stride + 1
+
+
+def _longest(is_recorded: Bool[np.ndarray, " B"]) -> int:
+    """Length of the longest run of True."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], is_recorded, [0]])))
+    return int(np.max(ends[1::2] - ends[::2], initial=0))
+
+
+def wall_residuals(
+    angles: Float[np.ndarray, " A"], ranges: Float[np.ndarray, "S A"]
+) -> tuple[Float[np.ndarray, "R K"], Float[np.ndarray, " R"]]:
+    """Differences of measured distances from straight lines through K neighbouring beams.
+
+    Args:
+      angles: directions of the beams, in radians, in order.
+      ranges: `[S, A]` distances in metres, infinite without a return.
+
+    Returns:
+      `[R, K]` residuals along the beams, in metres, of all pieces of scans that no surface of
+      another depth interrupts and that face the scanner; and `[R]` their mean distances, in metres.
+    """
+    residuals, distances = [], []
+    for first in range(0, len(angles) - _BEAMS + 1, _BEAMS):
+        piece = slice(first, first + _BEAMS)
+        found = ranges[:, piece][np.isfinite(ranges[:, piece]).all(axis=1)]
+        directions = np.stack([np.cos(angles[piece]), np.sin(angles[piece])], axis=-1)
+        points = found[:, :, None] * directions[None]
+        centre = points.mean(axis=1, keepdims=True)
+        # The normal of the line with the least squared distances.
+        normal = np.linalg.svd(points - centre, full_matrices=False)[2][:, 1]
+        facing = normal @ directions.T
+        to_wall = np.sum(normal[:, None] * centre, axis=-1)
+        with np.errstate(divide="ignore"):
+            residual = found - to_wall / facing
+        is_wall = np.abs(facing).min(axis=1) > _MIN_FACING
+        is_wall &= np.abs(residual).max(axis=1) < _SURFACE
+        residuals.append(residual[is_wall])
+        distances.append(found[is_wall].mean(axis=1))
+    return np.concatenate(residuals), np.concatenate(distances)
+
+
+def fit_noise(
+    config: LidarConfig, angles: Float[np.ndarray, " A"], ranges: Float[np.ndarray, "S A"]
+) -> LidarConfig:
+    """Settings of a LiDAR whose noise is that of recorded scans, within its range.
+
+    `range_noise` and `range_noise_growth` are a line through the medians, in bins of distance, of
+    the standard deviations of pieces of walls: curved or rough ones are few enough not to matter.
+    `mixed_pixels` is the share of edges at which a beam measures a distance between both
+    surfaces; thin objects count as such. `dropout` is the share of beams without a return between
+    two of one surface.
+
+    Args:
+      config: other settings of the scanner.
+      angles: directions of the beams, in radians, in order.
+      ranges: `[S, A]` distances in metres, infinite without a return.
+
+    Raises:
+      ValueError: if the scans show too few straight walls or edges.
+    """
+    residuals, distances = wall_residuals(angles, ranges)
+    free = _BEAMS - 2  # a line has two parameters
+    unbiased = np.sqrt(scipy.stats.chi2.median(free) / free)
+    spread = np.sqrt(np.sum(residuals**2, axis=1) / free) / unbiased
+    bins = np.floor(2 * distances[distances < config.max_range]).astype(int)
+    number = np.bincount(bins)
+    kept = np.flatnonzero(number >= _MIN_PIECES)
+    if len(kept) < 2:
+        raise ValueError(f"scans show {len(distances)} pieces of walls: too few to fit the noise")
+    within = distances < config.max_range
+    middles = [np.median(distances[within][bins == i]) for i in kept]
+    medians = [np.median(spread[within][bins == i]) for i in kept]
+    growth, noise = np.polyfit(middles, medians, 1, w=np.sqrt(number[kept]))
+    mixed, dropout = _edges(ranges, config.max_range)
+    found = {"range_noise": noise, "range_noise_growth": growth, "mixed_pixels": mixed}
+    rounded = {name: round(max(float(x), 0.0), 5) for name, x in found.items()}
+    return dataclasses.replace(config, **rounded, dropout=round(dropout, 5))
+
+
+def _edges(ranges: Float[np.ndarray, "S A"], max_range: float) -> tuple[float, float]:
+    """Share of edges with a mixed pixel, and of beams on one surface that drop out."""
+    first, before, middle, after, last = (ranges[:, i : ranges.shape[1] - 4 + i] for i in range(5))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        is_smooth = (np.abs(first - before) < _SURFACE) & (np.abs(after - last) < _SURFACE)
+        near, far = np.minimum(before, after), np.maximum(before, after)
+        is_edge = is_smooth & (far - near > _EDGE) & (far < max_range) & np.isfinite(middle)
+        is_mixed = is_edge & (middle > near + _MARGIN) & (middle < far - _MARGIN)
+        is_surface = is_smooth & (far - near < _SURFACE) & (far < max_range)
+        # A mixed pixel lies anywhere between both surfaces; those near one are not seen.
+        visible = 1 - 2 * _MARGIN / (far - near)
+    if not is_edge.any():
+        raise ValueError("scans show no edges: too few to fit the noise")
+    mixed = np.sum(1 / visible[is_mixed])
+    # A clean edge is met twice, before and after its jump.
+    clean = np.sum(is_edge & ~is_mixed) / 2
+    lost = np.sum(is_surface & np.isinf(middle)) / max(np.sum(is_surface), 1)
+    return float(mixed / (mixed + clean)), float(lost)
+
+
+@pytree
+class Inserted:
+    """A recorded scan with a PoI in it.
+
+    Attributes:
+      ranges: `[A]` distances, in metres.
+      bearing: `[]` believed bearing of the PoI, in radians.
+      distance: `[]` distance of its centre, in metres.
+      label: `[]` int32 index of its shape.
+      is_visible: `[]` whether there was room for it: nothing recorded hides or touches it.
+    """
+
+    ranges: Float[Array, " A"]
+    bearing: Float[Array, ""]
+    distance: Float[Array, ""]
+    label: Int[Array, ""]
+    is_visible: Bool[Array, ""]
+
+
+def insert(
+    key: Key,
+    arena: ArenaConfig,
+    viewpoint: ViewpointConfig,
+    angles: Float[Array | np.ndarray, " A"],
+    ranges: Float[Array, " A"],
+    residuals: Float[Array, "R K"],
+    *,
+    mixed_pixels: float = 0.0,
+    margin: float = 0.0,
+) -> Inserted:
+    """Puts a PoI of random shape, position and yaw into a recorded scan of a LiDAR.
+
+    Each beam measures what is nearer, the recorded surface or the PoI's. At the PoI it has the
+    errors of measured ones: pieces of residuals, and mixed pixels at the PoI's edges.
+
+    Args:
+      key: random key.
+      arena: shapes and size of PoIs.
+      viewpoint: their distances, and the error of their bearings.
+      angles: directions of the beams, in radians, from right to left.
+      ranges: `[A]` recorded distances, in metres, infinite without a return.
+      residuals: `[R, K]` errors of neighbouring beams, from `wall_residuals`.
+      mixed_pixels: share of edges at which a beam measures a distance between both surfaces.
+      margin: smallest angle between the PoI and the first and the last beam, in radians.
+    """
+    place_key, piece_key, mixed_key = jax.random.split(key, 3)
+    draw = jax.random.uniform(place_key, (5,))
+    low, high = angles[0] + margin, angles[-1] - margin
+    bearing = low + (high - low) * draw[0]
+    near, far = viewpoint.min_distance, viewpoint.max_distance
+    distance = near + (far - near) * draw[1]
+    yaw = 2 * jnp.pi * draw[2]
+    shapes = [arena.shapes[name] for name in arena.labels("shape")]
+    label = jnp.floor(draw[3] * len(shapes)).astype(jnp.int32)
+    centre = distance * jnp.stack([jnp.cos(bearing), jnp.sin(bearing)])
+    hit = _hits(shapes, arena.poi_radius, centre, yaw, jnp.asarray(angles))[label]
+
+    half_width = jnp.arcsin(jnp.minimum(arena.poi_extent / distance, 1.0))
+    is_free = ranges > distance + arena.poi_extent
+    is_visible = jnp.all(is_free | (jnp.abs(angles - bearing) > half_width))
+    pieces = jax.random.randint(piece_key, (-(-len(angles) // residuals.shape[1]),), 0, 10**9)
+    error = residuals[pieces % len(residuals)].reshape(-1)[: len(angles)]
+    met = jnp.minimum(ranges, hit + error)
+
+    is_on = hit < ranges
+    following = jnp.append(met[1:], met[-1:])
+    uniform = jax.random.uniform(mixed_key, (2, len(angles)))
+    is_mixed = (is_on != jnp.append(is_on[1:], is_on[-1:])) & (uniform[0] < mixed_pixels)
+    both = jnp.isfinite(met) & jnp.isfinite(following)
+    between = met + uniform[1] * jnp.where(both, following - met, 0.0)
+    believed = bearing + jnp.radians(viewpoint.bearing_error) * (2 * draw[4] - 1)
+    measured = jnp.where(is_mixed, between, met)
+    return Inserted(measured, believed, distance, label, is_visible)
+
+
+def _hits(
+    shapes: Sequence[Shape],
+    radius: float,
+    centre: Float[Array, "2"],
+    yaw: Float[Array, ""],
+    angles: Float[Array, " A"],
+) -> Float[Array, "L A"]:
+    """Distance of each beam to a solid of each shape, infinite where it misses."""
+    axis = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])[None]
+
+    def of(shape: Shape) -> jax.Array:
+        half = radius * jnp.array(shape.half_sides)[None]
+        section = raycast.CrossSection(centre[None], axis, half, (0,), shape.primitive != "box")
+        return raycast.cast(section, np.zeros(2), angles).distance
+
+    return jnp.stack([of(shape) for shape in shapes])
