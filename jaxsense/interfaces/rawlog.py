@@ -14,6 +14,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+DIRECTORY = Path("/usr/share/mrpt/datasets")
+"""Where Debian installs logs."""
+LOGS = (
+    "2006-01ENE-21-SENA_Telecom Faculty_one_loop_only.rawlog",
+    "localization_demo.rawlog",
+    "uwb_ro-localization_demo.rawlog",
+    "malaga-cs-fac-building.simplemap.gz",
+)
+"""Those that hold scans of a real scanner, all of 361 beams over 180 degrees."""
 _SCAN = re.compile(rb"\x97CObservation2DRangeScan(.)", re.DOTALL)
 _VERSION = 6
 _HEAD = struct.Struct("<f?f")  # field of view [rad], whether from right to left, maximum range [m]
@@ -60,6 +69,20 @@ def read(path: Path | str) -> LaserScans:
     half = scans[0][0] / 2
     angles = np.linspace(-half, half, len(scans[0][1]), dtype=np.float32)
     return LaserScans(angles, np.stack([ranges for _, ranges in scans]))
+
+
+def read_logs(directory: Path = DIRECTORY) -> LaserScans:
+    """Reads the scans of all `LOGS`.
+
+    Args:
+      directory: where they are.
+
+    Raises:
+      OSError: if a log cannot be read.
+      ValueError: if a log is not what it should be, see `read`.
+    """
+    logs = [read(directory / name) for name in LOGS]
+    return LaserScans(logs[0].angles, np.concatenate([log.ranges for log in logs]))
 
 
 def _scan(content: bytes, found: re.Match[bytes]) -> tuple[float, np.ndarray]:

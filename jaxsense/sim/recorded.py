@@ -1,6 +1,6 @@
 """Recorded scans: other rays than the simulated sensor's, the noise of a LiDAR, PoIs cast in.
 
-`insert` can be traced; the other functions read recordings on the host.
+`insert` and `random_view` can be traced; the other functions work on the host.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import ArenaConfig, LidarConfig, Shape, ViewpointConfig
+from jaxsense.config import Config, LidarConfig, Shape
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.sim import raycast
@@ -194,6 +194,38 @@ def _edges(ranges: Float[np.ndarray, "S A"], max_range: float) -> tuple[float, f
 
 
 @pytree
+class Errors:
+    """Errors of a recorded LiDAR, to measure other surfaces with.
+
+    Attributes:
+      residuals: `[R, K]` of K neighbouring beams, in metres, see `wall_residuals`.
+      mixed_pixels: `[]` share of edges at which a beam measures a distance between both surfaces.
+    """
+
+    residuals: Float[Array, "R K"]
+    mixed_pixels: Float[Array, ""]
+
+
+def errors(
+    config: Config, angles: Float[np.ndarray, " A"], ranges: Float[np.ndarray, "S A"]
+) -> Errors:
+    """Errors of recorded scans at surfaces up to twice as far as PoIs.
+
+    Args:
+      config: all settings.
+      angles: directions of the beams, in radians, in order.
+      ranges: `[S, A]` distances in metres, infinite without a return.
+
+    Raises:
+      ValueError: if the scans show too few straight walls or edges.
+    """
+    residuals, distances = wall_residuals(angles, ranges)
+    near = residuals[distances < 2 * config.viewpoint.max_distance]
+    mixed_pixels = fit_noise(config.lidar, angles, ranges).mixed_pixels
+    return Errors(jnp.asarray(near), jnp.float32(mixed_pixels))
+
+
+@pytree
 class Inserted:
     """A recorded scan with a PoI in it.
 
@@ -212,59 +244,72 @@ class Inserted:
     is_visible: Bool[Array, ""]
 
 
-def insert(
-    key: Key,
-    arena: ArenaConfig,
-    viewpoint: ViewpointConfig,
-    angles: Float[Array | np.ndarray, " A"],
-    ranges: Float[Array, " A"],
-    residuals: Float[Array, "R K"],
-    *,
-    mixed_pixels: float = 0.0,
-    margin: float = 0.0,
-) -> Inserted:
-    """Puts a PoI of random shape, position and yaw into a recorded scan of a LiDAR.
-
-    Each beam measures what is nearer, the recorded surface or the PoI's. At the PoI it has the
-    errors of measured ones: pieces of residuals, and mixed pixels at the PoI's edges.
+def random_view(
+    key: Key, config: Config, angles: Float[Array | np.ndarray, " A"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Draws a bearing around which a whole window was recorded, and a distance.
 
     Args:
       key: random key.
-      arena: shapes and size of PoIs.
-      viewpoint: their distances, and the error of their bearings.
+      config: all settings.
+      angles: directions of the recorded beams, in radians, from right to left.
+
+    Returns:
+      The bearing, in radians, and the distance at which a PoI may be expected, in metres.
+    """
+    lidar, viewpoint = config.lidar, config.viewpoint
+    span = (lidar.window / 2 + 1) * lidar.stride / max(lidar.num_beams - 1, 1)
+    margin = jnp.radians(lidar.field_of_view * span + viewpoint.bearing_error)
+    draw = jax.random.uniform(key, (2,))
+    bearing = angles[0] + margin + (angles[-1] - angles[0] - 2 * margin) * draw[0]
+    near, far = viewpoint.min_distance, viewpoint.max_distance
+    return bearing, near + (far - near) * draw[1]
+
+
+def insert(
+    key: Key,
+    config: Config,
+    angles: Float[Array | np.ndarray, " A"],
+    ranges: Float[Array, " A"],
+    errors: Errors,
+) -> Inserted:
+    """Puts a PoI of random shape, position and yaw into a recorded scan of a LiDAR.
+
+    Each beam measures what is nearer, the recorded surface or the PoI's. At the PoI it has
+    recorded errors: those of pieces of walls, and mixed pixels at the edges.
+
+    Args:
+      key: random key.
+      config: all settings, of which arena and viewpoint say what PoIs are and where.
       angles: directions of the beams, in radians, from right to left.
       ranges: `[A]` recorded distances, in metres, infinite without a return.
-      residuals: `[R, K]` errors of neighbouring beams, from `wall_residuals`.
-      mixed_pixels: share of edges at which a beam measures a distance between both surfaces.
-      margin: smallest angle between the PoI and the first and the last beam, in radians.
+      errors: of the scanner.
     """
-    place_key, piece_key, mixed_key = jax.random.split(key, 3)
-    draw = jax.random.uniform(place_key, (5,))
-    low, high = angles[0] + margin, angles[-1] - margin
-    bearing = low + (high - low) * draw[0]
-    near, far = viewpoint.min_distance, viewpoint.max_distance
-    distance = near + (far - near) * draw[1]
-    yaw = 2 * jnp.pi * draw[2]
+    view_key, place_key, piece_key, mixed_key = jax.random.split(key, 4)
+    arena, viewpoint, residuals = config.arena, config.viewpoint, errors.residuals
+    bearing, distance = random_view(view_key, config, angles)
+    draw = jax.random.uniform(place_key, (3,))
     shapes = [arena.shapes[name] for name in arena.labels("shape")]
-    label = jnp.floor(draw[3] * len(shapes)).astype(jnp.int32)
+    label = jnp.floor(draw[0] * len(shapes)).astype(jnp.int32)
     centre = distance * jnp.stack([jnp.cos(bearing), jnp.sin(bearing)])
+    yaw = 2 * jnp.pi * draw[1]
     hit = _hits(shapes, arena.poi_radius, centre, yaw, jnp.asarray(angles))[label]
 
     half_width = jnp.arcsin(jnp.minimum(arena.poi_extent / distance, 1.0))
     is_free = ranges > distance + arena.poi_extent
     is_visible = jnp.all(is_free | (jnp.abs(angles - bearing) > half_width))
-    pieces = jax.random.randint(piece_key, (-(-len(angles) // residuals.shape[1]),), 0, 10**9)
-    error = residuals[pieces % len(residuals)].reshape(-1)[: len(angles)]
-    met = jnp.minimum(ranges, hit + error)
+    number = -(-len(angles) // residuals.shape[1])
+    pieces = jax.random.randint(piece_key, (number,), 0, len(residuals))
+    met = jnp.minimum(ranges, hit + residuals[pieces].reshape(-1)[: len(angles)])
 
-    is_on = hit < ranges
-    following = jnp.append(met[1:], met[-1:])
+    is_on, following = hit < ranges, jnp.append(met[1:], met[-1:])
     uniform = jax.random.uniform(mixed_key, (2, len(angles)))
-    is_mixed = (is_on != jnp.append(is_on[1:], is_on[-1:])) & (uniform[0] < mixed_pixels)
-    both = jnp.isfinite(met) & jnp.isfinite(following)
-    between = met + uniform[1] * jnp.where(both, following - met, 0.0)
-    believed = bearing + jnp.radians(viewpoint.bearing_error) * (2 * draw[4] - 1)
-    measured = jnp.where(is_mixed, between, met)
+    is_edge = is_on != jnp.append(is_on[1:], is_on[-1:])
+    # Nothing lies between a surface and nothing.
+    is_edge &= jnp.isfinite(met) & jnp.isfinite(following)
+    between = met + uniform[1] * jnp.where(is_edge, following - met, 0.0)
+    measured = jnp.where(is_edge & (uniform[0] < errors.mixed_pixels), between, met)
+    believed = bearing + jnp.radians(viewpoint.bearing_error) * (2 * draw[2] - 1)
     return Inserted(measured, believed, distance, label, is_visible)
 
 

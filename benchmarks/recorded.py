@@ -1,0 +1,188 @@
+"""`python -m benchmarks.recorded RUN`: looks through the real laser scans of mrpt-common."""
+
+import argparse
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import rich.console
+import rich.table
+
+import jaxsense
+from jaxsense.interfaces import rawlog
+from jaxsense.sim import recorded, sensors, windows
+from jaxsense.vae import detectors
+from jaxsense.vae.detectors import Detector
+
+_VIEWS = 10  # of each scan
+_LABELLED = 200  # windows to retrain with
+_RETRAINED = 5  # times, each with other windows
+_SEED = 31
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """Looks at PoIs in real scans.
+
+    Attributes:
+      scans: `[L, B]` readings of the run's beams, in metres.
+      bearings: `[L]` in radians.
+      distances: `[L]` in metres.
+      labels: `[L]` true shapes.
+      rows: `[L]` indices of the recorded scans.
+    """
+
+    scans: np.ndarray
+    bearings: np.ndarray
+    distances: np.ndarray
+    labels: np.ndarray
+    rows: np.ndarray
+
+
+class Recorded:
+    """The LiDAR of a run, and real scans along its beams.
+
+    Attributes:
+      every: step between the recorded beams that are used.
+    """
+
+    def __init__(
+        self,
+        config: jaxsense.Config,
+        models: jaxsense.Models,
+        scans: rawlog.LaserScans,
+        every: int = 1,
+    ):
+        self.config, self.models, self.scans, self.every = config, models, scans, every
+        self.modality = config.modalities.index("lidar")
+        self.sensor = sensors.make(config)[self.modality]
+
+        def detect(scan: jax.Array, bearing: jax.Array, distance: jax.Array) -> tuple:
+            found = models.detect(self.modality, self.sensor, scan, bearing, distance)
+            return found.is_there, jnp.argmax(found.features)
+
+        self.detect = jax.jit(jax.vmap(detect))
+
+    def resampled(self, ranges: np.ndarray) -> np.ndarray:
+        """`[S, A]` recorded ranges along the run's beams, `[S, B]`."""
+        angles = self.scans.angles[:: self.every]
+        return recorded.resample(self.sensor, angles, ranges[:, :: self.every])
+
+    def empty(self, key: jax.Array) -> dict[str, float]:
+        """Shares of looks at nothing that are answered with a class, by the expected distance."""
+        keys = jax.random.split(key, (len(self.scans.ranges), _VIEWS))
+        draw = jax.vmap(jax.vmap(lambda k: recorded.random_view(k, self.config, self.scans.angles)))
+        bearings, distances = (np.asarray(x) for x in draw(keys))
+        scans = np.repeat(self.resampled(self.scans.ranges), _VIEWS, axis=0)
+        bearings = bearings.reshape(-1)
+        # What is measured there, if a PoI may be there: its centre is behind its surface.
+        ray = np.abs(self.sensor.angles[None] - bearings[:, None]).argmin(axis=1)
+        there = scans[np.arange(len(scans)), ray] + self.config.arena.poi_half_width
+        limits = self.config.viewpoint
+        is_near = (there >= limits.min_distance) & (there <= limits.max_distance)
+        of_random, _ = self.detect(scans, bearings, distances.reshape(-1))
+        of_measured, _ = self.detect(scans[is_near], bearings[is_near], there[is_near])
+        return {
+            f"random distance, {len(scans)} looks": float(np.mean(of_random)),
+            f"at the measured distance, {int(is_near.sum())} looks": float(np.mean(of_measured)),
+        }
+
+    def shown(self, key: jax.Array, errors: recorded.Errors, rows: np.ndarray) -> Shown:
+        """Looks at PoIs that are cast into some scans, `_VIEWS` times into each."""
+        rows = np.repeat(rows, _VIEWS)
+
+        def insert(key: jax.Array, ranges: jax.Array) -> recorded.Inserted:
+            return recorded.insert(key, self.config, self.scans.angles, ranges, errors)
+
+        keys = jax.random.split(key, len(rows))
+        found = jax.jit(jax.vmap(insert))(keys, self.scans.ranges[rows])
+        kept = np.asarray(found.is_visible)
+        found = jax.tree.map(lambda x: np.asarray(x)[kept], found)
+        scans = self.resampled(found.ranges)
+        return Shown(scans, found.bearing, found.distance, found.label, rows[kept])
+
+    def windows(self, looks: Shown) -> jax.Array:
+        """Inputs of the detector, `[L, F]`."""
+
+        def cut(scan: jax.Array, bearing: jax.Array) -> jax.Array:
+            return windows.as_window(self.sensor, windows.around(self.sensor, scan, bearing))
+
+        return jax.jit(jax.vmap(cut))(looks.scans, looks.bearings)
+
+    def right(self, detector: Detector, looks: Shown) -> float:
+        """Share of looks whose shape a detector finds, without the gate."""
+        of_window = jax.vmap(lambda window: detectors.logits(detector, window))
+        found = np.argmax(of_window(self.windows(looks)), axis=1)
+        return float(np.mean(found == looks.labels))
+
+    def retrained(self, key: jax.Array, errors: recorded.Errors) -> tuple[float, float]:
+        """Shares of right shapes before and after a retraining, means of several.
+
+        Half of the scans give the windows to train with, the other half those to measure with.
+        """
+        before, after = [], []
+        detector, number = self.models.detectors[self.modality], len(self.scans.ranges)
+        for each in jax.random.split(key, _RETRAINED):
+            order_key, train_key, test_key, fit_key = jax.random.split(each, 4)
+            order = np.asarray(jax.random.permutation(order_key, number))
+            train = self.shown(train_key, errors, order[: number // 2])
+            test = self.shown(test_key, errors, order[number // 2 :])
+            chosen = jax.random.permutation(fit_key, len(train.labels))[:_LABELLED]
+            given = self.windows(train)[chosen], jnp.asarray(train.labels)[chosen]
+            other = jax.jit(detectors.retrain)(fit_key, detector, *given)
+            before.append(self.right(detector, test))
+            after.append(self.right(other, test))
+        return float(np.mean(before)), float(np.mean(after))
+
+
+def figures(
+    config: jaxsense.Config, models: jaxsense.Models, scans: rawlog.LaserScans
+) -> Mapping[str, float]:
+    """The figures of `docs/recorded.md`.
+
+    Args:
+      config: settings of the run.
+      models: its trained models.
+      scans: the recorded scans.
+    """
+    found: dict[str, float] = {}
+    empty_key, shown_key, *keys = jax.random.split(jax.random.key(_SEED), 4)
+    real = Recorded(config, models, scans)
+    of_empty = real.empty(empty_key)
+    found |= {f"nothing there, {name}: answered": share for name, share in of_empty.items()}
+    errors = recorded.errors(config, scans.angles, scans.ranges)
+    looks = real.shown(shown_key, errors, np.arange(len(scans.ranges)))
+    is_there, label = real.detect(looks.scans, looks.bearings, looks.distances)
+    is_there, is_right = np.asarray(is_there), np.asarray(label == looks.labels)
+    found[f"PoI, {len(looks.labels)} looks: answered"] = float(np.mean(is_there))
+    found["PoI: shape right, of those answered"] = float(np.mean(is_right[is_there]))
+    for every, key in enumerate(keys, 1):
+        coarse = Recorded(config, models, scans, every)
+        step = np.degrees(scans.angles[every] - scans.angles[0])
+        before, after = coarse.retrained(key, errors)
+        found[f"PoI, a beam each {step:.1f} degrees: shape right"] = before
+        found[f"PoI, a beam each {step:.1f} degrees: after retraining"] = after
+    return found
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Runs the program."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path, help="directory of a finished run")
+    parser.add_argument("--logs", type=Path, default=rawlog.DIRECTORY, help="of the logs")
+    arguments = parser.parse_args(argv)
+    config, models = jaxsense.load(arguments.run)
+    scans = rawlog.read_logs(arguments.logs)
+    table = rich.table.Table("", "share", title=f"{len(scans.ranges)} real scans")
+    for name, share in figures(config, models, scans).items():
+        table.add_row(name, f"{share:.4f}")
+    console = rich.console.Console()
+    console.print(table)
+    console.print(recorded.fit_noise(config.lidar, scans.angles, scans.ranges))
+
+
+if __name__ == "__main__":
+    main()
