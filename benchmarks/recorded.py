@@ -46,7 +46,12 @@ class Recorded:
     """The LiDAR of a run, and real scans along its beams.
 
     Attributes:
+      config: settings of the run.
+      models: its trained models.
+      scans: the recorded scans.
       every: step between the recorded beams that are used.
+      offset: error of all distances, in metres, as of a scanner that is mounted or calibrated
+        differently.
     """
 
     def __init__(
@@ -55,8 +60,10 @@ class Recorded:
         models: jaxsense.Models,
         scans: rawlog.LaserScans,
         every: int = 1,
+        offset: float = 0.0,
     ):
-        self.config, self.models, self.scans, self.every = config, models, scans, every
+        self.config, self.models, self.scans = config, models, scans
+        self.every, self.offset = every, offset
         self.modality = config.modalities.index("lidar")
         self.sensor = sensors.make(config)[self.modality]
 
@@ -69,7 +76,7 @@ class Recorded:
     def resampled(self, ranges: np.ndarray) -> np.ndarray:
         """`[S, A]` recorded ranges along the run's beams, `[S, B]`."""
         angles = self.scans.angles[:: self.every]
-        return recorded.resample(self.sensor, angles, ranges[:, :: self.every])
+        return recorded.resample(self.sensor, angles, ranges[:, :: self.every] + self.offset)
 
     def empty(self, key: jax.Array) -> dict[str, float]:
         """Shares of looks at nothing that are answered with a class, by the expected distance."""
@@ -149,7 +156,7 @@ def figures(
       scans: the recorded scans.
     """
     found: dict[str, float] = {}
-    empty_key, shown_key, *keys = jax.random.split(jax.random.key(_SEED), 4)
+    empty_key, shown_key, *keys = jax.random.split(jax.random.key(_SEED), 5)
     real = Recorded(config, models, scans)
     of_empty = real.empty(empty_key)
     found |= {f"nothing there, {name}: answered": share for name, share in of_empty.items()}
@@ -159,12 +166,15 @@ def figures(
     is_there, is_right = np.asarray(is_there), np.asarray(label == looks.labels)
     found[f"PoI, {len(looks.labels)} looks: answered"] = float(np.mean(is_there))
     found["PoI: shape right, of those answered"] = float(np.mean(is_right[is_there]))
-    for every, key in enumerate(keys, 1):
-        coarse = Recorded(config, models, scans, every)
-        step = np.degrees(scans.angles[every] - scans.angles[0])
-        before, after = coarse.retrained(key, errors)
-        found[f"PoI, a beam each {step:.1f} degrees: shape right"] = before
-        found[f"PoI, a beam each {step:.1f} degrees: after retraining"] = after
+    others = {
+        "half of the scans": real,
+        "a beam each degree": Recorded(config, models, scans, every=2),
+        "5 cm too far": Recorded(config, models, scans, offset=0.05),
+    }
+    for (name, other), key in zip(others.items(), keys, strict=True):
+        before, after = other.retrained(key, errors)
+        found[f"PoI, {name}: shape right"] = before
+        found[f"PoI, {name}: after retraining"] = after
     return found
 
 

@@ -9,6 +9,7 @@ EXPECTED = (
     "multivae",
     # Not a package of Python.
     "none of chromium",
+    "mrpt-common",
     "Python 3.11 is not installed",
     "Python 3.12 is not installed",
 )

@@ -21,6 +21,7 @@ from jaxsense.config import PRESETS
 from jaxsense.core.types import pytree
 from jaxsense.dqn import policies
 from jaxsense.dqn.reference import reference
+from jaxsense.interfaces import rawlog
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.training import learn, stages
 from jaxsense.vae import InPlace
@@ -177,6 +178,68 @@ def test_recorded_scans_neither_invents_nor_replaces_a_recording(
     assert "\n" not in str(stop.value)
     assert capsys.readouterr().out == ""
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"precious"] * is_there
+
+
+@pytest.mark.skipif(not rawlog.DIRECTORY.exists(), reason="mrpt-common is not installed")
+def test_laser_logs(example, recorded_scans, runs, tmp_path, monkeypatch, capsys):
+    main, read_logs = example("laser_logs").main, rawlog.read_logs
+
+    def few(directory):
+        scans = read_logs(directory)
+        return rawlog.LaserScans(scans.angles, scans.ranges[::20])
+
+    # The example needs no custom sensors, and so no option to trust those of this run.
+    load = jaxsense.load
+    monkeypatch.setattr(jaxsense, "load", lambda run, trust=True: load(run, True))
+    monkeypatch.setattr(rawlog, "read_logs", few)
+    recording = tmp_path / "scans.npz"
+    main([str(runs / "thermal"), str(recording)])
+    content = np.load(recording)
+    number = len(content["places"])
+    assert 30 < number <= 36
+    assert content["lidar_scans"].shape == (number, 361)
+    distance = np.linalg.norm(content["places"], axis=1)
+    assert ((distance >= 0.3) & (distance <= 1.2)).all()
+    # No look is out of view, and most show their PoI.
+    recorded_scans(recording)
+    told = capsys.readouterr().out
+    assert told.count("lidar: cylinder") > 0.8 * number
+    assert "thermal" not in told
+    before = recording.read_bytes()
+    with pytest.raises(SystemExit, match=r"^laser_logs: .*scans\.npz"):
+        main([str(runs / "thermal"), str(recording)])
+    assert recording.read_bytes() == before
+
+
+def test_laser_logs_names_a_missing_log(example, runs, tmp_path, monkeypatch):
+    load = jaxsense.load
+    monkeypatch.setattr(jaxsense, "load", lambda run: load(run, True))
+    argv = [str(runs / "thermal"), str(tmp_path / "scans.npz"), "--logs", str(tmp_path)]
+    with pytest.raises(SystemExit, match=r"^laser_logs: .*SENA_Telecom") as stop:
+        example("laser_logs").main(argv)
+    assert "\n" not in str(stop.value)
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.slow
+def test_recorded_scans_of_other_rays(recorded_scans, tmp_path, capsys):
+    recorded_scans(tmp_path / "recorded.npz", "--simulate")
+    content = dict(np.load(tmp_path / "recorded.npz"))
+    # Of the 683 rays of the run, 401 over 141 degrees.
+    lidar = sim.sensors.lidar(PRESETS["smoke"].lidar)
+    content |= {"lidar_scans": content["lidar_scans"][:, 141:542]}
+    content |= {"lidar_angles": lidar.angles[141:542].astype(float)}
+    np.savez(tmp_path / "narrow.npz", **content)
+    recorded_scans(tmp_path / "recorded.npz")
+    whole = capsys.readouterr().out
+    recorded_scans(tmp_path / "narrow.npz")
+    assert capsys.readouterr().out == whole
+    content |= {"lidar_scans": content["lidar_scans"][:, :100]}
+    content |= {"lidar_angles": content["lidar_angles"][:100]}
+    np.savez(tmp_path / "too_narrow.npz", **content)
+    expected = r"field of view of lidar = 34\.8 degrees: must be at least 44\.7"
+    with pytest.raises(SystemExit, match=expected):
+        recorded_scans(tmp_path / "too_narrow.npz")
 
 
 def test_recorded_scans_names_missing_arguments(example, capsys):

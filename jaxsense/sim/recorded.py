@@ -62,14 +62,15 @@ def resample(
     left = np.clip(np.searchsorted(turned, targets, side="right") - 1, 0, len(turned) - 2)
     gap = turned[left + 1] - turned[left]
     share = np.clip((targets - turned[left]) / gap, 0.0, 1.0)
-    is_recorded = (targets > turned[0] - step / 2) & (targets < turned[-1] + step / 2)
-    is_recorded &= gap < _MAX_STEPS * step
+    is_between = (targets >= turned[0]) & (targets <= turned[-1]) & (gap < _MAX_STEPS * step)
+    to_nearest = np.minimum(*np.abs(targets - turned[[left, left + 1]]))
+    is_recorded = is_between | (to_nearest < step / 2)
     if _longest(is_recorded) < window:
         width = np.degrees(np.abs(targets[window - 1] - targets[0]))
         expected = f"must be at least {width:.1f}, as wide as the window of its detector"
         found = np.degrees(np.ptp(turned))
         raise ValueError(f"field of view of {sensor.name} = {found:.1f} degrees: {expected}")
-    share = share.reshape(-1, *[1] * (scans.ndim - 2))
+    share = np.where(is_between, share, np.round(share)).reshape(-1, *[1] * (scans.ndim - 2))
     before, after = scans[:, left], scans[:, left + 1]
     with np.errstate(invalid="ignore"):  # a beam without a return is infinitely long
         between = before + share * (after - before)

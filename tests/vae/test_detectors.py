@@ -175,3 +175,32 @@ def test_a_window_of_the_wrong_shape_raises_an_error_that_names_it(trained):
         detectors.detect(detector, jnp.zeros(5))
     with pytest.raises(AssertionError, match="windows"):
         detectors.init(jax.random.key(0), jnp.zeros(5), 2, CONFIG)
+
+
+def test_few_windows_teach_an_offset_and_keep_what_was_learned(trained):
+    detector = trained[1]
+    windows, labels = synthetic_windows(jax.random.key(5), 200)
+    others, of_others = synthetic_windows(jax.random.key(6), 2000)
+    retrain = jax.jit(detectors.retrain)
+    before = accuracy(detector, others, of_others)
+    assert before > 0.99
+    # Where there is nothing to learn, nothing is forgotten.
+    same = retrain(jax.random.key(7), detector, windows, labels)
+    assert accuracy(same, others, of_others) > before - 0.005
+    # Readings that are all too low by more than half of what tells the labels.
+    offset = 0.7
+    assert accuracy(detector, others - offset, of_others) < 0.95
+    config = replace(CONFIG, calibration=0.25)
+    retrain = jax.jit(lambda *given: detectors.retrain(*given, config))
+    moved = retrain(jax.random.key(7), detector, windows - offset, labels)
+    assert accuracy(moved, others - offset, of_others) > 0.99
+    jax.tree.map(np.testing.assert_array_equal, moved.gate, detector.gate)
+
+
+def test_retraining_moves_no_farther_than_serves_windows_kept_from_it(trained):
+    # The last quarter of the windows is kept. Labels that are wrong before it teach nonsense.
+    detector = trained[1]
+    windows, labels = synthetic_windows(jax.random.key(8), 200)
+    wrong = jnp.where(jnp.arange(200) < 150, 1 - labels, labels)
+    same = jax.jit(detectors.retrain)(jax.random.key(9), detector, windows, wrong)
+    assert accuracy(same, windows, labels) >= accuracy(detector, windows, labels) - 0.01

@@ -1,0 +1,56 @@
+"""Looks through real scans, with a detector that was trained on few simulated ones."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsense
+from benchmarks import recorded
+from jaxsense.config import PRESETS
+from jaxsense.interfaces import rawlog
+from jaxsense.training import learn
+
+pytestmark = pytest.mark.skipif(
+    not rawlog.DIRECTORY.exists(), reason="mrpt-common is not installed"
+)
+
+
+def figures_of(preset, every):
+    """Figures of a LiDAR's detector through some of the scans."""
+    config = PRESETS[preset]
+    train = jax.jit(
+        lambda key: learn(key, config, until="detector_lidar").outputs["detector_lidar"]
+    )
+    models = jaxsense.init(jax.random.key(0), config)
+    models = replace(models, detectors=(models.detectors[0], train(jax.random.key(1))))
+    scans = rawlog.read_logs()
+    scans = replace(scans, ranges=scans.ranges[::every])
+    return recorded.figures(config, models, scans)
+
+
+def share(figures, *words):
+    """The only figure whose name holds all words."""
+    (found,) = (x for name, x in figures.items() if all(word in name for word in words))
+    return found
+
+
+def test_nothing_is_found_in_real_scans_and_pois_are(monkeypatch):
+    monkeypatch.setattr(recorded, "_RETRAINED", 1)
+    found = figures_of("smoke", every=8)
+    assert np.isfinite([*found.values()]).all()
+    assert share(found, "random distance, 880 looks") < 0.03
+    assert share(found, "PoI, 8", "answered") > 0.9
+    assert share(found, "of those answered") > 0.9
+    assert (
+        share(found, "5 cm too far", "after") > share(found, "5 cm too far", "shape right") + 0.05
+    )
+
+
+@pytest.mark.slow  # trains a detector of `default`
+def test_default_keeps_its_figures_in_real_scans():
+    found = figures_of("default", every=1)
+    assert share(found, "random distance, 7040 looks") <= 0.02
+    assert share(found, "of those answered") >= 0.97
+    assert share(found, "half of the scans", "after") >= 0.985

@@ -1,0 +1,217 @@
+"""Recorded scans: other rays, the noise of a LiDAR, and PoIs that are cast in."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense.config import PRESETS, CameraConfig, LidarConfig
+from jaxsense.sim import disturbances, raycast, recorded, sensors
+
+LIDAR = sensors.lidar(LidarConfig(num_beams=9, field_of_view=80.0, window=3))  # every 10 degrees
+CAMERA = sensors.camera(CameraConfig(num_pixels=8, window=3, stride=1))
+CONFIG = PRESETS["default"]
+ANGLES = np.radians(np.linspace(-90, 90, 361)).astype(np.float32)
+
+
+def degrees(*values):
+    return np.radians(np.array(values, float))
+
+
+def test_the_rays_of_a_sensor_read_what_was_recorded_along_them():
+    readings = np.arange(18.0).reshape(2, 9)
+    np.testing.assert_allclose(recorded.resample(LIDAR, LIDAR.angles, readings), readings)
+
+
+def test_distances_are_interpolated_on_a_surface_and_nearest_at_an_edge():
+    angles = degrees(-35, -25, -15, -5, 5, 15, 25, 35)
+    #                     surface          edge      no return
+    readings = np.array([[1.0, 1.08, 1.04, 3.0, 3.02, np.inf, np.inf, 2.0]])
+    found = recorded.resample(LIDAR, angles + degrees(1)[0], readings)[0]
+    # The ray at -40 is 6 degrees beyond the first, more than half a step; that at 40 is 4 beyond.
+    np.testing.assert_array_equal(np.isnan(found), [True, *[False] * 8])
+    # At -30, 4 of 10 degrees after the ray at -34; at -10, 4 degrees after 1.04, before an edge.
+    # At -20: 1.08 + .4 (1.04 - 1.08); at 0: 3 + .4 * .02; at 20 and 30 the nearest.
+    expected = [1.032, 1.064, 1.04, 3.008, 3.02, np.inf, np.inf]
+    np.testing.assert_allclose(found[1:], [*expected, 2.0], rtol=1e-5)
+
+
+def test_rays_may_come_in_any_order_and_turn():
+    readings = np.arange(9.0)[None]
+    turned = LIDAR.angles.astype(float) % (2 * np.pi)  # 0 to 360 degrees, as some drivers count
+    np.testing.assert_allclose(recorded.resample(LIDAR, turned, readings), readings, atol=1e-5)
+    back = recorded.resample(LIDAR, LIDAR.angles[::-1], readings[:, ::-1])
+    np.testing.assert_allclose(back, readings)
+
+
+def test_pixels_are_interpolated_for_each_channel():
+    angles = np.linspace(0.8, -0.8, 60)
+    colour = np.stack([angles, angles**2, np.ones(60)], axis=-1)[None]
+    found = recorded.resample(CAMERA, angles, colour)[0]
+    expected = np.stack([CAMERA.angles, CAMERA.angles**2, np.ones(8)], axis=-1)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+def test_a_gap_in_the_recording_was_not_recorded():
+    sensor = sensors.lidar(LidarConfig(num_beams=81, field_of_view=80.0, window=20))
+    angles = degrees(*range(-40, -9), *range(10, 41))
+    found = recorded.resample(sensor, angles, np.ones((1, len(angles))))[0]
+    is_gap = np.abs(np.arange(-40, 41)) < 9.5
+    np.testing.assert_array_equal(np.isnan(found), is_gap)
+
+
+@pytest.mark.parametrize(
+    ("angles", "reason"),
+    [
+        (
+            degrees(-40, 0, 40),
+            r"step between the rays of lidar = 40.00 degrees: must be at most 30",
+        ),
+        (degrees(0), r"step between the rays of lidar = inf degrees"),
+        (degrees(0, 5, 10), r"field of view of lidar = 10.0 degrees: must be at least 20.0, as"),
+        (degrees(0, np.nan, 10), "angles of lidar = nan: must be finite"),
+    ],
+)
+def test_scans_that_do_not_suffice_are_refused_with_what_would_fit(angles, reason):
+    with pytest.raises(ValueError, match=reason):
+        recorded.resample(LIDAR, angles, np.ones((1, len(angles))))
+
+
+def test_each_ray_of_a_scan_has_an_angle():
+    with pytest.raises(
+        ValueError, match=r"have the shape \(9,\): must be \(4,\), one for each ray"
+    ):
+        recorded.resample(LIDAR, LIDAR.angles, np.ones((1, 4)))
+
+
+def rooms(noise, number=1500):
+    """Scans of rooms with a pillar, by a scanner with known noise."""
+    angles = jnp.asarray(ANGLES)
+
+    @jax.jit
+    @jax.vmap
+    def scan(key):
+        place_key, noise_key = jax.random.split(key)
+        x, y, turn, size = jax.random.uniform(place_key, (4,))
+        centre = jnp.stack([jnp.array([1.2, y - 0.5]), jnp.array([x - 0.5, y - 0.5])])
+        axis = jnp.stack([jnp.array([1.0, 0.0]), jnp.stack([jnp.cos(turn), jnp.sin(turn)])])
+        half = jnp.stack([jnp.full(2, 0.3), jnp.stack([3.0 + size, 3.0 + x])])
+        section = raycast.CrossSection(centre, axis, half, (0, 1), 0)
+        distance = raycast.cast(section, jnp.zeros(2), angles).distance
+        return disturbances.measured_ranges(noise_key, distance, noise)
+
+    ranges = np.asarray(scan(jax.random.split(jax.random.key(0), number)))
+    return np.where(ranges >= noise.max_range, np.inf, ranges)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    noise = LidarConfig(range_noise=0.006, range_noise_growth=0.001, mixed_pixels=0.1, dropout=0.01)
+    return noise, rooms(noise)
+
+
+def test_noise_is_fitted_to_scans(measured):
+    noise, ranges = measured
+    found = recorded.fit_noise(LidarConfig(), ANGLES, ranges)
+    assert found.range_noise == pytest.approx(noise.range_noise, abs=0.0005)
+    assert found.range_noise_growth == pytest.approx(noise.range_noise_growth, abs=0.0002)
+    assert found.mixed_pixels == pytest.approx(noise.mixed_pixels, abs=0.02)
+    assert found.dropout == pytest.approx(noise.dropout, abs=0.001)
+    assert replace(noise, range_noise=0.01) == replace(
+        found, range_noise=0.01, range_noise_growth=0.001, mixed_pixels=0.1, dropout=0.01
+    )
+
+
+def test_residuals_are_those_of_straight_walls():
+    # The wall x = 2 m, of which residuals are as small as float32 allows, and what is no wall.
+    wall = 2 / np.cos(ANGLES[90:271])
+    residuals, distances = recorded.wall_residuals(ANGLES[90:271], wall[None])
+    assert residuals.shape == (12, 15)  # 181 beams
+    np.testing.assert_allclose(residuals, 0.0, atol=1e-5)
+    np.testing.assert_allclose(distances[0], wall[:15].mean(), rtol=1e-6)
+    edge = np.where(np.arange(15) < 7, wall[:15], wall[:15] + 1)
+    for other in (edge, np.full(15, np.inf), 1 / np.cos(np.linspace(1.2, 1.4, 15))):
+        with np.errstate(all="ignore"):
+            found, _ = recorded.wall_residuals(ANGLES[90:105], other[None])
+        assert len(found) == 0
+
+
+def test_too_few_scans_to_fit_the_noise_to_are_named():
+    with pytest.raises(ValueError, match="too few to fit the noise"):
+        recorded.fit_noise(LidarConfig(), ANGLES, np.full((3, 361), np.inf, np.float32))
+
+
+def exact(mixed_pixels=0.0):
+    return recorded.Errors(jnp.zeros((1, 15)), jnp.float32(mixed_pixels))
+
+
+@jax.jit
+def insert_all(keys, ranges, errors):
+    return jax.vmap(lambda k: recorded.insert(k, CONFIG, ANGLES, ranges, errors))(keys)
+
+
+KEYS = jax.random.split(jax.random.key(1), 300)
+
+
+def test_a_poi_in_an_empty_scan_is_where_it_should_be():
+    found = insert_all(KEYS, jnp.full(361, jnp.inf), exact())
+    assert found.is_visible.all()
+    radius, is_cylinder = CONFIG.arena.poi_radius, np.asarray(found.label) == 0
+    assert 100 < is_cylinder.sum() < 200
+    # The nearest beam of a cylinder is a radius before its centre, that of a cube no farther.
+    depth = np.asarray(found.distance - found.ranges.min(axis=1))
+    np.testing.assert_allclose(depth[is_cylinder], radius, atol=2e-4)
+    assert (depth[~is_cylinder] > radius - 2e-4).all()
+    assert (depth[~is_cylinder] < np.sqrt(2) * radius).all()
+    # Half of a cylinder's width is arcsin(radius / distance), to either side of its bearing.
+    is_on = np.isfinite(found.ranges)
+    width = is_on.sum(axis=1) * np.radians(0.5)
+    expected = 2 * np.arcsin(radius / np.asarray(found.distance))
+    np.testing.assert_allclose(width[is_cylinder], expected[is_cylinder], atol=np.radians(0.6))
+    middle = np.array([ANGLES[on].mean() for on in is_on])
+    error = np.degrees(np.abs(middle - found.bearing)[is_cylinder])
+    assert 0.9 < error.max() < CONFIG.viewpoint.bearing_error + 0.3
+    assert found.distance.min() < 0.35
+    assert found.distance.max() > 1.15
+
+
+def test_what_is_recorded_hides_a_poi():
+    found = insert_all(KEYS, jnp.full(361, 0.9), exact())
+    has_room = np.asarray(found.distance) + CONFIG.arena.poi_extent < 0.9
+    np.testing.assert_array_equal(found.is_visible, has_room)
+    assert found.ranges.max() <= 0.9
+
+
+def test_a_poi_is_measured_with_recorded_errors():
+    errors = recorded.Errors(jnp.full((1, 15), 0.03), jnp.float32(0.0))
+    background = jnp.full(361, 4.0)
+    found, as_is = insert_all(KEYS, background, errors), insert_all(KEYS, background, exact())
+    off = np.where(np.asarray(as_is.ranges) < 4.0, 0.03, 0.0)
+    np.testing.assert_allclose(found.ranges - as_is.ranges, off, atol=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_edges_of_a_poi_are_mixed(share):
+    found = insert_all(KEYS, jnp.full(361, 4.0), exact(share))
+    as_is = insert_all(KEYS, jnp.full(361, 4.0), exact())
+    changed = np.asarray(found.ranges != as_is.ranges).sum(axis=1)
+    assert changed.mean() == pytest.approx(2 * share, abs=0.15)
+    between = np.asarray(found.ranges)[np.asarray(found.ranges != as_is.ranges)]
+    assert between.mean() == pytest.approx((4.0 + 0.7) / 2, abs=0.25)
+    nowhere = insert_all(KEYS, jnp.full(361, jnp.inf), exact(share))
+    assert not np.isnan(nowhere.ranges).any()
+
+
+def test_views_show_a_whole_window():
+    sensor = sensors.lidar(CONFIG.lidar)
+    draw = jax.jit(jax.vmap(lambda key: recorded.random_view(key, CONFIG, ANGLES)))
+    bearings, distances = draw(jax.random.split(jax.random.key(2), 2000))
+    ends = np.degrees(np.asarray(bearings))
+    # 180 degrees, less the 65 beams of half a window to either side and an error of 1 degree.
+    limit = 90 - 65 * 240 / 682 - 1
+    np.testing.assert_allclose([ends.min(), ends.max()], [-limit, limit], atol=0.2)
+    assert 0.3 <= distances.min() < 0.31
+    assert 1.19 < distances.max() <= 1.2
+    assert sensor.window == 128

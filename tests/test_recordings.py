@@ -1,0 +1,185 @@
+"""Recordings of real sensors: read, checked against a run, and compared with simulated looks."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from smoke import save_models
+
+import jaxsense
+from jaxsense import sim
+from jaxsense.config import PRESETS
+from jaxsense.run import recordings
+from jaxsense.run.rundir import RunDirectory, Settings
+
+CONFIG = replace(PRESETS["smoke"], arena=replace(PRESETS["smoke"].arena, side=4.0))
+LIDAR = sim.sensors.make(CONFIG)[1]
+PLACES = np.array([[1.0, 0.0], [0.0, 0.8], [-0.5, 0.0]])
+POSES = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.2], [0.0, 0.0, -3.0]])
+EMPTY = np.full((3, 683), 5.0)
+HALF_CIRCLE = np.radians(np.linspace(-90, 90, 361))
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a recording of the LiDAR, some of whose arrays are changed, or missing if None."""
+
+    def write(**changes):
+        found = {"places": PLACES, "lidar_poses": POSES, "lidar_scans": EMPTY, **changes}
+        path = tmp_path / "recorded.npz"
+        np.savez(path, **{name: values for name, values in found.items() if values is not None})
+        return path
+
+    return write
+
+
+def test_bearing_and_distance_follow_from_poses(write):
+    looks = recordings.read(CONFIG, write())
+    bearing, distance = looks.seen_from("lidar")
+    # Straight ahead; at 90 degrees from a robot at 1.2 rad; behind, 180 degrees from -3 rad.
+    np.testing.assert_allclose(bearing, [0.0, np.pi / 2 - 1.2, 3.0 - np.pi], atol=1e-6)
+    np.testing.assert_allclose(distance, [1.0, 0.8, 0.5], rtol=1e-6)
+    expected = [sim.bearing(jnp.array(p), jnp.array(q)) for p, q in zip(POSES, PLACES, strict=True)]
+    np.testing.assert_allclose(bearing, expected, atol=1e-6)
+
+
+def test_a_sensor_may_be_missing_and_have_other_rays(write):
+    looks = recordings.read(CONFIG, write())
+    assert [*looks.scans] == [*looks.poses] == ["lidar"]
+    np.testing.assert_array_equal(looks.scans["lidar"], EMPTY)
+    scans = np.stack([np.full(361, 3.0), 2 + HALF_CIRCLE, np.full(361, np.inf)])
+    path = write(lidar_scans=scans, lidar_angles=HALF_CIRCLE)
+    found = recordings.read(CONFIG, path).scans["lidar"]
+    assert found.shape == (3, 683)
+    is_seen = np.abs(LIDAR.angles) <= np.pi / 2
+    assert np.isnan(found[:, np.abs(LIDAR.angles) > np.radians(90.3)]).all()
+    np.testing.assert_allclose(found[0, is_seen], 3.0)
+    np.testing.assert_allclose(found[1, is_seen], 2 + LIDAR.angles[is_seen], atol=1e-5)
+    assert np.isinf(found[2, is_seen]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"lidar_poses": None, "lidar_scans": None}, "camera_poses is missing; a recording holds"),
+        ({"camera_poses": POSES}, "camera_scans is missing"),
+        ({"lidar_poses": None}, "lidar_poses is missing"),
+        ({"places": None}, "places is missing; a recording holds places, camera_poses"),
+        ({"places": np.zeros((2, 2))}, r"lidar_poses has the shape \(3, 3\); must be \(C, 3\) for"),
+        (
+            {"lidar_scans": np.zeros((3, 361))},
+            r"lidar_scans has the shape \(3, 361\); must be \(C, 683\) for C places; "
+            "of other rays, lidar_angles must hold the angles, in radians$",
+        ),
+        (
+            {"lidar_angles": np.zeros((3, 2))},
+            r"lidar_angles has the shape \(3, 2\); must be \(A,\)",
+        ),
+        (
+            {"lidar_angles": HALF_CIRCLE},
+            r"lidar_scans has the shape \(3, 683\); must be \(C, 361\) for C places$",
+        ),
+        (
+            {"lidar_angles": HALF_CIRCLE[:60], "lidar_scans": EMPTY[:, :60]},
+            "field of view of lidar = 29.5 degrees: must be at least 44.7",
+        ),
+        (
+            {"lidar_angles": HALF_CIRCLE[::5], "lidar_scans": EMPTY[:, :73]},
+            "step between the rays of lidar = 2.50 degrees: must be at most 1.06 degrees",
+        ),
+    ],
+)
+def test_a_recording_that_does_not_fit_is_named_with_what_would(write, changes, reason):
+    with pytest.raises(ValueError, match=reason):
+        recordings.read(CONFIG, write(**changes))
+
+
+@pytest.mark.parametrize("content", [b"PK\x03\x04 half of a file", b""])
+def test_a_broken_file_is_named(tmp_path, content):
+    path = tmp_path / "recorded.npz"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="is not a whole file of NumPy's format"):
+        recordings.read(CONFIG, path)
+    np.save(tmp_path / "one.npy", EMPTY)
+    with pytest.raises(ValueError, match="is not a whole file of NumPy's format"):
+        recordings.read(CONFIG, tmp_path / "one.npy")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A directory with a run whose networks are not trained."""
+    path = tmp_path_factory.mktemp("runs") / "run"
+    with RunDirectory.create(path, Settings("smoke", 0, CONFIG)) as created:
+        save_models(created, jaxsense.init(jax.random.key(0), CONFIG))
+    return path
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Few windows to find the nearest of, for they are simulated one after the other."""
+    monkeypatch.setattr(sim.similar, "NUM_SIMULATED", 24)
+
+
+def simulated(number=8):
+    """A simulated recording by both sensors."""
+    world, found = sim.make_world(CONFIG), {}
+
+    @jax.jit
+    @jax.vmap
+    def record(key):
+        scene_key, *keys = jax.random.split(key, 3)
+        scene = sim.random_scene(scene_key, world, jnp.array([0, 1, 2]))
+        found = {"places": scene.layout.position[0]}
+        for m, sensor in enumerate(world.sensors):
+            look_key, noise_key = jax.random.split(keys[m])
+            _, scene = sim.look(look_key, world, scene, m, jnp.int32(0))
+            data, rays = sim.place(world.arena, scene.layout, scene.poses), sensor.directions
+            found[f"{sensor.name}_scans"] = sim.scan(
+                noise_key, sensor, world.arena, data, scene.layout, scene.light, m, jnp.array(rays)
+            )
+            found[f"{sensor.name}_poses"] = scene.poses[m]
+        return found
+
+    found = record(jax.random.split(jax.random.key(1), number))
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def test_recorded_windows_are_compared_with_simulated_ones(run, write, few):
+    path = write(**simulated())
+    found = jaxsense.compare_scans(run, path)
+    assert [*found.of_sensors] == ["camera", "lidar"]
+    for apart in found.of_sensors.values():
+        # A simulated recording is as far from simulated windows as they are from each other.
+        assert apart.looks == 8
+        assert 0 < apart.recorded < 1.5 * apart.simulated
+    # Each beam is off by .01 m, and so is each of the windows that it is compared with.
+    assert found.of_sensors["lidar"].recorded == pytest.approx(0.0125, abs=0.003)
+    assert found.picture == path.with_name("recorded.npz.png")
+    assert found.picture.read_bytes().startswith(b"\x89PNG")
+    camera, lidar = str(found).splitlines()
+    assert camera.startswith("camera: 8 recorded windows are 0.0")
+    assert lidar.startswith(
+        f"lidar: 8 recorded windows are {found.of_sensors['lidar'].recorded:.4f}"
+    )
+    with pytest.raises(FileExistsError, match=r"recorded\.npz\.png"):
+        jaxsense.compare_scans(run, path)
+
+
+def test_another_scanner_is_farther_from_simulated_windows(run, write, few, tmp_path):
+    content = simulated()
+    number = len(content["places"])
+    # Too far by .2 m, and the last three looks are behind the robot.
+    content["lidar_scans"] = content["lidar_scans"] + 0.2
+    content["lidar_poses"][-3:, 2] += np.pi
+    content = {name: x for name, x in content.items() if not name.startswith("camera")}
+    found = jaxsense.compare_scans(run, write(**content), tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").exists()
+    assert [*found.of_sensors] == ["lidar"]
+    assert found.of_sensors["lidar"].looks == number - 3
+    assert 0.13 < found.of_sensors["lidar"].recorded < 0.22
+    content["lidar_poses"][:-3, 2] += np.pi
+    with pytest.raises(ValueError, match="lidar_scans: no window around a place was recorded"):
+        jaxsense.compare_scans(run, write(**content), tmp_path / "another.png")
+    assert not (tmp_path / "another.png").exists()
