@@ -177,7 +177,7 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
     [
         (
             ["--preset", "best"],
-            "preset = 'best': must be one of default, paper, noisy, many, team, smoke",
+            "preset = 'best': must be one of default, paper, noisy, many, team, recorded, smoke",
         ),
         (["--taste", "sweet"], "train: unknown option --taste; see --help-all"),
         (["--jmvae.hiden", "3"], "unknown option --jmvae.hiden; did you mean --jmvae.hidden?"),

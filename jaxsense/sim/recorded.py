@@ -188,10 +188,11 @@ def _edges(ranges: Float[np.ndarray, "S A"], max_range: float) -> tuple[float, f
     if not is_edge.any():
         raise ValueError("scans show no edges: too few to fit the noise")
     mixed = np.sum(1 / visible[is_mixed])
-    # A clean edge is met twice, before and after its jump.
+    # A clean edge is met twice, before and after its jump; one whose mixed pixel is not seen looks
+    # the same.
     clean = np.sum(is_edge & ~is_mixed) / 2
     lost = np.sum(is_surface & np.isinf(middle)) / max(np.sum(is_surface), 1)
-    return float(mixed / (mixed + clean)), float(lost)
+    return float(mixed / (np.sum(is_mixed) + clean)), float(lost)
 
 
 @pytree

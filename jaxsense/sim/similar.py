@@ -11,7 +11,8 @@ from jaxsense.core.types import Key, pytree
 from jaxsense.sim import absence, windows
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import world as worlds
-from jaxsense.sim.world import World
+from jaxsense.sim.light import random_light
+from jaxsense.sim.world import Scene, World
 
 NUM_SIMULATED = 96
 """Simulated windows to find the nearest of."""
@@ -68,16 +69,16 @@ def simulate(
     Returns:
       The readings of the rays that the detector reads.
     """
-    scene_key, error_key, noise_key = jax.random.split(key, 3)
+    layout_key, light_key, error_key, noise_key = jax.random.split(key, 4)
     config, limit = world.arena.config, jnp.radians(world.viewpoint.bearing_error)
-    scene = worlds.random_scene(scene_key, world, jnp.full(config.num_pois, poi_class))
+    layout = arenas.random_layout(layout_key, config, jnp.full(config.num_pois, poi_class))
     away = jnp.array(absence.outside(config))
     true = bearing - jax.random.uniform(error_key, minval=-limit, maxval=limit)
     centre = distance * jnp.stack([jnp.cos(true), jnp.sin(true)])
     positions = jnp.tile(away, (config.num_pois, 1)).at[0].set(centre)
-    poses = jnp.zeros_like(scene.poses).at[:, :2].set(away).at[modality, :2].set(0.0)
-    layout = dataclasses.replace(scene.layout, position=positions)
-    scene = dataclasses.replace(scene, layout=layout, poses=poses)
+    poses = jnp.zeros((len(world.sensors), 3)).at[:, :2].set(away).at[modality, :2].set(0.0)
+    layout = dataclasses.replace(layout, position=positions)
+    scene = Scene(layout, random_light(light_key, world.reads_conditions), poses)
     data = arenas.place(world.arena, layout, poses)
     return worlds.scan_around(noise_key, world, scene, data, modality, bearing, modality)
 

@@ -124,6 +124,22 @@ def test_noise_is_fitted_to_scans(measured):
     )
 
 
+def test_noise_is_fitted_without_bias():
+    # Two walls, 2 and 3 m ahead, and one edge between them, at which 30 % of the beams are mixed.
+    rng = np.random.default_rng(0)
+    angles = ANGLES[90:271]
+    depth = np.where(np.arange(181) < 90, 2.0, 3.0) / np.cos(angles)
+    ranges = np.repeat(depth[None], 6000, axis=0)
+    is_mixed = rng.uniform(size=6000) < 0.3
+    ranges[is_mixed, 90] = rng.uniform(2.0, 3.0, is_mixed.sum())
+    ranges += 0.01 * rng.normal(size=ranges.shape)
+    found = recorded.fit_noise(LidarConfig(), angles, ranges)
+    at_wall = found.range_noise + 2.5 * found.range_noise_growth
+    assert at_wall == pytest.approx(0.01, rel=0.01)
+    assert found.mixed_pixels == pytest.approx(0.3, abs=0.025)
+    assert found.dropout == 0.0
+
+
 def test_residuals_are_those_of_straight_walls():
     # The wall x = 2 m, of which residuals are as small as float32 allows, and what is no wall.
     wall = 2 / np.cos(ANGLES[90:271])

@@ -57,8 +57,8 @@ def test_a_window_is_as_far_from_simulated_ones_as_it_is_off(world):
 
     keys = jax.random.split(jax.random.key(3), 8)
     found = jax.tree.map(lambda *x: np.stack(x), *(compare(key, 0.0) for key in keys))
-    assert np.median(found.apart) < 0.003
-    assert np.median(found.usual) < 0.003
+    assert np.median(found.apart) < 0.01
+    assert np.median(found.usual) < 0.01
     off = jax.tree.map(lambda *x: np.stack(x), *(compare(key, -0.2) for key in keys))
     # A cube's corner is nearer by .04 m than its side, which makes up for a part.
     assert 0.14 < np.median(off.apart) < 0.2
