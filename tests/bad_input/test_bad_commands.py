@@ -118,7 +118,10 @@ TRAIN = [
     (["--devices", "-1"], "devices = -1: must be from 1 to"),
     (["--devices", "1000000000"], "devices = 1000000000: must be from 1 to"),
     (["--devices", "1e9"], "devices = '1e9': must be a whole number or None"),
-    (["--preset", ""], "preset = '': must be one of default, paper, noisy, many, team, smoke"),
+    (
+        ["--preset", ""],
+        "preset = '': must be one of default, paper, noisy, many, team, recorded, smoke",
+    ),
     (["--preset", "Smoke"], "preset = 'Smoke': must be one of"),
     (["--preset"], "argument --preset: expected one argument"),
     (["--out", ""], "out = '': must be a path"),
