@@ -15,7 +15,7 @@ import jaxsense
 from jaxsense.interfaces import rawlog
 from jaxsense.sim import recorded, sensors, windows
 from jaxsense.vae import detectors
-from jaxsense.vae.detectors import Detector
+from jaxsense.vae.detectors import Classifier, Detector
 
 _VIEWS = 10  # of each scan
 _LABELLED = 200  # windows to retrain with
@@ -121,7 +121,7 @@ class Recorded:
 
     def right(self, detector: Detector, looks: Shown) -> float:
         """Share of looks whose shape a detector finds, without the gate."""
-        of_window = jax.vmap(lambda window: detectors.logits(detector, window))
+        of_window = jax.vmap(detector.features)
         found = np.argmax(of_window(self.windows(looks)), axis=1)
         return float(np.mean(found == looks.labels))
 
@@ -132,6 +132,7 @@ class Recorded:
         """
         before, after = [], []
         detector, number = self.models.detectors[self.modality], len(self.scans.ranges)
+        assert isinstance(detector, Classifier)
         for each in jax.random.split(key, _RETRAINED):
             order_key, train_key, test_key, fit_key = jax.random.split(each, 4)
             order = np.asarray(jax.random.permutation(order_key, number))

@@ -197,11 +197,11 @@ RETRAINING = DetectorConfig(steps=600, batch=64, learning_rate=3e-4, calibration
 
 def retrain(
     key: Key,
-    detector: Detector,
+    detector: Classifier,
     windows: Float[Array, "S F"],
     labels: Int[Array, " S"],
     config: DetectorConfig = RETRAINING,
-) -> Detector:
+) -> Classifier:
     """Continues the training of a detector with other windows, for example 200 recorded ones.
 
     Few windows may replace what many have taught. So the parameters move from the old ones towards
