@@ -32,7 +32,7 @@ def stages_of(config: Config) -> dict[str, Stage]:
 
 @pytest.fixture(scope="module")
 def learned():
-    return jax.jit(lambda key: learn(key, TINY, until="latent_space"))(KEY)
+    return jax.jit(lambda key: learn(key, TINY, until="grouped"))(KEY)
 
 
 def test_every_stage_follows_those_that_it_takes_from():
@@ -63,12 +63,13 @@ def test_scenes_come_in_groups_that_show_the_same_pois():
 def test_the_same_pois_stand_in_another_light():
     world = worlds.make_world(TINY)
     classes, place, keys = jnp.array([0, 1, 2]), jax.random.key(7), jax.random.split(KEY)
-    one, two = (worlds.survey(key, world, classes, None, place)[0] for key in keys)
+    draw = jax.jit(lambda key, place: worlds.random_scene(key, world, classes, place))
+    one, two = (draw(key, place) for key in keys)
     for name in ("position", "yaw", "shape", "colour"):
         np.testing.assert_array_equal(getattr(one.layout, name), getattr(two.layout, name))
     assert not np.allclose(one.light.direction, two.light.direction)
     assert not np.allclose(one.poses, two.poses)
-    other = worlds.survey(keys[0], world, classes, None, jax.random.key(8))[0]
+    other = draw(keys[0], jax.random.key(8))
     assert not np.allclose(one.layout.position, other.layout.position)
     np.testing.assert_array_equal(one.light.direction, other.light.direction)
 
