@@ -1,49 +1,37 @@
-"""`python -m jaxsense.export RUN_DIR`: a run's models as one file that runs without jaxsense.
+"""`python -m jaxsense.export RUN_DIR`: a run's models as one file for robots without JAX.
 
-The file is a zip archive of `jax.export` artefacts and a `contents.json` with their names, inputs
-and outputs. `examples/run_exported.py` shows how to run them.
+The file is a zip archive: each function as an ONNX file; weights as NumPy arrays in `weights.npz`,
+and in `programs.json` the functions as operators on them; a `contents.json` that describes inputs
+and outputs; and `robot_numpy.py` and `robot_onnx.py`, which run the functions.
 """
 
 import dataclasses
-import importlib
-import importlib.metadata
 import io
 import json
 import sys
 import zipfile
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated
 
-import jax
 import numpy as np
-from jax import export
 
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
-from jaxsense.interfaces.onboard import Function, functions
+from jaxsense.interfaces import onboard
+from jaxsense.interfaces.graph import OPSET, Constants, as_onnx
+from jaxsense.interfaces.onboard import functions
+from jaxsense.interfaces.translate import arrays_of, program
+from jaxsense.mission.state import RECENT_LOOKS
 from jaxsense.models import Models
 from jaxsense.run import cli, files, rundir
 from jaxsense.run.version import __version__
+from jaxsense.sim import sensors
+from jaxsense.sim.sensors import Sensor
 
 PROGRAM = "jaxsense.export"
-PLATFORMS = ("cpu", "cuda", "tpu")
-"""Platforms that the programs of a file run on."""
-
-
-class _Aval(Protocol):
-    """Shape and dtype of an input or an output."""
-
-    shape: tuple[object, ...]
-    dtype: np.dtype
-
-
-def exported(function: Function) -> export.Exported:
-    """A function for a batch of any size, lowered for all of `PLATFORMS`."""
-    one = [jax.ShapeDtypeStruct((1, *x.shape), x.dtype) for x in function.inputs.values()]
-    sizes = [f"batch, {function.any_size.get(name, '...')}" for name in function.inputs]
-    inputs = export.symbolic_args_specs(one, sizes)
-    return export.export(jax.jit(jax.vmap(function.apply)), platforms=PLATFORMS)(*inputs)
+ROBOTS = ("robot_numpy.py", "robot_onnx.py")
+"""Files that run an archive on a robot, and are in it."""
 
 
 def archive(config: Config, models: Models) -> bytes:
@@ -52,54 +40,86 @@ def archive(config: Config, models: Models) -> bytes:
     Args:
       config: settings of the run.
       models: its trained models.
+
+    Raises:
+      ModuleNotFoundError: if the package `onnx` is not installed.
+      NotImplementedError: if a custom sensor, fusion or agent computes what has no translation.
     """
-    content, programs = io.BytesIO(), {}
+    content, described, graphs = io.BytesIO(), {}, {}
+    constants = Constants(arrays_of(models))
+    read: set[str] = set()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as files:
-        for name, function in functions(config, models).items():
-            program = exported(function)
-            files.writestr(f"{name}.bin", program.serialize())
-            outputs = jax.tree.unflatten(program.out_tree, program.out_avals)
-            programs[name] = {
+        for name, function in functions(config).items():
+            inputs = {key: (each.dtype, each.shape) for key, each in function.inputs.items()}
+            found = program(function.apply, models, inputs, constants)
+            onnx = as_onnx(name, function.about, found.graph, constants.arrays, found.outputs)
+            files.writestr(f"{name}.onnx", onnx)
+            graphs[name] = found.graph.as_json()
+            read |= found.graph.read()
+            described[name] = {
                 "about": function.about,
                 "inputs": {
-                    name: _described(aval)
-                    for name, aval in zip(function.inputs, program.in_avals, strict=True)
+                    key: _described(*inputs[key], each.about)
+                    for key, each in function.inputs.items()
                 },
-                "outputs": {name: _described(aval) for name, aval in outputs.items()},
+                "outputs": {
+                    key: _described(*each, function.outputs[key])
+                    for key, each in found.outputs.items()
+                },
             }
-        contents = json.dumps({**_description(config, models), "programs": programs}, indent=2)
+        weights = {name: x for name, x in constants.arrays.items() if name in read}
+        with files.open("weights.npz", "w") as file:
+            np.savez(file, **weights)
+        files.writestr("programs.json", json.dumps(graphs))
+        for name in ROBOTS:
+            files.writestr(name, (Path(onboard.__file__).parent / name).read_bytes())
+        contents = json.dumps({**_description(config, models), "programs": described}, indent=2)
         files.writestr("contents.json", contents + "\n")
     return content.getvalue()
 
 
 def _description(config: Config, models: Models) -> dict[str, object]:
     """Everything a reader of the file needs except the programs."""
-    arena = config.arena
-    versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib")}
-    prior = models.fusion.prior
+    prior, mission = models.fusion.prior, config.mission
     return {
         "modalities": config.modalities,
         "robots": config.carried,
-        "classes": arena.classes,
+        "classes": config.arena.classes,
         "labels": {name: config.labels(name) for name in config.modalities},
         "label_of_class": {name: config.label_of_class(name) for name in config.modalities},
         "class_means": np.asarray(models.fusion.classes.mean).tolist(),
-        "num_pois": arena.num_pois,
+        "num_pois": config.arena.num_pois,
         "unseen": {name: np.asarray(x).tolist() for name, x in vars(prior).items()},
-        "platforms": PLATFORMS,
-        "versions": {"jaxsense": __version__, **versions},
+        "sensors": {sensor.name: _of_sensor(sensor) for sensor in sensors.make(config)},
+        "mission": {"attempts": int(mission.attempts), "redecides": bool(mission.redecides)},
+        "remembered_looks": RECENT_LOOKS,
+        "opset": OPSET,
+        "versions": {"jaxsense": __version__},
     }
 
 
-def _described(aval: _Aval) -> dict[str, object]:
-    """Dtype and shape, with the names of axes of any size, such as "batch"."""
-    shape = [n if isinstance(n, int) else str(n) for n in aval.shape]
-    return {"shape": shape, "dtype": aval.dtype.name}
+def _of_sensor(sensor: Sensor) -> dict[str, object]:
+    """How a scan is given to `detect`."""
+    return {
+        "readings": "distances in metres, infinite for none"
+        if sensor.measures_distance
+        else "linear RGB from 0 to 1"
+        if sensor.channels == 3
+        else "readings",
+        "angles": [round(float(angle), 6) for angle in sensor.angles],
+        "about": "one reading for each ray; `angles` are the rays' directions in the robot's frame "
+        "(x ahead, y left), in radians, positive to the left",
+    }
+
+
+def _described(dtype: str, shape: tuple[int | str, ...], about: str) -> dict[str, object]:
+    """An array, with the names of axes of any size, such as "pois"."""
+    return {"shape": shape, "dtype": dtype, "about": about}
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Writes a run's detectors, encoders and policies into one file that runs without jaxsense."""
+    """Writes a run's detectors, encoders and policies into one file for robots without JAX."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
@@ -129,7 +149,7 @@ def main(argv: list[str] | None = None) -> None:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"out = {str(path)!r}: cannot be written ({cli.reason(error)})")
-    print(f"{path}: {len(content) / 1e3:.0f} kB, for {', '.join(PLATFORMS)}")
+    print(f"{path}: {len(content) / 1e3:.0f} kB, for NumPy and ONNX")
 
 
 if __name__ == "__main__":

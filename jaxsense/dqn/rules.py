@@ -88,7 +88,7 @@ def _is_useful(gains: jax.Array, team: Team) -> jax.Array:
 def _is_taken(team: Team, agent: jax.Array) -> jax.Array:
     """`[N]` bool, PoIs that other robots head for."""
     heads = team.target[:, None] == jnp.arange(team.positions.shape[0])[None]
-    is_other = team.works & (jnp.arange(len(team.target)) != agent)
+    is_other = team.works & (jnp.arange(team.target.shape[0]) != agent)
     return jnp.any(heads & is_other[:, None], axis=0)
 
 

@@ -204,7 +204,7 @@ class TeamAgent:
           team: robots and PoIs at this moment.
           robot: `[]` int32, the robot that chooses.
         """
-        alone = team_mdp.alone(len(team.present), team.modality[robot])
+        alone = team_mdp.alone(team.present.shape[0], team.modality[robot])
         alone = dataclasses.replace(alone, present=team.present)
         after = self._q_alone(params, classes, belief, alone, jnp.int32(0))
         return self._less_way(after, self.observe(belief, team, robot))

@@ -1,4 +1,4 @@
-"""The functions of a run that a robot needs, for export; each takes one example."""
+"""The functions of a run that a robot needs, for export: what missions play, each for one look."""
 
 import dataclasses
 from collections.abc import Callable
@@ -8,10 +8,29 @@ import jax.numpy as jnp
 
 from jaxsense.config import Config
 from jaxsense.core.types import Belief
+from jaxsense.dqn.policies import POLICIES, Known
 from jaxsense.dqn.team_mdp import Team
-from jaxsense.models import Models, make_jmvae
+from jaxsense.mission.choice import choose, times_to_new_looks, values_of
+from jaxsense.models import Models, make_agent, make_jmvae
 from jaxsense.sim import sensors
-from jaxsense.vae import jmvae, latent
+from jaxsense.vae import jmvae
+
+_ENDS = "N for none"
+
+
+@dataclasses.dataclass(frozen=True)
+class Input:
+    """An input of a function.
+
+    Attributes:
+      shape: its axes; one that is named, such as "pois", has any size, the same in all inputs.
+      about: its meaning, with units, order and frame.
+      dtype: "float32", "int32" or "bool".
+    """
+
+    shape: tuple[int | str, ...]
+    about: str
+    dtype: str = "float32"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,146 +38,212 @@ class Function:
     """A function of one example.
 
     Attributes:
-      about: its result, in one line.
-      inputs: shape and dtype of each input, by its name.
-      apply: `(*inputs) -> {name: output}`.
-      any_size: names of the axes of any size, by input, for example `"points, ..."`.
+      about: what it does, in one line.
+      inputs: by name, in the order of `apply`.
+      outputs: meaning of each output, by name.
+      apply: `(models, *inputs) -> {name: output}`.
     """
 
     about: str
-    inputs: dict[str, jax.ShapeDtypeStruct]
+    inputs: dict[str, Input]
+    outputs: dict[str, str]
     apply: Callable[..., dict[str, jax.Array]]
-    any_size: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
-def functions(config: Config, models: Models) -> dict[str, Function]:
+def functions(config: Config) -> dict[str, Function]:
     """All functions, by name.
 
-    For each modality M `detect_M`, `weigh_M`, `write_M` and `decide_M`; for each encoder of the
-    JMVAE an `encode_M`, for example `encode_camera+lidar`; and `classify`.
+    For each modality M `detect_M`, `weigh_M` and `write_M`; for each encoder of the JMVAE an
+    `encode_M`, for example `encode_camera+lidar`; `classify`; and `decide`.
 
     Args:
       config: all settings.
-      models: trained models.
     """
     model = make_jmvae(config)
     found = {}
     for m, name in enumerate(model.modalities):
         found |= {
-            f"detect_{name}": _detect(config, models, m),
-            f"weigh_{name}": _weigh(models, m),
-            f"write_{name}": _update(models, model, m),
-            f"decide_{name}": _decide(config, models, m),
+            f"detect_{name}": _detect(config, m),
+            f"weigh_{name}": _weigh(m),
+            f"write_{name}": _write(config, m),
         }
     for subset in model.subsets:
-        found[f"encode_{model.encoder_name(subset)}"] = _encode(models, model, subset)
-    return {**found, "classify": _classify(models)}
+        found[f"encode_{model.encoder_name(subset)}"] = _encode(config, subset)
+    return {**found, "classify": _classify(config), "decide": _decide(config)}
 
 
-def _detect(config: Config, models: Models, m: int) -> Function:
-    sensor = sensors.make(config)[m]
+def _detect(config: Config, m: int) -> Function:
+    sensor, least = sensors.make(config)[m], config.mission.least_confidence
 
-    def apply(readings: jax.Array, bearing: jax.Array, distance: jax.Array) -> dict[str, jax.Array]:
-        found = models.detect(m, sensor, readings, bearing, distance)
-        return {"is_there": found.is_there, "features": found.features}
-
-    channels = () if sensor.channels == 1 else (sensor.channels,)
-    inputs = {
-        "readings": _floats(len(sensor.angles), *channels),
-        "bearing": _floats(),
-        "distance": _floats(),
-    }
-    about = "whether a whole scan shows a PoI, and probabilities of its labels, equal if not"
-    return Function(about, inputs, apply)
-
-
-def _weigh(models: Models, m: int) -> Function:
-    def apply(apart: jax.Array) -> dict[str, jax.Array]:
-        return {"weight": models.novelty.weight(apart, m)}
-
-    about = (
-        "the share of a look that is new evidence, by the distances from earlier ones at the PoI"
-    )
-    return Function(about, {"apart": _floats(4)}, apply, {"apart": "looks"})
-
-
-def _update(models: Models, model: jmvae.Jmvae, m: int) -> Function:
     def apply(
-        mean: jax.Array, std: jax.Array, seen: jax.Array, features: jax.Array, weight: jax.Array
+        models: Models, readings: jax.Array, bearing: jax.Array, distance: jax.Array
     ) -> dict[str, jax.Array]:
-        return _named(models.fusion.update(Belief(mean, std), seen, features, m, weight))
-
-    inputs = {
-        "mean": _floats(model.latent_size),
-        "std": _floats(model.latent_size),
-        "seen": jax.ShapeDtypeStruct((len(model.modalities),), bool),
-        "features": _floats(model.feature_sizes[m]),
-        "weight": _floats(),
-    }
-    return Function("the belief about a PoI after a look of that weight", inputs, apply)
-
-
-def _encode(models: Models, model: jmvae.Jmvae, subset: tuple[int, ...]) -> Function:
-    def apply(*features: jax.Array) -> dict[str, jax.Array]:
-        given = dict(zip(subset, features, strict=True))
-        of_each = tuple(given.get(m) for m in range(len(model.modalities)))
-        return _named(jmvae.posterior(models.jmvae, model, of_each))
-
-    inputs = {model.modalities[m]: _floats(model.feature_sizes[m]) for m in subset}
-    return Function("the belief after a look by each of these", inputs, apply)
-
-
-def _decide(config: Config, models: Models, m: int) -> Function:
-    num_pois = config.arena.num_pois
-    of_team = models.agent.team_inputs(num_pois, len(config.carried))
-    alone = {
-        "positions": jnp.zeros((num_pois, 2)),
-        "present": jnp.ones(num_pois, bool),
-        "poses": jnp.zeros((1, 3)),
-        "modality": jnp.array([m]),
-        "works": jnp.array([True]),
-        "target": jnp.array([num_pois]),
-        "robot": jnp.int32(0),
-    }
-
-    def apply(mean: jax.Array, std: jax.Array, *known: jax.Array) -> dict[str, jax.Array]:
-        given = {**alone, **dict(zip(of_team, known, strict=True))}
-        robot = given.pop("robot")
-        values = models.agent.decide(
-            models.q_networks[m],
-            models.tours,
-            models.fusion.classes,
-            Belief(mean, std),
-            Team(**given),
-            robot,
-        )
-        return {"action": jnp.argmax(values).astype(jnp.int32), "values": values}
-
-    of_map = _floats(num_pois, config.jmvae.latent_size)
-    of_pois = dict.fromkeys(("mean", "std", "positions", "present"), "points, ...")
-    of_robots = dict.fromkeys(("poses", "modality", "works", "target"), "robots, ...")
-    any_number = {**of_pois, **of_robots} if models.agent.plays(num_pois + 1) else {}
-    about = "the PoI to look at next, N for NOP, and the value of each; the same for targets"
-    return Function(about, {"mean": of_map, "std": of_map, **of_team}, apply, any_number)
-
-
-def _classify(models: Models) -> Function:
-    means = models.fusion.classes.mean
-
-    def apply(mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
-        belief = Belief(mean, std)
+        found = models.detect(m, sensor, readings, bearing, distance)
+        is_confident = jnp.max(found.features) >= least
         return {
-            "most_likely": models.fusion.most_likely_class(belief).astype(jnp.int32),
-            "plausible": latent.plausible_classes(belief, means),
+            "is_there": found.is_there,
+            "detects": found.is_there & is_confident,
+            "features": found.features,
         }
 
-    inputs = {"mean": _floats(means.shape[1]), "std": _floats(means.shape[1])}
-    return Function("the most likely class, and those that a belief leaves open", inputs, apply)
+    channels = () if sensor.channels == 1 else (sensor.channels,)
+    kind = "distances in metres" if sensor.measures_distance else "readings"
+    order = "in the order of `angles` in `sensors`"
+    bright = "" if sensor.channels != 3 else ", linear RGB from 0 to 1"
+    inputs = {
+        "readings": Input(
+            (len(sensor.angles), *channels), f"{kind} of all rays of a scan, {order}{bright}"
+        ),
+        "bearing": Input(
+            (),
+            "of the PoI in the robot's frame (x ahead, y left), in radians, positive to the left",
+        ),
+        "distance": Input((), "expected from the sensor to the PoI's centre, in metres"),
+    }
+    outputs = {
+        "is_there": "whether the scan shows the PoI",
+        "detects": f"whether it is there and a label has a probability of at least {float(least):g}"
+        ": only then write the look",
+        "features": "probability of each label, in the order of `labels`; equal if it is not there",
+    }
+    return Function("What a look says, by gate and detector.", inputs, outputs, apply)
 
 
-def _floats(*shape: int) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(shape, jnp.float32)
+def _weigh(m: int) -> Function:
+    def apply(models: Models, apart: jax.Array) -> dict[str, jax.Array]:
+        return {
+            "weight": models.novelty.weight(apart, m),
+            "to_go": models.novelty.to_go(apart, m),
+        }
+
+    apart = Input(("looks",), "distances from earlier looks by this sensor at the PoI, in metres")
+    outputs = {
+        "weight": "share of the look that is new evidence, above 0 and up to 1",
+        "to_go": "metres straight away from the earlier looks to where half of a look is new",
+    }
+    about = "How much of a look is new after earlier ones; give an infinite distance for none."
+    return Function(about, {"apart": apart}, outputs, apply)
 
 
-def _named(belief: Belief) -> dict[str, jax.Array]:
-    return {"mean": belief.mean, "std": belief.std}
+def _write(config: Config, m: int) -> Function:
+    def apply(
+        models: Models,
+        mean: jax.Array,
+        std: jax.Array,
+        seen: jax.Array,
+        features: jax.Array,
+        weight: jax.Array,
+    ) -> dict[str, jax.Array]:
+        after = models.fusion.update(Belief(mean, std), seen, features, m, weight)
+        return {"new_mean": after.mean, "new_std": after.std}
+
+    model = make_jmvae(config)
+    inputs = {
+        **_belief(model.latent_size),
+        "seen": Input((len(model.modalities),), "which sensors have looked at it before", "bool"),
+        "features": Input((model.feature_sizes[m],), "from `detect`"),
+        "weight": Input((), "from `weigh`"),
+    }
+    outputs = {f"new_{name}": about for name, about in _BELIEF.items()}
+    return Function("The belief about a PoI after a look.", inputs, outputs, apply)
+
+
+def _encode(config: Config, subset: tuple[int, ...]) -> Function:
+    model = make_jmvae(config)
+
+    def apply(models: Models, *features: jax.Array) -> dict[str, jax.Array]:
+        given = dict(zip(subset, features, strict=True))
+        of_each = tuple(given.get(m) for m in range(len(model.modalities)))
+        return vars(jmvae.posterior(models.jmvae, model, of_each))
+
+    inputs = {
+        model.modalities[m]: Input((model.feature_sizes[m],), "features, from its `detect`")
+        for m in subset
+    }
+    return Function("The JMVAE's belief after a look by each of these.", inputs, _BELIEF, apply)
+
+
+def _classify(config: Config) -> Function:
+    def apply(models: Models, mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
+        belief, fusion = Belief(mean, std), models.fusion
+        return {
+            "probabilities": jax.vmap(fusion.class_probabilities)(belief),
+            "most_likely": jax.vmap(fusion.most_likely_class)(belief).astype(jnp.int32),
+            "plausible": jax.vmap(models.plausible_classes)(belief),
+        }
+
+    outputs = {
+        "probabilities": "of each class, in the order of `classes`",
+        "most_likely": "index of the most likely class",
+        "plausible": "which classes the belief leaves open",
+    }
+    inputs = _belief("pois", config.jmvae.latent_size)
+    return Function("What the map says about the classes.", inputs, outputs, apply)
+
+
+def _decide(config: Config) -> Function:
+    policies, first = {"latent": POLICIES["latent"]}, jnp.int32(0)
+    key, settings = jax.random.key(0), config.mission  # the policy draws nothing
+
+    def apply(
+        models: Models,
+        mean: jax.Array,
+        std: jax.Array,
+        looked_from: jax.Array,
+        robot: jax.Array,
+        *of_team: jax.Array,
+    ) -> dict[str, jax.Array]:
+        team, pois = Team(*of_team), mean.shape[0]
+        known = Known(
+            belief=Belief(mean, std),
+            # The policy of a run reads neither.
+            looks=jnp.zeros((pois, len(config.modalities)), jnp.int32),
+            log_posterior=jnp.zeros((pois, len(config.arena.classes))),
+            team=team,
+            times=times_to_new_looks(config.team.travel, models.novelty, team, looked_from),
+            robot=robot,
+        )
+        return {
+            "action": choose(key, settings, policies, models, known, first),
+            "values": values_of(key, policies, models, known, first),
+        }
+
+    pois: int | str = config.arena.num_pois
+    if make_agent(config).plays(pois + 1):
+        pois = "pois"
+    frame = "in one frame of the map that all robots share"
+    inputs = {
+        **_belief(pois, config.jmvae.latent_size),
+        "looked_from": Input(
+            (pois, len(config.modalities), "looks", 2),
+            f"places of earlier looks by each sensor at each PoI, x and y in metres {frame}; "
+            "infinite for none; missions remember the last 32",
+        ),
+        "robot": Input((), "index of the robot that chooses", "int32"),
+        "positions": Input((pois, 2), f"of the PoIs, x and y in metres, {frame}"),
+        "present": Input((pois,), "PoIs that this robot has not given up", "bool"),
+        "poses": Input(
+            ("robots", 3), f"of the robots, x and y in metres and yaw in radians, {frame}"
+        ),
+        "modality": Input(("robots",), "index of each robot's sensor in `modalities`", "int32"),
+        "works": Input(("robots",), "robots that have neither ended by NOP nor failed", "bool"),
+        "target": Input(("robots",), f"PoI that each robot heads for, {_ENDS}", "int32"),
+    }
+    outputs = {
+        "action": "PoI to look at next; N for NOP, which ends the robot's part; -1 if a value is "
+        "not a number",
+        "values": "the policy's value of each action, NOP's last; the rules choose among the best",
+    }
+    return Function(
+        "The robot's choice, by its policy and the rules of missions.", inputs, outputs, apply
+    )
+
+
+_BELIEF = {"mean": "of the new belief", "std": "standard deviation of the new belief"}
+
+
+def _belief(*shape: int | str) -> dict[str, Input]:
+    return {
+        "mean": Input(shape, "of the belief about each PoI in the latent space"),
+        "std": Input(shape, "standard deviation of that belief, above 0"),
+    }

@@ -1,16 +1,13 @@
 """The choice of the PoI that a robot looks at next, and of the viewpoint."""
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.core.types import Index, Key, others, pytree
-from jaxsense.dqn import rules, team_mdp
+from jaxsense.core.types import Index, Key, pytree
 from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission import roadmap
+from jaxsense.mission.choice import choose, times_to_new_looks
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
@@ -24,7 +21,6 @@ from jaxsense.mission.state import (
 from jaxsense.models import Models
 from jaxsense.sim import viewpoints
 
-_KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
 RECOVERY_TIME = 1.0  # s that a robot backs off
 AT_VIEWPOINT = 0.05  # m, from a viewpoint within which a robot is there
@@ -116,67 +112,11 @@ def _choose(
     key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> Int[Array, ""]:
     """PoI that a robot's policy chooses, N for NOP, or -1 if any value is NaN."""
-    config, robots = mission.config, state.robots
-    settings, num_pois = config.mission, config.arena.num_pois
+    robots = state.robots
     given_up = robots.unreachable[robot] | robots.undetected[robot] | robots.exhausted[robot]
     known = _known_to(mission, models, state, robot, given_up)
-    values = _values(key, mission, models, known, state.policy)
-    # Values that include travel time need no order.
-    counts_time = jnp.array(
-        [policy.counts_time(models.agent) for policy in mission.policies.values()]
-    )[state.policy]
-    tolerance = jnp.where(counts_time, 0.0, settings.equal_values)
-    of_pois = jnp.where(given_up, -jnp.inf, values[:num_pois])
-    is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > values[num_pois])
-    by_values = _by_values(mission, state, robot, is_best)
-    gains = _gains(key, mission, models, known, state.policy)
-    by_auction = jnp.argmax(rules.auction(gains, known.times, known.team, known.robot))
-    is_unordered = jnp.array([each.is_unordered for each in mission.policies.values()])
-    is_auction = settings.auctions & is_unordered[state.policy] & ~counts_time
-    choice = jnp.where(is_auction, by_auction, by_values)
-    return jnp.where(jnp.any(jnp.isnan(jnp.append(of_pois, values[num_pois]))), -1, choice)
-
-
-def _by_values(
-    mission: Mission, state: MissionState, robot: Index, is_best: Bool[Array, " N"]
-) -> Int[Array, ""]:
-    """One of the PoIs with the best values, by the rules; N if there is none."""
-    settings, robots, num_pois = mission.config.mission, state.robots, len(is_best)
-    position = state.scene.poses[robot, :2]
-    distance = jnp.linalg.norm(state.scene.layout.position - position[None], axis=-1)
-    is_kept = jnp.arange(num_pois) == robots.target[robot]
-    targets = others(robots.target, robot)
-    is_others = jnp.any(jnp.arange(num_pois)[:, None] == targets[None], axis=-1)
-    # Prefer the robot's present target, then PoIs that no other robot heads for, then near ones.
-    rank = jnp.where(settings.nearest_first, distance, jnp.arange(num_pois))
-    rank += _KEPT * is_kept + _HEADED_FOR * (is_others & settings.avoids_targets)
-    poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
-    return jnp.where(jnp.any(is_best), poi, num_pois)
-
-
-def _values(
-    key: Key, mission: Mission, models: Models, known: Known, policy: Int[Array, ""]
-) -> Float[Array, " A"]:
-    """Values of the A = N + 1 actions of a policy, NOP's last."""
-    of_each = [each.values(key, models, known) for each in mission.policies.values()]
-    return jnp.stack(of_each)[policy]
-
-
-def _gains(
-    key: Key, mission: Mission, models: Models, known: Known, policy: Int[Array, ""]
-) -> Float[Array, "R N"]:
-    """Expected gain of each robot's look at each PoI, by its policy: above 0 if it pays."""
-
-    def of_robot(robot: Int[Array, ""]) -> jax.Array:
-        there = dataclasses.replace(known, robot=robot)
-        nothing = jnp.zeros(mission.config.arena.num_pois)
-        of_each = [
-            each.gains(key, models, there) if each.is_unordered else nothing
-            for each in mission.policies.values()
-        ]
-        return jnp.stack(of_each)[policy]
-
-    return jax.vmap(of_robot)(jnp.arange(len(mission.config.carried)))
+    settings = mission.config.mission
+    return choose(key, settings, mission.policies, models, known, state.policy)
 
 
 def _known_to(
@@ -201,26 +141,10 @@ def _known_to(
         looks=state.times_seen,
         log_posterior=state.log_posterior,
         team=team,
-        times=team_mdp.travel_times(mission.config.team.travel, team)
-        + _times_to_new_places(mission, models, state),
+        times=times_to_new_looks(
+            mission.config.team.travel, models.novelty, team, state.looked_from
+        ),
         robot=jnp.asarray(robot),
-    )
-
-
-def _times_to_new_places(
-    mission: Mission, models: Models, state: MissionState
-) -> Float[Array, "R N"]:
-    """Seconds until each robot is where a look at each PoI is new, which travel times leave out."""
-
-    def of_look(position: jax.Array, modality: jax.Array, poi: jax.Array) -> jax.Array:
-        apart = state.apart(position[None], poi, modality)[0]
-        return models.novelty.to_go(apart, modality) / mission.config.team.travel.speed
-
-    of_robot = jax.vmap(of_look, (None, None, 0))
-    return jax.vmap(of_robot, (0, 0, None))(
-        state.scene.poses[:, :2],
-        mission.modalities,
-        jnp.arange(mission.config.arena.num_pois),
     )
 
 

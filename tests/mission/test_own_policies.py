@@ -14,7 +14,7 @@ from teams import CONFIG, POLICIES
 from jaxsense import dqn, evaluate, mission, train
 from jaxsense.config import ConfigError
 from jaxsense.dqn.policies import Policy
-from jaxsense.mission import decide
+from jaxsense.mission import choice, decide
 from jaxsense.mission.state import DRIVING, FAILED
 from jaxsense.run import cli, pipeline, programs
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -92,7 +92,7 @@ def test_every_policy_of_the_table_is_played(own, models, arena_of):
     state = replace(state, times_seen=jnp.array([[1, 0], [0, 1], [0, 0]], jnp.int32))
     key, given_up = jax.random.key(1), jnp.zeros(3, bool)
     known = decide._known_to(own, models, state, 0, given_up)
-    values_of = jax.jit(lambda policy: decide._values(key, own, models, known, policy))
+    values_of = jax.jit(lambda policy: choice.values_of(key, own.policies, models, known, policy))
     assert [*own.policies] == [*POLICIES, *OWN]
     for name in POLICIES:
         expected = dqn.POLICIES[name].values(key, models, known)

@@ -1,0 +1,286 @@
+"""What primitives of JAX are in ONNX operators: numbers, shapes, sums and products."""
+
+import ast
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxsense.interfaces.graph import Array, Builder
+
+Size = Any
+"""The size of an axis: a number, or an expression of JAX such as `pois + 1`."""
+
+SAME = {
+    "add": "Add",
+    "sub": "Sub",
+    "mul": "Mul",
+    "max": "Max",
+    "min": "Min",
+    "pow": "Pow",
+    "exp": "Exp",
+    "log": "Log",
+    "tanh": "Tanh",
+    "logistic": "Sigmoid",
+    "tan": "Tan",
+    "sqrt": "Sqrt",
+    "abs": "Abs",
+    "neg": "Neg",
+    "sign": "Sign",
+    "floor": "Floor",
+    "ceil": "Ceil",
+    "div": "Div",
+    "lt": "Less",
+    "le": "LessOrEqual",
+    "gt": "Greater",
+    "ge": "GreaterOrEqual",
+    "eq": "Equal",
+    "and": "And",
+    "or": "Or",
+    "not": "Not",
+    "copy": "Identity",
+    "stop_gradient": "Identity",
+}
+"""Primitives that are one operator."""
+
+
+def described(aval: Any) -> Array:
+    """Dtype and shape of what JAX has traced."""
+    shape = tuple(n if isinstance(n, int) else str(n) for n in aval.shape)
+    return aval.dtype.name, shape
+
+
+class Operators:
+    """Builds the operators of a primitive: method `_NAME(equation, *inputs)`, by names of arrays.
+
+    Attributes:
+      build: builds the graph.
+      sizes: names of the numbers that hold the sizes of named axes.
+    """
+
+    def __init__(self, build: Builder, sizes: Mapping[str, str]):
+        self.build = build
+        self.sizes = sizes
+
+    # Sizes.
+
+    def size(self, size: Size) -> str:
+        """The name of a number that holds the size of an axis, int64."""
+        return self._expression(ast.parse(str(size), mode="eval").body)
+
+    def _expression(self, tree: ast.expr) -> str:
+        """A sum of products of sizes, such as `2*pois + 1`."""
+        operators: dict[type, str] = {ast.Add: "Add", ast.Sub: "Sub", ast.Mult: "Mul"}
+        match tree:
+            case ast.Constant(value=int(value)):
+                return self.build.constant(np.int64(value))
+            case ast.Name(id=name) if name in self.sizes:
+                return self.sizes[name]
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                return self.build.op("Neg", self._expression(operand))
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in operators:
+                sides = self._expression(left), self._expression(right)
+                return self.build.op(operators[type(op)], *sides)
+        raise NotImplementedError(f"the size {ast.unparse(tree)} has no ONNX translation")
+
+    def shape(self, sizes: Sequence[Size]) -> str:
+        """The name of a list of sizes, int64."""
+        if all(isinstance(size, (int, np.integer)) for size in sizes):
+            return self.build.integers(*sizes)
+        axis = self.build.integers(0)
+        return self.build.op(
+            "Concat", *(self.build.op("Unsqueeze", self.size(n), axis) for n in sizes), axis=0
+        )
+
+    def _dim_as_value(self, equation: Any) -> str:
+        return self.cast(self.size(equation.params["dim"]), equation.outvars[0].aval.dtype)
+
+    # Numbers.
+
+    def cast(self, x: str, dtype: Any) -> str:
+        return self.build.op("Cast", x, to=np.dtype(dtype).name)
+
+    def _convert_element_type(self, equation: Any, x: str) -> str:
+        before, after = equation.invars[0].aval.dtype, equation.params["new_dtype"]
+        return x if before == after else self.cast(x, after)
+
+    def _ne(self, equation: Any, x: str, y: str) -> str:
+        return self.build.op("Not", self.build.op("Equal", x, y))
+
+    def _is_finite(self, equation: Any, x: str) -> str:
+        odd = self.build.op("Or", self.build.op("IsNaN", x), self.build.op("IsInf", x))
+        return self.build.op("Not", odd)
+
+    def _rem(self, equation: Any, x: str, y: str) -> str:
+        return self.build.op("Mod", x, y, fmod=1)
+
+    def _round(self, equation: Any, x: str) -> str:
+        if equation.params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+            raise NotImplementedError("rounding away from zero has no ONNX translation")
+        return self.build.op("Round", x)
+
+    def _square(self, equation: Any, x: str) -> str:
+        return self.build.op("Mul", x, x)
+
+    def _rsqrt(self, equation: Any, x: str) -> str:
+        return self.build.op("Reciprocal", self.build.op("Sqrt", x))
+
+    def _integer_pow(self, equation: Any, x: str) -> str:
+        power = equation.params["y"]
+        product = functools.reduce(
+            lambda y, _: self.build.op("Mul", y, x), range(abs(power) - 1), x
+        )
+        return product if power > 0 else self.build.op("Reciprocal", product)
+
+    def _atan2(self, equation: Any, y: str, x: str) -> str:
+        """By the arc tangent of `y / x`, which is one of two half planes."""
+        zero, op = self.build.constant(np.float32(0)), self.build.op
+        half = op(
+            "Where", op("Less", y, zero), *map(self.build.constant, np.float32([-np.pi, np.pi]))
+        )
+        steep = op("Div", half, self.build.constant(np.float32(2)))
+        steep = op("Where", op("Equal", y, zero), zero, steep)
+        angle = op("Atan", op("Div", y, op("Where", op("Equal", x, zero), x, x)))
+        behind = op("Where", op("Less", x, zero), op("Add", angle, half), angle)
+        return op("Where", op("Equal", x, zero), steep, behind)
+
+    def _select_n(self, equation: Any, which: str, *cases: str) -> str:
+        if len(cases) != 2 or equation.invars[0].aval.dtype != bool:
+            raise NotImplementedError("a choice among more than two has no ONNX translation")
+        if equation.invars[1].aval.dtype != bool:
+            return self.build.op("Where", which, cases[1], cases[0])
+        # Runtimes choose no bool.
+        op = self.build.op
+        return op("Or", op("And", which, cases[1]), op("And", op("Not", which), cases[0]))
+
+    # Shapes.
+
+    def _iota(self, equation: Any) -> str:
+        shape, axis = equation.params["shape"], equation.params["dimension"]
+        numbers = self.cast(self.range(shape[axis]), equation.params["dtype"])
+        return self.broadcast(numbers, shape[axis : axis + 1], shape, (axis,))
+
+    def range(self, size: Size) -> str:
+        first, step = self.build.constant(np.int64(0)), self.build.constant(np.int64(1))
+        return self.build.op("Range", first, self.size(size), step)
+
+    def _broadcast_in_dim(self, equation: Any, x: str, *_: str) -> str:
+        before, shape = equation.invars[0].aval.shape, equation.params["shape"]
+        return self.broadcast(x, before, shape, equation.params["broadcast_dimensions"])
+
+    def broadcast(
+        self, x: str, before: Sequence[Size], shape: Sequence[Size], axes: Sequence[int]
+    ) -> str:
+        new = [axis for axis in range(len(shape)) if axis not in axes]
+        if new:
+            x = self.build.op("Unsqueeze", x, self.build.integers(*new))
+        widened = [before[axes.index(a)] if a in axes else 1 for a in range(len(shape))]
+        return x if widened == list(shape) else self.build.op("Expand", x, self.shape(shape))
+
+    def _reshape(self, equation: Any, x: str, *_: str) -> str:
+        return self.build.op("Reshape", x, self.shape(equation.params["new_sizes"]))
+
+    def _squeeze(self, equation: Any, x: str) -> str:
+        return self.without(x, equation.params["dimensions"])
+
+    def without(self, x: str, axes: Sequence[int]) -> str:
+        return self.build.op("Squeeze", x, self.build.integers(*axes)) if len(axes) else x
+
+    def _transpose(self, equation: Any, x: str) -> str:
+        return self.permuted(x, equation.params["permutation"])
+
+    def permuted(self, x: str, axes: Sequence[int]) -> str:
+        axes = [int(axis) for axis in axes]
+        return x if axes == sorted(axes) else self.build.op("Transpose", x, perm=axes)
+
+    def _concatenate(self, equation: Any, *parts: str) -> str:
+        return self.build.op("Concat", *parts, axis=int(equation.params["dimension"]))
+
+    def _stack(self, equation: Any, *parts: str) -> str:
+        axis = int(equation.params["axis"])
+        parts = tuple(self.build.op("Unsqueeze", x, self.build.integers(axis)) for x in parts)
+        return self.build.op("Concat", *parts, axis=axis)
+
+    def _split(self, equation: Any, x: str) -> Sequence[str]:
+        sizes, axis = equation.params["sizes"], int(equation.params["axis"])
+        return self.build.ops("Split", len(sizes), x, self.build.integers(*sizes), axis=axis)
+
+    def _slice(self, equation: Any, x: str) -> str:
+        params = equation.params
+        starts, ends = self.shape(params["start_indices"]), self.shape(params["limit_indices"])
+        steps = params["strides"] or [1] * len(params["start_indices"])
+        axes = self.build.integers(*range(len(steps)))
+        return self.build.op("Slice", x, starts, ends, axes, self.build.integers(*steps))
+
+    def _dynamic_slice(self, equation: Any, x: str, *starts: str) -> str:
+        sizes, shape = equation.params["slice_sizes"], equation.invars[0].aval.shape
+        return self.window(x, shape, dict(enumerate(starts)), sizes)
+
+    def window(
+        self, x: str, shape: Sequence[Size], starts: Mapping[int, str], sizes: Sequence[Size]
+    ) -> str:
+        """A slice from starts on some axes that are moved inside, as XLA does."""
+        op, zero = self.build.op, self.build.constant(np.int64(0))
+        for axis, start in starts.items():
+            if sizes[axis] == shape[axis]:
+                continue
+            size = self.size(sizes[axis])
+            last = op("Sub", self.size(shape[axis]), size)
+            first = op("Max", op("Min", self.cast(start, np.int64), last), zero)
+            axes = self.build.integers(0)
+            ends = (op("Unsqueeze", n, axes) for n in (first, op("Add", first, size)))
+            x = op("Slice", x, *ends, self.build.integers(axis))
+        return x
+
+    # Reductions.
+
+    def reduced(self, operator: str, equation: Any, x: str) -> str:
+        axes = self.build.integers(*equation.params["axes"])
+        return self.build.op(operator, x, axes, keepdims=0) if len(equation.params["axes"]) else x
+
+    def _reduce_sum(self, equation: Any, x: str) -> str:
+        return self.reduced("ReduceSum", equation, x)
+
+    def _reduce_max(self, equation: Any, x: str) -> str:
+        return self.reduced("ReduceMax", equation, x)
+
+    def _reduce_min(self, equation: Any, x: str) -> str:
+        return self.reduced("ReduceMin", equation, x)
+
+    def _reduce_and(self, equation: Any, x: str) -> str:
+        return self.cast(self.reduced("ReduceMin", equation, self.cast(x, np.int32)), bool)
+
+    def _reduce_or(self, equation: Any, x: str) -> str:
+        return self.cast(self.reduced("ReduceMax", equation, self.cast(x, np.int32)), bool)
+
+    def _argmax(self, equation: Any, x: str) -> str:
+        return self.best("ArgMax", equation, x)
+
+    def _argmin(self, equation: Any, x: str) -> str:
+        return self.best("ArgMin", equation, x)
+
+    def best(self, operator: str, equation: Any, x: str) -> str:
+        (axis,) = equation.params["axes"]
+        found = self.build.op(operator, x, axis=int(axis), keepdims=0)
+        return self.cast(found, equation.params["index_dtype"])
+
+    def _dot_general(self, equation: Any, x: str, y: str) -> str:
+        (of_x, of_y), (batch_x, batch_y) = equation.params["dimension_numbers"]
+        letters = iter("abcdefghijklmnopqrstuvwxyz")
+        left = [next(letters) for _ in equation.invars[0].aval.shape]
+        right = [next(letters) for _ in equation.invars[1].aval.shape]
+        for i, j in zip([*of_x, *batch_x], [*of_y, *batch_y], strict=True):
+            right[j] = left[i]
+        both = [left[i] for i in batch_x]
+        summed = [left[i] for i in of_x]
+        free_x = [n for n in left if n not in both + summed]
+        free_y = [n for n in right if n not in both + summed]
+        if len(summed) == 1 and len(free_y) <= 1 and (not both or len(free_x) == len(free_y) == 1):
+            x = self.permuted(x, [left.index(n) for n in both + free_x + summed])
+            y = self.permuted(y, [right.index(n) for n in both + summed + free_y])
+            return self.build.op("MatMul", x, y)
+        result = "".join(both + free_x + free_y)
+        sides = f"{''.join(left)},{''.join(right)}->{result}"
+        return self.build.op("Einsum", x, y, equation=sides)

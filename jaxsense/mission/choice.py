@@ -1,0 +1,133 @@
+"""The choice of the PoI that a robot looks at next: its policy's values, and the rules of missions.
+
+It reads nothing but what a robot knows, so that `python -m jaxsense.export` takes it along.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsense.config import MissionConfig, TravelConfig
+from jaxsense.core.types import Key
+from jaxsense.dqn import rules, team_mdp
+from jaxsense.dqn.policies import Known, Policy
+from jaxsense.dqn.team_mdp import Team
+from jaxsense.models import Models
+from jaxsense.vae.novelty import Novelty
+
+_KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
+
+
+def choose(
+    key: Key,
+    settings: MissionConfig,
+    policies: Mapping[str, Policy],
+    models: Models,
+    known: Known,
+    policy: Int[Array, ""],
+) -> Int[Array, ""]:
+    """PoI that a robot's policy chooses, N for NOP, or -1 if any value is NaN.
+
+    Args:
+      key: random key.
+      settings: the rules.
+      policies: by name.
+      models: trained models.
+      known: what the robot knows; PoIs that are not present are never chosen.
+      policy: `[]` int32 index into `policies`.
+    """
+    values, present = values_of(key, policies, models, known, policy), known.team.present
+    # Values that include travel time need no order.
+    counts_time = jnp.array([each.counts_time(models.agent) for each in policies.values()])[policy]
+    tolerance = jnp.where(counts_time, 0.0, settings.equal_values)
+    of_pois, of_nop = jnp.where(present, values[:-1], -jnp.inf), values[-1]
+    is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > of_nop)
+    by_values = _by_values(settings, known, is_best)
+    gains = _gains(key, policies, models, known, policy)
+    by_auction = jnp.argmax(rules.auction(gains, known.times, known.team, known.robot))
+    is_unordered = jnp.array([each.is_unordered for each in policies.values()])
+    is_auction = settings.auctions & is_unordered[policy] & ~counts_time
+    choice = jnp.where(is_auction, by_auction, by_values)
+    is_nan = jnp.any(jnp.isnan(of_pois)) | jnp.isnan(of_nop)
+    return jnp.where(is_nan, -1, choice).astype(jnp.int32)
+
+
+def values_of(
+    key: Key,
+    policies: Mapping[str, Policy],
+    models: Models,
+    known: Known,
+    policy: Int[Array, ""],
+) -> Float[Array, " A"]:
+    """Values of the A = N + 1 actions of a policy, NOP's last.
+
+    Args:
+      key: random key.
+      policies: by name.
+      models: trained models.
+      known: what the robot knows.
+      policy: `[]` int32 index into `policies`.
+    """
+    return jnp.stack([each.values(key, models, known) for each in policies.values()])[policy]
+
+
+def times_to_new_looks(
+    travel: TravelConfig, novelty: Novelty, team: Team, looked_from: Float[Array, "N M K 2"]
+) -> Float[Array, "R N"]:
+    """Seconds until each robot has looked at each PoI from where a look is new.
+
+    Args:
+      travel: the travel model, which leaves out the way to such a place.
+      novelty: how much of a look is new.
+      team: robots and PoIs at this moment.
+      looked_from: places of earlier looks by each modality at each PoI, in metres; infinite for
+        none.
+
+    Returns:
+      `[R, N]` seconds.
+    """
+
+    def to_go(pose: jax.Array, modality: jax.Array) -> jax.Array:
+        apart = jnp.linalg.norm(pose[None, None, :2] - looked_from[:, modality], axis=-1)
+        return novelty.to_go(apart, modality)
+
+    metres = jax.vmap(to_go)(team.poses, team.modality)
+    return team_mdp.travel_times(travel, team) + metres / travel.speed
+
+
+def _by_values(settings: MissionConfig, known: Known, is_best: Bool[Array, " N"]) -> Int[Array, ""]:
+    """One of the PoIs with the best values, by the rules; N if there is none."""
+    team, robot = known.team, known.robot
+    pois, robots = jnp.arange(team.positions.shape[0]), jnp.arange(team.poses.shape[0])
+    distance = jnp.linalg.norm(team.positions - team.poses[robot, :2][None], axis=-1)
+    heads = team.target[:, None] == pois[None]
+    is_others = jnp.any(heads & (robots != robot)[:, None], axis=0)
+    # Prefer the robot's present target, then PoIs that no other robot heads for, then near ones.
+    rank = jnp.where(settings.nearest_first, distance, pois)
+    rank += _KEPT * heads[robot] + _HEADED_FOR * (is_others & settings.avoids_targets)
+    poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
+    return jnp.where(jnp.any(is_best), poi, pois.shape[0])
+
+
+def _gains(
+    key: Key,
+    policies: Mapping[str, Policy],
+    models: Models,
+    known: Known,
+    policy: Int[Array, ""],
+) -> Float[Array, "R N"]:
+    """Expected gain of each robot's look at each PoI, by its policy: above 0 if it pays."""
+
+    def of_robot(robot: Int[Array, ""]) -> jax.Array:
+        there = dataclasses.replace(known, robot=robot)
+        nothing = jnp.zeros(known.team.positions.shape[0])
+        of_each = [
+            each.gains(key, models, there) if each.is_unordered else nothing
+            for each in policies.values()
+        ]
+        return jnp.stack(of_each)[policy]
+
+    return jax.vmap(of_robot)(jnp.arange(known.team.poses.shape[0]))
