@@ -165,10 +165,11 @@ def _encode(config: Config, subset: tuple[int, ...]) -> Function:
 
 def _classify(config: Config) -> Function:
     def apply(models: Models, mean: jax.Array, std: jax.Array) -> dict[str, jax.Array]:
-        belief, fusion = Belief(mean, std), models.fusion
+        belief = Belief(mean, std)
+        probabilities = jax.vmap(models.fusion.class_probabilities)(belief)
         return {
-            "probabilities": jax.vmap(fusion.class_probabilities)(belief),
-            "most_likely": jax.vmap(fusion.most_likely_class)(belief).astype(jnp.int32),
+            "probabilities": probabilities,
+            "most_likely": jnp.argmax(probabilities, axis=1).astype(jnp.int32),
             "plausible": jax.vmap(models.plausible_classes)(belief),
         }
 

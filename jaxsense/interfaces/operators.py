@@ -68,10 +68,10 @@ class Operators:
 
     def size(self, size: Size) -> str:
         """The name of a number that holds the size of an axis, int64."""
-        return self._expression(ast.parse(str(size), mode="eval").body)
+        return self._expression(ast.parse(str(size).replace("^", "**"), mode="eval").body)
 
     def _expression(self, tree: ast.expr) -> str:
-        """A sum of products of sizes, such as `2*pois + 1`."""
+        """A polynomial in sizes, such as `2*pois + 1`."""
         operators: dict[type, str] = {ast.Add: "Add", ast.Sub: "Sub", ast.Mult: "Mul"}
         match tree:
             case ast.Constant(value=int(value)):
@@ -80,6 +80,9 @@ class Operators:
                 return self.sizes[name]
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 return self.build.op("Neg", self._expression(operand))
+            case ast.BinOp(left=left, op=ast.Pow(), right=ast.Constant(value=int(power))):
+                factors = [self._expression(left)] * power
+                return functools.reduce(lambda x, y: self.build.op("Mul", x, y), factors)
             case ast.BinOp(left=left, op=op, right=right) if type(op) in operators:
                 sides = self._expression(left), self._expression(right)
                 return self.build.op(operators[type(op)], *sides)
@@ -222,17 +225,22 @@ class Operators:
         self, x: str, shape: Sequence[Size], starts: Mapping[int, str], sizes: Sequence[Size]
     ) -> str:
         """A slice from starts on some axes that are moved inside, as XLA does."""
-        op, zero = self.build.op, self.build.constant(np.int64(0))
+        axes = self.build.integers(0)
         for axis, start in starts.items():
             if sizes[axis] == shape[axis]:
                 continue
-            size = self.size(sizes[axis])
-            last = op("Sub", self.size(shape[axis]), size)
-            first = op("Max", op("Min", self.cast(start, np.int64), last), zero)
-            axes = self.build.integers(0)
-            ends = (op("Unsqueeze", n, axes) for n in (first, op("Add", first, size)))
-            x = op("Slice", x, *ends, self.build.integers(axis))
+            first = self.inside(start, shape[axis], sizes[axis])
+            last = self.build.op("Add", first, self.size(sizes[axis]))
+            ends = (self.build.op("Unsqueeze", n, axes) for n in (first, last))
+            x = self.build.op("Slice", x, *ends, self.build.integers(axis))
         return x
+
+    def inside(self, index: str, size: Size, window: Size = 1) -> str:
+        """The index where a window starts, moved into the axis if it is not inside."""
+        op = self.build.op
+        last = op("Sub", self.size(size), self.size(window))
+        index = op("Min", self.cast(index, np.int64), last)
+        return op("Max", index, self.build.constant(np.int64(0)))
 
     # Reductions.
 
@@ -280,7 +288,11 @@ class Operators:
         if len(summed) == 1 and len(free_y) <= 1 and (not both or len(free_x) == len(free_y) == 1):
             x = self.permuted(x, [left.index(n) for n in both + free_x + summed])
             y = self.permuted(y, [right.index(n) for n in both + summed + free_y])
-            return self.build.op("MatMul", x, y)
+            # As a matrix: onnxruntime 1.32 multiplies a transposed matrix and a vector wrongly.
+            vector = [axis for axis, free in ((-2, free_x), (-1, free_y)) if not free]
+            x = x if free_x else self.build.op("Unsqueeze", x, self.build.integers(0))
+            y = y if free_y else self.build.op("Unsqueeze", y, self.build.integers(1))
+            return self.without(self.build.op("MatMul", x, y), vector)
         result = "".join(both + free_x + free_y)
         sides = f"{''.join(left)},{''.join(right)}->{result}"
         return self.build.op("Einsum", x, y, equation=sides)

@@ -83,44 +83,44 @@ class Translator(Operators):
         # A whole axis starts at 0 wherever it is told to.
         moved = [axis for axis in mapped if sizes[axis] != shape[axis] or axis in dropped]
         moved = moved or mapped[:1]
-        if any(sizes[axis] != 1 for axis in moved):
-            raise NotImplementedError("gather of windows has no ONNX translation")
+        wide = [axis for axis in moved if sizes[axis] != 1]
         rest = [axis for axis in range(len(shape)) if axis not in moved + batched]
+        leading = [*together, *(axis for axis in range(rank - 1) if axis not in together)]
+        indices = self.permuted(indices, [*leading, rank - 1])
+        of_batch = [equation.invars[1].aval.shape[axis] for axis in leading]
+        grid = self.shape([*of_batch, *(sizes[axis] for axis in wide)])
+        parts = []
+        for axis in moved:
+            start = self.component(indices, rank - 1, mapped.index(axis))
+            part = self.inside(start, shape[axis], sizes[axis])
+            if wide:
+                part = self.build.op("Unsqueeze", part, self.build.integers(*range(-len(wide), 0)))
+            if axis in wide:
+                after = range(1, len(wide) - wide.index(axis))
+                steps = self.range(sizes[axis])
+                steps = self.build.op("Unsqueeze", steps, self.build.integers(*after))
+                part = self.build.op("Add", part, steps)
+            part = self.build.op("Expand", part, grid)
+            parts.append(self.build.op("Unsqueeze", part, self.build.integers(-1)))
         x = self.permuted(x, batched + moved + rest)
-        parts = [
-            self.inside(self.component(indices, rank - 1, mapped.index(axis)), shape[axis])
-            for axis in moved
-        ]
-        axis = self.build.integers(-1)
-        parts = [self.build.op("Unsqueeze", part, axis) for part in parts]
-        others = [axis for axis in range(rank - 1) if axis not in together]
-        index = self.permuted(
-            self.build.op("Concat", *parts, axis=-1), [*together, *others, rank - 1]
-        )
+        index = self.build.op("Concat", *parts, axis=-1)
         found = self.build.op("GatherND", x, index, batch_dims=len(batched))
-        # Axes of size 1 that were taken and are not dropped come back where they were.
+        # Axes of size 1 that were taken, and are not dropped, come back at the end.
         kept = [axis for axis in range(len(shape)) if axis not in dropped + batched]
-        back = [rank - 1 + i for i, axis in enumerate(kept) if axis in moved]
-        if back:
-            found = self.build.op("Unsqueeze", found, self.build.integers(*back))
+        single = [axis for axis in kept if axis in moved and axis not in wide]
+        of_window = [*wide, *rest, *single]
+        if single:
+            ends = range(rank - 1 + len(wide + rest), rank - 1 + len(of_window))
+            found = self.build.op("Unsqueeze", found, self.build.integers(*ends))
+        batch = iter([leading.index(axis) for axis in range(rank - 1)])
+        window = iter([rank - 1 + of_window.index(axis) for axis in kept])
         offset = [int(axis) for axis in numbers.offset_dims]
-        order, of_batch, of_window = (
-            [],
-            iter(_inverse([*together, *others])),
-            iter(range(rank - 1, 99)),
-        )
-        for axis in range(rank - 1 + len(kept)):
-            order.append(next(of_window if axis in offset else of_batch))
+        order = [next(window if n in offset else batch) for n in range(rank - 1 + len(kept))]
         return self.permuted(found, order)
 
     def component(self, indices: str, axis: int, i: int) -> str:
         """One number of each index."""
         return self.build.op("Gather", indices, self.build.constant(np.int64(i)), axis=axis)
-
-    def inside(self, index: str, size: Size) -> str:
-        op, one = self.build.op, self.build.constant(np.int64(1))
-        index = op("Min", self.cast(index, np.int64), op("Sub", self.size(size), one))
-        return op("Max", index, self.build.constant(np.int64(0)))
 
     def _scatter(self, equation: Any, x: str, indices: str, updates: str) -> str:
         return self._scattered(equation, x, indices, lambda old: updates)
@@ -294,7 +294,3 @@ def _array(x: Any) -> np.ndarray:
 
 def _is_array(variable: Any) -> bool:
     return not jax.dtypes.issubdtype(variable.aval.dtype, jax.dtypes.extended)
-
-
-def _inverse(order: Sequence[int]) -> list[int]:
-    return [order.index(n) for n in range(len(order))]

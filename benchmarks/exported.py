@@ -1,0 +1,310 @@
+"""How far exported programs are from ours, and how long they take: `python -m benchmarks.exported`.
+
+Plays missions of a run, and asks the programs of its archive, with NumPy and with onnxruntime on
+one core, what ours say in the same states.
+"""
+
+import dataclasses
+import io
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import rich.console
+import rich.table
+
+from jaxsense import export, mission
+from jaxsense.config import Config
+from jaxsense.config.checks import check_fields
+from jaxsense.config.options import Name
+from jaxsense.interfaces import robot_numpy, robot_onnx
+from jaxsense.interfaces.onboard import Function, functions
+from jaxsense.mission import decide
+from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
+from jaxsense.models import Models
+from jaxsense.run import cli, devices, rundir
+from jaxsense.sim import arena as arenas
+from jaxsense.sim import sensors, viewpoints
+
+PROGRAM = "benchmarks.exported"
+LOADERS = {"NumPy": robot_numpy.load, "onnxruntime": robot_onnx.load}
+"""What plays an archive."""
+_MISSIONS = 16
+_TIMED = 200
+_TINY = 1e-3  # values below count as of this size
+
+Inputs = dict[str, np.ndarray]
+Arrays = dict[str, np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Compare what an exported run says with the run itself, in states of missions."""
+
+    run: Annotated[Path, Name("RUN")]
+    """The directory of a finished run."""
+    states: int = 1000
+    """How many states of missions."""
+    trust: bool = False
+    """Run the code of custom sensors that the run's `config.json` names."""
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """A moment in which a robot chooses.
+
+    Attributes:
+      inputs: of `decide`.
+      action: that the robot of the mission takes.
+      seen: `[N, M]` bool, sensors that have looked at each PoI.
+      poi: the nearest PoI.
+      readings: a whole scan.
+      bearing: of the nearest PoI, in radians.
+      distance: of the nearest PoI, in metres.
+    """
+
+    inputs: Inputs
+    action: int
+    seen: np.ndarray
+    poi: int
+    readings: np.ndarray
+    bearing: np.ndarray
+    distance: np.ndarray
+
+
+def choices(config: Config, models: Models, number: int, seed: int = 0) -> list[Choice]:
+    """Moments of missions with the trained policy, in which a robot is at work and must choose.
+
+    Args:
+      config: settings of the run.
+      models: its models.
+      number: how many.
+      seed: of the arenas.
+    """
+    scenario = mission.make_mission(config)
+    keys = jax.random.split(jax.random.key(seed), _MISSIONS)
+    begin = jax.jit(jax.vmap(lambda key: mission.reset(key, scenario, models)))
+
+    @jax.jit
+    def advance(keys: jax.Array, states: MissionState) -> MissionState:
+        return mission.rollout_batch(keys, scenario, models, states, 1, every=_MISSIONS)[0]
+
+    observe = [
+        jax.jit(jax.vmap(_observer(scenario, models, robot)))
+        for robot in range(len(config.carried))
+    ]
+    found: list[Choice] = []
+    round_ = 0
+    while len(found) < number:
+        states = begin(jax.vmap(lambda key: jax.random.fold_in(key, round_))(keys))  # noqa: B023
+        step = 0
+        while not states.done.all() and len(found) < number:
+            step_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1000 + step))(keys)  # noqa: B023
+            for each in observe:
+                found += _rows(jax.tree.map(np.asarray, each(step_keys, states)))
+            states = advance(step_keys, states)
+            step += 1
+        round_ += 1
+    return found[:number]
+
+
+def _rows(seen: tuple[np.ndarray, Any]) -> Iterator[Choice]:
+    is_due, choice = seen
+    for row in np.flatnonzero(is_due):
+        yield Choice(**jax.tree.map(lambda x: x[row], choice))  # noqa: B023
+
+
+def _observer(
+    scenario: Mission, models: Models, robot: int
+) -> Callable[[jax.Array, MissionState], tuple[jax.Array, dict[str, Any]]]:
+    config, index = scenario.config, jnp.int32(robot)
+    sensor = scenario.world.sensors[config.modality_of_robot[robot]]
+
+    def observe(key: jax.Array, state: MissionState) -> tuple[jax.Array, dict[str, Any]]:
+        robots, scene = state.robots, state.scene
+        given_up = robots.unreachable | robots.undetected | robots.exhausted
+        phase, position = robots.phase, scene.layout.position
+        away = jnp.linalg.norm(position - scene.poses[robot, None, :2], axis=-1)
+        poi = jnp.argmin(away)
+        data = arenas.place(scenario.world.arena, scene.layout, scene.poses)
+        readings = sensors.scan(
+            key,
+            sensor,
+            scenario.world.arena,
+            data,
+            scene.layout,
+            scene.light,
+            robot,
+            sensor.directions,
+            scenario.time(state),
+        )
+        inputs = {
+            "mean": state.belief.mean,
+            "std": state.belief.std,
+            "looked_from": state.looked_from,
+            "robot": index,
+            "positions": position,
+            "present": ~given_up[robot],
+            "poses": scene.poses,
+            "modality": scenario.modalities,
+            "works": (phase != ENDED) & (phase != FAILED),
+            "target": robots.target,
+        }
+        is_due = decide.is_due(scenario, state, index) & ~state.done
+        return is_due, {
+            "inputs": inputs,
+            "action": decide._choose(key, scenario, models, state, index),
+            "seen": state.seen,
+            "poi": poi,
+            "readings": readings,
+            "bearing": viewpoints.bearing(scene.poses[robot], position[poi]),
+            "distance": away[poi],
+        }
+
+    return observe
+
+
+@dataclasses.dataclass(frozen=True)
+class Compared:
+    """A program and ours.
+
+    Attributes:
+      states: how many.
+      different: in how many of them a whole number or a bool is another one.
+      error: largest difference of real numbers, as a share of the largest number of the output.
+      seconds: median duration of a call.
+    """
+
+    states: int
+    different: int
+    error: float
+    seconds: float
+
+
+def compare(
+    config: Config, models: Models, archive: bytes, found: list[Choice]
+) -> dict[str, dict[str, Compared]]:
+    """Compares all programs that a mission plays, by player and program.
+
+    Args:
+      config: settings of the run.
+      models: its models.
+      archive: from `export.archive`.
+      found: moments of missions.
+
+    Raises:
+      AssertionError: if the choices of our own function are not those of the missions.
+    """
+    ours = functions(config)
+    given = _given(config, models, ours, found)
+    expected = {
+        name: [
+            jax.tree.map(np.asarray, apply(models, *(x[key] for key in ours[name].inputs)))
+            for x in inputs
+        ]
+        for name, inputs in given.items()
+        for apply in [jax.jit(ours[name].apply)]
+    }
+    actions = [int(each["action"]) for each in expected["decide"]]
+    assert actions == [int(choice.action) for choice in found]
+    return {
+        player: {
+            name: _compared(program, given[name], expected[name])
+            for name, program in load(io.BytesIO(archive))[1].items()
+            if name in given
+        }
+        for player, load in LOADERS.items()
+    }
+
+
+def _given(
+    config: Config, models: Models, ours: dict[str, Function], found: list[Choice]
+) -> dict[str, list[Inputs]]:
+    """Inputs of each program in the states."""
+    given: dict[str, list[Inputs]] = {"decide": [choice.inputs for choice in found]}
+    given["classify"] = [{key: x[key] for key in ("mean", "std")} for x in given["decide"]]
+    detect = {name: jax.jit(f.apply) for name, f in ours.items() if name.startswith("detect")}
+    weigh = {name: jax.jit(f.apply) for name, f in ours.items() if name.startswith("weigh")}
+    for choice in found:
+        x = choice.inputs
+        robot, poi = int(x["robot"]), int(choice.poi)
+        m = int(x["modality"][robot])
+        sensor = config.modalities[m]
+        look = {key: getattr(choice, key) for key in ("readings", "bearing", "distance")}
+        apart = np.linalg.norm(x["poses"][robot, None, :2] - x["looked_from"][poi, m], axis=-1)
+        features = detect[f"detect_{sensor}"](models, *look.values())["features"]
+        weight = weigh[f"weigh_{sensor}"](models, apart)["weight"]
+        write = {
+            "mean": x["mean"][poi],
+            "std": x["std"][poi],
+            "seen": choice.seen[poi],
+            "features": np.asarray(features),
+            "weight": np.asarray(weight),
+        }
+        of_sensor = {"detect": look, "weigh": {"apart": apart}, "write": write}
+        for name, inputs in of_sensor.items():
+            given.setdefault(f"{name}_{sensor}", []).append(inputs)
+    return given
+
+
+def _compared(
+    program: Callable[..., Arrays], given: list[Inputs], expected: list[Arrays]
+) -> Compared:
+    different, error = 0, 0.0
+    for inputs, ours in zip(given, expected, strict=True):
+        theirs, is_different = program(**inputs), False
+        for key, value in ours.items():
+            is_real = value.dtype == np.float32
+            if is_real:
+                error = max(error, relative_error(theirs[key], value))
+            else:
+                is_different |= not np.array_equal(theirs[key], value)
+        different += is_different
+    seconds = []
+    for inputs in given[:_TIMED]:
+        start = time.perf_counter()
+        program(**inputs)
+        seconds.append(time.perf_counter() - start)
+    return Compared(len(given), different, error, float(np.median(seconds)))
+
+
+def relative_error(theirs: np.ndarray, ours: np.ndarray) -> float:
+    """Largest difference as a share of the largest number, among those that stand for values.
+
+    Numbers of 1e5 and more, or infinite, say that an action is not open; infinite if they differ.
+
+    Args:
+      theirs: an array.
+      ours: of the same shape.
+    """
+    is_value = np.abs(ours) < 1e5
+    if theirs.shape != ours.shape or not np.array_equal(is_value, np.abs(theirs) < 1e5):
+        return np.inf
+    size = np.abs(ours[is_value]).max(initial=_TINY)
+    return float(np.abs(theirs[is_value] - ours[is_value]).max(initial=0.0) / size)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    devices.start(None)
+    config, models = rundir.load(cli.find_run(arguments.run), arguments.trust)
+    found = choices(config, models, arguments.states)
+    table = rich.table.Table("program", "by", "states", "other answers", "error", "microseconds")
+    for player, programs in compare(config, models, export.archive(config, models), found).items():
+        for name, each in programs.items():
+            figures = each.states, each.different, f"{each.error:.1e}", f"{each.seconds * 1e6:.0f}"
+            table.add_row(name, player, *map(str, figures))
+    rich.console.Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
