@@ -69,7 +69,7 @@ def archive(config: Config, models: Models) -> bytes:
             }
         weights = {name: x for name, x in constants.arrays.items() if name in read}
         with files.open("weights.npz", "w") as file:
-            np.savez(file, **weights)
+            np.savez(file, allow_pickle=False, **weights)
         files.writestr("programs.json", json.dumps(graphs))
         for name in ROBOTS:
             files.writestr(name, (Path(onboard.__file__).parent / name).read_bytes())
@@ -145,7 +145,7 @@ def main(argv: list[str] | None = None) -> None:
             file.write(content := archive(config, models))
     except FileExistsError:
         cli.fail(PROGRAM, str(ConfigError("out", str(path), "already exists; must be a new file")))
-    except ConfigError as error:
+    except (ConfigError, ModuleNotFoundError, NotImplementedError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"out = {str(path)!r}: cannot be written ({cli.reason(error)})")

@@ -73,15 +73,6 @@ class Agent(Protocol):
         """Random parameters of each of `tour_networks`."""
         ...
 
-    def team_inputs(self, num_pois: int, num_robots: int) -> dict[str, jax.ShapeDtypeStruct]:
-        """Shapes of what `decide` reads besides the map: fields of `Team`, and `robot`.
-
-        Args:
-          num_pois: N.
-          num_robots: R.
-        """
-        ...
-
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
         """Input of a robot's network.
 

@@ -90,16 +90,6 @@ class MapAgent:
         del key
         return ()
 
-    def team_inputs(self, num_pois: int, num_robots: int) -> dict[str, jax.ShapeDtypeStruct]:
-        """The PoIs that are left: the others are shown as known.
-
-        Args:
-          num_pois: N.
-          num_robots: not used.
-        """
-        del num_robots
-        return {"present": jax.ShapeDtypeStruct((num_pois,), bool)}
-
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
         """The map, see `observation`.
 

@@ -98,24 +98,6 @@ class TeamAgent:
         """Random parameters of each of `tour_networks`."""
         return (self.init(key),) * self.orders
 
-    def team_inputs(self, num_pois: int, num_robots: int) -> dict[str, jax.ShapeDtypeStruct]:
-        """All fields of `Team`, and the index of the robot that chooses.
-
-        Args:
-          num_pois: N.
-          num_robots: R.
-        """
-        struct_of = jax.ShapeDtypeStruct
-        return {
-            "positions": struct_of((num_pois, 2), jnp.float32),
-            "present": struct_of((num_pois,), bool),
-            "poses": struct_of((num_robots, 3), jnp.float32),
-            "modality": struct_of((num_robots,), jnp.int32),
-            "works": struct_of((num_robots,), bool),
-            "target": struct_of((num_robots,), jnp.int32),
-            "robot": struct_of((), jnp.int32),
-        }
-
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
         """What a robot knows of each PoI, see `team_mdp.observation`.
 

@@ -174,7 +174,7 @@ def as_onnx(
         return helper.make_tensor_value_info(name, kind, shape)
 
     def node(each: Node) -> onnx.NodeProto:
-        attributes = {
+        attributes: dict[str, Any] = {
             key: helper.make_graph(
                 [node(x) for x in value.nodes],
                 key,

@@ -37,9 +37,6 @@ SAME = {
     "gt": "Greater",
     "ge": "GreaterOrEqual",
     "eq": "Equal",
-    "and": "And",
-    "or": "Or",
-    "not": "Not",
     "copy": "Identity",
     "stop_gradient": "Identity",
 }
@@ -103,6 +100,7 @@ class Operators:
     # Numbers.
 
     def cast(self, x: str, dtype: Any) -> str:
+        """An array with another dtype."""
         return self.build.op("Cast", x, to=np.dtype(dtype).name)
 
     def _convert_element_type(self, equation: Any, x: str) -> str:
@@ -116,8 +114,25 @@ class Operators:
         odd = self.build.op("Or", self.build.op("IsNaN", x), self.build.op("IsInf", x))
         return self.build.op("Not", odd)
 
+    def _and(self, equation: Any, x: str, y: str) -> str:
+        return self._of_bools("And", equation, x, y)
+
+    def _or(self, equation: Any, x: str, y: str) -> str:
+        return self._of_bools("Or", equation, x, y)
+
+    def _not(self, equation: Any, x: str) -> str:
+        return self._of_bools("Not", equation, x)
+
+    def _of_bools(self, operator: str, equation: Any, *given: str) -> str:
+        if equation.invars[0].aval.dtype != bool:
+            raise NotImplementedError(f"{operator} of bits has no ONNX translation")
+        return self.build.op(operator, *given)
+
     def _rem(self, equation: Any, x: str, y: str) -> str:
         return self.build.op("Mod", x, y, fmod=1)
+
+    def _clamp(self, equation: Any, least: str, x: str, most: str) -> str:
+        return self.build.op("Min", self.build.op("Max", x, least), most)
 
     def _round(self, equation: Any, x: str) -> str:
         if equation.params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
@@ -139,13 +154,12 @@ class Operators:
 
     def _atan2(self, equation: Any, y: str, x: str) -> str:
         """By the arc tangent of `y / x`, which is one of two half planes."""
-        zero, op = self.build.constant(np.float32(0)), self.build.op
-        half = op(
-            "Where", op("Less", y, zero), *map(self.build.constant, np.float32([-np.pi, np.pi]))
-        )
+        op = self.build.op
+        zero, pi = (self.build.constant(np.float32(n)) for n in (0, np.pi))
+        half = op("Where", op("Less", y, zero), op("Neg", pi), pi)
         steep = op("Div", half, self.build.constant(np.float32(2)))
         steep = op("Where", op("Equal", y, zero), zero, steep)
-        angle = op("Atan", op("Div", y, op("Where", op("Equal", x, zero), x, x)))
+        angle = op("Atan", op("Div", y, x))
         behind = op("Where", op("Less", x, zero), op("Add", angle, half), angle)
         return op("Where", op("Equal", x, zero), steep, behind)
 
@@ -166,6 +180,7 @@ class Operators:
         return self.broadcast(numbers, shape[axis : axis + 1], shape, (axis,))
 
     def range(self, size: Size) -> str:
+        """The numbers from 0 below a size, int64."""
         first, step = self.build.constant(np.int64(0)), self.build.constant(np.int64(1))
         return self.build.op("Range", first, self.size(size), step)
 
@@ -176,6 +191,7 @@ class Operators:
     def broadcast(
         self, x: str, before: Sequence[Size], shape: Sequence[Size], axes: Sequence[int]
     ) -> str:
+        """An array of shape `before` repeated to `shape`, where its axes are `axes`."""
         new = [axis for axis in range(len(shape)) if axis not in axes]
         if new:
             x = self.build.op("Unsqueeze", x, self.build.integers(*new))
@@ -189,12 +205,14 @@ class Operators:
         return self.without(x, equation.params["dimensions"])
 
     def without(self, x: str, axes: Sequence[int]) -> str:
+        """An array less axes of size 1."""
         return self.build.op("Squeeze", x, self.build.integers(*axes)) if len(axes) else x
 
     def _transpose(self, equation: Any, x: str) -> str:
         return self.permuted(x, equation.params["permutation"])
 
     def permuted(self, x: str, axes: Sequence[int]) -> str:
+        """An array with its axes in another order."""
         axes = [int(axis) for axis in axes]
         return x if axes == sorted(axes) else self.build.op("Transpose", x, perm=axes)
 
@@ -245,6 +263,7 @@ class Operators:
     # Reductions.
 
     def reduced(self, operator: str, equation: Any, x: str) -> str:
+        """An array reduced along the axes of an equation."""
         axes = self.build.integers(*equation.params["axes"])
         return self.build.op(operator, x, axes, keepdims=0) if len(equation.params["axes"]) else x
 
@@ -270,6 +289,7 @@ class Operators:
         return self.best("ArgMin", equation, x)
 
     def best(self, operator: str, equation: Any, x: str) -> str:
+        """Index of the first greatest or smallest number along an axis."""
         (axis,) = equation.params["axes"]
         found = self.build.op(operator, x, axis=int(axis), keepdims=0)
         return self.cast(found, equation.params["index_dtype"])

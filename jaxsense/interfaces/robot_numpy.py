@@ -14,19 +14,20 @@ import sys
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 Arrays = dict[str, np.ndarray]
 Program = Callable[..., Arrays]
+Step = tuple[Callable[..., Any], list[str], list[str]]
 
 
-def load(path: Path | str) -> tuple[dict[str, Any], dict[str, Program]]:
+def load(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, Program]]:
     """Reads an archive.
 
     Args:
-      path: the archive.
+      path: the archive, or a file that is open.
 
     Returns:
       Its `contents.json`, and its programs by name: from arrays by name to arrays by name.
@@ -40,7 +41,8 @@ def load(path: Path | str) -> tuple[dict[str, Any], dict[str, Program]]:
 
 
 def _program(graph: Mapping[str, Any], weights: Arrays, about: Mapping[str, Any]) -> Program:
-    known, steps = dict(weights), []
+    known: dict[str, Any] = dict(weights)
+    steps: list[Step] = []
     # What depends on weights alone is computed once.
     for node in graph["nodes"]:
         operator, inputs, *_ = node
@@ -54,14 +56,16 @@ def _program(graph: Mapping[str, Any], weights: Arrays, about: Mapping[str, Any]
         values = dict(known)
         for name, each in about["inputs"].items():
             values[name] = np.asarray(given[name], each["dtype"])
-        _play(steps, values)
+        # As on other runtimes, infinity and NaN are no errors.
+        with np.errstate(all="ignore"):
+            _play(steps, values)
         names = zip(about["outputs"], graph["outputs"], strict=True)
         return {name: np.asarray(values[output]) for name, output in names}
 
     return program
 
 
-def _step(node: list[Any]) -> tuple[Callable[..., Any], list[str], list[str]]:
+def _step(node: list[Any]) -> Step:
     """A function of `values`, or of arrays, and the names of its inputs and outputs."""
     operator, inputs, outputs, attributes = node
     if operator == "Loop":
@@ -74,7 +78,7 @@ def _step(node: list[Any]) -> tuple[Callable[..., Any], list[str], list[str]]:
     return function, inputs, outputs
 
 
-def _play(steps: list[tuple[Callable[..., Any], list[str], list[str]]], values: Arrays) -> None:
+def _play(steps: list[Step], values: dict[str, Any]) -> None:
     """Applies operators in their order; `values` are all arrays by name."""
     for function, inputs, outputs in steps:
         found = function(*[values[name] for name in inputs]) if inputs else function(values)
@@ -84,13 +88,13 @@ def _play(steps: list[tuple[Callable[..., Any], list[str], list[str]]], values: 
             values.update(zip(outputs, found, strict=True))
 
 
-def _loop(body: Mapping[str, Any], inputs: list[str]) -> Callable[[Arrays], Any]:
+def _loop(body: Mapping[str, Any], inputs: list[str]) -> Callable[[dict[str, Any]], Any]:
     """ONNX's `Loop`: at most `most` steps, as long as the first output of the body is true."""
     steps = [_step(node) for node in body["nodes"]]
     most, goes_on, *first = inputs
     number = len(first)
 
-    def loop(values: Arrays) -> Any:
+    def loop(values: dict[str, Any]) -> Any:
         limit = int(values[most]) if most else sys.maxsize
         is_going, carry = bool(values[goes_on]), [values[name] for name in first]
         rows: list[list[np.ndarray]] = [[] for _ in body["outputs"][1 + number :]]
@@ -108,11 +112,11 @@ def _loop(body: Mapping[str, Any], inputs: list[str]) -> Callable[[Arrays], Any]
     return loop
 
 
-def _branch(graphs: Mapping[str, Any], which: str) -> Callable[[Arrays], Any]:
+def _branch(graphs: Mapping[str, Any], which: str) -> Callable[[dict[str, Any]], Any]:
     """ONNX's `If`."""
     steps = {key: [_step(node) for node in graph["nodes"]] for key, graph in graphs.items()}
 
-    def branch(values: Arrays) -> Any:
+    def branch(values: dict[str, Any]) -> Any:
         key = "then_branch" if values[which] else "else_branch"
         _play(steps[key], values)
         found = [values[name] for name in graphs[key]["outputs"]]
@@ -130,8 +134,8 @@ def _divide(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def _slice(x: np.ndarray, starts: Any, ends: Any, axes: Any, steps: Any = None) -> np.ndarray:
     parts = [slice(None)] * x.ndim
-    steps = np.ones(len(axes), np.int64) if steps is None else steps
-    for axis, start, end, step in zip(axes, starts, ends, steps, strict=True):
+    each = [1] * len(axes) if steps is None else steps
+    for axis, start, end, step in zip(axes, starts, ends, each, strict=True):
         parts[axis] = slice(int(start), int(end), int(step))
     return x[tuple(parts)]
 

@@ -12,7 +12,7 @@ import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import onnxruntime
@@ -21,11 +21,11 @@ Arrays = dict[str, np.ndarray]
 Program = Callable[..., Arrays]
 
 
-def load(path: Path | str) -> tuple[dict[str, Any], dict[str, Program]]:
+def load(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, Program]]:
     """Reads an archive.
 
     Args:
-      path: the archive.
+      path: the archive, or a file that is open.
 
     Returns:
       Its `contents.json`, and its programs by name: from arrays by name to arrays by name.
@@ -49,6 +49,7 @@ def _program(model: bytes, about: dict[str, Any]) -> Program:
         inputs = {
             name: np.asarray(given[name], each["dtype"]) for name, each in about["inputs"].items()
         }
-        return dict(zip(outputs, session.run(outputs, inputs), strict=True))
+        found = session.run(outputs, inputs)
+        return {name: np.asarray(x) for name, x in zip(outputs, found, strict=True)}
 
     return program

@@ -9,13 +9,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import export
 from jax.extend import core
 from jax.lax import GatherScatterMode
 
 from jaxsense.interfaces.graph import Array, Builder, Constants, Graph
-from jaxsense.interfaces.operators import SAME, Operators, Size, described
+from jaxsense.interfaces.operators import SAME, Operators, described
 
 _INLINED = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 
@@ -41,7 +42,7 @@ class Translator(Operators):
             value = variable.val if isinstance(variable, core.Literal) else names[variable]
             if isinstance(value, str):
                 return value
-            return self.build.constant(np.asarray(value, variable.aval.dtype))
+            return self.build.constant(np.asarray(value, described(variable.aval)[0]))
 
         for equation in jaxpr.eqns:
             # An input that nobody reads, such as a random key, may have no name.
@@ -293,4 +294,4 @@ def _array(x: Any) -> np.ndarray:
 
 
 def _is_array(variable: Any) -> bool:
-    return not jax.dtypes.issubdtype(variable.aval.dtype, jax.dtypes.extended)
+    return not jnp.issubdtype(variable.aval.dtype, jax.dtypes.extended)
