@@ -1,7 +1,6 @@
-"""The exported file, run by the example in a process that cannot import jaxsense."""
+"""The exported file, run in processes that can import neither jaxsense nor JAX."""
 
 import dataclasses
-import importlib.metadata
 import io
 import json
 import re
@@ -14,15 +13,18 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnx
 import pytest
 from smoke import error_line, save_models
 
+from benchmarks import exported
 from jaxsense import export
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
-from jaxsense.dqn import observation
+from jaxsense.dqn import observation, team_mdp
 from jaxsense.dqn.team_mdp import Team
+from jaxsense.interfaces import robot_numpy, robot_onnx
 from jaxsense.interfaces.onboard import functions
 from jaxsense.models import init, make_in_place, make_jmvae
 from jaxsense.run.rundir import RunDirectory, Settings
@@ -38,32 +40,43 @@ CONFIG = dataclasses.replace(
     jmvae=JmvaeConfig(hidden=(8,)),
 )
 BATCH = 5
+SIZES = {"pois": 3, "robots": 2, "looks": 4}
 ALONE = f"""
 import runpy, sys
 
-class NoJaxsense:
+class Only:
     def find_spec(self, name, *_):
-        if name.partition(".")[0] == "jaxsense":
-            raise ModuleNotFoundError("jaxsense is not here")
+        if name.partition(".")[0] in sys.argv[1].split(","):
+            raise ModuleNotFoundError(f"{{name}} is not here")
 
-sys.meta_path.insert(0, NoJaxsense())
+sys.meta_path.insert(0, Only())
+del sys.argv[1]
 example = runpy.run_path({str(EXAMPLE)!r})
 """
 RUN_ALL = """
+import importlib
 import numpy as np
-contents, programs = example["load"](sys.argv[1])
-inputs, found = np.load(sys.argv[2]), {}
+sys.path.insert(0, sys.argv[1])
+contents, programs = importlib.import_module(sys.argv[2]).load(sys.argv[1])
+inputs, found = np.load(sys.argv[3]), {}
 for name, about in contents["programs"].items():
-    given = [inputs[f"{name}/{key}"] for key in about["inputs"] if f"{name}/{key}" in inputs]
+    given = {key: inputs[f"{name}/{key}"] for key in about["inputs"] if f"{name}/{key}" in inputs}
     if not given:
         continue
-    found |= {f"{name}/{key}": value for key, value in programs[name](*given).items()}
-np.savez(sys.argv[3], **found)
+    rows = [programs[name](**{key: x[row] for key, x in given.items()})
+            for row in range(len(next(iter(given.values()))))]
+    found |= {f"{name}/{key}": np.stack([row[key] for row in rows]) for key in rows[0]}
+np.savez(sys.argv[4], **found)
 """
+ABSENT = {
+    "robot_numpy": "jaxsense,jax,jaxlib,onnx,onnxruntime",
+    "robot_onnx": "jaxsense,jax,jaxlib,onnx",
+}
 
 
-def run_alone(code, *arguments):
-    command = [sys.executable, "-I", "-c", ALONE + code, *map(str, arguments)]
+def run_alone(code, player, *arguments):
+    """Runs code where nothing is there but what a player needs."""
+    command = [sys.executable, "-I", "-c", ALONE + code, ABSENT[player], *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
@@ -99,20 +112,24 @@ def file(run, tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
-def results(models, file, tmp_path_factory):
+@pytest.fixture(scope="module", params=[*ABSENT])
+def results(request, models, file, tmp_path_factory):
     """`{NAME/KEY: array}` of what all programs were given, and of what they gave elsewhere."""
     rng, inputs = np.random.default_rng(0), {}
-    for name, function in functions(CONFIG, models).items():
-        for key, aval in function.inputs.items():
-            drawn = rng.uniform(0.1, 1.0, (BATCH, *aval.shape)) * (0.3 if key == "bearing" else 1)
-            drawn = drawn > 0.55 if aval.dtype == bool else drawn
+    for name, function in functions(CONFIG).items():
+        for key, each in function.inputs.items():
+            shape = tuple(SIZES.get(n, n) for n in each.shape)
+            drawn = rng.uniform(0.1, 1.0, (BATCH, *shape)) * (0.3 if key == "bearing" else 1)
+            drawn = drawn > 0.4 if each.dtype == "bool" else drawn
             # Features are probabilities.
-            drawn = drawn / drawn.sum(axis=-1, keepdims=True) if key == "features" else drawn
-            inputs[f"{name}/{key}"] = drawn.astype(aval.dtype)
+            is_probability = key == "features" or name.startswith("encode")
+            drawn = drawn / drawn.sum(axis=-1, keepdims=True) if is_probability else drawn
+            drawn = rng.integers(0, 2, (BATCH, *shape)) if each.dtype == "int32" else drawn
+            inputs[f"{name}/{key}"] = drawn.astype(each.dtype)
     folder = tmp_path_factory.mktemp("results")
     np.savez(folder / "in.npz", **inputs)
-    done = run_alone(RUN_ALL, file, folder / "in.npz", folder / "out.npz")
+    player = request.param
+    done = run_alone(RUN_ALL, player, file, player, folder / "in.npz", folder / "out.npz")
     assert done.returncode == 0, done.stderr
     return inputs, dict(np.load(folder / "out.npz"))
 
@@ -138,17 +155,28 @@ def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
         first = round(centre - (sensor.window - 1) * sensor.stride / 2)
         rays = first + np.arange(sensor.window) * sensor.stride
         window = np.minimum(readings[rays], sensor.window_limit).reshape(-1)
-        return True, detectors.detect(models.detectors[m], window)
+        features = detectors.detect(models.detectors[m], window)
+        return True, features.max() >= CONFIG.mission.least_confidence, features
 
     def write(mean, std, seen, features, weight):
         belief = models.fusion.update(Belief(mean, std), seen, features, m, weight)
         return belief.mean, belief.std
 
-    network = MLP(CONFIG.dqn.hidden, CONFIG.arena.num_pois + 1)
+    def weigh(apart):
+        return models.novelty.weight(apart, m), models.novelty.to_go(apart, m)
 
-    def decide(mean, std, present):
+    check(results, f"detect_{name}", detect, "is_there", "detects", "features")
+    check(results, f"weigh_{name}", weigh, "weight", "to_go")
+    check(results, f"write_{name}", write, "new_mean", "new_std")
+
+
+def test_decisions_are_those_of_the_policy_and_the_rules(models, results):
+    network = MLP(CONFIG.dqn.hidden, CONFIG.arena.num_pois + 1)
+    classes, settings = models.fusion.classes, CONFIG.mission
+    assert settings.auctions
+
+    def values_of(mean, std, present, m):
         # A mean over all classes that a PoI which is not present may have.
-        classes = models.fusion.classes
         of_each = [
             network.apply(
                 models.q_networks[m],
@@ -161,20 +189,40 @@ def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
             )
             for c in range(len(classes.mean))
         ]
-        values = np.mean(of_each, axis=0)
-        values = np.where(np.append(present, True), values, -np.inf)
-        return np.argmax(values), values
+        return np.where(np.append(present, True), np.mean(of_each, axis=0), -np.inf)
 
-    check(results, f"detect_{name}", detect, "is_there", "features")
-    check(results, f"weigh_{name}", lambda apart: [models.novelty.weight(apart, m)], "weight")
-    check(results, f"write_{name}", write, "mean", "std")
-    check(results, f"decide_{name}", decide, "action", "values")
+    def decide(mean, std, looked_from, robot, positions, present, poses, modality, works, target):
+        values = values_of(mean, std, present, modality[robot])
+        bids = {}
+        for r, poi in np.ndindex(SIZES["robots"], SIZES["pois"]):
+            only = present & (np.arange(SIZES["pois"]) == poi)
+            alone = values_of(mean, std, only, modality[r])
+            apart = np.linalg.norm(poses[r, :2] - looked_from[poi, modality[r]], axis=-1)
+            way = models.novelty.to_go(apart, modality[r]) / CONFIG.team.travel.speed
+            there = team_mdp.travel_seconds(CONFIG.team.travel, poses[r], positions[poi][None])
+            if only.any() and alone[poi] > alone[-1]:
+                bids[r, poi] = float(there[0] + way)
+        of_robot = {poi: time for (r, poi), time in bids.items() if r == robot}
+        bids, won = {(r, n): x for (r, n), x in bids.items() if works[r]}, {}
+        while bids:
+            r, n = min(bids, key=bids.get)
+            won[r] = n
+            bids = {(i, j): x for (i, j), x in bids.items() if i != r and j != n}
+        taken = [target[r] for r in range(SIZES["robots"]) if works[r] and r != robot]
+        cost = {n: time + 100 * (n in taken) for n, time in of_robot.items()}
+        nearest = min(cost, key=cost.get) if cost else SIZES["pois"]
+        return won.get(robot, nearest), values
+
+    check(results, "decide", decide, "action", "values")
+    _, outputs = results
+    assert len(set(outputs["decide/action"].tolist())) > 1
 
 
+@pytest.mark.parametrize("player", [*ABSENT])
 @pytest.mark.parametrize("m", [0, 1])
-def test_an_exported_detector_answers_what_is_not_there(models, file, tmp_path, m):
+def test_an_exported_detector_answers_what_is_not_there(file, tmp_path, m, player):
     name = CONFIG.modalities[m]
-    inputs = functions(CONFIG, models)[f"detect_{name}"].inputs
+    inputs = functions(CONFIG)[f"detect_{name}"].inputs
     scan = np.full(inputs["readings"].shape, 0.5, np.float32)
     ahead = len(scan) // 2
     at = {"bearing": 0.0, "distance": 1.0}
@@ -194,7 +242,7 @@ def test_an_exported_detector_answers_what_is_not_there(models, file, tmp_path, 
         **{f"detect_{name}/{key}": np.float32([x[key] for _, x, _ in cases]) for key in at},
     }
     np.savez(tmp_path / "in.npz", **given)
-    done = run_alone(RUN_ALL, file, tmp_path / "in.npz", tmp_path / "out.npz")
+    done = run_alone(RUN_ALL, player, file, player, tmp_path / "in.npz", tmp_path / "out.npz")
     assert done.returncode == 0, done.stderr
     found = np.load(tmp_path / "out.npz")
     expected = [is_there for _, _, is_there in cases]
@@ -222,30 +270,37 @@ def test_the_map_is_read_as_jaxsense_reads_it(models, results):
     means = models.fusion.classes.mean
 
     def classify(mean, std):
-        belief = Belief(mean, std)
-        shown = models.fusion.most_likely_class(belief)
-        return shown, latent.plausible_classes(belief, means)
+        beliefs = [Belief(*each) for each in zip(mean, std, strict=True)]
+        probabilities = [models.fusion.class_probabilities(belief) for belief in beliefs]
+        most_likely = [models.fusion.most_likely_class(belief) for belief in beliefs]
+        told = [latent.plausible_classes(belief, means) for belief in beliefs]
+        return np.stack(probabilities), np.stack(most_likely), np.stack(told)
 
-    check(results, "classify", classify, "most_likely", "plausible")
+    check(results, "classify", classify, "probabilities", "most_likely", "plausible")
 
 
-def test_the_policy_of_a_team_serves_any_number_of_points_and_robots():
+@pytest.fixture(scope="module")
+def team(tmp_path_factory):
+    """Settings, models and archive of a team with tours."""
     dqn = dataclasses.replace(PRESETS["team"].dqn, hidden=(8,))
     config = dataclasses.replace(CONFIG, dqn=dqn, robots=("camera", "lidar", "lidar"))
     trained = with_classes(init(jax.random.key(0), config), config)
-    of_run = functions(config, trained)
-    decide = export.exported(of_run["decide_lidar"])
+    path = tmp_path_factory.mktemp("team") / "team.zip"
+    path.write_bytes(export.archive(config, trained))
+    return config, trained, path
 
-    @jax.jit
-    def values(belief, team, robot):
-        q_network, classes = trained.q_networks[1], trained.fusion.classes
-        return trained.agent.decide(q_network, trained.tours, classes, belief, team, robot)
 
-    assert [str(n) for n in decide.out_avals[1].shape] == ["batch", "points + 1"]
-    for num_pois, num_robots in ((5, 3), (2, 1)):
+@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
+def test_a_team_may_have_any_number_of_points_and_robots(team, player):
+    _, trained, path = team
+    assert trained.agent.orders
+    contents, programs = player.load(path)
+    about = contents["programs"]["decide"]
+    assert about["outputs"]["values"]["shape"] == ["pois + 1"]
+    for num_pois, num_robots, num_looks in ((5, 3, 2), (2, 1, 1), (9, 4, 32)):
         rng = np.random.default_rng(num_pois)
         belief = Belief(*rng.uniform(0.1, 1, (2, num_pois, 2)).astype(np.float32))
-        team = Team(
+        of_team = Team(
             positions=rng.normal(size=(num_pois, 2)).astype(np.float32),
             present=np.arange(num_pois) < 4,
             poses=rng.normal(size=(num_robots, 3)).astype(np.float32),
@@ -253,41 +308,90 @@ def test_the_policy_of_a_team_serves_any_number_of_points_and_robots():
             works=np.ones(num_robots, bool),
             target=np.full(num_robots, num_pois, np.int32),
         )
-        given = {**vars(belief), **vars(team), "robot": np.int32(num_robots - 1)}
-        inputs = (np.asarray(given[name])[None] for name in of_run["decide_lidar"].inputs)
-        found = decide.call(*inputs)
-        expected = values(belief, team, given["robot"])
-        np.testing.assert_allclose(found["values"][0], expected, rtol=1e-4)
-        assert found["action"][0] == np.argmax(expected)
+        robot = np.int32(num_robots - 1)
+        looked_from = np.full((num_pois, 2, num_looks, 2), np.inf, np.float32)
+        given = {**vars(belief), **vars(of_team), "robot": robot, "looked_from": looked_from}
+        found = programs["decide"](**given)
+        expected = trained.agent.decide(
+            trained.q_networks[1],
+            trained.tours,
+            trained.fusion.classes,
+            belief,
+            jax.tree.map(jnp.asarray, of_team),
+            robot,
+        )
+        np.testing.assert_allclose(found["values"], expected, rtol=1e-4)
+        # Values count travel time: the best is taken.
+        assert found["action"] == np.argmax(expected)
 
-    # The example plays a team with the same functions.
-    programs = {name: jax.jit(jax.vmap(f.apply)) for name, f in of_run.items()}
-    contents = export._description(config, trained)
-    contents["programs"] = {name: {"inputs": list(f.inputs)} for name, f in of_run.items()}
-    lines = runpy.run_path(str(EXAMPLE))["explore"](contents, programs, [0, 1, 2, 0])
+
+def test_a_value_that_is_not_a_number_is_answered_by_minus_one(team):
+    _, _, path = team
+    for player in (robot_numpy, robot_onnx):
+        contents, programs = player.load(path)
+        given = {
+            name: np.ones([{"pois": 2}.get(n, n if isinstance(n, int) else 1) for n in x["shape"]])
+            for name, x in contents["programs"]["decide"]["inputs"].items()
+        }
+        given["robot"] = 0
+        assert programs["decide"](**given)["action"] >= 0
+        given["mean"][1, 0] = np.nan
+        assert programs["decide"](**given)["action"] == -1
+
+
+@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
+def test_the_example_plays_a_team(team, player):
+    lines = runpy.run_path(str(EXAMPLE))["explore"](*player.load(team[2]), [0, 1, 2, 0])
     assert [line.split(" is a ")[0] for line in lines[-4:]] == [f"PoI {n}" for n in range(4)]
     assert any("looks at PoI" in line for line in lines)
 
 
+def test_decisions_are_those_of_missions(models, file):
+    found = exported.choices(CONFIG, models, 60)
+    compared = exported.compare(CONFIG, models, file.read_bytes(), found)
+    assert {*compared} == {"NumPy", "onnxruntime"}
+    for programs in compared.values():
+        assert programs["decide"].states == len(found)
+        assert {"classify", "decide", "write_camera", "detect_lidar"} < {*programs}
+        assert all(each.different == 0 for each in programs.values())
+        assert all(each.error < 1e-5 for each in programs.values())
+
+
 def test_contents_describe_what_is_there(results, file):
     with zipfile.ZipFile(file) as files:
-        contents = json.loads(files.read("contents.json"))
-        names = {name.removesuffix(".bin") for name in files.namelist()} - {"contents.json"}
-    assert set(contents["programs"]) == names
-    sizes = {"looks": 4}
+        contents, names = json.loads(files.read("contents.json")), {*files.namelist()}
+        weights = np.load(io.BytesIO(files.read("weights.npz")))
+        kernel = weights["q_networks/0/params/Dense_0/kernel"]
+    others = {"contents.json", "programs.json", "weights.npz", "robot_numpy.py", "robot_onnx.py"}
+    assert {f"{name}.onnx" for name in contents["programs"]} | others == names
     for given, end in zip(results, ("inputs", "outputs"), strict=True):
         described = {
-            f"{name}/{key}": (
-                [BATCH, *(sizes.get(n, n) for n in about["shape"][1:])],
-                about["dtype"],
-            )
+            f"{name}/{key}": ([BATCH, *(SIZES.get(n, n) for n in about["shape"])], about["dtype"])
             for name, program in contents["programs"].items()
             for key, about in program[end].items()
         }
         assert described == {key: (list(x.shape), x.dtype.name) for key, x in given.items()}
+        assert all(x["about"] for p in contents["programs"].values() for x in p[end].values())
+    assert kernel.shape[0] == 12  # three PoIs, two latent dimensions
     assert contents["labels"] == {"camera": ["red", "green"], "lidar": ["cylinder", "cube"]}
     assert contents["classes"] == list(CONFIG.arena.classes)
-    assert contents["versions"]["jax"] == jax.__version__
+    for sensor in sensors.make(CONFIG):
+        angles = contents["sensors"][sensor.name]["angles"]
+        np.testing.assert_allclose(angles, sensor.angles, atol=1e-6)
+    assert contents["versions"] == {"jaxsense": __version__}
+
+
+def test_onnx_files_name_what_they_take_and_give(file):
+    with zipfile.ZipFile(file) as files:
+        contents = json.loads(files.read("contents.json"))
+        for name, about in contents["programs"].items():
+            graph = onnx.load_model_from_string(files.read(f"{name}.onnx")).graph
+            for ends, key in ((graph.input, "inputs"), (graph.output, "outputs")):
+                shapes = {
+                    each.name: [n.dim_param or n.dim_value for n in each.type.tensor_type.shape.dim]
+                    for each in ends
+                }
+                assert shapes == {n: x["shape"] for n, x in about[key].items()}
 
 
 @pytest.mark.parametrize("variance", [20.0, 5.0])
@@ -299,20 +403,24 @@ def test_contents_hold_the_belief_before_any_look(variance):
     assert contents["unseen"] == {"mean": [0.0, 0.0], "std": pytest.approx([variance**0.5] * 2)}
 
 
-def test_programs_are_lowered_for_accelerators_too(models):
-    program = export.exported(functions(CONFIG, models)["classify"])
-    assert program.platforms == ("cpu", "cuda", "tpu")
-
-
-def test_the_example_plays_a_map_and_refuses_other_files(file, tmp_path):
-    done = run_alone("sys.argv[0] = 'run_exported.py'; example['main']()", file)
+@pytest.mark.parametrize("player", [*ABSENT])
+def test_the_example_plays_a_map_and_refuses_other_files(file, tmp_path, player):
+    options = ["--onnx"] if player == "robot_onnx" else []
+    done = run_alone("example['main']()", player, file, *options)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert [line for line in lines if line.startswith("PoI 2 is a red cube; the map says: ")]
     (tmp_path / "text").write_text("no archive")
-    done = run_alone("example['main']()", tmp_path / "text")
+    done = run_alone("example['main']()", player, tmp_path / "text", *options)
     assert done.returncode == 1
     assert "must be a file of `python -m jaxsense.export`" in done.stderr
+
+
+def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    line = error_line([str(run), "--out", str(tmp_path / "x.zip")], capsys, export)
+    assert line == "jaxsense.export: onnx is not installed: pip install 'jaxsense[export]'"
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("problem", ["run", "out", "folder"])
@@ -357,18 +465,3 @@ def test_an_export_that_is_stopped_leaves_nothing(run, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         export.main([str(run), "--out", str(tmp_path / "x.zip")])
     assert not [*tmp_path.iterdir()]
-
-
-def test_a_package_that_is_not_installed_can_export(models, monkeypatch):
-    version = importlib.metadata.version
-
-    def of_others(name):
-        if name == "jaxsense":
-            raise importlib.metadata.PackageNotFoundError(name)
-        return version(name)
-
-    monkeypatch.setattr(importlib.metadata, "version", of_others)
-    monkeypatch.setattr(export, "functions", lambda config, models: {})
-    with zipfile.ZipFile(io.BytesIO(export.archive(CONFIG, models))) as files:
-        contents = json.loads(files.read("contents.json"))
-    assert contents["versions"]["jaxsense"] == __version__

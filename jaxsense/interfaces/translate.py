@@ -198,15 +198,20 @@ class Translator(Operators):
         params = equation.params
         if params["reverse"]:
             raise NotImplementedError("a scan from the end has no ONNX translation")
-        first, last = params["num_consts"], params["num_consts"] + params["num_carry"]
-        consts, carry, rows = given[:first], given[first:last], given[last:]
+        inner, before, after = params["jaxpr"], equation.invars, equation.outvars
+        # What moves along has one axis more outside; versions of JAX name the numbers otherwise.
+        rows = sum(v.aval.ndim > x.ndim for v, x in zip(before, inner.in_avals, strict=True))
+        number = sum(v.aval.ndim == x.ndim for v, x in zip(after, inner.out_avals, strict=True))
+        last = len(before) - rows
+        first = last - number
+        consts, carry, moving = given[:first], given[first:last], given[last:]
         true = self.build.constant(np.bool_(True))
 
         def body(inner: "Translator", step: str, carry: list[str]) -> Sequence[str]:
-            of_step = [inner.build.op("Gather", row, step, axis=0) for row in rows]
+            of_step = [inner.build.op("Gather", row, step, axis=0) for row in moving]
             return [true, *inner._closed(params["jaxpr"], [*consts, *carry, *of_step])]
 
-        avals = [v.aval for v in equation.invars[first:last]]
+        avals = [v.aval for v in before[first:last]]
         return self._loop(equation, self.size(params["length"]), true, carry, avals, body)
 
     def _while(self, equation: Any, *given: str) -> Sequence[str]:
