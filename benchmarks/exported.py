@@ -179,7 +179,7 @@ class Compared:
     Attributes:
       states: how many.
       different: in how many of them a whole number or a bool is another one.
-      error: largest difference of real numbers, as a share of the largest number of the output.
+      error: largest difference of real numbers, as a share of the maximum magnitude of the output.
       seconds: median duration of a call.
     """
 
@@ -277,7 +277,7 @@ def _compared(
 
 
 def relative_error(theirs: np.ndarray, ours: np.ndarray) -> float:
-    """Largest difference as a share of the largest number, among those that stand for values.
+    """Largest difference as a share of the maximum magnitude, among numbers that stand for values.
 
     Numbers of 1e5 and more, or infinite, say that an action is not open; infinite if they differ.
 

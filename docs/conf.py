@@ -58,6 +58,8 @@ autodoc_mock_imports = [
         "gymnasium",
         "gymnax",
         "jaxmarl",
+        "onnx",
+        "onnxruntime",
         "pettingzoo",
         "rejax",
         "stable_baselines3",

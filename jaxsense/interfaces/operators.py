@@ -289,7 +289,7 @@ class Operators:
         return self.best("ArgMin", equation, x)
 
     def best(self, operator: str, equation: Any, x: str) -> str:
-        """Index of the first greatest or smallest number along an axis."""
+        """Index of the first maximum or minimum along an axis."""
         (axis,) = equation.params["axes"]
         found = self.build.op(operator, x, axis=int(axis), keepdims=0)
         return self.cast(found, equation.params["index_dtype"])

@@ -187,7 +187,7 @@ class Translator(Operators):
         avals: Sequence[Any],
         body: Callable[["Translator", str, list[str]], Sequence[str]],
     ) -> Sequence[str]:
-        """ONNX's loop; `body(inner, step, carry)` gives whether it goes on, carry and rows."""
+        """ONNX's loop; `body(inner, step, carry)` gives whether it continues, carry and rows."""
         kinds: list[Array] = [("int64", ()), ("bool", ()), *map(described, avals)]
         inputs = {self.build.constants.name(): kind for kind in kinds}
         step, _, *within = inputs

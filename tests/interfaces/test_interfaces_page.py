@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import re
+import sys
 from pathlib import Path
 
 import jax
@@ -25,7 +26,7 @@ PACKAGES = (
     "stable_baselines3",
     "jaxmarl",
     "pettingzoo",
-    "flatbuffers",
+    "onnx",
 )
 TEAM = OTHERS.pop(4)
 EXAMPLES = dict(zip(PACKAGES, OTHERS, strict=True))
@@ -66,8 +67,10 @@ def test_examples_run(names, package, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     if package == "stable_baselines3":
         importlib.import_module("torch").set_num_threads(1)  # more get into each other's way
-    if package == "flatbuffers":
+    if package == "onnx":
         Path("robot.zip").write_bytes(export.archive(names["config"], names["models"]))
+        monkeypatch.setattr(sys, "path", [*sys.path])
+        monkeypatch.delitem(sys.modules, "robot_numpy", raising=False)
     exec(compile(example, PAGE.name, "exec"), dict(names))
     (printed,) = re.findall(r"^print\(.*\)  # (.*)$", example, re.MULTILINE)
     assert capsys.readouterr().out == f"{printed}\n"
