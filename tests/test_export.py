@@ -39,7 +39,7 @@ CONFIG = dataclasses.replace(
     detector=DetectorConfig(hidden=(8,)),
     jmvae=JmvaeConfig(hidden=(8,)),
 )
-BATCH = 5
+BATCH = 12
 SIZES = {"pois": 3, "robots": 2, "looks": 4}
 ALONE = f"""
 import runpy, sys
@@ -92,7 +92,7 @@ def with_classes(models, config):
     return dataclasses.replace(
         models,
         fusion=make_in_place(config, models.jmvae, classes),
-        novelty=Novelty(jnp.array([0.5, 2.0]), jnp.array([0.3, 0.6])),
+        novelty=Novelty(jnp.array([5.0, 20.0]), jnp.array([0.3, 0.9])),
     )
 
 

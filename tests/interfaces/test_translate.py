@@ -107,6 +107,7 @@ INDEXED = {"x": FLOATS, "i": ("int32", ("k",))}
         lambda x, i: jax.vmap(lambda row: x[row, :2])(i),
         lambda x, i: jax.vmap(lambda row: jax.lax.dynamic_slice(x, (row, row), (1, 2)))(i),
         lambda x, i: jax.lax.dynamic_slice(x, (i[1], i[1]), (1, 2)),
+        lambda x, i: jax.lax.dynamic_slice(x, (i[1] - 9, i[1]), (1, 2)),  # moves inside
         lambda x, i: x.at[i[1]].set(7.0),
         lambda x, i: x.at[:, i[1]].add(7.0),
         lambda x, i: x.at[i[1] + 5].set(7.0),  # does not exist
