@@ -36,7 +36,8 @@ LOADERS = {"NumPy": robot_numpy.load, "onnxruntime": robot_onnx.load}
 """What plays an archive."""
 _MISSIONS = 16
 _TIMED = 200
-_TINY = 1e-3  # values below count as of this size
+_CLOSED = 1e5  # above any value of an action that is open
+_TINY = 1e-3  # scale of an output that is about 0
 
 Inputs = dict[str, np.ndarray]
 Arrays = dict[str, np.ndarray]
@@ -179,7 +180,7 @@ class Compared:
     Attributes:
       states: how many.
       different: in how many of them a whole number or a bool is another one.
-      error: largest difference of real numbers, as a share of the maximum magnitude of the output.
+      error: largest difference of real numbers as a share of the scale, see `relative_error`.
       seconds: median duration of a call.
     """
 
@@ -258,38 +259,40 @@ def _given(
 def _compared(
     program: Callable[..., Arrays], given: list[Inputs], expected: list[Arrays]
 ) -> Compared:
-    different, error = 0, 0.0
-    for inputs, ours in zip(given, expected, strict=True):
-        theirs, is_different = program(**inputs), False
-        for key, value in ours.items():
-            is_real = value.dtype == np.float32
-            if is_real:
-                error = max(error, relative_error(theirs[key], value))
-            else:
-                is_different |= not np.array_equal(theirs[key], value)
-        different += is_different
+    theirs = [program(**inputs) for inputs in given]
+    is_other, error = np.zeros(len(given), bool), 0.0
+    for key, first in expected[0].items():
+        ours, found = (np.stack([each[key] for each in both]) for both in (expected, theirs))
+        if first.dtype == np.float32:
+            error = max(error, relative_error(found, ours))
+        else:
+            is_other |= (found != ours).reshape(len(given), -1).any(axis=1)
     seconds = []
     for inputs in given[:_TIMED]:
         start = time.perf_counter()
         program(**inputs)
         seconds.append(time.perf_counter() - start)
-    return Compared(len(given), different, error, float(np.median(seconds)))
+    return Compared(len(given), int(is_other.sum()), error, float(np.median(seconds)))
 
 
 def relative_error(theirs: np.ndarray, ours: np.ndarray) -> float:
-    """Largest difference as a share of the maximum magnitude, among numbers that stand for values.
+    """Largest difference as a share of the scale of an output, its maximum magnitude.
 
-    Numbers of 1e5 and more, or infinite, say that an action is not open; infinite if they differ.
+    Numbers of 1e5 and more, or infinite, say that an action is not open: they are not compared, but
+    must be the same ones.
 
     Args:
-      theirs: an array.
+      theirs: of all states.
       ours: of the same shape.
+
+    Returns:
+      The share; infinite if other actions are open.
     """
-    is_value = np.abs(ours) < 1e5
-    if theirs.shape != ours.shape or not np.array_equal(is_value, np.abs(theirs) < 1e5):
+    is_value = np.abs(ours) < _CLOSED
+    if not np.array_equal(is_value, np.abs(theirs) < _CLOSED):
         return np.inf
-    size = np.abs(ours[is_value]).max(initial=_TINY)
-    return float(np.abs(theirs[is_value] - ours[is_value]).max(initial=0.0) / size)
+    scale = np.abs(ours[is_value]).max(initial=_TINY)
+    return float(np.abs(theirs[is_value] - ours[is_value]).max(initial=0.0) / scale)
 
 
 def main(argv: list[str] | None = None) -> None:

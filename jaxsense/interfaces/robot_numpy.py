@@ -146,7 +146,7 @@ def _unsqueeze(x: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 def _gather_nd(x: np.ndarray, indices: np.ndarray, batch_dims: int) -> np.ndarray:
     """Rows of `x` at vectors of indices; the first axes belong together."""
-    batch = np.indices(indices.shape[:batch_dims], sparse=True)
+    batch: Any = np.indices(indices.shape[:batch_dims], sparse=True)
     extra = indices.ndim - 1 - batch_dims
     batch = [index.reshape(*index.shape, *[1] * extra) for index in batch]
     return x[(*batch, *np.moveaxis(indices, -1, 0))]
