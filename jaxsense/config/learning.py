@@ -91,14 +91,19 @@ class JmvaeConfig(Section, place="jmvae"):
 
     def check(self) -> None:
         """Checks that the fusion fits what is learned; raises `ConfigError`."""
-        fits = self.learns_from != "scans" or self.fusion == "filter"
+        fits = not self.reads_scans or self.fusion == "filter"
         expected = f"must be filter, because learns_from = {self.learns_from}"
         require(fits, self, "fusion", expected)
 
     @property
+    def reads_scans(self) -> bool:
+        """Whether the JMVAE learns from scans, so that its encoders read no features."""
+        return self.learns_from == "scans"
+
+    @property
     def num_together(self) -> int:
         """Looks by each sensor at a PoI in one training example."""
-        return self.looks if self.learns_from == "scans" else 1
+        return self.looks if self.reads_scans else 1
 
     def arrays(self, sizes: Sizes) -> dict[str, int]:
         """How many numbers each large array holds."""

@@ -53,8 +53,8 @@ class Function:
 def functions(config: Config) -> dict[str, Function]:
     """All functions, by name.
 
-    For each modality M `detect_M`, `weigh_M` and `write_M`; for each encoder of the JMVAE an
-    `encode_M`, for example `encode_camera+lidar`; `classify`; and `decide`.
+    For each modality M `detect_M`, `weigh_M` and `write_M`; for each encoder of the JMVAE that reads
+    features an `encode_M`, for example `encode_camera+lidar`; `classify`; and `decide`.
 
     Args:
       config: all settings.
@@ -67,7 +67,7 @@ def functions(config: Config) -> dict[str, Function]:
             f"weigh_{name}": _weigh(m),
             f"write_{name}": _write(config, m),
         }
-    for subset in model.subsets:
+    for subset in () if config.jmvae.reads_scans else model.subsets:
         found[f"encode_{model.encoder_name(subset)}"] = _encode(config, subset)
     return {**found, "classify": _classify(config), "decide": _decide(config)}
 
