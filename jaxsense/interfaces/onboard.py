@@ -53,8 +53,8 @@ class Function:
 def functions(config: Config) -> dict[str, Function]:
     """All functions, by name.
 
-    For each modality M `detect_M`, `weigh_M` and `write_M`; for each encoder of the JMVAE that reads
-    features an `encode_M`, for example `encode_camera+lidar`; `classify`; and `decide`.
+    For each modality M `detect_M`, `weigh_M` and `write_M`; for each encoder of the JMVAE an
+    `encode_M`, for example `encode_camera+lidar`, if it reads features; `classify`; and `decide`.
 
     Args:
       config: all settings.
