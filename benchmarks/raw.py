@@ -1,7 +1,7 @@
 """`python -m benchmarks.raw`: what a JMVAE needs to learn from scans, and what it fails without.
 
-Every variant trains on the same looks of the preset `raw`, several seeds at a time. `paper` is the
-paper's way: one look by each sensor, summed squares of the windows as they are. `ours` is
+Every variant trains on looks of the preset `raw`, several seeds at a time. `paper` is the paper's
+way, with our schedules: one look by each sensor, summed squares of windows as they are. `ours` is
 `vae.leave_one_out`; the others change one thing each. A second table repeats the numbers of the
 camera's windows, so that they weigh more in the summed squares; a third makes the networks deeper.
 Held-out PoIs count as right if their joint posterior is nearest to the mean of their class.
@@ -238,7 +238,8 @@ class Model:
                 z = jnp.concatenate([z, gaussian.sample(noise, *of_look)])
             error = jnp.sum((x - _apply(self.decoders[m], params["decoders"][m], z)) ** 2, axis=0)
             if variant.learns_variance:
-                scaled = 60 * error / jax.lax.stop_gradient(jnp.mean(error))
+                variance = jax.lax.stop_gradient(jnp.mean(error) / len(x))
+                scaled = 60 * (error / (len(x) * variance) + jnp.log(variance))
             else:
                 scaled = error
             total += 0.5 * jnp.sum(scaled, axis=-1)
@@ -271,7 +272,7 @@ def _divergence(p: tuple, q: tuple | None = None) -> jax.Array:
 
 
 def train(key: Key, model: Model, data: Data, steps: int) -> tuple[Params, Float[Array, "steps 2"]]:
-    """Parameters, and in each step the norms of the gradients of a decoder's outer layers.
+    """Parameters, and in each step gradients' norms of a decoder's first and last layer.
 
     Args:
       key: random key.
@@ -293,7 +294,7 @@ def train(key: Key, model: Model, data: Data, steps: int) -> tuple[Params, Float
         of_params = lambda params: model.loss(noise_key, params, looks, beta, has_begun)  # noqa: E731
         gradient = jax.grad(of_params)(params)
         update, state = optimiser.update(gradient, state, params)
-        layers = list(gradient["alone"][0]["params"].values())
+        layers = list(gradient["decoders"][0]["params"].values())
         norms = jnp.stack([optax.tree.norm(layers[0]), optax.tree.norm(layers[-1])])
         return (optax.apply_updates(params, update), state), norms
 

@@ -134,11 +134,11 @@ class Recorded:
         detector, number = self.models.detectors[self.modality], len(self.scans.ranges)
         assert isinstance(detector, Classifier)
         for each in jax.random.split(key, _RETRAINED):
-            order_key, train_key, test_key, fit_key = jax.random.split(each, 4)
+            order_key, train_key, test_key, choice_key, fit_key = jax.random.split(each, 5)
             order = np.asarray(jax.random.permutation(order_key, number))
             train = self.shown(train_key, errors, order[: number // 2])
             test = self.shown(test_key, errors, order[number // 2 :])
-            chosen = jax.random.permutation(fit_key, len(train.labels))[:_LABELLED]
+            chosen = jax.random.permutation(choice_key, len(train.labels))[:_LABELLED]
             given = self.windows(train)[chosen], jnp.asarray(train.labels)[chosen]
             other = jax.jit(detectors.retrain)(fit_key, detector, *given)
             before.append(self.right(detector, test))

@@ -187,7 +187,8 @@ def test_a_config_reproduces_its_run(resumed, smoke_run, capsys):
         ('{"seed": 1.5}', "seed = 1.5: must be a whole number"),
         (
             '{"preset": "best"}',
-            "preset = 'best': must be one of default, paper, noisy, many, team, recorded, smoke",
+            "preset = 'best': must be one of default, paper, noisy, many, raw, team, recorded, "
+            "smoke",
         ),
         (
             '{"config": {"dqn": {"epoch": 3}}}',

@@ -177,7 +177,8 @@ def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
     [
         (
             ["--preset", "best"],
-            "preset = 'best': must be one of default, paper, noisy, many, team, recorded, smoke",
+            "preset = 'best': must be one of default, paper, noisy, many, raw, team, recorded, "
+            "smoke",
         ),
         (["--taste", "sweet"], "train: unknown option --taste; see --help-all"),
         (["--jmvae.hiden", "3"], "unknown option --jmvae.hiden; did you mean --jmvae.hidden?"),
@@ -322,7 +323,7 @@ def test_every_setting_has_a_sentence_of_help():
 
 
 def test_presets_are_configurations():
-    assert set(PRESETS) == {"default", "paper", "noisy", "many", "team", "recorded", "smoke"}
+    assert set(PRESETS) == {"default", "paper", "noisy", "many", "raw", "team", "recorded", "smoke"}
     assert all(isinstance(preset, Config) for preset in PRESETS.values())
     assert PRESETS["default"].dqn.observe == "live"
     assert PRESETS["paper"].dqn.observe == "bank"

@@ -60,10 +60,10 @@ class Grouped(TypedDict):
     """`jmvae.grouped`: joint posteriors of a JMVAE that learns from scans, at held-out PoIs."""
 
     pair: Annotated[
-        float, Metric("right, of one look each", "Share nearest to the true class, by cluster.", 4)
+        float, Metric("right, one look each", "Share nearest to the true class, by cluster.", 4)
     ]
     all_looks: Annotated[
-        float, Metric("right, of all looks", "The same after `jmvae.looks` by each sensor.", 4)
+        float, Metric("right, all looks", "The same after `jmvae.looks` by each sensor.", 4)
     ]
 
 

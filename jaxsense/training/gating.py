@@ -92,7 +92,7 @@ def of_gate(config: DetectorConfig, gate: Gate, examples: Examples) -> gates.Fit
 
 
 def checks_of(config: DetectorConfig, gate: Gate, examples: Examples) -> gates.Fitting:
-    """The like problem with looks that set the gate's threshold, see `gates.fitted`.
+    """The same problem with other looks, which set the gate's threshold, see `gates.fitted`.
 
     Args:
       config: of the fit.

@@ -131,7 +131,8 @@ def draw_scenes(key: Key, config: Config) -> Scenes:
     is_empty = jnp.arange(total) >= sum(numbers[:3])
     places = None
     if each > 1:
-        place_keys = jax.random.split(jax.random.fold_in(key, 1), -(-total // each))
+        scene_key, place_key = jax.random.split(scene_key)
+        place_keys = jax.random.split(place_key, -(-total // each))
         places = jnp.repeat(place_keys, each)[:total]
     return jax.random.split(scene_key, total), classes, is_empty, places
 

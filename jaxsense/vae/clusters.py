@@ -36,7 +36,7 @@ def nearest(points: Float[Array, "S D"], centres: Float[Array, "K D"]) -> Int[Ar
 def named(
     members: Int[Array, " S"], classes: Int[Array, " S"], num_classes: int
 ) -> Int[Array, " C"]:
-    """The cluster of each class: the one that holds most of its points.
+    """The cluster of each class, none of two: those that share most points first.
 
     Args:
       members: `[S]` cluster of each point.
@@ -44,7 +44,15 @@ def named(
       num_classes: C, the number of classes and of clusters; static.
     """
     counts = jnp.zeros((num_classes, num_classes), jnp.int32).at[classes, members].add(1)
-    return jnp.argmax(counts, axis=1).astype(jnp.int32)
+
+    def name(_: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        left, found = carry
+        poi_class, cluster = jnp.unravel_index(jnp.argmax(left), left.shape)
+        left = left.at[poi_class].set(-1).at[:, cluster].set(-1)
+        return left, found.at[poi_class].set(cluster)
+
+    found = jnp.zeros(num_classes, jnp.int32)
+    return jax.lax.fori_loop(0, num_classes, name, (counts, found))[1]
 
 
 def _one(key: Key, points: jax.Array, number: int) -> tuple[jax.Array, jax.Array]:

@@ -205,7 +205,7 @@ def retrain(
     """Continues the training of a detector with other windows, for example 200 recorded ones.
 
     Few windows may replace what many have taught. So the parameters move from the old ones towards
-    the new ones (as in Wortsman et al. 2022) as far as serves windows that are kept from training.
+    the new ones (as in Wortsman et al. 2022) as far as that helps with windows kept from training.
 
     Args:
       key: random key.

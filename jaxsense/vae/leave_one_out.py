@@ -28,7 +28,7 @@ from jaxsense.vae.jmvae import annealed_beta
 from jaxsense.vae.readout import Readout
 
 _EMBEDDING = 64  # numbers that a network finds in a look
-_FIRST_ALPHA = 0.1  # before alpha sets in, single encoders follow the joint one and do not draw it
+_FIRST_ALPHA = 0.1  # before alpha sets in, posteriors of few looks follow and do not draw
 _ALPHA_RAMP = 0.2  # of the training
 _LOG_VARIANCES = -10.0, 6.0
 _MOST_SHARPNESS = 4.0
@@ -127,20 +127,21 @@ def losses(
 ) -> Float[Array, " B"]:
     """Losses of a batch of PoIs, to minimise.
 
-    For each PoI with looks `x_mk`, `sum_mk -w_m / F_m log p(x_mk | z_mk)`, with `z_mk` drawn from
-    `q(z | all looks but x_mk)` and p a Gaussian of the variance at which these looks are likeliest;
-    plus `beta` times the divergences of these posteriors, and of that of all looks, from the prior;
-    plus `alpha` times the divergences of the posterior of all looks from those of single looks and
-    of sets of one by each sensor.
+    For each PoI with looks `x_mk`, `sum_mk -w_m / F_m log p(x_mk | z_mk)` up to a constant, with
+    `z_mk` drawn from `q(z | all looks but x_mk)` and p a Gaussian of the variance at which the
+    looks of the batch by this sensor are likeliest; plus `beta` times the divergences of these
+    posteriors, and of that of all looks, from the prior; plus `alpha` times the divergences of the
+    posterior of all looks from those of single looks and of sets of one by each sensor.
 
     Args:
       noise: `[M, D, B, K]` standard normal draws.
       params: from `init`.
       shape: sizes of the networks.
-      looks: K looks by each sensor at each of B PoIs.
+      looks: K looks, two or more, by each sensor at each of B PoIs.
       alpha: weight of the divergences to the posteriors of fewer looks.
       beta: weight of the divergences from the prior.
-      has_begun: from 0, where these posteriors follow that of all looks without drawing it, to 1.
+      has_begun: from 0, where these posteriors follow that of all looks and their divergences do
+        not move it, to 1.
       reconstruction_weights: w_m.
     """
     number = looks[0].shape[1]
@@ -159,8 +160,7 @@ def losses(
         return jnp.sum(weighted, axis=-1)
 
     for m, x in enumerate(columns):
-        # Of the others, at least one.
-        left = (means[m][..., None] * number - found[m]) / max(number - 1, 1)
+        left = (means[m][..., None] * number - found[m]) / (number - 1)
         others = [left if i == m else _each(means[i], number) for i in range(len(columns))]
         mean_of_others, log_variance_of_others = _joint(params, shape, others)
         total += beta * jnp.mean(
@@ -169,9 +169,10 @@ def losses(
         z = gaussian.sample(noise[m], mean_of_others, log_variance_of_others)
         decoder = params["decoders"][shape.modalities[m]]
         error = jnp.sum((x - _columns(shape.decoder(m), decoder, z)) ** 2, axis=0)
+        # The variance is at its optimum, where its own gradient is 0.
         variance = jax.lax.stop_gradient(jnp.mean(error) / len(x))
-        weight = reconstruction_weights[m] / len(x)
-        total += 0.5 * weight * jnp.sum(error, axis=-1) / variance
+        of_looks = jnp.sum(error, axis=-1) / (len(x) * variance) + number * jnp.log(variance)
+        total += 0.5 * reconstruction_weights[m] * of_looks
         total += draws(*_alone(params, shape, m, x))
     return total + draws(*_joint(params, shape, found))
 

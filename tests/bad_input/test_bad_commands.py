@@ -120,7 +120,7 @@ TRAIN = [
     (["--devices", "1e9"], "devices = '1e9': must be a whole number or None"),
     (
         ["--preset", ""],
-        "preset = '': must be one of default, paper, noisy, many, team, recorded, smoke",
+        "preset = '': must be one of default, paper, noisy, many, raw, team, recorded, smoke",
     ),
     (["--preset", "Smoke"], "preset = 'Smoke': must be one of"),
     (["--preset"], "argument --preset: expected one argument"),

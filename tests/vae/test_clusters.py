@@ -28,6 +28,14 @@ def test_a_point_belongs_to_the_nearest_centre():
     np.testing.assert_array_equal(clusters.nearest(points, centres), [0, 1, 1])
 
 
+def test_no_two_classes_are_one_cluster():
+    members, classes = jnp.array([0, 0, 0, 0, 0, 1, 2]), jnp.array([0, 0, 0, 1, 1, 2, 2])
+    # Most of both are in the first cluster; it has three points of the first class.
+    found = np.asarray(clusters.named(members, classes, 3))
+    assert found[0] == 0
+    assert sorted(found) == [0, 1, 2]
+
+
 def test_a_class_is_the_cluster_with_most_of_its_points():
     members = jnp.array([2, 2, 0, 0, 0, 1, 2])
     classes = jnp.array([0, 0, 0, 1, 1, 2, 2])
