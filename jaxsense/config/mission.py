@@ -36,6 +36,24 @@ class NavigationConfig(Section, place="navigation"):
         return self.robot_radius - ROBOT_RADIUS
 
 
+class LocalisationConfig(Section, place="mission.localisation"):
+    """Errors of the poses that robots believe they have; none in all presets.
+
+    All errors are normally distributed, and those of x and y are independent.
+    """
+
+    position_error: Traced[float] = limited(0.0, at_least=0, at_most=1)
+    """Standard deviation of the constant error of a robot's x and y in a mission, in metres."""
+    heading_error: Traced[float] = limited(0.0, at_least=0, at_most=180)
+    """Standard deviation of the constant error of a robot's heading in a mission, in degrees."""
+    position_drift: Traced[float] = limited(0.0, at_least=0, at_most=1)
+    """Standard deviation of what driving adds to the errors of x and y, in metres after one metre;
+    it grows with the square root of the distance."""
+    heading_drift: Traced[float] = limited(0.0, at_least=0, at_most=180)
+    """Standard deviation of what driving adds to the error of the heading, in degrees after one
+    metre; it grows with the square root of the distance."""
+
+
 class MissionConfig(Section, place="mission"):
     """The closed loop of all robots in one arena."""
 
@@ -67,6 +85,7 @@ class MissionConfig(Section, place="mission"):
     attempts: Traced[int] = limited(3, at_least=1)
     """Failed looks or goals after which a robot gives up a PoI. Before it finishes, it retries PoIs
     where it was stuck, with as many attempts."""
+    localisation: LocalisationConfig = LocalisationConfig()
 
     def check(self) -> None:
         """Checks the control period, and that no policy repeats; raises `ConfigError`."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Belief, Index, Key, call, others, pytree
-from jaxsense.mission import navigation, roadmap
+from jaxsense.mission import localisation, navigation, roadmap
 from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, is_taken, sees
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.state import (
@@ -49,7 +49,7 @@ def approach(mission: Mission, models: Models, state: MissionState, robot: Index
     config, own = mission.config, state.robot(robot)
     num_views = state.roadmap.viewpoints.shape[1]
     poi, view = _target(mission, own), jnp.minimum(own.view, num_views - 1)
-    position, standing = state.scene.poses[robot, :2], state.standing_robots(robot)
+    position, standing = state.believed_poses[robot, :2], state.standing_robots(robot)
     length, waypoint = roadmap.next_waypoint(
         config, state.scene.layout, state.roadmap, position, standing, poi, view
     )
@@ -104,8 +104,12 @@ def _wanted(
     waypoint: Float[Array, "2"],
     makes_room: Bool[Array, ""],
 ) -> Float[Array, "2"]:
-    """Speeds that a robot wants: along its path, backing off, or turning."""
+    """Speeds that a robot wants: along its path, backing off, or turning.
+
+    It senses where obstacles are, but has to trust its own pose for where the waypoint is.
+    """
     config, scene = mission.config, state.scene
+    aim = localisation.aimed_at(waypoint, scene.poses[robot], state.pose_error[robot])
     drive = navigation.drive_to(
         config.navigation,
         config.arena,
@@ -113,7 +117,7 @@ def _wanted(
         scene.poses,
         state.robots.command,
         robot,
-        waypoint,
+        aim,
         config.mission.control_period,
         backs_off=(phase == BACKING) | makes_room,
     )
@@ -123,14 +127,14 @@ def _wanted(
 
 
 def _bearing(mission: Mission, state: MissionState, robot: Index) -> Float[Array, ""]:
-    """Angle from a robot's heading to its target, in radians within -pi and pi."""
+    """Angle from a robot's heading to its target, as it believes, from -pi to pi radians."""
     poi = _target(mission, state.robot(robot))
-    return viewpoints.bearing(state.scene.poses[robot], state.scene.layout.position[poi])
+    return viewpoints.bearing(state.believed_poses[robot], state.scene.layout.position[poi])
 
 
 def _is_in_the_way(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, ""]:
     """Whether another robot nearby drives without progress, or backs off."""
-    robots, poses = state.robots, state.scene.poses
+    robots, poses = state.robots, state.believed_poses
     waits = mission.time(state) - robots.progress_at > _PATIENCE
     needs_room = (robots.phase == BACKING) | ((robots.phase == DRIVING) & waits)
     is_near = jnp.linalg.norm(poses[:, :2] - poses[robot][None, :2], axis=-1) < _NEARBY
@@ -230,8 +234,8 @@ def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
     is_aligned = jnp.abs(bearing) <= jnp.radians(GOAL_ANGLE)
     is_calm = jnp.abs(own.command[1]) <= _TURNS_SLOWLY
     # It waits for a robot that drives through the view, but not for long.
-    position = scene.poses[robot, :2]
-    beside = others(scene.poses[:, :2], robot)
+    positions = state.believed_poses[:, :2]
+    position, beside = positions[robot], others(positions, robot)
     room = viewpoints.free_room(
         position[:1], position[1:], 0.0, config.arena, scene.layout, beside, poi
     )
@@ -267,7 +271,7 @@ def _look(
     found = models.detect_in_window(modality, sensor, readings, aim.bearing, aim.distance)
     is_confident = jnp.max(found.features) >= mission.config.mission.least_confidence
     old = jax.tree.map(lambda x: x[aim.poi], state.belief)
-    apart = state.apart(scene.poses[robot, :2][None], aim.poi, modality)[0]
+    apart = state.apart(state.believed_poses[robot, :2][None], aim.poi, modality)[0]
     weight = models.novelty.weight(apart, modality)
     return _Look(
         detects=found.is_there & is_confident,
@@ -304,7 +308,7 @@ def _write(
     )
     number = state.times_seen[poi, modality] % RECENT_LOOKS
     place = jnp.where(
-        detects, state.scene.poses[robot, :2], state.looked_from[poi, modality, number]
+        detects, state.believed_poses[robot, :2], state.looked_from[poi, modality, number]
     )
     return dataclasses.replace(
         state,

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.mission import roadmap
+from jaxsense.mission import localisation, roadmap
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.mission.state import (
     IDLE,
@@ -52,7 +52,7 @@ def reset(
       ValueError: if a class, the policy or a time is out of range.
     """
     config = mission.config
-    class_key, layout_key, light_key, pose_key = jax.random.split(key, 4)
+    class_key, layout_key, light_key, pose_key, error_key = jax.random.split(key, 5)
     num_pois = config.arena.num_pois
     if classes is None:
         classes = jax.random.randint(class_key, (num_pois,), 0, len(config.arena.classes))
@@ -62,7 +62,9 @@ def reset(
     light = random_light(light_key, mission.world.reads_conditions)
     scene = Scene(layout, light, poses)
     faults = no_faults(config) if faults is None else faults
-    return start(mission, models, scene, classes, jnp.asarray(policy, jnp.int32), faults, paths)
+    error = localisation.draw(error_key, config.mission.localisation, len(config.carried))
+    policy = jnp.asarray(policy, jnp.int32)
+    return start(mission, models, scene, classes, policy, faults, paths, error)
 
 
 def start(
@@ -73,6 +75,7 @@ def start(
     policy: Int[Array, ""],
     faults: Faults,
     paths: Roadmap | None = None,
+    pose_error: Float[Array, "R 3"] | None = None,
 ) -> MissionState:
     """Starts a mission in a given arena with an empty map.
 
@@ -84,6 +87,7 @@ def start(
       policy: `[]` int32 index into `Mission.policies`.
       faults: which robots will fail.
       paths: roadmap of the layout; computed by default.
+      pose_error: `[R, 3]` errors of localisation, see `localisation.draw`; none by default.
 
     Raises:
       ValueError: if a class, the policy or a time is out of range.
@@ -97,8 +101,11 @@ def start(
     chex.assert_shape(scene.poses, (num_robots, 3), custom_message="scene.poses")
     _check_faults(faults, num_robots)
     paths = roadmap.build(config, scene.layout) if paths is None else paths
+    pose_error = jnp.zeros((num_robots, 3)) if pose_error is None else pose_error
+    chex.assert_shape(pose_error, (num_robots, 3), custom_message="pose_error")
     return MissionState(
         scene=scene,
+        pose_error=pose_error,
         classes=classes,
         roadmap=paths,
         faults=faults,

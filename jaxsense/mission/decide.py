@@ -77,7 +77,7 @@ def decide(
     poi = jnp.minimum(action, config.arena.num_pois - 1)
     nothing_left = decides & (action == config.arena.num_pois)
     # Obstacles may have moved: before it ends, a robot retries the PoIs where it was stuck.
-    position = state.scene.poses[robot, :2]
+    position = state.believed_poses[robot, :2]
     reachable = roadmap.reachable(config, state.scene.layout, state.roadmap, position)
     stuck_at = own.unreachable & reachable
     tries_again = nothing_left & jnp.any(stuck_at) & ~own.tried_again
@@ -131,7 +131,7 @@ def _known_to(
     team = Team(
         positions=state.scene.layout.position,
         present=~given_up,
-        poses=state.scene.poses,
+        poses=state.believed_poses,
         modality=mission.modalities,
         works=(phase != ENDED) & (phase != FAILED),
         target=state.robots.target,
@@ -176,11 +176,11 @@ def _best_view(
     """Nearest viewpoint of a PoI from which a look is new."""
     config, scene = mission.config, state.scene
     poi = jnp.minimum(target, config.arena.num_pois - 1)
-    length = roadmap.lengths(config, scene.layout, state.roadmap, scene.poses[robot, :2], poi)
+    position, modality = state.believed_poses[robot, :2], mission.modalities[robot]
+    length = roadmap.lengths(config, scene.layout, state.roadmap, position, poi)
     positions, margin = state.roadmap.viewpoints[poi], config.navigation.margin
     is_free = _room(mission, state, robot, poi, positions, margin) > 0
     length += jnp.where(is_free, 0.0, _DETOUR)
-    position, modality = scene.poses[robot, :2], mission.modalities[robot]
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
     apart = state.apart(jnp.concatenate([positions, position[None]]), poi, modality)
     is_new = models.novelty.to_go(apart, modality) <= 0
@@ -224,7 +224,7 @@ def sees(
       robot: index of the robot.
       poi: index of the PoI.
     """
-    config, position = mission.config, state.scene.poses[robot, :2]
+    config, position = mission.config, state.believed_poses[robot, :2]
     distance = jnp.linalg.norm(state.scene.layout.position[poi] - position)
     in_range = distance >= config.viewpoint.min_distance
     in_range &= distance <= config.navigation.view_range

@@ -8,7 +8,7 @@ from jaxtyping import Array, Int
 
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key
-from jaxsense.mission import act, decide
+from jaxsense.mission import act, decide, localisation
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.motion import move
 from jaxsense.mission.state import (
@@ -101,7 +101,8 @@ def step(
     """
     before = states
     num_robots = mission.world.arena.num_robots
-    robot_keys = jax.vmap(lambda key: jax.random.split(key, num_robots), out_axes=1)(keys)
+    step_keys = jax.vmap(lambda key: jax.random.split(key, num_robots + 1), out_axes=1)(keys)
+    robot_keys, drift_keys = step_keys[:-1], step_keys[-1]
     # One after the other, so that no robot scans what another has just identified.
     states, _ = jax.lax.scan(
         lambda states, robot: (_act(robot[1], mission, models, states, robot[0], parts), None),
@@ -109,6 +110,7 @@ def step(
         (jnp.arange(num_robots), robot_keys),
     )
     states, clearance = move(mission, states)
+    states = _drift(drift_keys, mission, before, states)
     robots = states.robots
     is_idle = jnp.all((robots.phase == ENDED) | (robots.phase == FAILED), axis=-1)
     steps, settings = states.steps + 1, mission.config.mission
@@ -154,6 +156,16 @@ def _act(
     states = dataclasses.replace(states, robots=robots)
     states = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
     return act.scan(scan_keys, mission, models, states, robot, parts)
+
+
+def _drift(keys: Key, mission: Mission, before: MissionState, after: MissionState) -> MissionState:
+    """The states with what driving has added to the errors of the robots' poses."""
+    way = after.scene.poses[..., :2] - before.scene.poses[..., :2]
+    drift = jax.vmap(localisation.drift, (0, None, 0, 0))
+    error = drift(
+        keys, mission.config.mission.localisation, after.pose_error, jnp.linalg.norm(way, axis=-1)
+    )
+    return dataclasses.replace(after, pose_error=error)
 
 
 def _fail(mission: Mission, state: MissionState, robot: Index) -> MissionState:

@@ -92,6 +92,8 @@ class MissionState:
 
     Attributes:
       scene: PoIs, light and the robots' poses.
+      pose_error: `[R, 3]` pose that each robot believes it has minus its true pose: x [m], y [m]
+        and yaw [rad].
       classes: `[N]` int32 true classes, hidden from the robots.
       roadmap: paths through the layout.
       faults: which robots will fail.
@@ -103,7 +105,7 @@ class MissionState:
         policies `bayes` and `optimal`.
       times_seen: `[N, M]` int32, number of detections of each PoI by each modality.
       looked_from: `[N, M, RECENT_LOOKS, 2]` places from which each modality has last detected each
-        PoI, in metres; infinite for none.
+        PoI, as the robots believe, in metres; infinite for none.
       version: `[]` int32, number of updates of the map.
       robots: their state.
       steps: `[]` int32 control periods since the start.
@@ -113,6 +115,7 @@ class MissionState:
     """
 
     scene: Scene
+    pose_error: Float[Array, "R 3"]
     classes: Int[Array, " N"]
     roadmap: Roadmap
     faults: Faults
@@ -129,6 +132,11 @@ class MissionState:
     contacts: Int[Array, ""]
     min_clearance: Float[Array, ""]
     done: Bool[Array, ""]
+
+    @property
+    def believed_poses(self) -> Float[Array, "*B R 3"]:
+        """The poses that robots believe they have, and tell the others; see `Scene.poses`."""
+        return self.scene.poses + self.pose_error
 
     @property
     def seen(self) -> Bool[Array, "... N M"]:
@@ -156,7 +164,7 @@ class MissionState:
         """Positions of the other robots; moving ones, which will be gone, count as far away."""
         phase = others(self.robots.phase, robot)
         moves = (phase == DRIVING) | (phase == BACKING)
-        return jnp.where(moves[:, None], 1e3, others(self.scene.poses[:, :2], robot))
+        return jnp.where(moves[:, None], 1e3, others(self.believed_poses[:, :2], robot))
 
     def with_robot(self, robot: Index, **changes: jax.Array) -> "MissionState":
         """Changes one robot.

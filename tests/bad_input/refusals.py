@@ -19,7 +19,12 @@ SECTIONS = {
 }
 FIELDS = [(name, f) for name, section in SECTIONS.items() for f in dataclasses.fields(section)]
 # With those of a section within a section.
-PARTS = {**SECTIONS, "team.travel": SMOKE.team.travel, "team.tours": SMOKE.team.tours}
+PARTS = {
+    **SECTIONS,
+    "team.travel": SMOKE.team.travel,
+    "team.tours": SMOKE.team.tours,
+    "mission.localisation": SMOKE.mission.localisation,
+}
 NUMBERS = [
     (name, field)
     for name, section in PARTS.items()

@@ -80,7 +80,10 @@ LIMITS = {
     Limits(at_least=0, at_most=0.5): "detector.calibration",
     Limits(at_least=0, at_most=1): "arena.colours lidar.range_noise_growth lidar.mixed_pixels "
     "lidar.dropout camera.pixel_noise camera.low_light camera.shadow jmvae.annealing team.alone "
-    "team.partly_seen dqn.discount dqn.final_learning_rate dqn.epsilon_start",
+    "team.partly_seen dqn.discount dqn.final_learning_rate dqn.epsilon_start "
+    "mission.localisation.position_error mission.localisation.position_drift",
+    Limits(at_least=0, at_most=180): "mission.localisation.heading_error "
+    "mission.localisation.heading_drift",
     Limits(at_least=0, at_most=10): "camera.exposure_error camera.colour_cast "
     "viewpoint.bearing_error",
     Limits(at_least=0, at_most=10_000): "team.tours.walk",
@@ -190,6 +193,10 @@ ZERO = {
     "team.tours.steps",
     "team.tours.walk",
     "team.travel.view_distance",
+    "mission.localisation.position_error",
+    "mission.localisation.heading_error",
+    "mission.localisation.position_drift",
+    "mission.localisation.heading_drift",
 }  # fmt: skip
 
 

@@ -1,0 +1,72 @@
+"""Errors of localisation: what robots believe about their own poses, less the truth.
+
+The error of a robot's pose has a part that stays as it is throughout a mission, such as that of
+its first fix, and one that grows while the robot drives, like that of odometry: a random walk whose
+variance is proportional to the distance.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsense.config import LocalisationConfig
+from jaxsense.core.types import Key
+
+
+def draw(key: Key, config: LocalisationConfig, num_robots: int) -> Float[Array, "R 3"]:
+    """Draws the error of each robot's pose at the start of a mission.
+
+    Args:
+      key: random key.
+      config: the standard deviations.
+      num_robots: R.
+
+    Returns:
+      `[R, 3]` believed minus true x [m], y [m] and yaw [rad].
+    """
+    scale = _scale(config.position_error, config.heading_error)
+    return scale * jax.random.normal(key, (num_robots, 3))
+
+
+def drift(
+    key: Key,
+    config: LocalisationConfig,
+    error: Float[Array, "R 3"],
+    driven: Float[Array, " R"],
+) -> Float[Array, "R 3"]:
+    """Errors of the poses after the robots have driven on.
+
+    Args:
+      key: random key.
+      config: the standard deviations.
+      error: `[R, 3]` before, see `draw`.
+      driven: `[R]` metres since then.
+    """
+    scale = _scale(config.position_drift, config.heading_drift)
+    return error + scale * jnp.sqrt(driven)[:, None] * jax.random.normal(key, error.shape)
+
+
+def aimed_at(
+    position: Float[Array, "2"], pose: Float[Array, "3"], error: Float[Array, "3"]
+) -> Float[Array, "2"]:
+    """Where a robot really heads when it drives to a position.
+
+    It takes the course that would lead there from the pose that it believes it has.
+
+    Args:
+      position: `[2]` in metres.
+      pose: `[3]` true pose.
+      error: `[3]` of the pose, see `draw`.
+
+    Returns:
+      `[2]` metres; without an error the position itself, to the last bit.
+    """
+    to_x, to_y = position - (pose + error)[:2]
+    cos, sin = jnp.cos(error[2]) - 1, jnp.sin(error[2])
+    turned = jnp.stack([cos * to_x + sin * to_y, cos * to_y - sin * to_x])
+    return position - error[:2] + turned
+
+
+def _scale(position: float, heading: float) -> Float[Array, "1 3"]:
+    """Standard deviations of x [m], y [m] and yaw [rad], from metres and degrees."""
+    return jnp.stack([position, position, jnp.radians(heading)])[None]

@@ -1,0 +1,187 @@
+"""Errors of the poses that robots believe they have: their size, and what robots do with them."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from teams import CONFIG, POSES, POSITIONS, alone, with_config, with_values
+
+from jaxsense import mission
+from jaxsense.config import LocalisationConfig
+from jaxsense.mission import act, localisation
+from jaxsense.mission.rollout import _drift
+from jaxsense.mission.state import DRIVING, FACING
+
+CAMERA, LIDAR = 0, 1
+AHEAD = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
+AWAY = [0.0, 1.2, 0.0]
+
+
+@pytest.fixture(scope="module")
+def facing(arena_of, set_robot):
+    """A robot at a pose, with an error, that turns to a red cube 0.8 m east of the origin."""
+
+    def make(robot, pose, error):
+        poses = [pose, AWAY] if robot == CAMERA else [AWAY, pose]
+        state = arena_of(AHEAD, poses, classes=(2, 0, 1))
+        errors = jnp.zeros((2, 3)).at[robot].set(jnp.array(error))
+        state = replace(state, pose_error=errors)
+        return set_robot(state, robot, phase=FACING, target=0, progress_at=-100.0)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def scan(team, models):
+    @jax.jit
+    def of_one(key, state, robot):
+        return alone(lambda key, state: act.scan(key, team, models, state, robot))(key, state)
+
+    return lambda state, robot: of_one(jax.random.key(0), state, robot)
+
+
+def test_constant_errors_have_their_standard_deviations():
+    config = LocalisationConfig(position_error=0.03, heading_error=2.0)
+    errors = np.asarray(localisation.draw(jax.random.key(0), config, 20_000))
+    expected = [0.03, 0.03, np.radians(2.0)]
+    np.testing.assert_allclose(errors.std(axis=0), expected, rtol=0.02)
+    np.testing.assert_allclose(errors.mean(axis=0) / expected, 0.0, atol=0.03)
+    np.testing.assert_allclose(np.corrcoef(errors.T), np.eye(3), atol=0.03)
+    np.testing.assert_array_equal(
+        localisation.draw(jax.random.key(0), LocalisationConfig(), 3), np.zeros((3, 3))
+    )
+
+
+def test_drift_grows_with_the_root_of_the_distance():
+    config = LocalisationConfig(position_drift=0.02, heading_drift=1.0)
+    before = jnp.full((20_000, 3), 0.5)
+    for driven in (1.0, 0.25, 4.0):
+        after = localisation.drift(jax.random.key(0), config, before, jnp.full(len(before), driven))
+        expected = driven**0.5 * np.array([0.02, 0.02, np.radians(1.0)])
+        np.testing.assert_allclose((after - before).std(axis=0), expected, rtol=0.02)
+    still = localisation.drift(jax.random.key(0), config, before, jnp.zeros(len(before)))
+    np.testing.assert_array_equal(still, before)
+
+
+@pytest.mark.parametrize(
+    ("pose", "error", "expected"),
+    [
+        # It believes to be 0.1 m further east, and so stops 0.1 m short.
+        ([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.9, 0.0]),
+        # It faces east and believes to face north: what it has on its right is south of it.
+        ([0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2], [0.0, -1.0]),
+        # From (0, 0) it believes to be at (0, 1): (1, 0) is (1, -1) away, which it turns by -90
+        # degrees to (-1, -1).
+        ([0.0, 0.0, 2.0], [0.0, 1.0, np.pi / 2], [-1.0, -1.0]),
+    ],
+)
+def test_a_robot_heads_for_where_its_error_leads(pose, error, expected):
+    found = localisation.aimed_at(jnp.array([1.0, 0.0]), jnp.array(pose), jnp.array(error))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_without_an_error_positions_stay_to_the_last_bit():
+    position, pose = jax.random.normal(jax.random.key(0), (2, 1000, 3))
+    aim = jax.jit(jax.vmap(localisation.aimed_at))
+    found = aim(position[:, :2], pose, jnp.zeros((1000, 3)))
+    np.testing.assert_array_equal(found, position[:, :2])
+
+
+@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
+@pytest.mark.parametrize(
+    ("degrees", "error", "looks", "detections"),
+    [
+        (0.0, 3.0, 1, 1),
+        (0.0, 10.0, 0, 0),  # the PoI seems to be to the right
+        (-10.0, 10.0, 1, 0),  # it seems to be ahead, and a window is cut out where it is not
+        (-10.0, 0.0, 0, 0),
+    ],
+)
+def test_a_robot_scans_where_it_believes_the_poi_to_be(
+    scan, facing, robot, degrees, error, looks, detections
+):
+    state = facing(robot, [0.0, 0.0, np.radians(degrees)], [0.0, 0.0, np.radians(error)])
+    robots = scan(state, robot).robots
+    assert (robots.looks[robot], robots.detections[robot]) == (looks, detections)
+
+
+def test_the_gate_is_given_the_distance_that_the_robot_believes(scan, facing):
+    # The LiDAR's refuses what is 0.24 m nearer than expected.
+    for error, detections in ((0.0, 1), (-0.1, 1), (-0.3, 0)):
+        robots = scan(facing(LIDAR, [0.0, 0.0, 0.0], [error, 0.0, 0.0]), LIDAR).robots
+        assert (robots.looks[LIDAR], robots.detections[LIDAR]) == (1, detections)
+
+
+def test_a_look_is_remembered_at_the_place_that_the_robot_believes(scan, facing):
+    after = scan(facing(CAMERA, [0.0, 0.0, 0.0], [0.05, -0.02, 0.0]), CAMERA)
+    np.testing.assert_allclose(after.looked_from[0, CAMERA, 0], [0.05, -0.02], atol=1e-6)
+
+
+def test_a_robot_arrives_where_it_believes_the_viewpoint_to_be(team, models, facing, set_robot):
+    approach = jax.jit(lambda state: act.approach(team, models, state, CAMERA))
+    viewpoint = facing(CAMERA, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]).roadmap.viewpoints[0, 0]
+    there, short = [*viewpoint, 0.0], [viewpoint[0] + 0.25, viewpoint[1], 0.0]
+    for pose, error, phase in (
+        (there, 0.0, FACING),
+        (there, 0.25, DRIVING),
+        (short, 0.0, DRIVING),
+        (short, -0.25, FACING),
+    ):
+        state = facing(CAMERA, pose, [error, 0.0, 0.0])
+        state = set_robot(state, CAMERA, phase=DRIVING, view=0, path_left=0.5, progress_at=0.0)
+        assert approach(state).robots.phase[CAMERA] == phase
+
+
+def test_a_robot_chooses_the_poi_that_it_believes_to_be_nearest(arena_of, models, decides):
+    equal = with_values(models, [1.0, 1.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0])
+    state = arena_of(POSITIONS, POSES, policy=0)
+    assert decides(equal, state).robots.target[0] == 1
+    # From (0.6, 0), PoI 0 is at 0.4 m and PoI 1 at 1.0 m.
+    misplaced = replace(state, pose_error=state.pose_error.at[0, 0].set(0.6))
+    assert decides(equal, misplaced).robots.target[0] == 0
+
+
+def test_errors_are_of_the_robots_that_drive(team, arena_of):
+    localised = LocalisationConfig(position_drift=0.1, heading_drift=5.0)
+    config = replace(CONFIG, mission=replace(CONFIG.mission, localisation=localised))
+    before = arena_of(POSITIONS, POSES)
+    poses = before.scene.poses.at[1, 0].add(0.02)
+    after = replace(before, scene=replace(before.scene, poses=poses))
+    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], (before, after))
+    key = jax.random.key(0)[None]
+    error = _drift(key, with_config(team, config), *batch).pose_error[0]
+    np.testing.assert_array_equal(error[0], 0.0)
+    assert np.all(error[1] != 0)
+    without = _drift(key, team, *batch).pose_error[0]
+    np.testing.assert_array_equal(without, 0.0)
+
+
+def test_a_mission_starts_with_constant_errors(team, models):
+    localised = LocalisationConfig(position_error=0.1, heading_error=5.0)
+
+    @jax.jit
+    def begin(keys, localisation):
+        config = replace(CONFIG, mission=replace(CONFIG.mission, localisation=localisation))
+        changed = with_config(team, config)
+        states = jax.vmap(lambda key: mission.reset(key, changed, models))(keys)
+        return states.scene.poses, states.pose_error, states.believed_poses
+
+    keys = jax.random.split(jax.random.key(0), 64)
+    poses, errors, believed = begin(keys, localised)
+    np.testing.assert_allclose(errors.std(axis=(0, 1)), [0.1, 0.1, np.radians(5.0)], rtol=0.3)
+    np.testing.assert_allclose(believed, poses + errors, atol=1e-6)
+    # They change nothing else.
+    same, none, _ = begin(keys, LocalisationConfig())
+    np.testing.assert_array_equal(same, poses)
+    np.testing.assert_array_equal(none, 0.0)
+
+
+def test_errors_must_be_of_all_robots(team, models, arena_of):
+    state = arena_of(POSITIONS, POSES)
+    with pytest.raises(AssertionError, match="pose_error"):
+        mission.start(
+            *(team, models, state.scene, state.classes, state.policy, state.faults),
+            pose_error=jnp.zeros((3, 3)),
+        )
