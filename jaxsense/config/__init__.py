@@ -18,6 +18,7 @@ from jaxsense.config.learning import TravelConfig as TravelConfig
 from jaxsense.config.mission import MISSIONS_AT_ONCE as MISSIONS_AT_ONCE
 from jaxsense.config.mission import NODES_PER_POI as NODES_PER_POI
 from jaxsense.config.mission import VIEW_SIDES as VIEW_SIDES
+from jaxsense.config.mission import CommunicationConfig as CommunicationConfig
 from jaxsense.config.mission import LocalisationConfig as LocalisationConfig
 from jaxsense.config.mission import MissionConfig as MissionConfig
 from jaxsense.config.mission import NavigationConfig as NavigationConfig

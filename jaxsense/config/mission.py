@@ -54,6 +54,26 @@ class LocalisationConfig(Section, place="mission.localisation"):
     metre; it grows with the square root of the distance."""
 
 
+class CommunicationConfig(Section, place="mission.communication"):
+    """What robots tell each other of their looks, and how much of it arrives."""
+
+    own_maps: bool = False
+    """Whether each robot decides by a map of its own, from its looks and from messages of the
+    others. Otherwise all share one map. Needs `jmvae.fusion` = `filter`, by which looks add up."""
+    loss: Traced[float] = limited(0.0, at_least=0, at_most=0.95)
+    """Share of the messages that are lost; only with `own_maps`."""
+    delay: Traced[float] = limited(0.0, at_least=0, at_most=3600)
+    """Mean delay of a message, in seconds, from none to twice as much; only with `own_maps`."""
+    period: Traced[float] = limited(1.0, above=0, at_most=3600)
+    """Seconds after which a robot repeats its message, which it also sends after each look."""
+
+    def check(self) -> None:
+        """Checks that messages are sent if they are lost or late; raises `ConfigError`."""
+        for name in ("loss", "delay"):
+            is_used = self.own_maps or getattr(self, name) == 0
+            require(is_used, self, name, "must be 0 without mission.communication.own_maps")
+
+
 class MissionConfig(Section, place="mission"):
     """The closed loop of all robots in one arena."""
 
@@ -86,6 +106,7 @@ class MissionConfig(Section, place="mission"):
     """Failed looks or goals after which a robot gives up a PoI. Before it finishes, it retries PoIs
     where it was stuck, with as many attempts."""
     localisation: LocalisationConfig = LocalisationConfig()
+    communication: CommunicationConfig = CommunicationConfig()
 
     def check(self) -> None:
         """Checks the control period, and that no policy repeats; raises `ConfigError`."""

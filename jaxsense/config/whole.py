@@ -113,6 +113,9 @@ class Config(Section):
         leaves_some = self.detector.num_training(scans) > 0
         expected = f"leaves none of {scans} scans to train on; lower it"
         require(leaves_some, self.detector, "calibration", expected)
+        adds_up = self.jmvae.fusion == "filter" or not self.mission.communication.own_maps
+        expected = "must be off unless jmvae.fusion is 'filter', by which looks add up"
+        require(adds_up, self.mission.communication, "own_maps", expected)
 
     def _least_latent_size(self) -> int:
         """Minimum size that gives the labels of each attribute dimensions of their own.

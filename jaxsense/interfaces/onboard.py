@@ -195,13 +195,15 @@ def _decide(config: Config) -> Function:
         *of_team: jax.Array,
     ) -> dict[str, jax.Array]:
         team, pois = Team(*of_team), mean.shape[0]
+        ways = team.poses[:, None, None, :2] - jnp.swapaxes(looked_from, 0, 1)[team.modality]
+        apart = jnp.linalg.norm(ways, axis=-1)
         known = Known(
             belief=Belief(mean, std),
             # The policy of a run reads neither.
             looks=jnp.zeros((pois, len(config.modalities)), jnp.int32),
             log_posterior=jnp.zeros((pois, len(config.arena.classes))),
             team=team,
-            times=times_to_new_looks(config.team.travel, models.novelty, team, looked_from),
+            times=times_to_new_looks(config.team.travel, models.novelty, team, apart),
             robot=robot,
         )
         return {

@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.core.types import Belief, Index, Key, call, others, pytree
+from jaxsense.core.types import Index, Key, call, others, pytree
 from jaxsense.mission import localisation, navigation, roadmap
 from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, is_taken, sees
 from jaxsense.mission.groups import where_due
+from jaxsense.mission.maps import Learned, map_of
+from jaxsense.mission.memory import Evidence
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
@@ -56,7 +58,8 @@ def approach(mission: Mission, models: Models, state: MissionState, robot: Index
     to_goal = jnp.linalg.norm(state.roadmap.viewpoints[poi, view] - position)
     is_here = own.view == num_views
     modality = mission.modalities[robot]
-    to_go = models.novelty.to_go(state.apart(position[None], poi, modality)[0], modality)
+    apart = map_of(mission, state, robot).apart(position[None], poi, modality)[0]
+    to_go = models.novelty.to_go(apart, modality)
     is_near = to_goal <= jnp.where(to_go > 0, AT_VIEWPOINT, _GOAL_DISTANCE)
     is_there = is_here | (is_near & sees(mission, state, robot, poi))
 
@@ -170,15 +173,15 @@ class _Aim:
     bearing: Float[Array, ""]
     distance: Float[Array, ""]
     noise_key: Key
+    message_key: Key
 
 
 @pytree
 class _Look:
-    """Whether a scan detects its PoI, and the belief and exact posterior if it does."""
+    """Whether a scan detects its PoI, and what it changes if it does."""
 
     detects: Bool[Array, ""]
-    belief: Belief
-    log_posterior: Float[Array, " C"]
+    learned: Learned
 
 
 def scan(
@@ -205,12 +208,10 @@ def scan(
     aims = jax.vmap(lambda key, state: _aim(key, mission, state, robot))(keys, states)
     of_robot = mission.config.modality_of_robot
     carried = sorted(set(of_robot))
-    # Rows that are not due; any belief will do, since it is not written.
-    nothing = _Look(
-        detects=jnp.zeros(len(keys), bool),
-        belief=jax.tree.map(lambda x: x[:, 0], states.belief),
-        log_posterior=states.log_posterior[:, 0],
-    )
+    # Rows that are not due; any content will do, since it is not written.
+    belief, log_posterior = jax.tree.map(lambda x: x[:, 0], (states.belief, states.log_posterior))
+    evidence = None if states.memory is None else Evidence(log_posterior, log_posterior)
+    nothing = _Look(jnp.zeros(len(keys), bool), Learned(belief, log_posterior, evidence))
 
     def look(i: int) -> _Look:
         def look_one(row: tuple[MissionState, _Aim]) -> _Look:
@@ -229,7 +230,7 @@ def scan(
 def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
     """Decides whether a robot scans, and what."""
     config, scene, own = mission.config, state.scene, state.robot(robot)
-    error_key, noise_key = jax.random.split(key)
+    error_key, noise_key, message_key = jax.random.split(key, 3)
     poi, bearing = _target(mission, own), _bearing(mission, state, robot)
     is_aligned = jnp.abs(bearing) <= jnp.radians(GOAL_ANGLE)
     is_calm = jnp.abs(own.command[1]) <= _TURNS_SLOWLY
@@ -248,6 +249,7 @@ def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
         bearing=bearing + jax.random.uniform(error_key, (), minval=-error, maxval=error),
         distance=jnp.linalg.norm(scene.layout.position[poi] - position),
         noise_key=noise_key,
+        message_key=message_key,
     )
 
 
@@ -270,23 +272,20 @@ def _look(
     readings = jnp.where(is_blind, sensor.blind, readings)
     found = models.detect_in_window(modality, sensor, readings, aim.bearing, aim.distance)
     is_confident = jnp.max(found.features) >= mission.config.mission.least_confidence
-    old = jax.tree.map(lambda x: x[aim.poi], state.belief)
-    apart = state.apart(state.believed_poses[robot, :2][None], aim.poi, modality)[0]
+    known = map_of(mission, state, robot)
+    apart = known.apart(state.believed_poses[robot, :2][None], aim.poi, modality)[0]
     weight = models.novelty.weight(apart, modality)
     return _Look(
         detects=found.is_there & is_confident,
-        belief=models.fusion.update(old, state.seen[aim.poi], found.features, modality, weight),
-        log_posterior=models.bayes.update(
-            state.log_posterior[aim.poi], found.features, modality, weight
-        ),
+        learned=known.learn(models, aim.poi, found.features, modality, weight),
     )
 
 
 def _write(
     mission: Mission, state: MissionState, aim: _Aim, look: _Look, robot: Index
 ) -> MissionState:
-    """Records a scan, and updates the map if it detects the PoI."""
-    poi, detects = aim.poi, aim.scans & look.detects
+    """Records a scan; if it detects the PoI, updates the map and tells the other robots."""
+    poi, detects, learned = aim.poi, aim.scans & look.detects, look.learned
     modality = mission.modalities[robot]
     own = state.robot(robot)
     failure = _fail(own, aim.scans & ~detects, mission.config.mission.attempts)
@@ -304,12 +303,16 @@ def _write(
     belief, log_posterior = jax.tree.map(
         lambda rows, new: rows.at[poi].set(jnp.where(detects, new, rows[poi])),
         (state.belief, state.log_posterior),
-        (look.belief, look.log_posterior),
+        (learned.belief, learned.log_posterior),
     )
     number = state.times_seen[poi, modality] % RECENT_LOOKS
-    place = jnp.where(
-        detects, state.believed_poses[robot, :2], state.looked_from[poi, modality, number]
-    )
+    position, memory = state.believed_poses[robot, :2], state.memory
+    place = jnp.where(detects, position, state.looked_from[poi, modality, number])
+    if memory is not None and learned.evidence is not None:
+        time, settings = mission.time(state), mission.config.mission.communication
+        memory = memory.with_look(robot, poi, position, learned.evidence, time, detects)
+        sends = detects & (jnp.arange(len(memory.number)) == robot)
+        memory = memory.after_messages(aim.message_key, settings, time, sends)
     return dataclasses.replace(
         state,
         looked_from=state.looked_from.at[poi, modality, number].set(place),
@@ -317,4 +320,5 @@ def _write(
         log_posterior=log_posterior,
         times_seen=state.times_seen.at[poi, modality].add(detects),
         version=state.version + detects,
+        memory=memory,
     )

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.mission import localisation, roadmap
+from jaxsense.mission import localisation, memory, roadmap
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.mission.state import (
     IDLE,
@@ -101,6 +101,7 @@ def start(
     chex.assert_shape(scene.poses, (num_robots, 3), custom_message="scene.poses")
     _check_faults(faults, num_robots)
     paths = roadmap.build(config, scene.layout) if paths is None else paths
+    own_maps = config.mission.communication.own_maps
     pose_error = jnp.zeros((num_robots, 3)) if pose_error is None else pose_error
     chex.assert_shape(pose_error, (num_robots, 3), custom_message="pose_error")
     return MissionState(
@@ -117,6 +118,7 @@ def start(
         times_seen=jnp.zeros((num_pois, len(config.modalities)), jnp.int32),
         looked_from=jnp.full((num_pois, len(config.modalities), RECENT_LOOKS, 2), jnp.inf),
         version=jnp.int32(0),
+        memory=memory.empty(mission.modalities, num_classes) if own_maps else None,
         robots=_idle_robots(num_robots, num_pois, paths.is_free.shape[1]),
         steps=jnp.int32(0),
         contacts=jnp.int32(0),

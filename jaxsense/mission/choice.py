@@ -75,7 +75,7 @@ def values_of(
 
 
 def times_to_new_looks(
-    travel: TravelConfig, novelty: Novelty, team: Team, looked_from: Float[Array, "N M K 2"]
+    travel: TravelConfig, novelty: Novelty, team: Team, apart: Float[Array, "R N K"]
 ) -> Float[Array, "R N"]:
     """Seconds until each robot has looked at each PoI from where a look is new.
 
@@ -83,18 +83,13 @@ def times_to_new_looks(
       travel: the travel model, which leaves out the way to such a place.
       novelty: how much of a look is new.
       team: robots and PoIs at this moment.
-      looked_from: places of earlier looks by each modality at each PoI, in metres; infinite for
-        none.
+      apart: distances of each robot from earlier looks by its sensor at each PoI, in metres;
+        infinite for none.
 
     Returns:
       `[R, N]` seconds.
     """
-
-    def to_go(pose: jax.Array, modality: jax.Array) -> jax.Array:
-        apart = jnp.linalg.norm(pose[None, None, :2] - looked_from[:, modality], axis=-1)
-        return novelty.to_go(apart, modality)
-
-    metres = jax.vmap(to_go)(team.poses, team.modality)
+    metres = jax.vmap(novelty.to_go)(apart, team.modality)
     return team_mdp.travel_times(travel, team) + metres / travel.speed
 
 

@@ -8,6 +8,7 @@ from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission import roadmap
 from jaxsense.mission.choice import choose, times_to_new_looks
+from jaxsense.mission.maps import map_of
 from jaxsense.mission.state import (
     BACKING,
     DRIVING,
@@ -37,7 +38,8 @@ def is_due(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, "
     """
     own = state.robot(robot)
     is_under_way = (own.phase == DRIVING) | (own.phase == FACING)
-    has_news = (state.version != own.decided_on) & mission.config.mission.redecides
+    has_news = map_of(mission, state, robot).version != own.decided_on
+    has_news &= mission.config.mission.redecides
     return (own.phase == IDLE) | (is_under_way & has_news)
 
 
@@ -95,7 +97,7 @@ def decide(
         ),
         target=action,
         view=jnp.where(sets_out_now, view, own.view),
-        decided_on=jnp.where(decides, state.version, own.decided_on),
+        decided_on=jnp.where(decides, map_of(mission, state, robot).version, own.decided_on),
         excluded=found.excluded,
         attempts=attempts,
         backs_off_until=jnp.where(backs_off, time + RECOVERY_TIME, own.backs_off_until),
@@ -127,7 +129,8 @@ def _known_to(
     given_up: Bool[Array, " N"],
 ) -> Known:
     """Knowledge of a robot that chooses, without the PoIs it has given up."""
-    phase = state.robots.phase
+    phase, own = state.robots.phase, map_of(mission, state, robot)
+    known = own.read(models)
     team = Team(
         positions=state.scene.layout.position,
         present=~given_up,
@@ -136,14 +139,16 @@ def _known_to(
         works=(phase != ENDED) & (phase != FAILED),
         target=state.robots.target,
     )
+    pois = jnp.arange(mission.config.arena.num_pois)
+    of_pose = lambda pose, poi, m: own.apart(pose[None, :2], poi, m)[0]  # noqa: E731
+    of_pois = jax.vmap(of_pose, (None, 0, None))
+    apart = jax.vmap(of_pois, (0, None, 0))(team.poses, pois, team.modality)
     return Known(
-        belief=state.belief,
-        looks=state.times_seen,
-        log_posterior=state.log_posterior,
+        belief=known.belief,
+        looks=known.times_seen,
+        log_posterior=known.log_posterior,
         team=team,
-        times=times_to_new_looks(
-            mission.config.team.travel, models.novelty, team, state.looked_from
-        ),
+        times=times_to_new_looks(mission.config.team.travel, models.novelty, team, apart),
         robot=jnp.asarray(robot),
     )
 
@@ -182,7 +187,8 @@ def _best_view(
     is_free = _room(mission, state, robot, poi, positions, margin) > 0
     length += jnp.where(is_free, 0.0, _DETOUR)
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
-    apart = state.apart(jnp.concatenate([positions, position[None]]), poi, modality)
+    known = map_of(mission, state, robot)
+    apart = known.apart(jnp.concatenate([positions, position[None]]), poi, modality)
     is_new = models.novelty.to_go(apart, modality) <= 0
     # A robot at a viewpoint would look from where it stands.
     is_away = jnp.linalg.norm(positions - position[None], axis=-1) > AT_VIEWPOINT

@@ -101,8 +101,8 @@ def step(
     """
     before = states
     num_robots = mission.world.arena.num_robots
-    step_keys = jax.vmap(lambda key: jax.random.split(key, num_robots + 1), out_axes=1)(keys)
-    robot_keys, drift_keys = step_keys[:-1], step_keys[-1]
+    step_keys = jax.vmap(lambda key: jax.random.split(key, num_robots + 2), out_axes=1)(keys)
+    robot_keys, drift_keys, message_keys = step_keys[:-2], step_keys[-2], step_keys[-1]
     # One after the other, so that no robot scans what another has just identified.
     states, _ = jax.lax.scan(
         lambda states, robot: (_act(robot[1], mission, models, states, robot[0], parts), None),
@@ -116,6 +116,7 @@ def step(
     steps, settings = states.steps + 1, mission.config.mission
     is_late = steps * settings.control_period >= settings.time_limit
     after = dataclasses.replace(states, steps=steps, done=is_idle | is_late)
+    after = jax.vmap(lambda key, state: _repeat_messages(key, mission, state))(message_keys, after)
     keep = jax.vmap(jnp.where)
     states = jax.tree.map(lambda x, y: keep(before.done, x, y), before, after)
     records = Record(
@@ -166,6 +167,19 @@ def _drift(keys: Key, mission: Mission, before: MissionState, after: MissionStat
         keys, mission.config.mission.localisation, after.pose_error, jnp.linalg.norm(way, axis=-1)
     )
     return dataclasses.replace(after, pose_error=error)
+
+
+def _repeat_messages(key: Key, mission: Mission, state: MissionState) -> MissionState:
+    """Lets all robots that work tell their looks again, once in a while."""
+    settings = mission.config.mission
+    if state.memory is None:
+        return state
+    periods = jnp.maximum(
+        jnp.round(settings.communication.period / settings.control_period), 1
+    ).astype(jnp.int32)
+    sends = (state.steps % periods == 0) & (state.robots.phase != FAILED)
+    heard = state.memory.after_messages(key, settings.communication, mission.time(state), sends)
+    return dataclasses.replace(state, memory=heard)
 
 
 def _fail(mission: Mission, state: MissionState, robot: Index) -> MissionState:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import Config, ConfigError
 from jaxsense.core.types import Belief, Index, others, pytree
 from jaxsense.dqn.policies import Policy, Values, table
+from jaxsense.mission.memory import Memory
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.sim import arena as arenas_of
 from jaxsense.sim import world as worlds
@@ -100,13 +101,14 @@ class MissionState:
       policy: `[]` int32 index into `Mission.policies`.
       velocity: `[R, 3]` time derivative of the poses.
       warmstart: `[3 R]` MJX's last accelerations.
-      belief: `[N, D]` the shared map.
+      belief: `[N, D]` the map of all looks; robots that keep maps of their own decide by these.
       log_posterior: `[N, C]` logarithms of the classes' probabilities by exact Bayes, for the
         policies `bayes` and `optimal`.
       times_seen: `[N, M]` int32, number of detections of each PoI by each modality.
       looked_from: `[N, M, RECENT_LOOKS, 2]` places from which each modality has last detected each
         PoI, as the robots believe, in metres; infinite for none.
       version: `[]` int32, number of updates of the map.
+      memory: the looks that each robot knows of; None where all robots share one map.
       robots: their state.
       steps: `[]` int32 control periods since the start.
       contacts: `[]` int32 control periods in which a robot touched something.
@@ -127,6 +129,7 @@ class MissionState:
     times_seen: Int[Array, "N M"]
     looked_from: Float[Array, "N M K 2"]
     version: Int[Array, ""]
+    memory: Memory | None
     robots: Robots
     steps: Int[Array, ""]
     contacts: Int[Array, ""]
@@ -142,19 +145,6 @@ class MissionState:
     def seen(self) -> Bool[Array, "... N M"]:
         """Which modalities have detected which PoI."""
         return self.times_seen > 0
-
-    def apart(
-        self, positions: Float[Array, "C 2"], poi: Int[Array, ""], modality: Index
-    ) -> Float[Array, "C K"]:
-        """Distances from the recent looks by a sensor at a PoI, in metres.
-
-        Args:
-          positions: `[C, 2]` places to look from.
-          poi: index of the PoI.
-          modality: index of the sensor.
-        """
-        places = self.looked_from[poi, modality]
-        return jnp.linalg.norm(positions[:, None] - places[None], axis=-1)
 
     def robot(self, robot: Index) -> Robots:
         """State of one robot: the fields of `Robots` without their first axis."""

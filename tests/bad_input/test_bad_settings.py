@@ -27,7 +27,7 @@ from refusals import (
 )
 
 from jaxsense import Attribute, Config, ConfigError, SensorConfig, Shape
-from jaxsense.config import COLOURS, SHAPES, ArenaConfig, as_plain, from_plain
+from jaxsense.config import COLOURS, SHAPES, ArenaConfig, CommunicationConfig, as_plain, from_plain
 from jaxsense.config.checks import Limits
 
 
@@ -69,7 +69,7 @@ LIMITS = {
     Limits(above=0, at_most=1000): "lidar.max_range",
     Limits(above=0, at_most=1_000_000): "jmvae.beta jmvae.initial_beta mdp.unseen_variance",
     Limits(above=0, at_most=360): "lidar.field_of_view",
-    Limits(above=0, at_most=3600): "mission.time_limit",
+    Limits(above=0, at_most=3600): "mission.time_limit mission.communication.period",
     Limits(above=0, below=180): "camera.field_of_view",
     Limits(above=0, min_items=1, max_items=20): "navigation.view_distances",
     Limits(above=0.0495): "navigation.robot_radius",
@@ -84,6 +84,8 @@ LIMITS = {
     "mission.localisation.position_error mission.localisation.position_drift",
     Limits(at_least=0, at_most=180): "mission.localisation.heading_error "
     "mission.localisation.heading_drift",
+    Limits(at_least=0, at_most=0.95): "mission.communication.loss",
+    Limits(at_least=0, at_most=3600): "mission.communication.delay",
     Limits(at_least=0, at_most=10): "camera.exposure_error camera.colour_cast "
     "viewpoint.bearing_error",
     Limits(at_least=0, at_most=10_000): "team.tours.walk",
@@ -197,6 +199,8 @@ ZERO = {
     "mission.localisation.heading_error",
     "mission.localisation.position_drift",
     "mission.localisation.heading_drift",
+    "mission.communication.loss",
+    "mission.communication.delay",
 }  # fmt: skip
 
 
@@ -464,6 +468,20 @@ def changed(changes: dict, base: Config = SMOKE) -> Config:
         for name, part in parts.items()
     }
     return dataclasses.replace(base, **made)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"own_maps": True}, "own_maps = True: must be off unless jmvae.fusion is 'filter'"),
+        ({"loss": 0.5}, "loss = 0.5: must be 0 without mission.communication.own_maps"),
+        ({"delay": 2.0}, "delay = 2.0: must be 0 without mission.communication.own_maps"),
+    ],
+)
+def test_messages_that_no_map_reads_are_named(changes, expected):
+    with pytest.raises(ConfigError) as error:
+        changed({"mission.communication": CommunicationConfig(**changes)})
+    assert str(error.value).startswith(f"mission.communication.{expected}")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,208 @@
+"""What each robot knows of the looks of all: a map by each robot, and messages between them.
+
+The evidence of looks adds up in log-likelihoods of the classes, so a robot's map follows from the
+sums that each robot keeps of its own looks. A message holds the whole sums of its sender and how
+many looks they are of. Of two messages from one sender, a receiver keeps the one of more looks:
+messages that come late or twice change nothing, and the next one makes up for those that are lost.
+
+So all that a robot knows of another are the first k of its looks, for some k that only grows. This
+module stores every look once and, for each robot, when it heard of it, which is the same.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Shaped
+
+from jaxsense.config import CommunicationConfig
+from jaxsense.core.types import Belief, Fusion, Index, Key, pytree
+from jaxsense.vae import readout
+
+MOST_LOOKS = 256
+"""Detections that a robot remembers in a mission; further ones do not reach any robot's map."""
+
+
+@pytree
+class Evidence:
+    """Log-likelihoods of the classes given one or several looks, up to a constant.
+
+    Attributes:
+      log_likelihood: `[..., C]` by fusion.
+      exact: `[..., C]` by exact Bayes.
+    """
+
+    log_likelihood: Float[Array, "*S C"]
+    exact: Float[Array, "*S C"]
+
+
+@pytree
+class Memory:
+    """The L looks that each of R robots remembers, and when each robot heard of them.
+
+    Attributes:
+      modality: `[R]` int32 index of each robot's sensor.
+      number: `[R]` int32 detections so far.
+      poi: `[R, L]` int32 PoI of each look.
+      place: `[R, L, 2]` from where, as the robot believes, in metres.
+      evidence: `[R, L, C]` of each look, as far as it is new.
+      heard_at: `[R, R, L]` seconds from the start at which the first robot heard of a look of the
+        second; infinite for never.
+    """
+
+    modality: Int[Array, " R"]
+    number: Int[Array, " R"]
+    poi: Int[Array, "R L"]
+    place: Float[Array, "R L 2"]
+    evidence: Evidence
+    heard_at: Float[Array, "R R L"]
+
+    def known_to(self, robot: Index, seconds: Float[Array, ""] | float) -> Bool[Array, "R L"]:
+        """Which looks a robot knows of.
+
+        Args:
+          robot: its index.
+          seconds: from the start.
+        """
+        return self.heard_at[robot] <= seconds
+
+    def taken(self) -> Bool[Array, "R L"]:
+        """Which looks have been taken."""
+        return jnp.arange(MOST_LOOKS)[None] < self.number[:, None]
+
+    def total(self, known: Bool[Array, "R L"], num_pois: int) -> Evidence:
+        """`[N, C]` sums of the evidence of some looks for each PoI.
+
+        Args:
+          known: `[R, L]` which looks.
+          num_pois: N.
+        """
+        return jax.tree.map(lambda x: self._sum(known, x, num_pois), self.evidence)
+
+    def times_seen(
+        self, known: Bool[Array, "R L"], num_pois: int, num_modalities: int
+    ) -> Int[Array, "N M"]:
+        """Number of some looks at each PoI by each modality, int32.
+
+        Args:
+          known: `[R, L]` which looks.
+          num_pois: N.
+          num_modalities: M.
+        """
+        is_by = jax.nn.one_hot(self.modality, num_modalities, dtype=jnp.int32)
+        by_look = jnp.broadcast_to(is_by[:, None], (*known.shape, num_modalities))
+        return self._sum(known, by_look, num_pois)
+
+    def _sum(
+        self, known: Bool[Array, "R L"], values: Shaped[Array, "R L X"], num_pois: int
+    ) -> Shaped[Array, "N X"]:
+        """Sums of values of some looks for each PoI."""
+        # A product, because an accelerator adds scattered rows in any order.
+        is_at = (jnp.arange(num_pois)[:, None, None] == self.poi[None]) & known[None]
+        flat = values.reshape(-1, values.shape[-1])
+        is_at = is_at.reshape(num_pois, -1).astype(values.dtype)
+        return jnp.matmul(is_at, flat, precision=jax.lax.Precision.HIGHEST)
+
+    def apart(
+        self,
+        known: Bool[Array, "R L"],
+        positions: Float[Array, "P 2"],
+        poi: Int[Array, ""],
+        modality: Index,
+    ) -> Float[Array, "P K"]:
+        """Distances from some looks by a sensor at a PoI, in metres; infinite for others.
+
+        Args:
+          known: `[R, L]` which looks.
+          positions: `[P, 2]` places to look from, in metres.
+          poi: index of the PoI.
+          modality: index of the sensor.
+        """
+        counts = known & (self.poi == poi) & (self.modality == modality)[:, None]
+        away = positions[:, None] - self.place.reshape(1, -1, 2)
+        return jnp.where(counts.reshape(1, -1), jnp.linalg.norm(away, axis=-1), jnp.inf)
+
+    def with_look(
+        self,
+        robot: Index,
+        poi: Int[Array, ""],
+        place: Float[Array, "2"],
+        evidence: Evidence,
+        seconds: Float[Array, ""],
+        applies: Bool[Array, ""],
+    ) -> "Memory":
+        """Adds a look, which at first only the robot itself knows of.
+
+        Args:
+          robot: its index.
+          poi: index of the PoI.
+          place: `[2]` from where, in metres.
+          evidence: `[C]` of the look, as far as it is new.
+          seconds: from the start.
+          applies: whether there is such a look.
+        """
+        # Beyond the end, which drops it.
+        slot = jnp.where(applies, self.number[robot], MOST_LOOKS)
+        put = lambda rows, row: rows.at[robot, slot].set(row, mode="drop")  # noqa: E731
+        return dataclasses.replace(
+            self,
+            number=self.number.at[robot].add(applies),
+            poi=put(self.poi, poi),
+            place=put(self.place, place),
+            evidence=jax.tree.map(put, self.evidence, evidence),
+            heard_at=self.heard_at.at[robot, robot, slot].set(seconds, mode="drop"),
+        )
+
+    def after_messages(
+        self,
+        key: Key,
+        config: CommunicationConfig,
+        seconds: Float[Array, ""],
+        sends: Bool[Array, " R"],
+    ) -> "Memory":
+        """Some robots tell all others of all looks that they have taken themselves.
+
+        Args:
+          key: random key.
+          config: how many messages are lost, and how late they are.
+          seconds: from the start.
+          sends: `[R]` which robots.
+        """
+        lost_key, delay_key = jax.random.split(key)
+        links = len(sends), len(sends)
+        is_lost = jax.random.bernoulli(lost_key, config.loss, links)
+        delay = config.delay * jax.random.uniform(delay_key, links, maxval=2.0)
+        arrives = jnp.where(is_lost | ~sends[None], jnp.inf, seconds + delay)
+        told = jnp.where(self.taken()[None], arrives[..., None], jnp.inf)
+        return dataclasses.replace(self, heard_at=jnp.minimum(self.heard_at, told))
+
+
+def empty(modality: Int[Array, " R"], num_classes: int) -> Memory:
+    """Memory before the first look.
+
+    Args:
+      modality: `[R]` int32 index of each robot's sensor.
+      num_classes: C.
+    """
+    shape = len(modality), MOST_LOOKS
+    nothing = jnp.zeros((*shape, num_classes))
+    return Memory(
+        modality=modality,
+        number=jnp.zeros(len(modality), jnp.int32),
+        poi=jnp.zeros(shape, jnp.int32),
+        place=jnp.zeros((*shape, 2)),
+        evidence=Evidence(nothing, nothing),
+        heard_at=jnp.full((len(modality), *shape), jnp.inf),
+    )
+
+
+def belief_of(fusion: Fusion, log_likelihood: Float[Array, " C"]) -> Belief:
+    """Belief that holds some evidence, `[D]`; the prior if there is none.
+
+    Args:
+      fusion: how looks update beliefs.
+      log_likelihood: `[C]` sum of the looks' log-likelihoods, up to a constant; 0 for no looks.
+    """
+    mixed = readout.mixture(fusion.classes, jax.nn.softmax(log_likelihood))
+    is_none = jnp.all(log_likelihood == 0)
+    return jax.tree.map(lambda new, old: jnp.where(is_none, old, new), mixed, fusion.prior)

@@ -1,0 +1,257 @@
+"""Maps by each robot: what messages leave known, and that without losses nothing changes."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from teams import CONFIG, LATENT, POSES, POSITIONS, alone, with_config, with_gates
+
+import jaxsense
+from jaxsense import mission
+from jaxsense.config import CommunicationConfig
+from jaxsense.core import networks
+from jaxsense.core.networks import MLP
+from jaxsense.core.types import Belief
+from jaxsense.mission import act, decide, memory
+from jaxsense.mission.maps import Contents, OwnMap, SharedMap, map_of
+from jaxsense.mission.memory import MOST_LOOKS, Evidence
+from jaxsense.mission.rollout import _repeat_messages
+from jaxsense.mission.state import DRIVING, FACING, FAILED
+from jaxsense.vae import readout
+from jaxsense.vae.filter import Filter
+
+MODALITY = jnp.array([0, 1, 1])
+OWN = CommunicationConfig(own_maps=True)
+NOTHING = Evidence(jnp.zeros(3), jnp.zeros(3))
+
+
+def communicating(config, **settings):
+    """Settings with maps by each robot, and the filter, which they need."""
+    own = replace(config.mission, communication=CommunicationConfig(own_maps=True, **settings))
+    return replace(config, mission=own, jmvae=replace(config.jmvae, fusion="filter"))
+
+
+@pytest.fixture(scope="module")
+def own_models():
+    """Models with a filter that says different things of different features."""
+    models = with_gates(jaxsense.init(jax.random.key(0), communicating(CONFIG)))
+    classes = Belief(jnp.array([[1.5, 0.0], [-1.0, 1.2], [-0.8, -1.4]]), jnp.full((3, 2), 0.3))
+    fusion = models.fusion
+    assert isinstance(fusion, Filter)
+    read = readout.make(classes, readout.directions(fusion.model.feature_sizes))
+    network = MLP(fusion.hidden, read.of_classes.shape[1])
+    params = {
+        name: networks.scale_last(network, networks.init(jax.random.key(i), network, size), 0.3)
+        for i, (name, size) in enumerate(
+            zip(fusion.model.modalities, fusion.model.feature_sizes, strict=True)
+        )
+    }
+    fusion = replace(fusion, classes=classes, readout=read, networks=params)
+    return replace(models, fusion=fusion)
+
+
+@pytest.fixture(scope="module")
+def own_team(team):
+    return with_config(team, communicating(CONFIG))
+
+
+@pytest.fixture(scope="module")
+def own_arena(own_team, own_models, arena_of):
+    """A mission with maps by each robot in a chosen arena."""
+
+    def make(positions, poses, policy=LATENT):
+        state = arena_of(positions, poses, classes=(2, 0, 1), policy=policy)
+        return mission.start(
+            *(own_team, own_models, state.scene, state.classes, state.policy, state.faults),
+            paths=state.roadmap,
+        )
+
+    return make
+
+
+def looked(held, robot, poi=0, seconds=0.0, evidence=NOTHING, place=(0.0, 0.0)):
+    seconds, applies = jnp.float32(seconds), jnp.bool_(True)
+    return held.with_look(robot, jnp.int32(poi), jnp.array(place), evidence, seconds, applies)
+
+
+def test_messages_leave_known_what_a_protocol_with_counters_does():
+    """A receiver keeps, of the messages that have come, the one of most looks."""
+    settings = CommunicationConfig(own_maps=True, loss=0.4, delay=2.0)
+    look = jax.jit(looked)
+    tell = jax.jit(lambda held, key, time, sends: held.after_messages(key, settings, time, sends))
+    rng, held = np.random.default_rng(0), memory.empty(MODALITY, 3)
+    numbers, messages, known, overtaken = [0, 0, 0], [], np.zeros((3, 3), int), 0
+    for step in range(60):
+        time = 0.5 * step
+        for robot in np.flatnonzero(rng.random(3) < 0.3):
+            held = look(held, robot, seconds=time)
+            numbers[robot] += 1
+            known[robot, robot] += 1
+        sends, key = rng.random(3) < 0.4, jax.random.key(step)
+        for _ in range(2):  # every message comes twice
+            held = tell(held, key, jnp.float32(time), jnp.asarray(sends))
+        lost_key, delay_key = jax.random.split(key)
+        is_lost = jax.random.bernoulli(lost_key, 0.4, (3, 3))
+        delay = 2.0 * jax.random.uniform(delay_key, (3, 3), maxval=2.0)
+        messages += [
+            (np.float32(time) + delay[to, of], to, of, numbers[of])
+            for of in np.flatnonzero(sends)
+            for to in range(3)
+            if to != of and not is_lost[to, of]
+        ]
+        for message in sorted(m for m in messages if m[0] <= time):
+            _, to, of, count = message
+            overtaken += count < known[to, of]
+            known[to, of] = max(known[to, of], count)
+        messages = [m for m in messages if m[0] > time]
+        for robot in range(3):
+            heard = np.asarray(held.known_to(robot, jnp.float32(time)))
+            np.testing.assert_array_equal(heard.sum(axis=1), known[robot])
+            # The first ones, which is what a sum and a counter stand for.
+            assert all(row[: row.sum()].all() for row in heard)
+    assert min(numbers) > 5
+    assert overtaken > 5
+
+
+def test_without_losses_and_delay_all_know_all_at_once():
+    held = looked(looked(memory.empty(MODALITY, 3), 0, seconds=1.0), 2, seconds=3.0)
+    held = held.after_messages(jax.random.key(0), OWN, jnp.float32(3.0), jnp.array([1, 0, 1], bool))
+    for robot in range(3):
+        np.testing.assert_array_equal(held.known_to(robot, 3.0).sum(axis=1), [1, 0, 1])
+    # Before, only the robot itself knew.
+    np.testing.assert_array_equal(held.known_to(0, 2.9).sum(axis=1), [1, 0, 0])
+    np.testing.assert_array_equal(held.known_to(1, 2.9).sum(axis=1), [0, 0, 0])
+
+
+def test_as_many_messages_are_lost_and_as_late_as_the_settings_say():
+    settings = CommunicationConfig(own_maps=True, loss=0.25, delay=2.0)
+    held = looked(memory.empty(MODALITY, 3), 0, seconds=5.0)
+    sends = jnp.array([True, False, False])
+    tell = jax.vmap(lambda key: held.after_messages(key, settings, jnp.float32(5.0), sends))
+    at = np.asarray(tell(jax.random.split(jax.random.key(0), 4000)).heard_at[:, 1:, 0, 0])
+    assert np.isinf(at).mean() == pytest.approx(0.25, abs=0.02)
+    came = at[np.isfinite(at)]
+    assert (came.min(), came.max()) == pytest.approx((5.0, 9.0), abs=0.05)
+    assert came.mean() == pytest.approx(7.0, abs=0.05)
+
+
+def test_sums_are_of_the_looks_that_are_known():
+    says = lambda *values: Evidence(jnp.array(values), 10 * jnp.array(values))  # noqa: E731
+    held = memory.empty(MODALITY, 3)
+    held = looked(held, 0, poi=1, evidence=says(1.0, 0.0, 0.0), place=(1.0, 0.0))
+    held = looked(held, 0, poi=0, evidence=says(0.0, 2.0, 0.0))
+    held = looked(held, 1, poi=1, evidence=says(0.0, 0.0, 4.0), place=(0.0, 3.0))
+    own, every = held.known_to(0, jnp.float32(0)), held.taken()
+    np.testing.assert_array_equal(held.total(own, 2).log_likelihood, [[0, 2, 0], [1, 0, 0]])
+    np.testing.assert_array_equal(held.total(every, 2).exact, [[0, 20, 0], [10, 0, 40]])
+    np.testing.assert_array_equal(held.times_seen(own, 2, 2), [[1, 0], [1, 0]])
+    np.testing.assert_array_equal(held.times_seen(every, 2, 2), [[1, 0], [1, 1]])
+    # Of PoI 1, the LiDAR has looked from (0, 3) only, as far as all know.
+    apart = held.apart(every, jnp.array([[4.0, 0.0]]), jnp.int32(1), 1)
+    np.testing.assert_allclose(np.sort(apart[0])[:2], [5.0, np.inf])
+    assert np.isinf(held.apart(own, jnp.array([[4.0, 0.0]]), jnp.int32(1), 1)).all()
+
+
+def test_a_full_memory_takes_nothing_more():
+    held = memory.empty(MODALITY, 3)
+    full = replace(held, number=held.number.at[0].set(MOST_LOOKS))
+    after = looked(full, 0, evidence=Evidence(jnp.ones(3), jnp.ones(3)))
+    jax.tree.map(np.testing.assert_array_equal, replace(after, number=full.number), full)
+
+
+def test_looks_one_by_one_come_to_the_shared_map(own_models):
+    """To rounding: `MIN_PROBABILITY` is far below these."""
+    fusion, held = own_models.fusion, memory.empty(MODALITY, 3)
+    tiled = jax.tree.map(lambda x: jnp.tile(x, (2, 1)), fusion.prior)
+    prior = jnp.tile(own_models.bayes.prior, (2, 1))
+    shared = Contents(tiled, prior, jnp.zeros((2, 2), jnp.int32))
+    rng = np.random.default_rng(0)
+    for look in range(6):
+        modality, weight = look % 2, jnp.float32(rng.uniform(0.3, 1.0))
+        features = jnp.asarray(rng.dirichlet([1.0, 1.0]), jnp.float32)
+        args = own_models, jnp.int32(1), features, modality, weight
+        found = SharedMap(shared, jnp.zeros(0), jnp.int32(0)).learn(*args)
+        own = OwnMap(held, held.taken(), 2).learn(*args)
+        np.testing.assert_allclose(own.belief.mean, found.belief.mean, atol=2e-4)
+        np.testing.assert_allclose(own.belief.std, found.belief.std, atol=2e-4)
+        np.testing.assert_allclose(own.log_posterior, found.log_posterior, atol=1e-5)
+        shared = replace(
+            shared,
+            belief=jax.tree.map(lambda x, new: x.at[1].set(new), shared.belief, found.belief),
+            log_posterior=shared.log_posterior.at[1].set(found.log_posterior),
+        )
+        assert own.evidence is not None
+        held = looked(held, modality, poi=1, evidence=own.evidence)
+    assert np.abs(shared.belief.mean).max() > 0.3
+    # The map of a robot that knows all of them is the same; PoI 0 has not been looked at.
+    read = OwnMap(held, held.taken(), 2).read(own_models)
+    np.testing.assert_allclose(read.belief.mean, shared.belief.mean, atol=2e-4)
+    np.testing.assert_array_equal(read.belief.std[0], fusion.prior.std)
+    np.testing.assert_allclose(read.log_posterior, shared.log_posterior, atol=1e-5)
+    np.testing.assert_array_equal(read.times_seen, [[0, 0], [3, 3]])
+
+
+@pytest.mark.parametrize(("delay", "hears"), [(0.0, True), (5.0, False)])
+def test_a_scan_is_remembered_and_told(own_team, own_models, own_arena, set_robot, delay, hears):
+    @jax.jit
+    def scan(key, state, config):
+        changed = with_config(own_team, config)
+        return alone(lambda key, state: act.scan(key, changed, own_models, state, 0))(key, state)
+
+    state = own_arena([[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]], [[0.0, 0.0, 0.0], [0.0, 1.2, 0.0]])
+    state = set_robot(state, 0, phase=FACING, target=0, progress_at=-100.0)
+    state = set_robot(state, 1, phase=DRIVING, target=0)
+    after = scan(jax.random.key(0), state, communicating(CONFIG, delay=delay))
+    assert after.robots.detections[0] == 1
+    own, others = (map_of(own_team, after, robot) for robot in (0, 1))
+    assert (own.version, others.version) == (1, hears)
+    # The map of all looks has it at once, and the robot itself.
+    np.testing.assert_array_equal(after.times_seen, [[1, 0], [0, 0], [0, 0]])
+    read = own.read(own_models)
+    np.testing.assert_allclose(read.belief.mean, after.belief.mean, atol=1e-6)
+    np.testing.assert_allclose(read.log_posterior, after.log_posterior, atol=1e-6)
+    assert np.abs(after.belief.mean[0]).max() > 0.01
+    # News make a robot that drives decide again, by what it knows.
+    assert decide.is_due(own_team, after, 1) == hears
+    nobody = jnp.zeros(3, bool)
+    looks = decide._known_to(own_team, own_models, after, 1, nobody).looks
+    np.testing.assert_array_equal(looks, after.times_seen * hears)
+
+
+def test_robots_that_work_repeat_their_messages(own_team, own_arena, set_robot):
+    state = own_arena(POSITIONS, POSES)
+    state = replace(state, memory=looked(state.memory, 0))
+    repeat = jax.jit(lambda state: _repeat_messages(jax.random.key(0), own_team, state))
+    # Once a second, every ten control periods.
+    for steps, version in ((9, 0), (10, 1), (11, 0), (20, 1)):
+        after = repeat(replace(state, steps=jnp.int32(steps)))
+        assert map_of(own_team, after, 1).version == version
+    failed = set_robot(replace(state, steps=jnp.int32(10)), 0, phase=FAILED)
+    assert map_of(own_team, repeat(failed), 1).version == 0
+
+
+@pytest.mark.slow  # compiles a mission twice
+def test_without_losses_and_delay_missions_are_those_of_a_shared_map(team, own_models, as_numpy):
+    whole = communicating(CONFIG)
+    shared = replace(whole, mission=replace(whole.mission, communication=CommunicationConfig()))
+
+    def play(config):
+        changed = with_config(team, config)
+
+        @jax.jit
+        def run(keys):
+            begin = lambda key: mission.reset(key, changed, own_models, LATENT)  # noqa: E731
+            return mission.rollout_batch(keys, changed, own_models, jax.vmap(begin)(keys), 150, 1)
+
+        return as_numpy(run(jax.random.split(jax.random.key(1), 6)))
+
+    (end, records), (own_end, own_records) = play(shared), play(whole)
+    assert records.detected.sum() > 20
+    for name in ("phase", "target", "scanned", "detected", "seen"):
+        np.testing.assert_array_equal(getattr(own_records, name), getattr(records, name))
+    np.testing.assert_allclose(own_records.poses, records.poses, atol=1e-4)
+    np.testing.assert_allclose(own_records.belief.mean, records.belief.mean, atol=1e-3)
+    assert own_end.memory is not None
+    np.testing.assert_array_equal(own_end.memory.number.sum(axis=1), end.version)
