@@ -27,7 +27,7 @@ from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
 from jaxsense.dqn import policies
 from jaxsense.dqn.policies import Known, Policy, Trained
-from jaxsense.mission import MissionState
+from jaxsense.mission import Mission, MissionState
 from jaxsense.models import make_agent
 from jaxsense.run import cli, rundir
 from jaxsense.run.version import commit, versions
@@ -187,13 +187,18 @@ class Curves:
         """
         self.scenario = mission.make_mission(config, own)
         self._keys = jax.random.split(key, episodes)
-        self._begin = jax.jit(jax.vmap(self._start, in_axes=(0, None, None)))
+        self._begin = jax.jit(jax.vmap(self._start, in_axes=(0, None, None, None)))
         self._go_on = jax.jit(self._play_on)
-        self._measure = jax.jit(jax.vmap(self._result, in_axes=(None, 0)))
+        self._measure = jax.jit(jax.vmap(self._result, in_axes=(None, None, 0)))
 
-    def _start(self, key: Key, models: Models, policy: jax.Array) -> MissionState:
+    def _with(self, config: Config) -> Mission:
+        """The same mission with other numbers, which may be traced."""
+        arenas = self.scenario.world.arena, self.scenario.free_arena
+        return mission.make_mission(config, self.scenario.policies, arenas=arenas)
+
+    def _start(self, key: Key, config: Config, models: Models, policy: jax.Array) -> MissionState:
         """A mission in which the policies `oracle` read the true classes."""
-        state = mission.reset(key, self.scenario, models, policy)
+        state = mission.reset(key, self._with(config), models, policy)
         names = [*self.scenario.policies]
         knows = jnp.array([name.startswith("oracle") for name in names])[policy]
         of_class = jax.nn.one_hot(state.classes, state.log_posterior.shape[1])
@@ -202,12 +207,14 @@ class Curves:
             state, log_posterior=jnp.where(knows, truth, state.log_posterior)
         )
 
-    def _play_on(self, keys: Key, models: Models, states: MissionState) -> MissionState:
-        each = len(self._keys)
-        return mission.rollout_batch(keys, self.scenario, models, states, _CHUNK, each)[0]
+    def _play_on(
+        self, keys: Key, config: Config, models: Models, states: MissionState
+    ) -> MissionState:
+        each, scenario = len(self._keys), self._with(config)
+        return mission.rollout_batch(keys, scenario, models, states, _CHUNK, each)[0]
 
-    def _result(self, models: Models, state: MissionState) -> dict[str, jax.Array]:
-        found = mission.measure(self.scenario, models, state)
+    def _result(self, config: Config, models: Models, state: MissionState) -> dict[str, jax.Array]:
+        found = mission.measure(self._with(config), models, state)
         return {
             "accuracy": jnp.mean(found["is_right"].astype(jnp.float32)),
             "confidence": jnp.mean(found["confidence"]),
@@ -215,19 +222,24 @@ class Curves:
             "time": found["time_s"],
         }
 
-    def play(self, models: Models, policy: str) -> dict[str, np.ndarray]:
+    def play(
+        self, models: Models, policy: str, config: Config | None = None
+    ) -> dict[str, np.ndarray]:
         """`accuracy`, `confidence`, `looks` per PoI and `time` of a policy, `[E]` each.
 
         Args:
           models: trained models.
           policy: its name.
+          config: settings with other numbers; by default those of the missions.
         """
-        states = self._begin(self._keys, models, jnp.int32(self.scenario.policy(policy)))
+        config = self.scenario.config if config is None else config
+        number = jnp.int32(self.scenario.policy(policy))
+        states = self._begin(self._keys, config, models, number)
         for chunk in itertools.count(1):
             keys = jax.vmap(lambda key: jax.random.fold_in(key, chunk))(self._keys)  # noqa: B023
-            states = self._go_on(keys, models, states)
+            states = self._go_on(keys, config, models, states)
             if np.all(states.done):
-                return jax.tree.map(np.asarray, self._measure(models, states))
+                return jax.tree.map(np.asarray, self._measure(config, models, states))
         raise AssertionError
 
 

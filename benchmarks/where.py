@@ -107,12 +107,17 @@ def within(config: Config, farthest: float) -> Config:
     return dataclasses.replace(config, navigation=navigation)
 
 
-def compare(found: dict[str, np.ndarray], usual: dict[str, np.ndarray]) -> dict[str, list[float]]:
+def compare(
+    found: dict[str, np.ndarray],
+    usual: dict[str, np.ndarray],
+    keys: tuple[str, ...] = _KEYS,
+) -> dict[str, list[float]]:
     """Means, and differences from the usual rule in the same arenas with their 95% half-widths.
 
     Args:
       found: `[E]` figures of missions.
       usual: the same of the usual rule.
+      keys: which figures.
 
     Returns:
       By figure its mean, the mean difference and its half-width.
@@ -123,7 +128,7 @@ def compare(found: dict[str, np.ndarray], usual: dict[str, np.ndarray]) -> dict[
         width = stats.sem(less) * stats.t.ppf(0.975, len(less) - 1)
         return [float(found[key].mean()), float(less.mean()), float(width)]
 
-    return {key: of(key) for key in _KEYS}
+    return {key: of(key) for key in keys}
 
 
 def by_rule(

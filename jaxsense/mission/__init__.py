@@ -2,7 +2,8 @@
 
 Each robot asks its policy which PoI to look at, drives to a viewpoint, turns to the PoI, scans it,
 updates the shared map with the detection and asks again, until the policy chooses NOP. Robots
-decide independently of each other, and again when the map changes under way. Most functions take
+decide independently of each other, and again when the map changes under way. By settings, they have
+errors of localisation, and maps of their own in place of the shared one. Most functions take
 one mission, for `vmap`; those that are faster for many take B missions.
 """
 

@@ -1,0 +1,278 @@
+"""`python -m benchmarks.imperfect RUN`: missions of robots that are misplaced or hear badly.
+
+Plays the same arenas with errors of pose and heading, and, where looks add up, with maps by each
+robot between which messages are lost and late. All rows are compared, arena by arena, with robots
+that know their poses and share one map. Errors and messages of one arena are drawn alike for all
+sizes, so that a curve is smooth. `break` is the size at which the accuracy has fallen by .01.
+"""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.curves import Curves, Need
+from benchmarks.where import compare
+from jaxsense import Config, Models, mission
+from jaxsense.config import CommunicationConfig, ConfigError, LocalisationConfig
+from jaxsense.config.checks import check_fields, require
+from jaxsense.config.options import Name
+from jaxsense.config.section import Section
+from jaxsense.mission import MissionState
+from jaxsense.mission.maps import map_of
+from jaxsense.run import cli, rundir
+from jaxsense.run.version import commit, versions
+
+PROGRAM = "benchmarks.imperfect"
+FALL = 0.01
+"""Loss of accuracy that counts as broken."""
+_KEYS = ("accuracy", "own", "nll", "looks", "time", "collisions")
+_DRAWS = 1000  # of the bootstrap
+_DELAY_OF_LOSSES, _LOSS_OF_DELAYS = 2.0, 0.5  # s and share, of the sweeps of both together
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Play missions with errors of localisation and with messages that are lost or late."""
+
+    run: Annotated[Path, Name("RUN")]
+    """The directory of a finished run, or `latest`."""
+    episodes: int = 256
+    """Missions of each row."""
+    seed: int = 0
+    """Seed of the arenas."""
+    policy: str = "latent"
+    """The policy that plays."""
+    num_pois: int | None = None
+    """Number of points of interest; the run's by default."""
+    side: float | None = None
+    """Side of the arena, in metres; the run's by default."""
+    robots: tuple[str, ...] | None = None
+    """Sensors of the robots, one per robot; the run's by default."""
+    positions: tuple[float, ...] = (0.01, 0.02, 0.03, 0.05, 0.1)
+    """Errors of the position in metres."""
+    headings: tuple[float, ...] = (1.0, 2.0, 3.0, 5.0, 10.0)
+    """Errors of the heading in degrees; a sweep of both takes them in pairs."""
+    losses: tuple[float, ...] = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9)
+    """Shares of the messages that are lost."""
+    delays: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0, 10.0)
+    """Mean delays of a message in seconds."""
+    json: Path | None = None
+    """File to write the figures to."""
+
+    def __post_init__(self):
+        check_fields(self, bits=64)
+        require(self.episodes >= 2, self, "episodes", "must be at least 2")
+        is_paired = len(self.headings) == len(self.positions)
+        require(is_paired, self, "headings", "must be as many as positions")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """One thing that gets worse.
+
+    Attributes:
+      name: of what varies.
+      sizes: of each row.
+      changes: the mission's sections of each row.
+    """
+
+    name: str
+    sizes: tuple[float, ...]
+    changes: tuple[Mapping[str, Section], ...]
+
+
+class Imperfect(Curves):
+    """Plays missions in the same arenas, and also measures what each robot knows."""
+
+    def _result(self, config: Config, models: Models, state: MissionState) -> dict[str, jax.Array]:
+        found, scenario = super()._result(config, models, state), self._with(config)
+        measured = mission.measure(scenario, models, state)
+
+        def of_robot(robot: jax.Array) -> jax.Array:
+            known = map_of(scenario, state, robot).read(models)
+            shown = jax.vmap(models.fusion.most_likely_class)(known.belief)
+            is_seen = jnp.any(known.times_seen > 0, axis=-1)
+            return jnp.mean(is_seen & (shown == state.classes))
+
+        return {
+            **found,
+            "own": jnp.mean(jax.vmap(of_robot)(jnp.arange(len(config.carried)))),
+            "nll": jnp.mean(measured["nll"]),
+            "collisions": measured["collisions"].astype(jnp.float32),
+        }
+
+
+def poses(arguments: Arguments) -> list[Sweep]:
+    """Errors of position, of heading, and of both.
+
+    Args:
+      arguments: of the program.
+    """
+    at, to = arguments.positions, arguments.headings
+    of = lambda **errors: {"localisation": LocalisationConfig(**errors)}  # noqa: E731
+    both = zip(at, to, strict=True)
+    return [
+        Sweep("position [m]", at, tuple(of(position_error=x) for x in at)),
+        Sweep("heading [deg]", to, tuple(of(heading_error=x) for x in to)),
+        Sweep("both [m]", at, tuple(of(position_error=x, heading_error=y) for x, y in both)),
+    ]
+
+
+def messages(arguments: Arguments) -> list[Sweep]:
+    """Losses, delays, losses of late messages, and delays of messages half of which are lost.
+
+    Args:
+      arguments: of the program.
+    """
+    lost, late = arguments.losses, arguments.delays
+    share, seconds = _LOSS_OF_DELAYS, _DELAY_OF_LOSSES
+
+    def of(loss: float, delay: float) -> Mapping[str, Section]:
+        return {"communication": CommunicationConfig(own_maps=True, loss=loss, delay=delay)}
+
+    return [
+        Sweep("loss", lost, tuple(of(x, 0.0) for x in lost)),
+        Sweep("delay [s]", late, tuple(of(0.0, x) for x in late)),
+        Sweep(f"loss, delay {seconds:g} s", lost, tuple(of(x, seconds) for x in lost)),
+        Sweep(f"delay [s], loss {share:g}", late, tuple(of(share, x) for x in late)),
+    ]
+
+
+def elsewhere(arguments: Arguments, config: Config, models: Models) -> Config:
+    """Settings with the arena and the robots of the arguments.
+
+    Args:
+      arguments: of the program.
+      config: of the run.
+      models: of the run.
+
+    Raises:
+      ConfigError: if they cannot be played.
+    """
+    given = {"num_pois": arguments.num_pois, "side": arguments.side}
+    chosen = {name: value for name, value in given.items() if value is not None}
+    arena = dataclasses.replace(config.arena, **chosen)
+    if not models.agent.plays(arena.num_pois):
+        raise ConfigError("num_pois", arena.num_pois, "must be a number that the run has learned")
+    robots = config.robots if arguments.robots is None else arguments.robots
+    return dataclasses.replace(config, arena=arena, robots=robots)
+
+
+def changed(config: Config, sections: Mapping[str, Section]) -> Config:
+    """Settings with other sections of the mission.
+
+    Args:
+      config: all settings.
+      sections: by name.
+    """
+    return dataclasses.replace(config, mission=dataclasses.replace(config.mission, **sections))
+
+
+def break_point(sizes: tuple[float, ...], lost: np.ndarray) -> Need | None:
+    """Size at which the mean loss of accuracy reaches `FALL`, with a 95% interval.
+
+    Args:
+      sizes: K of them, rising.
+      lost: `[K, E]` losses of accuracy in E arenas; 0 is lost at size 0.
+
+    Returns:
+      `mean` with `low` and `high`, the last of which is None if it may be larger than all sizes;
+      None if the mean is.
+    """
+    middle = _reached(sizes, lost.mean(axis=1))
+    if not np.isfinite(middle):
+        return None
+    draws = np.random.default_rng(0).integers(lost.shape[1], size=(_DRAWS, lost.shape[1]))
+    again = [_reached(sizes, lost[:, rows].mean(axis=1)) for rows in draws]
+    ends = np.quantile(again, (0.025, 0.975), method="inverted_cdf")
+    low, high = (float(end) if np.isfinite(end) else None for end in ends)
+    return {"mean": middle, "low": low, "high": high}
+
+
+def _reached(sizes: tuple[float, ...], lost: np.ndarray) -> float:
+    """First size at which lines through the points and the origin reach `FALL`, or infinity."""
+    before = (0.0, 0.0)
+    for size, loss in zip(sizes, lost, strict=True):
+        if loss >= FALL:
+            share = (FALL - before[1]) / (loss - before[1])
+            return float(before[0] + share * (size - before[0]))
+        before = (size, loss)
+    return float("inf")
+
+
+def play(
+    arguments: Arguments, config: Config, models: Models, sweeps: list[Sweep], usual: dict
+) -> Iterator[dict]:
+    """Rows of each sweep, and its break point.
+
+    Args:
+      arguments: of the program.
+      config: all settings.
+      models: of a finished run.
+      sweeps: whose settings differ in numbers alone.
+      usual: `[E]` figures of robots that know their poses and share one map.
+    """
+    curves = Imperfect(
+        jax.random.key(arguments.seed),
+        changed(config, sweeps[0].changes[0]),
+        arguments.episodes,
+    )
+    for sweep in sweeps:
+        rows, lost = [], []
+        for size, sections in zip(sweep.sizes, sweep.changes, strict=True):
+            found = curves.play(models, arguments.policy, changed(config, sections))
+            rows.append({"size": size, **compare(found, usual, _KEYS)})
+            lost.append(usual["accuracy"] - found["accuracy"])
+            print(_row(sweep.name, rows[-1], usual), flush=True)
+        point = break_point(sweep.sizes, np.stack(lost))
+        print(f"| {sweep.name} | break | {_text(point)} |" + " |" * len(_KEYS[1:]), flush=True)
+        yield {"sweep": sweep.name, "rows": rows, "break": point}
+
+
+def _row(name: str, row: dict, usual: dict[str, np.ndarray]) -> str:
+    """A line of the table."""
+    cells = [f"{row[k][0]:.4f} {row[k][1]:+.4f} ± {row[k][2]:.4f}" for k in _KEYS]
+    ratio = row["time"][0] / usual["time"].mean()
+    return f"| {name} | {row['size']:g} | {' | '.join(cells)} ({ratio:.3f}) |"
+
+
+def _text(point: Need | None) -> str:
+    if point is None:
+        return "-"
+    mean, low, high = ("?" if x is None else f"{x:.3g}" for x in point.values())
+    return f"{mean} ({low} to {high})"
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    trained, models = rundir.load(cli.find_run(arguments.run))
+    try:
+        config = elsewhere(arguments, trained, models)
+    except ConfigError as error:
+        cli.fail(PROGRAM, str(error))
+    exact = {"localisation": LocalisationConfig(), "communication": CommunicationConfig()}
+    config = changed(config, exact)
+    key = jax.random.key(arguments.seed)
+    usual = Imperfect(key, config, arguments.episodes).play(models, arguments.policy)
+    print(f"| what | size | {' | '.join(_KEYS)} |\n{'| --- ' * (2 + len(_KEYS))}|")
+    print(_row("-", {"size": 0.0, **compare(usual, usual, _KEYS)}, usual), flush=True)
+    found = [*play(arguments, config, models, poses(arguments), usual)]
+    if models.fusion.accumulates:
+        found += play(arguments, config, models, messages(arguments), usual)
+    if arguments.json is not None:
+        whole = {"commit": commit(), "versions": versions(), "episodes": arguments.episodes}
+        whole |= {"seed": arguments.seed, "policy": arguments.policy, "sweeps": found}
+        whole |= {"usual": {name: float(usual[name].mean()) for name in _KEYS}}
+        arguments.json.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""Robots that are misplaced or hear badly: break points by hand, and what the sweeps change."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import imperfect
+from jaxsense import PRESETS
+from jaxsense.config import ConfigError
+
+ARGUMENTS = imperfect.Arguments(run=Path("latest"))
+MODELS: Any = SimpleNamespace(agent=SimpleNamespace(plays=lambda number: number in (3, 16)))
+
+
+def lost(*means):
+    """Losses of accuracy that are the same in ten arenas."""
+    return np.repeat(np.array(means)[:, None], 10, axis=1)
+
+
+def test_break_points_lie_between_two_sizes():
+    # From 0 at size 0 to .02 at size 1: half way.
+    assert imperfect.break_point((1.0, 2.0), lost(0.02, 0.1)) == pytest.approx(
+        {"mean": 0.5, "low": 0.5, "high": 0.5}
+    )
+    # From .004 at 1 to .012 at 3, .006 of .008: 1 + .75 x 2.
+    found = imperfect.break_point((1.0, 3.0), lost(0.004, 0.012))
+    assert found is not None
+    assert found["mean"] == pytest.approx(2.5)
+    # The accuracy may rise at first.
+    found = imperfect.break_point((1.0, 2.0), lost(-0.01, 0.03))
+    assert found is not None
+    assert found["mean"] == pytest.approx(1.5)
+    assert imperfect.break_point((1.0, 2.0), lost(0.002, 0.009)) is None
+
+
+def test_break_points_have_intervals_of_arenas():
+    # A tenth of the arenas loses .15, the others nothing; a bootstrap that misses it never breaks.
+    each = np.zeros((1, 10))
+    each[0, 0] = 0.15
+    found = imperfect.break_point((1.0,), each)
+    assert found is not None
+    assert found["mean"] == pytest.approx(2 / 3)
+    assert found["low"] is not None
+    assert found["low"] < 0.3
+    assert found["high"] is None
+
+
+def test_sweeps_change_one_thing_or_two():
+    position, heading, both = imperfect.poses(ARGUMENTS)
+    config = imperfect.changed(PRESETS["noisy"], both.changes[2])
+    errors = config.mission.localisation
+    assert (errors.position_error, errors.heading_error) == (0.03, 3.0)
+    errors = imperfect.changed(PRESETS["noisy"], position.changes[2]).mission.localisation
+    assert (errors.position_error, errors.heading_error) == (0.03, 0.0)
+    errors = imperfect.changed(PRESETS["noisy"], heading.changes[2]).mission.localisation
+    assert (errors.position_error, errors.heading_error) == (0.0, 3.0)
+    for sweep in imperfect.messages(ARGUMENTS):
+        assert len(sweep.sizes) == len(sweep.changes)
+        for size, change in zip(sweep.sizes, sweep.changes, strict=True):
+            told = imperfect.changed(PRESETS["noisy"], change).mission.communication
+            expected = {
+                "loss": (size, 0.0),
+                "delay [s]": (0.0, size),
+                "loss, delay 2 s": (size, 2.0),
+                "delay [s], loss 0.5": (0.5, size),
+            }[sweep.name]
+            assert told.own_maps
+            assert (told.loss, told.delay) == expected
+
+
+def test_other_arenas_and_robots():
+    four = imperfect.Arguments(
+        run=Path("latest"), num_pois=16, side=6.0, robots=("camera", "lidar") * 2
+    )
+    config = imperfect.elsewhere(four, PRESETS["team"], MODELS)
+    assert (config.arena.num_pois, config.arena.side, len(config.carried)) == (16, 6.0, 4)
+    assert imperfect.elsewhere(ARGUMENTS, PRESETS["default"], MODELS) == PRESETS["default"]
+    with pytest.raises(ConfigError, match="num_pois = 8: must be a number that the run"):
+        imperfect.elsewhere(ARGUMENTS, PRESETS["team"], MODELS)
+    with pytest.raises(ConfigError, match=r"headings .*: must be as many as positions"):
+        imperfect.Arguments(run=Path("latest"), headings=(1.0,))
