@@ -208,26 +208,22 @@ def _reached(sizes: tuple[float, ...], lost: np.ndarray) -> float:
 
 
 def play(
-    arguments: Arguments, config: Config, models: Models, sweeps: list[Sweep], usual: dict
+    curves: Curves, models: Models, policy: str, sweeps: list[Sweep], usual: dict[str, np.ndarray]
 ) -> Iterator[dict]:
     """Rows of each sweep, and its break point.
 
     Args:
-      arguments: of the program.
-      config: all settings.
+      curves: plays missions, whose settings differ in numbers alone from those of the sweeps.
       models: of a finished run.
-      sweeps: whose settings differ in numbers alone.
+      policy: the name of the policy that plays.
+      sweeps: what gets worse.
       usual: `[E]` figures of robots that know their poses and share one map.
     """
-    curves = Imperfect(
-        jax.random.key(arguments.seed),
-        changed(config, sweeps[0].changes[0]),
-        arguments.episodes,
-    )
     for sweep in sweeps:
         rows, lost = [], []
         for size, sections in zip(sweep.sizes, sweep.changes, strict=True):
-            found = curves.play(models, arguments.policy, changed(config, sections))
+            config = changed(curves.scenario.config, sections)
+            found = curves.play(models, policy, config)
             rows.append({"size": size, **compare(found, usual, _KEYS)})
             lost.append(usual["accuracy"] - found["accuracy"])
             print(_row(sweep.name, rows[-1], usual), flush=True)
@@ -261,12 +257,15 @@ def main(argv: list[str] | None = None) -> None:
     exact = {"localisation": LocalisationConfig(), "communication": CommunicationConfig()}
     config = changed(config, exact)
     key = jax.random.key(arguments.seed)
-    usual = Imperfect(key, config, arguments.episodes).play(models, arguments.policy)
+    share = Imperfect(key, config, arguments.episodes)
+    usual = share.play(models, arguments.policy)
     print(f"| what | size | {' | '.join(_KEYS)} |\n{'| --- ' * (2 + len(_KEYS))}|")
     print(_row("-", {"size": 0.0, **compare(usual, usual, _KEYS)}, usual), flush=True)
-    found = [*play(arguments, config, models, poses(arguments), usual)]
+    found = [*play(share, models, arguments.policy, poses(arguments), usual)]
     if models.fusion.accumulates:
-        found += play(arguments, config, models, messages(arguments), usual)
+        own_maps = {"communication": CommunicationConfig(own_maps=True)}
+        each = Imperfect(key, changed(config, own_maps), arguments.episodes)
+        found += play(each, models, arguments.policy, messages(arguments), usual)
     if arguments.json is not None:
         whole = {"commit": commit(), "versions": versions(), "episodes": arguments.episodes}
         whole |= {"seed": arguments.seed, "policy": arguments.policy, "sweeps": found}
