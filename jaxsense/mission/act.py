@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Index, Key, call, others, pytree
-from jaxsense.mission import localisation, navigation, roadmap
+from jaxsense.mission import navigation, roadmap
 from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, is_taken, sees
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.maps import Learned, map_of
@@ -25,7 +25,7 @@ from jaxsense.mission.state import (
 )
 from jaxsense.models import Models
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import viewpoints
+from jaxsense.sim import localisation, viewpoints
 from jaxsense.sim import world as worlds
 
 GOAL_ANGLE = 6.0  # degrees, maximum angle to the PoI at which a robot scans it

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.mission import localisation, memory, roadmap
+from jaxsense.mission import memory, roadmap
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.mission.state import (
     IDLE,
@@ -21,6 +21,7 @@ from jaxsense.mission.state import (
 )
 from jaxsense.models import Models
 from jaxsense.sim import arena as arenas
+from jaxsense.sim import localisation
 from jaxsense.sim.light import random_light
 from jaxsense.sim.world import Scene
 

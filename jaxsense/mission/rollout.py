@@ -8,7 +8,7 @@ from jaxtyping import Array, Int
 
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key
-from jaxsense.mission import act, decide, localisation
+from jaxsense.mission import act, decide
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.motion import move
 from jaxsense.mission.state import (
@@ -20,6 +20,7 @@ from jaxsense.mission.state import (
     Robots,
 )
 from jaxsense.models import Models
+from jaxsense.sim import localisation
 
 
 def rollout(

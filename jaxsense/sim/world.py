@@ -9,10 +9,10 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
-from jaxsense.config import Config, ViewpointConfig
+from jaxsense.config import Config, LocalisationConfig, ViewpointConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, others, pytree
-from jaxsense.sim import absence, sensors, viewpoints, windows
+from jaxsense.sim import absence, localisation, sensors, viewpoints, windows
 from jaxsense.sim import arena as arenas
 from jaxsense.sim.absence import View
 from jaxsense.sim.light import Light, random_light
@@ -26,11 +26,13 @@ class World:
       arena: the compiled arena; static.
       sensors: the sensor of each modality; in training robot m carries the m-th.
       viewpoint: the settings of viewpoints.
+      localisation: errors of the poses that robots believe they have; None if they know them.
     """
 
     arena: arenas.Arena = struct.field(pytree_node=False)
     sensors: tuple[sensors.Sensor, ...]
     viewpoint: ViewpointConfig
+    localisation: LocalisationConfig | None
 
     @property
     def reads_conditions(self) -> bool:
@@ -79,7 +81,9 @@ def make_world(
         arena = arenas.build(config.arena, carries_lidar, contacts=contacts)
     elif arena.config != config.arena:
         raise ValueError("arena: must be compiled from config.arena; its settings differ")
-    return World(arena, sensors.make(config), config.viewpoint)
+    errors = config.mission.localisation
+    localised = errors if errors.in_training else None
+    return World(arena, sensors.make(config), config.viewpoint, localised)
 
 
 def random_scene(
@@ -136,6 +140,8 @@ def look(
     viewpoint_key, noise_key = jax.random.split(key)
     others = jnp.delete(scene.poses, robot, axis=0)
     pose, bearing = _viewpoint(viewpoint_key, world, scene.layout, others, poi)
+    error_key, position = jax.random.fold_in(key, 2), scene.layout.position[poi]
+    bearing, _ = _believed(error_key, world, pose, bearing, position)
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
     data = arenas.place(world.arena, scene.layout, scene.poses)
     readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
@@ -179,6 +185,8 @@ def look_again(
         scene.poses[robot, :2],
         farthest * jax.random.uniform(distance_key) ** 3,
     )
+    error_key, position = jax.random.fold_in(key, 3), scene.layout.position[poi]
+    bearing, _ = _believed(error_key, world, pose, bearing, position)
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
     data = arenas.place(world.arena, scene.layout, scene.poses)
     readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
@@ -248,12 +256,14 @@ def survey(
     def stand(key: Key, robot: jax.Array, poi: jax.Array) -> tuple[View, mjx.Data]:
         standing = others(scene.poses, robot)
         pose, bearing = _viewpoint(key, world, scene.layout, standing, poi)
+        error_key = jax.random.fold_in(key, 2)
+        bearing, distance = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
         view = View(
             positions=scene.layout.position,
             poses=scene.poses.at[robot].set(pose),
             twin=jnp.array(absence.outside(world.arena.config)),
             bearing=bearing,
-            distance=jnp.linalg.norm(scene.layout.position[poi] - pose[:2]),
+            distance=distance,
         )
         if is_empty is not None:
             # Folded in: the viewpoints do not depend on it.
@@ -287,6 +297,21 @@ def survey(
         return jax.vmap(read)(noise_keys[robot], view, state)
 
     return scene, tuple(map(read_all, range(len(world.sensors)))), views.distance
+
+
+def _believed(
+    key: Key,
+    world: World,
+    pose: Float[Array, "3"],
+    bearing: Float[Array, ""],
+    position: Float[Array, "2"],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Bearing [rad] and distance [m] of a PoI as a robot believes, with errors of localisation."""
+    if world.localisation is None:
+        return bearing, jnp.linalg.norm(position - pose[:2])
+    believed = pose + localisation.draw(key, world.localisation, 1)[0]
+    turned = viewpoints.bearing(believed, position) - viewpoints.bearing(pose, position)
+    return bearing + turned, jnp.linalg.norm(position - believed[:2])
 
 
 def _viewpoint(key: Key, world: World, layout: arenas.Layout, others: jax.Array, poi: jax.Array):

@@ -1,4 +1,4 @@
-"""Errors of the poses that robots believe they have: their size, and what robots do with them."""
+"""What robots do that are elsewhere than they believe."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from teams import CONFIG, POSES, POSITIONS, alone, with_config, with_values
 
 from jaxsense import mission
 from jaxsense.config import LocalisationConfig
-from jaxsense.mission import act, localisation
+from jaxsense.mission import act
 from jaxsense.mission.rollout import _drift
 from jaxsense.mission.state import DRIVING, FACING
 
@@ -40,53 +40,6 @@ def scan(team, models):
         return alone(lambda key, state: act.scan(key, team, models, state, robot))(key, state)
 
     return lambda state, robot: of_one(jax.random.key(0), state, robot)
-
-
-def test_constant_errors_have_their_standard_deviations():
-    config = LocalisationConfig(position_error=0.03, heading_error=2.0)
-    errors = np.asarray(localisation.draw(jax.random.key(0), config, 20_000))
-    expected = [0.03, 0.03, np.radians(2.0)]
-    np.testing.assert_allclose(errors.std(axis=0), expected, rtol=0.02)
-    np.testing.assert_allclose(errors.mean(axis=0) / expected, 0.0, atol=0.03)
-    np.testing.assert_allclose(np.corrcoef(errors.T), np.eye(3), atol=0.03)
-    np.testing.assert_array_equal(
-        localisation.draw(jax.random.key(0), LocalisationConfig(), 3), np.zeros((3, 3))
-    )
-
-
-def test_drift_grows_with_the_root_of_the_distance():
-    config = LocalisationConfig(position_drift=0.02, heading_drift=1.0)
-    before = jnp.full((20_000, 3), 0.5)
-    for driven in (1.0, 0.25, 4.0):
-        after = localisation.drift(jax.random.key(0), config, before, jnp.full(len(before), driven))
-        expected = driven**0.5 * np.array([0.02, 0.02, np.radians(1.0)])
-        np.testing.assert_allclose((after - before).std(axis=0), expected, rtol=0.02)
-    still = localisation.drift(jax.random.key(0), config, before, jnp.zeros(len(before)))
-    np.testing.assert_array_equal(still, before)
-
-
-@pytest.mark.parametrize(
-    ("pose", "error", "expected"),
-    [
-        # It believes to be 0.1 m further east, and so stops 0.1 m short.
-        ([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.9, 0.0]),
-        # It faces east and believes to face north: what it has on its right is south of it.
-        ([0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2], [0.0, -1.0]),
-        # From (0, 0) it believes to be at (0, 1): (1, 0) is (1, -1) away, which it turns by -90
-        # degrees to (-1, -1).
-        ([0.0, 0.0, 2.0], [0.0, 1.0, np.pi / 2], [-1.0, -1.0]),
-    ],
-)
-def test_a_robot_heads_for_where_its_error_leads(pose, error, expected):
-    found = localisation.aimed_at(jnp.array([1.0, 0.0]), jnp.array(pose), jnp.array(error))
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
-def test_without_an_error_positions_stay_to_the_last_bit():
-    position, pose = jax.random.normal(jax.random.key(0), (2, 1000, 3))
-    aim = jax.jit(jax.vmap(localisation.aimed_at))
-    found = aim(position[:, :2], pose, jnp.zeros((1000, 3)))
-    np.testing.assert_array_equal(found, position[:, :2])
 
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])

@@ -1,0 +1,112 @@
+"""Errors of the poses that robots believe they have, in missions and in the looks of training."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import PRESETS
+from jaxsense.config import LocalisationConfig
+from jaxsense.sim import localisation, world
+
+
+def test_constant_errors_have_their_standard_deviations():
+    config = LocalisationConfig(position_error=0.03, heading_error=2.0)
+    errors = np.asarray(localisation.draw(jax.random.key(0), config, 20_000))
+    expected = [0.03, 0.03, np.radians(2.0)]
+    np.testing.assert_allclose(errors.std(axis=0), expected, rtol=0.02)
+    np.testing.assert_allclose(errors.mean(axis=0) / expected, 0.0, atol=0.03)
+    np.testing.assert_allclose(np.corrcoef(errors.T), np.eye(3), atol=0.03)
+    np.testing.assert_array_equal(
+        localisation.draw(jax.random.key(0), LocalisationConfig(), 3), np.zeros((3, 3))
+    )
+
+
+def test_drift_grows_with_the_root_of_the_distance():
+    config = LocalisationConfig(position_drift=0.02, heading_drift=1.0)
+    before = jnp.full((20_000, 3), 0.5)
+    for driven in (1.0, 0.25, 4.0):
+        after = localisation.drift(jax.random.key(0), config, before, jnp.full(len(before), driven))
+        expected = driven**0.5 * np.array([0.02, 0.02, np.radians(1.0)])
+        np.testing.assert_allclose((after - before).std(axis=0), expected, rtol=0.02)
+    still = localisation.drift(jax.random.key(0), config, before, jnp.zeros(len(before)))
+    np.testing.assert_array_equal(still, before)
+
+
+@pytest.mark.parametrize(
+    ("pose", "error", "expected"),
+    [
+        # It believes to be 0.1 m further east, and so stops 0.1 m short.
+        ([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.9, 0.0]),
+        # It faces east and believes to face north: what it has on its right is south of it.
+        ([0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2], [0.0, -1.0]),
+        # From (0, 0) it believes to be at (0, 1): (1, 0) is (1, -1) away, which it turns by -90
+        # degrees to (-1, -1).
+        ([0.0, 0.0, 2.0], [0.0, 1.0, np.pi / 2], [-1.0, -1.0]),
+    ],
+)
+def test_a_robot_heads_for_where_its_error_leads(pose, error, expected):
+    found = localisation.aimed_at(jnp.array([1.0, 0.0]), jnp.array(pose), jnp.array(error))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_without_an_error_positions_stay_to_the_last_bit():
+    position, pose = jax.random.normal(jax.random.key(0), (2, 1000, 3))
+    aim = jax.jit(jax.vmap(localisation.aimed_at))
+    found = aim(position[:, :2], pose, jnp.zeros((1000, 3)))
+    np.testing.assert_array_equal(found, position[:, :2])
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return world.make_world(PRESETS["smoke"])
+
+
+def test_training_looks_have_the_bearing_and_distance_of_a_misplaced_robot(simulation):
+    errors = LocalisationConfig(position_error=0.01, heading_error=2.0)
+    keys = jax.random.split(jax.random.key(0), 20_000)
+
+    @jax.jit
+    @jax.vmap
+    def believed(key):
+        pose, place = jnp.array([1.0, 2.0, 0.3]), jnp.array([1.5, 2.0])
+        misplaced = replace(simulation, localisation=errors)
+        return world._believed(key, misplaced, pose, jnp.float32(0.1), place)
+
+    bearing, distance = believed(keys)
+    # 0.01 m across a view of 0.5 m are 1.15 degrees, and 2 of the heading: together 2.31.
+    assert np.degrees(np.std(bearing)) == pytest.approx(2.31, rel=0.02)
+    assert np.mean(bearing) == pytest.approx(0.1, abs=0.002)
+    assert np.std(distance) == pytest.approx(0.01, rel=0.02)
+    assert np.mean(distance) == pytest.approx(0.5, abs=0.001)
+
+
+def test_surveys_expect_pois_where_misplaced_robots_do(simulation):
+    classes, keys = jnp.array([0, 1, 2]), jax.random.split(jax.random.key(0), 64)
+
+    @jax.jit
+    def survey(errors):
+        misplaced = replace(simulation, localisation=errors)
+        scenes, windows, distances = jax.vmap(lambda key: world.survey(key, misplaced, classes))(
+            keys
+        )
+        return scenes.poses, windows[1], distances
+
+    poses, windows, distances = survey(None)
+    same, others, apart = survey(LocalisationConfig(position_error=0.05))
+    np.testing.assert_array_equal(poses, same)
+    assert np.std(apart - distances) == pytest.approx(0.05, rel=0.15)
+    assert np.any(windows != others)
+    _, turned, exact = survey(LocalisationConfig(heading_error=5.0))
+    np.testing.assert_allclose(exact, distances, atol=1e-6)
+    assert np.any(windows != turned)
+
+
+def test_training_has_the_errors_only_where_the_settings_say_so(simulation):
+    assert simulation.localisation is None
+    config, errors = PRESETS["smoke"], LocalisationConfig(in_training=True, heading_error=3.0)
+    mission = replace(config.mission, localisation=errors)
+    made = world.make_world(replace(config, mission=mission), arena=simulation.arena)
+    assert made.localisation == errors
