@@ -68,8 +68,8 @@ def archive(config: Config, models: Models) -> bytes:
                 },
             }
         weights = {name: x for name, x in constants.arrays.items() if name in read}
-        with files.open("weights.npz", "w") as file:
-            np.savez(file, allow_pickle=False, **weights)
+        np.savez(packed := io.BytesIO(), allow_pickle=False, **weights)
+        files.writestr("weights.npz", packed.getvalue())
         files.writestr("programs.json", json.dumps(graphs))
         for name in ROBOTS:
             files.writestr(name, (Path(onboard.__file__).parent / name).read_bytes())

@@ -1,5 +1,6 @@
 """The choice of the PoI that a robot looks at next, and of the viewpoint."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 

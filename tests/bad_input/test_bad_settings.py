@@ -80,6 +80,7 @@ LIMITS = {
     Limits(at_least=0, at_most=0.5): "detector.calibration",
     Limits(at_least=0, at_most=1): "arena.colours lidar.range_noise_growth lidar.mixed_pixels "
     "lidar.dropout camera.pixel_noise camera.low_light camera.shadow jmvae.annealing team.alone "
+    "jmvae.alpha_start "
     "team.partly_seen dqn.discount dqn.final_learning_rate dqn.epsilon_start "
     "mission.localisation.position_error mission.localisation.position_drift",
     Limits(at_least=0, at_most=180): "mission.localisation.heading_error "
@@ -100,6 +101,7 @@ LIMITS = {
     "dqn.num_envs dqn.epochs dqn.updates dqn.batch dqn.replay_capacity dqn.target_period "
     "dqn.num_starts dqn.chunk evaluation.num_starts evaluation.num_repeats mission.attempts",
     Limits(at_least=1, at_most=100): "filter.looks",
+    Limits(at_least=2, at_most=100): "jmvae.looks",
     Limits(at_least=1, at_most=100_000): "lidar.num_beams camera.num_pixels team.max_steps "
     "evaluation.num_states evaluation.value_points mission.episodes",
     Limits(at_least=1, at_most=10_000): "mdp.max_steps evaluation.value_looks",
@@ -186,7 +188,7 @@ def test_limits_are_told_in_words(limits, value, expected):
 
 ZERO = {
     "lidar.range_noise", "camera.pixel_noise", "viewpoint.max_bearing", "viewpoint.bearing_error",
-    "viewpoint.clearance", "jmvae.alpha", "jmvae.annealing", "mdp.min_increase", "dqn.discount",
+    "viewpoint.clearance", "jmvae.alpha", "jmvae.alpha_start", "jmvae.annealing", "mdp.min_increase", "dqn.discount",
     "dqn.final_learning_rate", "dqn.epsilon_min", "navigation.inflation", "mission.equal_values",
     "mission.least_confidence", "lidar.range_noise_growth", "lidar.mixed_pixels", "lidar.dropout",
     "camera.exposure_error", "camera.colour_cast", "camera.low_light", "camera.shadow",
