@@ -188,7 +188,8 @@ def test_limits_are_told_in_words(limits, value, expected):
 
 ZERO = {
     "lidar.range_noise", "camera.pixel_noise", "viewpoint.max_bearing", "viewpoint.bearing_error",
-    "viewpoint.clearance", "jmvae.alpha", "jmvae.alpha_start", "jmvae.annealing", "mdp.min_increase", "dqn.discount",
+    "viewpoint.clearance", "jmvae.alpha", "jmvae.alpha_start", "jmvae.annealing",
+    "mdp.min_increase", "dqn.discount",
     "dqn.final_learning_rate", "dqn.epsilon_min", "navigation.inflation", "mission.equal_values",
     "mission.least_confidence", "lidar.range_noise_growth", "lidar.mixed_pixels", "lidar.dropout",
     "camera.exposure_error", "camera.colour_cast", "camera.low_light", "camera.shadow",
