@@ -108,7 +108,9 @@ class MissionConfig(Section, place="mission"):
     """Failed looks or goals after which a robot gives up a PoI. Before it finishes, it retries PoIs
     where it was stuck, with as many attempts."""
     localisation: LocalisationConfig = LocalisationConfig()
+    """Errors of the poses that robots believe they have."""
     communication: CommunicationConfig = CommunicationConfig()
+    """What robots tell each other of their looks."""
 
     def check(self) -> None:
         """Checks the control period, and that no policy repeats; raises `ConfigError`."""
