@@ -290,7 +290,7 @@ def team(tmp_path_factory):
     return config, trained, path
 
 
-@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
+@pytest.mark.parametrize("player", [pytest.param(robot_numpy, marks=pytest.mark.slow), robot_onnx])
 def test_a_team_may_have_any_number_of_points_and_robots(team, player):
     _, trained, path = team
     assert trained.agent.orders
@@ -346,6 +346,7 @@ def test_the_example_plays_a_team(team, player):
     assert any("looks at PoI" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_decisions_are_those_of_missions(models, file):
     found = exported.choices(CONFIG, models, 60)
     compared = exported.compare(CONFIG, models, file.read_bytes(), found)

@@ -36,6 +36,7 @@ def share(figures, *words):
     return found
 
 
+@pytest.mark.slow
 def test_nothing_is_found_in_real_scans_and_pois_are(monkeypatch):
     monkeypatch.setattr(recorded, "_RETRAINED", 1)
     found = figures_of("smoke", every=8)
