@@ -15,12 +15,12 @@ class DetectorConfig(Section, place="detector"):
     """The scanline detectors f_x and f_w."""
 
     hidden: tuple[int, ...] = limited((64, 64), at_least=1, min_items=1)
-    """Sizes of the hidden layers."""
+    """Sizes of the hidden layers; not used if the JMVAE learns from scans."""
     num_scans: int = limited(98304, at_least=1)
     """Simulated scans to train on, per modality."""
     calibration: float = limited(0.0, at_least=0, at_most=0.5)
     """Share of these scans that calibrates the detector instead: their likelihood sets the
-    temperature of its probabilities."""
+    temperature of its probabilities. Not used if the JMVAE learns from scans."""
     num_held_out: int = limited(8192, at_least=1)
     """Simulated scans that measure the accuracy."""
     num_repeats: int = limited(0, at_least=0, at_most=1_000_000)
@@ -77,7 +77,7 @@ class JmvaeConfig(Section, place="jmvae"):
     looks, see the section filter."""
     restarts: int = limited(3, at_least=1, at_most=1000)
     """Trainings from different random parameters; the one with the lowest loss is kept, of those
-    from whose beliefs class probabilities are read exactly."""
+    from whose beliefs class probabilities are read exactly (which is not asked of one of scans)."""
     looks: int = limited(4, at_least=2, at_most=100)
     """Looks by each sensor at a PoI, if the JMVAE learns from scans."""
     samples_per_class: int = limited(10000, at_least=1)
