@@ -290,7 +290,8 @@ def team(tmp_path_factory):
     return config, trained, path
 
 
-@pytest.mark.parametrize("player", [pytest.param(robot_numpy, marks=pytest.mark.slow), robot_onnx])
+@pytest.mark.slow
+@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
 def test_a_team_may_have_any_number_of_points_and_robots(team, player):
     _, trained, path = team
     assert trained.agent.orders
@@ -325,6 +326,7 @@ def test_a_team_may_have_any_number_of_points_and_robots(team, player):
         assert found["action"] == np.argmax(expected)
 
 
+@pytest.mark.slow
 def test_a_value_that_is_not_a_number_is_answered_by_minus_one(team):
     _, _, path = team
     for player in (robot_numpy, robot_onnx):
@@ -339,6 +341,7 @@ def test_a_value_that_is_not_a_number_is_answered_by_minus_one(team):
         assert programs["decide"](**given)["action"] == -1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
 def test_the_example_plays_a_team(team, player):
     lines = runpy.run_path(str(EXAMPLE))["explore"](*player.load(team[2]), [0, 1, 2, 0])

@@ -146,6 +146,7 @@ def simulated(number=8):
     return {name: np.array(values) for name, values in found.items()}
 
 
+@pytest.mark.slow
 def test_recorded_windows_are_compared_with_simulated_ones(run, write, few):
     path = write(**simulated())
     found = jaxsense.compare_scans(run, path)
