@@ -1,6 +1,9 @@
 """Stages that fit a network: detectors, the JMVAE and the filter."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
+
+import jax
 
 from jaxsense.config import Config
 from jaxsense.core import supervised
@@ -62,3 +65,39 @@ def fit_stage(
         chunks=num_chunks(steps),
         is_optional=is_optional,
     )
+
+
+def jmvae_restarts(
+    config: Config,
+    inputs: Mapping[str, str],
+    *,
+    init: Callable[[Key, Config], Params],
+    problem: Callable[..., Problem[Output]],
+) -> list[Stage]:
+    """Makes the stages that train a JMVAE from different random parameters.
+
+    Each outputs the parameters and the `[]` mean loss of the last chunk.
+
+    Args:
+      config: all settings.
+      inputs: see `Stage`.
+      init: `(key, config) -> random parameters`.
+      problem: `(config, **inputs) -> Problem`.
+    """
+
+    def trained(
+        config: Config, model: Output, fit: FitState, **inputs: Output
+    ) -> tuple[Params, jax.Array]:
+        return fit.params, fit.loss
+
+    stage = fit_stage(
+        "jmvae",
+        inputs,
+        config,
+        settings=lambda config: config.jmvae,
+        untrained=lambda key, config, **inputs: ((), init(key, config)),
+        problem=lambda config, model, **inputs: problem(config, **inputs),
+        trained=trained,
+        is_optional=config.jmvae.restarts > 1,
+    )
+    return [dataclasses.replace(stage, name=f"jmvae_{i + 1}") for i in range(config.jmvae.restarts)]

@@ -17,7 +17,7 @@ from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene, make_world
 from jaxsense.training import gating, histories
-from jaxsense.training.fits import fit_stage
+from jaxsense.training.fits import fit_stage, jmvae_restarts
 from jaxsense.training.gating import Examples
 from jaxsense.training.stage import Stage
 from jaxsense.vae import detectors, jmvae
@@ -310,34 +310,16 @@ def make_stages(config: Config) -> list[Stage]:
 def jmvae_stages(config: Config) -> list[Stage]:
     """Makes stages that train the JMVAE from different random parameters, and pick the best."""
 
-    def untrained(key: Key, config: Config, *, detections: Detections) -> tuple[tuple[()], Params]:
-        del detections
-        return (), jmvae.init(key, make_jmvae(config))
-
-    def problem(config: Config, fitted: tuple[()], *, detections: Detections) -> jmvae.Fitting:
+    def problem(config: Config, *, detections: Detections) -> jmvae.Fitting:
         return jmvae.Fitting(config.jmvae, detections.bank, make_jmvae(config))
 
-    def trained(
-        config: Config, fitted: tuple[()], fit: FitState, *, detections: Detections
-    ) -> tuple[Params, jax.Array]:
-        """Parameters, and the `[]` mean loss of the last chunk."""
-        return fit.params, fit.loss
+    def init(key: Key, config: Config) -> Params:
+        return jmvae.init(key, make_jmvae(config))
 
-    restart = fit_stage(
-        "jmvae",
-        {"detections": "detections"},
-        config,
-        settings=lambda config: config.jmvae,
-        untrained=untrained,
-        problem=problem,
-        trained=trained,
-        is_optional=config.jmvae.restarts > 1,
-    )
-    restarts = [
-        dataclasses.replace(restart, name=f"jmvae_{i + 1}") for i in range(config.jmvae.restarts)
-    ]
+    given = {"detections": "detections"}
+    restarts = jmvae_restarts(config, given, init=init, problem=problem)
     names = tuple(stage.name for stage in restarts)
-    best = Stage("best_jmvae", _best_jmvae, {"restarts": names, "detections": "detections"})
+    best = Stage("best_jmvae", _best_jmvae, {"restarts": names, **given})
     return [*restarts, best]
 
 

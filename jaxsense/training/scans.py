@@ -5,8 +5,6 @@ posteriors are the classes. The labels of the training scenes only name them: ea
 cluster that holds most of its PoIs.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -18,7 +16,7 @@ from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.models import make_frame, make_prior, make_readout, make_shape
 from jaxsense.sim import sensors
 from jaxsense.training import gating, perception
-from jaxsense.training.fits import fit_stage
+from jaxsense.training.fits import fit_stage, jmvae_restarts
 from jaxsense.training.gating import Examples
 from jaxsense.training.perception import Detections, Surveys
 from jaxsense.training.stage import Stage
@@ -98,29 +96,13 @@ def grouped(windows: Float[Array, "S N F"], config: Config) -> Float[Array, "P K
 def _jmvae_stages(config: Config) -> list[Stage]:
     """Trainings from different random parameters."""
 
-    def untrained(key: Key, config: Config, *, views: Views) -> tuple[tuple[()], Params]:
-        del views
-        return (), leave_one_out.init(key, make_shape(config))
-
-    def problem(config: Config, fitted: tuple[()], *, views: Views) -> leave_one_out.Fitting:
+    def problem(config: Config, *, views: Views) -> leave_one_out.Fitting:
         return leave_one_out.Fitting(config.jmvae, views.groups, make_shape(config))
 
-    def trained(
-        config: Config, fitted: tuple[()], fit: FitState, *, views: Views
-    ) -> tuple[Params, jax.Array]:
-        return fit.params, fit.loss
+    def init(key: Key, config: Config) -> Params:
+        return leave_one_out.init(key, make_shape(config))
 
-    stage = fit_stage(
-        "jmvae",
-        {"views": "views"},
-        config,
-        settings=lambda config: config.jmvae,
-        untrained=untrained,
-        problem=problem,
-        trained=trained,
-        is_optional=config.jmvae.restarts > 1,
-    )
-    return [dataclasses.replace(stage, name=f"jmvae_{i + 1}") for i in range(config.jmvae.restarts)]
+    return jmvae_restarts(config, {"views": "views"}, init=init, problem=problem)
 
 
 def _best(key: Key, config: Config, *, restarts: tuple[tuple[Params, jax.Array], ...]) -> Params:
