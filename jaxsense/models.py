@@ -123,12 +123,18 @@ def make_jmvae(config: Config) -> Jmvae:
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
 
-def make_frame(sensor: Sensor) -> Frame:
+def make_frame(config: Config, sensor: Sensor) -> Frame:
     """How a network that learns from scans sees the windows of a sensor."""
     span = (sensor.window - 1) * sensor.stride
     start = (len(sensor.angles) - 1 - span) // 2
     angles = sensor.angles[start : start + span + 1 : sensor.stride]
-    return frames.make(angles, sensor.channels, sensor.measures_distance)
+    return frames.make(
+        angles,
+        sensor.channels,
+        sensor.measures_distance,
+        config.arena.poi_extent,
+        jnp.radians(config.viewpoint.bearing_error),
+    )
 
 
 def make_shape(config: Config) -> Shape:
@@ -136,7 +142,7 @@ def make_shape(config: Config) -> Shape:
 
     def size(sensor: Sensor) -> int:
         window = jax.ShapeDtypeStruct((sensor.window * sensor.channels,), jnp.float32)
-        return jax.eval_shape(make_frame(sensor), window).shape[0]
+        return jax.eval_shape(make_frame(config, sensor), window).shape[0]
 
     inputs = tuple(map(size, sensors.make(config)))
     return Shape(config.modalities, inputs, config.jmvae.latent_size, config.jmvae.hidden)
@@ -252,7 +258,7 @@ def _encoders(
         offset = jnp.zeros(sensor.window * sensor.channels)
         return Encoder(
             params=params["encoders"][sensor.name],
-            scaling=Scaling(make_frame(sensor), jnp.zeros(size), jnp.float32(1.0)),
+            scaling=Scaling(make_frame(config, sensor), jnp.zeros(size), jnp.float32(1.0)),
             gate=gate.init(key, offset, jnp.float32(1.0), sensor.measures_distance),
             classes=classes,
             readout=make_readout(config, classes),

@@ -26,10 +26,11 @@ from jaxsense.dqn import observation, team_mdp
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.interfaces import robot_numpy, robot_onnx
 from jaxsense.interfaces.onboard import functions
-from jaxsense.models import init, make_in_place, make_jmvae
+from jaxsense.models import init, make_in_place, make_jmvae, make_readout
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
+from jaxsense.sim import windows as windowing
 from jaxsense.vae import detectors, jmvae, latent
 from jaxsense.vae.novelty import Novelty
 
@@ -250,6 +251,43 @@ def test_an_exported_detector_answers_what_is_not_there(file, tmp_path, m, playe
     features = found[f"detect_{name}/features"]
     assert np.isfinite(features).all()
     np.testing.assert_allclose(features[~np.array(expected)], 0.5)
+
+
+@pytest.mark.parametrize("player", [*ABSENT])
+def test_encoders_of_scans_give_what_jaxsense_gives(tmp_path, player):
+    networks = dataclasses.replace(PRESETS["raw"].jmvae, hidden=(8, 8))
+    config = dataclasses.replace(CONFIG, jmvae=networks)
+    learned = init(jax.random.key(0), config)
+    means = jnp.array([[0.5, 0.5], [-0.5, 0.5], [0.5, -0.5]])
+    classes = Belief(means, jnp.full((3, 2), 0.9))
+    readout = make_readout(config, classes)
+    encoders = tuple(dataclasses.replace(x, readout=readout) for x in learned.detectors)
+    learned = dataclasses.replace(learned, detectors=encoders)
+    with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as created:
+        save_models(created, learned)
+    export.main([str(tmp_path / "run"), "--out", str(tmp_path / "exported.zip")])
+    rng, given, expected = np.random.default_rng(0), {}, {}
+    for m, sensor in enumerate(sensors.make(config)):
+        shape = functions(config)[f"detect_{sensor.name}"].inputs["readings"].shape
+        scans = rng.uniform(0.3, 0.9, (BATCH, *shape)).astype(np.float32)
+        given |= {
+            f"detect_{sensor.name}/readings": scans,
+            f"detect_{sensor.name}/bearing": rng.uniform(-0.3, 0.3, BATCH).astype(np.float32),
+            f"detect_{sensor.name}/distance": np.full(BATCH, 0.6, np.float32),
+        }
+        windows = [
+            windowing.cut_out(sensor, scan, bearing)
+            for scan, bearing in zip(scans, given[f"detect_{sensor.name}/bearing"], strict=True)
+        ]
+        expected[sensor.name] = jax.vmap(learned.detectors[m].features)(jnp.stack(windows))
+        assert np.ptp(np.asarray(expected[sensor.name]), axis=0).max() > 1e-3
+    np.savez(tmp_path / "in.npz", **given)
+    files = tmp_path / "in.npz", tmp_path / "out.npz"
+    done = run_alone(RUN_ALL, player, tmp_path / "exported.zip", player, *files)
+    assert done.returncode == 0, done.stderr
+    found = np.load(tmp_path / "out.npz")
+    for name, features in expected.items():
+        np.testing.assert_allclose(found[f"detect_{name}/features"], features, atol=1e-5)
 
 
 @pytest.mark.parametrize(

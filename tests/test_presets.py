@@ -110,6 +110,21 @@ def test_paper_preset(paper):
     assert paper["timing"]["total_s"] <= 300
 
 
+def test_raw_preset(default, seed, tmp_path, summary_of):
+    raw = summary_of("raw", seed, tmp_path / "raw")
+    latent = raw["jmvae"]
+    assert latent["grouped"]["pair"] >= 0.995
+    assert latent["grouped"]["all_looks"] >= 0.999
+    assert latent["unambiguous"] == TABLE_1
+    assert min(min(shares) for shares in latent["consistent"].values()) >= 0.95
+    assert latent["active_units"] == 2
+    assert raw["belief"]["nll"][-1] - raw["belief"]["bayes_nll"][-1] <= 0.02
+    found, usual = (summary["mission"]["latent"] for summary in (raw, default))
+    assert abs(found["accuracy"] - usual["accuracy"]) <= 0.005
+    assert found["observations_per_poi"] == pytest.approx(usual["observations_per_poi"], rel=0.04)
+    assert raw["timing"]["total_s"] <= 240
+
+
 def test_live_and_bank_train_equally_good_policies(default, seed, tmp_path, summary_of):
     # The same seed trains the same detectors and the same JMVAE, so that rewards are comparable.
     bank = summary_of("default", seed, tmp_path / "bank", "--dqn.observe", "bank")

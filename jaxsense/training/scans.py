@@ -76,7 +76,7 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
     for sensor, windows in zip(sensors.make(config), surveys.windows, strict=True):
         groups = grouped(windows[:number], config)
         flat = groups.reshape(-1, groups.shape[-1])
-        scaling, seen = frames.scaled(make_frame(sensor), flat)
+        scaling, seen = frames.scaled(make_frame(config, sensor), flat)
         found.append(seen.reshape(*groups.shape[:2], -1))
         scalings.append(scaling)
     return Views(tuple(found), tuple(scalings))

@@ -14,12 +14,14 @@ from jaxtyping import Array, Float
 
 from jaxsense.core.types import pytree
 
-_HALF_WIDTH = 0.22  # m to each side of the PoI's middle
 _BINS = 64
-_AHEAD = 0.12  # rad from the middle of a window within which the PoI's front is looked for
-_TO_MIDDLE = 0.05  # m from the front of a PoI on, half of a small one's depth
-_NEAR = 0.16  # m, depth within which a beam is on the PoI
-_DEPTHS = -0.2, 0.3  # m, beyond which depth tells nothing of the PoI
+_HALF_WIDTH = 1.5  # this and what follows in extents of a PoI, the radius of a circle around it
+_TO_MIDDLE = 0.35  # from the front of a PoI on, half of a small one's depth
+_NEAR = 1.15  # depth within which a beam is on the PoI
+_DEPTHS = -1.4, 2.1  # beyond which depth tells nothing of the PoI
+_AHEAD = 0.1  # rad, half the width of a PoI's front
+_NOTHING = 0.05  # beams, as many as which a place without any counts as having hit nothing
+_FEWEST = 3  # beams, fewer of which show no profile
 _DARK = 0.03  # keeps chromaticity finite
 
 
@@ -40,24 +42,42 @@ class Profile:
     """Depth over lateral position around a PoI's middle, from a window of distances.
 
     Attributes:
-      angles: `[W]` of the beams from the middle of the window, in radians.
+      across: `[W]` sines of the beams' angles from the middle of the window.
+      along: `[W]` cosines of these angles.
+      ahead: `[]` sine of the angle up to which the PoI's front is looked for.
+      extent: `[]` radius of the circle that holds a PoI, in metres.
     """
 
-    angles: Float[Array, " W"]
+    across: Float[Array, " W"]
+    along: Float[Array, " W"]
+    ahead: Float[Array, ""]
+    extent: Float[Array, ""]
 
     def __call__(self, window: Float[Array, " W"]) -> Float[Array, " G"]:
-        """See `Frame`: `[64]` depths in metres, from 22 cm on one side to 22 cm on the other."""
-        ahead = jnp.where(jnp.abs(self.angles) < _AHEAD, window, jnp.inf)
-        # The nearest one may be an outlier.
-        middle = -jnp.mean(jax.lax.top_k(-ahead, 4)[0][1:]) + _TO_MIDDLE
-        is_near = jnp.abs(window - middle) < _NEAR
-        is_near &= jnp.abs(self.angles) < jnp.arctan2(1.15 * _HALF_WIDTH, middle)
-        total = jnp.maximum(jnp.sum(is_near), 1)
-        angles = self.angles - jnp.sum(jnp.where(is_near, self.angles, 0.0)) / total
-        across, depth = window * jnp.sin(angles), window * jnp.cos(angles) - middle
-        order = jnp.argsort(across)
-        places = jnp.linspace(-_HALF_WIDTH, _HALF_WIDTH, _BINS)
-        return jnp.interp(places, across[order], jnp.clip(depth[order], *_DEPTHS))
+        """See `Frame`: `[64]` depths in metres, from 1.5 extents on one side to 1.5 on the other.
+
+        Each is the mean of the beams up to a bin or the pitch of the beams away; where there is
+        none, as beside the PoI, it is as large as a depth can be.
+        """
+        # One beam alone may be an outlier.
+        triples = jnp.maximum(jnp.maximum(window[:-2], window[1:-1]), window[2:])
+        is_ahead = jnp.abs(self.across[1:-1]) <= self.ahead
+        middle = jnp.min(jnp.where(is_ahead, triples, jnp.inf)) + _TO_MIDDLE * self.extent
+        half_width = _HALF_WIDTH * self.extent
+        is_near = jnp.abs(window - middle) < _NEAR * self.extent
+        is_near &= jnp.abs(window * self.across) < 1.15 * half_width
+        sine = jnp.sum(jnp.where(is_near, self.across, 0.0)) / jnp.maximum(jnp.sum(is_near), 1)
+        cosine = jnp.sqrt(1 - sine**2)
+        across = window * (self.across * cosine - self.along * sine)
+        depth = window * (self.along * cosine + self.across * sine) - middle
+        lowest, highest = (limit * self.extent for limit in _DEPTHS)
+        pitch = jnp.abs(self.across[-1] - self.across[0]) / (len(window) - 1)
+        width = jnp.maximum(2 * half_width / (_BINS - 1), pitch * middle)
+        places = half_width * jnp.linspace(-1.0, 1.0, _BINS)
+        apart = jnp.abs(across[None] - places[:, None])
+        weights = jnp.maximum(0.0, 1.0 - apart / width)
+        total = jnp.sum(weights * jnp.clip(depth, lowest, highest)[None], axis=1)
+        return (total + _NOTHING * highest) / (jnp.sum(weights, axis=1) + _NOTHING)
 
 
 @pytree
@@ -80,16 +100,27 @@ class Plain:
         return window
 
 
-def make(angles: Float[np.ndarray, " W"], channels: int, measures_distance: bool) -> Frame:
+def make(
+    angles: Float[np.ndarray, " W"],
+    channels: int,
+    measures_distance: bool,
+    extent: Float[Array, ""] | float,
+    bearing_error: Float[Array, ""] | float,
+) -> Frame:
     """The frame for windows of a sensor.
 
     Args:
       angles: `[W]` of the rays in the middle of its view, in radians.
       channels: numbers in the reading of one ray.
       measures_distance: whether readings are distances in metres.
+      extent: radius of the circle that holds a PoI, in metres.
+      bearing_error: largest error of the window's middle, in radians.
     """
-    if measures_distance and channels == 1:
-        return Profile(jnp.asarray(angles - angles.mean(), jnp.float32))
+    if measures_distance and channels == 1 and len(angles) >= _FEWEST:
+        apart = jnp.asarray(angles - angles.mean(), jnp.float32)
+        pitch = jnp.abs(apart[1] - apart[0])
+        ahead = jnp.sin(jnp.maximum(_AHEAD + bearing_error, 1.01 * pitch))
+        return Profile(jnp.sin(apart), jnp.cos(apart), ahead, jnp.float32(extent))
     return Chromaticity() if channels == 3 else Plain()
 
 

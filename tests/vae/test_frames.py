@@ -10,10 +10,12 @@ from jaxsense.models import make_frame
 from jaxsense.sim import sensors
 from jaxsense.vae import frames
 
-CAMERA, LIDAR = sensors.make(PRESETS["default"])
-PROFILE = make_frame(LIDAR)
-ANGLES = np.asarray(PROFILE.angles)
-PLACES = np.linspace(-0.22, 0.22, 64)
+CONFIG = PRESETS["default"]
+CAMERA, LIDAR = sensors.make(CONFIG)
+PROFILE = make_frame(CONFIG, LIDAR)
+ANGLES = np.arctan2(PROFILE.across, PROFILE.along)
+EXTENT = 0.1 * np.sqrt(2)
+PLACES = 1.5 * EXTENT * np.linspace(-1, 1, 64)
 
 
 def cylinder(distance, bearing, radius=0.1, wall=3.0):
@@ -36,8 +38,8 @@ def test_a_cylinder_has_the_depth_of_a_circle():
     inside = np.abs(PLACES) < 0.08
     expected = 0.1 - np.sqrt(0.01 - PLACES[inside] ** 2)
     np.testing.assert_allclose(found[inside] - found[inside].min(), expected, atol=0.006)
-    # Beyond it, the depth rises to that of the wall.
-    assert (np.diff(found[PLACES > 0.11]) > 0).all()
+    # Where no beam has hit it, the depth is the largest, 2.1 extents.
+    np.testing.assert_allclose(found[np.abs(PLACES) > 0.115], 2.1 * EXTENT, rtol=1e-5)
     np.testing.assert_allclose(found, found[::-1], atol=2e-3)
 
 
@@ -57,7 +59,7 @@ def test_one_near_outlier_does_not_matter():
 
 
 def test_chromaticity_keeps_colour_and_tells_brightness_apart():
-    frame = make_frame(CAMERA)
+    frame = make_frame(CONFIG, CAMERA)
     pixels = jnp.array([[0.6, 0.2, 0.1], [0.3, 0.1, 0.05]])
     bright, dark = frame(pixels.reshape(-1)).reshape(2, 3)
     # (r + g + b) + .03: shares .645 and .215, then .625 and .208.
@@ -67,8 +69,9 @@ def test_chromaticity_keeps_colour_and_tells_brightness_apart():
 
 def test_other_sensors_are_seen_as_they_are():
     window = jnp.arange(4.0)
-    np.testing.assert_array_equal(frames.make(np.zeros(4), 1, False)(window), window)
-    assert isinstance(frames.make(np.zeros(2), 2, True), frames.Plain)
+    np.testing.assert_array_equal(frames.make(np.zeros(4), 1, False, 0.1, 0.0)(window), window)
+    for angles, channels in ((np.zeros(4), 2), (np.array([0.0, 0.1]), 1)):
+        assert isinstance(frames.make(angles, channels, True, 0.1, 0.0), frames.Plain)
 
 
 def test_scaling_standardises_by_the_training():
@@ -77,3 +80,16 @@ def test_scaling_standardises_by_the_training():
     np.testing.assert_allclose(seen.mean(axis=0), 0, atol=1e-5)
     np.testing.assert_allclose(seen.std(), 1, rtol=1e-3)
     np.testing.assert_allclose(jax.vmap(scaling)(windows), seen, rtol=1e-4, atol=1e-5)
+
+
+def test_a_profile_grows_with_the_poi():
+    twice = frames.make(ANGLES, 1, True, 2 * EXTENT, 0.0)
+    small, large = cylinder(0.5, 0.0), cylinder(1.0, 0.0, radius=0.2, wall=6.0)
+    np.testing.assert_allclose(twice(large), 2 * PROFILE(small), atol=1e-5)
+
+
+def test_few_beams_leave_no_gaps():
+    few = frames.make(ANGLES[::6], 1, True, EXTENT, 0.0)
+    inside = np.abs(PLACES) < 0.07
+    found = few(cylinder(1.0, 0.0)[::6])[inside]
+    np.testing.assert_allclose(found, PROFILE(cylinder(1.0, 0.0))[inside], atol=0.02)
