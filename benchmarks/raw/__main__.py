@@ -2,9 +2,10 @@
 
 import dataclasses
 import json
+import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
@@ -15,7 +16,7 @@ import numpy as np
 
 from benchmarks.measure import reserve
 from benchmarks.raw.looks import Looks, simulate
-from benchmarks.raw.training import PARTS, compiled
+from benchmarks.raw.training import PARTS, compiled, split
 from benchmarks.raw.variants import TABLES, Variant
 from jaxsense import Key
 from jaxsense.config.checks import check_fields, limited, require
@@ -68,16 +69,22 @@ def chosen(arguments: Arguments) -> list[tuple[str, Variant]]:
     ]
 
 
-def trained(variants: list[Variant], looks: Looks, keys: Key):
-    """Yields the figures of each variant; others are compiled while it trains.
+def trained(
+    variants: list[Variant], looks: Looks, keys: Key
+) -> Iterator[tuple[Variant, dict, float]]:
+    """Yields each variant, its figures and the seconds it took; others are compiled meanwhile.
 
     Args:
       variants: the ways of training.
       looks: of all PoIs.
       keys: `[seeds]` random keys.
     """
-    work: Callable[[Variant], Callable[[], dict]] = lambda x: compiled(x, looks, keys)  # noqa: E731
-    with ThreadPoolExecutor() as pool:
+    data = {view: split(looks, view) for view in dict.fromkeys(x.view for x in variants)}
+
+    def work(variant: Variant) -> Callable[[], dict]:
+        return compiled(variant, data[variant.view], keys)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
         for variant, program in zip(variants, pool.map(work, variants), strict=True):
             begin = time.perf_counter()
             found = program()

@@ -1,18 +1,17 @@
 """Trains a variant, several seeds side by side, and measures what it has learned."""
 
-import dataclasses
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from benchmarks.raw.looks import Looks, Seen, regrouped
+from benchmarks.raw.looks import TOGETHER, Looks, Seen, View, regrouped
 from benchmarks.raw.model import Columns, Model, hidden
 from benchmarks.raw.variants import Variant
-from jaxsense import Key
+from jaxsense import Key, pytree
 from jaxsense.core.networks import Params
 from jaxsense.vae import latent
 from jaxsense.vae.jmvae import annealed_beta
@@ -26,39 +25,37 @@ _FOR_MEANS = 8192  # groups of looks
 _FIRST = 0.01  # of the training
 
 
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Data:
-    """Looks as a variant sees them.
+    """Looks in one view: groups of eight by each sensor at a PoI.
 
     Attributes:
-      train: groups of K looks, `[P, K, F_m]` of each sensor.
-      classes: `[P]` what they show.
-      held_out: groups of eight looks at other PoIs, `[H, 8, F_m]`.
-      others: what else is known of the held-out PoIs.
+      train: `[P, 8, F_m]` of each sensor.
+      held_out: `[H, 8, F_m]` at other PoIs.
+      circumstances: `[H, 8, 7]` of the held-out looks, see `Looks`.
+      classes: `[P]` and `[H]` of the PoIs.
     """
 
     train: Seen
-    classes: np.ndarray
     held_out: Seen
-    others: Looks
+    circumstances: Float[Array, "H 8 7"]
+    classes: tuple[Int[Array, " P"], Int[Array, " H"]]
 
 
-def split(looks: Looks, variant: Variant) -> Data:
-    """Data of a variant; the same PoIs are held out for all variants.
+def split(looks: Looks, view: View) -> Data:
+    """Holds out the same PoIs for all views.
 
     Args:
       looks: of all PoIs.
-      variant: the way of training.
+      view: how networks see them.
     """
-    seen, total = variant.view(looks), len(looks.classes)
-    number = min(_HELD_OUT, total // 4)
-    train = regrouped(tuple(x[number:] for x in seen), variant.looks)
-    classes = np.repeat(looks.classes[number:], len(train[0]) // (total - number))
-    # In the order of `regrouped` the groups of a PoI follow one another.
-    order = np.random.default_rng(0).permutation(len(classes))
-    held_out = tuple(x[:number] for x in seen)
+    seen, classes = view(looks), jnp.asarray(looks.classes)
+    number = min(_HELD_OUT, len(classes) // 4)
     return Data(
-        tuple(x[order] for x in train), classes[order], held_out, looks.part(slice(number))
+        train=tuple(x[number:] for x in seen),
+        held_out=tuple(x[:number] for x in seen),
+        circumstances=looks.circumstances[:number],
+        classes=(classes[number:], classes[:number]),
     )
 
 
@@ -158,10 +155,10 @@ def measured(key: Key, model: Model, params: Params, data: Data) -> dict:
       share of hidden units of the decoders and the joint encoder that no look switches on, and
       `dead_in_layer`, that of the worst layer; `posteriors`, of some PoIs.
     """
-    truth = jnp.asarray(data.others.classes)
-    number = model.variant.looks
-    trained = _means(model, params, tuple(x[:_FOR_MEANS] for x in data.train))
-    is_of = jax.nn.one_hot(data.classes[:_FOR_MEANS], 3).T
+    number, (of_train, truth) = model.variant.looks, data.classes
+    groups = tuple(x[:_FOR_MEANS] for x in regrouped(data.train, number))
+    trained = _means(model, params, groups)
+    is_of = jax.nn.one_hot(jnp.repeat(of_train, TOGETHER // number)[:_FOR_MEANS], 3).T
     centres = is_of @ trained / jnp.sum(is_of, axis=1, keepdims=True)
 
     def is_right(found: jax.Array) -> jax.Array:
@@ -170,7 +167,7 @@ def measured(key: Key, model: Model, params: Params, data: Data) -> dict:
 
     whole = _means(model, params, tuple(x[:, :number] for x in data.held_out))
     pair = _means(model, params, _pairs(data.held_out))
-    of_class, around = jax.nn.one_hot(truth, 3), data.others.circumstances[:, 0]
+    of_class, around = jax.nn.one_hot(truth, 3), data.circumstances[:, 0]
     of_pair = is_right(pair)
     dead = _dead(key, model, params, tuple(x[:, :number] for x in data.held_out))
     return {
@@ -194,7 +191,9 @@ def _dead(key: Key, model: Model, params: Params, seen: Seen) -> list[jax.Array]
     """Which units of each layer are 0 for all looks, for the joint encoder and the decoders."""
     looks: Columns = model.columns(seen)
     flat = [x.reshape(len(x), -1) for x in looks]
-    layers = [layer for p, x in zip(params["embedding"], flat, strict=True) for layer in hidden(p, x)]
+    layers = [
+        layer for p, x in zip(params["embedding"], flat, strict=True) for layer in hidden(p, x)
+    ]
     keys = jax.random.split(key, len(flat))
     for k, p, (mean, log_variance) in zip(
         keys, params["decoders"], model.sources(params, looks), strict=True
@@ -207,14 +206,12 @@ def _dead(key: Key, model: Model, params: Params, seen: Seen) -> list[jax.Array]
 
 def _posteriors(model: Model, params: Params, data: Data) -> dict[str, jax.Array]:
     """Means and standard deviations, `[C, 40, 2, D]`, of one look by each sensor and by both."""
-    classes = data.others.classes
-    rows = [np.flatnonzero(classes == c) for c in range(3)]
-    number = min(SHOWN, *map(len, rows))
-    chosen = np.concatenate([x[:number] for x in rows])
+    _, classes = data.classes
+    chosen = jnp.concatenate([jnp.flatnonzero(classes == c, size=SHOWN) for c in range(3)])
     looks = model.columns(tuple(x[chosen, :1] for x in data.held_out))
 
     def of(posterior: tuple[jax.Array, jax.Array]) -> jax.Array:
-        mean, log_variance = (x.reshape(model.latent_size, 3, number) for x in posterior)
+        mean, log_variance = (x.reshape(model.latent_size, 3, SHOWN) for x in posterior)
         return jnp.moveaxis(jnp.stack([mean, jnp.exp(0.5 * log_variance)]), (2, 3), (0, 1))
 
     found = {"joint": of(model.posterior(params, looks))}
@@ -251,7 +248,9 @@ def of_seed(key: Key, model: Model, data: Data) -> dict:
     train_key, noise_key = jax.random.split(key)
     pairs = _pairs(data.held_out)
     watch = lambda params: latent.active_units(_means(model, params, pairs))  # noqa: E731
-    first, last, norms, units = train(train_key, model, data.train, watch)
+    first, last, norms, units = train(
+        train_key, model, regrouped(data.train, model.variant.looks), watch
+    )
     ratio = norms[..., 0] / (norms[..., 1] + 1e-12)
     begun = max(int(_FIRST * len(ratio)), 1)
     return measured(noise_key, model, last, data) | {
@@ -262,23 +261,18 @@ def of_seed(key: Key, model: Model, data: Data) -> dict:
     }
 
 
-def compiled(variant: Variant, looks: Looks, keys: Key) -> Callable[[], dict]:
+def compiled(variant: Variant, data: Data, keys: Key) -> Callable[[], dict]:
     """A program that trains a variant from each of the keys.
 
     Args:
       variant: the way of training.
-      looks: of all PoIs.
+      data: in the variant's view.
       keys: `[seeds]` random keys.
     """
-    data = split(looks, variant)
     model = Model(variant, tuple(x.shape[-1] for x in data.train))
 
-    # Large arrays are arguments: as constants they would be part of the program.
-    def figures(keys: Key, train: Seen, held_out: Seen, circumstances: jax.Array) -> dict:
-        others = dataclasses.replace(data.others, circumstances=circumstances)
-        given = dataclasses.replace(data, train=train, held_out=held_out, others=others)
-        return jax.vmap(lambda key: of_seed(key, model, given))(keys)
+    def figures(keys: Key, data: Data) -> dict:
+        return jax.vmap(lambda key: of_seed(key, model, data))(keys)
 
-    arguments = (keys, data.train, data.held_out, data.others.circumstances)
-    program = jax.jit(figures).lower(*arguments).compile()
-    return lambda: jax.tree.map(np.asarray, program(*arguments))
+    program = jax.jit(figures).lower(keys, data).compile()
+    return lambda: jax.tree.map(np.asarray, program(keys, data))
