@@ -99,6 +99,9 @@ def main(argv: list[str] | None = None) -> None:
     looks = simulate(jax.random.key(arguments.first_seed), arguments.scans)
     keys = jnp.stack([jax.random.key(seed) for seed in arguments.range])
     tables = chosen(arguments)
+    whole = {"commit": commit(), "versions": versions(), "seeds": [*arguments.range]}
+    whole |= {"device": jax.devices()[0].device_kind, "steps": arguments.steps}
+    whole |= {"scans": arguments.scans}
     rows = []
     found = trained([variant for _, variant in tables], looks, keys)
     for (table, _), (variant, figures, seconds) in zip(tables, found, strict=True):
@@ -109,11 +112,10 @@ def main(argv: list[str] | None = None) -> None:
             f"({right.min():.3f} to {right.max():.3f}), {seconds:.1f} s",
             flush=True,
         )
-    if arguments.json is not None:
-        whole = {"commit": commit(), "versions": versions(), "seeds": [*arguments.range]}
-        whole |= {"device": jax.devices()[0].device_kind, "steps": arguments.steps}
-        whole |= {"scans": arguments.scans, "variants": rows}
-        arguments.json.write_text(json.dumps(whole) + "\n", encoding="utf-8")
+        if arguments.json is not None:
+            # After each variant, so that what was measured before a failure is kept.
+            text = json.dumps({**whole, "variants": rows})
+            arguments.json.write_text(text + "\n", encoding="utf-8")
 
 
 def _as_json(figures: dict) -> dict:
