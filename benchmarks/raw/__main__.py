@@ -96,7 +96,9 @@ def main(argv: list[str] | None = None) -> None:
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     if arguments.json is not None:
         reserve(PROGRAM, "json", arguments.json)
-    looks = simulate(jax.random.key(arguments.first_seed), arguments.scans)
+    # The trainings consume the keys of the seeds.
+    simulate_key = jax.random.fold_in(jax.random.key(arguments.first_seed), 1)
+    looks = simulate(simulate_key, arguments.scans)
     keys = jnp.stack([jax.random.key(seed) for seed in arguments.range])
     tables = chosen(arguments)
     whole = {"commit": commit(), "versions": versions(), "seeds": [*arguments.range]}

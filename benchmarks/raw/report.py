@@ -33,7 +33,7 @@ from jaxsense.summary.compare import bounds, interval
 
 PROGRAM = "benchmarks.raw.report"
 _COLOURS = {"paper": "C3", "paper, standardised": "C1", "ours, sum of squares": "C2"}
-_CHANCE = 1 / 3
+_KNOWN = 1 / 3, 2 / 3  # accuracies of chance, and of one who knows the colour or the shape alone
 _ALL_LOOKS, _SINGLE_LOOKS, _DECODERS = range(3)  # networks whose gradients are measured
 
 Figures = dict[str, Any]
@@ -137,7 +137,7 @@ def of_depth(found: Found) -> str:
     """
     heads = ["", "depth", "right, one look by each", "units", "gradient, encoder: first steps",
              "all steps", "decoders: first steps", "all steps", "weights, least layer",
-             "dead units, worst layer"]  # fmt: skip
+             "dead units, worst layer: at the start", "at the end"]  # fmt: skip
 
     def row(name: str, depth: int) -> list[str]:
         of = found["depth", f"{name}, depth {depth}"]
@@ -145,7 +145,8 @@ def of_depth(found: Found) -> str:
         for network in (_ALL_LOOKS, _DECODERS):
             cells.append(_spread(np.array(of["gradient_at_start"])[:, network], 2))
             cells.append(_spread(_gradient(of, network), 2))
-        return [*cells, _spread(of["least_weights"], 2), _spread(of["dead_in_layer"], 2)]
+        others = ("least_weights", "dead_at_start", "dead")
+        return [*cells, *(_spread(of[figure], 2) for figure in others)]
 
     return _table(heads, [row(name, depth) for name in OF_DEPTH for depth in DEPTHS])
 
@@ -192,7 +193,8 @@ def draw(found: Found) -> Figure:
         each = [found["ratio", f"{name}, {c}:{w}"]["pair"] for c, w in RATIOS]
         _line(axes["ratio"], places, each, name)
     axes["ratio"].set_xticks(places, [f"{c}:{w}" for c, w in RATIOS])
-    axes["ratio"].axhline(_CHANCE, color="0.6", linestyle=":")
+    for accuracy in _KNOWN:
+        axes["ratio"].axhline(accuracy, color="0.6", linestyle=":")
     axes["ratio"].set(
         xlabel="numbers of the camera's window : of the LiDAR's",
         ylabel="right after one look by each sensor",
@@ -229,7 +231,8 @@ def _draw_ablation(axis: Axes, found: Found) -> None:
         axis.plot(values, np.full(len(values), place), ".", color=colour, alpha=0.3)
         axis.plot([low, high], [place, place], color=colour, linewidth=2.5)
         axis.plot(values.mean(), place, "o", color=colour, markersize=9 if is_named else 6)
-    axis.axvline(_CHANCE, color="0.6", linestyle=":")
+    for accuracy in _KNOWN:
+        axis.axvline(accuracy, color="0.6", linestyle=":")
     axis.set_yticks(range(len(ABLATION)), [variant.name for variant in ABLATION])
     axis.invert_yaxis()
     axis.set(xlabel="right after one look by each sensor", xlim=(0.25, 1.02))

@@ -9,7 +9,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from benchmarks.raw.looks import TOGETHER, Looks, Seen, View, regrouped
-from benchmarks.raw.model import Columns, Model, hidden
+from benchmarks.raw.model import Model, hidden
 from benchmarks.raw.variants import Variant
 from jaxsense import Key, pytree
 from jaxsense.core.networks import Params
@@ -138,11 +138,10 @@ def explained(z: Float[Array, "P D"], given: Float[Array, "P C"]) -> Float[Array
     return 1 - jnp.sum(rest**2) / jnp.maximum(jnp.sum(z**2), 1e-12)
 
 
-def measured(key: Key, model: Model, params: Params, data: Data) -> dict:
+def measured(model: Model, params: Params, data: Data) -> dict:
     """What a trained variant knows of held-out PoIs.
 
     Args:
-      key: random key.
       model: the networks.
       params: of the networks.
       data: see `Data`.
@@ -151,9 +150,8 @@ def measured(key: Key, model: Model, params: Params, data: Data) -> dict:
       `right` and `pair`, the shares of PoIs whose joint posterior of K looks, or of one look, by
       each sensor is nearest to the mean of their class; `of_classes`, the same of a pair for each
       class; `units`, active units; `by_class` and `by_view`, the shares of the variance of the
-      posterior means of pairs that the class explains, and that distances and light do; `dead`, the
-      share of hidden units of the decoders and the joint encoder that no look switches on, and
-      `dead_in_layer`, that of the worst layer; `posteriors`, of some PoIs.
+      posterior means of pairs that the class explains, and that distances and light do;
+      `posteriors`, of some PoIs.
     """
     number, (of_train, truth) = model.variant.looks, data.classes
     groups = tuple(x[:_FOR_MEANS] for x in regrouped(data.train, number))
@@ -169,7 +167,6 @@ def measured(key: Key, model: Model, params: Params, data: Data) -> dict:
     pair = _means(model, params, _pairs(data.held_out))
     of_class, around = jax.nn.one_hot(truth, 3), data.circumstances[:, 0]
     of_pair = is_right(pair)
-    dead = _dead(key, model, params, tuple(x[:, :number] for x in data.held_out))
     return {
         "right": jnp.mean(is_right(whole)),
         "pair": jnp.mean(of_pair),
@@ -177,8 +174,6 @@ def measured(key: Key, model: Model, params: Params, data: Data) -> dict:
         "units": latent.active_units(whole),
         "by_class": explained(pair, of_class[:, 1:]),
         "by_view": explained(pair, jnp.concatenate([around, around**2], axis=1)),
-        "dead": jnp.mean(jnp.concatenate(dead)),
-        "dead_in_layer": jnp.max(jnp.stack([jnp.mean(x) for x in dead])),
         "posteriors": _posteriors(model, params, data),
     }
 
@@ -187,21 +182,29 @@ def _means(model: Model, params: Params, seen: Seen) -> Float[Array, "P D"]:
     return model.posterior(params, model.columns(seen))[0].T
 
 
-def _dead(key: Key, model: Model, params: Params, seen: Seen) -> list[jax.Array]:
-    """Which units of each layer are 0 for all looks, for the joint encoder and the decoders."""
-    looks: Columns = model.columns(seen)
+def dead(key: Key, model: Model, params: Params, data: Data) -> Float[Array, " L"]:
+    """Share of the units of each hidden layer that are 0 for all held-out looks.
+
+    Args:
+      key: random key.
+      model: the networks.
+      params: of the networks.
+      data: see `Data`.
+
+    Returns:
+      `[L]` for the layers of the joint encoder that read looks, and of the decoders.
+    """
+    looks = model.columns(tuple(x[:, : model.variant.looks] for x in data.held_out))
     flat = [x.reshape(len(x), -1) for x in looks]
-    layers = [
-        layer for p, x in zip(params["embedding"], flat, strict=True) for layer in hidden(p, x)
-    ]
+    layers = [y for p, x in zip(params["embedding"], flat, strict=True) for y in hidden(p, x)]
     keys = jax.random.split(key, len(flat))
     for k, p, (mean, log_variance) in zip(
         keys, params["decoders"], model.sources(params, looks), strict=True
     ):
-        z = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(k, mean.shape)
-        private = jax.random.normal(k, (model.variant.private, *z.shape[1:]))
-        layers += hidden(p, jnp.concatenate([z, private]).reshape(-1, z[0].size))
-    return [jnp.all(layer <= 0, axis=1).astype(jnp.float32) for layer in layers]
+        noise = jax.random.normal(k, (len(mean) + model.variant.private, *mean.shape[1:]))
+        z = mean + jnp.exp(0.5 * log_variance) * noise[: len(mean)]
+        layers += hidden(p, jnp.concatenate([z, noise[len(mean) :]]).reshape(len(noise), -1))
+    return jnp.stack([jnp.mean(jnp.all(y <= 0, axis=1).astype(jnp.float32)) for y in layers])
 
 
 def _posteriors(model: Model, params: Params, data: Data) -> dict[str, jax.Array]:
@@ -239,11 +242,12 @@ def of_seed(key: Key, model: Model, data: Data) -> dict:
       data: see `Data`.
 
     Returns:
-      Those of `measured`; `least_weights`, see `of_layers`; `gradient_at_start`, `[3]` medians over
-      the first hundredth of the training of the gradient's norm in the first layer over that in
-      the last, of the encoder of all looks, those of single looks and the decoders;
-      `gradient`, `[10, 3]`, the same over each tenth; and `units_during`, `[10]` active units
-      after each tenth.
+      Those of `measured`; `least_weights`, see `of_layers`; `dead_at_start` and `dead`, the share
+      of dead units in the worst layer before and after the training, see `dead`;
+      `gradient_at_start`, `[3]` medians over the first hundredth of the training of the gradient's
+      norm in the first layer over that in the last, of the encoder of all looks, those of single
+      looks and the decoders; `gradient`, `[10, 3]`, the same over each tenth; and `units_during`,
+      `[10]` active units after each tenth.
     """
     train_key, noise_key = jax.random.split(key)
     pairs = _pairs(data.held_out)
@@ -253,7 +257,10 @@ def of_seed(key: Key, model: Model, data: Data) -> dict:
     )
     ratio = norms[..., 0] / (norms[..., 1] + 1e-12)
     begun = max(int(_FIRST * len(ratio)), 1)
-    return measured(noise_key, model, last, data) | {
+    worst = lambda params: jnp.max(dead(noise_key, model, params, data))  # noqa: E731
+    return measured(model, last, data) | {
+        "dead_at_start": worst(first),
+        "dead": worst(last),
         "least_weights": of_layers(first, last),
         "gradient_at_start": jnp.median(ratio[:begun], axis=0),
         "gradient": jnp.median(ratio.reshape(PARTS, -1, ratio.shape[1]), axis=1),

@@ -187,6 +187,20 @@ def test_hidden_layers_are_those_of_the_network():
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
+def test_dead_units_are_those_that_nothing_switches_on():
+    looks = of_easy()
+    data = training.split(looks, in_frames)
+    model = Model(OURS, (3, 3))
+    params = model.init(KEY)
+    before = training.dead(KEY, model, params, data)
+    assert len(before) == 6  # one layer for each sensor, and two in each decoder
+    layers = params["decoders"][1]["params"]
+    layers["Dense_1"] = {**layers["Dense_1"], "bias": jnp.where(jnp.arange(128) < 64, -1e3, 1e3)}
+    after = training.dead(KEY, model, params, data)
+    assert after[-1] == 0.5
+    np.testing.assert_array_equal(after[:-1], before[:-1])
+
+
 def test_least_weights_are_of_the_layer_that_shrinks_most():
     first = Model(OURS, SIZES).init(KEY)
     last = jax.tree.map(lambda x: 2 * x, first)
@@ -208,7 +222,7 @@ def test_views_and_groups():
 def figures(pair):
     """Figures of two seeds, as the program writes them."""
     posterior = np.ones((3, 4, 2, 2)).tolist()
-    names = ("by_class", "by_view", "dead", "dead_in_layer", "least_weights")
+    names = ("by_class", "by_view", "dead", "dead_at_start", "least_weights")
     lists = {name: [0.25, 0.75] for name in names} | {"right": pair, "pair": pair}
     return lists | {
         "units": [1, 2],
@@ -231,7 +245,9 @@ def test_the_report_reads_files_of_several_programs(tmp_path, capsys):
     # t of 1 degree of freedom, 12.706, times the standard error, 0.05
     assert "| paper | 0.450 ± 0.635 (0.400 to 0.500) |  | 1.5 (1.0 to 2.0) | 0.50 (0.25" in printed
     assert "| 16:1 | 0.450 ± 0.635 (0.400 to 0.500) |" in printed
-    assert "| ours | 8 | 0.450 ± 0.635 (0.400 to 0.500) | 1.5 (1.0 to 2.0) | 1.00" in printed
+    gradients = " | ".join(f"{x}.00 ({x}.00 to {x}.00)" for x in (1, 1, 3, 3))
+    accuracy = "0.450 ± 0.635 (0.400 to 0.500) | 1.5 (1.0 to 2.0)"
+    assert f"| ours | 8 | {accuracy} | {gradients} | 0.50 (0.25 to 0.75) |" in printed
     assert "| 101 | 0.500 | 1.00, 0.50, 0.25 | 2 | 0.75 |" in printed
     assert all(path.stat().st_size > 1000 for path in pictures)
 
