@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsense.config import Config
+from jaxsense.core import networks
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, pytree
@@ -150,9 +151,7 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
     def untrained(
         key: Key, config: Config, *, examples: tuple[Examples, ...], **_: object
     ) -> tuple[Gate, Params]:
-        windows = examples[modality].windows
-        offset = jnp.mean(windows, axis=0)
-        scale = jnp.std(windows - offset[None]) + 1e-6
+        offset, scale = networks.statistics(examples[modality].windows)
         is_range = sensors.make(config)[modality].measures_distance
         gate = gates.init(key, offset, scale, is_range)
         return gate, gate.params
