@@ -5,6 +5,8 @@ posteriors are the classes. The labels of the training scenes only name them: ea
 cluster that holds most of its PoIs.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -24,7 +26,6 @@ from jaxsense.training.stage import Stage
 from jaxsense.vae import clusters, frames, leave_one_out
 from jaxsense.vae import gate as gates
 from jaxsense.vae.frames import Scaling
-from jaxsense.vae.gate import Gate
 from jaxsense.vae.leave_one_out import Encoder, Groups
 
 _POSTERIORS_AT_ONCE = 4096
@@ -149,33 +150,21 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
     """The stage that makes a detector of the encoder of one modality, and trains its gate."""
 
     def untrained(
-        key: Key, config: Config, *, examples: tuple[Examples, ...], **_: object
-    ) -> tuple[Gate, Params]:
-        offset, scale = networks.statistics(examples[modality].windows)
-        is_range = sensors.make(config)[modality].measures_distance
-        gate = gates.init(key, offset, scale, is_range)
-        return gate, gate.params
-
-    def problem(
-        config: Config, gate: Gate, *, examples: tuple[Examples, ...], **_: object
-    ) -> gates.Fitting:
-        return gating.of_gate(config.detector, gate, examples[modality])
-
-    def trained(
+        key: Key,
         config: Config,
-        gate: Gate,
-        fit: FitState,
         *,
         examples: tuple[Examples, ...],
         params: Params,
         views: Views,
         classes: Belief,
-    ) -> Encoder:
+    ) -> tuple[Encoder, Params]:
         sensor, given = config.modalities[modality], examples[modality]
+        offset, scale = networks.statistics(given.windows)
+        is_range = sensors.make(config)[modality].measures_distance
         encoder = Encoder(
             params=params["encoders"][sensor],
             scaling=views.scalings[modality],
-            gate=gates.fitted(fit.params, gating.checks_of(config.detector, gate, given)),
+            gate=gates.init(key, offset, scale, is_range),
             classes=classes,
             readout=make_readout(config, classes),
             prior=make_prior(config),
@@ -185,8 +174,25 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
         )
         some = tuple(x[:_CALIBRATING] for x in views.groups)
         shown = clusters.nearest(_posteriors(params, config, some).mean, classes.mean)
-        looks = grouped(given.windows.reshape(-1, config.arena.num_pois, len(gate.offset)), config)
-        return leave_one_out.calibrate(encoder, looks[:_CALIBRATING, 0], shown)
+        looks = grouped(given.windows.reshape(-1, config.arena.num_pois, len(offset)), config)
+        found = leave_one_out.calibrate(encoder, looks[:_CALIBRATING, 0], shown)
+        return found, found.gate.params
+
+    def problem(
+        config: Config, encoder: Encoder, *, examples: tuple[Examples, ...], **_: object
+    ) -> gates.Fitting:
+        return gating.of_gate(config.detector, encoder.gate, examples[modality])
+
+    def trained(
+        config: Config,
+        encoder: Encoder,
+        fit: FitState,
+        *,
+        examples: tuple[Examples, ...],
+        **_: object,
+    ) -> Encoder:
+        checks = gating.checks_of(config.detector, encoder.gate, examples[modality])
+        return dataclasses.replace(encoder, gate=gates.fitted(fit.params, checks))
 
     return fit_stage(
         name,

@@ -12,6 +12,7 @@ from jaxsense.config import ConfigError, DetectorConfig, FilterConfig, JmvaeConf
 from jaxsense.sim import world as worlds
 from jaxsense.training import perception, scans
 from jaxsense.training.stage import Stage
+from jaxsense.vae import leave_one_out
 
 SMOKE = PRESETS["smoke"]
 TINY = dataclasses.replace(
@@ -139,3 +140,15 @@ def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypat
 def test_a_jmvae_of_scans_needs_a_filter():
     with pytest.raises(ConfigError, match=r"jmvae.fusion = 'in_place'.*must be filter"):
         JmvaeConfig(learns_from="scans")
+
+
+def test_encoders_are_calibrated_once(learned, monkeypatch):
+    """Before the gate is trained: a run finishes a stage after every chunk, to check it."""
+    stage = stages_of(TINY)["detector_lidar"]
+    inputs = stage.select(learned.outputs)
+    state = stage.begin(stage.key(KEY), TINY, **inputs)
+    monkeypatch.setattr(leave_one_out, "calibrate", None)
+    monkeypatch.setattr(scans, "_posteriors", None)
+    found = stage.finish(TINY, state, **inputs)
+    assert found.sharpness == learned.outputs["detector_lidar"].sharpness
+    assert np.isfinite(found.gate.threshold)
