@@ -19,8 +19,8 @@ class DetectorConfig(Section, place="detector"):
     num_scans: int = limited(98304, at_least=1)
     """Simulated scans to train on, per modality."""
     calibration: float = limited(0.0, at_least=0, at_most=0.5)
-    """Share of these scans that calibrates the detector instead: their likelihood sets the
-    temperature of its probabilities. Not used if the JMVAE learns from scans."""
+    """Share of these scans that calibrates the detector instead, or the encoder if the JMVAE learns
+    from scans: their likelihood sets the temperature of its probabilities."""
     num_held_out: int = limited(8192, at_least=1)
     """Simulated scans that measure the accuracy."""
     num_repeats: int = limited(0, at_least=0, at_most=1_000_000)
@@ -34,7 +34,7 @@ class DetectorConfig(Section, place="detector"):
     """Initial learning rate of Adam; decays to zero along a cosine."""
 
     def num_training(self, number: int) -> int:
-        """How many of a number of scans are left to train on."""
+        """How many of a number of scans are left to train on, or of groups of them."""
         return number - math.ceil(self.calibration * number)
 
     def arrays(self, sizes: Sizes) -> dict[str, int]:

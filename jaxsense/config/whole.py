@@ -108,9 +108,12 @@ class Config(Section):
             f"must be at least {least}, so that beliefs can hold {len(self.arena.classes)} classes"
         )
         require(self.jmvae.latent_size >= least, self.jmvae, "latent_size", expected)
-        # Scans come in whole scenes.
-        scans = -(-self.detector.num_scans // self.arena.num_pois) * self.arena.num_pois
-        leaves_some = self.detector.num_training(scans) > 0
+        # Scans come in whole scenes, and these in groups that show the same PoIs.
+        in_group = self.arena.num_pois * self.jmvae.num_together
+        groups = -(-self.detector.num_scans // in_group)
+        scans = groups * in_group
+        parts = groups if self.jmvae.reads_scans else scans
+        leaves_some = self.detector.num_training(parts) > 0
         expected = f"leaves none of {scans} scans to train on; lower it"
         require(leaves_some, self.detector, "calibration", expected)
         adds_up = self.jmvae.fusion == "filter" or not self.mission.communication.own_maps

@@ -198,7 +198,7 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
         key: Key, config: Config, *, examples: tuple[Examples, ...]
     ) -> tuple[Classifier, tuple[Params, Params]]:
         num_labels = len(config.labels(config.modalities[modality]))
-        windows = examples[modality].windows[: _num_training(config, examples[modality])]
+        windows = _for_training(config, examples[modality]).windows
         is_range = sensors.make(config)[modality].measures_distance
         detector = detectors.init(key, windows, num_labels, config.detector, is_range)
         return detector, (detector.params, detector.gate.params)
@@ -241,13 +241,7 @@ def _num_training(config: Config, examples: Examples) -> int:
 
 def _for_training(config: Config, examples: Examples) -> Examples:
     """The examples without those that calibrate the detector."""
-    number = _num_training(config, examples)
-    return dataclasses.replace(
-        examples,
-        windows=examples.windows[:number],
-        labels=examples.labels[:number],
-        distances=examples.distances[:number],
-    )
+    return gating.first(examples, _num_training(config, examples))
 
 
 def detect(

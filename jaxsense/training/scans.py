@@ -2,14 +2,14 @@
 
 Looks are grouped by the PoI that they show; no label enters the training. Clusters of the joint
 posteriors are the classes. The labels of the training scenes only name them: each class is the
-cluster that holds most of its PoIs.
+cluster that holds most of its PoIs. From then on, what all looks at a PoI show is its class.
 """
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsense.config import Config
 from jaxsense.core import networks
@@ -30,7 +30,19 @@ from jaxsense.vae.leave_one_out import Encoder, Groups
 
 _POSTERIORS_AT_ONCE = 4096
 _CLUSTERED = 8192  # PoIs
-_CALIBRATING = 8192  # PoIs
+
+
+@pytree
+class Shown:
+    """Classes that all looks at a PoI show together, of scenes that the JMVAE did not learn from.
+
+    Attributes:
+      calibrating: `[S, N]` int32 of the training scenes that calibrate the encoders.
+      bank: `[S', N]` int32 of the scenes of the bank.
+    """
+
+    calibrating: Int[Array, "S N"]
+    bank: Int[Array, "S' N"]
 
 
 @pytree
@@ -38,7 +50,7 @@ class Views:
     """What a JMVAE learns from.
 
     Attributes:
-      groups: looks at the PoIs of the training scenes, each sensor's in its frame.
+      groups: looks at the PoIs of training scenes, each sensor's in its frame.
       scalings: by modality, how it comes to this frame.
     """
 
@@ -53,13 +65,15 @@ def make_stages(config: Config) -> list[Stage]:
     restarts = _jmvae_stages(config)
     best = {"restarts": tuple(stage.name for stage in restarts)}
     clustered = {**learned, "surveys": "survey", "classes": "class_beliefs"}
+    detected = {"surveys": "survey", "trained": detectors, "shown": "shown"}
     return [
         Stage("views", views, {"surveys": "survey"}),
         *restarts,
         Stage("best_jmvae", _best, best),
         Stage("class_beliefs", class_beliefs, {**learned, "surveys": "survey"}),
+        Stage("shown", shown, clustered),
         *(_encoder_stage(m, name, config) for m, name in enumerate(detectors)),
-        Stage("detections", detect, {**clustered, "trained": detectors}),
+        Stage("detections", detect, detected),
         Stage("grouped", accuracies, clustered),
     ]
 
@@ -73,7 +87,7 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
       surveys: of all scenes.
     """
     del key
-    number = perception.num_scenes(config)[0]
+    number = _num_training(config)
     found, scalings = [], []
     for sensor, windows in zip(sensors.make(config), surveys.windows, strict=True):
         groups = grouped(windows[:number], config)
@@ -82,6 +96,12 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
         found.append(seen.reshape(*groups.shape[:2], -1))
         scalings.append(scaling)
     return Views(tuple(found), tuple(scalings))
+
+
+def _num_training(config: Config) -> int:
+    """Training scenes to learn from, in whole groups; the others calibrate the encoders."""
+    together = config.jmvae.num_together
+    return together * config.detector.num_training(perception.num_scenes(config)[0] // together)
 
 
 def grouped(windows: Float[Array, "S N F"], config: Config) -> Float[Array, "P K F"]:
@@ -135,7 +155,7 @@ def class_beliefs(
       views: what it has learned from.
       surveys: of all scenes, for the labels.
     """
-    number, num_classes = perception.num_scenes(config)[0], len(config.arena.classes)
+    number, num_classes = _num_training(config), len(config.arena.classes)
     found = _posteriors(params, config, views.groups)
     truth = surveys.classes[: number : config.jmvae.num_together].reshape(-1)
     centres = clusters.centres(key, found.mean[:_CLUSTERED], num_classes)
@@ -149,6 +169,9 @@ def class_beliefs(
 def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
     """The stage that makes a detector of the encoder of one modality, and trains its gate."""
 
+    def num_looks(config: Config) -> int:
+        return _num_training(config) * config.arena.num_pois
+
     def untrained(
         key: Key,
         config: Config,
@@ -157,8 +180,10 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
         params: Params,
         views: Views,
         classes: Belief,
+        shown: Shown,
     ) -> tuple[Encoder, Params]:
-        sensor, given = config.modalities[modality], examples[modality]
+        sensor, number = config.modalities[modality], num_looks(config)
+        given = gating.first(examples[modality], number)
         offset, scale = networks.statistics(given.windows)
         is_range = sensors.make(config)[modality].measures_distance
         encoder = Encoder(
@@ -172,16 +197,16 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
             shape=make_shape(config),
             label_of_class=config.label_of_class(sensor),
         )
-        some = tuple(x[:_CALIBRATING] for x in views.groups)
-        shown = clusters.nearest(_posteriors(params, config, some).mean, classes.mean)
-        looks = grouped(given.windows.reshape(-1, config.arena.num_pois, len(offset)), config)
-        found = leave_one_out.calibrate(encoder, looks[:_CALIBRATING, 0], shown)
-        return found, found.gate.params
+        others, taken_for = examples[modality].windows[number:], shown.calibrating.reshape(-1)
+        if len(others):
+            encoder = leave_one_out.calibrate(encoder, others, taken_for)
+        return encoder, encoder.gate.params
 
     def problem(
         config: Config, encoder: Encoder, *, examples: tuple[Examples, ...], **_: object
     ) -> gates.Fitting:
-        return gating.of_gate(config.detector, encoder.gate, examples[modality])
+        given = gating.first(examples[modality], num_looks(config))
+        return gating.of_gate(config.detector, encoder.gate, given)
 
     def trained(
         config: Config,
@@ -201,6 +226,7 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
             "params": "best_jmvae",
             "views": "views",
             "classes": "class_beliefs",
+            "shown": "shown",
         },
         config,
         settings=lambda config: config.detector,
@@ -210,15 +236,35 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
     )
 
 
+def shown(
+    key: Key, config: Config, *, surveys: Surveys, params: Params, views: Views, classes: Belief
+) -> Shown:
+    """What all looks at PoIs show together, which takes the place of labels.
+
+    Args:
+      key: not used.
+      config: all settings.
+      surveys: of all scenes.
+      params: of the JMVAE.
+      views: for the frames of the sensors.
+      classes: `[C, D]` mean joint posterior of each class.
+    """
+    del key
+    num_train, num_bank, _, _ = perception.num_scenes(config)
+
+    def of_scenes(part: slice) -> jax.Array:
+        if part.start == part.stop:
+            return jnp.zeros((0, config.arena.num_pois), jnp.int32)
+        of_groups = _shown(config, params, views, classes, surveys, part)
+        of_groups = of_groups.reshape(-1, config.arena.num_pois)
+        return jnp.repeat(of_groups, config.jmvae.num_together, axis=0)
+
+    calibrating = slice(_num_training(config), num_train)
+    return Shown(of_scenes(calibrating), of_scenes(slice(num_train, num_train + num_bank)))
+
+
 def detect(
-    key: Key,
-    config: Config,
-    *,
-    surveys: Surveys,
-    trained: tuple[Encoder, ...],
-    params: Params,
-    views: Views,
-    classes: Belief,
+    key: Key, config: Config, *, surveys: Surveys, trained: tuple[Encoder, ...], shown: Shown
 ) -> Detections:
     """Applies the encoders to the surveys that nothing was trained on.
 
@@ -230,16 +276,9 @@ def detect(
       config: all settings.
       surveys: of all scenes.
       trained: one encoder for each modality.
-      params: of the JMVAE.
-      views: for the frames of the sensors.
-      classes: `[C, D]` mean joint posterior of each class.
+      shown: what all looks at the PoIs show.
     """
-    num_train, num_bank, _, _ = perception.num_scenes(config)
-    part = slice(num_train, num_train + num_bank)
-    shown = _shown(config, params, views, classes, surveys, part)
-    num_pois, looks = surveys.classes.shape[1], config.jmvae.num_together
-    of_scenes = jnp.repeat(shown.reshape(-1, num_pois), looks, axis=0)
-    return perception.detect(key, config, surveys=surveys, trained=trained, taken_for=of_scenes)
+    return perception.detect(key, config, surveys=surveys, trained=trained, taken_for=shown.bank)
 
 
 def _shown(
