@@ -16,7 +16,7 @@ from jaxsense.sim import sensors
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene, make_world
-from jaxsense.training import gating, histories
+from jaxsense.training import gating, histories, repeats
 from jaxsense.training.fits import fit_stage, jmvae_restarts
 from jaxsense.training.gating import Examples
 from jaxsense.training.stage import Stage
@@ -285,11 +285,12 @@ def detect(
     )
 
 
-def make_stages(config: Config) -> list[Stage]:
-    """Makes the stages from surveys to detections and class beliefs, with detectors.
+def make_stages(config: Config, arena: Arena) -> list[Stage]:
+    """Makes the stages from surveys to detections, class beliefs and novelty, with detectors.
 
     Args:
       config: all settings.
+      arena: of the simulation.
     """
     names = tuple(f"detector_{name}" for name in config.modalities)
     given = {"params": "best_jmvae", "detections": "detections"}
@@ -298,6 +299,7 @@ def make_stages(config: Config) -> list[Stage]:
         Stage("detections", detect, {"surveys": "survey", "trained": names}),
         *jmvae_stages(config),
         Stage("class_beliefs", class_beliefs, given),
+        repeats.novelty_stage(arena, config),
     ]
 
 

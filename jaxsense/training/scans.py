@@ -18,10 +18,12 @@ from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.models import make_frame, make_prior, make_readout, make_shape
 from jaxsense.sim import sensors
-from jaxsense.training import gating, perception
+from jaxsense.sim.arena import Arena
+from jaxsense.training import gating, perception, repeats
 from jaxsense.training.fits import fit_stage, jmvae_restarts
 from jaxsense.training.gating import Examples
-from jaxsense.training.perception import Detections, Surveys
+from jaxsense.training.perception import Detections, Scenes, Surveys
+from jaxsense.training.repeats import Repeated
 from jaxsense.training.stage import Stage
 from jaxsense.vae import clusters, frames, leave_one_out
 from jaxsense.vae import gate as gates
@@ -58,8 +60,8 @@ class Views:
     scalings: tuple[Scaling, ...]
 
 
-def make_stages(config: Config) -> list[Stage]:
-    """Makes the stages from surveys to detections; see `perception.make_stages`."""
+def make_stages(config: Config, arena: Arena) -> list[Stage]:
+    """Makes the stages from surveys to detections and novelty; see `perception.make_stages`."""
     detectors = tuple(f"detector_{name}" for name in config.modalities)
     learned = {"params": "best_jmvae", "views": "views"}
     restarts = _jmvae_stages(config)
@@ -75,6 +77,7 @@ def make_stages(config: Config) -> list[Stage]:
         *(_encoder_stage(m, name, config) for m, name in enumerate(detectors)),
         Stage("detections", detect, detected),
         Stage("grouped", accuracies, clustered),
+        repeats.novelty_stage(arena, config, repeated, {"scenes": "scenes", "shown": "shown"}),
     ]
 
 
@@ -279,6 +282,25 @@ def detect(
       shown: what all looks at the PoIs show.
     """
     return perception.detect(key, config, surveys=surveys, trained=trained, taken_for=shown.bank)
+
+
+def repeated(key: Key, config: Config, *, scenes: Scenes, shown: Shown) -> Repeated:
+    """Scenes with PoIs of the bank, in another light, of which it is known what all looks show.
+
+    Args:
+      key: not used.
+      config: all settings.
+      scenes: see `perception.draw_scenes`.
+      shown: what all looks at the PoIs show.
+    """
+    del key
+    _, classes, _, places = scenes
+    assert places is not None
+    number, together = config.detector.num_repeats, config.jmvae.num_together
+    # One scene of each group; from the first again if there are fewer.
+    rows = jnp.arange(number) * together % len(shown.bank)
+    of_bank = perception.num_scenes(config)[0] + rows
+    return Repeated(classes[of_bank], places[of_bank], shown.bank[rows, 0])
 
 
 def _shown(

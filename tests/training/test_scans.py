@@ -15,7 +15,7 @@ from jaxsense.sim import world as worlds
 from jaxsense.training import perception, scans
 from jaxsense.training.scans import Shown
 from jaxsense.training.stage import Stage
-from jaxsense.vae import leave_one_out
+from jaxsense.vae import detectors, leave_one_out, novelty
 
 SMOKE = PRESETS["smoke"]
 TINY = dataclasses.replace(
@@ -204,6 +204,49 @@ def test_calibration_leaves_a_group_to_learn_from():
     with pytest.raises(ConfigError, match=r"calibration = 0.5: leaves none of 9 scans"):
         dataclasses.replace(TINY, detector=few)
     dataclasses.replace(TINY, detector=dataclasses.replace(few, num_scans=10))
+
+
+REPEATING = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, num_repeats=30))
+
+
+def test_repeated_looks_are_at_pois_of_the_bank_and_show_what_all_looks_show(learned):
+    scenes, num_train = learned.outputs["scenes"], perception.num_scenes(TINY)[0]
+    _, classes, _, places = scenes
+    num_bank = perception.num_scenes(TINY)[1]
+    bank = (classes[num_train : num_train + num_bank] + 1) % 3  # nowhere the true class
+    found = scans.repeated(KEY, REPEATING, scenes=scenes, shown=Shown(bank[:0], bank))
+    assert found.classes.shape == (30, 3)
+    np.testing.assert_array_equal(found.taken_for, (found.classes[:, 0] + 1) % 3)
+    groups = num_bank // 3
+    assert groups < 30
+    # The i-th scene shows the PoIs of the i-th group of three scenes, then the first again.
+    of_scenes = jax.random.key_data(places)[num_train : num_train + num_bank]
+    expected = np.asarray(of_scenes)[np.arange(30) % groups * 3]
+    np.testing.assert_array_equal(jax.random.key_data(found.places), expected)
+
+
+def test_novelty_learns_from_what_all_looks_show(learned, monkeypatch):
+    given = {}
+
+    def repeat(keys, world, classes, modality, number, places):
+        given[modality] = classes, places
+        return jnp.zeros((30, number, 2)), jnp.zeros((30, number, 2))
+
+    def fit(found, positions, classes):
+        given["fit"] = classes
+        return jnp.float32(0), jnp.float32(1)
+
+    monkeypatch.setattr(looks, "repeats", repeat)
+    monkeypatch.setattr(detectors, "detect", lambda detector, window: jnp.ones(2) / 2)
+    monkeypatch.setattr(novelty, "fit", fit)
+    stage, outputs = stages_of(REPEATING)["novelty"], learned.outputs
+    shown = dataclasses.replace(outputs["shown"], bank=jnp.full_like(outputs["shown"].bank, 2))
+    stage.begin(KEY, REPEATING, **stage.select({**outputs, "shown": shown}))
+    expected = scans.repeated(KEY, REPEATING, scenes=outputs["scenes"], shown=shown)
+    np.testing.assert_array_equal(given["fit"], np.full(30, 2))
+    for m in range(2):
+        np.testing.assert_array_equal(given[m][0], expected.classes)
+        assert (given[m][1] == expected.places).all()
 
 
 def test_encoders_are_calibrated_once(learned, monkeypatch):
