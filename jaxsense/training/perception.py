@@ -84,7 +84,8 @@ def num_scenes(config: Config) -> tuple[int, int, int, int]:
     num_held_out = -(-_held_out_per_class(config) * num_classes // num_pois)
     num_train = -(-config.detector.num_scans // num_pois)
     num_empty = -(-num_train // _SHARE_OF_EMPTY)
-    parts = num_train, max(num_bank, _num_starts(config)), num_held_out
+    num_for_starts = _num_starts(config) * config.jmvae.num_together
+    parts = num_train, max(num_bank, num_for_starts), num_held_out
     num_train, num_bank, num_held_out = (_whole(number, config) for number in parts)
     return num_train, num_bank, num_held_out, num_empty
 
@@ -277,10 +278,13 @@ def detect(
     of_bank = others.classes[for_bank] if taken_for is None else taken_for
     of_measuring = others.classes[for_measuring]
     starts = Starts(others.classes, others.scenes, features)
+    # One scene of each group: no two starts show the same PoIs.
+    together = config.jmvae.num_together
+    rows = slice(0, _num_starts(config) * together, together)
     return Detections(
         bank=by_class(features, for_bank, of_bank, config.jmvae.samples_per_class),
         held_out=by_class(features, for_measuring, of_measuring, _held_out_per_class(config)),
-        starts=jax.tree.map(lambda x: x[: _num_starts(config)], starts),
+        starts=jax.tree.map(lambda x: x[rows], starts),
         windows=by_class(others.windows, for_measuring, of_measuring, 1),
     )
 

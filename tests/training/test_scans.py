@@ -1,6 +1,7 @@
 """A JMVAE that learns from scans: groups of looks, and labels that only name what it has found."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -204,6 +205,23 @@ def test_calibration_leaves_a_group_to_learn_from():
     with pytest.raises(ConfigError, match=r"calibration = 0.5: leaves none of 9 scans"):
         dataclasses.replace(TINY, detector=few)
     dataclasses.replace(TINY, detector=dataclasses.replace(few, num_scans=10))
+
+
+def test_no_two_starts_of_live_episodes_show_the_same_pois(monkeypatch):
+    dqn = dataclasses.replace(SMOKE.dqn, observe="live", num_starts=64)
+    config = dataclasses.replace(TINY, dqn=dqn)
+    num_train, num_bank, num_held_out, num_empty = perception.num_scenes(config)
+    total = num_train + num_bank + num_held_out + num_empty
+    group = jnp.arange(total) // 3
+    windows = tuple(jnp.zeros((total, 3, 1)) for _ in range(2))
+    surveyed: Any = perception.Surveys(
+        jnp.repeat(group[:, None], 3, axis=1) % 3, group, windows, jnp.ones((total, 2, 3))
+    )
+    monkeypatch.setattr(looks, "detect_all", lambda trained, windows: windows)
+    found = perception.detect(KEY, config, surveys=surveyed, trained=()).starts
+    np.testing.assert_array_equal(found.scenes, num_train // 3 + np.arange(64))
+    assert num_bank == 3 * 64  # none of those to measure on
+    np.testing.assert_array_equal(found.classes[:, 0], found.scenes % 3)
 
 
 REPEATING = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, num_repeats=30))
