@@ -7,6 +7,8 @@ from typing import Literal
 from jaxsense.config.checks import limited, require
 from jaxsense.config.section import Section, Sizes, Traced
 
+PROFILE = 64
+"""Numbers in a LiDAR's window as a network of scans sees it, see `vae.frames`."""
 _MAX_BLOCKS = 32
 _MAX_WEIGHT = 1_000_000
 
@@ -107,12 +109,24 @@ class JmvaeConfig(Section, place="jmvae"):
 
     def arrays(self, sizes: Sizes) -> dict[str, int]:
         """How many numbers each large array holds."""
-        latent = self.latent_size
-        encoder = _weights(sizes.labels, *self.hidden, 2 * latent)
+        of_learning = self._arrays_of_scans if self.reads_scans else self._arrays_of_detections
+        samples = self.samples_per_class * sizes.classes * sizes.window
+        return {"samples_per_class": samples, **of_learning(sizes)}
+
+    def _arrays_of_detections(self, sizes: Sizes) -> dict[str, int]:
+        encoder = _weights(sizes.labels, *self.hidden, 2 * self.latent_size)
         return {
             "hidden": 2**sizes.modalities * encoder,
-            "samples_per_class": self.samples_per_class * sizes.classes * sizes.window,
-            "batch steps": self.batch * self.steps * (latent + sizes.labels),
+            "batch steps": self.batch * self.steps * (self.latent_size + sizes.labels),
+        }
+
+    def _arrays_of_scans(self, sizes: Sizes) -> dict[str, int]:
+        encoder = _weights(sizes.window, *self.hidden, 2 * self.latent_size)
+        groups, noise = self.batch * self.looks, sizes.modalities * self.latent_size
+        return {
+            "hidden": 2 * sizes.modalities * encoder,
+            "batch steps looks": groups * self.steps * noise,
+            "batch looks": groups * max(sizes.window, *self.hidden),
         }
 
 
@@ -294,7 +308,7 @@ class DqnConfig(Section, place="dqn"):
         return {
             "hidden": _weights(sizes.state, *self.hidden, sizes.pois + 1),
             "replay_capacity": self.replay_capacity * (2 * sizes.state + 3),
-            "num_starts": self.num_starts * start,
+            "num_starts": self.num_starts * sizes.together * start,
             "num_envs chunk": self.num_envs * max(5 * self.chunk, start),
             "batch updates chunk": 2 * self.batch * max(self.chunk * self.updates, sizes.state),
         }

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from jaxsense.config.checks import ConfigError, limited, require
 from jaxsense.config.frozen import FrozenDict
 from jaxsense.config.learning import (
+    PROFILE,
     DetectorConfig,
     DqnConfig,
     EvaluationConfig,
@@ -186,13 +187,14 @@ class Config(Section):
     def _sizes(self) -> Sizes:
         """Sizes of arrays that follow from several sections."""
         num_pois, windows = self.arena.num_pois, {"camera": 3 * self.camera.window}
-        windows["lidar"] = self.lidar.window
+        windows["lidar"] = max(self.lidar.window, PROFILE if self.jmvae.reads_scans else 1)
         return Sizes(
             pois=num_pois,
             classes=len(self.arena.classes),
             modalities=len(self.modalities),
             labels=sum(len(self.labels(name)) for name in self.modalities),
             window=max(windows.get(name, 1) for name in self.modalities),
+            together=self.jmvae.num_together,
             state=self._task.most_pois(self) * self._task.features(self),
             views=num_pois * VIEW_SIDES * len(self.navigation.view_distances),
         )
