@@ -125,25 +125,27 @@ class Recorded:
         found = np.argmax(of_window(self.windows(looks)), axis=1)
         return float(np.mean(found == looks.labels))
 
-    def retrained(self, key: jax.Array, errors: recorded.Errors) -> tuple[float, float]:
-        """Shares of right shapes before and after a retraining, means of several.
+    def retrained(self, key: jax.Array, errors: recorded.Errors) -> dict[str, float]:
+        """Shares of right shapes as trained and after retraining, means of several.
 
-        Half of the scans give the windows to train with, the other half those to measure with.
+        Half of the scans give the windows to train with, the other half those to measure with. An
+        encoder that has learned without labels is not retrained with labels.
         """
         before, after = [], []
         detector, number = self.models.detectors[self.modality], len(self.scans.ranges)
-        assert isinstance(detector, Classifier)
         for each in jax.random.split(key, _RETRAINED):
             order_key, train_key, test_key, choice_key, fit_key = jax.random.split(each, 5)
             order = np.asarray(jax.random.permutation(order_key, number))
             train = self.shown(train_key, errors, order[: number // 2])
             test = self.shown(test_key, errors, order[number // 2 :])
-            chosen = jax.random.permutation(choice_key, len(train.labels))[:_LABELLED]
-            given = self.windows(train)[chosen], jnp.asarray(train.labels)[chosen]
-            other = jax.jit(detectors.retrain)(fit_key, detector, *given)
             before.append(self.right(detector, test))
-            after.append(self.right(other, test))
-        return float(np.mean(before)), float(np.mean(after))
+            if isinstance(detector, Classifier):
+                chosen = jax.random.permutation(choice_key, len(train.labels))[:_LABELLED]
+                given = self.windows(train)[chosen], jnp.asarray(train.labels)[chosen]
+                other = jax.jit(detectors.retrain)(fit_key, detector, *given)
+                after.append(self.right(other, test))
+        found = {"shape right": before, "after retraining": after}
+        return {name: float(np.mean(shares)) for name, shares in found.items() if shares}
 
 
 def figures(
@@ -173,9 +175,8 @@ def figures(
         "5 cm too far": Recorded(config, models, scans, offset=0.05),
     }
     for (name, other), key in zip(others.items(), keys, strict=True):
-        before, after = other.retrained(key, errors)
-        found[f"PoI, {name}: shape right"] = before
-        found[f"PoI, {name}: after retraining"] = after
+        shares = other.retrained(key, errors)
+        found |= {f"PoI, {name}: {figure}": share for figure, share in shares.items()}
     return found
 
 

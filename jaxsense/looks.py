@@ -194,7 +194,12 @@ def surveys(
 
 
 def repeats(
-    keys: Key, world: World, classes: Int[Array, "S N"], modality: int, number: int
+    keys: Key,
+    world: World,
+    classes: Int[Array, "S N"],
+    modality: int,
+    number: int,
+    places: Key | None = None,
 ) -> tuple[Float[Array, "S {number} F"], Float[Array, "S {number} 2"]]:
     """Looks several times at the first PoI of many scenes, from near the first look.
 
@@ -206,16 +211,17 @@ def repeats(
       classes: `[S, N]` int32 classes of the PoIs.
       modality: index of the sensor; static.
       number: T, looks in each scene; static.
+      places: `[S]` random keys of the PoIs' places, see `surveys`; different ones by default.
 
     Returns:
       `[S, T, F]` windows, and `[S, T, 2]` positions of the looks, in metres.
     """
 
-    def look(scene: tuple[Key, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        key, classes = scene
+    def look(scene: tuple[Key, jax.Array, Key | None]) -> tuple[jax.Array, jax.Array]:
+        key, classes, places = scene
         scene_key, move_key, first_key, *later_keys = jax.random.split(key, 2 + number)
         farthest = jnp.where(jax.random.bernoulli(move_key), _FARTHEST_MOVE, 0.0)
-        drawn, poi = worlds.random_scene(scene_key, world, classes), jnp.int32(0)
+        drawn, poi = worlds.random_scene(scene_key, world, classes, places), jnp.int32(0)
         first, seen = worlds.look(first_key, world, drawn, modality, poi)
         again = jax.vmap(lambda key: worlds.look_again(key, world, seen, modality, poi, farthest))
         windows, positions = again(jnp.stack(later_keys))
@@ -226,7 +232,7 @@ def repeats(
         )
 
     batch = min(_SCENES_AT_ONCE, len(keys))
-    return jax.lax.map(look, (keys, classes), batch_size=batch)
+    return jax.lax.map(look, (keys, classes, places), batch_size=batch)
 
 
 def detect_all(

@@ -7,6 +7,8 @@ from typing import Literal
 from jaxsense.config.checks import limited, require
 from jaxsense.config.section import Section, Sizes, Traced
 
+PROFILE = 64
+"""Numbers in a LiDAR's window as a network of scans sees it, see `vae.frames`."""
 _MAX_BLOCKS = 32
 _MAX_WEIGHT = 1_000_000
 
@@ -19,8 +21,8 @@ class DetectorConfig(Section, place="detector"):
     num_scans: int = limited(98304, at_least=1)
     """Simulated scans to train on, per modality."""
     calibration: float = limited(0.0, at_least=0, at_most=0.5)
-    """Share of these scans that calibrates the detector instead: their likelihood sets the
-    temperature of its probabilities. Not used if the JMVAE learns from scans."""
+    """Share of these scans that calibrates the detector instead, or the encoder if the JMVAE learns
+    from scans: their likelihood sets the temperature of its probabilities."""
     num_held_out: int = limited(8192, at_least=1)
     """Simulated scans that measure the accuracy."""
     num_repeats: int = limited(0, at_least=0, at_most=1_000_000)
@@ -34,7 +36,7 @@ class DetectorConfig(Section, place="detector"):
     """Initial learning rate of Adam; decays to zero along a cosine."""
 
     def num_training(self, number: int) -> int:
-        """How many of a number of scans are left to train on."""
+        """How many of a number of scans are left to train on, or of groups of them."""
         return number - math.ceil(self.calibration * number)
 
     def arrays(self, sizes: Sizes) -> dict[str, int]:
@@ -107,12 +109,24 @@ class JmvaeConfig(Section, place="jmvae"):
 
     def arrays(self, sizes: Sizes) -> dict[str, int]:
         """How many numbers each large array holds."""
-        latent = self.latent_size
-        encoder = _weights(sizes.labels, *self.hidden, 2 * latent)
+        of_learning = self._arrays_of_scans if self.reads_scans else self._arrays_of_detections
+        samples = self.samples_per_class * sizes.classes * sizes.window
+        return {"samples_per_class": samples, **of_learning(sizes)}
+
+    def _arrays_of_detections(self, sizes: Sizes) -> dict[str, int]:
+        encoder = _weights(sizes.labels, *self.hidden, 2 * self.latent_size)
         return {
             "hidden": 2**sizes.modalities * encoder,
-            "samples_per_class": self.samples_per_class * sizes.classes * sizes.window,
-            "batch steps": self.batch * self.steps * (latent + sizes.labels),
+            "batch steps": self.batch * self.steps * (self.latent_size + sizes.labels),
+        }
+
+    def _arrays_of_scans(self, sizes: Sizes) -> dict[str, int]:
+        encoder = _weights(sizes.window, *self.hidden, 2 * self.latent_size)
+        groups, noise = self.batch * self.looks, sizes.modalities * self.latent_size
+        return {
+            "hidden": 2 * sizes.modalities * encoder,
+            "batch steps looks": groups * self.steps * noise,
+            "batch looks": groups * max(sizes.window, *self.hidden),
         }
 
 
@@ -294,7 +308,7 @@ class DqnConfig(Section, place="dqn"):
         return {
             "hidden": _weights(sizes.state, *self.hidden, sizes.pois + 1),
             "replay_capacity": self.replay_capacity * (2 * sizes.state + 3),
-            "num_starts": self.num_starts * start,
+            "num_starts": self.num_starts * sizes.together * start,
             "num_envs chunk": self.num_envs * max(5 * self.chunk, start),
             "batch updates chunk": 2 * self.batch * max(self.chunk * self.updates, sizes.state),
         }

@@ -108,6 +108,7 @@ _NOISY = Config(
 )
 
 _RAW = Config(
+    detector=DetectorConfig(calibration=0.1),
     jmvae=JmvaeConfig(
         learns_from="scans",
         hidden=(128, 128),

@@ -31,7 +31,9 @@ class Sizes(NamedTuple):
     labels: int
     """Labels of all modalities."""
     window: int
-    """Numbers in the largest window."""
+    """Numbers in the largest window, or in its frame if the JMVAE learns from scans."""
+    together: int
+    """Looks by each sensor at a PoI that are surveyed together."""
     state: int
     """Numbers in a state of the MDP."""
     views: int

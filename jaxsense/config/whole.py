@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from jaxsense.config.checks import ConfigError, limited, require
 from jaxsense.config.frozen import FrozenDict
 from jaxsense.config.learning import (
+    PROFILE,
     DetectorConfig,
     DqnConfig,
     EvaluationConfig,
@@ -108,9 +109,12 @@ class Config(Section):
             f"must be at least {least}, so that beliefs can hold {len(self.arena.classes)} classes"
         )
         require(self.jmvae.latent_size >= least, self.jmvae, "latent_size", expected)
-        # Scans come in whole scenes.
-        scans = -(-self.detector.num_scans // self.arena.num_pois) * self.arena.num_pois
-        leaves_some = self.detector.num_training(scans) > 0
+        # Scans come in whole scenes, and these in groups that show the same PoIs.
+        in_group = self.arena.num_pois * self.jmvae.num_together
+        groups = -(-self.detector.num_scans // in_group)
+        scans = groups * in_group
+        parts = groups if self.jmvae.reads_scans else scans
+        leaves_some = self.detector.num_training(parts) > 0
         expected = f"leaves none of {scans} scans to train on; lower it"
         require(leaves_some, self.detector, "calibration", expected)
         adds_up = self.jmvae.fusion == "filter" or not self.mission.communication.own_maps
@@ -183,13 +187,14 @@ class Config(Section):
     def _sizes(self) -> Sizes:
         """Sizes of arrays that follow from several sections."""
         num_pois, windows = self.arena.num_pois, {"camera": 3 * self.camera.window}
-        windows["lidar"] = self.lidar.window
+        windows["lidar"] = max(self.lidar.window, PROFILE if self.jmvae.reads_scans else 1)
         return Sizes(
             pois=num_pois,
             classes=len(self.arena.classes),
             modalities=len(self.modalities),
             labels=sum(len(self.labels(name)) for name in self.modalities),
             window=max(windows.get(name, 1) for name in self.modalities),
+            together=self.jmvae.num_together,
             state=self._task.most_pois(self) * self._task.features(self),
             views=num_pois * VIEW_SIDES * len(self.navigation.view_distances),
         )

@@ -80,6 +80,21 @@ def apply(
     return jnp.asarray(network.apply(params, x))
 
 
+def statistics(
+    inputs: Float[Array, "S F"],
+) -> tuple[Float[Array, " F"], Float[Array, ""]]:
+    """Offset and scale that standardise inputs of a network.
+
+    Args:
+      inputs: `[S, F]` those for training.
+
+    Returns:
+      Their `[F]` mean, and the `[]` overall standard deviation from it, which is never 0.
+    """
+    offset = jnp.mean(inputs, axis=0)
+    return offset, jnp.std(inputs - offset[None]) + 1e-6
+
+
 def scale_last(network: MLP, params: Params, factor: float | jax.Array) -> Params:
     """Multiplies the last layer, and so the outputs, of an `MLP`.
 

@@ -35,7 +35,7 @@ def resample(
     """Turns scans along other rays into scans along the rays of a sensor.
 
     Between two recorded rays, readings are interpolated; distances only on one surface, otherwise
-    the nearest ray counts.
+    the nearest ray counts. The last ray of a full circle has the first as its neighbour.
 
     Args:
       sensor: the sensor.
@@ -55,30 +55,38 @@ def resample(
     if readings.shape[1:2] != angles.shape:
         expected = f"must be {readings.shape[1:2]}, one for each ray of the scans"
         raise ValueError(f"angles of {sensor.name} have the shape {angles.shape}: {expected}")
-    turned, order = np.unique((angles + np.pi) % (2 * np.pi) - np.pi, return_index=True)
-    scans = np.asarray(readings, np.float32)[:, order]
+    turned, order = np.unique(_within_a_turn(angles), return_index=True)
     step, window = _require_dense(sensor, turned)
-    targets = sensor.angles.astype(np.float64)
-    left = np.clip(np.searchsorted(turned, targets, side="right") - 1, 0, len(turned) - 2)
-    gap = turned[left + 1] - turned[left]
-    share = np.clip((targets - turned[left]) / gap, 0.0, 1.0)
-    is_between = (targets >= turned[0]) & (targets <= turned[-1]) & (gap < _MAX_STEPS * step)
-    to_nearest = np.minimum(*np.abs(targets - turned[[left, left + 1]]))
+    # The last ray also comes before the first one, and this after the last.
+    circle = np.concatenate([turned[-1:] - 2 * np.pi, turned, turned[:1] + 2 * np.pi])
+    scans = np.asarray(readings, np.float32)[:, np.concatenate([order[-1:], order, order[:1]])]
+    targets = _within_a_turn(sensor.angles.astype(np.float64))
+    left = np.searchsorted(circle, targets, side="right") - 1
+    gap = circle[left + 1] - circle[left]
+    share = (targets - circle[left]) / gap
+    is_between = gap < _MAX_STEPS * step
+    to_nearest = np.minimum(*np.abs(targets - circle[[left, left + 1]]))
     is_recorded = is_between | (to_nearest < step / 2)
     if _longest(is_recorded) < window:
-        width = np.degrees(np.abs(targets[window - 1] - targets[0]))
+        width = np.degrees(np.abs(sensor.angles[window - 1] - sensor.angles[0]))
         expected = f"must be at least {width:.1f}, as wide as the window of its detector"
         found = np.degrees(np.ptp(turned))
         raise ValueError(f"field of view of {sensor.name} = {found:.1f} degrees: {expected}")
-    share = np.where(is_between, share, np.round(share)).reshape(-1, *[1] * (scans.ndim - 2))
+    of_rays = (-1, *[1] * (scans.ndim - 2))
+    share, is_between = share.reshape(of_rays), is_between.reshape(of_rays)
     before, after = scans[:, left], scans[:, left + 1]
     with np.errstate(invalid="ignore"):  # a beam without a return is infinitely long
         between = before + share * (after - before)
         is_same = np.abs(after - before) < _SURFACE if sensor.measures_distance else True
     nearest = np.where(share < 0.5, before, after)
-    found = np.where(is_same, between, nearest).astype(np.float32)
+    found = np.where(is_between & is_same, between, nearest).astype(np.float32)
     found[:, ~is_recorded] = np.nan
     return found
+
+
+def _within_a_turn(angles: Float[np.ndarray, " A"]) -> Float[np.ndarray, " A"]:
+    """Angles in radians, turned to where they are from -pi to pi."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi
 
 
 def _require_dense(sensor: Sensor, turned: Float[np.ndarray, " A"]) -> tuple[float, int]:

@@ -1,5 +1,7 @@
 """What a detector and its gate are trained on, and the problem of fitting both together."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -35,6 +37,21 @@ class Examples:
     distances: Float[Array, " L"]
     nothing: gates.Looks
     checks: gates.Looks
+
+
+def first(examples: Examples, number: int) -> Examples:
+    """The examples with a number of looks at PoIs; the others may calibrate the detector.
+
+    Args:
+      examples: of one modality.
+      number: of looks; static.
+    """
+    return dataclasses.replace(
+        examples,
+        windows=examples.windows[:number],
+        labels=examples.labels[:number],
+        distances=examples.distances[:number],
+    )
 
 
 def nothing(

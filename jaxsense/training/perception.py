@@ -16,7 +16,7 @@ from jaxsense.sim import sensors
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene, make_world
-from jaxsense.training import gating, histories
+from jaxsense.training import gating, histories, repeats
 from jaxsense.training.fits import fit_stage, jmvae_restarts
 from jaxsense.training.gating import Examples
 from jaxsense.training.stage import Stage
@@ -84,7 +84,8 @@ def num_scenes(config: Config) -> tuple[int, int, int, int]:
     num_held_out = -(-_held_out_per_class(config) * num_classes // num_pois)
     num_train = -(-config.detector.num_scans // num_pois)
     num_empty = -(-num_train // _SHARE_OF_EMPTY)
-    parts = num_train, max(num_bank, _num_starts(config)), num_held_out
+    num_for_starts = _num_starts(config) * config.jmvae.num_together
+    parts = num_train, max(num_bank, num_for_starts), num_held_out
     num_train, num_bank, num_held_out = (_whole(number, config) for number in parts)
     return num_train, num_bank, num_held_out, num_empty
 
@@ -198,7 +199,7 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
         key: Key, config: Config, *, examples: tuple[Examples, ...]
     ) -> tuple[Classifier, tuple[Params, Params]]:
         num_labels = len(config.labels(config.modalities[modality]))
-        windows = examples[modality].windows[: _num_training(config, examples[modality])]
+        windows = _for_training(config, examples[modality]).windows
         is_range = sensors.make(config)[modality].measures_distance
         detector = detectors.init(key, windows, num_labels, config.detector, is_range)
         return detector, (detector.params, detector.gate.params)
@@ -241,13 +242,7 @@ def _num_training(config: Config, examples: Examples) -> int:
 
 def _for_training(config: Config, examples: Examples) -> Examples:
     """The examples without those that calibrate the detector."""
-    number = _num_training(config, examples)
-    return dataclasses.replace(
-        examples,
-        windows=examples.windows[:number],
-        labels=examples.labels[:number],
-        distances=examples.distances[:number],
-    )
+    return gating.first(examples, _num_training(config, examples))
 
 
 def detect(
@@ -283,19 +278,23 @@ def detect(
     of_bank = others.classes[for_bank] if taken_for is None else taken_for
     of_measuring = others.classes[for_measuring]
     starts = Starts(others.classes, others.scenes, features)
+    # One scene of each group: no two starts show the same PoIs.
+    together = config.jmvae.num_together
+    rows = slice(0, _num_starts(config) * together, together)
     return Detections(
         bank=by_class(features, for_bank, of_bank, config.jmvae.samples_per_class),
         held_out=by_class(features, for_measuring, of_measuring, _held_out_per_class(config)),
-        starts=jax.tree.map(lambda x: x[: _num_starts(config)], starts),
+        starts=jax.tree.map(lambda x: x[rows], starts),
         windows=by_class(others.windows, for_measuring, of_measuring, 1),
     )
 
 
-def make_stages(config: Config) -> list[Stage]:
-    """Makes the stages from surveys to detections and class beliefs, with detectors.
+def make_stages(config: Config, arena: Arena) -> list[Stage]:
+    """Makes the stages from surveys to detections, class beliefs and novelty, with detectors.
 
     Args:
       config: all settings.
+      arena: of the simulation.
     """
     names = tuple(f"detector_{name}" for name in config.modalities)
     given = {"params": "best_jmvae", "detections": "detections"}
@@ -304,6 +303,7 @@ def make_stages(config: Config) -> list[Stage]:
         Stage("detections", detect, {"surveys": "survey", "trained": names}),
         *jmvae_stages(config),
         Stage("class_beliefs", class_beliefs, given),
+        repeats.novelty_stage(arena, config),
     ]
 
 

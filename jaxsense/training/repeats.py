@@ -1,15 +1,18 @@
 """The stage that learns how much of a repeated look is new."""
 
+from collections.abc import Callable, Mapping
+
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Int
 
 from jaxsense import looks
 from jaxsense.config import Config
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, pytree
 from jaxsense.models import make_bayes
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
-from jaxsense.training.stage import Stage
+from jaxsense.training.stage import Output, Stage
 from jaxsense.vae import detectors, novelty
 from jaxsense.vae.detectors import Detector
 from jaxsense.vae.novelty import Novelty
@@ -17,33 +20,69 @@ from jaxsense.vae.novelty import Novelty
 _REPEATS = 4  # looks in a scene
 
 
-def novelty_stage(arena: Arena, config: Config) -> Stage:
+@pytree
+class Repeated:
+    """Scenes at whose first PoIs a sensor looks again and again.
+
+    Attributes:
+      classes: `[S, N]` int32 classes of the PoIs in the simulation.
+      places: `[S]` random keys of the PoIs' places, see `looks.repeats`; None for any.
+      taken_for: `[S]` int32 class to learn that the first PoI shows.
+    """
+
+    classes: Int[Array, "S N"]
+    places: Key | None
+    taken_for: Int[Array, " S"]
+
+
+def random_scenes(key: Key, config: Config) -> Repeated:
+    """Scenes with PoIs of random classes, which are known.
+
+    Args:
+      key: random key.
+      config: all settings.
+    """
+    shape = config.detector.num_repeats, config.arena.num_pois
+    classes = jax.random.randint(key, shape, 0, len(config.arena.classes))
+    return Repeated(classes, None, classes[:, 0])
+
+
+def novelty_stage(
+    arena: Arena,
+    config: Config,
+    scenes: Callable[..., Repeated] = random_scenes,
+    inputs: Mapping[str, str] | None = None,
+) -> Stage:
     """Makes the stage that learns how much of a look is new; all of it if there are no pairs.
 
     Args:
       arena: of the simulation.
       config: all settings.
+      scenes: `(key, config, **inputs) -> Repeated`, with `detector.num_repeats` scenes.
+      inputs: what `scenes` takes, see `Stage`; nothing by default.
     """
     number = config.detector.num_repeats
     if not number:
         num_modalities = len(config.modalities)
         return Stage("novelty", lambda key, config: novelty.independent(num_modalities))
 
-    def begin(key: Key, config: Config, *, trained: tuple[Detector, ...]) -> Novelty:
+    def begin(
+        key: Key, config: Config, *, trained: tuple[Detector, ...], **given: Output
+    ) -> Novelty:
         world, exact = make_world(config, arena=arena), make_bayes(config)
         class_key, *keys = jax.random.split(key, 1 + len(trained))
-        classes = jax.random.randint(
-            class_key, (number, config.arena.num_pois), 0, len(config.arena.classes)
-        )
+        drawn = scenes(class_key, config, **given)
 
         def fit(m: int) -> tuple[jax.Array, jax.Array]:
             scene_keys = jax.random.split(keys[m], number)
-            windows, places = looks.repeats(scene_keys, world, classes, m, _REPEATS)
+            windows, places = looks.repeats(
+                scene_keys, world, drawn.classes, m, _REPEATS, drawn.places
+            )
             read = lambda x: exact.log_likelihoods(detectors.detect(trained[m], x), m)  # noqa: E731
-            return novelty.fit(jax.vmap(jax.vmap(read))(windows), places, classes[:, 0])
+            return novelty.fit(jax.vmap(jax.vmap(read))(windows), places, drawn.taken_for)
 
         strength, length = zip(*map(fit, range(len(trained))), strict=True)
         return Novelty(jnp.stack(strength), jnp.stack(length))
 
     names = tuple(f"detector_{name}" for name in config.modalities)
-    return Stage("novelty", begin, {"trained": names})
+    return Stage("novelty", begin, {"trained": names, **(inputs or {})})

@@ -2,33 +2,49 @@
 
 Looks are grouped by the PoI that they show; no label enters the training. Clusters of the joint
 posteriors are the classes. The labels of the training scenes only name them: each class is the
-cluster that holds most of its PoIs.
+cluster that holds most of its PoIs. From then on, what all looks at a PoI show is its class.
 """
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsense.config import Config
+from jaxsense.core import networks
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.models import make_frame, make_prior, make_readout, make_shape
 from jaxsense.sim import sensors
-from jaxsense.training import gating, perception
+from jaxsense.sim.arena import Arena
+from jaxsense.training import gating, perception, repeats
 from jaxsense.training.fits import fit_stage, jmvae_restarts
 from jaxsense.training.gating import Examples
-from jaxsense.training.perception import Detections, Surveys
+from jaxsense.training.perception import Detections, Scenes, Surveys
+from jaxsense.training.repeats import Repeated
 from jaxsense.training.stage import Stage
 from jaxsense.vae import clusters, frames, leave_one_out
 from jaxsense.vae import gate as gates
 from jaxsense.vae.frames import Scaling
-from jaxsense.vae.gate import Gate
 from jaxsense.vae.leave_one_out import Encoder, Groups
 
 _POSTERIORS_AT_ONCE = 4096
 _CLUSTERED = 8192  # PoIs
-_CALIBRATING = 8192  # PoIs
+
+
+@pytree
+class Shown:
+    """Classes that all looks at a PoI show together, of scenes that the JMVAE did not learn from.
+
+    Attributes:
+      calibrating: `[S, N]` int32 of the training scenes that calibrate the encoders.
+      bank: `[S', N]` int32 of the scenes of the bank.
+    """
+
+    calibrating: Int[Array, "S N"]
+    bank: Int[Array, "S' N"]
 
 
 @pytree
@@ -36,7 +52,7 @@ class Views:
     """What a JMVAE learns from.
 
     Attributes:
-      groups: looks at the PoIs of the training scenes, each sensor's in its frame.
+      groups: looks at the PoIs of training scenes, each sensor's in its frame.
       scalings: by modality, how it comes to this frame.
     """
 
@@ -44,21 +60,24 @@ class Views:
     scalings: tuple[Scaling, ...]
 
 
-def make_stages(config: Config) -> list[Stage]:
-    """Makes the stages from surveys to detections; see `perception.make_stages`."""
+def make_stages(config: Config, arena: Arena) -> list[Stage]:
+    """Makes the stages from surveys to detections and novelty; see `perception.make_stages`."""
     detectors = tuple(f"detector_{name}" for name in config.modalities)
     learned = {"params": "best_jmvae", "views": "views"}
     restarts = _jmvae_stages(config)
     best = {"restarts": tuple(stage.name for stage in restarts)}
     clustered = {**learned, "surveys": "survey", "classes": "class_beliefs"}
+    detected = {"surveys": "survey", "trained": detectors, "shown": "shown"}
     return [
         Stage("views", views, {"surveys": "survey"}),
         *restarts,
         Stage("best_jmvae", _best, best),
         Stage("class_beliefs", class_beliefs, {**learned, "surveys": "survey"}),
+        Stage("shown", shown, clustered),
         *(_encoder_stage(m, name, config) for m, name in enumerate(detectors)),
-        Stage("detections", detect, {**clustered, "trained": detectors}),
+        Stage("detections", detect, detected),
         Stage("grouped", accuracies, clustered),
+        repeats.novelty_stage(arena, config, repeated, {"scenes": "scenes", "shown": "shown"}),
     ]
 
 
@@ -71,7 +90,7 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
       surveys: of all scenes.
     """
     del key
-    number = perception.num_scenes(config)[0]
+    number = _num_training(config)
     found, scalings = [], []
     for sensor, windows in zip(sensors.make(config), surveys.windows, strict=True):
         groups = grouped(windows[:number], config)
@@ -80,6 +99,12 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
         found.append(seen.reshape(*groups.shape[:2], -1))
         scalings.append(scaling)
     return Views(tuple(found), tuple(scalings))
+
+
+def _num_training(config: Config) -> int:
+    """Training scenes to learn from, in whole groups; the others calibrate the encoders."""
+    together = config.jmvae.num_together
+    return together * config.detector.num_training(perception.num_scenes(config)[0] // together)
 
 
 def grouped(windows: Float[Array, "S N F"], config: Config) -> Float[Array, "P K F"]:
@@ -133,7 +158,7 @@ def class_beliefs(
       views: what it has learned from.
       surveys: of all scenes, for the labels.
     """
-    number, num_classes = perception.num_scenes(config)[0], len(config.arena.classes)
+    number, num_classes = _num_training(config), len(config.arena.classes)
     found = _posteriors(params, config, views.groups)
     truth = surveys.classes[: number : config.jmvae.num_together].reshape(-1)
     centres = clusters.centres(key, found.mean[:_CLUSTERED], num_classes)
@@ -147,36 +172,27 @@ def class_beliefs(
 def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
     """The stage that makes a detector of the encoder of one modality, and trains its gate."""
 
+    def num_looks(config: Config) -> int:
+        return _num_training(config) * config.arena.num_pois
+
     def untrained(
-        key: Key, config: Config, *, examples: tuple[Examples, ...], **_: object
-    ) -> tuple[Gate, Params]:
-        windows = examples[modality].windows
-        offset = jnp.mean(windows, axis=0)
-        scale = jnp.std(windows - offset[None]) + 1e-6
-        is_range = sensors.make(config)[modality].measures_distance
-        gate = gates.init(key, offset, scale, is_range)
-        return gate, gate.params
-
-    def problem(
-        config: Config, gate: Gate, *, examples: tuple[Examples, ...], **_: object
-    ) -> gates.Fitting:
-        return gating.of_gate(config.detector, gate, examples[modality])
-
-    def trained(
+        key: Key,
         config: Config,
-        gate: Gate,
-        fit: FitState,
         *,
         examples: tuple[Examples, ...],
         params: Params,
         views: Views,
         classes: Belief,
-    ) -> Encoder:
-        sensor, given = config.modalities[modality], examples[modality]
+        shown: Shown,
+    ) -> tuple[Encoder, Params]:
+        sensor, number = config.modalities[modality], num_looks(config)
+        given = gating.first(examples[modality], number)
+        offset, scale = networks.statistics(given.windows)
+        is_range = sensors.make(config)[modality].measures_distance
         encoder = Encoder(
             params=params["encoders"][sensor],
             scaling=views.scalings[modality],
-            gate=gates.fitted(fit.params, gating.checks_of(config.detector, gate, given)),
+            gate=gates.init(key, offset, scale, is_range),
             classes=classes,
             readout=make_readout(config, classes),
             prior=make_prior(config),
@@ -184,10 +200,27 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
             shape=make_shape(config),
             label_of_class=config.label_of_class(sensor),
         )
-        some = tuple(x[:_CALIBRATING] for x in views.groups)
-        shown = clusters.nearest(_posteriors(params, config, some).mean, classes.mean)
-        looks = grouped(given.windows.reshape(-1, config.arena.num_pois, len(gate.offset)), config)
-        return leave_one_out.calibrate(encoder, looks[:_CALIBRATING, 0], shown)
+        others, taken_for = examples[modality].windows[number:], shown.calibrating.reshape(-1)
+        if len(others):
+            encoder = leave_one_out.calibrate(encoder, others, taken_for)
+        return encoder, encoder.gate.params
+
+    def problem(
+        config: Config, encoder: Encoder, *, examples: tuple[Examples, ...], **_: object
+    ) -> gates.Fitting:
+        given = gating.first(examples[modality], num_looks(config))
+        return gating.of_gate(config.detector, encoder.gate, given)
+
+    def trained(
+        config: Config,
+        encoder: Encoder,
+        fit: FitState,
+        *,
+        examples: tuple[Examples, ...],
+        **_: object,
+    ) -> Encoder:
+        checks = gating.checks_of(config.detector, encoder.gate, examples[modality])
+        return dataclasses.replace(encoder, gate=gates.fitted(fit.params, checks))
 
     return fit_stage(
         name,
@@ -196,6 +229,7 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
             "params": "best_jmvae",
             "views": "views",
             "classes": "class_beliefs",
+            "shown": "shown",
         },
         config,
         settings=lambda config: config.detector,
@@ -205,15 +239,35 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
     )
 
 
+def shown(
+    key: Key, config: Config, *, surveys: Surveys, params: Params, views: Views, classes: Belief
+) -> Shown:
+    """What all looks at PoIs show together, which takes the place of labels.
+
+    Args:
+      key: not used.
+      config: all settings.
+      surveys: of all scenes.
+      params: of the JMVAE.
+      views: for the frames of the sensors.
+      classes: `[C, D]` mean joint posterior of each class.
+    """
+    del key
+    num_train, num_bank, _, _ = perception.num_scenes(config)
+
+    def of_scenes(part: slice) -> jax.Array:
+        if part.start == part.stop:
+            return jnp.zeros((0, config.arena.num_pois), jnp.int32)
+        of_groups = _shown(config, params, views, classes, surveys, part)
+        of_groups = of_groups.reshape(-1, config.arena.num_pois)
+        return jnp.repeat(of_groups, config.jmvae.num_together, axis=0)
+
+    calibrating = slice(_num_training(config), num_train)
+    return Shown(of_scenes(calibrating), of_scenes(slice(num_train, num_train + num_bank)))
+
+
 def detect(
-    key: Key,
-    config: Config,
-    *,
-    surveys: Surveys,
-    trained: tuple[Encoder, ...],
-    params: Params,
-    views: Views,
-    classes: Belief,
+    key: Key, config: Config, *, surveys: Surveys, trained: tuple[Encoder, ...], shown: Shown
 ) -> Detections:
     """Applies the encoders to the surveys that nothing was trained on.
 
@@ -225,16 +279,28 @@ def detect(
       config: all settings.
       surveys: of all scenes.
       trained: one encoder for each modality.
-      params: of the JMVAE.
-      views: for the frames of the sensors.
-      classes: `[C, D]` mean joint posterior of each class.
+      shown: what all looks at the PoIs show.
     """
-    num_train, num_bank, _, _ = perception.num_scenes(config)
-    part = slice(num_train, num_train + num_bank)
-    shown = _shown(config, params, views, classes, surveys, part)
-    num_pois, looks = surveys.classes.shape[1], config.jmvae.num_together
-    of_scenes = jnp.repeat(shown.reshape(-1, num_pois), looks, axis=0)
-    return perception.detect(key, config, surveys=surveys, trained=trained, taken_for=of_scenes)
+    return perception.detect(key, config, surveys=surveys, trained=trained, taken_for=shown.bank)
+
+
+def repeated(key: Key, config: Config, *, scenes: Scenes, shown: Shown) -> Repeated:
+    """Scenes with PoIs of the bank, in another light, of which it is known what all looks show.
+
+    Args:
+      key: not used.
+      config: all settings.
+      scenes: see `perception.draw_scenes`.
+      shown: what all looks at the PoIs show.
+    """
+    del key
+    _, classes, _, places = scenes
+    assert places is not None
+    number, together = config.detector.num_repeats, config.jmvae.num_together
+    # One scene of each group; from the first again if there are fewer.
+    rows = jnp.arange(number) * together % len(shown.bank)
+    of_bank = perception.num_scenes(config)[0] + rows
+    return Repeated(classes[of_bank], places[of_bank], shown.bank[rows, 0])
 
 
 def _shown(

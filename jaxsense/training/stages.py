@@ -12,7 +12,7 @@ from jaxsense.core.types import Key
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
-from jaxsense.training import agents, comparison, fusions, measures, perception, repeats, scans
+from jaxsense.training import agents, comparison, fusions, measures, perception, scans
 from jaxsense.training.stage import Learned, Output, Stage, compose, key_of
 
 _LEARNS_FROM = {"detections": perception.make_stages, "scans": scans.make_stages}
@@ -42,9 +42,8 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
         Stage("scenes", perception.draw_scenes),
         perception.survey_stage(arena),
         Stage("examples", perception.split_examples, {"surveys": "survey"}),
-        *_LEARNS_FROM[config.jmvae.learns_from](config),
+        *_LEARNS_FROM[config.jmvae.learns_from](config, arena),
         Stage("detector_metrics", measures.detector_metrics, detections),
-        repeats.novelty_stage(arena, config),
         *fusions.make_stages(config),
         Stage("latent_space", measures.latent_space, {**fusion, **detections}),
         Stage("look_values", agents.look_values, {**classes, **detections}),

@@ -85,8 +85,7 @@ def init(
     """
     chex.assert_rank(windows, 2, custom_message="windows")
     params = networks.init(key, MLP(config.hidden, num_labels), windows.shape[1])
-    offset = jnp.mean(windows, axis=0)
-    scale = jnp.std(windows - offset[None]) + 1e-6
+    offset, scale = networks.statistics(windows)
     # Folded in: `key` draws the network of the labels.
     gate = gates.init(jax.random.fold_in(key, 1), offset, scale, measures_distance)
     return Classifier(params, offset, scale, gate, config.hidden, num_labels)

@@ -12,9 +12,10 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+from jaxsense.config.learning import PROFILE
+from jaxsense.core import networks
 from jaxsense.core.types import pytree
 
-_BINS = 64
 _HALF_WIDTH = 1.5  # this and what follows in extents of a PoI, the radius of a circle around it
 _TO_MIDDLE = 0.35  # from the front of a PoI on, half of a small one's depth
 _NEAR = 1.15  # depth within which a beam is on the PoI
@@ -72,8 +73,8 @@ class Profile:
         depth = window * (self.along * cosine + self.across * sine) - middle
         lowest, highest = (limit * self.extent for limit in _DEPTHS)
         pitch = jnp.abs(self.across[-1] - self.across[0]) / (len(window) - 1)
-        width = jnp.maximum(2 * half_width / (_BINS - 1), pitch * middle)
-        places = half_width * jnp.linspace(-1.0, 1.0, _BINS)
+        width = jnp.maximum(2 * half_width / (PROFILE - 1), pitch * middle)
+        places = half_width * jnp.linspace(-1.0, 1.0, PROFILE)
         apart = jnp.abs(across[None] - places[:, None])
         weights = jnp.maximum(0.0, 1.0 - apart / width)
         total = jnp.sum(weights * jnp.clip(depth, lowest, highest)[None], axis=1)
@@ -82,13 +83,18 @@ class Profile:
 
 @pytree
 class Chromaticity:
-    """Two shares of the brightness and its logarithm for each pixel, from a window of RGB."""
+    """Shares of red, green and blue in the brightness of each pixel, from a window of RGB.
+
+    The mean brightness of the window is added to that of the pixel: shares of dark pixels are
+    mostly noise, and become small.
+    """
 
     def __call__(self, window: Float[Array, " F"]) -> Float[Array, " F"]:
-        """See `Frame`: the shares of red and green, and the logarithm, for each pixel."""
+        """See `Frame`: three shares for each pixel, which do not change with the light."""
         pixels = window.reshape(-1, 3)
-        total = jnp.sum(pixels, axis=1, keepdims=True) + _DARK
-        return jnp.concatenate([pixels[:, :2] / total, jnp.log(total)], axis=1).reshape(-1)
+        brightness = jnp.sum(pixels, axis=1, keepdims=True)
+        total = brightness + jnp.mean(brightness) + _DARK
+        return (pixels / total).reshape(-1)
 
 
 @pytree
@@ -151,6 +157,5 @@ def scaled(frame: Frame, windows: Float[Array, "S F"]) -> tuple[Scaling, Float[A
       windows: `[S, F]`.
     """
     seen = jax.lax.map(frame, windows, batch_size=min(4096, len(windows)))
-    offset = jnp.mean(seen, axis=0)
-    scale = jnp.std(seen - offset[None]) + 1e-6
+    offset, scale = networks.statistics(seen)
     return Scaling(frame, offset, scale), (seen - offset[None]) / scale

@@ -290,7 +290,7 @@ def calibrate(encoder: Encoder, windows: Float[Array, "S F"], classes: Int[Array
 
     Args:
       encoder: trained.
-      windows: `[S, F]` single looks.
+      windows: `[S, F]` single looks that nothing was trained on.
       classes: `[S]` int32 what all looks at their PoIs show together.
     """
     found = jax.vmap(encoder._log_probabilities)(windows)

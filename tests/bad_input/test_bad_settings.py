@@ -251,6 +251,7 @@ TWINS = {**COLOURS, "crimson": COLOURS["red"]}
 TURNED = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "board": Shape("box", (0.5, 1.0))}
 SIX = tuple(f"{colour} {shape}" for colour in ("red", "green", "blue") for shape in SHAPES)
 REDS = "red cylinder", "red cube"
+SCANS = {"jmvae.learns_from": "scans", "jmvae.fusion": "filter", "jmvae.looks": 100}
 POSTS = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "post": Shape("box", (0.5, 0.5))}
 SIXTEEN = tuple(f"{colour} {shape}" for colour in COLOURS for shape in POSTS)
 EIGHT = tuple(
@@ -379,6 +380,32 @@ CHANGES = [
     ({"jmvae.samples_per_class": 10**9}, "jmvae.samples_per_class = 1000000000: takes"),
     ({"jmvae.steps": 10**9}, "jmvae.steps = 1000000000: takes"),
     ({"jmvae.batch": 10**9}, "jmvae.batch = 1000000000: takes"),
+    # 10^5 PoIs in 300 steps, 2 x 100 looks at each, 2 latents: 1.2 x 10^10 draws.
+    ({**SCANS, "jmvae.batch": 10**5}, "jmvae.batch = 100000: takes 45 GiB"),
+    # 2 x 10^5 PoIs, 100 looks at each, layers of 300: 6 x 10^9 numbers.
+    (
+        {**SCANS, "jmvae.batch": 2 * 10**5, "jmvae.steps": 1, "jmvae.hidden": (300,)},
+        "jmvae.batch = 200000: takes 22 GiB",
+    ),
+    # Encoders and decoders of 2 sensors, from profiles of 64 and wider windows to 3 x 10^7 numbers.
+    ({**SCANS, "jmvae.hidden": (3 * 10**7,)}, "jmvae.hidden = (30000000,): takes"),
+    # 10^5 groups of 100 scenes with 3 PoIs.
+    (
+        {**SCANS, "dqn.observe": "live", "dqn.num_starts": 32 * 10**4},
+        "dqn.num_starts = 320000: takes",
+    ),
+    # Each window of 4 beams becomes 64 numbers, and there are 10^8.
+    (
+        {
+            **SCANS,
+            "modalities": ("lidar",),
+            "jmvae.reconstruction_weights": (1.0,),
+            "lidar.window": 4,
+            "detector.num_scans": 10**8,
+            "arena.classes": ("red cylinder", "red cube"),
+        },
+        "detector.num_scans = 100000000: takes 24 GiB",
+    ),
     ({"jmvae.reconstruction_weights": (1.0,) * 9}, "must have one value for each of modalities ="),
     ({"jmvae.reconstruction_weights": (NAN, 1.0)}, "must be a list of numbers, each 0 or"),
     ({"mdp.reward": "bits"}, "mdp.reward = 'bits': must be one of paper, nats"),

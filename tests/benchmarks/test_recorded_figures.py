@@ -49,6 +49,16 @@ def test_nothing_is_found_in_real_scans_and_pois_are(monkeypatch):
     )
 
 
+def test_encoders_that_learn_without_labels_are_not_retrained_with_them(monkeypatch):
+    monkeypatch.setattr(recorded, "_RETRAINED", 1)
+    config, scans = PRESETS["raw"], rawlog.read_logs()
+    models = jaxsense.init(jax.random.key(0), config)
+    found = recorded.figures(config, models, replace(scans, ranges=scans.ranges[::16]))
+    assert np.isfinite([*found.values()]).all()
+    assert len([name for name in found if "shape right" in name]) == 4
+    assert not [name for name in found if "retrain" in name]
+
+
 @pytest.mark.slow  # trains a detector of `default`
 def test_default_keeps_its_figures_in_real_scans():
     found = figures_of("default", every=1)

@@ -51,3 +51,11 @@ def test_parameters_are_those_of_flax():
     assert np.std(layers["Dense_1"]["kernel"]) == pytest.approx((2 / 64) ** 0.5, rel=0.05)
     assert np.std(layers["Dense_2"]["kernel"]) == pytest.approx((1 / 64) ** 0.5, rel=0.15)
     assert not np.any(layers["Dense_0"]["bias"])
+
+
+def test_inputs_are_standardised_by_each_mean_and_one_deviation():
+    # Means 2 and 4, from which the numbers differ by 1, 1, 2 and 2.
+    offset, scale = networks.statistics(jnp.array([[1.0, 2.0], [3.0, 6.0]]))
+    np.testing.assert_array_equal(offset, [2.0, 4.0])
+    assert scale == pytest.approx(2.5**0.5)
+    assert networks.statistics(jnp.ones((3, 2)))[1] > 0

@@ -46,6 +46,45 @@ def test_rays_may_come_in_any_order_and_turn():
     np.testing.assert_allclose(back, readings)
 
 
+# A whole turn every 10 degrees, from -180 to 180; those at both ends look in one direction.
+AROUND = sensors.lidar(LidarConfig(num_beams=37, field_of_view=360.0, window=3))
+
+
+def test_a_full_circle_is_closed():
+    angles = degrees(*range(-175, 180, 10))
+    readings = np.full((1, 36), 2.0)
+    #              -175, -165  165,  175
+    readings[0, [0, 1, 34, 35]] = 1.0, 1.02, 1.1, 1.06
+    found = recorded.resample(AROUND, angles, readings)[0]
+    # At -180 and at 180, half way from the ray at 175 to that at -175.
+    np.testing.assert_allclose(found[[0, 1, 35, 36]], [1.03, 1.01, 1.08, 1.03], rtol=1e-5)
+    assert np.isfinite(found).all()
+    # From 0 on, as some drivers count, and with a ray at both ends.
+    turned = recorded.resample(AROUND, angles % (2 * np.pi), readings)[0]
+    np.testing.assert_allclose(turned, found, rtol=1e-6)
+    twice = np.arange(37.0)[None]
+    twice[0, -1] = 0.0
+    np.testing.assert_allclose(
+        recorded.resample(AROUND, AROUND.angles, twice)[0], twice[0], atol=1e-4
+    )
+
+
+def test_a_circle_has_an_edge_where_its_ends_measure_two_surfaces():
+    angles = degrees(*range(-178, 180, 10))
+    readings = np.full((1, 36), 2.0)
+    readings[0, 0] = 1.0
+    found = recorded.resample(AROUND, angles, readings)[0]
+    # The ray at -180 is 2 degrees before that at -178, 8 after that at 172.
+    np.testing.assert_allclose(found[[0, 1, 35, 36]], [1.0, 2.0, 2.0, 1.0])
+
+
+def test_a_circle_with_a_gap_behind_is_open():
+    sensor = sensors.lidar(LidarConfig(num_beams=361, field_of_view=360.0, window=20))
+    angles = degrees(*range(-160, 161))
+    found = recorded.resample(sensor, angles, np.ones((1, 321)))[0]
+    np.testing.assert_array_equal(np.isnan(found), np.abs(np.arange(-180, 181)) > 160)
+
+
 def test_pixels_are_interpolated_for_each_channel():
     angles = np.linspace(0.8, -0.8, 60)
     colour = np.stack([angles, angles**2, np.ones(60)], axis=-1)[None]

@@ -1,6 +1,7 @@
 """A JMVAE that learns from scans: groups of looks, and labels that only name what it has found."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +10,18 @@ import pytest
 
 from jaxsense import PRESETS, Config, learn, looks, training
 from jaxsense.config import ConfigError, DetectorConfig, FilterConfig, JmvaeConfig
+from jaxsense.core import supervised
+from jaxsense.models import make_shape
 from jaxsense.sim import world as worlds
 from jaxsense.training import perception, scans
+from jaxsense.training.scans import Shown
 from jaxsense.training.stage import Stage
+from jaxsense.vae import detectors, leave_one_out, novelty
 
 SMOKE = PRESETS["smoke"]
 TINY = dataclasses.replace(
     SMOKE,
-    detector=DetectorConfig(num_scans=120, num_held_out=36, steps=2, batch=8),
+    detector=DetectorConfig(num_scans=120, calibration=0.25, num_held_out=36, steps=2, batch=8),
     jmvae=JmvaeConfig(
         learns_from="scans", fusion="filter", looks=3, hidden=(8,), steps=2, batch=4,
         restarts=2, samples_per_class=12,
@@ -37,9 +42,9 @@ def learned():
 
 def test_every_stage_follows_those_that_it_takes_from():
     names = list(stages_of(TINY))
-    assert names[:11] == [
+    assert names[:12] == [
         "scenes", "survey", "examples", "views", "jmvae_1", "jmvae_2", "best_jmvae",
-        "class_beliefs", "detector_camera", "detector_lidar", "detections",
+        "class_beliefs", "shown", "detector_camera", "detector_lidar", "detections",
     ]  # fmt: skip
     for i, stage in enumerate(stages_of(TINY).values()):
         assert set(stage.sources) <= set(names[:i])
@@ -121,21 +126,165 @@ def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypat
     """A PoI that looks like another class goes there, whatever its label."""
     outputs, listed = learned.outputs, stages_of(TINY)
     num_bank = perception.num_scenes(TINY)[1]
-    num_groups = num_bank // 3 * TINY.arena.num_pois
-    shown = jnp.arange(num_groups) % 3
-    monkeypatch.setattr(scans, "_shown", lambda *_: shown)
+    shown = jnp.arange(num_bank * TINY.arena.num_pois).reshape(num_bank, -1) % 3
     monkeypatch.setattr(looks, "detect_all", lambda trained, windows: tuple(
-        jnp.concatenate([
-            jnp.repeat(shown.reshape(-1, TINY.arena.num_pois), 3, axis=0),
-            jnp.full((len(w) - num_bank, TINY.arena.num_pois), 9),
-        ])[..., None] for w in windows
+        jnp.concatenate([shown, jnp.full((len(w) - num_bank, TINY.arena.num_pois), 9)])[..., None]
+        for w in windows
     ))  # fmt: skip
-    stage = listed["detections"]
-    found = stage.begin(KEY, TINY, **stage.select(outputs))
+    stage, taken_for = listed["detections"], Shown(outputs["shown"].calibrating, bank=shown)
+    found = stage.begin(KEY, TINY, **stage.select({**outputs, "shown": taken_for}))
     for bank in found.bank:
         np.testing.assert_array_equal(bank[..., 0], np.repeat([[0], [1], [2]], 12, axis=1))
+
+
+def test_the_check_of_memory_knows_the_largest_frame():
+    lidar = dataclasses.replace(TINY.lidar, window=4)
+    alone = dataclasses.replace(
+        TINY, modalities=("lidar",), robots=None, lidar=lidar,
+        arena=dataclasses.replace(TINY.arena, classes=("red cylinder", "red cube")),
+        jmvae=dataclasses.replace(TINY.jmvae, reconstruction_weights=(1.0,)),
+    )  # fmt: skip
+    for config in (TINY, alone):
+        assert max(make_shape(config).inputs) == config._sizes().window
 
 
 def test_a_jmvae_of_scans_needs_a_filter():
     with pytest.raises(ConfigError, match=r"jmvae.fusion = 'in_place'.*must be filter"):
         JmvaeConfig(learns_from="scans")
+
+
+def test_what_all_looks_show_is_the_class_nearest_to_their_posterior(learned):
+    outputs, shape = learned.outputs, make_shape(TINY)
+    num_train, num_bank, *_ = perception.num_scenes(TINY)
+    classes = np.asarray(outputs["class_beliefs"].mean)
+
+    def plain(scene, poi):
+        """From the three looks by each sensor at a PoI, of which `scene` is the first."""
+        given = tuple(
+            jax.vmap(scaling)(x[scene : scene + 3, poi])
+            for scaling, x in zip(outputs["views"].scalings, outputs["survey"].windows, strict=True)
+        )
+        mean = leave_one_out.posterior(outputs["best_jmvae"], shape, given).mean
+        return np.argmin(np.sum((classes - np.asarray(mean)) ** 2, axis=1))
+
+    shown = outputs["shown"]
+    assert shown.bank.shape == (num_bank, 3)
+    assert shown.calibrating.shape == (12, 3)
+    for scene, poi in ((0, 0), (3, 2), (9, 1)):
+        for found, start in ((shown.bank, num_train), (shown.calibrating, num_train - 12)):
+            expected = plain(start + scene, poi)
+            np.testing.assert_array_equal(found[scene : scene + 3, poi], expected)
+
+
+def test_encoders_are_calibrated_with_looks_that_nothing_learned_from(learned, monkeypatch):
+    """A quarter of 14 groups of scenes, rounded up: 4 groups of 3."""
+    outputs, stage = learned.outputs, stages_of(TINY)["detector_camera"]
+    num_train, size = perception.num_scenes(TINY)[0], outputs["survey"].windows[0].shape[-1]
+    assert num_train == 42
+    windows = np.asarray(outputs["survey"].windows[0][:42])
+    given = []
+
+    def calibrate(encoder, *given_here):
+        given.extend(given_here)
+        return encoder
+
+    monkeypatch.setattr(leave_one_out, "calibrate", calibrate)
+    monkeypatch.setattr(supervised, "fit", lambda key, state, problem, number: (problem, ()))
+    inputs = stage.select(outputs)
+    state = stage.begin(KEY, TINY, **inputs)
+    (encoder, problem), _ = stage.advance(KEY, TINY, state, **inputs)
+    np.testing.assert_array_equal(given[0], windows[30:].reshape(-1, size))
+    np.testing.assert_array_equal(given[1], outputs["shown"].calibrating.reshape(-1))
+    np.testing.assert_array_equal(problem.shown.windows, windows[:30].reshape(-1, size))
+    np.testing.assert_allclose(encoder.gate.offset, windows[:30].mean(axis=(0, 1)), rtol=1e-5)
+    assert all(len(x) == 10 * TINY.arena.num_pois for x in outputs["views"].groups)
+
+
+def test_without_looks_to_calibrate_with_probabilities_stay_as_they_are(learned):
+    config = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, calibration=0.0))
+    listed, outputs = stages_of(config), dict(learned.outputs)
+    for name in ("shown", "detector_lidar"):
+        stage = listed[name]
+        outputs[name] = stage.begin(KEY, config, **stage.select(outputs))
+    assert outputs["shown"].calibrating.shape == (0, 3)
+    assert outputs["detector_lidar"][0].sharpness == 1
+
+
+def test_calibration_leaves_a_group_to_learn_from():
+    """Two scenes of three PoIs in one group of scenes that show the same."""
+    few = DetectorConfig(num_scans=6, calibration=0.5)
+    with pytest.raises(ConfigError, match=r"calibration = 0.5: leaves none of 9 scans"):
+        dataclasses.replace(TINY, detector=few)
+    dataclasses.replace(TINY, detector=dataclasses.replace(few, num_scans=10))
+
+
+def test_no_two_starts_of_live_episodes_show_the_same_pois(monkeypatch):
+    dqn = dataclasses.replace(SMOKE.dqn, observe="live", num_starts=64)
+    config = dataclasses.replace(TINY, dqn=dqn)
+    num_train, num_bank, num_held_out, num_empty = perception.num_scenes(config)
+    total = num_train + num_bank + num_held_out + num_empty
+    group = jnp.arange(total) // 3
+    windows = tuple(jnp.zeros((total, 3, 1)) for _ in range(2))
+    surveyed: Any = perception.Surveys(
+        jnp.repeat(group[:, None], 3, axis=1) % 3, group, windows, jnp.ones((total, 2, 3))
+    )
+    monkeypatch.setattr(looks, "detect_all", lambda trained, windows: windows)
+    found = perception.detect(KEY, config, surveys=surveyed, trained=()).starts
+    np.testing.assert_array_equal(found.scenes, num_train // 3 + np.arange(64))
+    assert num_bank == 3 * 64  # none of those to measure on
+    np.testing.assert_array_equal(found.classes[:, 0], found.scenes % 3)
+
+
+REPEATING = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, num_repeats=30))
+
+
+def test_repeated_looks_are_at_pois_of_the_bank_and_show_what_all_looks_show(learned):
+    scenes, num_train = learned.outputs["scenes"], perception.num_scenes(TINY)[0]
+    _, classes, _, places = scenes
+    num_bank = perception.num_scenes(TINY)[1]
+    bank = (classes[num_train : num_train + num_bank] + 1) % 3  # nowhere the true class
+    found = scans.repeated(KEY, REPEATING, scenes=scenes, shown=Shown(bank[:0], bank))
+    assert found.classes.shape == (30, 3)
+    np.testing.assert_array_equal(found.taken_for, (found.classes[:, 0] + 1) % 3)
+    groups = num_bank // 3
+    assert groups < 30
+    # The i-th scene shows the PoIs of the i-th group of three scenes, then the first again.
+    of_scenes = jax.random.key_data(places)[num_train : num_train + num_bank]
+    expected = np.asarray(of_scenes)[np.arange(30) % groups * 3]
+    np.testing.assert_array_equal(jax.random.key_data(found.places), expected)
+
+
+def test_novelty_learns_from_what_all_looks_show(learned, monkeypatch):
+    given = {}
+
+    def repeat(keys, world, classes, modality, number, places):
+        given[modality] = classes, places
+        return jnp.zeros((30, number, 2)), jnp.zeros((30, number, 2))
+
+    def fit(found, positions, classes):
+        given["fit"] = classes
+        return jnp.float32(0), jnp.float32(1)
+
+    monkeypatch.setattr(looks, "repeats", repeat)
+    monkeypatch.setattr(detectors, "detect", lambda detector, window: jnp.ones(2) / 2)
+    monkeypatch.setattr(novelty, "fit", fit)
+    stage, outputs = stages_of(REPEATING)["novelty"], learned.outputs
+    shown = dataclasses.replace(outputs["shown"], bank=jnp.full_like(outputs["shown"].bank, 2))
+    stage.begin(KEY, REPEATING, **stage.select({**outputs, "shown": shown}))
+    expected = scans.repeated(KEY, REPEATING, scenes=outputs["scenes"], shown=shown)
+    np.testing.assert_array_equal(given["fit"], np.full(30, 2))
+    for m in range(2):
+        np.testing.assert_array_equal(given[m][0], expected.classes)
+        assert (given[m][1] == expected.places).all()
+
+
+def test_encoders_are_calibrated_once(learned, monkeypatch):
+    """Before the gate is trained: a run finishes a stage after every chunk, to check it."""
+    stage = stages_of(TINY)["detector_lidar"]
+    inputs = stage.select(learned.outputs)
+    state = stage.begin(stage.key(KEY), TINY, **inputs)
+    monkeypatch.setattr(leave_one_out, "calibrate", None)
+    monkeypatch.setattr(scans, "_posteriors", None)
+    found = stage.finish(TINY, state, **inputs)
+    assert found.sharpness == learned.outputs["detector_lidar"].sharpness
+    assert np.isfinite(found.gate.threshold)

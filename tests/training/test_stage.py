@@ -141,7 +141,7 @@ def test_every_stage_is_called_as_it_is_in_the_list():
     assert stage_of("best_jmvae").sources == ("jmvae_1", "jmvae_2", "detections")
     assert names == [
         "scenes", "survey", "examples", "detector_camera", "detector_lidar", "detections",
-        "jmvae_1", "jmvae_2", "best_jmvae", "class_beliefs", "detector_metrics", "novelty",
+        "jmvae_1", "jmvae_2", "best_jmvae", "class_beliefs", "novelty", "detector_metrics",
         "fusion", "latent_space", "look_values", "beliefs", "starts", "dqn_camera", "dqn_lidar",
         "policies_camera", "policies_lidar",
     ]  # fmt: skip

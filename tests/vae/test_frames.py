@@ -58,13 +58,15 @@ def test_one_near_outlier_does_not_matter():
     np.testing.assert_allclose(PROFILE(spoilt)[far], PROFILE(window)[far], atol=0.01)
 
 
-def test_chromaticity_keeps_colour_and_tells_brightness_apart():
+def test_chromaticity_keeps_colour_and_drops_the_light():
     frame = make_frame(CONFIG, CAMERA)
-    pixels = jnp.array([[0.6, 0.2, 0.1], [0.3, 0.1, 0.05]])
+    pixels = jnp.array([[0.6, 0.2, 0.1], [0.03, 0.01, 0.05]])
     bright, dark = frame(pixels.reshape(-1)).reshape(2, 3)
-    # (r + g + b) + .03: shares .645 and .215, then .625 and .208.
-    np.testing.assert_allclose(bright, [0.6 / 0.93, 0.2 / 0.93, np.log(0.93)], rtol=1e-5)
-    np.testing.assert_allclose(dark, [0.3 / 0.48, 0.1 / 0.48, np.log(0.48)], rtol=1e-5)
+    # Brightness .9 and .09, mean .495, and .03: over 1.425 and .615.
+    np.testing.assert_allclose(bright, [0.6 / 1.425, 0.2 / 1.425, 0.1 / 1.425], rtol=1e-5)
+    np.testing.assert_allclose(dark, [0.03 / 0.615, 0.01 / 0.615, 0.05 / 0.615], rtol=1e-5)
+    half = frame(0.5 * pixels.reshape(-1)).reshape(2, 3)
+    np.testing.assert_allclose(half, [bright, dark], rtol=0.06)
 
 
 def test_other_sensors_are_seen_as_they_are():
