@@ -13,6 +13,7 @@ from benchmarks.raw.model import Model, hidden
 from benchmarks.raw.variants import Variant
 from jaxsense import Key, pytree
 from jaxsense.core.networks import Params
+from jaxsense.run.devices import compiler_options
 from jaxsense.vae import latent
 from jaxsense.vae.jmvae import annealed_beta
 
@@ -281,5 +282,5 @@ def compiled(variant: Variant, data: Data, keys: Key) -> Callable[[], dict]:
     def figures(keys: Key, data: Data) -> dict:
         return jax.vmap(lambda key: of_seed(key, model, data))(keys)
 
-    program = jax.jit(figures).lower(keys, data).compile()
+    program = jax.jit(figures).lower(keys, data).compile(compiler_options=compiler_options())
     return lambda: jax.tree.map(np.asarray, program(keys, data))
