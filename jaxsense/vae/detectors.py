@@ -18,6 +18,8 @@ from jaxsense.vae import gate as gates
 from jaxsense.vae.gate import Gate
 
 _MAX_TEMPERATURE = 4.0
+_NEVER = -1e9  # log-odds of what is no candidate; finite, so that there may be none
+_MIN_PROBABILITY = 1e-9  # whose logarithm counts
 
 
 class Detector(Protocol):
@@ -139,6 +141,38 @@ def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array
     is_there = gates.passes(detector.gate, window, distance)
     features = jnp.where(is_there, detect(detector, window), 1 / detector.num_labels)
     return Detection(is_there, features)
+
+
+def search(
+    detector: Detector,
+    windows: Float[Array, "K F"],
+    distances: Float[Array, " J"],
+    is_near: Bool[Array, " K"],
+) -> Detection:
+    """What a look says that shows its PoI in one of several windows, at one of several distances.
+
+    The PoI is there if any of them passes the gate. Features are the logarithmic pool of all windows
+    (Genest and Zidek 1986), each weighted by the odds that the gate gives it: windows beside the
+    best one show the PoI nearly as well, and their mean is less noisy than a single one.
+
+    Args:
+      detector: of the sensor.
+      windows: `[K, F]`, of which those with a reading that is not finite count for nothing.
+      distances: `[J]` expected distances of the PoI's centre, in metres.
+      is_near: `[K]` which windows to consider.
+    """
+    chex.assert_equal_shape_prefix([windows, is_near], 1)
+    is_valid = jnp.isfinite(windows).all(axis=1) & is_near
+    given = jnp.where(is_valid[:, None], windows, 0.0)
+    may_be = is_valid[None] & (jnp.isfinite(distances) & (distances > 0))[:, None]
+    each = jnp.where(may_be, distances[:, None], 1.0)
+    found = jax.vmap(lambda at: gates.logits(detector.gate, given.T, at))(each)
+    odds = jnp.where(may_be, found, _NEVER)
+    is_there = jnp.any(may_be & (odds >= detector.gate.threshold))
+    share = jax.nn.softmax(odds.reshape(-1)).reshape(odds.shape).sum(axis=0)
+    logs = jnp.log(jnp.maximum(jax.vmap(detector.features)(given), _MIN_PROBABILITY))
+    pooled = jax.nn.softmax(share @ logs)
+    return Detection(is_there, jnp.where(is_there, pooled, 1 / detector.num_labels))
 
 
 def _standard(detector: Classifier, window: Float[Array, " F"]) -> Float[Array, " F"]:

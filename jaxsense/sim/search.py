@@ -1,0 +1,74 @@
+"""Search: the windows of a scan in which a robot that may be misplaced looks for a PoI."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxsense.config import SearchConfig
+from jaxsense.core.types import pytree
+from jaxsense.sim import windows
+from jaxsense.sim.sensors import Sensor
+
+_NEAREST = 0.3  # m, distance for which a window is widened; misplaced robots stay farther away
+_STEP = 0.03  # m, between expected distances
+
+
+@pytree
+class Candidates:
+    """Windows that may show a PoI, and distances at which it may be.
+
+    Attributes:
+      windows: `[K, F]` inputs of the detector, in the order of the rays.
+      distances: `[J]` of the PoI's centre, in metres.
+      is_near: `[K]` whether an error that is searched for explains the window's bearing.
+    """
+
+    windows: Float[Array, "K F"]
+    distances: Float[Array, " J"]
+    is_near: Bool[Array, " K"]
+
+
+def widened(sensor: Sensor, search: SearchConfig) -> Sensor:
+    """The sensor with a window that contains those of a search; without one, the sensor itself.
+
+    Args:
+      sensor: the sensor.
+      search: the largest errors.
+    """
+    between = sensor.field_of_view * sensor.stride / max(len(sensor.angles) - 1, 1)
+    off = search.heading + math.degrees(math.asin(min(search.position / _NEAREST, 1.0)))
+    most = (len(sensor.angles) - 1) // sensor.stride + 1
+    return sensor.replace(window=min(sensor.window + 2 * math.ceil(off / between), most))
+
+
+def candidates(
+    sensor: Sensor,
+    search: SearchConfig,
+    readings: Float[Array, "wide *channels"],
+    bearing: Float[Array, ""],
+    distance: Float[Array, ""],
+) -> Candidates:
+    """Windows one ray of the detector apart, and distances at most 3 cm apart.
+
+    Args:
+      sensor: the sensor.
+      search: the largest errors.
+      readings: of the rays around the bearing that `widened` reads.
+      bearing: at which the robot expects the PoI, in its frame, in radians.
+      distance: at which it expects the PoI's centre, in metres.
+    """
+    wide = widened(sensor, search)
+    number, steps = wide.window - sensor.window + 1, math.ceil(search.position / _STEP)
+    angles = windows.around(wide, sensor.angles, bearing)
+    low, high = (sensor.window - 1) // 2, sensor.window // 2
+    middles = (angles[low : low + number] + angles[high : high + number]) / 2
+    off = jnp.abs(middles - bearing)
+    aside = jnp.arcsin(jnp.clip(search.position / distance, 0.0, 1.0))
+    inputs = [windows.as_window(sensor, readings[i : i + sensor.window]) for i in range(number)]
+    return Candidates(
+        windows=jnp.stack(inputs),
+        distances=distance + np.linspace(-search.position, search.position, 2 * steps + 1),
+        is_near=(off <= jnp.radians(search.heading) + aside) | (off == jnp.min(off)),
+    )
