@@ -229,7 +229,7 @@ def play(
       sweeps: what gets worse.
       usual: `[E]` figures of robots that know their poses and share one map.
     """
-    for sweep in sweeps:
+    for sweep in (each for each in sweeps if each.sizes):
         rows, lost = [], []
         for size, sections in zip(sweep.sizes, sweep.changes, strict=True):
             config = changed(curves.scenario.config, sections)

@@ -151,9 +151,9 @@ def search(
 ) -> Detection:
     """What a look says that shows its PoI in one of several windows, at one of several distances.
 
-    The PoI is there if any of them passes the gate. Features are the logarithmic pool of all windows
-    (Genest and Zidek 1986), each weighted by the odds that the gate gives it: windows beside the
-    best one show the PoI nearly as well, and their mean is less noisy than a single one.
+    The PoI is there if any of them passes the gate. The features are the logarithmic pool of all
+    windows (Genest and Zidek 1986), each weighted by the odds that the gate gives it: windows next
+    to the best one show the PoI nearly as well, and their mean is less noisy than a single one.
 
     Args:
       detector: of the sensor.
