@@ -123,7 +123,7 @@ class Models:
         if not search.applies:
             return detectors.answer(detector, windows.as_window(sensor, valid), expected)
         tried = searching.candidates(sensor, search, valid, bearing, expected)
-        return detectors.search(detector, tried.windows, tried.distances, tried.is_near)
+        return detectors.search(detector, tried.windows, tried.distances, tried.log_prior)
 
     def plausible_classes(self, belief: Belief) -> Bool[Array, " C"]:
         """Classes that are plausible given a `[D]` belief, see `vae.plausible_classes`."""

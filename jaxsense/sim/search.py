@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxsense.config import SearchConfig
 from jaxsense.core.types import pytree
@@ -13,6 +13,7 @@ from jaxsense.sim.sensors import Sensor
 
 _NEAREST = 0.3  # m, distance for which a window is widened; misplaced robots stay farther away
 _STEP = 0.03  # m, between expected distances
+_DEVIATIONS = 3.0  # standard deviations that the largest errors are
 
 
 @pytree
@@ -22,12 +23,13 @@ class Candidates:
     Attributes:
       windows: `[K, F]` inputs of the detector, in the order of the rays.
       distances: `[J]` of the PoI's centre, in metres.
-      is_near: `[K]` whether an error that is searched for explains the window's bearing.
+      log_prior: `[J, K]` logarithm of how likely an error is that explains them, up to a constant;
+        minus infinity beyond the largest errors.
     """
 
     windows: Float[Array, "K F"]
     distances: Float[Array, " J"]
-    is_near: Bool[Array, " K"]
+    log_prior: Float[Array, "J K"]
 
 
 def widened(sensor: Sensor, search: SearchConfig) -> Sensor:
@@ -38,7 +40,7 @@ def widened(sensor: Sensor, search: SearchConfig) -> Sensor:
       search: the largest errors.
     """
     between = sensor.field_of_view * sensor.stride / max(len(sensor.angles) - 1, 1)
-    off = search.heading + math.degrees(math.asin(min(search.position / _NEAREST, 1.0)))
+    off = math.hypot(search.heading, math.degrees(search.position / _NEAREST))
     most = (len(sensor.angles) - 1) // sensor.stride + 1
     return sensor.replace(window=min(sensor.window + 2 * math.ceil(off / between), most))
 
@@ -51,6 +53,8 @@ def candidates(
     distance: Float[Array, ""],
 ) -> Candidates:
     """Windows one ray of the detector apart, and distances at most 3 cm apart.
+
+    Errors are independent and normal; the largest ones are three standard deviations.
 
     Args:
       sensor: the sensor.
@@ -65,10 +69,15 @@ def candidates(
     low, high = (sensor.window - 1) // 2, sensor.window // 2
     middles = (angles[low : low + number] + angles[high : high + number]) / 2
     off = jnp.abs(middles - bearing)
-    aside = jnp.arcsin(jnp.clip(search.position / distance, 0.0, 1.0))
+    largest = jnp.hypot(jnp.radians(search.heading), search.position / distance)
+    # The plain window is one of them, though no ray may be along the bearing.
+    is_near = (off <= largest) | (off == jnp.min(off))
+    of_bearings = jnp.where(is_near, -((_DEVIATIONS * off / largest) ** 2) / 2, -jnp.inf)
+    shares = np.linspace(-1.0, 1.0, 2 * steps + 1)
+    of_distances = -((_DEVIATIONS * shares) ** 2) / 2
     inputs = [windows.as_window(sensor, readings[i : i + sensor.window]) for i in range(number)]
     return Candidates(
         windows=jnp.stack(inputs),
-        distances=distance + np.linspace(-search.position, search.position, 2 * steps + 1),
-        is_near=(off <= jnp.radians(search.heading) + aside) | (off == jnp.min(off)),
+        distances=distance + search.position * shares,
+        log_prior=of_distances[:, None] + of_bearings[None],
     )

@@ -147,28 +147,32 @@ def search(
     detector: Detector,
     windows: Float[Array, "K F"],
     distances: Float[Array, " J"],
-    is_near: Bool[Array, " K"],
+    log_prior: Float[Array, "J K"],
 ) -> Detection:
     """What a look says that shows its PoI in one of several windows, at one of several distances.
 
     The PoI is there if any of them passes the gate. The features are the logarithmic pool of all
-    windows (Genest and Zidek 1986), each weighted by the odds that the gate gives it: windows next
-    to the best one show the PoI nearly as well, and their mean is less noisy than a single one.
+    windows (Genest and Zidek 1986), each weighted by its posterior odds, from the prior and the
+    gate: windows next to the best one show the PoI nearly as well, and their mean is less noisy
+    than a single one.
 
     Args:
       detector: of the sensor.
       windows: `[K, F]`, of which those with a reading that is not finite count for nothing.
       distances: `[J]` expected distances of the PoI's centre, in metres.
-      is_near: `[K]` which windows to consider.
+      log_prior: `[J, K]` logarithm of the prior, up to a constant; minus infinity for what is not
+        to be considered.
     """
-    chex.assert_equal_shape_prefix([windows, is_near], 1)
-    is_valid = jnp.isfinite(windows).all(axis=1) & is_near
+    chex.assert_shape(log_prior, (len(distances), len(windows)), custom_message="log_prior")
+    is_valid = jnp.isfinite(windows).all(axis=1)
     given = jnp.where(is_valid[:, None], windows, 0.0)
-    may_be = is_valid[None] & (jnp.isfinite(distances) & (distances > 0))[:, None]
-    each = jnp.where(may_be, distances[:, None], 1.0)
-    found = jax.vmap(lambda at: gates.logits(detector.gate, given.T, at))(each)
-    odds = jnp.where(may_be, found, _NEVER)
-    is_there = jnp.any(may_be & (odds >= detector.gate.threshold))
+    is_distance = jnp.isfinite(distances) & (distances > 0)
+    may_be = is_valid[None] & is_distance[:, None] & jnp.isfinite(log_prior)
+    found = jax.vmap(lambda at: gates.logits(detector.gate, given.T, jnp.full(len(given), at)))(
+        jnp.where(is_distance, distances, 1.0)
+    )
+    is_there = jnp.any(may_be & (found >= detector.gate.threshold))
+    odds = jnp.where(may_be, found + log_prior, _NEVER)
     share = jax.nn.softmax(odds.reshape(-1)).reshape(odds.shape).sum(axis=0)
     logs = jnp.log(jnp.maximum(jax.vmap(detector.features)(given), _MIN_PROBABILITY))
     pooled = jax.nn.softmax(share @ logs)

@@ -123,7 +123,7 @@ def test_a_robot_that_searches_looks_from_farther_away(team, facing):
     state = facing(CAMERA, [0.45, 0.0, 0.0], [0.0, 0.0, 0.0])
     for position, expected in ((0.0, True), (0.04, True), (0.06, False)):
         config = searching(SearchConfig(position=position))
-        assert bool(decide.sees(with_config(team, config), state, CAMERA, 0)) is expected
+        assert bool(decide.sees(with_config(team, config), state, CAMERA, jnp.int32(0))) is expected
 
 
 def searching(search):

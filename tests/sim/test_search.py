@@ -17,12 +17,6 @@ BOTH = pytest.mark.parametrize("sensor", [CAMERA, LIDAR], ids=["camera", "lidar"
 @BOTH
 def test_who_does_not_search_reads_the_plain_window(sensor):
     assert search.widened(sensor, SearchConfig()) == sensor
-    found = search.candidates(
-        *(sensor, SearchConfig(), readings_of(sensor)[: sensor.window]),
-        *(jnp.float32(0.1), jnp.float32(0.8)),
-    )
-    np.testing.assert_array_equal(found.distances, [np.float32(0.8)])
-    assert found.is_near.tolist() == [True]
 
 
 def test_a_search_reads_as_many_more_rays_as_its_errors_need():
@@ -31,9 +25,12 @@ def test_a_search_reads_as_many_more_rays_as_its_errors_need():
     heading = SearchConfig(heading=6.0)
     assert search.widened(LIDAR, heading).window == LIDAR.window + 2 * 18
     assert search.widened(CAMERA, heading).window == CAMERA.window + 2 * 12
-    # .15 m across .3 m are asin(.5) = 30 degrees, and 30 / .3519 = 85.25.
+    # .15 m across .3 m are half a radian or 28.65 degrees, and 28.65 / .3519 = 81.41.
     position = SearchConfig(position=0.15)
-    assert search.widened(LIDAR, position).window == LIDAR.window + 2 * 86
+    assert search.widened(LIDAR, position).window == LIDAR.window + 2 * 82
+    # The larger of two errors counts more: (6^2 + 28.65^2)^.5 = 29.27, and / .3519 = 83.2.
+    both = SearchConfig(position=0.15, heading=6.0)
+    assert search.widened(LIDAR, both).window == LIDAR.window + 2 * 84
     # The camera has 640 rays, of which 160 are read.
     wide = SearchConfig(position=0.3, heading=30.0)
     assert search.widened(CAMERA, wide).window == 160
@@ -55,17 +52,26 @@ def test_each_window_is_the_plain_one_at_another_bearing(sensor, bearing):
 
 def test_a_search_is_as_wide_as_its_errors_explain():
     scan, errors = readings_of(LIDAR), SearchConfig(position=0.09, heading=2.0)
-    wide = windows.around(search.widened(LIDAR, errors), scan, jnp.float32(0.0))
+    # The middle of 128 rays is half way between two of them.
+    ahead = jnp.float32(np.radians(240 / 682 / 2))
+    wide = windows.around(search.widened(LIDAR, errors), scan, ahead)
     for distance in (0.5, 2.0):
-        found = search.candidates(LIDAR, errors, wide, jnp.float32(0.0), jnp.float32(distance))
-        # 2 degrees and asin(.09 / .5) = 10.37, or asin(.09 / 2) = 2.58, to either side.
-        half = 2.0 + np.degrees(np.arcsin(0.09 / distance))
-        expected = 2 * np.floor(half / (240 / 682)) + 1
-        assert abs(found.is_near.sum() - expected) <= 1
-        middle = len(found.is_near) // 2
-        assert found.is_near[middle]
+        found = search.candidates(LIDAR, errors, wide, ahead, jnp.float32(distance))
+        # 2 degrees, and .09 / .5 = .18 or .09 / 2 = .045 radians, which are 10.3 or 2.58 degrees.
+        half = np.hypot(2.0, np.degrees(0.09 / distance))
+        middle = len(found.windows) // 2
+        steps = int(half / (240 / 682))
+        near = np.isfinite(found.log_prior).all(axis=0).nonzero()[0]
+        np.testing.assert_array_equal(near, np.arange(middle - steps, middle + steps + 1))
         np.testing.assert_allclose(
             found.distances, distance + np.array([-0.09, -0.06, -0.03, 0.0, 0.03, 0.06, 0.09])
+        )
+        # The largest errors are three standard deviations: e^-4.5, and at both ends e^-9.
+        prior = found.log_prior - np.max(found.log_prior)
+        np.testing.assert_allclose(prior[0, middle], -4.5, rtol=1e-3)
+        off = steps * 240 / 682 / half
+        np.testing.assert_allclose(
+            prior[[3, 6], middle + steps], [-4.5 * off**2, -4.5 * (1 + off**2)], rtol=1e-3
         )
 
 

@@ -153,27 +153,29 @@ def test_a_search_of_one_window_is_a_look(problem):
     detector = detectors.init(jax.random.key(1), windows, 3, CONFIG)
     for window in (windows[0], windows[1].at[1].set(jnp.nan)):
         plain = detectors.answer(detector, window, jnp.float32(1.0))
-        found = detectors.search(detector, window[None], jnp.ones(1), jnp.ones(1, bool))
+        found = detectors.search(detector, window[None], jnp.ones(1), jnp.zeros((1, 1)))
         assert found.is_there == plain.is_there
         np.testing.assert_allclose(found.features, plain.features, atol=1e-6)
 
 
-def test_a_search_pools_the_windows_by_the_odds_of_the_gate(monkeypatch):
+def test_a_search_pools_the_windows_by_their_posterior_odds(monkeypatch):
     # The first reading is the log-odds of the window, the second the logit of a label.
     monkeypatch.setattr(gate, "logits", lambda g, windows, at: windows[0] - jnp.abs(at - 1.0))
     detector = Read(Threshold(jnp.float32(1.5)))
-    windows = jnp.array([[2.0, 3.0], [2.0 - np.log(3.0), -1.0], [9.0, 5.0], [np.nan, 5.0]])
-    near = jnp.array([True, True, False, True])
-    found = detectors.search(detector, windows, jnp.array([1.0]), near)
+    windows = jnp.array([[2.0, 3.0], [2.0, -1.0], [9.0, 5.0], [np.nan, 5.0]])
+    prior = jnp.array([0.0, -np.log(3.0), -np.inf, 0.0])
+    found = detectors.search(detector, windows, jnp.array([1.0]), prior[None])
     # Shares 3/4 and 1/4: a logit of 3 x .75 - 1 x .25 = 2, and the sigmoid of 2 is .8808.
     assert found.is_there
     np.testing.assert_allclose(found.features, [0.8808, 0.1192], atol=1e-4)
     # A PoI is there if it is at one of the distances; one that is not positive is none.
     for distances, is_there in (([3.0, 1.2], True), ([3.0, 0.2], False), ([-1.0, np.nan], False)):
-        found = detectors.search(detector, windows, jnp.array(distances), near)
+        both = jnp.tile(prior, (2, 1))
+        found = detectors.search(detector, windows, jnp.array(distances), both)
         assert bool(found.is_there) is is_there
         assert is_there or found.features.tolist() == [0.5, 0.5]
-    assert not detectors.search(detector, windows, jnp.ones(1), jnp.zeros(4, bool)).is_there
+    nowhere = jnp.full((1, 4), -jnp.inf)
+    assert not detectors.search(detector, windows, jnp.ones(1), nowhere).is_there
 
 
 @dataclass(frozen=True)
