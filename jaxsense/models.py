@@ -116,13 +116,14 @@ class Models:
         """
         most = jnp.inf if sensor.measures_distance else jnp.finfo(readings.dtype).max
         is_valid = (readings >= 0) & (readings <= most)
-        valid = jnp.where(is_valid, readings, jnp.nan)
+        wide = searching.widened(sensor, search)
+        window = windows.as_window(wide, jnp.where(is_valid, readings, jnp.nan))
         # What is out of view is expected nowhere.
         expected = jnp.where(windows.is_in_view(sensor, bearing), distance, jnp.nan)
         detector = self.detectors[modality]
         if not search.applies:
-            return detectors.answer(detector, windows.as_window(sensor, valid), expected)
-        tried = searching.candidates(sensor, search, valid, bearing, expected)
+            return detectors.answer(detector, window, expected)
+        tried = searching.candidates(sensor, search, window, bearing, expected)
         return detectors.search(detector, tried.windows, tried.distances, tried.log_prior)
 
     def plausible_classes(self, belief: Belief) -> Bool[Array, " C"]:

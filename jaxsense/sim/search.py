@@ -48,7 +48,7 @@ def widened(sensor: Sensor, search: SearchConfig) -> Sensor:
 def candidates(
     sensor: Sensor,
     search: SearchConfig,
-    readings: Float[Array, "wide *channels"],
+    window: Float[Array, " F"],
     bearing: Float[Array, ""],
     distance: Float[Array, ""],
 ) -> Candidates:
@@ -59,7 +59,7 @@ def candidates(
     Args:
       sensor: the sensor.
       search: the largest errors.
-      readings: of the rays around the bearing that `widened` reads.
+      window: `[F]` readings of the rays that `widened` reads around the bearing, see `as_window`.
       bearing: at which the robot expects the PoI, in its frame, in radians.
       distance: at which it expects the PoI's centre, in metres.
     """
@@ -75,9 +75,9 @@ def candidates(
     of_bearings = jnp.where(is_near, -((_DEVIATIONS * off / largest) ** 2) / 2, -jnp.inf)
     shares = np.linspace(-1.0, 1.0, 2 * steps + 1)
     of_distances = -((_DEVIATIONS * shares) ** 2) / 2
-    inputs = [windows.as_window(sensor, readings[i : i + sensor.window]) for i in range(number)]
+    rays = window.reshape(wide.window, -1)
     return Candidates(
-        windows=jnp.stack(inputs),
+        windows=jnp.stack([rays[i : i + sensor.window].reshape(-1) for i in range(number)]),
         distances=distance + search.position * shares,
         log_prior=of_distances[:, None] + of_bearings[None],
     )

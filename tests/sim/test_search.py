@@ -40,7 +40,7 @@ def test_a_search_reads_as_many_more_rays_as_its_errors_need():
 @pytest.mark.parametrize("bearing", [-0.1, 0.001, 0.07])  # no half rays
 def test_each_window_is_the_plain_one_at_another_bearing(sensor, bearing):
     errors, scan = SearchConfig(heading=3.0), readings_of(sensor)
-    wide = windows.around(search.widened(sensor, errors), scan, jnp.float32(bearing))
+    wide = wide_window(sensor, errors, scan, jnp.float32(bearing))
     found = search.candidates(sensor, errors, wide, jnp.float32(bearing), jnp.float32(0.8))
     half = len(found.windows) // 2
     first = windows._first_ray(sensor, jnp.float32(bearing))
@@ -54,7 +54,7 @@ def test_a_search_is_as_wide_as_its_errors_explain():
     scan, errors = readings_of(LIDAR), SearchConfig(position=0.09, heading=2.0)
     # The middle of 128 rays is half way between two of them.
     ahead = jnp.float32(np.radians(240 / 682 / 2))
-    wide = windows.around(search.widened(LIDAR, errors), scan, ahead)
+    wide = wide_window(LIDAR, errors, scan, ahead)
     for distance in (0.5, 2.0):
         found = search.candidates(LIDAR, errors, wide, ahead, jnp.float32(distance))
         # 2 degrees, and .09 / .5 = .18 or .09 / 2 = .045 radians, which are 10.3 or 2.58 degrees.
@@ -94,3 +94,9 @@ def readings_of(sensor):
     number = len(sensor.angles) * sensor.channels
     shape = (len(sensor.angles), *(() if sensor.channels == 1 else (sensor.channels,)))
     return np.linspace(0.1, 0.9, number, dtype=np.float32).reshape(shape)
+
+
+def wide_window(sensor, errors, scan, bearing):
+    """What a robot that searches reads."""
+    wide = search.widened(sensor, errors)
+    return windows.as_window(wide, windows.around(wide, scan, bearing))
