@@ -74,7 +74,7 @@ def candidates(
     is_near = (off <= largest) | (off == jnp.min(off))
     of_bearings = jnp.where(is_near, -((_DEVIATIONS * off / largest) ** 2) / 2, -jnp.inf)
     shares = np.linspace(-1.0, 1.0, 2 * steps + 1)
-    of_distances = -((_DEVIATIONS * shares) ** 2) / 2
+    of_distances = jnp.asarray(-((_DEVIATIONS * shares) ** 2) / 2)
     rays = window.reshape(wide.window, -1)
     return Candidates(
         windows=jnp.stack([rays[i : i + sensor.window].reshape(-1) for i in range(number)]),
