@@ -151,10 +151,10 @@ def search(
 ) -> Detection:
     """What a look says that shows its PoI in one of several windows, at one of several distances.
 
-    The PoI is there if any of them passes the gate. The features are the logarithmic pool of all
-    windows (Genest and Zidek 1986), each weighted by its posterior odds, from the prior and the
-    gate: windows next to the best one show the PoI nearly as well, and their mean is less noisy
-    than a single one.
+    The PoI is there if the gate's mean odds reach its threshold: of many windows that show nothing,
+    the best one would pass too often. The features are the logarithmic pool of all windows (Genest
+    and Zidek 1986), weighted by their posterior, from the prior and the gate: windows next to the
+    best one show the PoI nearly as well, and their mean is less noisy than a single one.
 
     Args:
       detector: of the sensor.
@@ -171,9 +171,10 @@ def search(
     found = jax.vmap(lambda at: gates.logits(detector.gate, given.T, jnp.full(len(given), at)))(
         jnp.where(is_distance, distances, 1.0)
     )
-    is_there = jnp.any(may_be & (found >= detector.gate.threshold))
-    odds = jnp.where(may_be, found + log_prior, _NEVER)
-    share = jax.nn.softmax(odds.reshape(-1)).reshape(odds.shape).sum(axis=0)
+    prior = jax.nn.log_softmax(jnp.where(may_be, log_prior, _NEVER).reshape(-1))
+    odds = jnp.where(may_be.reshape(-1), found.reshape(-1) + prior, _NEVER)
+    is_there = jnp.any(may_be) & (jax.nn.logsumexp(odds) >= detector.gate.threshold)
+    share = jax.nn.softmax(odds).reshape(may_be.shape).sum(axis=0)
     logs = jnp.log(jnp.maximum(jax.vmap(detector.features)(given), _MIN_PROBABILITY))
     pooled = jax.nn.softmax(share @ logs)
     return Detection(is_there, jnp.where(is_there, pooled, 1 / detector.num_labels))

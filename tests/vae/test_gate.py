@@ -168,8 +168,12 @@ def test_a_search_pools_the_windows_by_their_posterior_odds(monkeypatch):
     # Shares 3/4 and 1/4: a logit of 3 x .75 - 1 x .25 = 2, and the sigmoid of 2 is .8808.
     assert found.is_there
     np.testing.assert_allclose(found.features, [0.8808, 0.1192], atol=1e-4)
-    # A PoI is there if it is at one of the distances; one that is not positive is none.
-    for distances, is_there in (([3.0, 1.2], True), ([3.0, 0.2], False), ([-1.0, np.nan], False)):
+    # Log-odds of 2 and, at the other distance, of 2 - x: a mean of 2 - log 2 + log(1 + e^-x), which
+    # is 1.5 for x = 1.55. A distance that is not positive is none, and has no share in the mean.
+    for distances, is_there in (
+        *(([1.0, 2.5], True), ([1.0, 2.6], False), ([1.0, -1.0], True), ([1.0, np.nan], True)),
+        ([-1.0, np.nan], False),
+    ):
         both = jnp.tile(prior, (2, 1))
         found = detectors.search(detector, windows, jnp.array(distances), both)
         assert bool(found.is_there) is is_there
