@@ -64,7 +64,7 @@ class LocalisationConfig(Section, place="mission.localisation"):
 
     in_training: bool = False
     """Whether the looks that detectors and policies learn from have the constant errors, too; never
-    those that driving adds. They need no search."""
+    those that driving adds."""
     position_error: Traced[float] = limited(0.0, at_least=0, at_most=1)
     """Standard deviation of the constant error of a robot's x and y in a mission, in metres."""
     heading_error: Traced[float] = limited(0.0, at_least=0, at_most=180)
