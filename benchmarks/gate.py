@@ -10,7 +10,8 @@ import rich.console
 import rich.table
 
 import jaxsense
-from jaxsense.sim import absence, amiro, viewpoints
+from jaxsense.config import SearchConfig
+from jaxsense.sim import absence, amiro, search, viewpoints
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import world as worlds
 from jaxsense.sim.absence import View
@@ -115,7 +116,10 @@ def simulate(
 
 
 def answered(
-    config: jaxsense.Config, models: jaxsense.Models, number: int
+    config: jaxsense.Config,
+    models: jaxsense.Models,
+    number: int,
+    errors: SearchConfig | None = None,
 ) -> dict[str, dict[str, float]]:
     """Share of looks that are answered with a class, by modality and situation.
 
@@ -123,9 +127,13 @@ def answered(
       config: settings of the run.
       models: its trained models.
       number: looks in each situation.
+      errors: largest errors of the robot's pose to search for; none by default.
     """
+    errors = SearchConfig() if errors is None else errors
     arena = dataclasses.replace(config.arena, side=max(config.arena.side, _MIN_SIDE))
-    world = worlds.make_world(dataclasses.replace(config, arena=arena))
+    made = worlds.make_world(dataclasses.replace(config, arena=arena))
+    wide = tuple(search.widened(sensor, errors) for sensor in made.sensors)
+    world = dataclasses.replace(made, sensors=wide)
     found: dict[str, dict[str, float]] = {}
     for robot, modality in enumerate(config.modalities):
 
@@ -134,9 +142,8 @@ def answered(
             def answers(keys: jax.Array, models: jaxsense.Models) -> jax.Array:
                 def one(key: jax.Array) -> jax.Array:
                     readings, bearing, distance = simulate(key, world, robot, name)
-                    sensor = world.sensors[robot]
                     return models.detect_in_window(
-                        robot, sensor, readings, bearing, distance
+                        robot, made.sensors[robot], readings, bearing, distance, errors
                     ).is_there
 
                 return jax.lax.map(one, keys, batch_size=_AT_ONCE)
@@ -153,10 +160,13 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="directory of a finished run")
     parser.add_argument("--looks", type=int, default=10_000, help="in each situation")
+    parser.add_argument(
+        "--search", type=float, nargs=2, default=(0.0, 0.0), metavar=("M", "DEGREES")
+    )
     parser.add_argument("--trust", action="store_true", help="import the run's own sensors")
     arguments = parser.parse_args(argv)
     config, models = jaxsense.load(arguments.run, arguments.trust)
-    found = answered(config, models, arguments.looks)
+    found = answered(config, models, arguments.looks, SearchConfig(*arguments.search))
     table = rich.table.Table("answered with a class", *found, title=f"{arguments.looks} looks each")
     for name in SITUATIONS:
         table.add_row(name, *(f"{of_modality[name]:.4f}" for of_modality in found.values()))

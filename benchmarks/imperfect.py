@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.curves import Curves, Need
 from benchmarks.where import compare
 from jaxsense import Config, Models, mission
-from jaxsense.config import CommunicationConfig, ConfigError, LocalisationConfig
+from jaxsense.config import CommunicationConfig, ConfigError, LocalisationConfig, SearchConfig
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
 from jaxsense.config.section import Section
@@ -63,6 +63,10 @@ class Arguments:
     """Shares of the messages that are lost."""
     delays: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0, 10.0)
     """Mean delays of a message in seconds."""
+    search_position: float = 0.0
+    """Largest error of the position that misplaced robots search for, in metres."""
+    search_heading: float = 0.0
+    """Largest error of the heading that misplaced robots search for, in degrees."""
     json: Path | None = None
     """File to write the figures to."""
 
@@ -71,6 +75,12 @@ class Arguments:
         require(self.episodes >= 2, self, "episodes", "must be at least 2")
         is_paired = len(self.headings) == len(self.positions)
         require(is_paired, self, "headings", "must be as many as positions")
+        self.search  # noqa: B018
+
+    @property
+    def search(self) -> SearchConfig:
+        """How far misplaced robots search."""
+        return SearchConfig(position=self.search_position, heading=self.search_heading)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,8 +125,8 @@ def poses(arguments: Arguments) -> list[Sweep]:
     Args:
       arguments: of the program.
     """
-    at, to = arguments.positions, arguments.headings
-    of = lambda **errors: {"localisation": LocalisationConfig(**errors)}  # noqa: E731
+    at, to, search = arguments.positions, arguments.headings, arguments.search
+    of = lambda **errors: {"localisation": LocalisationConfig(search=search, **errors)}  # noqa: E731
     both = zip(at, to, strict=True)
     return [
         Sweep("position [m]", at, tuple(of(position_error=x) for x in at)),
@@ -219,7 +229,7 @@ def play(
       sweeps: what gets worse.
       usual: `[E]` figures of robots that know their poses and share one map.
     """
-    for sweep in sweeps:
+    for sweep in (each for each in sweeps if each.sizes):
         rows, lost = [], []
         for size, sections in zip(sweep.sizes, sweep.changes, strict=True):
             config = changed(curves.scenario.config, sections)

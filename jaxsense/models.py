@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsense.config import Config
+from jaxsense.config import Config, SearchConfig
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
 from jaxsense.dqn import optimum, rewards
@@ -15,6 +15,7 @@ from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.map_agent import MapAgent
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team_agent import TeamAgent
+from jaxsense.sim import search as searching
 from jaxsense.sim import sensors, windows
 from jaxsense.sim.sensors import Sensor
 from jaxsense.vae import (
@@ -36,6 +37,8 @@ from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.leave_one_out import Encoder, Shape
 from jaxsense.vae.novelty import Novelty
 from jaxsense.vae.readout import Readout
+
+_NO_SEARCH = SearchConfig()
 
 
 @pytree
@@ -71,6 +74,7 @@ class Models:
         readings: Float[Array | np.ndarray, "B ..."],
         bearing: Float[Array, ""],
         distance: Float[Array, ""],
+        search: SearchConfig = _NO_SEARCH,
     ) -> Detection:
         """What a look says, from a whole scan.
 
@@ -84,9 +88,11 @@ class Models:
           readings: `[B, ...]` readings of all rays, see `sim.cut_out`.
           bearing: bearing of the PoI in the robot's frame, in radians, positive to the left.
           distance: distance at which the PoI's centre is expected, in metres.
+          search: largest errors of the robot's pose, within which other bearings and distances are
+            tried, too; static. By default none are.
         """
-        of_window = windows.around(sensor, readings, bearing)
-        return self.detect_in_window(modality, sensor, of_window, bearing, distance)
+        of_window = windows.around(searching.widened(sensor, search), readings, bearing)
+        return self.detect_in_window(modality, sensor, of_window, bearing, distance, search)
 
     def detect_in_window(
         self,
@@ -95,22 +101,30 @@ class Models:
         readings: Float[Array, "W ..."],
         bearing: Float[Array, ""],
         distance: Float[Array, ""],
+        search: SearchConfig = _NO_SEARCH,
     ) -> Detection:
         """What a look says, from the rays that the detector reads, see `detect`.
 
         Args:
           modality: index of the sensor; static.
           sensor: the sensor.
-          readings: `[window, ...]` of the rays around the PoI's bearing.
+          readings: `[window, ...]` of the rays around the PoI's bearing; with a search, of those of
+            `sim.search.widened`.
           bearing: of the PoI, see `detect`.
           distance: of the PoI, see `detect`.
+          search: see `detect`.
         """
         most = jnp.inf if sensor.measures_distance else jnp.finfo(readings.dtype).max
         is_valid = (readings >= 0) & (readings <= most)
-        window = windows.as_window(sensor, jnp.where(is_valid, readings, jnp.nan))
+        wide = searching.widened(sensor, search)
+        window = windows.as_window(wide, jnp.where(is_valid, readings, jnp.nan))
         # What is out of view is expected nowhere.
         expected = jnp.where(windows.is_in_view(sensor, bearing), distance, jnp.nan)
-        return detectors.answer(self.detectors[modality], window, expected)
+        detector = self.detectors[modality]
+        if not search.applies:
+            return detectors.answer(detector, window, expected)
+        tried = searching.candidates(sensor, search, window, bearing, expected)
+        return detectors.search(detector, tried.windows, tried.distances, tried.log_prior)
 
     def plausible_classes(self, belief: Belief) -> Bool[Array, " C"]:
         """Classes that are plausible given a `[D]` belief, see `vae.plausible_classes`."""

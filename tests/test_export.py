@@ -19,7 +19,13 @@ from smoke import error_line, save_models
 
 from benchmarks import exported
 from jaxsense import export
-from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
+from jaxsense.config import (
+    PRESETS,
+    DetectorConfig,
+    JmvaeConfig,
+    LocalisationConfig,
+    SearchConfig,
+)
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
 from jaxsense.dqn import observation, team_mdp
@@ -507,3 +513,39 @@ def test_an_export_that_is_stopped_leaves_nothing(run, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         export.main([str(run), "--out", str(tmp_path / "x.zip")])
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
+def test_an_exported_robot_searches_as_missions_do(models, player, tmp_path):
+    errors = SearchConfig(position=0.06, heading=3.0)
+    localisation = LocalisationConfig(search=errors)
+    config = dataclasses.replace(
+        CONFIG, mission=dataclasses.replace(CONFIG.mission, localisation=localisation)
+    )
+    # Untrained detectors have no scale, and are never unsure.
+    unsure = tuple(
+        dataclasses.replace(
+            each,
+            scale=jnp.float32(1.0),
+            gate=dataclasses.replace(each.gate, scale=jnp.float32(1.0)),
+        )
+        for each in models.detectors
+    )
+    models = dataclasses.replace(models, detectors=unsure)
+    path = tmp_path / "searching.zip"
+    path.write_bytes(export.archive(config, models))
+    _, programs = player.load(path)
+    rng = np.random.default_rng(0)
+    for m, sensor in enumerate(sensors.make(config)):
+        channels = () if sensor.channels == 1 else (sensor.channels,)
+        for bearing, distance in ((0.1, 0.7), (-0.2, 0.4), (3.0, 0.5)):
+            scan = rng.uniform(0.1, 1.0, (len(sensor.angles), *channels)).astype(np.float32)
+            given = scan, np.float32(bearing), np.float32(distance)
+            searched = models.detect(m, sensor, *given, errors)
+            plain = models.detect(m, sensor, *given)
+            about = dict(zip(("readings", "bearing", "distance"), given, strict=True))
+            found = programs[f"detect_{sensor.name}"](**about)
+            assert found["is_there"] == searched.is_there == (bearing < 1)
+            np.testing.assert_allclose(found["features"], searched.features, atol=1e-5)
+            assert bearing > 1 or np.abs(searched.features - plain.features).max() > 1e-4

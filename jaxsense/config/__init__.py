@@ -22,6 +22,7 @@ from jaxsense.config.mission import CommunicationConfig as CommunicationConfig
 from jaxsense.config.mission import LocalisationConfig as LocalisationConfig
 from jaxsense.config.mission import MissionConfig as MissionConfig
 from jaxsense.config.mission import NavigationConfig as NavigationConfig
+from jaxsense.config.mission import SearchConfig as SearchConfig
 from jaxsense.config.objects import COLOURS as COLOURS
 from jaxsense.config.objects import SHAPES as SHAPES
 from jaxsense.config.objects import Attribute as Attribute

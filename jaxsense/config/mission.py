@@ -36,6 +36,26 @@ class NavigationConfig(Section, place="navigation"):
         return self.robot_radius - ROBOT_RADIUS
 
 
+class SearchConfig(Section, place="mission.localisation.search"):
+    """How far a robot that may be misplaced searches its scan for a PoI; by default not at all.
+
+    The gate judges all windows and distances that errors up to these explain. A robot also looks
+    from farther away than `viewpoint.min_distance`, by the error of its position.
+    """
+
+    position: float = limited(0.0, at_least=0, at_most=0.3)
+    """Largest error of a robot's position to search for, in metres, for example three times
+    `position_error`."""
+    heading: float = limited(0.0, at_least=0, at_most=30)
+    """Largest error of a robot's heading to search for, in degrees, for example three times
+    `heading_error`."""
+
+    @property
+    def applies(self) -> bool:
+        """Whether robots search at all."""
+        return self.position > 0 or self.heading > 0
+
+
 class LocalisationConfig(Section, place="mission.localisation"):
     """Errors of the poses that robots believe they have; none in all presets.
 
@@ -43,7 +63,8 @@ class LocalisationConfig(Section, place="mission.localisation"):
     """
 
     in_training: bool = False
-    """Whether the looks that detectors and policies learn from have the constant errors, too."""
+    """Whether the looks that detectors and policies learn from have the constant errors, too; never
+    those that driving adds."""
     position_error: Traced[float] = limited(0.0, at_least=0, at_most=1)
     """Standard deviation of the constant error of a robot's x and y in a mission, in metres."""
     heading_error: Traced[float] = limited(0.0, at_least=0, at_most=180)
@@ -54,6 +75,8 @@ class LocalisationConfig(Section, place="mission.localisation"):
     heading_drift: Traced[float] = limited(0.0, at_least=0, at_most=180)
     """Standard deviation of what driving adds to the error of the heading, in degrees after one
     metre; it grows with the square root of the distance."""
+    search: SearchConfig = SearchConfig()
+    """How far a robot searches its scan for a PoI, because it may be misplaced."""
 
 
 class CommunicationConfig(Section, place="mission.communication"):

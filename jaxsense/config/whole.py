@@ -154,7 +154,9 @@ class Config(Section):
         farthest = navigation.view_range
         expected = f"must be at most viewpoint.max_distance = {viewpoint.max_distance} m"
         require(farthest <= viewpoint.max_distance, navigation, "view_range", expected)
-        nearest = max(self.arena.poi_extent + navigation.robot_radius, viewpoint.min_distance)
+        # A robot that searches keeps away by the error of its position.
+        nearest = viewpoint.min_distance + self.mission.localisation.search.position
+        nearest = max(self.arena.poi_extent + navigation.robot_radius, nearest)
         distances = navigation.view_distances
         is_between = nearest <= min(distances) <= max(distances) <= farthest
         expected = (

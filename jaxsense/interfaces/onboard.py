@@ -74,11 +74,12 @@ def functions(config: Config) -> dict[str, Function]:
 
 def _detect(config: Config, m: int) -> Function:
     sensor, least = sensors.make(config)[m], config.mission.least_confidence
+    search = config.mission.localisation.search
 
     def apply(
         models: Models, readings: jax.Array, bearing: jax.Array, distance: jax.Array
     ) -> dict[str, jax.Array]:
-        found = models.detect(m, sensor, readings, bearing, distance)
+        found = models.detect(m, sensor, readings, bearing, distance, search)
         is_confident = jnp.max(found.features) >= least
         return {
             "is_there": found.is_there,

@@ -26,6 +26,7 @@ from jaxsense.mission.state import (
 from jaxsense.models import Models
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import localisation, viewpoints
+from jaxsense.sim import search as searching
 from jaxsense.sim import world as worlds
 
 GOAL_ANGLE = 6.0  # degrees, maximum angle to the PoI at which a robot scans it
@@ -263,6 +264,9 @@ def _look(
 ) -> _Look:
     """Simulates a scan; it detects a PoI that is there if the detector is confident enough."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
+    search = mission.config.mission.localisation.search
+    wide = tuple(searching.widened(each, search) for each in world.sensors)
+    world = dataclasses.replace(world, sensors=wide)
     data = arenas.place(world.arena, scene.layout, scene.poses)
     time = mission.time(state)
     readings = worlds.scan_around(
@@ -270,7 +274,7 @@ def _look(
     )
     is_blind = time >= state.faults.blind_at[robot]
     readings = jnp.where(is_blind, sensor.blind, readings)
-    found = models.detect_in_window(modality, sensor, readings, aim.bearing, aim.distance)
+    found = models.detect_in_window(modality, sensor, readings, aim.bearing, aim.distance, search)
     is_confident = jnp.max(found.features) >= mission.config.mission.least_confidence
     known = map_of(mission, state, robot)
     apart = known.apart(state.believed_poses[robot, :2][None], aim.poi, modality)[0]

@@ -233,7 +233,9 @@ def sees(
     """
     config, position = mission.config, state.believed_poses[robot, :2]
     distance = jnp.linalg.norm(state.scene.layout.position[poi] - position)
-    in_range = distance >= config.viewpoint.min_distance
+    # A robot may be nearer than it believes.
+    nearer = config.mission.localisation.search.position
+    in_range = distance >= config.viewpoint.min_distance + nearer
     in_range &= distance <= config.navigation.view_range
     return in_range & (_room(mission, state, robot, poi, position[None], 0.0)[0] > 0)
 

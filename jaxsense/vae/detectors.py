@@ -18,6 +18,8 @@ from jaxsense.vae import gate as gates
 from jaxsense.vae.gate import Gate
 
 _MAX_TEMPERATURE = 4.0
+_NEVER = -1e9  # log-odds of what is no candidate; finite, so that there may be none
+_MIN_PROBABILITY = 1e-9  # whose logarithm counts
 
 
 class Detector(Protocol):
@@ -138,6 +140,43 @@ def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array
     is_there = gates.passes(detector.gate, window, distance)
     features = jnp.where(is_there, detect(detector, window), 1 / detector.num_labels)
     return Detection(is_there, features)
+
+
+def search(
+    detector: Detector,
+    windows: Float[Array, "K F"],
+    distances: Float[Array, " J"],
+    log_prior: Float[Array, "J K"],
+) -> Detection:
+    """What a look says that shows its PoI in one of several windows, at one of several distances.
+
+    The PoI is there if the gate's mean odds reach its threshold: of many windows that show nothing,
+    the best one would pass too often. The features are the logarithmic pool of all windows (Genest
+    and Zidek 1986), weighted by their posterior, from the prior and the gate: windows next to the
+    best one show the PoI nearly as well, and their mean is less noisy than a single one.
+
+    Args:
+      detector: of the sensor.
+      windows: `[K, F]`, of which those with a reading that is not finite count for nothing.
+      distances: `[J]` expected distances of the PoI's centre, in metres.
+      log_prior: `[J, K]` logarithm of the prior, up to a constant; minus infinity for what is not
+        to be considered.
+    """
+    chex.assert_shape(log_prior, (len(distances), len(windows)), custom_message="log_prior")
+    is_valid = jnp.isfinite(windows).all(axis=1)
+    given = jnp.where(is_valid[:, None], windows, 0.0)
+    is_distance = jnp.isfinite(distances) & (distances > 0)
+    may_be = is_valid[None] & is_distance[:, None] & jnp.isfinite(log_prior)
+    found = jax.vmap(lambda at: gates.logits(detector.gate, given.T, jnp.full(len(given), at)))(
+        jnp.where(is_distance, distances, 1.0)
+    )
+    prior = jax.nn.log_softmax(jnp.where(may_be, log_prior, _NEVER).reshape(-1))
+    odds = jnp.where(may_be.reshape(-1), found.reshape(-1) + prior, _NEVER)
+    is_there = jnp.any(may_be) & (jax.nn.logsumexp(odds) >= detector.gate.threshold)
+    share = jax.nn.softmax(odds).reshape(may_be.shape).sum(axis=0)
+    logs = jnp.log(jnp.maximum(jax.vmap(detector.features)(given), _MIN_PROBABILITY))
+    pooled = jax.nn.softmax(share @ logs)
+    return Detection(is_there, jnp.where(is_there, pooled, 1 / detector.num_labels))
 
 
 def _standard(detector: Classifier, window: Float[Array, " F"]) -> Float[Array, " F"]:

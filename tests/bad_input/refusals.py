@@ -24,6 +24,7 @@ PARTS = {
     "team.travel": SMOKE.team.travel,
     "team.tours": SMOKE.team.tours,
     "mission.localisation": SMOKE.mission.localisation,
+    "mission.localisation.search": SMOKE.mission.localisation.search,
     "mission.communication": dataclasses.replace(SMOKE.mission.communication, own_maps=True),
 }
 NUMBERS = [

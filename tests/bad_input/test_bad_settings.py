@@ -85,6 +85,7 @@ LIMITS = {
     "mission.localisation.position_error mission.localisation.position_drift",
     Limits(at_least=0, at_most=180): "mission.localisation.heading_error "
     "mission.localisation.heading_drift",
+    Limits(at_least=0, at_most=0.3): "mission.localisation.search.position",
     Limits(at_least=0, at_most=0.95): "mission.communication.loss",
     Limits(at_least=0, at_most=3600): "mission.communication.delay",
     Limits(at_least=0, at_most=10): "camera.exposure_error camera.colour_cast "
@@ -92,7 +93,7 @@ LIMITS = {
     Limits(at_least=0, at_most=10_000): "team.tours.walk",
     Limits(at_least=0, at_most=1_000_000): "jmvae.alpha mdp.look_cost detector.num_repeats",
     Limits(at_least=0, at_most=1_000_000, min_items=1): "jmvae.reconstruction_weights",
-    Limits(at_least=0, at_most=30): "viewpoint.max_bearing",
+    Limits(at_least=0, at_most=30): "viewpoint.max_bearing mission.localisation.search.heading",
     Limits(at_least=0, below=1): "mission.least_confidence",
     Limits(at_least=0.5, at_most=1): "shape.half_sides",
     Limits(at_least=1): "lidar.window lidar.stride camera.window camera.stride detector.num_scans "
@@ -202,6 +203,8 @@ ZERO = {
     "mission.localisation.heading_error",
     "mission.localisation.position_drift",
     "mission.localisation.heading_drift",
+    "mission.localisation.search.position",
+    "mission.localisation.search.heading",
     "mission.communication.loss",
     "mission.communication.delay",
 }  # fmt: skip

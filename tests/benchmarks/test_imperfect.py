@@ -71,6 +71,16 @@ def test_sweeps_change_one_thing_or_two():
             assert (told.loss, told.delay) == expected
 
 
+def test_misplaced_robots_may_search():
+    given = imperfect.Arguments(run=Path("latest"), search_position=0.09, search_heading=6.0)
+    for sweep in imperfect.poses(given):
+        for changes in sweep.changes:
+            searched = imperfect.changed(PRESETS["noisy"], changes).mission.localisation.search
+            assert (searched.position, searched.heading) == (0.09, 6.0)
+    with pytest.raises(ConfigError, match=r"search.heading = 31"):
+        imperfect.Arguments(run=Path("latest"), search_heading=31.0)
+
+
 def test_other_arenas_and_robots():
     four = imperfect.Arguments(
         run=Path("latest"), num_pois=16, side=6.0, robots=("camera", "lidar") * 2

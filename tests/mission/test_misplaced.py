@@ -1,5 +1,6 @@
 """What robots do that are elsewhere than they believe."""
 
+import functools
 from dataclasses import replace
 
 import jax
@@ -9,8 +10,8 @@ import pytest
 from teams import CONFIG, POSES, POSITIONS, alone, with_config, with_values
 
 from jaxsense import mission
-from jaxsense.config import LocalisationConfig
-from jaxsense.mission import act
+from jaxsense.config import LocalisationConfig, SearchConfig
+from jaxsense.mission import act, decide
 from jaxsense.mission.rollout import _drift
 from jaxsense.mission.state import DRIVING, FACING
 
@@ -65,6 +66,97 @@ def test_the_gate_is_given_the_distance_that_the_robot_believes(scan, facing):
     for error, detections in ((0.0, 1), (-0.1, 1), (-0.3, 0)):
         robots = scan(facing(LIDAR, [0.0, 0.0, 0.0], [error, 0.0, 0.0]), LIDAR).robots
         assert (robots.looks[LIDAR], robots.detections[LIDAR]) == (1, detections)
+
+
+@pytest.fixture(scope="module")
+def certain(models):
+    """Models whose gates are certain of what they pass, as trained ones are."""
+
+    def of(detector):
+        params = jax.tree.map(np.array, detector.gate.params)
+        params["params"]["Dense_2"] = {n: 300 * x for n, x in params["params"]["Dense_2"].items()}
+        return replace(detector, gate=replace(detector.gate, params=params))
+
+    return replace(models, detectors=tuple(map(of, models.detectors)))
+
+
+def test_a_poi_is_found_in_a_whole_scan_where_an_error_explains_it(team, certain):
+    lidar = team.world.sensors[LIDAR]
+    # 30 rays, .7 m away, whose middle is 40 rays or 14.1 degrees from the expected bearing.
+    scan = np.full(len(lidar.angles), 3.0, np.float32)
+    scan[341 + 40 - 15 : 341 + 40 + 15] = 0.7
+
+    def is_there(scan, search):
+        return bool(certain.detect(LIDAR, lidar, scan, 0.0, 0.8, search).is_there)
+
+    assert not is_there(scan, SearchConfig())
+    assert is_there(scan, SearchConfig(heading=14.0))
+    assert is_there(scan[::-1], SearchConfig(heading=14.0))
+    assert not is_there(scan, SearchConfig(heading=5.0))
+    # What is wrong elsewhere in the scan does not matter, and nobody searches beyond its ends.
+    broken = np.where(np.arange(len(scan)) < 260, np.nan, scan)
+    assert is_there(broken, SearchConfig(heading=14.0))
+    assert not is_there(np.where(scan == 3.0, np.nan, scan), SearchConfig(heading=14.0))
+    assert not certain.detect(LIDAR, lidar, scan, 2.5, 0.8, SearchConfig(heading=30.0)).is_there
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
+@pytest.mark.parametrize(
+    ("search", "degrees", "aside", "detections"),
+    [
+        (SearchConfig(heading=12.0), -15.0, 0.0, 1),
+        (SearchConfig(heading=3.0), -15.0, 0.0, 0),
+        # .2 m across a view of .8 m are 14 degrees.
+        (SearchConfig(position=0.15), 0.0, 0.2, 1),
+        (SearchConfig(position=0.04), 0.0, 0.2, 0),
+    ],
+)
+def test_a_robot_that_searches_finds_what_its_errors_explain(
+    searches, facing, robot, search, degrees, aside, detections
+):
+    turned = np.radians(degrees)
+    state = facing(robot, [0.0, aside, turned], [0.0, -aside, -turned])
+    robots = searches(search)(state, robot).robots
+    assert (robots.looks[robot], robots.detections[robot]) == (1, detections)
+
+
+@pytest.mark.slow
+def test_a_robot_that_searches_tries_other_distances(searches, facing):
+    # The gate refuses what is more than .24 m nearer than expected. The cube's side is, by .3 m.
+    state = facing(LIDAR, [0.0, 0.0, 0.0], [-0.2, 0.0, 0.0])
+    for position, detections in ((0.03, 0), (0.12, 1)):
+        robots = searches(SearchConfig(position=position))(state, LIDAR).robots
+        assert (robots.looks[LIDAR], robots.detections[LIDAR]) == (1, detections)
+
+
+def test_a_robot_that_searches_looks_from_farther_away(team, facing):
+    # It is .35 m from the PoI, and looks from .3 m and farther.
+    state = facing(CAMERA, [0.45, 0.0, 0.0], [0.0, 0.0, 0.0])
+    for position, expected in ((0.0, True), (0.04, True), (0.06, False)):
+        config = searching(SearchConfig(position=position))
+        assert bool(decide.sees(with_config(team, config), state, CAMERA, jnp.int32(0))) is expected
+
+
+def searching(search):
+    """Settings of missions in which robots search."""
+    localisation = LocalisationConfig(search=search)
+    return replace(CONFIG, mission=replace(CONFIG.mission, localisation=localisation))
+
+
+@pytest.fixture(scope="module")
+def searches(team, certain):
+    @functools.cache
+    def of(search):
+        wide = with_config(team, searching(search))
+
+        @jax.jit
+        def of_one(key, state, robot):
+            return alone(lambda key, state: act.scan(key, wide, certain, state, robot))(key, state)
+
+        return lambda state, robot: of_one(jax.random.key(0), state, robot)
+
+    return of
 
 
 def test_a_look_is_remembered_at_the_place_that_the_robot_believes(scan, facing):

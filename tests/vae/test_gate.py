@@ -1,6 +1,7 @@
 """Gates on windows whose answer is known."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -145,3 +146,56 @@ def test_what_does_not_pass_has_no_features_of_a_class():
     ):
         assert not answer.is_there
         np.testing.assert_allclose(answer.features, [1 / 3] * 3)
+
+
+def test_a_search_of_one_window_is_a_look(problem):
+    windows = jax.random.normal(jax.random.key(0), (20, RAYS))
+    detector = detectors.init(jax.random.key(1), windows, 3, CONFIG)
+    for window in (windows[0], windows[1].at[1].set(jnp.nan)):
+        plain = detectors.answer(detector, window, jnp.float32(1.0))
+        found = detectors.search(detector, window[None], jnp.ones(1), jnp.zeros((1, 1)))
+        assert found.is_there == plain.is_there
+        np.testing.assert_allclose(found.features, plain.features, atol=1e-6)
+
+
+def test_a_search_pools_the_windows_by_their_posterior_odds(monkeypatch):
+    # The first reading is the log-odds of the window, the second the logit of a label.
+    monkeypatch.setattr(gate, "logits", lambda g, windows, at: windows[0] - jnp.abs(at - 1.0))
+    detector = Read(Threshold(jnp.float32(1.5)))
+    windows = jnp.array([[2.0, 3.0], [2.0, -1.0], [9.0, 5.0], [np.nan, 5.0]])
+    prior = jnp.array([0.0, -np.log(3.0), -np.inf, 0.0])
+    found = detectors.search(detector, windows, jnp.array([1.0]), prior[None])
+    # Shares 3/4 and 1/4: a logit of 3 x .75 - 1 x .25 = 2, and the sigmoid of 2 is .8808.
+    assert found.is_there
+    np.testing.assert_allclose(found.features, [0.8808, 0.1192], atol=1e-4)
+    # Log-odds of 2 and, at the other distance, of 2 - x: a mean of 2 - log 2 + log(1 + e^-x), which
+    # is 1.5 for x = 1.55. A distance that is not positive is none, and has no share in the mean.
+    for distances, is_there in (
+        *(([1.0, 2.5], True), ([1.0, 2.6], False), ([1.0, -1.0], True), ([1.0, np.nan], True)),
+        ([-1.0, np.nan], False),
+    ):
+        both = jnp.tile(prior, (2, 1))
+        found = detectors.search(detector, windows, jnp.array(distances), both)
+        assert bool(found.is_there) is is_there
+        assert is_there or found.features.tolist() == [0.5, 0.5]
+    nowhere = jnp.full((1, 4), -jnp.inf)
+    assert not detectors.search(detector, windows, jnp.ones(1), nowhere).is_there
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """The threshold of a gate, and nothing else."""
+
+    threshold: Any
+
+
+@dataclass(frozen=True)
+class Read:
+    """A detector of two labels, whose logit is the second reading."""
+
+    gate: Any
+    num_labels: int = 2
+
+    def features(self, window):
+        probability = jax.nn.sigmoid(window[1])
+        return jnp.stack([probability, 1 - probability])

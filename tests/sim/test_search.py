@@ -1,0 +1,102 @@
+"""Windows and distances that a misplaced robot tries, by hand and against the plain window."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import PRESETS
+from jaxsense.config import ConfigError, SearchConfig
+from jaxsense.sim import search, sensors, windows
+
+CAMERA, LIDAR = sensors.make(PRESETS["default"])
+BOTH = pytest.mark.parametrize("sensor", [CAMERA, LIDAR], ids=["camera", "lidar"])
+
+
+@BOTH
+def test_who_does_not_search_reads_the_plain_window(sensor):
+    assert search.widened(sensor, SearchConfig()) == sensor
+
+
+def test_a_search_reads_as_many_more_rays_as_its_errors_need():
+    # The LiDAR's rays are 240 / 682 = .3519 degrees apart, and 6 / .3519 = 17.05. Every fourth of
+    # the camera's is read, 4 x 80 / 639 = .5008 apart, and 6 / .5008 = 11.98.
+    heading = SearchConfig(heading=6.0)
+    assert search.widened(LIDAR, heading).window == LIDAR.window + 2 * 18
+    assert search.widened(CAMERA, heading).window == CAMERA.window + 2 * 12
+    # .15 m across .3 m are half a radian or 28.65 degrees, and 28.65 / .3519 = 81.41.
+    position = SearchConfig(position=0.15)
+    assert search.widened(LIDAR, position).window == LIDAR.window + 2 * 82
+    # The larger of two errors counts more: (6^2 + 28.65^2)^.5 = 29.27, and / .3519 = 83.2.
+    both = SearchConfig(position=0.15, heading=6.0)
+    assert search.widened(LIDAR, both).window == LIDAR.window + 2 * 84
+    # The camera has 640 rays, of which 160 are read.
+    wide = SearchConfig(position=0.3, heading=30.0)
+    assert search.widened(CAMERA, wide).window == 160
+
+
+@BOTH
+@pytest.mark.parametrize("bearing", [-0.1, 0.001, 0.07])  # no half rays
+def test_each_window_is_the_plain_one_at_another_bearing(sensor, bearing):
+    errors, scan = SearchConfig(heading=3.0), readings_of(sensor)
+    wide = wide_window(sensor, errors, scan, jnp.float32(bearing))
+    found = search.candidates(sensor, errors, wide, jnp.float32(bearing), jnp.float32(0.8))
+    half = len(found.windows) // 2
+    first = windows._first_ray(sensor, jnp.float32(bearing))
+    for k in range(-half, half + 1):
+        rays = first + sensor.stride * (k + np.arange(sensor.window))
+        plain = windows.as_window(sensor, jnp.asarray(scan[rays]))
+        np.testing.assert_array_equal(found.windows[half + k], plain)
+
+
+def test_a_search_is_as_wide_as_its_errors_explain():
+    scan, errors = readings_of(LIDAR), SearchConfig(position=0.09, heading=2.0)
+    # The middle of 128 rays is half way between two of them.
+    ahead = jnp.float32(np.radians(240 / 682 / 2))
+    wide = wide_window(LIDAR, errors, scan, ahead)
+    for distance in (0.5, 2.0):
+        found = search.candidates(LIDAR, errors, wide, ahead, jnp.float32(distance))
+        # 2 degrees, and .09 / .5 = .18 or .09 / 2 = .045 radians, which are 10.3 or 2.58 degrees.
+        half = np.hypot(2.0, np.degrees(0.09 / distance))
+        middle = len(found.windows) // 2
+        steps = int(half / (240 / 682))
+        near = np.isfinite(found.log_prior).all(axis=0).nonzero()[0]
+        np.testing.assert_array_equal(near, np.arange(middle - steps, middle + steps + 1))
+        np.testing.assert_allclose(
+            found.distances, distance + np.array([-0.09, -0.06, -0.03, 0.0, 0.03, 0.06, 0.09])
+        )
+        # The largest errors are three standard deviations: e^-4.5, and at both ends e^-9.
+        prior = found.log_prior - np.max(found.log_prior)
+        np.testing.assert_allclose(prior[0, middle], -4.5, rtol=1e-3)
+        off = steps * 240 / 682 / half
+        np.testing.assert_allclose(
+            prior[[3, 6], middle + steps], [-4.5 * off**2, -4.5 * (1 + off**2)], rtol=1e-3
+        )
+
+
+def test_robots_that_search_keep_away_by_the_error_of_their_position():
+    config = PRESETS["default"]
+
+    def searching(position):
+        errors = SearchConfig(position=position)
+        localisation = replace(config.mission.localisation, search=errors)
+        return replace(config, mission=replace(config.mission, localisation=localisation))
+
+    assert searching(0.2).mission.localisation.search.applies
+    # .3 m, the nearest look of training, and .21 m are beyond the viewpoints at .5 m.
+    with pytest.raises(ConfigError, match=r"view_distances.*from 0.510 m"):
+        searching(0.21)
+
+
+def readings_of(sensor):
+    """A scan in which every reading tells its ray, below the limit of a window."""
+    number = len(sensor.angles) * sensor.channels
+    shape = (len(sensor.angles), *(() if sensor.channels == 1 else (sensor.channels,)))
+    return np.linspace(0.1, 0.9, number, dtype=np.float32).reshape(shape)
+
+
+def wide_window(sensor, errors, scan, bearing):
+    """What a robot that searches reads."""
+    wide = search.widened(sensor, errors)
+    return windows.as_window(wide, windows.around(wide, scan, bearing))
