@@ -1,6 +1,6 @@
 """What a JMVAE needs to learn from scans themselves, and what it fails without.
 
 `python -m benchmarks.raw` trains variants of the JMVAE on the same scans, ten seeds of each side by
-side, and writes figures of every seed; `python -m benchmarks.raw.report` makes of them the tables
-and pictures of `docs/raw.md`.
+side, and writes figures of every seed; `python -m benchmarks.raw.report` makes tables and pictures
+of them.
 """

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.raw.report FILES`: tables and pictures of `docs/raw.md`.
+"""`python -m benchmarks.raw.report FILES`: tables and pictures of what fails.
 
 FILES are what `python -m benchmarks.raw --json` has written, one or more tables in each.
 """
