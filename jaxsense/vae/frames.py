@@ -58,7 +58,7 @@ class Profile:
         """See `Frame`: `[64]` depths in metres, from 1.5 extents on one side to 1.5 on the other.
 
         Each is the mean of the beams up to a bin or the pitch of the beams away; where there is
-        none, as beside the PoI, it is as large as a depth can be.
+        none, as next to the PoI, it is as large as a depth can be.
         """
         # One beam alone may be an outlier.
         triples = jnp.maximum(jnp.maximum(window[:-2], window[1:-1]), window[2:])
