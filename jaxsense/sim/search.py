@@ -39,7 +39,9 @@ def widened(sensor: Sensor, search: SearchConfig) -> Sensor:
       sensor: the sensor.
       search: the largest errors.
     """
-    between = sensor.field_of_view * sensor.stride / max(len(sensor.angles) - 1, 1)
+    if not search.applies or len(sensor.angles) < 2:
+        return sensor
+    between = sensor.field_of_view * sensor.stride / (len(sensor.angles) - 1)
     off = math.hypot(search.heading, math.degrees(search.position / _NEAREST))
     most = (len(sensor.angles) - 1) // sensor.stride + 1
     return sensor.replace(window=min(sensor.window + 2 * math.ceil(off / between), most))
@@ -70,7 +72,7 @@ def candidates(
     middles = (angles[low : low + number] + angles[high : high + number]) / 2
     off = jnp.abs(middles - bearing)
     largest = jnp.hypot(jnp.radians(search.heading), search.position / distance)
-    # The plain window is one of them, though no ray may be along the bearing.
+    # Keeps the window nearest to the bearing even if no ray lies within the error.
     is_near = (off <= largest) | (off == jnp.min(off))
     of_bearings = jnp.where(is_near, -((_DEVIATIONS * off / largest) ** 2) / 2, -jnp.inf)
     shares = np.linspace(-1.0, 1.0, 2 * steps + 1)

@@ -100,3 +100,11 @@ def wide_window(sensor, errors, scan, bearing):
     """What a robot that searches reads."""
     wide = search.widened(sensor, errors)
     return windows.as_window(wide, windows.around(wide, scan, bearing))
+
+
+def test_a_sensor_of_one_ray_has_nothing_to_widen():
+    one = PRESETS["default"].lidar
+    config = replace(PRESETS["default"], lidar=replace(one, num_beams=1, window=1))
+    sensor = sensors.make(config)[1]
+    for given in (SearchConfig(), SearchConfig(position=0.09, heading=6.0)):
+        assert search.widened(sensor, given) is sensor
