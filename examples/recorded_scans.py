@@ -43,7 +43,8 @@ def read(config: jaxsense.Config, models: jaxsense.Models, looks: RecordedLooks)
             # What the look says of the PoI, which may be that there is nothing.
             bearing, distance = (jnp.float32(values[n]) for values in views[sensor.name])
             scan = looks.scans[sensor.name][n]
-            detection = models.detect(m, sensor, scan, bearing, distance)
+            search = config.mission.localisation.search
+            detection = models.detect(m, sensor, scan, bearing, distance, search)
             if not detection.is_there:
                 print(f"  {sensor.name}: nothing there")
                 continue

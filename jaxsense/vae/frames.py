@@ -57,8 +57,8 @@ class Profile:
     def __call__(self, window: Float[Array, " W"]) -> Float[Array, " G"]:
         """See `Frame`: `[64]` depths in metres, from 1.5 extents on one side to 1.5 on the other.
 
-        Each is the mean of the beams up to a bin or the pitch of the beams away; where there is
-        none, as next to the PoI, it is as large as a depth can be.
+        Each is the mean of the beams up to a bin or the pitch of the beams away, weighted by how
+        near they are, and of 2.1 extents with the weight .05: the depth where no beam is near.
         """
         # One beam alone may be an outlier.
         triples = jnp.maximum(jnp.maximum(window[:-2], window[1:-1]), window[2:])
