@@ -10,7 +10,7 @@ import rich.console
 import rich.table
 
 import jaxsense
-from jaxsense.config import SearchConfig
+from jaxsense.config import ConfigError, SearchConfig
 from jaxsense.sim import absence, amiro, search, viewpoints
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import world as worlds
@@ -165,8 +165,12 @@ def main(argv: list[str] | None = None) -> None:
     )
     parser.add_argument("--trust", action="store_true", help="import the run's own sensors")
     arguments = parser.parse_args(argv)
+    try:
+        errors = SearchConfig(*arguments.search)
+    except ConfigError as error:
+        parser.error(str(error))
     config, models = jaxsense.load(arguments.run, arguments.trust)
-    found = answered(config, models, arguments.looks, SearchConfig(*arguments.search))
+    found = answered(config, models, arguments.looks, errors)
     table = rich.table.Table("answered with a class", *found, title=f"{arguments.looks} looks each")
     for name in SITUATIONS:
         table.add_row(name, *(f"{of_modality[name]:.4f}" for of_modality in found.values()))

@@ -262,6 +262,7 @@ def main(argv: list[str] | None = None) -> None:
     trained, models = rundir.load(cli.find_run(arguments.run))
     try:
         config = elsewhere(arguments, trained, models)
+        changed(config, {"localisation": LocalisationConfig(search=arguments.search)})
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     exact = {"localisation": LocalisationConfig(), "communication": CommunicationConfig()}

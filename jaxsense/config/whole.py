@@ -155,12 +155,14 @@ class Config(Section):
         expected = f"must be at most viewpoint.max_distance = {viewpoint.max_distance} m"
         require(farthest <= viewpoint.max_distance, navigation, "view_range", expected)
         # A robot that searches keeps away by the error of its position.
-        nearest = viewpoint.min_distance + self.mission.localisation.search.position
+        searched = self.mission.localisation.search.position
+        nearest = viewpoint.min_distance + searched
         nearest = max(self.arena.poi_extent + navigation.robot_radius, nearest)
         distances = navigation.view_distances
         is_between = nearest <= min(distances) <= max(distances) <= farthest
         expected = (
-            f"must be from {nearest:.3f} m, where the robot is clear of the PoI, to "
+            f"must be from {nearest:.3f} m, where the robot is clear of the PoI"
+            f"{' by mission.localisation.search.position' if searched else ''}, to "
             f"navigation.view_range = {farthest} m"
         )
         require(is_between, navigation, "view_distances", expected)
