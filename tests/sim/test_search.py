@@ -108,3 +108,11 @@ def test_a_sensor_of_one_ray_has_nothing_to_widen():
     sensor = sensors.make(config)[1]
     for given in (SearchConfig(), SearchConfig(position=0.09, heading=6.0)):
         assert search.widened(sensor, given) is sensor
+
+
+def test_small_errors_of_position_try_other_distances_too():
+    sensor = sensors.make(PRESETS["default"])[1]
+    given = SearchConfig(position=0.01)
+    window = jnp.ones(search.widened(sensor, given).window)
+    found = search.candidates(sensor, given, window, jnp.float32(0), jnp.float32(1))
+    np.testing.assert_allclose(found.distances, [0.99, 1.0, 1.01], rtol=1e-6)

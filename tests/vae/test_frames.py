@@ -95,3 +95,11 @@ def test_few_beams_leave_no_gaps():
     inside = np.abs(PLACES) < 0.07
     found = few(cylinder(1.0, 0.0)[::6])[inside]
     np.testing.assert_allclose(found, PROFILE(cylinder(1.0, 0.0))[inside], atol=0.02)
+
+
+def test_the_front_is_sought_as_far_as_the_bearing_may_be_wrong():
+    near_only = frames.make(ANGLES, 1, True, EXTENT, 0.0)
+    # A pole 2 cm wide at .108 rad, beyond .1 and within .1 and a bearing error of 1 degree.
+    window = cylinder(1.0, 0.108, radius=0.01)
+    assert np.asarray(PROFILE(window)).max() > 2 * EXTENT  # the pole, with nothing to its sides
+    assert np.asarray(near_only(window)).max() < 0  # the wall behind
