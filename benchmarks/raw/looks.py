@@ -75,7 +75,10 @@ def simulate(key: Key, number: int) -> Looks:
     raw = PRESETS["raw"]
     config = dataclasses.replace(
         raw,
-        detector=dataclasses.replace(raw.detector, num_scans=number, num_held_out=1),
+        # No detector is calibrated, so all looks are to learn from.
+        detector=dataclasses.replace(
+            raw.detector, num_scans=number, num_held_out=1, calibration=0.0
+        ),
         jmvae=dataclasses.replace(raw.jmvae, looks=TOGETHER, samples_per_class=1),
         dqn=dataclasses.replace(raw.dqn, observe="bank"),
     )

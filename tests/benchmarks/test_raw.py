@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from benchmarks.raw import __main__, report, training
-from benchmarks.raw.looks import Looks, as_they_are, in_frames, regrouped, standardised
+from benchmarks.raw.looks import (
+    Looks,
+    as_they_are,
+    in_frames,
+    regrouped,
+    simulate,
+    standardised,
+)
 from benchmarks.raw.model import Model, hidden
 from benchmarks.raw.training import PARTS
 from benchmarks.raw.variants import ABLATION, OURS, PAPER, TABLES
@@ -17,6 +24,7 @@ from jaxsense import PRESETS
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP
 from jaxsense.vae import gaussian, leave_one_out
+from jaxsense.vae.frames import Chromaticity
 from jaxsense.vae.leave_one_out import Shape
 
 KEY = jax.random.key(0)
@@ -71,6 +79,16 @@ def test_the_paper_has_the_objective_of_a_jmvae():
     assert (PAPER.jmvae.alpha, PAPER.jmvae.beta) == (1.0, 0.1)
     found = model.loss(KEY, params, looks, jnp.float32(0.1), ONE)
     np.testing.assert_allclose(found, jnp.mean(expected), rtol=1e-5)
+
+
+def test_all_that_is_known_of_a_look_is_in_its_row():
+    looks = simulate(KEY, 288)
+    assert {len(x) for x in (*looks.windows, *looks.frames, looks.classes)} == {36}
+    of_windows = jax.vmap(jax.vmap(Chromaticity()))(looks.windows[0])
+    centred = of_windows - of_windows.mean(axis=(0, 1), keepdims=True)
+    np.testing.assert_allclose(
+        jnp.corrcoef(centred.ravel(), looks.frames[0].ravel())[0, 1], 1, atol=1e-3
+    )
 
 
 def test_names_are_unique():
