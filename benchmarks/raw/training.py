@@ -124,19 +124,17 @@ def _pairs(seen: Seen) -> Seen:
     return tuple(x[:, :1] for x in seen)
 
 
-def explained(z: Float[Array, "P D"], given: Float[Array, "P C"]) -> Float[Array, ""]:
+def explained(z: Float[np.ndarray, "P D"], given: Float[np.ndarray, "P C"]) -> float:
     """Share of the variance of latents that a linear regression explains.
 
     Args:
       z: latents.
       given: what they are regressed on.
     """
-    z, given = (x - jnp.mean(x, axis=0, keepdims=True) for x in (z, given))
-    given = given / (jnp.std(given, axis=0, keepdims=True) + 1e-6)
-    # Far smaller than any variance, but singular matrices have an inverse.
-    inverse = jnp.linalg.inv(given.T @ given + 1e-3 * jnp.eye(given.shape[1]))
-    rest = z - given @ (inverse @ (given.T @ z))
-    return 1 - jnp.sum(rest**2) / jnp.maximum(jnp.sum(z**2), 1e-12)
+    z, given = (x.astype(float) - x.mean(axis=0, dtype=float) for x in (z, given))
+    whole = np.sum(z**2)
+    rest = z - given @ np.linalg.lstsq(given, z)[0]
+    return 1 - float(np.sum(rest**2) / whole) if whole > 0 else 0.0
 
 
 def measured(model: Model, params: Params, data: Data) -> dict:
@@ -150,9 +148,8 @@ def measured(model: Model, params: Params, data: Data) -> dict:
     Returns:
       `right` and `pair`, the shares of PoIs whose joint posterior of K looks, or of one look, by
       each sensor is nearest to the mean of their class; `of_classes`, the same of a pair for each
-      class; `units`, active units; `by_class` and `by_view`, the shares of the variance of the
-      posterior means of pairs that the class explains, and that distances and light do;
-      `posteriors`, of some PoIs.
+      class; `units`, active units; `latents`, the posterior means of pairs; `posteriors`, of some
+      PoIs.
     """
     number, (of_train, truth) = model.variant.looks, data.classes
     groups = tuple(x[:_FOR_MEANS] for x in regrouped(data.train, number))
@@ -166,15 +163,14 @@ def measured(model: Model, params: Params, data: Data) -> dict:
 
     whole = _means(model, params, tuple(x[:, :number] for x in data.held_out))
     pair = _means(model, params, _pairs(data.held_out))
-    of_class, around = jax.nn.one_hot(truth, 3), data.circumstances[:, 0]
+    of_class = jax.nn.one_hot(truth, 3)
     of_pair = is_right(pair)
     return {
         "right": jnp.mean(is_right(whole)),
         "pair": jnp.mean(of_pair),
         "of_classes": of_pair @ of_class / jnp.sum(of_class, axis=0),
         "units": latent.active_units(whole),
-        "by_class": explained(pair, of_class[:, 1:]),
-        "by_view": explained(pair, jnp.concatenate([around, around**2], axis=1)),
+        "latents": pair,
         "posteriors": _posteriors(model, params, data),
     }
 
@@ -272,6 +268,10 @@ def of_seed(key: Key, model: Model, data: Data) -> dict:
 def compiled(variant: Variant, data: Data, keys: Key) -> Callable[[], dict]:
     """A program that trains a variant from each of the keys.
 
+    Its figures, over the keys, are those of `of_seed`, but for `latents`: instead, `by_class` and
+    `by_view` are the shares of their variance that the class explains, and that distances and light
+    do.
+
     Args:
       variant: the way of training.
       data: in the variant's view.
@@ -283,4 +283,18 @@ def compiled(variant: Variant, data: Data, keys: Key) -> Callable[[], dict]:
         return jax.vmap(lambda key: of_seed(key, model, data))(keys)
 
     program = jax.jit(figures).lower(keys, data).compile(compiler_options=compiler_options())
-    return lambda: jax.tree.map(np.asarray, program(keys, data))
+    around = np.asarray(data.circumstances[:, 0])
+    givens = {
+        "by_class": np.eye(3)[np.asarray(data.classes[1])],
+        "by_view": np.concatenate([around, around**2], axis=1),
+    }
+
+    def run() -> dict:
+        found = jax.tree.map(np.asarray, program(keys, data))
+        latents = found.pop("latents")
+        shares = {
+            name: np.array([explained(z, given) for z in latents]) for name, given in givens.items()
+        }
+        return found | shares
+
+    return run

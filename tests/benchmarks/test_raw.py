@@ -186,12 +186,15 @@ def test_variants_learn_what_is_easy():
 
 
 def test_explained_shares_are_those_of_a_regression():
-    given = jax.random.normal(KEY, (500, 2))
-    noise = jax.random.normal(jax.random.fold_in(KEY, 1), (500, 1))
+    given, noise = np.split(np.random.default_rng(0).normal(size=(500, 3)), [2], axis=1)
     half = given[:, :1] + noise  # variances 1 and 1
-    assert training.explained(given[:, :1] * 3 + 2, given) == pytest.approx(1, abs=1e-3)
+    assert training.explained(given[:, :1] * 3 + 2, given) == pytest.approx(1)
+    # Numbers that follow from the others, as squares of a direction do, add nothing.
+    repeated = np.concatenate([given, 1 - given.sum(axis=1, keepdims=True)], axis=1)
+    assert training.explained(half, repeated) == pytest.approx(training.explained(half, given))
     assert training.explained(half, given) == pytest.approx(0.5, abs=0.08)
     assert training.explained(noise, given) == pytest.approx(0, abs=0.02)
+    assert training.explained(np.ones((500, 2)), given) == 0
 
 
 def test_hidden_layers_are_those_of_the_network():
