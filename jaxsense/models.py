@@ -142,12 +142,16 @@ def make_frame(config: Config, sensor: Sensor) -> Frame:
     span = (sensor.window - 1) * sensor.stride
     start = (len(sensor.angles) - 1 - span) // 2
     angles = sensor.angles[start : start + span + 1 : sensor.stride]
+    # Near the edge of the field of view, a window ends at the last ray, off the PoI's bearing.
+    margin = (np.ptp(sensor.angles) - np.ptp(angles)) / 2
+    viewpoint = config.viewpoint
+    off = jnp.maximum(0.0, jnp.radians(viewpoint.max_bearing) - margin)
     return frames.make(
         angles,
         sensor.channels,
         sensor.measures_distance,
         config.arena.poi_extent,
-        jnp.radians(config.viewpoint.bearing_error),
+        jnp.radians(viewpoint.bearing_error) + off,
     )
 
 

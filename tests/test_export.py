@@ -515,8 +515,7 @@ def test_an_export_that_is_stopped_leaves_nothing(run, tmp_path, monkeypatch):
     assert not [*tmp_path.iterdir()]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
+@pytest.mark.parametrize("player", [robot_numpy, pytest.param(robot_onnx, marks=pytest.mark.slow)])
 def test_an_exported_robot_searches_as_missions_do(models, player, tmp_path):
     errors = SearchConfig(position=0.06, heading=3.0)
     localisation = LocalisationConfig(search=errors)

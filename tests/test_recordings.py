@@ -83,7 +83,7 @@ def test_a_sensor_may_be_missing_and_have_other_rays(write):
         ),
         (
             {"lidar_angles": HALF_CIRCLE[:60], "lidar_scans": EMPTY[:, :60]},
-            "field of view of lidar = 29.5 degrees: must be at least 44.7",
+            "recorded part of the field of view of lidar = 29.6 degrees: must be at least 44.7",
         ),
         (
             {"lidar_angles": HALF_CIRCLE[::5], "lidar_scans": EMPTY[:, :73]},

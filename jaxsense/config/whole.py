@@ -1,5 +1,6 @@
 """All sections together, and the checks between them."""
 
+import math
 from collections.abc import Mapping
 
 from jaxsense.config.checks import ConfigError, limited, require
@@ -66,6 +67,8 @@ class Config(Section):
         self._check_learning()
         self._check_task()
         self._check_viewpoints()
+        if self.jmvae.reads_scans and "lidar" in self.modalities:
+            self._check_profile()
         self._check_memory()
 
     def _check_modalities(self) -> None:
@@ -172,6 +175,22 @@ class Config(Section):
             shows = name not in self.modalities or viewpoint.max_bearing <= most
             half = f"half of {name}.field_of_view minus viewpoint.bearing_error"
             require(shows, viewpoint, "max_bearing", f"must be at most {half}, {most:g} degrees")
+
+    def _check_profile(self) -> None:
+        """A profile needs three beams on a PoI, and a window that does not reach behind."""
+        lidar, farthest = self.lidar, self.viewpoint.max_distance
+        sine = min(self.arena.poi_half_width / farthest, 1.0)
+        widest = math.degrees(2 * math.asin(sine)) / 3
+        least = math.ceil(lidar.field_of_view * lidar.stride / widest) + 1
+        expected = (
+            f"must be at least {least} to learn from scans: so that three of the beams that are "
+            f"read hit a PoI at viewpoint.max_distance = {farthest} m"
+        )
+        require(lidar.num_beams >= least, lidar, "num_beams", expected)
+        pitch = lidar.field_of_view / (lidar.num_beams - 1) * lidar.stride
+        most = math.floor(180 / pitch) + 1
+        expected = f"must be at most {most} to learn from scans: 180 degrees"
+        require(lidar.window <= most, lidar, "window", expected)
 
     def _check_memory(self) -> None:
         """No array that can become large may exceed a computer's memory."""

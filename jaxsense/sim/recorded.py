@@ -47,8 +47,8 @@ def resample(
       that nothing is there.
 
     Raises:
-      ValueError: if the recorded rays are too few or too far apart, or their field of view is
-        narrower than a window; it names what would fit.
+      ValueError: if the recorded rays are too few or too far apart, or no part of the sensor's
+        field of view as wide as a window was recorded; it names what would fit.
     """
     angles = np.asarray(angles, np.float64)
     checks.require_finite(f"angles of {sensor.name}", angles)
@@ -67,11 +67,15 @@ def resample(
     is_between = gap < _MAX_STEPS * step
     to_nearest = np.minimum(*np.abs(targets - circle[[left, left + 1]]))
     is_recorded = is_between | (to_nearest < step / 2)
-    if _longest(is_recorded) < window:
-        width = np.degrees(np.abs(sensor.angles[window - 1] - sensor.angles[0]))
-        expected = f"must be at least {width:.1f}, as wide as the window of its detector"
-        found = np.degrees(np.ptp(turned))
-        raise ValueError(f"field of view of {sensor.name} = {found:.1f} degrees: {expected}")
+    recorded = _longest(is_recorded)
+    if len(recorded) < window:
+        needed, found = (
+            np.degrees(np.ptp(angles)) if len(angles) else 0.0
+            for angles in (sensor.angles[:window], sensor.angles[recorded])
+        )
+        expected = f"must be at least {needed:.1f}, as wide as the window of its detector"
+        part = f"recorded part of the field of view of {sensor.name}"
+        raise ValueError(f"{part} = {found:.1f} degrees: {expected}")
     of_rays = (-1, *[1] * (scans.ndim - 2))
     share, is_between = share.reshape(of_rays), is_between.reshape(of_rays)
     before, after = scans[:, left], scans[:, left + 1]
@@ -105,10 +109,11 @@ def _require_dense(sensor: Sensor, turned: Float[np.ndarray, " A"]) -> tuple[flo
     return step, (sensor.window - 1) * sensor.stride + 1
 
 
-def _longest(is_recorded: Bool[np.ndarray, " B"]) -> int:
-    """Length of the longest run of True."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], is_recorded, [0]])))
-    return int(np.max(ends[1::2] - ends[::2], initial=0))
+def _longest(is_recorded: Bool[np.ndarray, " B"]) -> Int[np.ndarray, " _"]:
+    """Indices of the longest run of True."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], is_recorded, [0]]))).reshape(-1, 2)
+    start, end = max(ends, key=np.ptp, default=(0, 0))
+    return np.arange(start, end)
 
 
 def wall_residuals(

@@ -11,7 +11,7 @@ from jaxsense.core.types import pytree
 from jaxsense.sim import windows
 from jaxsense.sim.sensors import Sensor
 
-_NEAREST = 0.3  # m, distance for which a window is widened; misplaced robots stay farther away
+_NEAREST = 0.3  # m, expected distance below which a search gets no wider
 _STEP = 0.03  # m, between expected distances
 _DEVIATIONS = 3.0  # standard deviations that the largest errors are
 
@@ -34,6 +34,8 @@ class Candidates:
 
 def widened(sensor: Sensor, search: SearchConfig) -> Sensor:
     """The sensor with a window that contains those of a search; without one, the sensor itself.
+
+    It reaches no farther than the scan, and as far as errors explain at 0.3 m or farther away.
 
     Args:
       sensor: the sensor.

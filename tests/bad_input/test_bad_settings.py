@@ -255,6 +255,7 @@ TURNED = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "board": Shape("box", (0.5
 SIX = tuple(f"{colour} {shape}" for colour in ("red", "green", "blue") for shape in SHAPES)
 REDS = "red cylinder", "red cube"
 SCANS = {"jmvae.learns_from": "scans", "jmvae.fusion": "filter", "jmvae.looks": 100}
+FROM_SCANS = SCANS | {"jmvae.looks": 4}
 POSTS = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "post": Shape("box", (0.5, 0.5))}
 SIXTEEN = tuple(f"{colour} {shape}" for colour in COLOURS for shape in POSTS)
 EIGHT = tuple(
@@ -264,6 +265,20 @@ EIGHT = tuple(
     for heat in ("hot", "cold")
 )
 CHANGES = [
+    # 240 degrees / 76 = 3.16, of which three are 9.47; a PoI of 0.2 m at 1.2 m is 9.56 wide.
+    (
+        FROM_SCANS | {"lidar.num_beams": 76, "lidar.window": 20},
+        "lidar.num_beams = 76: must be at least 77 to learn from scans: so that three of the beams",
+    ),
+    (
+        FROM_SCANS | {"lidar.num_beams": 151, "lidar.stride": 2, "lidar.window": 20},
+        "lidar.num_beams = 151: must be at least 152 to learn from scans",
+    ),
+    # 240 / 682 x 511 = 179.8 degrees.
+    (
+        FROM_SCANS | {"lidar.window": 513},
+        "lidar.window = 513: must be at most 512 to learn from scans: 180 degrees",
+    ),
     ({"modalities": 5}, "modalities = 5: must be a list of texts"),
     ({"modalities": ("lidar", "lidar")}, "must name no modality twice"),
     (

@@ -100,16 +100,15 @@ def test_a_poi_is_found_in_a_whole_scan_where_an_error_explains_it(team, certain
     assert not certain.detect(LIDAR, lidar, scan, 2.5, 0.8, SearchConfig(heading=30.0)).is_there
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
+@pytest.mark.parametrize("robot", [pytest.param(CAMERA, marks=pytest.mark.slow), LIDAR])
 @pytest.mark.parametrize(
     ("search", "degrees", "aside", "detections"),
     [
         (SearchConfig(heading=12.0), -15.0, 0.0, 1),
-        (SearchConfig(heading=3.0), -15.0, 0.0, 0),
+        pytest.param(SearchConfig(heading=3.0), -15.0, 0.0, 0, marks=pytest.mark.slow),
         # .2 m across a view of .8 m are 14 degrees.
-        (SearchConfig(position=0.15), 0.0, 0.2, 1),
-        (SearchConfig(position=0.04), 0.0, 0.2, 0),
+        pytest.param(SearchConfig(position=0.15), 0.0, 0.2, 1, marks=pytest.mark.slow),
+        pytest.param(SearchConfig(position=0.04), 0.0, 0.2, 0, marks=pytest.mark.slow),
     ],
 )
 def test_a_robot_that_searches_finds_what_its_errors_explain(

@@ -110,6 +110,10 @@ def test_a_gap_in_the_recording_was_not_recorded():
         ),
         (degrees(0), r"step between the rays of lidar = inf degrees"),
         (degrees(0, 5, 10), r"field of view of lidar = 10.0 degrees: must be at least 20.0, as"),
+        (
+            degrees(*range(150, 211, 10)),
+            r"recorded part of the field of view of lidar = 0.0 degrees: must",
+        ),
         (degrees(0, np.nan, 10), "angles of lidar = nan: must be finite"),
     ],
 )

@@ -75,6 +75,16 @@ def test_a_search_is_as_wide_as_its_errors_explain():
         )
 
 
+@BOTH
+def test_errors_smaller_than_a_ray_leave_the_nearest_window(sensor):
+    errors = SearchConfig(heading=1e-3)
+    bearing = jnp.float32(0.013)
+    wide = wide_window(sensor, errors, readings_of(sensor), bearing)
+    found = search.candidates(sensor, errors, wide, bearing, jnp.float32(1.0))
+    is_tried = np.isfinite(found.log_prior).all(axis=0)
+    np.testing.assert_array_equal(is_tried, np.arange(len(is_tried)) == len(is_tried) // 2)
+
+
 def test_robots_that_search_keep_away_by_the_error_of_their_position():
     config = PRESETS["default"]
 

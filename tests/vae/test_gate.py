@@ -182,6 +182,15 @@ def test_a_search_pools_the_windows_by_their_posterior_odds(monkeypatch):
     assert not detectors.search(detector, windows, jnp.ones(1), nowhere).is_there
 
 
+def test_a_search_takes_no_window_for_impossible(monkeypatch):
+    monkeypatch.setattr(gate, "logits", lambda g, windows, at: windows[0])
+    detector = Read(Threshold(jnp.float32(0.0)))
+    # Certain of one label in one window, and of the other in the next.
+    windows = jnp.array([[2.0, 200.0], [2.0, -200.0]])
+    found = detectors.search(detector, windows, jnp.ones(1), jnp.zeros((1, 2)))
+    np.testing.assert_allclose(found.features, [0.5, 0.5], atol=1e-6)
+
+
 @dataclass(frozen=True)
 class Threshold:
     """The threshold of a gate, and nothing else."""
