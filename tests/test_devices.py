@@ -221,7 +221,7 @@ def test_the_first_process_listens_at_its_address_alone():
     assert (ended.returncode, ended.stdout) == (0, "refused\n"), ended.stderr
 
 
-@pytest.mark.parametrize("index", [0, 1])
+@pytest.mark.parametrize("index", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_ctrl_c_ends_a_process_that_waits_for_the_others(tmp_path, index):
     shared = ["--coordinator", f"localhost:{free_port()}", "--num-processes", "2"]
     command = [sys.executable, "-m", "jaxsense.train", "--cache", "None", "--preset", "smoke"]

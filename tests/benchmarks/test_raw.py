@@ -167,6 +167,7 @@ def of_easy(number=96):
     return Looks(seen, seen, jax.random.normal(KEY, (number, 8, 7)), classes)
 
 
+@pytest.mark.slow
 def test_variants_learn_what_is_easy():
     variant = OURS.but("", hidden=(128,), steps=300)
     looks = of_easy()

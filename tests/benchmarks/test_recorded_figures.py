@@ -49,6 +49,7 @@ def test_nothing_is_found_in_real_scans_and_pois_are(monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_encoders_that_learn_without_labels_are_not_retrained_with_them(monkeypatch):
     monkeypatch.setattr(recorded, "_RETRAINED", 1)
     config, scans = PRESETS["raw"], rawlog.read_logs()

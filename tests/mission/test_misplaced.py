@@ -86,8 +86,9 @@ def test_a_poi_is_found_in_a_whole_scan_where_an_error_explains_it(team, certain
     scan = np.full(len(lidar.angles), 3.0, np.float32)
     scan[341 + 40 - 15 : 341 + 40 + 15] = 0.7
 
-    def is_there(scan, search):
-        return bool(certain.detect(LIDAR, lidar, scan, 0.0, 0.8, search).is_there)
+    @functools.partial(jax.jit, static_argnums=1)
+    def is_there(scan, search, bearing=0.0):
+        return certain.detect(LIDAR, lidar, scan, bearing, 0.8, search).is_there
 
     assert not is_there(scan, SearchConfig())
     assert is_there(scan, SearchConfig(heading=14.0))
@@ -97,7 +98,7 @@ def test_a_poi_is_found_in_a_whole_scan_where_an_error_explains_it(team, certain
     broken = np.where(np.arange(len(scan)) < 260, np.nan, scan)
     assert is_there(broken, SearchConfig(heading=14.0))
     assert not is_there(np.where(scan == 3.0, np.nan, scan), SearchConfig(heading=14.0))
-    assert not certain.detect(LIDAR, lidar, scan, 2.5, 0.8, SearchConfig(heading=30.0)).is_there
+    assert not is_there(scan, SearchConfig(heading=30.0), 2.5)
 
 
 @pytest.mark.parametrize("robot", [pytest.param(CAMERA, marks=pytest.mark.slow), LIDAR])
