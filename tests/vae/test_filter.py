@@ -97,7 +97,9 @@ def test_looks_come_to_the_same_in_any_order_and_together():
         np.testing.assert_allclose(other.mean, first.mean, atol=1e-4)
         np.testing.assert_allclose(other.std, first.std, atol=1e-4)
     together = found.together({m: jnp.array(x) for m, x in looks[:2]})
-    jax.tree.map(np.testing.assert_array_equal, together, after(looks[:2], functools.partial(update, found)))
+    jax.tree.map(
+        np.testing.assert_array_equal, together, after(looks[:2], functools.partial(update, found))
+    )
 
 
 TRAINED = FilterConfig(hidden=(16,), steps=600, batch=128)
