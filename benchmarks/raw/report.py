@@ -80,9 +80,9 @@ def read(files: tuple[Path, ...]) -> tuple[Found, list[int]]:
 
 
 def _spread(values: Any, digits: int) -> str:
-    """The mean over the seeds with their range."""
-    mean, low, high = np.mean(values), np.min(values), np.max(values)
-    return f"{mean:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+    """The mean over the seeds with their range, unless all are alike."""
+    mean, low, high = (f"{x:.{digits}f}" for x in (np.mean(values), np.min(values), np.max(values)))
+    return mean if low == high else f"{mean} ({low} to {high})"
 
 
 def _share(values: Any) -> str:

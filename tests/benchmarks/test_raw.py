@@ -267,7 +267,7 @@ def test_the_report_reads_files_of_several_programs(tmp_path, capsys):
     # t of 1 degree of freedom, 12.706, times the standard error, 0.05
     assert "| paper | 0.450 ± 0.635 (0.400 to 0.500) |  | 1.5 (1.0 to 2.0) | 0.50 (0.25" in printed
     assert "| 16:1 | 0.450 ± 0.635 (0.400 to 0.500) |" in printed
-    gradients = " | ".join(f"{x}.00 ({x}.00 to {x}.00)" for x in (1, 1, 3, 3))
+    gradients = " | ".join(f"{x}.00" for x in (1, 1, 3, 3))  # alike in all seeds
     accuracy = "0.450 ± 0.635 (0.400 to 0.500) | 1.5 (1.0 to 2.0)"
     assert f"| ours | 8 | {accuracy} | {gradients} | 0.50 (0.25 to 0.75) |" in printed
     assert "| 101 | 0.500 | 1.00, 0.50, 0.25 | 2 | 0.75 |" in printed
