@@ -121,7 +121,7 @@ def test_raw_preset(default, seed, tmp_path, summary_of):
     assert raw["belief"]["nll"][-1] - raw["belief"]["bayes_nll"][-1] <= 0.02
     found, usual = (summary["mission"]["latent"] for summary in (raw, default))
     assert abs(found["accuracy"] - usual["accuracy"]) <= 0.005
-    assert found["observations_per_poi"] == pytest.approx(usual["observations_per_poi"], rel=0.04)
+    assert found["observations_per_poi"] == pytest.approx(usual["observations_per_poi"], rel=0.02)
     assert raw["timing"]["total_s"] <= 240
 
 
