@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.measure import save
 from jaxsense import Config, Key, Models, detections, mission
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
@@ -423,7 +424,7 @@ def main(argv: list[str] | None = None) -> None:
         text = json.dumps({**whole, "seed": arguments.seed, "policies": blocks}, indent=1)
         arguments.json.write_text(text + "\n", encoding="utf-8")
     if arguments.plot is not None:
-        draw(blocks).savefig(arguments.plot, dpi=120)
+        save(PROGRAM, "plot", arguments.plot, draw(blocks))
 
 
 if __name__ == "__main__":

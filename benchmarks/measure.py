@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.metadata
+import io
 import platform
 import statistics
 import time
@@ -11,6 +12,7 @@ from typing import Any
 
 import jax
 from jax.sharding import NamedSharding, PartitionSpec
+from matplotlib.figure import Figure
 
 from jaxsense.run import cli, devices
 from jaxsense.run.devices import Workers
@@ -234,6 +236,24 @@ def reserve(program: str, option: str, path: Path) -> None:
             file.write("[]\n")
     except FileExistsError:
         cli.fail(program, f"{option} = {str(path)!r}: already exists; must be new")
+    except OSError as error:
+        cli.fail(program, f"{option} = {str(path)!r}: cannot be written: {error.strerror}")
+
+
+def save(program: str, option: str, path: Path, figure: Figure) -> None:
+    """Writes a picture to a new file, or ends the program.
+
+    Args:
+      program: module that runs.
+      option: that names the file.
+      path: of the file; a PNG, whatever its name.
+      figure: the picture.
+    """
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=120)
+    try:
+        with path.open("xb") as file:
+            file.write(content.getvalue())
     except OSError as error:
         cli.fail(program, f"{option} = {str(path)!r}: cannot be written: {error.strerror}")
 

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from benchmarks.measure import save
 from benchmarks.raw.variants import (
     ABLATION,
     DEPTHS,
@@ -22,6 +23,7 @@ from benchmarks.raw.variants import (
     OURS,
     PAPER,
     RATIOS,
+    TABLES,
     Variant,
 )
 from jaxsense import PRESETS
@@ -69,14 +71,19 @@ def read(files: tuple[Path, ...]) -> tuple[Found, list[int]]:
       files: from `python -m benchmarks.raw --json`.
 
     Raises:
-      ValueError: if the files are of different seeds, steps or scans.
+      ValueError: if the files are of different seeds, steps or scans, or a table lacks variants.
     """
     wholes = [json.loads(path.read_text(encoding="utf-8")) for path in files]
     for field in ("seeds", "steps", "scans"):
         if any(whole[field] != wholes[0][field] for whole in wholes):
             raise ValueError(f"{field} = {[w[field] for w in wholes]}: must be the same in all")
     rows = [row for whole in wholes for row in whole["variants"]]
-    return {(row["table"], row["name"]): row for row in rows}, wholes[0]["seeds"]
+    found = {(row["table"], row["name"]): row for row in rows}
+    for table in dict.fromkeys(table for table, _ in found):
+        lacking = [v.name for v in TABLES[table] if (table, v.name) not in found]
+        if lacking:
+            raise ValueError(f"table {table}: lacks {', '.join(lacking)}")
+    return found, wholes[0]["seeds"]
 
 
 def _spread(values: Any, digits: int) -> str:
@@ -283,15 +290,18 @@ def main(argv: list[str] | None = None) -> None:
     except (OSError, ValueError, KeyError) as error:
         cli.fail(PROGRAM, f"files: {error}")
     tables = {table for table, _ in found}
+    for option, needs in (("plot", {*TABLES}), ("posteriors", {"ablation"})):
+        if getattr(arguments, option) is not None and not needs <= tables:
+            cli.fail(PROGRAM, f"{option}: needs the tables {', '.join(sorted(needs - tables))}")
     if "ablation" in tables:
         print(of_ablation(found), of_seeds(found, seeds), sep="\n\n", end="\n\n")
     for name, text in (("ratio", of_ratio), ("depth", of_depth)):
         if name in tables:
             print(text(found), end="\n\n")
     if arguments.plot is not None:
-        draw(found).savefig(arguments.plot, dpi=120)
+        save(PROGRAM, "plot", arguments.plot, draw(found))
     if arguments.posteriors is not None:
-        draw_posteriors(found).savefig(arguments.posteriors, dpi=120)
+        save(PROGRAM, "posteriors", arguments.posteriors, draw_posteriors(found))
 
 
 if __name__ == "__main__":

@@ -265,12 +265,28 @@ def of_seed(key: Key, model: Model, data: Data) -> dict:
     }
 
 
+def shares(latents: Float[np.ndarray, "seeds P D"], data: Data) -> dict[str, np.ndarray]:
+    """Shares of the latents' variance that a linear regression explains, for each seed.
+
+    Args:
+      latents: of one look by each sensor at the held-out PoIs.
+      data: see `Data`.
+
+    Returns:
+      `by_class`, what the class explains, and `by_view`, what distances and light do.
+    """
+    around = np.asarray(data.circumstances[:, 0])
+    givens = {
+        "by_class": np.eye(3)[np.asarray(data.classes[1])],
+        "by_view": np.concatenate([around, around**2], axis=1),
+    }
+    return {name: np.array([explained(z, x) for z in latents]) for name, x in givens.items()}
+
+
 def compiled(variant: Variant, data: Data, keys: Key) -> Callable[[], dict]:
     """A program that trains a variant from each of the keys.
 
-    Its figures, over the keys, are those of `of_seed`, but for `latents`: instead, `by_class` and
-    `by_view` are the shares of their variance that the class explains, and that distances and light
-    do.
+    It returns the figures of `of_seed` over the keys, with `shares` in place of the latents.
 
     Args:
       variant: the way of training.
@@ -283,18 +299,10 @@ def compiled(variant: Variant, data: Data, keys: Key) -> Callable[[], dict]:
         return jax.vmap(lambda key: of_seed(key, model, data))(keys)
 
     program = jax.jit(figures).lower(keys, data).compile(compiler_options=compiler_options())
-    around = np.asarray(data.circumstances[:, 0])
-    givens = {
-        "by_class": np.eye(3)[np.asarray(data.classes[1])],
-        "by_view": np.concatenate([around, around**2], axis=1),
-    }
 
     def run() -> dict:
         found = jax.tree.map(np.asarray, program(keys, data))
         latents = found.pop("latents")
-        shares = {
-            name: np.array([explained(z, given) for z in latents]) for name, given in givens.items()
-        }
-        return found | shares
+        return found | shares(latents, data)
 
     return run

@@ -177,8 +177,10 @@ class Config(Section):
             require(shows, viewpoint, "max_bearing", f"must be at most {half}, {most:g} degrees")
 
     def _check_profile(self) -> None:
-        """A profile needs three beams on a PoI, and a window that does not reach behind."""
+        """A profile needs three beams on a PoI, and a window that reaches it and not behind."""
         lidar, farthest = self.lidar, self.viewpoint.max_distance
+        expected = f"must be at least viewpoint.max_distance = {farthest} m to learn from scans"
+        require(lidar.window_range >= farthest, lidar, "window_range", expected)
         sine = min(self.arena.poi_half_width / farthest, 1.0)
         widest = math.degrees(2 * math.asin(sine)) / 3
         least = math.ceil(lidar.field_of_view * lidar.stride / widest) + 1
@@ -189,8 +191,8 @@ class Config(Section):
         require(lidar.num_beams >= least, lidar, "num_beams", expected)
         pitch = lidar.field_of_view / (lidar.num_beams - 1) * lidar.stride
         most = math.floor(180 / pitch) + 1
-        expected = f"must be at most {most} to learn from scans: 180 degrees"
-        require(lidar.window <= most, lidar, "window", expected)
+        expected = f"must be from 3 to {most} to learn from scans: at most 180 degrees"
+        require(3 <= lidar.window <= most, lidar, "window", expected)
 
     def _check_memory(self) -> None:
         """No array that can become large may exceed a computer's memory."""

@@ -277,7 +277,12 @@ CHANGES = [
     # 240 / 682 x 511 = 179.8 degrees.
     (
         FROM_SCANS | {"lidar.window": 513},
-        "lidar.window = 513: must be at most 512 to learn from scans: 180 degrees",
+        "lidar.window = 513: must be from 3 to 512 to learn from scans: at most 180 degrees",
+    ),
+    (FROM_SCANS | {"lidar.window": 2}, "lidar.window = 2: must be from 3 to 512 to learn"),
+    (
+        FROM_SCANS | {"lidar.window_range": 1.1},
+        "lidar.window_range = 1.1: must be at least viewpoint.max_distance = 1.2 m to learn from",
     ),
     ({"modalities": 5}, "modalities = 5: must be a list of texts"),
     ({"modalities": ("lidar", "lidar")}, "must name no modality twice"),
@@ -555,6 +560,12 @@ def test_settings_that_cannot_be_used_are_named(changes, expected):
         changed(changes)
     check_message(str(error.value))
     assert expected in str(error.value)
+
+
+def test_a_lidar_that_is_not_trained_may_be_too_coarse_for_scans():
+    camera = {"modalities": ("camera",), "jmvae.reconstruction_weights": (1.0,)}
+    classes = {"arena.classes": ("red cube", "green cube")}
+    changed(FROM_SCANS | camera | classes | {"lidar.num_beams": 10, "lidar.window": 2})
 
 
 @pytest.mark.parametrize(

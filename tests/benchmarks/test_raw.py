@@ -198,6 +198,25 @@ def test_explained_shares_are_those_of_a_regression():
     assert training.explained(np.ones((500, 2)), given) == 0
 
 
+def test_latents_are_explained_by_the_class_or_by_distances_and_light():
+    data = training.split(of_easy(), in_frames)
+    of_class = np.eye(3)[np.asarray(data.classes[1])][:, 1:]
+    around = np.asarray(data.circumstances[:, 0])
+    found = training.shares(np.stack([of_class, around[:, :2], around[:, 5:] ** 2]), data)
+    np.testing.assert_allclose(found["by_class"][0], 1, atol=1e-9)
+    np.testing.assert_allclose(found["by_view"][1:], 1, atol=1e-9)
+    assert (found["by_class"][1:] < 0.5).all()
+    assert found["by_view"][0] < 0.9
+
+
+def test_beta_weighs_as_much_where_looks_share_one_posterior():
+    # Three posteriors, the whole and one for each sensor, and three times the weight for one.
+    for variant in ABLATION:
+        number = 3 if variant.leaves_out else 1
+        usual = PAPER.jmvae.beta if variant.name.startswith("paper") else 3 * OURS.jmvae.beta
+        assert number * variant.jmvae.beta == pytest.approx(usual), variant.name
+
+
 def test_hidden_layers_are_those_of_the_network():
     network = MLP((4, 3), 2)
     params = networks.init(KEY, network, 5)
@@ -281,6 +300,20 @@ def test_files_of_different_runs_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         report.main([str(tmp_path / "a"), str(tmp_path / "b")])
     assert "steps = [10, 20]: must be the same in all" in capsys.readouterr().err
+
+
+def test_what_a_table_lacks_is_named(tmp_path, capsys):
+    row = {"table": "depth", "name": "ours, depth 1", **figures([0.4, 0.5])}
+    whole = {"seeds": [100, 101], "steps": 10, "scans": 100, "variants": [row]}
+    (tmp_path / "a").write_text(json.dumps(whole))
+    with pytest.raises(SystemExit):
+        report.main([str(tmp_path / "a")])
+    assert "files: table depth: lacks paper, depth 1, paper, depth 2" in capsys.readouterr().err
+    rows = [{**row, "name": variant.name} for variant in TABLES["depth"]]
+    (tmp_path / "a").write_text(json.dumps({**whole, "variants": rows}))
+    with pytest.raises(SystemExit):
+        report.main([str(tmp_path / "a"), "--plot", str(tmp_path / "p.png")])
+    assert "plot: needs the tables ablation, ratio" in capsys.readouterr().err
 
 
 def test_wrong_numbers_of_steps_are_refused(capsys):

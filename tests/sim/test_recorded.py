@@ -101,6 +101,13 @@ def test_a_gap_in_the_recording_was_not_recorded():
     np.testing.assert_array_equal(np.isnan(found), is_gap)
 
 
+def test_the_widest_part_that_was_recorded_counts():
+    sensor = sensors.lidar(LidarConfig(num_beams=81, field_of_view=80.0, window=60))
+    angles = degrees(*range(-40, -29), *range(-10, 31))
+    with pytest.raises(ValueError, match=r"= 40\.0 degrees: must be at least 59\.0"):
+        recorded.resample(sensor, angles, np.ones((1, len(angles))))
+
+
 @pytest.mark.parametrize(
     ("angles", "reason"),
     [
