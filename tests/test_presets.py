@@ -172,7 +172,9 @@ def test_noisy_preset(tmp_path, summary_of):
 
 
 def test_many_preset(tmp_path, summary_of):
-    many = summary_of("many", 0, tmp_path / "many")
+    # Of 32 missions, as in the preset, the share of right PoIs is uncertain by two points.
+    options = "--mission.policies", "latent", "naive_3", "--mission.episodes", "128"
+    many = summary_of("many", 0, tmp_path / "many", *options)
     belief = many["belief"]
     assert np.max(np.subtract(belief["nll"], belief["bayes_nll"])) <= 0.03
     assert np.min(np.subtract(belief["accuracy"], belief["bayes_accuracy"])) >= -0.005
