@@ -1,6 +1,8 @@
 """The directions of imports, as `pyproject.toml` states them, and what the page on them names."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,17 @@ def test_imports_keep_to_their_directions():
     # What is broken, and where, is in the captured output.
     status = lint_imports(str(ROOT / "pyproject.toml"), no_cache=True)
     assert status == EXIT_STATUS_SUCCESS
+
+
+@pytest.mark.parametrize("module", ["jaxsense", "jaxsense.vae", "jaxsense.dqn"])
+def test_who_does_not_simulate_does_not_import_mujoco(module):
+    program = f"import sys, {module}; sys.exit('mujoco' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_every_name_of_the_package_is_there():
+    assert {"learn", "load", "PRESETS", "sim", "Models"} <= set(jaxsense.__all__)
+    assert all(hasattr(jaxsense, name) for name in jaxsense.__all__)
 
 
 def rows_of(heading: str) -> list[tuple[str, str]]:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
+import scipy.special
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config, LidarConfig, Shape
@@ -170,7 +170,7 @@ def fit_noise(
     """
     residuals, distances = wall_residuals(angles, ranges)
     free = _BEAMS - 2  # a line has two parameters
-    unbiased = np.sqrt(scipy.stats.chi2.median(free) / free)
+    unbiased = np.sqrt(scipy.special.chdtri(free, 0.5) / free)
     spread = np.sqrt(np.sum(residuals**2, axis=1) / free) / unbiased
     bins = np.floor(2 * distances[distances < config.max_range]).astype(int)
     number = np.bincount(bins)
