@@ -224,7 +224,10 @@ def test_a_scene_is_the_same_whoever_works_it_out():
     listed = {stage.name: stage for stage in training.stages.stages(TINY, make_world(TINY).arena)}
     scenes = listed["scenes"].begin(KEY, TINY)
     survey = jax.jit(listed["survey"].begin)
-    first, second = (survey(KEY, TINY, scenes=tuple(x[i : i + 4] for x in scenes)) for i in (0, 2))
+    first, second = (
+        survey(KEY, TINY, scenes=jax.tree.map(lambda x: x[i : i + 4], scenes))  # noqa: B023
+        for i in (0, 2)
+    )
     same = jax.tree.map(lambda x, y: np.abs(x[2:] - y[:2]).max(), first.scenes, second.scenes)
     assert max(jax.tree.leaves(same)) < 1e-6
     assert np.abs(first.scenes.poses[0] - first.scenes.poses[1]).max() > 0.01
