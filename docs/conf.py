@@ -49,7 +49,8 @@ napoleon_use_ivar = True
 napoleon_attr_annotations = False
 autodoc_member_order = "bysource"
 # Every pytree has the `replace` of flax.
-autodoc_default_options = {"exclude-members": "replace"}
+# Names that the package only passes on have a page of their own.
+autodoc_default_options = {"exclude-members": "replace", "ignore-module-all": True}
 autodoc_typehints_format = "short"
 # What only some extras need, and what is too large for building the site.
 autodoc_mock_imports = [
