@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.metadata
-import io
 import platform
 import statistics
 import time
@@ -16,6 +15,7 @@ from matplotlib.figure import Figure
 
 from jaxsense.run import cli, devices
 from jaxsense.run.devices import Workers
+from jaxsense.show.plots import png
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
 
@@ -249,11 +249,10 @@ def save(program: str, option: str, path: Path, figure: Figure) -> None:
       path: of the file; a PNG, whatever its name.
       figure: the picture.
     """
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=120)
+    content = png(figure)
     try:
         with path.open("xb") as file:
-            file.write(content.getvalue())
+            file.write(content)
     except OSError as error:
         cli.fail(program, f"{option} = {str(path)!r}: cannot be written: {error.strerror}")
 
