@@ -110,7 +110,8 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     key = jax.random.key(arguments.seed)
     with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
         number = arguments.episodes * len(played)
-        player = missions.Player(scenario, compiler, missions.batch_of(number), workers)
+        batch = missions.batch_of(config, number, workers)
+        player = missions.Player(scenario, compiler, batch, workers)
         player.wait()
         begin = time.perf_counter()
         try:

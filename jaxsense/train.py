@@ -22,7 +22,7 @@ from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, read_some
-from jaxsense.run import cli, devices, files, pipeline, rundir, seeds
+from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -119,7 +119,7 @@ def main(
         with _open(arguments) as run:
             seeds.check(run)
             devices.check(arguments.devices)
-            devices.join(
+            processes.join(
                 arguments.coordinator,
                 arguments.num_processes,
                 arguments.process_index,
@@ -127,7 +127,7 @@ def main(
             )
             workers = devices.start(arguments.devices)
             _train(begin, arguments, run, workers, console, policies)
-        devices.leave()
+        processes.leave()
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except files.WriteError as error:
@@ -247,7 +247,7 @@ def _train(
 
     paths = seeds.paths(run).items()
     is_left = np.array([not (path / "summary.json").exists() for _, path in paths])
-    left = list(itertools.compress(paths, devices.of_first_process(is_left)))
+    left = list(itertools.compress(paths, processes.of_first_process(is_left)))
     most = 1 if jax.default_backend() == "cpu" else _MOST_TOGETHER
     size = max(1, min(len(left), most))  # all seeds may already be finished
     try:
@@ -270,7 +270,7 @@ def _train(
             again += " with the same processes" if jax.process_count() > 1 else ""
             cli.complain(f"Stopped; all training so far is saved. To resume: {again}")
         # Other processes may be blocked in a collective; wait only briefly.
-        devices.leave(devices.LEAVE_TIMEOUT)
+        processes.leave(processes.LEAVE_TIMEOUT)
         sys.exit(cli.INTERRUPTED)
     if len(failed) == settings.num_seeds:
         sys.exit(2)

@@ -19,7 +19,7 @@ from smoke import without_times
 
 from jaxsense import train
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.run import devices
+from jaxsense.run import devices, processes
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import Workers
 from jaxsense.run.monitor import Monitor
@@ -174,14 +174,14 @@ def test_two_processes_stop_and_resume_several_seeds(tmp_path):
 )
 def test_processes_that_cannot_be_are_named(given, expected):
     with pytest.raises(ConfigError, match=re.escape(expected)):
-        devices.join(*given, begins=lambda: pytest.fail("waits"))
+        processes.join(*given, begins=lambda: pytest.fail("waits"))
 
 
 def test_who_joins_is_told_before_it_waits_for_others(monkeypatch):
     called = []
     initialise = lambda *given, **_: called.append(given)  # noqa: E731
     monkeypatch.setattr(jax.distributed, "initialize", initialise)
-    devices.join("localhost:1", 2, 0, begins=lambda: called.append("begins"))
+    processes.join("localhost:1", 2, 0, begins=lambda: called.append("begins"))
     assert called == ["begins", ("localhost:1", 2, 0)]
 
 
@@ -192,20 +192,20 @@ def free_port():
 
 
 def test_processes_that_do_not_come_are_named(monkeypatch):
-    monkeypatch.setattr(devices, "_JOIN_TIMEOUT", 0.5)
+    monkeypatch.setattr(processes, "_JOIN_TIMEOUT", 0.5)
     address = f"localhost:{free_port()}"
     with pytest.raises(ConfigError, match=r"first process does not listen \(Connection refused"):
-        devices.join(address, 2, 1)
+        processes.join(address, 2, 1)
     monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: time.sleep(9))
     with pytest.raises(ConfigError, match="not all 2 processes have joined within"):
-        devices.join(address, 2, 0)
+        processes.join(address, 2, 0)
 
 
 LISTENS = """
 import socket, sys
-from jaxsense.run import devices
+from jaxsense.run import processes
 port = int(sys.argv[1])
-devices.join(f"127.0.0.1:{port}", 1, 0)
+processes.join(f"127.0.0.1:{port}", 1, 0)
 socket.create_connection(("127.0.0.1", port), timeout=5).close()
 try:
     socket.create_connection(("127.0.0.2", port), timeout=5)
@@ -241,7 +241,7 @@ def test_ctrl_c_ends_a_process_that_waits_for_the_others(tmp_path, index):
 
 
 def test_the_first_process_checks_its_options_before_others_join(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(devices, "join", lambda *_, **__: pytest.fail("joined"))
+    monkeypatch.setattr(processes, "join", lambda *_, **__: pytest.fail("joined"))
     (tmp_path / "file").write_text("precious")
     shared = ["--coordinator", "localhost:1", "--num-processes", "2", "--process-index", "0"]
     for options, expected in (

@@ -248,7 +248,7 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
         devices.start(None),
     )
     with Compiler(Monitor(), kept) as compiler:
-        scenario, batch = mission.make_mission(config), missions.batch_of(11)
+        scenario, batch = mission.make_mission(config), missions.batch_of(config, 11, workers)
         player = missions.Player(scenario, compiler, batch, workers)
         played = player.play(jax.random.key(0), models, {"latent": case}, 1)
     found, recording = played.metrics["latent"], played.recording

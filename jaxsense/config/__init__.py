@@ -15,7 +15,6 @@ from jaxsense.config.learning import MdpConfig as MdpConfig
 from jaxsense.config.learning import TeamConfig as TeamConfig
 from jaxsense.config.learning import ToursConfig as ToursConfig
 from jaxsense.config.learning import TravelConfig as TravelConfig
-from jaxsense.config.mission import MISSIONS_AT_ONCE as MISSIONS_AT_ONCE
 from jaxsense.config.mission import NODES_PER_POI as NODES_PER_POI
 from jaxsense.config.mission import VIEW_SIDES as VIEW_SIDES
 from jaxsense.config.mission import CommunicationConfig as CommunicationConfig

@@ -2,12 +2,10 @@
 
 from jaxsense.config.checks import limited, require
 from jaxsense.config.scene import ROBOT_RADIUS, TIMESTEP
-from jaxsense.config.section import Section, Sizes, Traced
+from jaxsense.config.section import Section, Traced
 
 MAX_EPISODES = 100_000
-"""Maximum number of missions of one policy whose states fit into memory."""
-MISSIONS_AT_ONCE = 384
-"""Maximum number of missions that are played side by side."""
+"""Maximum number of missions of one policy."""
 NODES_PER_POI = 10
 """Waypoints of the roadmap around each PoI."""
 VIEW_SIDES = 16
@@ -146,7 +144,3 @@ class MissionConfig(Section, place="mission"):
         require(is_multiple, self, "control_period", expected)
         is_long = self.time_limit >= self.control_period
         require(is_long, self, "time_limit", "must be at least control_period")
-
-    def arrays(self, sizes: Sizes) -> dict[str, int]:
-        """How many numbers each large array holds."""
-        return {"episodes": self.episodes * sizes.views * sizes.pois * NODES_PER_POI}

@@ -36,8 +36,6 @@ class Sizes(NamedTuple):
     """Looks by each sensor at a PoI that are surveyed together."""
     state: int
     """Numbers in a state of the MDP."""
-    views: int
-    """Viewpoints in an arena."""
 
 
 @dataclass_transform(frozen_default=True)

@@ -15,7 +15,7 @@ from jaxsense.config.learning import (
     MdpConfig,
     TeamConfig,
 )
-from jaxsense.config.mission import VIEW_SIDES, MissionConfig, NavigationConfig
+from jaxsense.config.mission import MissionConfig, NavigationConfig
 from jaxsense.config.objects import require_words
 from jaxsense.config.scene import (
     MODALITIES,
@@ -221,7 +221,6 @@ class Config(Section):
             window=max(windows.get(name, 1) for name in self.modalities),
             together=self.jmvae.num_together,
             state=self._task.most_pois(self) * self._task.features(self),
-            views=num_pois * VIEW_SIDES * len(self.navigation.view_distances),
         )
 
     @property

@@ -38,6 +38,7 @@ _NEARBY = 1.0  # m, between the centres of two robots
 _TURNS_SLOWLY = 0.35  # rad/s, fastest turn at which a robot scans
 
 
+@jax.named_scope("mission.approach")
 def approach(mission: Mission, models: Models, state: MissionState, robot: Index) -> MissionState:
     """Drives to the viewpoint, turns to the PoI, and backs off without progress.
 
@@ -185,6 +186,7 @@ class _Look:
     learned: Learned
 
 
+@jax.named_scope("mission.scan")
 def scan(
     keys: Key,
     mission: Mission,
@@ -228,6 +230,7 @@ def scan(
     return write(states, aims, looks)
 
 
+@jax.named_scope("mission.aim")
 def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
     """Decides whether a robot scans, and what."""
     config, scene, own = mission.config, state.scene, state.robot(robot)
@@ -254,6 +257,7 @@ def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
     )
 
 
+@jax.named_scope("mission.look")
 def _look(
     mission: Mission,
     models: Models,
@@ -285,6 +289,7 @@ def _look(
     )
 
 
+@jax.named_scope("mission.write")
 def _write(
     mission: Mission, state: MissionState, aim: _Aim, look: _Look, robot: Index
 ) -> MissionState:

@@ -21,6 +21,7 @@ from jaxsense.vae.novelty import Novelty
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 
 
+@jax.named_scope("mission.choose")
 def choose(
     key: Key,
     settings: MissionConfig,

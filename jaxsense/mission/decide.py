@@ -29,6 +29,7 @@ AT_VIEWPOINT = 0.05  # m, from a viewpoint within which a robot is there
 _REPEATED = 1e3  # m, above any path, for places from which a look tells little
 
 
+@jax.named_scope("mission.is_due")
 def is_due(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, ""]:
     """Whether a robot must decide because it is idle or the map has changed.
 
@@ -44,6 +45,7 @@ def is_due(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, "
     return (own.phase == IDLE) | (is_under_way & has_news)
 
 
+@jax.named_scope("mission.decide")
 def decide(
     key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> MissionState:
@@ -171,6 +173,7 @@ class _View:
     waits: Bool[Array, ""]
 
 
+@jax.named_scope("mission.best_view")
 def _best_view(
     mission: Mission,
     models: Models,

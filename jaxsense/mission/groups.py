@@ -13,6 +13,7 @@ Result = TypeVar("Result")
 _MIN_ROWS = 8  # of a group; on a CPU, fewer take as long
 
 
+@jax.named_scope("mission.where_due")
 def where_due(
     due: Bool[Array, " B"],
     function: Callable[[Row], Result],

@@ -28,6 +28,7 @@ class _Motion:
     clearance: Float[Array, " B"]
 
 
+@jax.named_scope("mission.move")
 def move(mission: Mission, states: MissionState) -> tuple[MissionState, Float[Array, " B"]]:
     """Simulates one control period of B missions side by side.
 
@@ -71,6 +72,7 @@ def move(mission: Mission, states: MissionState) -> tuple[MissionState, Float[Ar
     return states, motion.clearance
 
 
+@jax.named_scope("mission.clearance")
 def _clearance(
     config: ArenaConfig, layout: Layout, poses: Float[Array, "B R 3"]
 ) -> Float[Array, " B"]:
@@ -79,6 +81,7 @@ def _clearance(
     return jnp.min(around(layout, poses), axis=-1)
 
 
+@jax.named_scope("mission.integrate")
 def _integrate(
     mission: Mission,
     arena: Arena,

@@ -125,6 +125,7 @@ class _Frame(NamedTuple):
         return pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y
 
 
+@jax.named_scope("mission.drive_to")
 def drive_to(
     settings: NavigationConfig,
     arena: ArenaConfig,
@@ -258,6 +259,7 @@ def _best(
     return jnp.where(jnp.isfinite(value[best]), jnp.array(arcs.commands)[best], 0.0)
 
 
+@jax.named_scope("mission.sidestep")
 def sidestep(
     settings: NavigationConfig,
     arena: ArenaConfig,

@@ -91,6 +91,7 @@ def lengths(
     return jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
 
 
+@jax.named_scope("mission.reachable")
 def reachable(
     config: Config, layout: Layout, roadmap: Roadmap, position: Float[Array, "2"]
 ) -> Bool[Array, " N"]:
@@ -110,6 +111,7 @@ def reachable(
     return jnp.any(direct, axis=-1) | jnp.any(around, axis=-1)
 
 
+@jax.named_scope("mission.next_waypoint")
 def next_waypoint(
     config: Config,
     layout: Layout,

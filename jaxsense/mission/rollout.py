@@ -82,6 +82,7 @@ def rollout_batch(
     return states, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), records)
 
 
+@jax.named_scope("mission.step")
 def step(
     keys: Key, mission: Mission, models: Models, states: MissionState, parts: int = 1
 ) -> tuple[MissionState, Record]:
@@ -160,6 +161,7 @@ def _act(
     return act.scan(scan_keys, mission, models, states, robot, parts)
 
 
+@jax.named_scope("mission.drift")
 def _drift(keys: Key, mission: Mission, before: MissionState, after: MissionState) -> MissionState:
     """The states with what driving has added to the errors of the robots' poses."""
     way = after.scene.poses[..., :2] - before.scene.poses[..., :2]

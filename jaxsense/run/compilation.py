@@ -17,7 +17,6 @@ from typing import NamedTuple, TypeAlias
 
 import jax
 from jax import export
-from jax.experimental import multihost_utils
 from jaxtyping import PyTree
 
 from jaxsense.run import devices, files
@@ -333,6 +332,13 @@ class Program:
             wait((self._compiled,), timeout=0.2)
         return self._compiled.result()
 
+    def run(self, *args: PyTree) -> PyTree[jax.Array]:
+        """Runs a program that threads do not share, and leaves its results on the devices."""
+        compiled = self.wait()
+        if self._is_of_many:
+            args = devices.put(args, self._places(len(args)))
+        return compiled(*args)
+
     def __call__(self, *args: PyTree) -> PyTree:
         """Runs the program, and blocks until its results are ready."""
         compiled = self.wait()
@@ -346,7 +352,7 @@ class Program:
 
         output = devices.joined(devices.side_by_side(run, number))
         if self._is_of_many:
-            output = multihost_utils.process_allgather(output, tiled=True)
+            output = devices.fetched(output)
         self._monitor.add(self._stage, "run_s", time.perf_counter() - begin)
         return output
 

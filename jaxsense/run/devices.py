@@ -1,13 +1,10 @@
-"""Spreads work over the cores of a CPU, over accelerators, and over processes."""
+"""Spreads work over the cores of a CPU and over accelerators."""
 
 import dataclasses
 import functools
 import os
-import socket
-import threading
-import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any, TypeAlias, TypeVar
 
 import jax
@@ -18,6 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from jaxsense.config import ConfigError
+from jaxsense.run import processes
 
 T = TypeVar("T")
 Row = TypeVar("Row", jax.Array, np.ndarray, jax.ShapeDtypeStruct)
@@ -26,8 +24,6 @@ Options: TypeAlias = dict[str, Any]  # JAX declares fewer types than it takes
 AXIS = "devices"
 NUM_THREADS = min(os.cpu_count() or 1, 8)
 _MAX_DEVICES = 256
-_JOIN_TIMEOUT = 300.0  # s
-LEAVE_TIMEOUT = 10.0  # s
 
 
 def compiler_options(*, runs_long: bool = False) -> Options:
@@ -121,7 +117,7 @@ def start(number: int | None) -> Workers:
     number = there if number is None else number
     if number > there:
         # All processes refuse; one that ends without the others makes them abort.
-        leave(LEAVE_TIMEOUT)
+        processes.leave(processes.LEAVE_TIMEOUT)
         raise ConfigError("devices", number, f"must be from 1 to {there}")
     return Workers(mesh=make_mesh(number) if number > 1 else None)
 
@@ -137,6 +133,12 @@ def _make_room(threads: int) -> None:
     is_known = hasattr(os, "sched_getaffinity")
     cores = len(os.sched_getaffinity(0)) if is_known else os.cpu_count() or 1
     os.environ.setdefault("NPROC", str(max(2 * threads, cores)))
+
+
+def memory() -> int | None:
+    """Bytes that an accelerator may hold; None for a CPU."""
+    stats = None if jax.default_backend() == "cpu" else jax.local_devices()[0].memory_stats()
+    return None if stats is None else stats.get("bytes_limit")
 
 
 def make_mesh(number: int | None = None) -> Mesh:
@@ -158,113 +160,6 @@ def make_mesh(number: int | None = None) -> Mesh:
             f"devices = {number}: must be from 1 to {len(there)}, the number of devices"
         )
     return Mesh(np.array(there[:number]), (AXIS,))
-
-
-def join(
-    coordinator: str | None,
-    number: int | None,
-    index: int | None,
-    begins: Callable[[], None] = lambda: None,
-) -> None:
-    """Joins the processes that share a run; does nothing without arguments.
-
-    Ctrl-C ends the wait for the other processes.
-
-    Args:
-      coordinator: `HOST:PORT` of the first process, which listens at this address only.
-      number: of processes.
-      index: of this process, from 0.
-      begins: called after the arguments are validated, before waiting for the others.
-
-    Raises:
-      ConfigError: if only some arguments are given, if a value is wrong, or if the others do not
-        come within five minutes.
-    """
-    given = {"coordinator": coordinator, "num_processes": number, "process_index": index}
-    if set(given.values()) == {None}:
-        return
-    if missing := [name for name, value in given.items() if value is None]:
-        name, value = next((name, value) for name, value in given.items() if value is not None)
-        others = " and ".join(f"--{other.replace('_', '-')}" for other in missing)
-        raise ConfigError(name, value, f"also needs {others}")
-    assert coordinator is not None
-    assert number is not None
-    assert index is not None
-    host, _, port = coordinator.rpartition(":")
-    if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 2**16):
-        reason = "must be HOST:PORT, with a port from 1 to 65535"
-        raise ConfigError("coordinator", coordinator, reason)
-    if number < 1:
-        raise ConfigError("num_processes", number, "must be greater than 0")
-    if not 0 <= index < number:
-        raise ConfigError("process_index", index, f"must be from 0 to {number - 1}")
-    host, port = host.strip("[]"), int(port)
-    try:
-        socket.getaddrinfo(host, port)
-    except OSError as error:
-        raise ConfigError("coordinator", coordinator, f"cannot be found ({error})") from None
-    begins()
-    joined: Future[None] = Future()
-
-    def initialise() -> None:
-        try:
-            jax.distributed.initialize(
-                coordinator,
-                number,
-                index,
-                coordinator_bind_address=coordinator if index == 0 else None,
-                # JAX ends the process when this is over, so it must come second.
-                initialization_timeout=int(2 * _JOIN_TIMEOUT),
-            )
-            joined.set_result(None)
-        except BaseException as error:
-            joined.set_exception(error)
-
-    end = time.monotonic() + _JOIN_TIMEOUT
-    if index > 0:
-        _wait_for_listener(host, port, end)
-    # A signal is not noticed in the thread that waits within JAX.
-    threading.Thread(target=initialise, daemon=True).start()
-    while not joined.done() and time.monotonic() < end:
-        wait((joined,), timeout=0.2)
-    try:
-        joined.result(timeout=0)
-    except TimeoutError:
-        reason = f"not all {number} processes have joined within {_JOIN_TIMEOUT:.0f} s"
-        raise ConfigError("coordinator", coordinator, reason) from None
-    except (RuntimeError, ValueError) as error:
-        reason = f"cannot be joined ({str(error).splitlines()[0]})"
-        raise ConfigError("coordinator", coordinator, reason) from None
-
-
-def _wait_for_listener(host: str, port: int, end: float) -> None:
-    """Waits until the first process listens, or raises `ConfigError` at `end`, in monotonic s."""
-    while True:
-        try:
-            socket.create_connection((host, port), timeout=1.0).close()
-            return
-        except OSError as error:
-            if time.monotonic() > end:
-                expected = f"the first process does not listen ({error.strerror or error})"
-                raise ConfigError("coordinator", f"{host}:{port}", expected) from None
-            time.sleep(0.2)
-
-
-def of_first_process(values: np.ndarray) -> np.ndarray:
-    """The first process's values, in all processes; blocks until all have called it."""
-    return np.asarray(multihost_utils.broadcast_one_to_all(values))
-
-
-def leave(timeout: float | None = None) -> None:
-    """Waits for the other processes of the run, if any, and disconnects.
-
-    Args:
-      timeout: seconds to wait for processes that may not end; by default without limit.
-    """
-    if jax.process_count() > 1:
-        waiting = threading.Thread(target=jax.distributed.shutdown, daemon=True)
-        waiting.start()
-        waiting.join(timeout)
 
 
 def shardings(mesh: Mesh, number: int, whole: tuple[int, ...]) -> tuple[NamedSharding, ...]:
@@ -292,6 +187,8 @@ def put(args: tuple[PyTree, ...], places: tuple[NamedSharding, ...]) -> tuple[Py
     def put_one(x: jax.Array, place: NamedSharding) -> jax.Array:
         if jnp.issubdtype(jnp.result_type(x), jax.dtypes.prng_key):
             return jax.random.wrap_key_data(put_one(jax.random.key_data(x), place))
+        if isinstance(x, jax.Array) and x.sharding == place:
+            return x
         local = np.asarray(x, jnp.result_type(x))
         return jax.make_array_from_callback(local.shape, place, lambda index: local[index])
 
@@ -385,6 +282,13 @@ def of_all_parts(shapes: PyTree, number: int) -> PyTree[jax.ShapeDtypeStruct]:
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((number * x.shape[0], *x.shape[1:]), x.dtype), shapes
     )
+
+
+def fetched(values: PyTree[jax.Array]) -> PyTree[np.ndarray]:
+    """Values of all devices on the host, in every process."""
+    if jax.process_count() > 1:
+        return multihost_utils.process_allgather(values, tiled=True)
+    return jax.device_get(values)
 
 
 def joined(parts: list[PyTree]) -> PyTree:

@@ -3,16 +3,17 @@
 import dataclasses
 import math
 import threading
+import time
 from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
-from jaxsense.config import MISSIONS_AT_ONCE, Config
+from jaxsense.config import NODES_PER_POI, VIEW_SIDES, Config
 from jaxsense.core import checks
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, pytree
 from jaxsense.mission import (
     Case,
     Faults,
@@ -26,15 +27,20 @@ from jaxsense.mission import (
     rollout_batch,
 )
 from jaxsense.models import Models, init
+from jaxsense.run import devices
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.ledger import Ledger
 from jaxsense.run.monitor import StageError
 
 _CHUNK_TIME = 2.5  # s
+# Missions side by side on each thread of a CPU or on each accelerator.
+_LEAST_OF_CPU, _MOST_OF_CPU, _CACHE = 8, 192, 2**26  # bytes
+_MOST_OF_ACCELERATOR, _SHARE_OF_MEMORY = 32768, 0.05
 Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
 
 
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Recording:
     """A whole mission.
 
@@ -67,17 +73,34 @@ def chunk_of(config: Config) -> int:
     return math.ceil(_CHUNK_TIME / config.mission.control_period)
 
 
-def batch_of(total: int) -> int:
-    """How many missions to play side by side: fewer than all, since some last long.
+def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
+    """How many missions to play side by side.
 
     Args:
+      config: all settings.
       total: number of missions.
+      workers: share the missions.
+
+    Returns:
+      On a CPU fewer than all, since some last long, and no more than its caches hold; on an
+      accelerator as many as fit into a small part of its memory.
 
     Raises:
-      ValueError: if it is not a number greater than 0.
+      ValueError: if `total` is not a number greater than 0.
     """
     checks.require_number("total", total)
-    return min(MISSIONS_AT_ONCE, -(-total // 3))
+    memory = devices.memory()
+    if memory is None:
+        most = min(_MOST_OF_CPU, max(_LEAST_OF_CPU, _CACHE // _bytes_of_state(config)))
+        return min(most * workers.number, -(-total // 3))
+    share = int(_SHARE_OF_MEMORY * memory) // _bytes_of_state(config)
+    return min(total, min(_MOST_OF_ACCELERATOR, share) * workers.number)
+
+
+def _bytes_of_state(config: Config) -> int:
+    """Bytes of a mission's roadmap, which takes nearly all of its state."""
+    views = config.arena.num_pois * VIEW_SIDES * len(config.navigation.view_distances)
+    return 4 * views * config.arena.num_pois * NODES_PER_POI
 
 
 def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
@@ -92,6 +115,36 @@ def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
     """
     arena_key, play_key = jax.random.split(key)
     return jax.random.fold_in(arena_key, episode), jax.random.fold_in(play_key, episode)
+
+
+@pytree
+class _Slots:
+    """B missions side by side: `[B]` episodes, chunks that they have played, and states."""
+
+    episode: Int[Array, " B"]
+    chunks: Int[Array, " B"]
+    states: MissionState
+
+
+@pytree
+class _Found:
+    """What the host reads of B missions after a chunk, `[B]` each.
+
+    Attributes:
+      done: whether they are over.
+      steps: control periods so far.
+      chunks: played so far.
+      is_finite: whether their beliefs are finite.
+      has_values: whether no policy returned NaN.
+      metrics: see `mission.measure`.
+    """
+
+    done: Bool[Array, " B"]
+    steps: Int[Array, " B"]
+    chunks: Int[Array, " B"]
+    is_finite: Bool[Array, " B"]
+    has_values: Bool[Array, " B"]
+    metrics: PyTree[Array]
 
 
 class Player:
@@ -110,12 +163,13 @@ class Player:
           mission: to play.
           compiler: compiles in the background.
           batch: number of missions side by side, rounded up to a multiple of the workers.
-          workers: share the missions.
+          workers: share the missions. Each thread plays its own, without waiting for the others.
         """
-        batch = -(-batch // workers.number) * workers.number
-        self.mission, self._monitor, self._batch = mission, compiler.monitor, batch
-        config, share = mission.config, batch // workers.number
-        parts = 1 if workers.mesh is None else workers.number  # a thread sees only its own rows
+        self.mission, self._monitor, self._workers = mission, compiler.monitor, workers
+        config, self._share = mission.config, -(-batch // workers.number)
+        # Devices of a mesh run one program together; a thread sees only its own rows.
+        together = Workers(mesh=workers.mesh)
+        share, parts = self._share, together.number
         chunk = chunk_of(config)
         self._lock = threading.Lock()
 
@@ -131,40 +185,48 @@ class Player:
             episode: jax.Array,
             policies: jax.Array,
             faults: Faults,
-        ):
+        ) -> _Slots:
             scenario = with_numbers(config)
 
             def begin_one(episode: jax.Array, policy: jax.Array, faults: Faults):
                 return reset(keys_of_episode(key, episode)[0], scenario, models, policy, faults)
 
-            return jax.vmap(begin_one)(episode, policies, faults)
+            states = jax.vmap(begin_one)(episode, policies, faults)
+            return _Slots(episode, jnp.zeros_like(episode), states)
 
         def go_on(
             key: Key,
             config: Config,
             models: Models,
-            episode: jax.Array,
-            number: jax.Array,
-            state: MissionState,
-        ):
+            slots: _Slots,
+            reserve: _Slots,
+            taken: jax.Array,
+        ) -> tuple[_Slots, _Found, Recording]:
             scenario = with_numbers(config)
-            keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(episode)
-            keys = jax.vmap(jax.random.fold_in)(keys, number)
-            state, records = rollout_batch(keys, scenario, models, state, chunk, share, parts)
-            return state, jax.vmap(lambda s: measure(scenario, models, s))(state), records
+            slots = _refilled(slots, reserve, taken, parts)
+            keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(slots.episode)
+            keys = jax.vmap(jax.random.fold_in)(keys, slots.chunks)
+            states, records = rollout_batch(
+                keys, scenario, models, slots.states, chunk, share, parts
+            )
+            slots = _Slots(slots.episode, slots.chunks + 1, states)
+            first = jax.tree.map(lambda x: x.reshape(parts, share, *x.shape[1:])[:, 0], states)
+            return slots, _found(scenario, models, slots), Recording(first, records)
 
-        key, numbers = jax.random.key(0), jax.ShapeDtypeStruct((batch,), jnp.int32)
+        key, number = jax.random.key(0), share * parts
+        numbers = jax.ShapeDtypeStruct((number,), jnp.int32)
         faults = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct((batch, *x.shape), x.dtype), no_faults(config)
+            lambda x: jax.ShapeDtypeStruct((number, *x.shape), x.dtype), no_faults(config)
         )
         models = jax.eval_shape(lambda: init(jax.random.key(0), config))
+        whole = (0, 1, 2)
         self._begin = Program(compiler, "mission", "begin")
-        state = self._begin.compile(
-            begin, key, config, models, numbers, numbers, faults, workers=workers, whole=(0, 1, 2)
+        slots = self._begin.compile(
+            begin, key, config, models, numbers, numbers, faults, workers=together, whole=whole
         )
         self._go_on = Program(compiler, "mission", "go_on")
-        self._go_on.compile(
-            go_on, key, config, models, numbers, numbers, state, workers=workers, whole=(0, 1, 2)
+        _, self._found, _ = self._go_on.compile(
+            go_on, key, config, models, slots, slots, numbers, workers=together, whole=whole
         )
 
     def wait(self) -> None:
@@ -187,83 +249,143 @@ class Player:
           Stopped: if the run was asked to stop.
         """
         with self._lock:  # one call uses the whole machine
-            return self._play(key, models, played, episodes)
+            self._monitor.check_finite("mission", "models", models)
+            self.wait()
+            begin = time.perf_counter()
+            call = _Call(key, models, played, episodes, self._found.metrics)
+            devices.side_by_side(lambda lane: self._play(call, lane), self._workers.threads)
+            self._monitor.add("mission", "run_s", time.perf_counter() - begin)
+            return call.result()
 
-    def _starts(
-        self, key: Key, models: Models, played: dict[str, Case], episodes: int
-    ) -> tuple[np.ndarray, MissionState]:
-        """Episodes and first states of all missions; the first ones repeat to fill a batch."""
-        total = episodes * len(played)
-        row = np.arange(-(-total // self._batch) * self._batch, dtype=np.int32) % total
-        case, episode = row // episodes, row % episodes
-        policies = np.array([c.policy for c in played.values()], np.int32)[case]
-        faults = jax.tree.map(lambda *x: np.stack(x)[case], *[c.faults for c in played.values()])
-
-        def begin(first: int) -> MissionState:
-            rows = slice(first, first + self._batch)
-            some = jax.tree.map(lambda x: x[rows], faults)
-            config = self.mission.config
-            state = self._begin(key, config, models, episode[rows], policies[rows], some)
-            return jax.tree.map(np.asarray, state)
-
-        begun = [begin(first) for first in range(0, len(row), self._batch)]
-        return episode, jax.tree.map(lambda *x: np.concatenate(x), *begun)
-
-    def _play(self, key: Key, models: Models, played: dict[str, Case], episodes: int) -> Played:
-        """See `play`."""
-        self._monitor.check_finite("mission", "models", models)
-        config, total = self.mission.config, episodes * len(played)
-        episode, starts = self._starts(key, models, played, episodes)
-
-        # The next mission takes the slot of one that is done, so that short ones do not wait.
-        state = jax.tree.map(lambda x: x[: self._batch].copy(), starts)
-        playing, waiting = np.arange(self._batch), iter(range(self._batch, total))
-        chunk, done = np.zeros(self._batch, np.int32), np.zeros(len(episode), bool)
-        results: Measured | None = None
-        ends, recorded = list[MissionState](), list[Record]()
-        control_steps = 0
-        while not done[:total].all():
-            self._monitor.check_stop()
-            state, found, records = self._go_on(key, config, models, episode[playing], chunk, state)
-            state, found, records = jax.tree.map(np.array, (state, found, records))
-            at = f"beliefs after {chunk.max() + 1} chunks"
-            self._monitor.check_finite("mission", at, state.belief)
-            _check_choices(self.mission, state)
-            if not done[0]:
-                ends.append(jax.tree.map(lambda x: x[0].copy(), state))
-                recorded.append(jax.tree.map(lambda x: x[0].copy(), records))
-            if results is None:
-                results = jax.tree.map(
-                    lambda x: np.zeros((len(done), *x.shape[1:]), x.dtype), found
+    def _play(self, call: "_Call", lane: int) -> None:
+        """Plays the missions of one of the threads."""
+        config, parts = self.mission.config, self._workers.number // self._workers.threads
+        missions = np.arange(call.total, dtype=np.int32)
+        lanes = [missions[lane * parts + p :: self._workers.number] for p in range(parts)]
+        ledger = Ledger(lanes, self._share)
+        slots: _Slots | None = None
+        reserve: _Slots | None = None
+        while not ledger.is_over and not call.failed.is_set():
+            try:
+                self._monitor.check_stop()
+                if ledger.needs_reserve:
+                    begun = call.begins(ledger.reserve())
+                    reserve = self._begin.run(call.key, config, call.models, *begun)
+                slots = reserve if slots is None else slots
+                taken = ledger.fill()
+                slots, found, first = self._go_on.run(
+                    call.key, config, call.models, slots, reserve, taken
                 )
-            chunk += 1
-            for slot in np.flatnonzero(state.done & ~done[playing]).tolist():
-                done[playing[slot]] = True
-                control_steps += int(state.steps[slot])
-                _set_row(results, int(playing[slot]), found, slot)
-                following = next(waiting, None)
-                if following is not None:
-                    playing[slot], chunk[slot] = following, 0
-                    _set_row(state, slot, starts, following)
-            self._monitor.progress("mission", int(done[:total].sum()), total)
-        whole = jax.tree.map(lambda *parts: np.concatenate(parts), *recorded)
+                self._check(call, ledger, found := devices.fetched(found))
+                if lane == 0:
+                    call.record(first)
+                playing = ledger.playing.copy()
+                ended = ledger.end(found.done)
+                call.end(playing[ended], jax.tree.map(lambda x: x[ended], found))  # noqa: B023
+                self._monitor.progress("mission", call.num_done, call.total)
+            except BaseException:
+                call.failed.set()
+                raise
+
+    def _check(self, call: "_Call", ledger: Ledger, found: _Found) -> None:
+        """Raises `StageError` if beliefs or values of a policy were not finite in a mission."""
+        plays = ledger.playing >= 0
+        for slot in np.flatnonzero(plays & ~found.is_finite):
+            at = f"beliefs after {found.chunks[slot]} chunks"
+            raise StageError(f"mission: {at} are not finite")
+        for slot in np.flatnonzero(plays & ~found.has_values):
+            policy = [*self.mission.policies][call.policies[ledger.playing[slot]]]
+            raise StageError(f"mission: values of policy {policy} are not finite")
+
+
+class _Call:
+    """The missions of one call of `Player.play`, case by case, and their results so far."""
+
+    def __init__(
+        self,
+        key: Key,
+        models: Models,
+        played: dict[str, Case],
+        episodes: int,
+        metrics: PyTree[jax.ShapeDtypeStruct],
+    ):
+        self.key, self.models = key, models
+        self.total = episodes * len(played)
+        self.failed = threading.Event()
+        self.num_done = 0
+        self._cases, self._episodes, self._control_steps = [*played], episodes, 0
+        of_case = np.arange(self.total, dtype=np.int32) // episodes
+        self.policies = np.array([c.policy for c in played.values()], np.int32)[of_case]
+        faults = [c.faults for c in played.values()]
+        self._faults: Faults = jax.tree.map(lambda *x: np.stack(x)[of_case], *faults)
+        self._metrics = jax.tree.map(
+            lambda x: np.zeros((self.total, *x.shape[1:]), x.dtype), metrics
+        )
+        self._recordings = list[Recording]()
+        self._is_recorded = False
+        self._lock = threading.Lock()
+
+    def begins(self, missions: Int[np.ndarray, " B"]) -> tuple[np.ndarray, np.ndarray, Faults]:
+        """Episodes, policies and faults of missions."""
+        faults = jax.tree.map(lambda x: x[missions], self._faults)
+        return missions % self._episodes, self.policies[missions], faults
+
+    def record(self, first: Recording) -> None:
+        """Keeps a chunk of the first mission, which is in the first slot until it is done."""
+        if not self._is_recorded:
+            first = jax.tree.map(lambda x: np.array(x[0]), devices.fetched(first))
+            self._recordings.append(first)
+            self._is_recorded = bool(first.end.done)
+
+    def end(self, missions: Int[np.ndarray, " E"], found: _Found) -> None:
+        """Keeps the results of missions that are done."""
+
+        def put(rows: np.ndarray, new: np.ndarray) -> None:
+            rows[missions] = new
+
+        jax.tree.map(put, self._metrics, found.metrics)
+        with self._lock:
+            self.num_done += len(missions)
+            self._control_steps += int(found.steps.sum())
+
+    def result(self) -> Played:
+        """The results of all missions, which must be done."""
+        number = self._episodes
         metrics = {
-            name: jax.tree.map(lambda x: x[i * episodes : (i + 1) * episodes], results)  # noqa: B023
-            for i, name in enumerate(played)
+            name: jax.tree.map(lambda x: x[i * number : (i + 1) * number], self._metrics)  # noqa: B023
+            for i, name in enumerate(self._cases)
         }
-        return Played(metrics, Recording(ends[-1], whole), control_steps)
+        records = [each.records for each in self._recordings]
+        whole = jax.tree.map(lambda *chunks: np.concatenate(chunks), *records)
+        return Played(metrics, Recording(self._recordings[-1].end, whole), self._control_steps)
 
 
-def _check_choices(mission: Mission, states: MissionState) -> None:
-    """Raises `StageError` if values of a policy were NaN in one of several missions."""
-    for policy in states.policy[np.any(states.robots.target < 0, axis=-1)]:
-        raise StageError(f"mission: values of policy {[*mission.policies][policy]} are not finite")
+def _refilled(slots: _Slots, reserve: _Slots, taken: jax.Array, parts: int) -> _Slots:
+    """Slots with missions of the reserve of their own part where `taken` is not -1."""
+    number = len(taken) // parts
+
+    def of_part(own: jax.Array, reserved: jax.Array, taken: jax.Array) -> jax.Array:
+        new = reserved[jnp.maximum(taken, 0)]
+        is_new = (taken >= 0).reshape(-1, *[1] * (own.ndim - 1))
+        return jnp.where(is_new, new, own)
+
+    def refill(own: jax.Array, reserved: jax.Array) -> jax.Array:
+        own, reserved = (x.reshape(parts, number, *x.shape[1:]) for x in (own, reserved))
+        filled = jax.vmap(of_part)(own, reserved, taken.reshape(parts, number))
+        return filled.reshape(-1, *own.shape[2:])
+
+    return jax.tree.map(refill, slots, reserve)
 
 
-def _set_row(target: PyTree, row: int, source: PyTree, from_row: int) -> None:
-    """Copies one row of each array of a tree into another tree."""
-
-    def copy(target: np.ndarray, source: np.ndarray) -> None:
-        target[row] = source[from_row]
-
-    jax.tree.map(copy, target, source)
+def _found(mission: Mission, models: Models, slots: _Slots) -> _Found:
+    """What the host reads of missions."""
+    states, belief = slots.states, slots.states.belief
+    is_finite = jnp.isfinite(belief.mean) & jnp.isfinite(belief.std)
+    return _Found(
+        done=states.done,
+        steps=states.steps,
+        chunks=slots.chunks,
+        is_finite=jnp.all(is_finite, axis=(1, 2)),
+        has_values=jnp.all(states.robots.target >= 0, axis=1),
+        metrics=jax.vmap(lambda state: measure(mission, models, state))(states),
+    )

@@ -198,9 +198,10 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
 
 def _trace_missions(programs: Programs, compiler: Compiler) -> None:
     config = programs.config
-    batch = missions.batch_of(len(config.mission.policies) * config.mission.episodes)
+    number, workers = len(config.mission.policies) * config.mission.episodes, programs.workers
+    batch = missions.batch_of(config, number, workers)
     scenario = mission.make_mission(config, programs.policies)
-    programs.player.set_result(missions.Player(scenario, compiler, batch, programs.workers))
+    programs.player.set_result(missions.Player(scenario, compiler, batch, workers))
 
 
 def _trace_stage(programs: Programs, stage: Stage) -> None:

@@ -493,10 +493,6 @@ CHANGES = [
         {"evaluation.value_points": 10**5, "evaluation.value_looks": 10**4},
         "evaluation.value_points = 100000: takes 67 GiB",
     ),
-    (
-        {"mission.episodes": 10**5, "arena.num_pois": 16},
-        "mission.episodes = 100000: takes 31 GiB",
-    ),
     ({"navigation.view_distances": (0.6, NAN)}, "must be a list of numbers, each 0 or"),
     ({"mission.policies": ("naive", "latent", "naive")}, "must name no policy twice"),
     ({"mission.policies": "naive"}, "mission.policies = 'naive': must be a list of texts"),

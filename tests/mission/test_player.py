@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,7 +52,8 @@ def play(team, models, monkeypatch):
         poses = jax.random.normal(key, state.scene.poses.shape)
         belief = jax.tree.map(lambda x: jnp.tile(x, (3, 1)), models.fusion.prior)
         scene = dataclasses.replace(state.scene, poses=poses)
-        return dataclasses.replace(state, scene=scene, belief=belief)
+        classes = jax.random.randint(key, state.classes.shape, 0, 4)
+        return dataclasses.replace(state, scene=scene, belief=belief, classes=classes)
 
     def measure(team, models, s):
         return {"steps": s.steps, "poses": s.scene.poses}
@@ -60,16 +62,16 @@ def play(team, models, monkeypatch):
     monkeypatch.setattr(missions, "reset", fake_reset)
     monkeypatch.setattr(missions, "measure", measure)
 
-    def run(workers, models=models):
+    def run(workers, models=models, batch=4, episodes=9):
         with Compiler(Monitor()) as compiler:
-            player = missions.Player(team, compiler, 4, workers)
+            player = missions.Player(team, compiler, batch, workers)
             waited = []
             wait = missions.Program.wait
             with monkeypatch.context() as patch:
                 patch.setattr(missions.Program, "wait", lambda p: (waited.append(p), wait(p)))
                 player.wait()
             assert len(set(waited)) == 2  # before anything is timed
-            return player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, 9)
+            return player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, episodes)
 
     return run
 
@@ -114,6 +116,22 @@ def test_events_of_a_mission_do_not_depend_on_when_it_is_played(play):
     for episode in (0, 3, 4, 8):
         walk = walk_of(episode, poses.shape[1:])
         np.testing.assert_allclose(poses[episode], walk[-1], atol=1e-4)
+
+
+@pytest.mark.parametrize("split", WORKERS)
+def test_results_do_not_depend_on_how_many_missions_play_at_once(split, play, monkeypatch):
+    def uneven(keys, team, models, states, parts):
+        # Every mission lasts as long as the first robot's position in the beginning tells.
+        states, records = fake_step(keys, team, models, states, parts)
+        last = CHUNK // 2 + jnp.abs(states.classes.sum(axis=-1)) * CHUNK // 2
+        return dataclasses.replace(states, done=states.steps >= last), records
+
+    monkeypatch.setattr(ROLLOUT, "step", uneven)
+    few, many = (play(WORKERS[split](), batch=batch, episodes=64) for batch in (8, 64))
+    assert len(set(many.metrics["naive"]["steps"].tolist())) > 3
+    chex.assert_trees_all_equal(few.metrics, many.metrics)
+    assert few.control_steps == many.control_steps == many.metrics["naive"]["steps"].sum()
+    chex.assert_trees_all_equal(few.recording, many.recording)
 
 
 def test_a_map_that_is_not_finite_ends_the_missions(play, monkeypatch):

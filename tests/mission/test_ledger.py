@@ -1,0 +1,69 @@
+"""Which missions play in which slots."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxsense.run.ledger import Ledger
+
+
+def test_missions_take_the_slots_of_those_that_are_done():
+    ledger = Ledger([np.arange(7)], 3)
+    assert ledger.needs_reserve
+    np.testing.assert_array_equal(ledger.reserve(), [0, 1, 2])
+    np.testing.assert_array_equal(ledger.fill(), [0, 1, 2])
+    np.testing.assert_array_equal(ledger.playing, [0, 1, 2])
+    assert ledger.needs_reserve
+    np.testing.assert_array_equal(ledger.reserve(), [3, 4, 5])
+    np.testing.assert_array_equal(ledger.fill(), [-1, -1, -1])
+    np.testing.assert_array_equal(ledger.end(np.array([True, False, True])), [0, 2])
+    np.testing.assert_array_equal(ledger.fill(), [0, -1, 1])
+    np.testing.assert_array_equal(ledger.playing, [3, 1, 4])
+    assert not ledger.needs_reserve
+    np.testing.assert_array_equal(ledger.end(np.array([True, True, False])), [0, 1])
+    np.testing.assert_array_equal(ledger.fill(), [2, -1, -1])  # one slot waits for the reserve
+    np.testing.assert_array_equal(ledger.playing, [5, -1, 4])
+    np.testing.assert_array_equal(ledger.reserve(), [6, 0, 0])
+    np.testing.assert_array_equal(ledger.fill(), [-1, 0, -1])
+    np.testing.assert_array_equal(ledger.playing, [5, 6, 4])
+    assert not ledger.needs_reserve
+    np.testing.assert_array_equal(ledger.end(np.ones(3, bool)), [0, 1, 2])
+    assert ledger.is_over
+
+
+def test_a_part_begins_again_what_it_has_left_when_another_one_needs_a_reserve():
+    ledger = Ledger([np.arange(0, 8, 2), np.arange(1, 8, 2)], 2)
+    np.testing.assert_array_equal(ledger.reserve(), [0, 2, 1, 3])
+    ledger.fill()
+    np.testing.assert_array_equal(ledger.reserve(), [4, 6, 5, 7])
+    ledger.end(np.array([True, True, True, False]))
+    np.testing.assert_array_equal(ledger.fill(), [0, 1, 0, -1])
+    np.testing.assert_array_equal(ledger.playing, [4, 6, 5, 3])
+    assert not ledger.needs_reserve  # the first part has no more missions
+    ledger.end(np.array([False, False, False, True]))
+    np.testing.assert_array_equal(ledger.fill(), [-1, -1, -1, 1])
+    np.testing.assert_array_equal(ledger.playing, [4, 6, 5, 7])
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    total=st.integers(1, 40),
+    parts=st.integers(1, 3),
+    slots=st.integers(1, 5),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_every_mission_is_played_once(total, parts, slots, seed):
+    random = np.random.default_rng(seed)
+    of_parts = [np.arange(total)[part::parts] for part in range(parts)]
+    ledger, ended = Ledger(of_parts, slots), []
+    reserved = shown = np.full(parts * slots, -1)
+    while not ledger.is_over:
+        if ledger.needs_reserve:
+            reserved = ledger.reserve()
+        taken, part = ledger.fill(), np.arange(parts * slots) // slots
+        shown = np.where(taken < 0, shown, reserved[part * slots + np.maximum(taken, 0)])
+        plays = ledger.playing >= 0
+        np.testing.assert_array_equal(ledger.playing[plays], shown[plays])
+        playing = ledger.playing.copy()
+        ended += playing[ledger.end(random.random(len(playing)) < 0.4)].tolist()
+    assert sorted(ended) == [*range(total)]
