@@ -25,6 +25,7 @@ from jaxsense.config.options import Name
 from jaxsense.interfaces import robot_numpy, robot_onnx
 from jaxsense.interfaces.onboard import Function, functions
 from jaxsense.mission import decide
+from jaxsense.mission.choice import choose
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
 from jaxsense.models import Models
 from jaxsense.run import cli, devices, rundir
@@ -126,7 +127,7 @@ def _rows(seen: tuple[np.ndarray, Any]) -> Iterator[Choice]:
 def _observer(
     scenario: Mission, models: Models, robot: int
 ) -> Callable[[jax.Array, MissionState], tuple[jax.Array, dict[str, Any]]]:
-    config, index = scenario.config, jnp.int32(robot)
+    config, index, policy = scenario.config, jnp.int32(robot), scenario.policies["latent"]
     sensor = scenario.world.sensors[config.modality_of_robot[robot]]
 
     def observe(key: jax.Array, state: MissionState) -> tuple[jax.Array, dict[str, Any]]:
@@ -160,9 +161,10 @@ def _observer(
             "target": robots.target,
         }
         is_due = decide.is_due(scenario, state, index) & ~state.done
+        known = decide.known_to(scenario, models, state, index)
         return is_due, {
             "inputs": inputs,
-            "action": decide._choose(key, scenario, models, state, index),
+            "action": choose(key, config.mission, policy, models, known),
             "seen": state.seen,
             "poi": poi,
             "readings": readings,

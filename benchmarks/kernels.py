@@ -9,15 +9,15 @@ import dataclasses
 import re
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import rich.console
 import rich.table
 
+from benchmarks import measure
 from benchmarks.missions import Playing, playing
 from jaxsense.config.checks import check_fields, limited
 from jaxsense.run import cli, devices
@@ -87,22 +87,22 @@ def main(argv: list[str] | None = None) -> None:
 
 def profile(program: jax.stages.Compiled, missions: Playing) -> tuple[float, Parts]:
     """Seconds of a call of a program without the profiler, and its parts with it."""
-    for _ in range(2):
-        begin = time.perf_counter()
-        jax.block_until_ready(program(*missions.args))
-        wall = time.perf_counter() - begin
+    run = lambda: jax.block_until_ready(program(*missions.args))  # noqa: E731
+    run()
+    wall = measure.seconds(run)
     with tempfile.TemporaryDirectory() as place:
         with jax.profiler.trace(place):
-            jax.block_until_ready(program(*missions.args))
+            run()
         (path,) = Path(place).rglob("*.xplane.pb")
         data = jax.profiler.ProfileData.from_file(str(path))
     return wall, _parts(data, program.as_text() or "")
 
 
-def _parts(data: jax.profiler.ProfileData, text: str) -> Parts:
+def _parts(data: Any, text: str) -> Parts:
     """The kernels of a profile by the part that the program's text says they belong to."""
     part_of = {name: (_SCOPE.findall(path) or [_OTHER])[-1] for name, path in _NAMED.findall(text)}
-    kernels, seconds = collections.Counter[str](), collections.Counter[str]()
+    kernels = collections.Counter[str]()
+    seconds = collections.defaultdict[str, float](float)
     for name, duration in _kernels(data):
         part = part_of.get(name, _OTHER)
         kernels[part] += 1
@@ -110,7 +110,7 @@ def _parts(data: jax.profiler.ProfileData, text: str) -> Parts:
     return {part: Part(kernels[part], seconds[part]) for part in kernels}
 
 
-def _kernels(data: jax.profiler.ProfileData) -> Iterator[tuple[str, float]]:
+def _kernels(data: Any) -> Iterator[tuple[str, float]]:
     """Operation and seconds of every kernel that ran."""
     planes = list(data.planes)
     of_device = [plane for plane in planes if plane.name.startswith("/device:")]

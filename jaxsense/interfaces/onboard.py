@@ -10,7 +10,7 @@ from jaxsense.config import Config
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
 from jaxsense.dqn.team_mdp import Team
-from jaxsense.mission.choice import choose, times_to_new_looks, values_of
+from jaxsense.mission.choice import choose, times_to_new_looks
 from jaxsense.models import Models, make_agent, make_jmvae
 from jaxsense.sim import sensors
 from jaxsense.vae import jmvae
@@ -184,8 +184,8 @@ def _classify(config: Config) -> Function:
 
 
 def _decide(config: Config) -> Function:
-    policies, first = {"latent": POLICIES["latent"]}, jnp.int32(0)
-    key, settings = jax.random.key(0), config.mission  # the policy draws nothing
+    policy, settings = POLICIES["latent"], config.mission
+    key = jax.random.key(0)  # the policy draws nothing
 
     def apply(
         models: Models,
@@ -208,8 +208,8 @@ def _decide(config: Config) -> Function:
             robot=robot,
         )
         return {
-            "action": choose(key, settings, policies, models, known, first),
-            "values": values_of(key, policies, models, known, first),
+            "action": choose(key, settings, policy, models, known),
+            "values": policy.values(key, models, known),
         }
 
     pois: int | str = config.arena.num_pois

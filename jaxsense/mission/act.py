@@ -38,9 +38,28 @@ _NEARBY = 1.0  # m, between the centres of two robots
 _TURNS_SLOWLY = 0.35  # rad/s, fastest turn at which a robot scans
 
 
+@pytree
+class Course:
+    """Where a robot wants to move.
+
+    Attributes:
+      phase: `[]` int32, what it is about, see `Robots`.
+      waypoint: `[2]` where its path leads next, in metres.
+      bearing: `[]` of its target, see `viewpoints.bearing`.
+      makes_room: `[]` bool, whether it makes room for another robot.
+    """
+
+    phase: Int[Array, ""]
+    waypoint: Float[Array, "2"]
+    bearing: Float[Array, ""]
+    makes_room: Bool[Array, ""]
+
+
 @jax.named_scope("mission.approach")
-def approach(mission: Mission, models: Models, state: MissionState, robot: Index) -> MissionState:
-    """Drives to the viewpoint, turns to the PoI, and backs off without progress.
+def approach(
+    mission: Mission, models: Models, state: MissionState, robot: Index
+) -> tuple[MissionState, Course]:
+    """Is on its way to the viewpoint, turns to the PoI, and backs off without progress.
 
     A robot need not get to the viewpoint itself if a look from nearby is new.
 
@@ -49,6 +68,9 @@ def approach(mission: Mission, models: Models, state: MissionState, robot: Index
       models: trained models.
       state: the current state.
       robot: index of the robot.
+
+    Returns:
+      The next state, and where the robot wants to move, see `steer`.
     """
     config, own = mission.config, state.robot(robot)
     num_views = state.roadmap.viewpoints.shape[1]
@@ -81,7 +103,8 @@ def approach(mission: Mission, models: Models, state: MissionState, robot: Index
     makes_room = (phase == ENDED) & _is_in_the_way(mission, state, robot)
     makes_room &= time < state.faults.stops_at[robot]
     blocked = failure.excluded.at[own.view].set(True)
-    return state.with_robot(
+    course = Course(phase, waypoint, _bearing(mission, state, robot), makes_room)
+    state = state.with_robot(
         robot,
         phase=phase,
         attempts=failure.attempts,
@@ -92,8 +115,8 @@ def approach(mission: Mission, models: Models, state: MissionState, robot: Index
         path_left=jnp.where(progresses, length, own.path_left),
         progress_at=jnp.where(progresses | arrives, time, own.progress_at),
         backs_off_until=jnp.where(is_stuck, time + RECOVERY_TIME, own.backs_off_until),
-        wanted=_wanted(mission, state, robot, phase, waypoint, makes_room),
     )
+    return state, course
 
 
 def _target(mission: Mission, own: Robots) -> Int[Array, ""]:
@@ -101,20 +124,23 @@ def _target(mission: Mission, own: Robots) -> Int[Array, ""]:
     return jnp.minimum(own.target, mission.config.arena.num_pois - 1)
 
 
-def _wanted(
-    mission: Mission,
-    state: MissionState,
-    robot: Index,
-    phase: Int[Array, ""],
-    waypoint: Float[Array, "2"],
-    makes_room: Bool[Array, ""],
-) -> Float[Array, "2"]:
+@jax.named_scope("mission.steer")
+def steer(mission: Mission, state: MissionState, robot: Index, course: Course) -> Float[Array, "2"]:
     """Speeds that a robot wants: along its path, backing off, or turning.
 
     It senses where obstacles are, but has to trust its own pose for where the waypoint is.
+
+    Args:
+      mission: the mission.
+      state: the current state.
+      robot: index of the robot.
+      course: from `approach`.
+
+    Returns:
+      `[2]` wanted command, see `navigation`.
     """
-    config, scene = mission.config, state.scene
-    aim = localisation.aimed_at(waypoint, scene.poses[robot], state.pose_error[robot])
+    config, scene, phase = mission.config, state.scene, course.phase
+    aim = localisation.aimed_at(course.waypoint, scene.poses[robot], state.pose_error[robot])
     drive = navigation.drive_to(
         config.navigation,
         config.arena,
@@ -124,10 +150,10 @@ def _wanted(
         robot,
         aim,
         config.mission.control_period,
-        backs_off=(phase == BACKING) | makes_room,
+        backs_off=(phase == BACKING) | course.makes_room,
     )
-    turn = navigation.face(_bearing(mission, state, robot))
-    is_driving = (phase == DRIVING) | (phase == BACKING) | makes_room
+    turn = navigation.face(course.bearing)
+    is_driving = (phase == DRIVING) | (phase == BACKING) | course.makes_room
     return jnp.where(is_driving, drive, jnp.where(phase == FACING, turn, 0.0))
 
 
@@ -217,11 +243,11 @@ def scan(
     nothing = _Look(jnp.zeros(len(keys), bool), Learned(belief, log_posterior, evidence))
 
     def look(i: int) -> _Look:
-        def look_one(row: tuple[MissionState, _Aim]) -> _Look:
-            state, aim = row
-            return _look(mission, models, robot, carried[i], state, aim)
+        def look_in(rows: tuple[MissionState, _Aim], _) -> _Look:
+            look_one = lambda state, aim: _look(mission, models, robot, carried[i], state, aim)  # noqa: E731
+            return jax.vmap(look_one)(*rows)
 
-        return where_due(aims.scans & ~states.done, look_one, nothing, (states, aims), parts)
+        return where_due(aims.scans & ~states.done, look_in, nothing, (states, aims), parts)
 
     # The choice of the sensor outside the batch: inside, it would be traced over and over.
     which = jnp.array([carried.index(modality) for modality in of_robot])[robot]

@@ -4,7 +4,6 @@ It reads nothing but what a robot knows, so that `python -m jaxsense.export` tak
 """
 
 import dataclasses
-from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -25,54 +24,33 @@ _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 def choose(
     key: Key,
     settings: MissionConfig,
-    policies: Mapping[str, Policy],
+    policy: Policy,
     models: Models,
     known: Known,
-    policy: Int[Array, ""],
 ) -> Int[Array, ""]:
     """PoI that a robot's policy chooses, N for NOP, or -1 if any value is NaN.
 
     Args:
       key: random key.
       settings: the rules.
-      policies: by name.
+      policy: what values looks.
       models: trained models.
       known: what the robot knows; PoIs that are not present are never chosen.
-      policy: `[]` int32 index into `policies`.
     """
-    values, present = values_of(key, policies, models, known, policy), known.team.present
+    values, present = policy.values(key, models, known), known.team.present
     # Values that include travel time need no order.
-    counts_time = jnp.array([each.counts_time(models.agent) for each in policies.values()])[policy]
+    counts_time = policy.counts_time(models.agent)
     tolerance = jnp.where(counts_time, 0.0, settings.equal_values)
     of_pois, of_nop = jnp.where(present, values[:-1], -jnp.inf), values[-1]
     is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > of_nop)
-    by_values = _by_values(settings, known, is_best)
-    gains = _gains(key, policies, models, known, policy)
-    by_auction = jnp.argmax(rules.auction(gains, known.times, known.team, known.robot))
-    is_unordered = jnp.array([each.is_unordered for each in policies.values()])
-    is_auction = settings.auctions & is_unordered[policy] & ~counts_time
-    choice = jnp.where(is_auction, by_auction, by_values)
+    choice = _by_values(settings, known, is_best)
+    if policy.is_unordered:
+        gains = _gains(key, policy, models, known)
+        by_auction = jnp.argmax(rules.auction(gains, known.times, known.team, known.robot))
+        is_auction = settings.auctions & jnp.logical_not(counts_time)
+        choice = jnp.where(is_auction, by_auction, choice)
     is_nan = jnp.any(jnp.isnan(of_pois)) | jnp.isnan(of_nop)
     return jnp.where(is_nan, -1, choice).astype(jnp.int32)
-
-
-def values_of(
-    key: Key,
-    policies: Mapping[str, Policy],
-    models: Models,
-    known: Known,
-    policy: Int[Array, ""],
-) -> Float[Array, " A"]:
-    """Values of the A = N + 1 actions of a policy, NOP's last.
-
-    Args:
-      key: random key.
-      policies: by name.
-      models: trained models.
-      known: what the robot knows.
-      policy: `[]` int32 index into `policies`.
-    """
-    return jnp.stack([each.values(key, models, known) for each in policies.values()])[policy]
 
 
 def times_to_new_looks(
@@ -108,22 +86,7 @@ def _by_values(settings: MissionConfig, known: Known, is_best: Bool[Array, " N"]
     return jnp.where(jnp.any(is_best), poi, pois.shape[0])
 
 
-def _gains(
-    key: Key,
-    policies: Mapping[str, Policy],
-    models: Models,
-    known: Known,
-    policy: Int[Array, ""],
-) -> Float[Array, "R N"]:
+def _gains(key: Key, policy: Policy, models: Models, known: Known) -> Float[Array, "R N"]:
     """Expected gain of each robot's look at each PoI, by its policy: above 0 if it pays."""
-
-    def of_robot(robot: Int[Array, ""]) -> jax.Array:
-        there = dataclasses.replace(known, robot=robot)
-        nothing = jnp.zeros(known.team.positions.shape[0])
-        of_each = [
-            each.gains(key, models, there) if each.is_unordered else nothing
-            for each in policies.values()
-        ]
-        return jnp.stack(of_each)[policy]
-
+    of_robot = lambda robot: policy.gains(key, models, dataclasses.replace(known, robot=robot))  # noqa: E731
     return jax.vmap(of_robot)(jnp.arange(known.team.poses.shape[0]))

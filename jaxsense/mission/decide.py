@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.core.types import Index, Key, pytree
+from jaxsense.core.types import Index, Key, call, pytree
 from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission import roadmap
@@ -45,13 +45,13 @@ def is_due(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, "
     return (own.phase == IDLE) | (is_under_way & has_news)
 
 
-@jax.named_scope("mission.decide")
 def decide(
     key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> MissionState:
     """Asks a robot's policy if a decision is due, and sets out for a viewpoint of the PoI.
 
-    If a value is NaN, the robot fails, with -1 for its target.
+    If a value is NaN, the robot fails, with -1 for its target. For many missions, `decide_alike` is
+    faster than a `vmap` of this.
 
     Args:
       key: random key.
@@ -60,9 +60,53 @@ def decide(
       state: the current state.
       robot: index of the robot.
     """
+    alone = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
+    after = decide_alike(key[None], mission, models, alone, robot, alone.policy[0])
+    return jax.tree.map(lambda x: x[0], after)
+
+
+@jax.named_scope("mission.decide")
+def decide_alike(
+    keys: Key,
+    mission: Mission,
+    models: Models,
+    states: MissionState,
+    robot: Index,
+    policy: Int[Array, ""],
+) -> MissionState:
+    """Decides as `decide` does, in B missions that have the same policy.
+
+    Args:
+      keys: `[B]` random keys.
+      mission: the mission.
+      models: trained models.
+      states: `[B]` current states.
+      robot: index of the robot, the same in all missions.
+      policy: `[]` int32 index into `mission.policies`.
+
+    Returns:
+      The `[B]` next states.
+    """
+    policies, settings = [*mission.policies.values()], mission.config.mission
+    known = jax.vmap(lambda state: known_to(mission, models, state, robot))(states)
+
+    def choices(index: int) -> Int[Array, " B"]:
+        chosen = lambda key, known: choose(key, settings, policies[index], models, known)  # noqa: E731
+        return jax.vmap(chosen)(keys, known)
+
+    # The choice of the policy outside the batch: inside, all would be asked.
+    actions = call(choices, policy, len(policies))
+    set_out = lambda state, action: _set_out(mission, models, state, robot, action)  # noqa: E731
+    return jax.vmap(set_out)(states, actions)
+
+
+def _set_out(
+    mission: Mission, models: Models, state: MissionState, robot: Index, chosen: Int[Array, ""]
+) -> MissionState:
+    """Sets out for a viewpoint of the PoI that a robot has chosen, if a decision is due."""
     own, config = state.robot(robot), mission.config
     is_idle, decides = own.phase == IDLE, is_due(mission, state, robot)
-    action = jnp.where(decides, _choose(key, mission, models, state, robot), own.target)
+    action = jnp.where(decides, chosen, own.target)
     is_new = action != own.target
     is_poi = (action >= 0) & (action < config.arena.num_pois)
     sets_out = decides & (is_idle | is_new) & is_poi
@@ -113,25 +157,17 @@ def decide(
     )
 
 
-def _choose(
-    key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
-) -> Int[Array, ""]:
-    """PoI that a robot's policy chooses, N for NOP, or -1 if any value is NaN."""
+def known_to(mission: Mission, models: Models, state: MissionState, robot: Index) -> Known:
+    """Knowledge of a robot that chooses, without the PoIs it has given up.
+
+    Args:
+      mission: the mission.
+      models: trained models.
+      state: the current state.
+      robot: index of the robot.
+    """
     robots = state.robots
     given_up = robots.unreachable[robot] | robots.undetected[robot] | robots.exhausted[robot]
-    known = _known_to(mission, models, state, robot, given_up)
-    settings = mission.config.mission
-    return choose(key, settings, mission.policies, models, known, state.policy)
-
-
-def _known_to(
-    mission: Mission,
-    models: Models,
-    state: MissionState,
-    robot: Index,
-    given_up: Bool[Array, " N"],
-) -> Known:
-    """Knowledge of a robot that chooses, without the PoIs it has given up."""
     phase, own = state.robots.phase, map_of(mission, state, robot)
     known = own.read(models)
     team = Team(

@@ -1,7 +1,6 @@
 """Physics of one control period, in MJX."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ from mujoco import mjx
 from jaxsense.config import ArenaConfig
 from jaxsense.core.types import pytree
 from jaxsense.mission import navigation
+from jaxsense.mission.groups import where_due
 from jaxsense.mission.state import Mission, MissionState
 from jaxsense.sim import amiro
 from jaxsense.sim import arena as arenas
@@ -29,16 +29,19 @@ class _Motion:
 
 
 @jax.named_scope("mission.move")
-def move(mission: Mission, states: MissionState) -> tuple[MissionState, Float[Array, " B"]]:
+def move(
+    mission: Mission, states: MissionState, parts: int = 1
+) -> tuple[MissionState, Float[Array, " B"]]:
     """Simulates one control period of B missions side by side.
 
-    Contacts cost several times as much as everything else, and the planner avoids them. While no
-    robot of any mission can touch anything within the period, the robots move in an empty arena,
-    which results in the same motion.
+    Contacts cost several times as much as everything else, and the planner avoids them. All robots
+    move in an empty arena, and once more among PoIs and walls in the missions where one can touch
+    anything within the period. In the others, both would result in the same motion.
 
     Args:
       mission: the mission.
-      states: `[B]` current states. Under a `vmap` contacts are always computed.
+      states: `[B]` current states.
+      parts: number of devices that share the batch, see `groups.where_due`.
 
     Returns:
       The `[B]` next states, and `[B]` the smallest free distance around any robot in the period, in
@@ -50,16 +53,11 @@ def move(mission: Mission, states: MissionState) -> tuple[MissionState, Float[Ar
     motion = _Motion(poses, states.velocity, states.warmstart, robots.command, far)
     # For two robots that drive at each other, with a margin for the lag of the wheels.
     reach = 2 * amiro.MAX_SPEED * config.mission.control_period + 0.005
-    is_near = jnp.any(_clearance(config.arena, layout, poses) < reach)
-
-    motion = jax.lax.cond(
-        is_near,
-        functools.partial(_integrate, mission, mission.world.arena),
-        functools.partial(_integrate, mission, mission.free_arena),
-        motion,
-        robots.wanted,
-        layout,
-    )
+    is_near = (_clearance(config.arena, layout, poses) < reach) & ~states.done
+    inputs = motion, robots.wanted, layout
+    free = _integrate(mission, mission.free_arena, *inputs)
+    among = lambda rows, _: _integrate(mission, mission.world.arena, *rows)  # noqa: E731
+    motion = where_due(is_near, among, free, inputs, parts)
     states = dataclasses.replace(
         states,
         scene=dataclasses.replace(states.scene, poses=motion.poses),

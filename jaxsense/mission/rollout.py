@@ -1,6 +1,7 @@
 """Missions from beginning to end, as one scan over control periods."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from jaxtyping import Array, Int
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key
 from jaxsense.mission import act, decide
+from jaxsense.mission.act import Course
 from jaxsense.mission.groups import where_due
 from jaxsense.mission.motion import move
 from jaxsense.mission.state import (
@@ -106,12 +108,17 @@ def step(
     step_keys = jax.vmap(lambda key: jax.random.split(key, num_robots + 2), out_axes=1)(keys)
     robot_keys, drift_keys, message_keys = step_keys[:-2], step_keys[-2], step_keys[-1]
     # One after the other, so that no robot scans what another has just identified.
-    states, _ = jax.lax.scan(
-        lambda states, robot: (_act(robot[1], mission, models, states, robot[0], parts), None),
+    all_robots = jnp.arange(num_robots)
+    states, courses = jax.lax.scan(
+        lambda states, robot: _act(robot[1], mission, models, states, robot[0], parts),
         states,
-        (jnp.arange(num_robots), robot_keys),
+        (all_robots, robot_keys),
     )
-    states, clearance = move(mission, states)
+    # Nothing that robots do here changes where the others are.
+    steer = jax.vmap(functools.partial(act.steer, mission), (None, 0, 0))
+    wanted = jax.vmap(steer, (0, None, 1))(states, all_robots, courses)
+    robots = dataclasses.replace(states.robots, wanted=wanted)
+    states, clearance = move(mission, dataclasses.replace(states, robots=robots), parts)
     states = _drift(drift_keys, mission, before, states)
     robots = states.robots
     is_idle = jnp.all((robots.phase == ENDED) | (robots.phase == FAILED), axis=-1)
@@ -144,21 +151,23 @@ def _act(
     states: MissionState,
     robot: Int[Array, ""],
     parts: int,
-) -> MissionState:
-    """Decides, sets speeds and scans for one robot of each of B missions."""
+) -> tuple[MissionState, Course]:
+    """Decides, sets a course and scans for one robot of each of B missions."""
 
-    def choose(row: tuple[Key, MissionState]) -> Robots:
-        key, state = row
-        return decide.decide(key, mission, models, state, robot).robots
+    def choose(rows: tuple[Key, MissionState], policy: Int[Array, ""]) -> Robots:
+        keys, states = rows
+        return decide.decide_alike(keys, mission, models, states, robot, policy).robots
 
     choice_keys, scan_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     states = jax.vmap(lambda state: _fail(mission, state, robot))(states)
     due = jax.vmap(lambda state: decide.is_due(mission, state, robot))(states)
     inputs = choice_keys, states
-    robots = where_due(due & ~states.done, choose, states.robots, inputs, parts)
+    robots = where_due(
+        due & ~states.done, choose, states.robots, inputs, parts, kinds=states.policy
+    )
     states = dataclasses.replace(states, robots=robots)
-    states = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
-    return act.scan(scan_keys, mission, models, states, robot, parts)
+    states, course = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
+    return act.scan(scan_keys, mission, models, states, robot, parts), course
 
 
 @jax.named_scope("mission.drift")

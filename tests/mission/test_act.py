@@ -263,7 +263,11 @@ def test_after_some_failures_the_poi_is_given_up(scan, facing, set_robot):
 
 @pytest.fixture(scope="module")
 def approach(team, models):
-    return jax.jit(lambda state, robot: act.approach(team, models, state, robot))
+    def approach_and_steer(state, robot):
+        state, course = act.approach(team, models, state, robot)
+        return state.with_robot(robot, wanted=act.steer(team, state, robot, course))
+
+    return jax.jit(approach_and_steer)
 
 
 def driving(state, set_robot, view, seconds, progress_at, path_left=0.1):

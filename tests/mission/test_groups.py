@@ -10,10 +10,10 @@ from jaxsense.mission.groups import where_due
 CALLS = []
 
 
-def draw(given):
-    key, row = given
-    jax.debug.callback(lambda _: CALLS.append(1), row["x"])
-    return {"drawn": row["x"] + jax.random.uniform(key)}
+def draw(given, kind):
+    keys, rows = given
+    jax.debug.callback(lambda kind: CALLS.append(int(kind)), kind)
+    return {"drawn": rows["x"] + jax.vmap(jax.random.uniform)(keys)}
 
 
 @pytest.mark.parametrize(("total", "parts"), [(1, 1), (5, 1), (40, 1), (300, 1), (40, 2)])
@@ -37,11 +37,32 @@ def test_rows_that_are_due_are_worked_out_and_the_others_stay(total, parts, shar
     share_of_part = total // parts
     size = min(share_of_part, max(8, share_of_part // 16))
     most = due.reshape(parts, -1).sum(axis=1).max()
-    assert len(CALLS) == parts * size * -(-most // size)
+    assert [0] * -(-most // size) == CALLS
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_the_rows_of_a_group_are_of_one_kind(parts):
+    rng = np.random.default_rng(0)
+    kinds, x = rng.integers(0, 5, 60), rng.normal(size=60).astype(np.float32)
+    due = (rng.random(60) < 0.7) & (kinds != 3)
+    CALLS.clear()
+
+    def times_kind(rows, kind):
+        jax.debug.callback(lambda kind: CALLS.append(int(kind)), kind)
+        branches = [lambda rows, k=k: k * rows for k in range(5)]
+        return jax.lax.switch(kind, branches, rows)
+
+    find = jax.jit(lambda due, x, kinds: where_due(due, times_kind, x, x, parts, kinds))
+    found = find(due, x, kinds.astype(np.int32))
+    jax.effects_barrier()
+    np.testing.assert_allclose(found, np.where(due, kinds * x, x))
+    # In order, each in groups of 8; none of a kind of which no row is due.
+    numbers = [max(np.sum((due & (kinds == k)).reshape(parts, -1), axis=1)) for k in range(5)]
+    assert [k for k in range(5) for _ in range(-(-numbers[k] // 8))] == CALLS
 
 
 def test_under_vmap_each_batch_has_its_own_rows():
     due = np.array([[True, False, False], [False, False, False], [True, True, True]])
     x = jnp.arange(9.0).reshape(3, 3)
-    found = jax.vmap(lambda due, x: where_due(due, lambda x: -x, x, x))(due, x)
+    found = jax.vmap(lambda due, x: where_due(due, lambda x, _: -x, x, x))(due, x)
     np.testing.assert_array_equal(found, np.where(due, -x, x))

@@ -215,8 +215,7 @@ def test_a_scan_is_remembered_and_told(own_team, own_models, own_arena, set_robo
     assert np.abs(after.belief.mean[0]).max() > 0.01
     # News make a robot that drives decide again, by what it knows.
     assert decide.is_due(own_team, after, 1) == hears
-    nobody = jnp.zeros(3, bool)
-    looks = decide._known_to(own_team, own_models, after, 1, nobody).looks
+    looks = decide.known_to(own_team, own_models, after, 1).looks
     np.testing.assert_array_equal(looks, after.times_seen * hears)
 
 

@@ -88,16 +88,19 @@ def test_a_robot_whose_policy_has_no_value_fails(own, decides, arena_of):
     assert decides(state).robots.phase[0] == DRIVING
 
 
-def test_every_policy_of_the_table_is_played(own, models, arena_of):
+def test_every_policy_of_the_table_is_played(own, decides, models, arena_of):
     state = arena_of(POSITIONS, POSES)
     state = replace(state, times_seen=jnp.array([[1, 0], [0, 1], [0, 0]], jnp.int32))
-    key, given_up = jax.random.key(1), jnp.zeros(3, bool)
-    known = decide._known_to(own, models, state, 0, given_up)
-    values_of = jax.jit(lambda policy: choice.values_of(key, own.policies, models, known, policy))
+    key, settings = jax.random.key(0), CONFIG.mission
+    known = decide.known_to(own, models, state, 0)
     assert [*own.policies] == [*POLICIES, *OWN]
-    for name in POLICIES:
-        expected = dqn.POLICIES[name].values(key, models, known)
-        np.testing.assert_allclose(values_of(own.policy(name)), expected, atol=1e-6)
+    choose_all = jax.jit(
+        lambda: [choice.choose(key, settings, p, models, known) for p in own.policies.values()]
+    )
+    chosen = np.array(choose_all())
+    played = [decides(replace(state, policy=jnp.int32(i))) for i in range(len(chosen))]
+    np.testing.assert_array_equal([after.robots.target[0] for after in played], chosen)
+    assert len(set(chosen)) > 2
 
 
 def test_an_unknown_policy_is_refused(own):
