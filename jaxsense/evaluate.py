@@ -18,7 +18,7 @@ from jaxsense.config import TIMESTEP, Config, ConfigError
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Name
-from jaxsense.run import cli, devices, files, missions, rundir
+from jaxsense.run import batches, cli, devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.programs import OwnPolicies
@@ -110,8 +110,9 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     key = jax.random.key(arguments.seed)
     with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
         number = arguments.episodes * len(played)
-        batch = missions.batch_of(config, number, workers)
-        player = missions.Player(scenario, compiler, batch, workers)
+        batch = batches.batch_of(config, number, workers)
+        runs_long = batches.runs_long(config, number)
+        player = missions.Player(scenario, compiler, batch, workers, runs_long)
         player.wait()
         begin = time.perf_counter()
         try:

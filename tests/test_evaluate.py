@@ -23,7 +23,7 @@ from smoke import MISSION_KEYS, error_line
 import jaxsense
 from jaxsense import dqn, evaluate, export, mission
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.run import cli, devices, files, missions
+from jaxsense.run import batches, cli, devices, files, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
 from jaxsense.show import animation
@@ -248,7 +248,7 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
         devices.start(None),
     )
     with Compiler(Monitor(), kept) as compiler:
-        scenario, batch = mission.make_mission(config), missions.batch_of(config, 11, workers)
+        scenario, batch = mission.make_mission(config), batches.batch_of(config, 11, workers)
         player = missions.Player(scenario, compiler, batch, workers)
         played = player.play(jax.random.key(0), models, {"latent": case}, 1)
     found, recording = played.metrics["latent"], played.recording

@@ -221,7 +221,7 @@ def _to_nearest(arcs: _Arcs, x: jax.Array, y: jax.Array) -> jax.Array:
 
     # All positions together exceed the cache, and unrolled they take long to compile.
     far = jnp.full_like(arcs.x, jnp.inf)
-    return jnp.sqrt(jax.lax.scan(nearer, far, (x, y))[0])
+    return jnp.sqrt(jax.lax.scan(nearer, far, (x, y), unroll=4)[0])
 
 
 def _arrival(
@@ -233,9 +233,10 @@ def _arrival(
 ) -> Float[Array, "S T"]:
     """Seconds to a goal for a robot that leaves the arc at each sample."""
     goal_x, goal_y = frame.of(goal)
-    distance = jnp.hypot(goal_x - arcs.x, goal_y - arcs.y)
-    turn = jnp.arctan2(goal_y - arcs.y, goal_x - arcs.x) - arcs.heading
-    turn = jnp.abs((turn + jnp.pi) % (2 * jnp.pi) - jnp.pi)
+    to_x, to_y = goal_x - arcs.x, goal_y - arcs.y
+    distance = jnp.hypot(to_x, to_y)
+    cos, sin = jnp.cos(arcs.heading), jnp.sin(arcs.heading)
+    turn = jnp.arctan2(jnp.abs(cos * to_y - sin * to_x), cos * to_x + sin * to_y)
     # The direction of a near waypoint is meaningless.
     turn *= jnp.clip(distance / 0.08 - 0.25, 0.0, 1.0)
     inflation = jnp.maximum(settings.inflation, 1e-6)

@@ -31,15 +31,35 @@ class Roadmap:
     Attributes:
       nodes: `[K, 2]` positions in metres.
       viewpoints: `[N, V, 2]` positions to look at a PoI from, in metres.
-      to_viewpoint: `[N, V, K]` length of the shortest path from each node to each viewpoint, in
-        metres; infinite if there is none or the viewpoint is not free.
+      between: `[K, K]` length of the shortest path from each node to each other, in metres;
+        0 from a node to itself, infinite if there is none or a robot cannot stand at one of them.
+      is_next: `[N, V, K]` bool, whether a path may lead straight from each node to each viewpoint;
+        never to one that is not free.
+      leads: `[N, K]` bool, whether a path leads from each node to any viewpoint of each PoI.
       is_free: `[N, V]` bool, viewpoints with room for a robot and a view of the PoI.
     """
 
     nodes: Float[Array, "K 2"]
     viewpoints: Float[Array, "N V 2"]
-    to_viewpoint: Float[Array, "N V K"]
+    between: Float[Array, "K K"]
+    is_next: Bool[Array, "N V K"]
+    leads: Bool[Array, "N K"]
     is_free: Bool[Array, "N V"]
+
+    def last(self, poi: Index, view: Index | slice) -> Float[Array, "... K"]:
+        """Lengths of straight lines from the nodes to viewpoints, the last parts of paths.
+
+        Args:
+          poi: index of the PoI.
+          view: index of the viewpoint, or a slice.
+
+        Returns:
+          `[..., K]` metres; infinite where no path may lead straight.
+        """
+        places = self.viewpoints[poi, view][..., None, :]
+        nodes = self.nodes.reshape(*[1] * (places.ndim - 2), -1, 2)
+        apart = jnp.linalg.norm(places - nodes, axis=-1)
+        return jnp.where(self.is_next[poi, view], apart, jnp.inf)
 
 
 def build(config: Config, layout: Layout) -> Roadmap:
@@ -60,11 +80,14 @@ def build(config: Config, layout: Layout) -> Roadmap:
     to_pois = jnp.linalg.norm(nodes[:, None] - layout.position[None], axis=-1)
     is_usable = jnp.all(to_pois >= radius, axis=-1) & (jnp.max(jnp.abs(nodes), axis=-1) <= reach)
     goals, is_free = _viewpoints(config, layout)
-    starts = jnp.concatenate([nodes, goals.reshape(-1, 2)])
-    edges = _straight(starts, nodes, layout.position, radius)
-    paths = _shortest(jnp.where(is_usable[None], edges, jnp.inf))
-    to_viewpoint = paths[len(nodes) :].reshape(*is_free.shape, -1)
-    return Roadmap(nodes, goals, jnp.where(is_free[..., None], to_viewpoint, jnp.inf), is_free)
+    edges = _straight(nodes, nodes, layout.position, radius)
+    between = _shortest(jnp.where(is_usable[:, None] & is_usable[None], edges, jnp.inf))
+    is_next = _is_clear(goals.reshape(-1, 2), nodes, layout.position, radius) & is_usable[None]
+    is_next = is_next.reshape(*is_free.shape, -1) & is_free[..., None]
+    ends = jnp.any(is_next, axis=1)
+    # Numbers of ways, which a product of matrices counts faster than anything else.
+    ways = jnp.dot(ends.astype(jnp.float32), jnp.isfinite(between).T.astype(jnp.float32))
+    return Roadmap(nodes, goals, between, is_next, ways > 0, is_free)
 
 
 def lengths(
@@ -87,7 +110,8 @@ def lengths(
     """
     goals = roadmap.viewpoints[poi]
     direct, to_node = _first(config, layout, roadmap, position, goals)
-    around = jnp.min(to_node[None] + roadmap.to_viewpoint[poi], axis=-1)
+    to_last = jnp.min(to_node[:, None] + roadmap.between, axis=0)
+    around = jnp.min(to_last[None] + roadmap.last(poi, slice(None)), axis=-1)
     return jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
 
 
@@ -103,11 +127,13 @@ def reachable(
       roadmap: of the layout.
       position: `[2]` of a robot, in metres.
     """
+    chex.assert_shape(position, (2,), custom_message="position")
     goals = roadmap.viewpoints.reshape(-1, 2)
-    to_goal, to_node = _first(config, layout, roadmap, position, goals)
-    direct = jnp.isfinite(to_goal).reshape(roadmap.is_free.shape) & roadmap.is_free
-    leads_on = jnp.any(jnp.isfinite(roadmap.to_viewpoint), axis=1)
-    around = jnp.isfinite(to_node)[None] & leads_on
+    ends = jnp.concatenate([goals, roadmap.nodes])
+    is_clear = _is_clear(position[None], ends, layout.position, _radius(config) - _MARGIN)[0]
+    to_goal, to_node = jnp.split(is_clear, [len(goals)])
+    direct = to_goal.reshape(roadmap.is_free.shape) & roadmap.is_free
+    around = to_node[None] & roadmap.leads
     return jnp.any(direct, axis=-1) | jnp.any(around, axis=-1)
 
 
@@ -142,7 +168,8 @@ def next_waypoint(
     apart = jnp.linalg.norm(ends[:, None] - others[None], axis=-1)
     is_taken = jnp.any(apart < 2 * config.navigation.robot_radius, axis=-1)
     # Of two nodes on one path the farther one, or a robot that has reached a node would stay there.
-    remaining = jnp.append(0.0, 1.001 * roadmap.to_viewpoint[poi, view])
+    remaining = jnp.min(roadmap.between + roadmap.last(poi, view)[None], axis=1)
+    remaining = jnp.append(0.0, 1.001 * remaining)
     total = first + jnp.where(roadmap.is_free[poi, view], remaining, jnp.inf)
     total = jnp.where(is_taken, jnp.inf, total)
     best = jnp.argmin(total)
@@ -191,9 +218,21 @@ def _straight(
     centres: Float[Array, "N 2"],
     radius: float,
 ) -> Float[Array, "A E"]:
-    """Lengths of straight lines between positions, infinite where they are not free.
+    """Lengths of straight lines between positions, infinite where they are not clear."""
+    along_x, along_y = end[None, :, 0] - start[:, :1], end[None, :, 1] - start[:, 1:]
+    is_clear = _is_clear(start, end, centres, radius)
+    return jnp.where(is_clear, jnp.sqrt(along_x**2 + along_y**2), jnp.inf)
 
-    A free line keeps `radius` from all centres or, where it begins or ends closer, comes no closer
+
+def _is_clear(
+    start: Float[Array, "A 2"],
+    end: Float[Array, "E 2"],
+    centres: Float[Array, "N 2"],
+    radius: float,
+) -> Bool[Array, "A E"]:
+    """Whether straight lines between positions are clear of PoIs.
+
+    A clear line keeps `radius` from all centres or, where it begins or ends closer, comes no closer
     in between.
     """
 
@@ -204,7 +243,7 @@ def _straight(
         kept = jnp.minimum(jnp.sqrt(x**2 + y**2), radius) - _SLACK
         return x, y, jnp.maximum(kept, 0.0) ** 2
 
-    def keep_off(is_free: jax.Array, ends: tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]):
+    def keep_off(is_clear: jax.Array, ends: tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]):
         """Excludes lines that come too close to one centre."""
         from_x, from_y, from_kept = (x[:, None] for x in ends[0])
         to_x, to_y, to_kept = (x[None] for x in ends[1])
@@ -216,26 +255,24 @@ def _straight(
         passes_by = (ahead > 0) & (ahead < squared)
         # Times the squared length of the line, which saves a division and a root.
         is_near = beside**2 < jnp.minimum(from_kept, to_kept) * squared
-        return is_free & ~(passes_by & is_near), None
+        return is_clear & ~(passes_by & is_near), None
 
     # All centres together exceed the cache, and unrolled they take long to compile.
-    is_free = jnp.ones((len(start), len(end)), bool)
-    is_free, _ = jax.lax.scan(keep_off, is_free, (around(start), around(end)))
-    along_x, along_y = end[None, :, 0] - start[:, :1], end[None, :, 1] - start[:, 1:]
-    return jnp.where(is_free, jnp.sqrt(along_x**2 + along_y**2), jnp.inf)
+    is_clear = jnp.ones((len(start), len(end)), bool)
+    return jax.lax.scan(keep_off, is_clear, (around(start), around(end)), unroll=4)[0]
 
 
-def _shortest(edges: Float[Array, "A K"]) -> Float[Array, "A K"]:
+def _shortest(edges: Float[Array, "K K"]) -> Float[Array, "K K"]:
     """Lengths of the shortest paths over any number of nodes, given the lengths of edges.
 
-    The first K of the A starts are the nodes. The method of Floyd (1962) and Warshall, with the
-    nodes of one PoI at a time, which passes over the memory a tenth as often.
+    The method of Floyd (1962) and Warshall, with the nodes of one PoI at a time, which passes over
+    the memory a tenth as often.
     """
-    num_starts, num_nodes = edges.shape
+    num_nodes = len(edges)
 
     def through(paths: jax.Array, first: jax.Array) -> tuple[jax.Array, None]:
         """Adds the paths through the nodes of one PoI."""
-        enter = jax.lax.dynamic_slice(paths, (0, first), (num_starts, NODES_PER_POI))
+        enter = jax.lax.dynamic_slice(paths, (0, first), (num_nodes, NODES_PER_POI))
         leave = jax.lax.dynamic_slice(paths, (first, 0), (NODES_PER_POI, num_nodes))
 
         def go_on(node: jax.Array, leave: jax.Array) -> jax.Array:

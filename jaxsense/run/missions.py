@@ -1,7 +1,6 @@
 """Plays many missions in batches, to compare policies and failures."""
 
 import dataclasses
-import math
 import threading
 import time
 from typing import TypeAlias
@@ -11,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, PyTree
 
-from jaxsense.config import NODES_PER_POI, VIEW_SIDES, Config
-from jaxsense.core import checks
+from jaxsense.config import Config
 from jaxsense.core.types import Key, pytree
 from jaxsense.mission import (
     Case,
@@ -28,15 +26,12 @@ from jaxsense.mission import (
 )
 from jaxsense.models import Models, init
 from jaxsense.run import devices
+from jaxsense.run.batches import chunk_of
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.ledger import Ledger
 from jaxsense.run.monitor import StageError
 
-_CHUNK_TIME = 2.5  # s
-# Missions side by side on each thread of a CPU or on each accelerator.
-_LEAST_OF_CPU, _MOST_OF_CPU, _CACHE = 8, 192, 2**26  # bytes
-_MOST_OF_ACCELERATOR, _SHARE_OF_MEMORY = 32768, 0.05
 Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
 
 
@@ -66,41 +61,6 @@ class Played:
     metrics: dict[str, Measured]
     recording: Recording
     control_steps: int
-
-
-def chunk_of(config: Config) -> int:
-    """Control periods between two reports. Traced settings must not enter: it is a size."""
-    return math.ceil(_CHUNK_TIME / config.mission.control_period)
-
-
-def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
-    """How many missions to play side by side.
-
-    Args:
-      config: all settings.
-      total: number of missions.
-      workers: share the missions.
-
-    Returns:
-      On a CPU fewer than all, since some last long, and no more than its caches hold; on an
-      accelerator as many as fit into a small part of its memory.
-
-    Raises:
-      ValueError: if `total` is not a number greater than 0.
-    """
-    checks.require_number("total", total)
-    memory = devices.memory()
-    if memory is None:
-        most = min(_MOST_OF_CPU, max(_LEAST_OF_CPU, _CACHE // _bytes_of_state(config)))
-        return min(most * workers.number, -(-total // 3))
-    share = int(_SHARE_OF_MEMORY * memory) // _bytes_of_state(config)
-    return min(total, min(_MOST_OF_ACCELERATOR, share) * workers.number)
-
-
-def _bytes_of_state(config: Config) -> int:
-    """Bytes of a mission's roadmap, which takes nearly all of its state."""
-    views = config.arena.num_pois * VIEW_SIDES * len(config.navigation.view_distances)
-    return 4 * views * config.arena.num_pois * NODES_PER_POI
 
 
 def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
@@ -156,7 +116,14 @@ class Player:
       mission: the mission.
     """
 
-    def __init__(self, mission: Mission, compiler: Compiler, batch: int, workers: Workers = ALONE):
+    def __init__(
+        self,
+        mission: Mission,
+        compiler: Compiler,
+        batch: int,
+        workers: Workers = ALONE,
+        runs_long: bool = False,
+    ):
         """Starts to compile the programs.
 
         Args:
@@ -164,6 +131,7 @@ class Player:
           compiler: compiles in the background.
           batch: number of missions side by side, rounded up to a multiple of the workers.
           workers: share the missions. Each thread plays its own, without waiting for the others.
+          runs_long: see `devices.compiler_options`.
         """
         self.mission, self._monitor, self._workers = mission, compiler.monitor, workers
         config, self._share = mission.config, -(-batch // workers.number)
@@ -222,11 +190,29 @@ class Player:
         whole = (0, 1, 2)
         self._begin = Program(compiler, "mission", "begin")
         slots = self._begin.compile(
-            begin, key, config, models, numbers, numbers, faults, workers=together, whole=whole
+            begin,
+            key,
+            config,
+            models,
+            numbers,
+            numbers,
+            faults,
+            workers=together,
+            whole=whole,
+            runs_long=runs_long,
         )
         self._go_on = Program(compiler, "mission", "go_on")
         _, self._found, _ = self._go_on.compile(
-            go_on, key, config, models, slots, slots, numbers, workers=together, whole=whole
+            go_on,
+            key,
+            config,
+            models,
+            slots,
+            slots,
+            numbers,
+            workers=together,
+            whole=whole,
+            runs_long=runs_long,
         )
 
     def wait(self) -> None:

@@ -16,7 +16,7 @@ from jaxsense import mission
 from jaxsense.config import Config
 from jaxsense.core.types import Key
 from jaxsense.dqn.policies import Policy, Values
-from jaxsense.run import missions
+from jaxsense.run import batches, missions
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.together import SharedProgram, Trainings
@@ -199,7 +199,7 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
 def _trace_missions(programs: Programs, compiler: Compiler) -> None:
     config = programs.config
     number, workers = len(config.mission.policies) * config.mission.episodes, programs.workers
-    batch = missions.batch_of(config, number, workers)
+    batch = batches.batch_of(config, number, workers)
     scenario = mission.make_mission(config, programs.policies)
     programs.player.set_result(missions.Player(scenario, compiler, batch, workers))
 

@@ -175,4 +175,4 @@ def free_room(
     of_pois = jnp.where(is_target, -jnp.inf, arena.poi_extent)
     of_robots = jnp.full(len(others), amiro.BODY_RADIUS)
     obstacles = jnp.concatenate([layout.position, others]), jnp.append(of_pois, of_robots)
-    return jax.lax.scan(around, to_wall, obstacles)[0]
+    return jax.lax.scan(around, to_wall, obstacles, unroll=4)[0]

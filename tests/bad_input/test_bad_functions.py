@@ -13,7 +13,7 @@ import jaxsense
 from jaxsense import Belief, dqn, mission, sim, vae
 from jaxsense.config import FilterConfig
 from jaxsense.interfaces import common
-from jaxsense.run import missions
+from jaxsense.run import batches
 from jaxsense.vae import filter
 
 # Settings whose models have other shapes.
@@ -361,7 +361,7 @@ FUNCTIONS = {
         ),
         "modality = 5",
     ),
-    "missions.batch_of": (lambda w: missions.batch_of(0), "total = 0"),
+    "batches.batch_of": (lambda w: batches.batch_of(SMOKE, 0), "total = 0"),
     "mission.rollout": (lambda w: mission.rollout(w.key, None, None, None, 0), "steps = 0"),
     "make_mdp without models": (
         lambda w: jaxsense.make_mdp(SMOKE, None),

@@ -143,7 +143,8 @@ def without_ways(state):
     ways = replace(
         state.roadmap,
         is_free=state.roadmap.is_free.at[2].set(False),
-        to_viewpoint=state.roadmap.to_viewpoint.at[2].set(jnp.inf),
+        is_next=state.roadmap.is_next.at[2].set(False),
+        leads=state.roadmap.leads.at[2].set(False),
     )
     return replace(state, roadmap=ways)
 

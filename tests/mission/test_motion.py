@@ -97,8 +97,8 @@ def test_where_nothing_can_be_touched_the_empty_arena_gives_the_same_motion(move
     empty, full, _ = way(start, move(start)[0])
     assert empty > 1e-3
     np.testing.assert_allclose(empty, full, atol=1e-6)
-    # The empty arena is used where nothing can be touched, and nowhere else, whatever other missions
-    # need: a robot stays if its wheels do not pull.
+    # The empty arena is used where nothing can be touched, and nowhere else: without the pull of
+    # its wheels, a robot stays.
     empty, *full = way(start, move(start, pull=0.0)[0])
     assert empty < 1e-3
     assert full[0] > 1e-2

@@ -216,7 +216,7 @@ def test_evaluate_plays_own_policies_and_keeps_no_programs(tmp_path, monkeypatch
     found = []
 
     class Player:
-        def __init__(self, team, compiler, batch, workers):
+        def __init__(self, team, compiler, batch, workers, runs_long):
             found.append(([*team.policies], compiler.kept))
 
         def wait(self):

@@ -13,7 +13,7 @@ from teams import CONFIG, NAIVE
 from jaxsense import mission
 from jaxsense.core.types import Belief
 from jaxsense.mission.state import Record
-from jaxsense.run import devices, missions
+from jaxsense.run import batches, devices, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
 from jaxsense.run.monitor import Monitor, StageError
@@ -21,7 +21,7 @@ from jaxsense.run.monitor import Monitor, StageError
 # The package gives its function this name.
 ROLLOUT = importlib.import_module("jaxsense.mission.rollout")
 KEY = jax.random.key(5)
-CHUNK = missions.chunk_of(CONFIG)
+CHUNK = batches.chunk_of(CONFIG)
 LAST = 2 * CHUNK - 3  # control periods, within the second chunk
 
 
@@ -162,4 +162,4 @@ def test_values_that_are_not_finite_end_the_missions(play, monkeypatch):
 
 def test_a_short_time_limit_changes_no_program():
     short = dataclasses.replace(CONFIG.mission, time_limit=1.0)
-    assert missions.chunk_of(dataclasses.replace(CONFIG, mission=short)) == CHUNK
+    assert batches.chunk_of(dataclasses.replace(CONFIG, mission=short)) == CHUNK

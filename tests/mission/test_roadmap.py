@@ -32,6 +32,12 @@ reachable = jax.jit(roadmap.reachable, static_argnums=0)
 next_waypoint = jax.jit(roadmap.next_waypoint, static_argnums=0)
 
 
+@jax.jit
+def last_parts(ways):
+    """`[N, V, K]` lengths from nodes straight to viewpoints."""
+    return jax.vmap(lambda poi: ways.last(poi, slice(None)))(jnp.arange(len(ways.viewpoints)))
+
+
 def planned(config, positions):
     """The first arguments of `lengths` and `next_waypoint`."""
     number = len(positions)
@@ -318,8 +324,12 @@ def test_ways_are_the_shortest_that_dijkstra_finds(arena, seed):
     shortest = csgraph.dijkstra(graph, indices=np.arange(len(nodes), len(starts)))
     assert np.isfinite(edges[: len(nodes)]).mean() < 0.7
     expected = shortest[:, : len(nodes)]
-    np.testing.assert_allclose(ways.to_viewpoint[ways.is_free], expected, atol=1e-5)
-    np.testing.assert_array_equal(ways.to_viewpoint[~ways.is_free], np.inf)
+    between, last = (np.asarray(x) for x in (ways.between, last_parts(ways)))
+    found = np.min(last[ways.is_free][:, None] + between[None], axis=-1)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_array_equal(last[~ways.is_free], np.inf)
+    leads = np.isfinite(last[:, :, None] + between).any(axis=(1, 3))
+    np.testing.assert_array_equal(ways.leads, leads)
 
 
 def test_a_place_reaches_the_pois_with_a_way_of_finite_length():
@@ -374,7 +384,7 @@ def test_only_free_viewpoints_have_a_way(beside_wall_and_poi, view, is_free):
     here = ways.viewpoints[0, view]
     expected = 0.0 if is_free else np.inf
     assert ways.is_free[0, view] == is_free
-    assert np.isinf(ways.to_viewpoint[0, view]).all() != is_free
+    assert np.isinf(ways.last(0, view)).all() != is_free
     # Even from where it is.
     assert lengths(*beside_wall_and_poi, here, 0)[view] == expected
     length, place = next_waypoint(*beside_wall_and_poi, here, FAR_AWAY, 0, view)

@@ -1,0 +1,60 @@
+"""How many missions play side by side, and for how long between two looks at them."""
+
+import math
+
+from jaxsense.config import NODES_PER_POI, VIEW_SIDES, Config
+from jaxsense.core import checks
+from jaxsense.run import devices
+from jaxsense.run.devices import ALONE, Workers
+
+_CHUNK_TIME = 2.5  # s
+# Missions side by side on each thread of a CPU or on each accelerator.
+_LEAST_OF_CPU, _MOST_OF_CPU, _CACHE = 8, 192, 2**26  # bytes
+_MOST_OF_ACCELERATOR, _SHARE_OF_MEMORY = 32768, 0.05
+_MANY_POIS = 2**14  # of all missions; on a CPU, one takes some 3 ms of a core
+
+
+def chunk_of(config: Config) -> int:
+    """Control periods between two reports. Traced settings must not enter: it is a size."""
+    return math.ceil(_CHUNK_TIME / config.mission.control_period)
+
+
+def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
+    """How many missions to play side by side.
+
+    Args:
+      config: all settings.
+      total: number of missions.
+      workers: share the missions.
+
+    Returns:
+      On a CPU fewer than all, since some last long, and no more than its caches hold; on an
+      accelerator as many as fit into a small part of its memory.
+
+    Raises:
+      ValueError: if `total` is not a number greater than 0.
+    """
+    checks.require_number("total", total)
+    memory = devices.memory()
+    if memory is None:
+        most = min(_MOST_OF_CPU, max(_LEAST_OF_CPU, _CACHE // _bytes_of_state(config)))
+        return min(most * workers.number, -(-total // 3))
+    share = int(_SHARE_OF_MEMORY * memory) // _bytes_of_state(config)
+    return min(total, min(_MOST_OF_ACCELERATOR, share) * workers.number)
+
+
+def _bytes_of_state(config: Config) -> int:
+    """Bytes of a mission's roadmap and some more, about as many as its state takes."""
+    views = config.arena.num_pois * VIEW_SIDES * len(config.navigation.view_distances)
+    nodes = config.arena.num_pois * NODES_PER_POI
+    return 2**13 + 4 * nodes**2 + nodes * views
+
+
+def runs_long(config: Config, total: int) -> bool:
+    """Whether missions take longer than it takes to compile faster programs.
+
+    Args:
+      config: all settings.
+      total: number of missions.
+    """
+    return total * config.arena.num_pois >= _MANY_POIS
