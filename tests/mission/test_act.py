@@ -95,7 +95,7 @@ def test_a_detection_updates_the_exact_posterior_and_is_counted(
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
 def test_a_look_from_near_an_earlier_one_counts_in_part(scan, models, facing, robot):
     trained = sure(models, robot, 0.8)
-    half = Novelty(strength=jnp.full(2, np.sqrt(2.0) - 1), length=jnp.full(2, 0.1))
+    half = Novelty(*np.float32([[np.sqrt(2.0) - 1] * 2, [0.1] * 2]))
     before = facing(robot)
     whole = scan(jax.random.key(0), before, robot, trained)
     np.testing.assert_allclose(whole.looked_from[0, robot, 0], [0.0, 0.0], atol=1e-6)
