@@ -87,8 +87,11 @@ def test_a_poi_is_found_in_a_whole_scan_where_an_error_explains_it(team, certain
     scan[341 + 40 - 15 : 341 + 40 + 15] = 0.7
 
     @functools.partial(jax.jit, static_argnums=1)
-    def is_there(scan, search, bearing=0.0):
+    def detects(scan, search, bearing):
         return certain.detect(LIDAR, lidar, scan, bearing, 0.8, search).is_there
+
+    def is_there(scan, search, bearing=0.0):
+        return detects(scan, search, np.float32(bearing))
 
     assert not is_there(scan, SearchConfig())
     assert is_there(scan, SearchConfig(heading=14.0))
