@@ -42,28 +42,44 @@ def example(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def learned():
-    """Settings with a thermal camera, what was learnt of the sensors, and what it is worth."""
+def config():
+    """Settings with a thermal camera."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(EXAMPLES)
         change = importlib.import_module("new_modality").change
-        config = train.parse([*SMALL, *THERMAL], change).config
-        arena = sim.make_world(config).arena
-        perceive = jax.jit(lambda key: learn(key, config, arena, until="look_values").outputs)
-        return config, perceive(jax.random.key(0))
+        return train.parse([*SMALL, *THERMAL], change).config
 
 
 @pytest.fixture(scope="module")
-def runs(learned, tmp_path_factory):
-    """A directory with a run `thermal`, whose Q-networks are not trained."""
-    config, outputs = learned
+def learned(config):
+    """What was learnt of the sensors, and what it is worth."""
+    arena = sim.make_world(config).arena
+    perceive = jax.jit(lambda key: learn(key, config, arena, until="look_values").outputs)
+    return perceive(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def runs(config, tmp_path_factory):
+    """A directory with a run `thermal` that has trained nothing."""
+    path = tmp_path_factory.mktemp("runs")
+    save(path / "thermal", config, jaxsense.init(jax.random.key(0), config))
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained_runs(config, learned, tmp_path_factory):
+    """A directory with a run `thermal`, of which only the Q-networks are not trained."""
     untrained = jaxsense.init(jax.random.key(0), config)
     q_networks = zip(config.modalities, untrained.q_networks, strict=True)
-    models = stages.models(outputs | {f"dqn_{name}": q for name, q in q_networks}, config)
-    path = tmp_path_factory.mktemp("runs")
-    with RunDirectory.create(path / "thermal", Settings("smoke", 0, config)) as created:
-        save_models(created, models)
+    models = stages.models(learned | {f"dqn_{name}": q for name, q in q_networks}, config)
+    path = tmp_path_factory.mktemp("trained")
+    save(path / "thermal", config, models)
     return path
+
+
+def save(path, config, models):
+    with RunDirectory.create(path, Settings("smoke", 0, config)) as created:
+        save_models(created, models)
 
 
 def run(change, out: Path, *options: str) -> dict:
@@ -93,24 +109,31 @@ def test_new_modality(example, tmp_path):
 
 @pytest.mark.slow
 def test_the_thermal_camera_tells_what_is_hot(learned):
-    _, outputs = learned
-    assert outputs["detector_metrics"]["thermal"]["accuracy"] >= 0.95
-    _, latent = outputs["latent_space"]
+    assert learned["detector_metrics"]["thermal"]["accuracy"] >= 0.95
+    _, latent = learned["latent_space"]
     # Only what is hot is told by the thermal camera alone.
     thermal = np.asarray(latent.sigma_norm["thermal"])
     assert thermal[3] < 0.7 * min(thermal[:3])
 
 
+def on_a_run(main, path):
+    """Runs an example on the run, as from the command line."""
+    return lambda *argv: main([str(path / "thermal"), *map(str, argv), "--trust"])
+
+
 @pytest.fixture
 def recorded_scans(example, runs):
-    """Runs the example on the run, as from the command line."""
-    main = example("recorded_scans").main
-    return lambda *argv: main([str(runs / "thermal"), *map(str, argv), "--trust"])
+    return on_a_run(example("recorded_scans").main, runs)
+
+
+@pytest.fixture
+def trained_recorded_scans(example, trained_runs):
+    return on_a_run(example("recorded_scans").main, trained_runs)
 
 
 @pytest.mark.slow
-def test_recorded_scans(recorded_scans, tmp_path, capsys):
-    recording = tmp_path / "recorded"  # without an ending
+def test_recorded_scans(trained_recorded_scans, tmp_path, capsys):
+    recorded_scans, recording = trained_recorded_scans, tmp_path / "recorded"  # without an ending
     recorded_scans(recording, "--simulate")
     assert capsys.readouterr().out == ""
     assert [*tmp_path.iterdir()] == [recording]
@@ -181,7 +204,7 @@ def test_recorded_scans_neither_invents_nor_replaces_a_recording(
 
 
 @pytest.mark.skipif(not rawlog.DIRECTORY.exists(), reason="mrpt-common is not installed")
-def test_laser_logs(example, recorded_scans, runs, tmp_path, monkeypatch, capsys):
+def test_laser_logs(example, trained_recorded_scans, trained_runs, tmp_path, monkeypatch, capsys):
     main, read_logs = example("laser_logs").main, rawlog.read_logs
 
     def few(directory):
@@ -193,7 +216,7 @@ def test_laser_logs(example, recorded_scans, runs, tmp_path, monkeypatch, capsys
     monkeypatch.setattr(jaxsense, "load", lambda run, trust=True: load(run, True))
     monkeypatch.setattr(rawlog, "read_logs", few)
     recording = tmp_path / "scans.npz"
-    main([str(runs / "thermal"), str(recording)])
+    main([str(trained_runs / "thermal"), str(recording)])
     content = np.load(recording)
     number = len(content["places"])
     assert 30 < number <= 36
@@ -201,13 +224,13 @@ def test_laser_logs(example, recorded_scans, runs, tmp_path, monkeypatch, capsys
     distance = np.linalg.norm(content["places"], axis=1)
     assert ((distance >= 0.3) & (distance <= 1.2)).all()
     # No look is out of view, and most show their PoI.
-    recorded_scans(recording)
+    trained_recorded_scans(recording)
     told = capsys.readouterr().out
     assert told.count("lidar: cylinder") > 0.8 * number
     assert "thermal" not in told
     before = recording.read_bytes()
     with pytest.raises(SystemExit, match=r"^laser_logs: .*scans\.npz"):
-        main([str(runs / "thermal"), str(recording)])
+        main([str(trained_runs / "thermal"), str(recording)])
     assert recording.read_bytes() == before
 
 
@@ -222,7 +245,8 @@ def test_laser_logs_names_a_missing_log(example, runs, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_recorded_scans_of_other_rays(recorded_scans, tmp_path, capsys):
+def test_recorded_scans_of_other_rays(trained_recorded_scans, tmp_path, capsys):
+    recorded_scans = trained_recorded_scans
     recorded_scans(tmp_path / "recorded.npz", "--simulate")
     content = dict(np.load(tmp_path / "recorded.npz"))
     # Of the 683 rays of the run, 401 over 141 degrees.

@@ -32,9 +32,9 @@ def models():
 
 def numbered_bank():
     """Detections that tell where they come from: (class + row / 10, modality)."""
-    classes, rows = jnp.meshgrid(jnp.arange(3.0), jnp.arange(5.0), indexing="ij")
-    place = classes + rows / 10
-    return tuple(jnp.stack([place, jnp.full_like(place, m)], axis=-1) for m in range(2))
+    place = np.arange(3)[:, None] + np.arange(5) / 10
+    stacked = (np.stack([place, np.full_like(place, m)], axis=-1) for m in range(2))
+    return tuple(jnp.asarray(x, jnp.float32) for x in stacked)
 
 
 @pytest.mark.parametrize("modality", [0, 1])
@@ -42,9 +42,11 @@ def test_bank_draws_every_detection_of_the_true_class_and_no_other(modality):
     bank, classes = Bank(numbered_bank()), jnp.array([2, 0, 1])
     scene = bank.scene(jax.random.key(0), classes)
     keys = jax.random.split(jax.random.key(1), 200)
+    look = jax.jit(
+        jax.vmap(lambda key, poi: bank.observe(key, scene, poi, modality)[0], in_axes=(0, None))
+    )
     for poi in range(3):
-        look = jax.vmap(lambda key: bank.observe(key, scene, jnp.int32(poi), modality)[0])  # noqa: B023
-        features = look(keys)
+        features = look(keys, np.int32(poi))
         expected = [int(classes[poi]) + row / 10 for row in range(5)]
         np.testing.assert_allclose(np.unique(features[:, 0]), expected, rtol=1e-6)
         np.testing.assert_array_equal(features[:, 1], modality)
@@ -58,8 +60,8 @@ def test_an_mdp_updates_beliefs_by_the_jmvae(models):
     state = reset(jax.random.key(1), mdp, jnp.array([2, 0, 1]), seen)
     np.testing.assert_allclose(state.belief.std[0], np.sqrt(20.0), rtol=1e-6)
     # PoI 1 is of class 0 and was seen by the LiDAR: one of five beliefs.
-    encode = jax.vmap(lambda x: jmvae.encode(models.jmvae, MODEL, (None, x))[0])
-    distances = np.abs(np.asarray(encode(numbered_bank()[1][0])) - state.belief.mean[1][None])
+    encode = jax.jit(jax.vmap(lambda x: jmvae.encode(models.jmvae, MODEL, (None, x))[0]))
+    distances = np.abs(np.asarray(encode(numbered_bank()[1][0])) - np.asarray(state.belief.mean[1]))
     assert np.min(np.max(distances, axis=1)) < 1e-5
 
 
@@ -70,15 +72,17 @@ def test_an_mdp_is_an_argument_of_jit(models):
         after, outcome = map_mdp.step(jax.random.key(1), mdp, state, jnp.int32(0), jnp.int32(0))
         return after.belief, outcome.reward
 
-    features = tuple(jnp.full((3, 4, 2), 0.5).at[:, :, 0].add(0.01 * m) for m in range(2))
-    features = jax.tree.map(lambda x: x.at[:, :, 1].set(1 - x[:, :, 0]), features)
-    found = []
+    features = tuple(
+        jnp.asarray(np.broadcast_to([p, 1 - p], (3, 4, 2)), jnp.float32) for p in (0.5, 0.51)
+    )
+    found, reset = [], jax.jit(map_mdp.reset)
+    posterior = jax.jit(jmvae.posterior, static_argnums=1)
     for number in range(2):
         other = jaxsense.init(jax.random.key(number), CONFIG)
         mdp = looks.make_mdp(CONFIG, other, Bank(features))
-        state = map_mdp.reset(jax.random.key(0), mdp, jnp.array([0, 1, 2]), jnp.zeros((3, 2), bool))
+        state = reset(jax.random.key(0), mdp, jnp.array([0, 1, 2]), np.zeros((3, 2), bool))
         belief, _ = gain(mdp, state)
-        expected = jmvae.posterior(other.jmvae, MODEL, (features[0][0, 0], None))
+        expected = posterior(other.jmvae, MODEL, (features[0][0, 0], None))
         np.testing.assert_allclose(belief.mean[0], expected.mean, rtol=1e-5)
         found.append(belief.mean[0])
     assert np.all(found[0] != found[1])

@@ -72,6 +72,7 @@ def states():
     return jax.jit(jax.vmap(reset))(SEEN)
 
 
+@jax.jit
 def values(params):
     """`[4, 3]` values in the states above."""
     agent = learning_in(MDP, PROBE).agent

@@ -33,22 +33,29 @@ def make_mdp(mapped=None, places=PLACES, robots_each=1, **config):
 MDP = make_mdp()
 
 
+reset_map = jax.jit(map_mdp.reset)
+seconds_of_ways = jax.jit(team_mdp.travel_seconds)
+move = jax.jit(team_mdp.move)
+
+
 def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
     """Nobody has chosen yet."""
     number = len(poses)
-    works = jnp.ones(number, bool) if works is None else jnp.array(works)
-    seen = jnp.zeros((3, 2), bool) if seen is None else jnp.array(seen, bool)
-    known = map_mdp.reset(jax.random.key(0), mdp.map, jnp.array([0, 1, 2]), seen)
+    works = np.ones(number, bool) if works is None else np.array(works)
+    seen = np.zeros((3, 2), bool) if seen is None else np.array(seen, bool)
+    known = reset_map(jax.random.key(0), mdp.map, np.array([0, 1, 2]), seen)
     team = Team(
         positions=places,
         present=jnp.ones(3, bool),
         poses=jnp.array(poses, jnp.float32),
         modality=jnp.array(modality),
-        works=works,
-        target=jnp.full(number, NOP),
+        works=jnp.asarray(works),
+        target=jnp.asarray(np.full(number, NOP)),
     )
-    first = jnp.argmax(works).astype(jnp.int32)
-    return TeamState(known, team, works, first, jnp.zeros(number), jnp.float32(0))
+    first, seconds = np.int32(np.argmax(works)), np.zeros(number, np.float32)
+    return TeamState(
+        known, team, jnp.asarray(works), jnp.asarray(first), jnp.asarray(seconds), jnp.float32(0)
+    )
 
 
 jitted = jax.jit(lambda key, state, action: team_mdp.step(key, MDP, state, action))
@@ -84,14 +91,14 @@ def play(state, *actions):
 )
 def test_time_until_a_look_as_worked_by_hand(pose, place, seconds):
     pose, places = jnp.array(pose, jnp.float32), jnp.array([place], jnp.float32)
-    np.testing.assert_allclose(team_mdp.travel_seconds(TRAVEL, pose, places), [seconds], rtol=1e-4)
+    np.testing.assert_allclose(seconds_of_ways(TRAVEL, pose, places), [seconds], rtol=1e-4)
 
 
 def test_every_number_of_the_model_counts():
     pose, places = jnp.zeros(3), jnp.array([[0.0, 2.0]])
     model = TravelConfig(speed=0.4, turn_rate=2.0, view_distance=0.4, look_seconds=3.0)
     expected = math.pi / 2 / 2 + (2 - 0.4) / 0.4 + 3
-    np.testing.assert_allclose(team_mdp.travel_seconds(model, pose, places)[0], expected, rtol=1e-5)
+    np.testing.assert_allclose(seconds_of_ways(model, pose, places)[0], expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -105,9 +112,9 @@ def test_every_number_of_the_model_counts():
     ],
 )
 def test_the_pose_on_the_way_as_worked_by_hand(seconds, expected):
-    moved = team_mdp.move(TRAVEL, jnp.zeros(3), jnp.array([0.0, 2.0]), jnp.float32(seconds))
+    moved = move(TRAVEL, jnp.zeros(3), jnp.array([0.0, 2.0]), jnp.float32(seconds))
     np.testing.assert_allclose(moved, expected, atol=1e-6)
-    mirrored = team_mdp.move(TRAVEL, jnp.zeros(3), jnp.array([0.0, -2.0]), jnp.float32(seconds))
+    mirrored = move(TRAVEL, jnp.zeros(3), jnp.array([0.0, -2.0]), jnp.float32(seconds))
     np.testing.assert_allclose(mirrored, np.array(expected) * (1, -1, -1), atol=1e-6)
 
 
@@ -128,7 +135,7 @@ PLACE = st.floats(-3, 3, width=32)
 @settings(max_examples=100, deadline=None, derandomize=True, database=None)
 @given(st.tuples(PLACE, PLACE, PLACE), st.tuples(PLACE, PLACE), st.floats(0, 1, width=32))
 def test_a_way_in_two_parts_takes_as_long_as_in_one(pose, place, share):
-    numbers = (jnp.array(x, jnp.float32) for x in (pose, place, share))
+    numbers = (np.float32(x) for x in (pose, place, share))
     one, two, end, end_of_two = in_two_parts(*numbers)
     np.testing.assert_allclose(one, two, atol=1e-3)
     np.testing.assert_allclose(end[:2], end_of_two[:2], atol=1e-3)
@@ -280,23 +287,25 @@ def test_an_episode_is_cut_after_its_own_number_of_choices():
     assert not ended.truncated
 
 
+@jax.jit
+def alone_and_on_the_map(key, mdp, team, known, action, modality):
+    there = map_mdp.step(key, mdp.map, known, action, modality)
+    return team_mdp.step(key, mdp, team, action), there
+
+
 @pytest.mark.parametrize("modality", [CAMERA, LIDAR])
 @pytest.mark.parametrize("mapped", [classes_mdp(partly_seen_starts=False), noisy_mdp()])
 def test_a_robot_alone_earns_what_the_map_mdp_gives(mapped, modality):
     mdp = make_mdp(mapped)
     alone = team_mdp.alone(3, modality)
-    known = map_mdp.reset(jax.random.key(4), mapped)
+    known = reset_map(jax.random.key(4), mapped)
     one = jnp.ones(1, bool)
     team = TeamState(known, alone, one, jnp.int32(0), jnp.zeros(1), jnp.float32(0))
-    both = jax.jit(
-        lambda key, team, known, action: (
-            team_mdp.step(key, mdp, team, action),
-            map_mdp.step(key, mapped, known, action, modality),
-        )
-    )
     for i, action in enumerate([0, 2, 2, 1, NOP]):
         key = jax.random.key(10 + i)
-        (team, here), (known, there) = both(key, team, known, jnp.int32(action))
+        (team, here), (known, there) = alone_and_on_the_map(
+            key, mdp, team, known, jnp.int32(action), jnp.int32(modality)
+        )
         np.testing.assert_allclose(here.reward, there.reward, rtol=1e-6)
         assert here.terminated == there.terminated
         assert float(here.seconds) == (0 if action == NOP else 1)

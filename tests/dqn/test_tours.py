@@ -113,14 +113,12 @@ def test_the_loss_is_of_differences_within_a_state():
     size = NETWORK.features * 3
     params = jax.tree.map(jnp.zeros_like, networks.init(jax.random.key(0), NETWORK, size))
     # All predictions are the ways themselves.
-    known = (
-        jnp.zeros((NETWORK.features, 3, 2)).at[4].set(jnp.array([[0.6, 0.1], [1.6, 0.2], [0, 0]]))
-    )
-    known = known.at[-3, :2].set(1.0)
+    known = np.zeros((NETWORK.features, 3, 2), np.float32)
+    known[4] = [[0.6, 0.1], [1.6, 0.2], [0, 0]]
+    known[-3, :2] = 1.0
     tried = jnp.array([[True, True], [True, True], [False, False]])
-    trials = Trials(
-        known.reshape(-1, 2), tried, jnp.array([[26.0, 31.0], [36.0, 32.0], [5.0, 9.0]])
-    )
+    seconds = jnp.array([[26.0, 31.0], [36.0, 32.0], [5.0, 9.0]])
+    trials = Trials(jnp.asarray(known.reshape(-1, 2)), tried, seconds)
     both = jnp.arange(2)
     loss = jax.jit(lambda trials: fitting(trials).loss(params, both, jnp.int32(0)))
     # 6 and 16 s, and 1 and 2 s: each 20 and 30 s too little, and that is no error.
@@ -208,7 +206,7 @@ def test_what_is_left_to_learn_elsewhere_makes_no_look_worth_its_way(monkeypatch
     belief = Belief(jnp.zeros((3, 2)), jnp.array([[0.1, 1.0], [1.5, 1.0], [0.1, 1.0]]))
     given = {**AT_ORIGIN, "belief": belief}
     # Were all three known, with sigmas of .2, it would say .2 - .5 + .2 of a look that earns -1.
-    worth = agent.worth({}, CLASSES, **given)
+    worth = jax.jit(lambda: agent.worth({}, CLASSES, **given))()
     np.testing.assert_allclose(worth, [0.1 - 0.2 - 1, 1.5 - 0.2 - 1, 0.1 - 0.2 - 1], rtol=1e-5)
 
 
@@ -223,11 +221,12 @@ def test_what_a_look_is_worth_does_not_depend_on_who_else_is_near(monkeypatch):
     team = AT_ORIGIN["team"]
     poses, heads = np.array([[0, 0, 0], [*PLACES[0], 0]], np.float32), np.array([3, 0])
     near = replace(team, poses=poses, target=heads)
-    worth, same = (AGENT.worth({}, CLASSES, **{**AT_ORIGIN, "team": each}) for each in (team, near))
+    of_team = jax.jit(lambda team: AGENT.worth({}, CLASSES, **{**AT_ORIGIN, "team": team}))
+    worth, same = of_team(team), of_team(near)
     np.testing.assert_array_equal(worth, same)
     # A PoI that the robot has given up is never worth a look.
     gone = replace(team, present=np.array([True, False, True]))
-    left = AGENT.worth({}, CLASSES, **{**AT_ORIGIN, "team": gone})
+    left = of_team(gone)
     assert left[1] <= 0
 
 
@@ -245,7 +244,7 @@ def of_sigmas(monkeypatch, after):
 
 def test_without_tours_the_values_are_those_of_setting_out(monkeypatch):
     of_sigmas(monkeypatch, [8.0, 3.0, 16.0])
-    values = AGENT.decide({}, (), classes=CLASSES, **AT_ORIGIN)
+    values = jax.jit(lambda: AGENT.decide({}, (), classes=CLASSES, **AT_ORIGIN))()
     # 6, 16 and, an eighth of a turn and 12.73 - .9 m away, 60.9 s, each of which halves a value.
     seconds = np.array([6, 16, math.pi / 4 + (9 * math.sqrt(2) - 0.9) / 0.2 + 1])
     expected = [*np.array([8.0, 3.0, 16.0]) * 0.5**seconds, 0.0]
@@ -255,6 +254,6 @@ def test_without_tours_the_values_are_those_of_setting_out(monkeypatch):
 def test_without_tours_a_look_no_better_than_one_at_a_known_poi_comes_last(monkeypatch):
     # A useless look earns -1, the network says 0: .9 is not enough.
     of_sigmas(monkeypatch, [8.0, 0.9, jnp.nan])
-    values = AGENT.decide({}, (), classes=CLASSES, **AT_ORIGIN)
+    values = jax.jit(lambda: AGENT.decide({}, (), classes=CLASSES, **AT_ORIGIN))()
     assert values[0] > values[3] == 0 > values[1]
     assert jnp.isnan(values[2])

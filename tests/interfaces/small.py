@@ -36,15 +36,19 @@ ONLY_CAMERAS = dataclasses.replace(
 
 def noisy_bank(key: jax.Array, config: Config, samples: int = 256) -> Samples:
     """Detections that give the true label a probability of .98 to 1."""
-    features = []
-    for k, name in zip(
-        jax.random.split(key, len(config.modalities)), config.modalities, strict=True
-    ):
+
+    def of_sensor(key: jax.Array, name: str) -> jax.Array:
         labels = jnp.array(config.arena.label_of_class(MODALITIES[name]))
-        sure = 1 - 0.02 * jax.random.uniform(k, (len(labels), samples, 1))
+        sure = 1 - 0.02 * jax.random.uniform(key, (len(labels), samples, 1))
         is_label = jax.nn.one_hot(labels, len(config.arena.labels(MODALITIES[name])))[:, None]
-        features.append(jnp.where(is_label > 0, sure, 1 - sure))
-    return tuple(features)
+        return jnp.where(is_label > 0, sure, 1 - sure)
+
+    @jax.jit
+    def of_all(key: jax.Array) -> Samples:
+        keys = jax.random.split(key, len(config.modalities))
+        return tuple(map(of_sensor, keys, config.modalities))
+
+    return of_all(key)
 
 
 @functools.cache
@@ -54,7 +58,7 @@ def trained() -> tuple[Models, Samples]:
     bank, model, settings = noisy_bank(jax.random.key(1), CONFIG), make_jmvae(CONFIG), CONFIG.jmvae
     train = jax.jit(lambda key, params: jmvae.train(key, params, model, bank, settings)[0])
     params = train(jax.random.key(2), models.jmvae)
-    joint = jax.vmap(jax.vmap(lambda *x: jmvae.posterior(params, model, x)))
+    joint = jax.jit(jax.vmap(jax.vmap(lambda *x: jmvae.posterior(params, model, x))))
     classes = jax.tree.map(lambda x: x.mean(axis=1), joint(*bank))
     fusion = make_in_place(CONFIG, params, classes)
     return dataclasses.replace(models, jmvae=params, fusion=fusion), bank

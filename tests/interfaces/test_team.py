@@ -1,6 +1,7 @@
 """The team behind all interfaces for several agents, without any of their libraries."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -14,45 +15,49 @@ from jaxsense.interfaces import team
 NOP = 4
 
 
+start = jax.jit(lambda key, mdp: team.start(key, mdp, small.TEAM))
+step = jax.jit(team.step)
+
+
 def at_the_limit(number):
     """Two cameras and a LiDAR, before the last of so many choices."""
     config = dataclasses.replace(small.team().config, max_steps=number)
     mdp = dataclasses.replace(small.team(), config=config)
-    state = jax.jit(lambda key: team.start(key, mdp, small.TEAM))(jax.random.key(0))
-    step = jax.jit(lambda state, actions: team.step(jax.random.key(1), mdp, state, actions))
+    act = functools.partial(step, jax.random.key(1), mdp)
+    state = start(jax.random.key(0), mdp)
     for _ in range(number - 1):
-        state, outcome = step(state, jnp.zeros(3, int))
+        state, outcome = act(state, jnp.zeros(3, int))
         assert not outcome.truncated.any()
-    return state, step
+    return state, act
 
 
 def test_a_robot_that_chose_nop_at_the_limit_is_done_and_not_cut():
-    state, step = at_the_limit(1)
-    _, outcome = step(state, jnp.full(3, NOP))
+    state, act = at_the_limit(1)
+    _, outcome = act(state, jnp.full(3, NOP))
     np.testing.assert_array_equal(outcome.terminated, [True, False, False])
     np.testing.assert_array_equal(outcome.truncated, [False, True, True])
 
 
 def test_all_that_work_are_cut_at_the_limit():
-    state, step = at_the_limit(3)
-    _, outcome = step(state, jnp.zeros(3, int))
+    state, act = at_the_limit(3)
+    _, outcome = act(state, jnp.zeros(3, int))
     np.testing.assert_array_equal(outcome.terminated, [False] * 3)
     np.testing.assert_array_equal(outcome.truncated, [True] * 3)
 
 
 def test_the_end_of_all_at_the_limit_is_no_cut():
-    state, step = at_the_limit(3)
+    state, act = at_the_limit(3)
     state = dataclasses.replace(
         state, team=dataclasses.replace(state.team, works=jnp.arange(3) == state.agent)
     )
-    _, outcome = step(state, jnp.full(3, NOP))
+    _, outcome = act(state, jnp.full(3, NOP))
     np.testing.assert_array_equal(outcome.terminated, [True] * 3)
     np.testing.assert_array_equal(outcome.truncated, [False] * 3)
 
 
 @pytest.mark.parametrize("actions", [np.array([0, 0, 5]), np.array([0.0, 0.0, 0.0])])
 def test_actions_that_do_not_exist_are_refused(actions):
-    state = team.start(jax.random.key(0), small.team(), small.TEAM)
+    state = start(jax.random.key(0), small.team())
     with pytest.raises(ValueError, match=r"actions"):
         team.step(jax.random.key(1), small.team(), state, jnp.asarray(actions))
 

@@ -64,7 +64,7 @@ _RULES = {"auctions": False, "nearest_first": True, "redecides": True, "avoids_t
 
 
 @pytest.fixture(scope="session")
-def decides(team):
+def decides(team, as_numpy):
     """The state after a decision of robot 0, by models and by rules of coordination."""
 
     def choose(key, models, state, rules):
@@ -72,6 +72,7 @@ def decides(team):
         return decide.decide(key, with_config(team, changed), models, state, 0)
 
     jitted = jax.jit(choose)
+    # JAX would compile another program for weakly typed numbers.
     return lambda models, state, **rules: jitted(
-        jax.random.key(0), models, state, {**_RULES, **rules}
+        jax.random.key(0), as_numpy(models), state, {**_RULES, **rules}
     )

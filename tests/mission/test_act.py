@@ -32,7 +32,7 @@ BLIND = Faults(jnp.full(2, jnp.inf), jnp.full(2, 0.0))
 
 
 @pytest.fixture(scope="module")
-def scan(team, models):
+def scan(team, models, as_numpy):
     """A scan in one mission, by one program for all robots, networks and numbers."""
 
     @jax.jit
@@ -40,8 +40,9 @@ def scan(team, models):
         changed = with_config(team, config)
         return alone(lambda key, state: act.scan(key, changed, models, state, robot))(key, state)
 
+    # JAX would compile another program for weakly typed numbers.
     return lambda key, state, robot, models=models, config=CONFIG: of_one(
-        key, state, robot, models, config
+        key, state, robot, as_numpy(models), config
     )
 
 
@@ -95,7 +96,9 @@ def test_a_detection_updates_the_exact_posterior_and_is_counted(
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
 def test_a_look_from_near_an_earlier_one_counts_in_part(scan, models, facing, robot):
     trained = sure(models, robot, 0.8)
-    half = Novelty(strength=jnp.full(2, np.sqrt(2.0) - 1), length=jnp.full(2, 0.1))
+    half = Novelty(
+        strength=np.full(2, np.sqrt(2.0) - 1, np.float32), length=np.full(2, 0.1, np.float32)
+    )
     before = facing(robot)
     whole = scan(jax.random.key(0), before, robot, trained)
     np.testing.assert_allclose(whole.looked_from[0, robot, 0], [0.0, 0.0], atol=1e-6)
@@ -206,14 +209,15 @@ def test_a_poi_that_is_not_where_it_is_expected_is_not_there(facing, robot, team
         )
         return models.detect_in_window(robot, sensor, readings, bearing, distance).is_there
 
-    assert is_there(scene, 0.0, 0.8)
-    assert not is_there(gone, 0.0, 0.8)
+    ahead, distance = np.float32(0.0), np.float32(0.8)
+    assert is_there(scene, ahead, distance)
+    assert not is_there(gone, ahead, distance)
     # The LiDAR also tells that it is nearer than expected.
-    assert is_there(scene, 0.0, 1.1) == (robot == CAMERA)
+    assert is_there(scene, ahead, np.float32(1.1)) == (robot == CAMERA)
     # The camera sees 40 degrees to either side, the LiDAR 120.
     limit = np.radians((40, 120)[robot])
     for bearing in (limit + 0.01, -limit - 0.01, np.pi, np.nan):
-        assert not is_there(scene, bearing, 0.8)
+        assert not is_there(scene, np.float32(bearing), distance)
 
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])

@@ -1,5 +1,6 @@
 """Maps by each robot: what messages leave known, and that without losses nothing changes."""
 
+import functools
 from dataclasses import replace
 
 import jax
@@ -71,30 +72,39 @@ def own_arena(own_team, own_models, arena_of):
     return make
 
 
+@jax.jit
+def with_look(held, robot, poi, place, evidence, seconds):
+    return held.with_look(robot, poi, place, evidence, seconds, jnp.bool_(True))
+
+
 def looked(held, robot, poi=0, seconds=0.0, evidence=NOTHING, place=(0.0, 0.0)):
-    seconds, applies = jnp.float32(seconds), jnp.bool_(True)
-    return held.with_look(robot, jnp.int32(poi), jnp.array(place), evidence, seconds, applies)
+    return with_look(
+        held, np.int32(robot), np.int32(poi), np.float32(place), evidence, np.float32(seconds)
+    )
+
+
+tell = jax.jit(lambda held, key, *given: held.after_messages(key, *given))
 
 
 def test_messages_leave_known_what_a_protocol_with_counters_does():
     """A receiver keeps, of the messages that have come, the one of most looks."""
     settings = CommunicationConfig(own_maps=True, loss=0.4, delay=2.0)
-    look = jax.jit(looked)
-    tell = jax.jit(lambda held, key, time, sends: held.after_messages(key, settings, time, sends))
+    draw = jax.jit(lambda key: jax.random.bernoulli(key, 0.4, (3, 3)))
+    draw_delay = jax.jit(lambda key: 2.0 * jax.random.uniform(key, (3, 3), maxval=2.0))
+    heard_by = jax.jit(lambda held, robot, time: held.known_to(robot, time))
     rng, held = np.random.default_rng(0), memory.empty(MODALITY, 3)
     numbers, messages, known, overtaken = [0, 0, 0], [], np.zeros((3, 3), int), 0
     for step in range(60):
         time = 0.5 * step
         for robot in np.flatnonzero(rng.random(3) < 0.3):
-            held = look(held, robot, seconds=time)
+            held = looked(held, robot, seconds=time)
             numbers[robot] += 1
             known[robot, robot] += 1
         sends, key = rng.random(3) < 0.4, jax.random.key(step)
         for _ in range(2):  # every message comes twice
-            held = tell(held, key, jnp.float32(time), jnp.asarray(sends))
+            held = tell(held, key, settings, jnp.float32(time), jnp.asarray(sends))
         lost_key, delay_key = jax.random.split(key)
-        is_lost = jax.random.bernoulli(lost_key, 0.4, (3, 3))
-        delay = 2.0 * jax.random.uniform(delay_key, (3, 3), maxval=2.0)
+        is_lost, delay = np.asarray(draw(lost_key)), np.asarray(draw_delay(delay_key))
         messages += [
             (np.float32(time) + delay[to, of], to, of, numbers[of])
             for of in np.flatnonzero(sends)
@@ -107,7 +117,7 @@ def test_messages_leave_known_what_a_protocol_with_counters_does():
             known[to, of] = max(known[to, of], count)
         messages = [m for m in messages if m[0] > time]
         for robot in range(3):
-            heard = np.asarray(held.known_to(robot, jnp.float32(time)))
+            heard = np.asarray(heard_by(held, robot, jnp.float32(time)))
             np.testing.assert_array_equal(heard.sum(axis=1), known[robot])
             # The first ones, which is what a sum and a counter stand for.
             assert all(row[: row.sum()].all() for row in heard)
@@ -117,7 +127,7 @@ def test_messages_leave_known_what_a_protocol_with_counters_does():
 
 def test_without_losses_and_delay_all_know_all_at_once():
     held = looked(looked(memory.empty(MODALITY, 3), 0, seconds=1.0), 2, seconds=3.0)
-    held = held.after_messages(jax.random.key(0), OWN, jnp.float32(3.0), jnp.array([1, 0, 1], bool))
+    held = tell(held, jax.random.key(0), OWN, jnp.float32(3.0), jnp.array([1, 0, 1], bool))
     for robot in range(3):
         np.testing.assert_array_equal(held.known_to(robot, 3.0).sum(axis=1), [1, 0, 1])
     # Before, only the robot itself knew.
@@ -129,8 +139,10 @@ def test_as_many_messages_are_lost_and_as_late_as_the_settings_say():
     settings = CommunicationConfig(own_maps=True, loss=0.25, delay=2.0)
     held = looked(memory.empty(MODALITY, 3), 0, seconds=5.0)
     sends = jnp.array([True, False, False])
-    tell = jax.vmap(lambda key: held.after_messages(key, settings, jnp.float32(5.0), sends))
-    at = np.asarray(tell(jax.random.split(jax.random.key(0), 4000)).heard_at[:, 1:, 0, 0])
+    of_each = jax.vmap(lambda key: held.after_messages(key, settings, jnp.float32(5.0), sends))
+    at = np.asarray(
+        jax.jit(of_each)(jax.random.split(jax.random.key(0), 4000)).heard_at[:, 1:, 0, 0]
+    )
     assert np.isinf(at).mean() == pytest.approx(0.25, abs=0.02)
     came = at[np.isfinite(at)]
     assert (came.min(), came.max()) == pytest.approx((5.0, 9.0), abs=0.05)
@@ -168,12 +180,17 @@ def test_looks_one_by_one_come_to_the_shared_map(own_models):
     prior = jnp.tile(own_models.bayes.prior, (2, 1))
     shared = Contents(tiled, prior, jnp.zeros((2, 2), jnp.int32))
     rng = np.random.default_rng(0)
-    for look in range(6):
-        modality, weight = look % 2, jnp.float32(rng.uniform(0.3, 1.0))
-        features = jnp.asarray(rng.dirichlet([1.0, 1.0]), jnp.float32)
+
+    @functools.partial(jax.jit, static_argnums=3)
+    def learn(shared, held, features, modality, weight):
         args = own_models, jnp.int32(1), features, modality, weight
         found = SharedMap(shared, jnp.zeros(0), jnp.int32(0)).learn(*args)
-        own = OwnMap(held, held.taken(), 2).learn(*args)
+        return found, OwnMap(held, held.taken(), 2).learn(*args)
+
+    for look in range(6):
+        modality, weight = look % 2, np.float32(rng.uniform(0.3, 1.0))
+        features = np.float32(rng.dirichlet([1.0, 1.0]))
+        found, own = learn(shared, held, features, modality, weight)
         np.testing.assert_allclose(own.belief.mean, found.belief.mean, atol=2e-4)
         np.testing.assert_allclose(own.belief.std, found.belief.std, atol=2e-4)
         np.testing.assert_allclose(own.log_posterior, found.log_posterior, atol=1e-5)
@@ -193,13 +210,22 @@ def test_looks_one_by_one_come_to_the_shared_map(own_models):
     np.testing.assert_array_equal(read.times_seen, [[0, 0], [3, 3]])
 
 
-@pytest.mark.parametrize(("delay", "hears"), [(0.0, True), (5.0, False)])
-def test_a_scan_is_remembered_and_told(own_team, own_models, own_arena, set_robot, delay, hears):
+@pytest.fixture(scope="module")
+def scan(own_team, own_models):
+    """A scan by robot 0."""
+
     @jax.jit
-    def scan(key, state, config):
+    def of_one(key, state, config):
         changed = with_config(own_team, config)
         return alone(lambda key, state: act.scan(key, changed, own_models, state, 0))(key, state)
 
+    return of_one
+
+
+@pytest.mark.parametrize(("delay", "hears"), [(0.0, True), (5.0, False)])
+def test_a_scan_is_remembered_and_told(
+    scan, own_team, own_models, own_arena, set_robot, delay, hears
+):
     state = own_arena([[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]], [[0.0, 0.0, 0.0], [0.0, 1.2, 0.0]])
     state = set_robot(state, 0, phase=FACING, target=0, progress_at=-100.0)
     state = set_robot(state, 1, phase=DRIVING, target=0)

@@ -87,8 +87,11 @@ def test_a_poi_is_found_in_a_whole_scan_where_an_error_explains_it(team, certain
     scan[341 + 40 - 15 : 341 + 40 + 15] = 0.7
 
     @functools.partial(jax.jit, static_argnums=1)
-    def is_there(scan, search, bearing=0.0):
+    def detects(scan, search, bearing):
         return certain.detect(LIDAR, lidar, scan, bearing, 0.8, search).is_there
+
+    def is_there(scan, search, bearing=0.0):
+        return detects(scan, search, np.float32(bearing))
 
     assert not is_there(scan, SearchConfig())
     assert is_there(scan, SearchConfig(heading=14.0))
@@ -195,11 +198,16 @@ def test_errors_are_of_the_robots_that_drive(team, arena_of):
     poses = before.scene.poses.at[1, 0].add(0.02)
     after = replace(before, scene=replace(before.scene, poses=poses))
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], (before, after))
-    key = jax.random.key(0)[None]
-    error = _drift(key, with_config(team, config), *batch).pose_error[0]
+
+    @jax.jit
+    def error_of(config):
+        key = jax.random.key(0)[None]
+        return _drift(key, with_config(team, config), *batch).pose_error[0]
+
+    error = error_of(config)
     np.testing.assert_array_equal(error[0], 0.0)
     assert np.all(error[1] != 0)
-    without = _drift(key, team, *batch).pose_error[0]
+    without = error_of(CONFIG)
     np.testing.assert_array_equal(without, 0.0)
 
 

@@ -28,6 +28,7 @@ CASES = {
     "nobody": ((0.0, 0.0), NEVER, 1),
 }
 NUM_ARENAS = CASES["healthy"][2]
+TOGETHER = sum(number for _, _, number in CASES.values())
 
 
 @pytest.fixture(scope="module")
@@ -38,22 +39,34 @@ def go_on(team, models):
 
 
 @pytest.fixture(scope="module")
-def played(team, models, go_on, as_numpy):
-    """For each case: states before, states after and records; and all states after 4 s."""
-    stops_at, blind_at = (
-        jnp.array([case[i] for case in CASES.values() for _ in range(case[2])], jnp.float32)
-        for i in (0, 1)
-    )
+def reset(team, models):
+    """Missions side by side, each of its own key, policy and faults; as many as are played."""
 
     @jax.jit
-    def begin(keys, faults):
-        return jax.vmap(lambda k, f: mission.reset(k, team, models, NAIVE, f))(keys, faults)
+    @jax.vmap
+    def of_each(key, policy, faults):
+        return mission.reset(key, team, models, policy, faults)
 
-    number = len(stops_at)
-    start = begin(jax.random.split(jax.random.key(4), number), Faults(stops_at, blind_at))
+    def begin(keys, policies, faults=None):
+        if faults is None:
+            faults = Faults(*np.full((2, TOGETHER, 2), np.inf, np.float32))
+        return of_each(keys, np.broadcast_to(np.int32(policies), TOGETHER), faults)
+
+    return begin
+
+
+@pytest.fixture(scope="module")
+def played(reset, go_on, as_numpy):
+    """For each case: states before, states after and records; and all states after 4 s."""
+    stops_at, blind_at = (
+        np.array([case[i] for case in CASES.values() for _ in range(case[2])], np.float32)
+        for i in (0, 1)
+    )
+    keys = jax.random.split(jax.random.key(4), TOGETHER)
+    start = reset(keys, NAIVE, Faults(stops_at, blind_at))
     states, records = [start], []
     for i in range(STEPS // CHUNK):
-        keys = jax.random.split(jax.random.key(1 + i), number)
+        keys = jax.random.split(jax.random.key(1 + i), TOGETHER)
         state, record = go_on(keys, states[-1])
         states.append(state)
         records.append(record)
@@ -205,13 +218,13 @@ def test_without_any_robot_the_mission_ends_at_once(played):
     assert np.all(end.robots.looks == 0)
 
 
-def test_same_keys_give_the_same_mission_and_the_policy_does_not_change_the_arena(team, models):
-    reset = jax.jit(lambda key, policy: mission.reset(key, team, models, policy))
-    first, again = (reset(jax.random.key(3), NAIVE) for _ in range(2))
-    latent, other = reset(jax.random.key(3), LATENT), reset(jax.random.key(4), 0)
+def test_same_keys_give_the_same_mission_and_the_policy_does_not_change_the_arena(reset):
+    keys, others = (jax.random.split(jax.random.key(n), TOGETHER) for n in (3, 4))
+    first, again = (reset(keys, NAIVE) for _ in range(2))
+    latent, other = reset(keys, LATENT), reset(others, 0)
     jax.tree.map(np.testing.assert_array_equal, first, again)
     jax.tree.map(np.testing.assert_array_equal, first.scene, latent.scene)
-    assert not np.array_equal(first.scene.poses, other.scene.poses)
+    assert not np.any(first.scene.poses[:, 0] == other.scene.poses[:, 0])
 
 
 @pytest.fixture(scope="module")

@@ -15,11 +15,13 @@ KEYS = jax.random.split(jax.random.key(0), NUMBER)
 EXACT = {"range_noise": 0.0, "max_range": 5.0}
 
 
+measure = jax.jit(jax.vmap(disturbances.measured_ranges, in_axes=(0, None, None)))
+lighting_of = jax.jit(jax.vmap(disturbances.lighting, in_axes=(0, None, None)), static_argnums=1)
+
+
 def ranges(distance, **settings):
     """`[NUMBER, B]` measurements of the same distances."""
-    config, distance = LidarConfig(**settings), jnp.array(distance, jnp.float32)
-    measure = jax.vmap(lambda key: disturbances.measured_ranges(key, distance, config))
-    return np.asarray(measure(KEYS))
+    return np.asarray(measure(KEYS, np.float32(distance), LidarConfig(**settings)))
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +34,7 @@ def values():
 @pytest.fixture(scope="module")
 def lighting(values):
     def of_scenes(**settings):
-        config = CameraConfig(**settings)
-        gain, is_lit = jax.vmap(lambda v: disturbances.lighting(v, 10, config))(values)
+        gain, is_lit = lighting_of(values, 10, CameraConfig(**settings))
         return np.asarray(gain), np.asarray(is_lit)
 
     return of_scenes

@@ -1,7 +1,9 @@
 """Windows and distances that a misplaced robot tries, by hand and against the plain window."""
 
+import functools
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -36,12 +38,27 @@ def test_a_search_reads_as_many_more_rays_as_its_errors_need():
     assert search.widened(CAMERA, wide).window == 160
 
 
+@functools.cache
+def searching(name, errors):
+    """Windows, distances and their prior, from a whole scan, a bearing and a distance."""
+    sensor = {"camera": CAMERA, "lidar": LIDAR}[name]
+
+    @jax.jit
+    def candidates(scan, bearing, distance):
+        wide = search.widened(sensor, errors)
+        seen = windows.as_window(wide, windows.around(wide, scan, bearing))
+        return search.candidates(sensor, errors, seen, bearing, distance)
+
+    return lambda scan, *expected: jax.tree.map(
+        np.asarray, candidates(scan, *map(np.float32, expected))
+    )
+
+
 @BOTH
 @pytest.mark.parametrize("bearing", [-0.1, 0.001, 0.07])  # no half rays
 def test_each_window_is_the_plain_one_at_another_bearing(sensor, bearing):
     errors, scan = SearchConfig(heading=3.0), readings_of(sensor)
-    wide = wide_window(sensor, errors, scan, jnp.float32(bearing))
-    found = search.candidates(sensor, errors, wide, jnp.float32(bearing), jnp.float32(0.8))
+    found = searching(sensor.name, errors)(scan, bearing, 0.8)
     half = len(found.windows) // 2
     first = windows._first_ray(sensor, jnp.float32(bearing))
     for k in range(-half, half + 1):
@@ -53,10 +70,9 @@ def test_each_window_is_the_plain_one_at_another_bearing(sensor, bearing):
 def test_a_search_is_as_wide_as_its_errors_explain():
     scan, errors = readings_of(LIDAR), SearchConfig(position=0.09, heading=2.0)
     # The middle of 128 rays is half way between two of them.
-    ahead = jnp.float32(np.radians(240 / 682 / 2))
-    wide = wide_window(LIDAR, errors, scan, ahead)
+    ahead = np.radians(240 / 682 / 2)
     for distance in (0.5, 2.0):
-        found = search.candidates(LIDAR, errors, wide, ahead, jnp.float32(distance))
+        found = searching("lidar", errors)(scan, ahead, distance)
         # 2 degrees, and .09 / .5 = .18 or .09 / 2 = .045 radians, which are 10.3 or 2.58 degrees.
         half = np.hypot(2.0, np.degrees(0.09 / distance))
         middle = len(found.windows) // 2
@@ -78,9 +94,7 @@ def test_a_search_is_as_wide_as_its_errors_explain():
 @BOTH
 def test_errors_smaller_than_a_ray_leave_the_nearest_window(sensor):
     errors = SearchConfig(heading=1e-3)
-    bearing = jnp.float32(0.013)
-    wide = wide_window(sensor, errors, readings_of(sensor), bearing)
-    found = search.candidates(sensor, errors, wide, bearing, jnp.float32(1.0))
+    found = searching(sensor.name, errors)(readings_of(sensor), 0.013, 1.0)
     is_tried = np.isfinite(found.log_prior).all(axis=0)
     np.testing.assert_array_equal(is_tried, np.arange(len(is_tried)) == len(is_tried) // 2)
 
@@ -88,15 +102,15 @@ def test_errors_smaller_than_a_ray_leave_the_nearest_window(sensor):
 def test_robots_that_search_keep_away_by_the_error_of_their_position():
     config = PRESETS["default"]
 
-    def searching(position):
+    def with_errors(position):
         errors = SearchConfig(position=position)
         localisation = replace(config.mission.localisation, search=errors)
         return replace(config, mission=replace(config.mission, localisation=localisation))
 
-    assert searching(0.2).mission.localisation.search.applies
+    assert with_errors(0.2).mission.localisation.search.applies
     # .3 m, the nearest look of training, and .21 m are beyond the viewpoints at .5 m.
     with pytest.raises(ConfigError, match=r"view_distances.*from 0.510 m"):
-        searching(0.21)
+        with_errors(0.21)
 
 
 def readings_of(sensor):
@@ -104,12 +118,6 @@ def readings_of(sensor):
     number = len(sensor.angles) * sensor.channels
     shape = (len(sensor.angles), *(() if sensor.channels == 1 else (sensor.channels,)))
     return np.linspace(0.1, 0.9, number, dtype=np.float32).reshape(shape)
-
-
-def wide_window(sensor, errors, scan, bearing):
-    """What a robot that searches reads."""
-    wide = search.widened(sensor, errors)
-    return windows.as_window(wide, windows.around(wide, scan, bearing))
 
 
 def test_a_sensor_of_one_ray_has_nothing_to_widen():

@@ -366,8 +366,13 @@ def test_other_numbers_of_pois_are_played_an_eighth_as_often_but_always_once(mon
 def test_policies_are_played_with_the_number_of_pois_that_is_asked_for(num_pois):
     mdp = held_out_mdp(CONFIG, in_place(), detections((), EXACT), num_pois)
     assert mdp.num_pois == (num_pois or 3)
-    assert map_mdp.reset(KEY, mdp).belief.mean.shape == (num_pois or 3, 3)
+    assert jax.eval_shape(map_mdp.reset, KEY, mdp).belief.mean.shape == (num_pois or 3, 3)
     np.testing.assert_array_equal(mdp.looks.features[1], EXACT[1])
+
+
+@jax.jit
+def beliefs(config, fusion):
+    return measures.beliefs(KEY, config, fusion=fusion, detections=detections(held_out=EXACT))
 
 
 @pytree
@@ -389,7 +394,7 @@ class Witness:
 def test_histories_tell_fusion_which_modalities_have_looked_before():
     config = replace(CONFIG, evaluation=replace(CONFIG.evaluation, num_histories=600))
     fusion = Witness(Belief(jnp.zeros((3, 2)), jnp.ones((3, 2))), Belief(jnp.zeros(2), jnp.ones(2)))
-    found = measures.beliefs(KEY, config, fusion=fusion, detections=detections(held_out=EXACT))
+    found = beliefs(config, fusion)
     # Each class is the true one of a third of the histories. Before the first look nobody has
     # looked, before the second one sensor; before the sixth two, unless all five were the same.
     none, one, two = (-(np.log(p) + 2 * np.log((1 - p) / 2)) / 3 for p in (1 / 3, 1 / 2, 4 / 5))
@@ -406,7 +411,7 @@ def test_exact_bayes_reads_the_same_looks():
     # where all looks were by one sensor that cannot tell: by the LiDAR at class 0, the camera at
     # class 2, and either at class 1.
     config = replace(CONFIG, evaluation=replace(CONFIG.evaluation, num_histories=600))
-    found = measures.beliefs(KEY, config, fusion=in_place(), detections=detections((), EXACT))
+    found = beliefs(config, in_place())
     share = 4 / 3 * 0.5 ** np.arange(1, 7)
     error = 4 * np.sqrt(share * (1 - share) / 600) * np.log(2)
     assert np.all(np.abs(found["bayes_nll"] - share * np.log(2)) < error)

@@ -1,6 +1,7 @@
 """Stages of perception: what detectors, the JMVAE and fusion are trained on."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -93,10 +94,16 @@ def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):
     # 41 steps are 14 chunks of 3, the last of which has 2. The loss of a step is its number.
     monkeypatch.setattr(jmvae.Fitting, "loss", lambda self, params, drawn, step: step + 1.0)
     stage, detections = stage_of("jmvae_1"), bank_of((jnp.ones((3, 4, 2)),) * 2)
-    state, seen = stage.begin(KEY, TINY, detections=detections), []
-    for _ in range(stage.chunks):
+
+    @jax.jit
+    def advance(state):
         state, progress = stage.advance(KEY, TINY, state, detections=detections)
-        seen.append(float(stage.finish(TINY, state, detections=detections)[1]))
+        return state, progress, stage.finish(TINY, state, detections=detections)[1]
+
+    state, seen = jax.jit(lambda: stage.begin(KEY, TINY, detections=detections))(), []
+    for _ in range(stage.chunks):
+        state, progress, loss = advance(state)
+        seen.append(float(loss))
         assert len(progress.loss) == 3
     assert seen[0] == 2.0  # of 1, 2, 3
     assert seen[-1] == 40.5  # of 40 and 41
@@ -108,29 +115,38 @@ CORNER = Belief(jnp.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]]), jnp.full((3, 
 PLACE = Belief(jnp.ones((3, 2)), jnp.full((3, 2), 0.3))
 
 
-def best_of(monkeypatch, losses, classes):
+@jax.jit
+def kept(losses, classes):
     """The restart that is kept, by losses and beliefs of the classes."""
-    together = jax.tree.map(lambda *x: jnp.stack(x), *classes)
-    of_restart = lambda *_, params, detections: jax.tree.map(lambda x: x[params], together)  # noqa: E731
-    monkeypatch.setattr(perception, "class_beliefs", of_restart)
-    restarts = tuple((jnp.int32(i), jnp.float32(x)) for i, x in enumerate(losses))
-    camera, lidar = (jnp.array(x)[:, None] for x in ([[0.1, 0.9], [0.9, 0.1], [0.9, 0.1]],) * 2)
-    detections = bank_of((camera, lidar[::-1]))
-    return int(stage_of("best_jmvae").begin(KEY, TINY, restarts=restarts, detections=detections))
+    restarts = tuple((jnp.int32(i), losses[i]) for i in range(len(losses)))
+    of_restart = lambda *_, params, detections: jax.tree.map(lambda x: x[params], classes)  # noqa: E731
+    camera = np.float32([[0.1, 0.9], [0.9, 0.1], [0.9, 0.1]])[:, None]
+    given = {
+        "restarts": restarts,
+        "detections": bank_of((jnp.asarray(camera), jnp.asarray(camera[::-1]))),
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(perception, "class_beliefs", of_restart)
+        return stage_of("best_jmvae").begin(KEY, TINY, **given)
 
 
-def test_the_exact_restart_with_the_lowest_loss_is_kept(monkeypatch):
+def best_of(losses, classes):
+    stacked = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *classes)
+    return int(kept(np.float32(losses), stacked))
+
+
+def test_the_exact_restart_with_the_lowest_loss_is_kept():
     nan, inf = jnp.nan, jnp.inf
     for losses, expected in {(1, 0.5, 0.9): 1, (1, nan, 0.9): 2, (nan, inf): 0, (nan,): 0}.items():
-        assert best_of(monkeypatch, losses, [CORNER] * len(losses)) == expected
+        assert best_of(losses, [CORNER] * len(losses)) == expected
     # From equal places no class can be read, whatever the loss.
-    assert best_of(monkeypatch, (1, 0.5, 0.9), [CORNER, PLACE, CORNER]) == 2
-    assert best_of(monkeypatch, (nan, 0.5, 0.9), [CORNER, PLACE, PLACE]) == 1
+    assert best_of((1, 0.5, 0.9), [CORNER, PLACE, CORNER]) == 2
+    assert best_of((nan, 0.5, 0.9), [CORNER, PLACE, PLACE]) == 1
 
 
-def test_of_inexact_restarts_the_most_exact_is_kept(monkeypatch):
+def test_of_inexact_restarts_the_most_exact_is_kept():
     line = Belief(jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0]]), jnp.full((3, 2), 0.3))
-    assert best_of(monkeypatch, (0.5, 0.9, 0.5), [PLACE, line, PLACE]) == 1
+    assert best_of((0.5, 0.9, 0.5), [PLACE, line, PLACE]) == 1
 
 
 @pytest.fixture
@@ -146,22 +162,26 @@ def surveys(monkeypatch) -> Surveys:
         return key, (windows, windows), distances
 
     monkeypatch.setattr(looks, "surveys", survey)
-    listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
-    scenes = listed["scenes"].begin(KEY, MEASURED)
-    return listed["survey"].begin(KEY, MEASURED, scenes=scenes)
+    return surveys_of(scenes())
+
+
+@functools.cache
+def scenes():
+    return jax.jit(stage_of("scenes", MEASURED).begin)(KEY, MEASURED)
+
+
+def surveys_of(scenes):
+    survey = stage_of("survey", MEASURED)
+    return jax.jit(lambda scenes: survey.begin(KEY, MEASURED, scenes=scenes))(scenes)
 
 
 def test_scenes_are_as_empty_whoever_works_them_out(surveys):
     """Threads and devices share the rows of a survey."""
-    listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
-    scenes = listed["scenes"].begin(KEY, MEASURED)
-    half = len(scenes[0]) // 2
-
-    def survey(part):
-        rows = jax.tree.map(lambda x: x[part], scenes)
-        return listed["survey"].begin(KEY, MEASURED, scenes=rows)
-
-    parts = [survey(slice(half)), survey(slice(half, None))]
+    half = len(scenes()[0]) // 2
+    parts = [
+        surveys_of(jax.tree.map(lambda x: x[part], scenes()))  # noqa: B023
+        for part in (slice(half), slice(half, None))
+    ]
     together = np.concatenate([part.distances for part in parts])
     np.testing.assert_array_equal(together, surveys.distances)
     assert (together[:half] == 1).all()
@@ -191,8 +211,8 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
     listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
     monkeypatch.setattr(supervised, "fit", fit)
     monkeypatch.setattr(detectors, "detect", lambda detector, window: window)
+    examples = jax.jit(listed["examples"].begin)(KEY, MEASURED, surveys=surveys)
     for name in ("detector_camera", "detector_lidar"):
-        examples = listed["examples"].begin(KEY, MEASURED, surveys=surveys)
         state = listed[name].begin(KEY, MEASURED, examples=examples)
         listed[name].advance(KEY, MEASURED, state, examples=examples)
     detections = jax.jit(listed["detections"].begin)
@@ -235,9 +255,10 @@ def test_a_scene_is_the_same_whoever_works_it_out():
 
 def test_beliefs_of_classes_are_of_detections_for_training():
     # Nothing else can be encoded.
-    params = jmvae.init(KEY, models.make_jmvae(TINY))
+    params = jax.jit(lambda: jmvae.init(KEY, models.make_jmvae(TINY)))()
     bank = tuple(jnp.full((3, 4, 2), 0.5) for _ in range(2))
     stage = stage_of("class_beliefs")
-    found = stage.begin(KEY, TINY, params=params, detections=bank_of(bank))
-    expected = jmvae.posterior(params, models.make_jmvae(TINY), tuple(x[0, 0] for x in bank))
+    found = jax.jit(stage.begin)(KEY, TINY, params=params, detections=bank_of(bank))
+    posterior = jax.jit(jmvae.posterior, static_argnums=1)
+    expected = posterior(params, models.make_jmvae(TINY), tuple(x[0, 0] for x in bank))
     np.testing.assert_allclose(found.mean, jnp.tile(expected.mean, (3, 1)), rtol=1e-5)

@@ -35,9 +35,25 @@ def stages_of(config: Config) -> dict[str, Stage]:
     return {stage.name: stage for stage in training.stages.stages(config)}
 
 
+def begun(stage: Stage, config: Config, outputs) -> Any:
+    """What a stage begins with, in one program."""
+    key = stage.key(KEY)
+    return jax.jit(lambda inputs: stage.begin(key, config, **inputs))(stage.select(outputs))
+
+
 @pytest.fixture(scope="module")
 def learned():
-    return jax.jit(lambda key: learn(key, TINY, until="grouped"))(KEY)
+    """All stages up to `grouped`, with a single JMVAE."""
+    once = dataclasses.replace(TINY, jmvae=dataclasses.replace(TINY.jmvae, restarts=1))
+    return jax.jit(lambda key: learn(key, once, until="grouped"))(KEY)
+
+
+def test_the_restart_with_the_lowest_finite_loss_is_kept():
+    restarts = tuple((jnp.float32(i), jnp.float32(x)) for i, x in enumerate((np.nan, 2.0, 1.0)))
+    best = jax.jit(lambda restarts: scans._best(KEY, TINY, restarts=restarts))
+    assert best(restarts) == 2
+    assert best(restarts[:2]) == 1
+    assert best(restarts[:1]) == 0
 
 
 def test_every_stage_follows_those_that_it_takes_from():
@@ -51,7 +67,8 @@ def test_every_stage_follows_those_that_it_takes_from():
 
 
 def test_scenes_come_in_groups_that_show_the_same_pois():
-    keys, classes, is_empty, places = perception.draw_scenes(KEY, TINY)
+    draw = jax.jit(perception.draw_scenes)
+    keys, classes, is_empty, places = draw(KEY, TINY)
     number = sum(perception.num_scenes(TINY)[:3])
     assert number % 3 == 0
     grouped = classes[:number].reshape(-1, 3, classes.shape[1])
@@ -63,7 +80,7 @@ def test_scenes_come_in_groups_that_show_the_same_pois():
     of_scenes = {tuple(x) for x in np.asarray(jax.random.key_data(keys))}
     assert len(of_scenes) == len(keys)
     assert not of_scenes & {tuple(x) for x in of_groups[:, 0]}
-    plain = perception.draw_scenes(KEY, dataclasses.replace(TINY, jmvae=JmvaeConfig()))
+    plain = draw(KEY, dataclasses.replace(TINY, jmvae=JmvaeConfig()))
     assert plain[3] is None
 
 
@@ -93,15 +110,17 @@ def test_no_label_enters_the_training(learned):
     """Other labels of the same scenes change names, and nothing that is learned."""
     surveys = learned.outputs["survey"]
     other = dataclasses.replace(surveys, classes=(surveys.classes + 1) % 3)
-    listed = stages_of(TINY)
-    views = [listed["views"].begin(KEY, TINY, surveys=s) for s in (surveys, other)]
+    both = surveys, other
+    views = [begun(stages_of(TINY)["views"], TINY, {"survey": s}) for s in both]
     for one, two in zip(*map(jax.tree.leaves, views), strict=True):
         np.testing.assert_array_equal(one, two)
     params = learned.outputs["best_jmvae"]
-    found, renamed = (
-        scans.class_beliefs(KEY, TINY, params=params, views=v, surveys=s)
-        for v, s in zip(views, (surveys, other), strict=True)
-    )
+
+    @jax.jit
+    def class_beliefs(views, surveys):
+        return scans.class_beliefs(KEY, TINY, params=params, views=views, surveys=surveys)
+
+    found, renamed = (class_beliefs(v, s) for v, s in zip(views, both, strict=True))
     # Class c is now what was called c - 1 before.
     np.testing.assert_allclose(renamed.mean, jnp.roll(found.mean, 1, axis=0), atol=1e-6)
 
@@ -115,7 +134,7 @@ def test_encoders_are_detectors(learned):
         assert bank.shape == (3, 12, 2)
         np.testing.assert_allclose(bank.sum(axis=-1), 1, rtol=1e-5)
         window = outputs["survey"].windows[m][0, 0]
-        assert encoder.features(window).shape == (2,)
+        assert jax.eval_shape(encoder.features, window).shape == (2,)
         assert np.isfinite(encoder.gate.threshold)
     grouped = outputs["grouped"]
     assert set(grouped) == {"pair", "all_looks"}
@@ -132,7 +151,7 @@ def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypat
         for w in windows
     ))  # fmt: skip
     stage, taken_for = listed["detections"], Shown(outputs["shown"].calibrating, bank=shown)
-    found = stage.begin(KEY, TINY, **stage.select({**outputs, "shown": taken_for}))
+    found = begun(stage, TINY, {**outputs, "shown": taken_for})
     for bank in found.bank:
         np.testing.assert_array_equal(bank[..., 0], np.repeat([[0], [1], [2]], 12, axis=1))
 
@@ -158,13 +177,18 @@ def test_what_all_looks_show_is_the_class_nearest_to_their_posterior(learned):
     num_train, num_bank, *_ = perception.num_scenes(TINY)
     classes = np.asarray(outputs["class_beliefs"].mean)
 
+    posterior = jax.jit(lambda given: leave_one_out.posterior(outputs["best_jmvae"], shape, given))
+    in_frames = jax.jit(
+        lambda given: tuple(
+            jax.vmap(scaling)(x)
+            for scaling, x in zip(outputs["views"].scalings, given, strict=True)
+        )
+    )
+
     def plain(scene, poi):
         """From the three looks by each sensor at a PoI, of which `scene` is the first."""
-        given = tuple(
-            jax.vmap(scaling)(x[scene : scene + 3, poi])
-            for scaling, x in zip(outputs["views"].scalings, outputs["survey"].windows, strict=True)
-        )
-        mean = leave_one_out.posterior(outputs["best_jmvae"], shape, given).mean
+        windows = [np.asarray(x)[scene : scene + 3, poi] for x in outputs["survey"].windows]
+        mean = posterior(in_frames(windows)).mean
         return np.argmin(np.sum((classes - np.asarray(mean)) ** 2, axis=1))
 
     shown = outputs["shown"]
@@ -204,8 +228,7 @@ def test_without_looks_to_calibrate_with_probabilities_stay_as_they_are(learned)
     config = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, calibration=0.0))
     listed, outputs = stages_of(config), dict(learned.outputs)
     for name in ("shown", "detector_lidar"):
-        stage = listed[name]
-        outputs[name] = stage.begin(KEY, config, **stage.select(outputs))
+        outputs[name] = begun(listed[name], config, outputs)
     assert outputs["shown"].calibrating.shape == (0, 3)
     assert outputs["detector_lidar"][0].sharpness == 1
 
@@ -281,10 +304,10 @@ def test_novelty_learns_from_what_all_looks_show(learned, monkeypatch):
 def test_encoders_are_calibrated_once(learned, monkeypatch):
     """Before the gate is trained: a run finishes a stage after every chunk, to check it."""
     stage = stages_of(TINY)["detector_lidar"]
-    inputs = stage.select(learned.outputs)
-    state = stage.begin(stage.key(KEY), TINY, **inputs)
+    state = begun(stage, TINY, learned.outputs)
     monkeypatch.setattr(leave_one_out, "calibrate", None)
     monkeypatch.setattr(scans, "_posteriors", None)
-    found = stage.finish(TINY, state, **inputs)
+    finish = jax.jit(lambda state, inputs: stage.finish(TINY, state, **inputs))
+    found = finish(state, stage.select(learned.outputs))
     assert found.sharpness == learned.outputs["detector_lidar"].sharpness
     assert np.isfinite(found.gate.threshold)

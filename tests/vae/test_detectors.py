@@ -1,5 +1,6 @@
 """Detectors on synthetic windows."""
 
+import functools
 from dataclasses import replace
 
 import jax
@@ -17,8 +18,10 @@ CONFIG = DetectorConfig(hidden=(16,), steps=200, batch=64, learning_rate=1e-2)
 calibrate = jax.jit(detectors.calibrate)
 detect = jax.jit(jax.vmap(detectors.detect, in_axes=(None, 0)))
 logits_of = jax.jit(jax.vmap(detectors.logits, in_axes=(None, 0)))
+retrain = jax.jit(detectors.retrain)
 
 
+@functools.partial(jax.jit, static_argnums=1)
 def synthetic_windows(key, number):
     """Windows of 6 readings around 5: the label says whether the middle two stand out."""
     label_key, noise_key = jax.random.split(key)
@@ -69,10 +72,10 @@ def test_detect_gives_probabilities_of_the_labels_in_order(trained):
 def with_logits(*logits):
     """A detector of these logits for every window, half by its last bias and half by its kernel."""
     detector = detectors.init(jax.random.key(0), jnp.zeros((2, 3)), len(logits), CONFIG)
-    layers = jax.tree.map(jnp.zeros_like, detector.params["params"])
-    half = jnp.array(logits) / 2
-    layers["Dense_0"]["bias"] = layers["Dense_0"]["bias"].at[0].set(1.0)
-    layers["Dense_1"] = {"kernel": layers["Dense_1"]["kernel"].at[0].set(half), "bias": half}
+    layers = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), detector.params["params"])
+    half = np.float32(logits) / 2
+    layers["Dense_0"]["bias"][0] = 1.0
+    layers["Dense_1"]["kernel"][0] = layers["Dense_1"]["bias"][:] = half
     return replace(detector, params={"params": layers})
 
 
@@ -97,7 +100,7 @@ def test_calibration_finds_the_temperature_of_the_logits(temperature, left, erro
     right, labels = np.log(4.0), jnp.array([0] * 8 + [1] * 2)
     detector = with_logits(0.5 + temperature * right, 0.5)
     calibrated = calibrate(detector, jnp.zeros((10, 3)), labels)
-    logits = detectors.logits(calibrated, jnp.zeros(3))
+    logits = logits_of(calibrated, jnp.zeros((1, 3)))[0]
     assert logits[0] - logits[1] == pytest.approx(left * right, rel=error)
 
 
@@ -161,12 +164,11 @@ def test_logits_do_not_depend_on_the_unit_of_the_readings():
     key = jax.random.key(1)
     in_metres = detectors.init(key, windows, 2, CONFIG)
     in_millimetres = detectors.init(key, 1000.0 * windows + 300.0, 2, CONFIG)
-    for window in windows[:3]:
-        np.testing.assert_allclose(
-            detectors.logits(in_metres, window),
-            detectors.logits(in_millimetres, 1000.0 * window + 300.0),
-            atol=1e-3,
-        )
+    np.testing.assert_allclose(
+        logits_of(in_metres, windows[:3]),
+        logits_of(in_millimetres, 1000.0 * windows[:3] + 300.0),
+        atol=1e-3,
+    )
 
 
 def test_a_window_of_the_wrong_shape_raises_an_error_that_names_it(trained):
@@ -181,7 +183,6 @@ def test_few_windows_teach_an_offset_and_keep_what_was_learned(trained):
     detector = trained[1]
     windows, labels = synthetic_windows(jax.random.key(5), 200)
     others, of_others = synthetic_windows(jax.random.key(6), 2000)
-    retrain = jax.jit(detectors.retrain)
     before = accuracy(detector, others, of_others)
     assert before > 0.99
     # Where there is nothing to learn, nothing is forgotten.
@@ -191,8 +192,9 @@ def test_few_windows_teach_an_offset_and_keep_what_was_learned(trained):
     offset = 0.7
     assert accuracy(detector, others - offset, of_others) < 0.95
     config = replace(CONFIG, calibration=0.25)
-    retrain = jax.jit(lambda *given: detectors.retrain(*given, config))
-    moved = retrain(jax.random.key(7), detector, windows - offset, labels)
+    moved = jax.jit(detectors.retrain)(
+        jax.random.key(7), detector, windows - offset, labels, config
+    )
     assert accuracy(moved, others - offset, of_others) > 0.99
     jax.tree.map(np.testing.assert_array_equal, moved.gate, detector.gate)
 
@@ -202,5 +204,5 @@ def test_retraining_moves_no_farther_than_serves_windows_kept_from_it(trained):
     detector = trained[1]
     windows, labels = synthetic_windows(jax.random.key(8), 200)
     wrong = jnp.where(jnp.arange(200) < 150, 1 - labels, labels)
-    same = jax.jit(detectors.retrain)(jax.random.key(9), detector, windows, wrong)
+    same = retrain(jax.random.key(9), detector, windows, wrong)
     assert accuracy(same, windows, labels) >= accuracy(detector, windows, labels) - 0.01

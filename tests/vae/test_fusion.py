@@ -19,9 +19,15 @@ THREE = Jmvae(("camera", "lidar", "sonar"), (2, 3, 1), latent_size=2, hidden=(8,
 OLD = Belief(jnp.array([0.4, -0.7]), jnp.array([0.9, 1.1]))
 
 
+init = jax.jit(jmvae.init, static_argnums=1)
+encode = jax.jit(jmvae.encode, static_argnums=1)
+decode = jax.jit(jmvae.decode, static_argnums=1)
+update = jax.jit(fusion.InPlace.update, static_argnames="modality")
+
+
 @pytest.fixture(scope="module", params=[TWO, THREE], ids=["two", "three"])
 def model_and_params(request):
-    return request.param, jmvae.init(jax.random.key(0), request.param)
+    return request.param, init(jax.random.key(0), request.param)
 
 
 def in_place(model, params, classes=None):
@@ -44,9 +50,8 @@ def assert_same(belief, mean_and_log_var):
 
 def test_every_update_encodes_the_look_with_what_the_map_says_of_the_others(model_and_params):
     model, params = model_and_params
-    update = jax.jit(fusion.InPlace.update, static_argnames="modality")
     number = len(model.modalities)
-    generated = jmvae.decode(params, model, OLD.mean)
+    generated = decode(params, model, OLD.mean)
     for modality in range(number):
         new = look(model, modality)
         for seen in itertools.product([False, True], repeat=number):
@@ -54,30 +59,30 @@ def test_every_update_encodes_the_look_with_what_the_map_says_of_the_others(mode
             belief = update(found, OLD, jnp.array(seen), new, modality=modality)
             inputs = [g if s else None for g, s in zip(generated, seen, strict=True)]
             inputs[modality] = new  # never generated, whether it has been seen before or not
-            assert_same(belief, jmvae.encode(params, model, tuple(inputs)))
+            assert_same(belief, encode(params, model, tuple(inputs)))
 
 
 @pytest.mark.parametrize("modality", [0, 1])
 def test_a_first_look_gives_the_uni_modal_posterior_whatever_the_belief_was(modality):
-    params, new = jmvae.init(jax.random.key(0), TWO), look(TWO, modality)
+    params, new = init(jax.random.key(0), TWO), look(TWO, modality)
     alone = tuple(new if m == modality else None for m in range(2))
     for own in (False, True):  # a second look with the same sensor starts afresh
         seen = (jnp.arange(2) == modality) & own
-        belief = in_place(TWO, params).update(OLD, seen, new, modality)
-        assert_same(belief, jmvae.encode(params, TWO, alone))
+        belief = update(in_place(TWO, params), OLD, seen, new, modality=modality)
+        assert_same(belief, encode(params, TWO, alone))
 
 
 def test_several_sensors_may_look_at_once():
     # What has looked before and does not look now is decoded; all the others are as they are.
-    params = jmvae.init(jax.random.key(0), THREE)
+    params = init(jax.random.key(0), THREE)
     camera, sonar = look(THREE, 0), look(THREE, 2)
-    generated = jmvae.decode(params, THREE, OLD.mean)
+    generated = decode(params, THREE, OLD.mean)
     for has_lidar in (False, True):
         belief = fusion.fuse(
             params, THREE, OLD, np.array([True, has_lidar, False]), (camera, None, sonar)
         )
         lidar = generated[1] if has_lidar else None
-        assert_same(belief, jmvae.encode(params, THREE, (camera, lidar, sonar)))
+        assert_same(belief, encode(params, THREE, (camera, lidar, sonar)))
     with pytest.raises(ValueError, match="must hold one modality or more"):
         fusion.fuse(params, THREE, OLD, jnp.zeros(3, bool), (None, None, None))
     with pytest.raises(ValueError, match="must be 3, one for each"):
@@ -85,19 +90,19 @@ def test_several_sensors_may_look_at_once():
 
 
 def test_fusion_decodes_the_mean_and_ignores_the_width_of_the_old_belief():
-    params, new = jmvae.init(jax.random.key(0), TWO), look(TWO, 1)
+    params, new = init(jax.random.key(0), TWO), look(TWO, 1)
     seen = jnp.array([True, False])
-    belief = in_place(TWO, params).update(OLD, seen, new, 1)
-    camera, _ = jmvae.decode(params, TWO, OLD.mean)
-    assert_same(belief, jmvae.encode(params, TWO, (camera, new)))
-    wider = in_place(TWO, params).update(replace(OLD, std=5 * OLD.std), seen, new, 1)
+    belief = update(in_place(TWO, params), OLD, seen, new, modality=1)
+    camera, _ = decode(params, TWO, OLD.mean)
+    assert_same(belief, encode(params, TWO, (camera, new)))
+    wider = update(in_place(TWO, params), replace(OLD, std=5 * OLD.std), seen, new, modality=1)
     np.testing.assert_array_equal(wider.mean, belief.mean)
-    moved = in_place(TWO, params).update(replace(OLD, mean=OLD.mean + 1), seen, new, 1)
+    moved = update(in_place(TWO, params), replace(OLD, mean=OLD.mean + 1), seen, new, modality=1)
     assert np.all(moved.mean != belief.mean)
 
 
 def test_a_batch_of_updates_equals_a_loop_of_singles_in_any_order():
-    params = jmvae.init(jax.random.key(0), TWO)
+    params = init(jax.random.key(0), TWO)
     mean, std = jax.random.normal(jax.random.key(1), (2, 6, 2))
     old = Belief(mean, jnp.abs(std))
     seen = jnp.array([[0, 0], [0, 1], [1, 0], [1, 1], [0, 1], [1, 0]], bool)
@@ -105,28 +110,30 @@ def test_a_batch_of_updates_equals_a_loop_of_singles_in_any_order():
 
     @jax.jit
     @jax.vmap
-    def update(old, seen, new):
-        return in_place(TWO, params).update(old, seen, new, 0)
+    def together(old, seen, new):
+        return update(in_place(TWO, params), old, seen, new, modality=0)
 
-    batch = update(old, seen, new)
+    batch = together(old, seen, new)
     for i in range(6):
-        single = in_place(TWO, params).update(Belief(old.mean[i], old.std[i]), seen[i], new[i], 0)
+        single = update(
+            in_place(TWO, params), Belief(old.mean[i], old.std[i]), seen[i], new[i], modality=0
+        )
         np.testing.assert_allclose(batch.mean[i], single.mean, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(batch.std[i], single.std, rtol=1e-5)
     order = np.array([3, 5, 0, 1, 4, 2])
-    permuted = update(Belief(old.mean[order], old.std[order]), seen[order], new[order])
+    permuted = together(Belief(old.mean[order], old.std[order]), seen[order], new[order])
     np.testing.assert_allclose(permuted.mean, batch.mean[order], rtol=1e-5, atol=1e-6)
 
 
 def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
-    params, looks = jmvae.init(jax.random.key(0), TWO), (look(TWO, 0), look(TWO, 1))
+    params, looks = init(jax.random.key(0), TWO), (look(TWO, 0), look(TWO, 1))
     config = JmvaeConfig(reconstruction_weights=(2.0, 0.5))
     problem = fusion.Decoding(config, params, tuple(x[None, None] for x in looks), TWO)
     drawn = jnp.zeros((2, 1)), tuple(x[:, None] for x in looks)
     found = problem.loss(params["decoders"], drawn, jnp.int32(0))
     expected = 0.0
     for given in ((looks[0], None), (None, looks[1]), looks):
-        decoded = jmvae.decode(params, TWO, jmvae.encode(params, TWO, given)[0])
+        decoded = decode(params, TWO, encode(params, TWO, given)[0])
         for weight, shown, read in zip((2.0, 0.5), given, decoded, strict=True):
             expected += 0.0 if shown is None else 0.5 * weight * np.sum((shown - read) ** 2)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
@@ -136,12 +143,12 @@ def test_trained_decoders_tell_what_a_sensor_alone_has_seen():
     """A camera that knows the row of four classes, and a LiDAR that knows the column."""
     row, column = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
     bank = tuple(jnp.eye(2)[x][:, None] for x in (row, column))
-    params = jmvae.init(jax.random.key(0), TWO)
+    params = init(jax.random.key(0), TWO)
     config = JmvaeConfig(batch=16, steps=300, learning_rate=0.02, reconstruction_weights=(1.0, 1.0))
     trained = fusion.train_decoders(jax.random.key(1), params, TWO, bank, config)
     jax.tree.map(np.testing.assert_array_equal, trained["encoders"], params["encoders"])
     for m, given in ((0, (bank[0][0, 0], None)), (1, (None, bank[1][1, 0]))):
-        read = jmvae.decode(trained, TWO, jmvae.encode(trained, TWO, given)[0])[m]
+        read = decode(trained, TWO, encode(trained, TWO, given)[0])[m]
         np.testing.assert_allclose(read, given[m], atol=0.05)
 
 
@@ -152,26 +159,26 @@ def test_a_prior_has_mean_zero_and_the_given_variance():
 
 
 def test_wrong_shapes_raise_errors_that_name_the_argument():
-    params, new = jmvae.init(jax.random.key(0), TWO), look(TWO, 0)
+    params, new = init(jax.random.key(0), TWO), look(TWO, 0)
     seen = jnp.array([False, False])
     with pytest.raises(AssertionError, match="belief"):
         in_place(TWO, params).update(Belief(jnp.zeros((1, 2)), jnp.ones((1, 2))), seen, new, 0)
     with pytest.raises(AssertionError, match="seen"):
-        in_place(TWO, params).update(OLD, jnp.array([False]), new, 0)
+        update(in_place(TWO, params), OLD, jnp.array([False]), new, modality=0)
     with pytest.raises(AssertionError, match="features of camera"):
-        in_place(TWO, params).update(OLD, seen, jnp.zeros(3), 0)
+        update(in_place(TWO, params), OLD, seen, jnp.zeros(3), modality=0)
 
 
 @pytest.mark.parametrize("modality", [-1, 2, 3])
 def test_a_modality_that_is_not_there_is_named(modality):
-    params, seen = jmvae.init(jax.random.key(0), TWO), jnp.array([False, False])
+    params, seen = init(jax.random.key(0), TWO), jnp.array([False, False])
     with pytest.raises(ValueError, match=rf"modality = {modality}: must be a whole number"):
-        in_place(TWO, params).update(OLD, seen, look(TWO, 0), modality)
+        update(in_place(TWO, params), OLD, seen, look(TWO, 0), modality=modality)
 
 
 CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
 KINDS = {
-    "in_place": lambda: in_place(TWO, jmvae.init(jax.random.key(0), TWO), CLASSES),
+    "in_place": lambda: in_place(TWO, init(jax.random.key(0), TWO), CLASSES),
     "filter": lambda: filter.init(
         jax.random.key(0), TWO, CLASSES, fusion.prior(TWO, 20.0), FilterConfig(hidden=(4,))
     ),
@@ -213,13 +220,13 @@ def test_every_kind_of_fusion_has_all_of_the_protocol(kind):
 
 
 def test_looks_together_in_place_are_the_posterior_of_all_of_them():
-    params = jmvae.init(jax.random.key(0), THREE)
+    params = init(jax.random.key(0), THREE)
     found, camera, sonar = in_place(THREE, params), look(THREE, 0), look(THREE, 2)
     for looks, given in (
         ({0: camera}, (camera, None, None)),
         ({2: sonar, 0: camera}, (camera, None, sonar)),
     ):
-        assert_same(found.together(looks), jmvae.encode(params, THREE, given))
+        assert_same(found.together(looks), encode(params, THREE, given))
 
 
 def test_in_place_the_class_shown_is_not_one_that_the_belief_rules_out():

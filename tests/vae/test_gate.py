@@ -1,5 +1,6 @@
 """Gates on windows whose answer is known."""
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +17,7 @@ CONFIG = DetectorConfig(hidden=(8,), steps=300, batch=64, learning_rate=1e-2)
 RAYS = 6
 
 
+@functools.partial(jax.jit, static_argnums=(1, 2))
 def looks(key, number, is_shown):
     """Ranges of 3 m in which, at the distance of its PoI, the two rays of a PoI stand out."""
     distance_key, noise_key = jax.random.split(key)
@@ -42,6 +44,7 @@ def params(problem):
 
 
 passes = jax.jit(jax.vmap(gate.passes, (None, 0, 0)))
+answer = jax.jit(detectors.answer)
 
 
 def share(found, looks):
@@ -49,7 +52,7 @@ def share(found, looks):
 
 
 def test_a_trained_gate_passes_pois_where_they_are_expected(problem, params):
-    found = gate.fitted(params, problem)
+    found = jax.jit(gate.fitted)(params, problem)
     keys = jax.random.split(jax.random.key(3), 2)
     assert share(found, looks(keys[0], 2000, True)) >= 0.97
     assert share(found, looks(keys[1], 2000, False)) <= 0.05
@@ -58,17 +61,20 @@ def test_a_trained_gate_passes_pois_where_they_are_expected(problem, params):
 def with_scores(monkeypatch):
     """Looks whose score is their distance."""
     monkeypatch.setattr(gate, "logits", lambda gate, windows, distances: distances)
-    return lambda distances: gate.Looks(jnp.zeros((len(distances), RAYS)), jnp.array(distances))
+    return lambda distances: gate.Looks(
+        np.zeros((len(distances), RAYS), np.float32), jnp.asarray(distances, jnp.float32)
+    )
 
 
 def test_a_threshold_loses_one_look_in_a_hundred_and_no_more_than_needed(monkeypatch, problem):
     of = with_scores(monkeypatch)
     scores = np.arange(1001.0)  # of looks at PoIs: 1 % of them are below 10
     overlapping = replace(problem, shown=of(scores), nothing=of(scores + 5.0))
-    assert gate.fitted({}, overlapping).threshold == pytest.approx(10.0)
+    fitted = jax.jit(lambda problem: gate.fitted({}, problem))
+    assert fitted(overlapping).threshold == pytest.approx(10.0)
     # 0.2 % of the looks at nothing are above 5.99 of 0 to 6.
     apart = replace(problem, shown=of(scores), nothing=of(np.linspace(0.0, 6.0, 1001)))
-    assert gate.fitted({}, apart).threshold == pytest.approx(0.998 * 6.0)
+    assert fitted(apart).threshold == pytest.approx(0.998 * 6.0)
 
 
 def test_a_window_at_the_threshold_passes(monkeypatch, problem):
@@ -92,21 +98,24 @@ def test_a_window_at_the_threshold_passes(monkeypatch, problem):
     ],
 )
 def test_an_untrained_gate_passes_what_is_valid(problem, reading, distance, expected):
-    window = jnp.zeros(RAYS).at[2].set(reading)
-    found = passes(problem.gate, window[None], jnp.float32([distance]))[0]
+    window = np.zeros(RAYS, np.float32)
+    window[2] = reading
+    found = passes(problem.gate, window[None], np.float32([distance]))[0]
     assert bool(found) is expected
 
 
 def test_a_gate_of_distances_reads_how_far_they_are_from_the_poi(problem):
     ranging = replace(problem.gate, measures_distance=True)
-    window = jnp.linspace(0.9, 1.1, RAYS)
+    window = np.linspace(0.9, 1.1, RAYS, dtype=np.float32)
     # Without what reads the expected distance itself.
     weights = jax.tree.map(np.array, ranging.params)
     weights["params"]["Dense_0"]["kernel"][RAYS:] = 0.0
     of_range = replace(ranging, params=weights)
 
+    logits = jax.jit(gate.logits)
+
     def score(window, distance):
-        return float(gate.logits(of_range, window, jnp.float32(distance)))
+        return float(logits(of_range, window, np.float32(distance)))
 
     near = score(window, 1.0)
     assert score(window + 0.5, 1.5) == pytest.approx(near, abs=1e-5)
@@ -117,7 +126,7 @@ def test_a_gate_of_distances_reads_how_far_they_are_from_the_poi(problem):
 
 def test_as_many_are_drawn_of_either_kind(problem):
     few = replace(problem, nothing=jax.tree.map(lambda x: x[:3], problem.nothing))
-    rows = np.asarray(few.draw(jax.random.key(0), 50))
+    rows = np.asarray(jax.jit(few.draw, static_argnums=1)(jax.random.key(0), 50))
     assert rows.shape == (50, 2, 32)
     assert set(rows[:, 1].ravel()) == {0, 1, 2}
     assert rows[:, 0].max() > 400
@@ -136,24 +145,26 @@ def test_what_does_not_pass_has_no_features_of_a_class():
     windows = jax.random.normal(jax.random.key(0), (20, RAYS))
     detector = detectors.init(jax.random.key(1), windows, 3, CONFIG)
     distance = jnp.float32(1.0)
-    found = detectors.answer(detector, windows[0], distance)
+    found = answer(detector, windows[0], distance)
     assert found.is_there
-    np.testing.assert_allclose(found.features, detectors.detect(detector, windows[0]))
+    expected = jax.jit(detectors.detect)(detector, windows[0])
+    np.testing.assert_allclose(found.features, expected, rtol=1e-6)
     closed = replace(detector, gate=replace(detector.gate, threshold=jnp.float32(jnp.inf)))
-    for answer in (
-        detectors.answer(closed, windows[0], distance),
-        detectors.answer(detector, windows[0].at[1].set(jnp.nan), distance),
+    for found in (
+        answer(closed, windows[0], distance),
+        answer(detector, windows[0].at[1].set(jnp.nan), distance),
     ):
-        assert not answer.is_there
-        np.testing.assert_allclose(answer.features, [1 / 3] * 3)
+        assert not found.is_there
+        np.testing.assert_allclose(found.features, [1 / 3] * 3)
 
 
 def test_a_search_of_one_window_is_a_look(problem):
     windows = jax.random.normal(jax.random.key(0), (20, RAYS))
     detector = detectors.init(jax.random.key(1), windows, 3, CONFIG)
+    search = jax.jit(detectors.search)
     for window in (windows[0], windows[1].at[1].set(jnp.nan)):
-        plain = detectors.answer(detector, window, jnp.float32(1.0))
-        found = detectors.search(detector, window[None], jnp.ones(1), jnp.zeros((1, 1)))
+        plain = answer(detector, window, jnp.float32(1.0))
+        found = search(detector, window[None], jnp.ones(1), jnp.zeros((1, 1)))
         assert found.is_there == plain.is_there
         np.testing.assert_allclose(found.features, plain.features, atol=1e-6)
 
@@ -164,7 +175,8 @@ def test_a_search_pools_the_windows_by_their_posterior_odds(monkeypatch):
     detector = Read(Threshold(jnp.float32(1.5)))
     windows = jnp.array([[2.0, 3.0], [2.0, -1.0], [9.0, 5.0], [np.nan, 5.0]])
     prior = jnp.array([0.0, -np.log(3.0), -np.inf, 0.0])
-    found = detectors.search(detector, windows, jnp.array([1.0]), prior[None])
+    search = jax.jit(lambda *given: detectors.search(detector, *given))
+    found = search(windows, jnp.array([1.0]), prior[None])
     # Shares 3/4 and 1/4: a logit of 3 x .75 - 1 x .25 = 2, and the sigmoid of 2 is .8808.
     assert found.is_there
     np.testing.assert_allclose(found.features, [0.8808, 0.1192], atol=1e-4)
@@ -175,11 +187,11 @@ def test_a_search_pools_the_windows_by_their_posterior_odds(monkeypatch):
         ([-1.0, np.nan], False),
     ):
         both = jnp.tile(prior, (2, 1))
-        found = detectors.search(detector, windows, jnp.array(distances), both)
+        found = search(windows, jnp.array(distances), both)
         assert bool(found.is_there) is is_there
         assert is_there or found.features.tolist() == [0.5, 0.5]
     nowhere = jnp.full((1, 4), -jnp.inf)
-    assert not detectors.search(detector, windows, jnp.ones(1), nowhere).is_there
+    assert not search(windows, jnp.ones(1), nowhere).is_there
 
 
 def test_a_search_takes_no_window_for_impossible(monkeypatch):

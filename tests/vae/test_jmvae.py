@@ -1,5 +1,6 @@
 """The JMVAE's encoders, decoders, loss and training."""
 
+import functools
 import itertools
 
 import jax
@@ -23,6 +24,7 @@ decode = jax.jit(jmvae.decode, static_argnums=1)
 loss = jax.jit(jmvae.loss, static_argnums=2)
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def some_features(model, seed=0):
     keys = jax.random.split(jax.random.key(seed), len(model.modalities))
     return tuple(
@@ -65,7 +67,7 @@ def test_every_subset_has_an_encoder_of_its_own(model):
     assert len(set(means)) == len(model.subsets)
     for changed in model.subsets:
         name = "+".join(model.modalities[m] for m in changed)
-        other = with_output(params, "encoders", name, jnp.full(2 * model.latent_size, 9.0))
+        other = with_output(params, "encoders", name, np.full(2 * model.latent_size, 9.0))
         for subset in model.subsets:
             mean, _ = encode(other, model, keep(features, subset))
             assert np.array_equal(mean, before[subset][0]) == (subset != changed)
@@ -267,6 +269,7 @@ MODEL = Jmvae(("camera", "lidar"), (2, 2), CONFIG.latent_size, CONFIG.hidden)
 LABELS = ((1, 0, 0), (0, 0, 1))  # green cylinder, red cylinder, red cube: colour and shape
 
 
+@functools.partial(jax.jit, static_argnums=1)
 def two_hot_bank(key, per_class):
     """`[C, S, 2]` probabilities per modality: .9 or more for the right label."""
 
@@ -283,7 +286,7 @@ def two_hot_bank(key, per_class):
 @pytest.fixture(scope="module")
 def trained():
     """Losses, and beliefs of new detections: joint and one per modality, `[C, S, D]`."""
-    untrained, bank = jmvae.init(jax.random.key(0), MODEL), two_hot_bank(jax.random.key(1), 500)
+    untrained, bank = init(jax.random.key(0), MODEL), two_hot_bank(jax.random.key(1), 500)
     train = jax.jit(jmvae.train, static_argnames=("model", "config"))
     params, losses = train(jax.random.key(2), untrained, model=MODEL, bank=bank, config=CONFIG)
     bank = two_hot_bank(jax.random.key(3), 50)
@@ -312,7 +315,7 @@ def test_training_lowers_the_loss(trained):
 def test_trained_posteriors_reproduce_table_1(trained):
     beliefs = trained[3]
     class_means = beliefs["joint"].mean.mean(axis=1)
-    plausible = jax.vmap(jax.vmap(latent.plausible_classes, (0, None)), (0, None))
+    plausible = jax.jit(jax.vmap(jax.vmap(latent.plausible_classes, (0, None)), (0, None)))
     only_true = np.eye(3, dtype=bool)[:, None]
     shares = {
         name: np.all(plausible(b, class_means) == only_true, axis=-1).mean(axis=1)

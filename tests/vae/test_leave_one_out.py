@@ -15,13 +15,15 @@ from jaxsense.vae.leave_one_out import Encoder, Shape
 SHAPE = Shape(("camera", "lidar"), (3, 5), latent_size=2, hidden=(4,))
 NUMBER, POIS = 3, 2
 KEY = jax.random.key(0)
-PARAMS = leave_one_out.init(KEY, SHAPE)
+PARAMS = jax.jit(lambda: leave_one_out.init(KEY, SHAPE))()
+RNG = np.random.default_rng(0)
 LOOKS = tuple(
-    jax.random.normal(jax.random.fold_in(KEY, m), (POIS, NUMBER, size))
-    for m, size in enumerate(SHAPE.inputs)
+    jnp.asarray(RNG.normal(size=(POIS, NUMBER, size)), jnp.float32) for size in SHAPE.inputs
 )
-NOISE = jax.random.normal(jax.random.fold_in(KEY, 9), (2, 2, POIS, NUMBER))
+NOISE = RNG.normal(size=(2, 2, POIS, NUMBER)).astype(np.float32)
 WEIGHTS = 6.0, 15.0
+posterior = jax.jit(leave_one_out.posterior, static_argnums=1)
+features = jax.jit(Encoder.features)
 
 
 def dense(params, x, has_relu=True):
@@ -78,9 +80,12 @@ def plain_losses(alpha, beta):
     return losses
 
 
-def losses_of(params, **changed):
-    given = {"alpha": 0.7, "beta": 0.3, "has_begun": 1.0, "reconstruction_weights": WEIGHTS}
-    return leave_one_out.losses(NOISE, params, SHAPE, LOOKS, **{**given, **changed})
+@jax.jit
+def losses_of(params, alpha=0.7, beta=0.3, has_begun=1.0):
+    weights = {"alpha": alpha, "beta": beta, "has_begun": has_begun}
+    return leave_one_out.losses(
+        NOISE, params, SHAPE, LOOKS, **weights, reconstruction_weights=WEIGHTS
+    )
 
 
 @pytest.mark.parametrize(("alpha", "beta"), [(0.0, 0.0), (0.7, 0.3)])
@@ -92,9 +97,11 @@ def test_the_loss_is_the_plain_one(alpha, beta):
 def test_before_alpha_sets_in_single_encoders_follow_and_do_not_draw():
     """Without sets of one look by each sensor, which the joint network encodes too."""
 
-    def of_part(part, **changed):
-        gradient = jax.grad(lambda params: jnp.sum(losses_of(params, **changed)))(PARAMS)
-        return jax.tree.leaves(gradient[part])
+    gradient = jax.jit(jax.grad(lambda params, weights: jnp.sum(losses_of(params, **weights))))
+
+    def of_part(part, alpha=0.7, has_begun=1.0):
+        of_all = gradient(PARAMS, {"alpha": alpha, "has_begun": has_begun})
+        return jax.tree.leaves(of_all[part])
 
     for usual, stronger in zip(
         of_part("encoders", has_begun=0.0), of_part("encoders", has_begun=0.0, alpha=5.0),
@@ -113,13 +120,13 @@ def test_worse_decoders_cost_more():
 
 
 def test_the_posterior_takes_any_number_of_looks_in_any_order():
-    looks = tuple(x[0] for x in LOOKS)
-    found = leave_one_out.posterior(PARAMS, SHAPE, looks)
+    looks = tuple(np.asarray(x[0]) for x in LOOKS)
+    found = posterior(PARAMS, SHAPE, looks)
     mean, log_var = joint(looks)
     np.testing.assert_allclose(found.mean, mean, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(found.std, np.exp(0.5 * log_var), rtol=1e-5)
-    turned = leave_one_out.posterior(PARAMS, SHAPE, (looks[0][::-1], looks[1][jnp.array([1, 0])]))
-    fewer = leave_one_out.posterior(PARAMS, SHAPE, (looks[0], looks[1][:2]))
+    turned = posterior(PARAMS, SHAPE, (looks[0][::-1], looks[1][[1, 0]]))
+    fewer = posterior(PARAMS, SHAPE, (looks[0], looks[1][:2]))
     np.testing.assert_allclose(turned.mean, fewer.mean, rtol=1e-5, atol=1e-6)
 
 
@@ -145,9 +152,9 @@ def test_alpha_sets_in_late():
     )  # fmt: skip
     problem = leave_one_out.Fitting(config, LOOKS, SHAPE)
     rows, noise = problem.draw(KEY, 1)
-    drawn = rows[0], noise[0]
+    drawn, loss = (rows[0], noise[0]), jax.jit(problem.loss)
     early, start, late, end = (
-        float(problem.loss(PARAMS, drawn, jnp.int32(step))) for step in (0, 50, 70, 99)
+        float(loss(PARAMS, drawn, jnp.int32(step))) for step in (0, 50, 70, 99)
     )
     assert early == start
     assert late == end
@@ -176,18 +183,18 @@ def encoder_of(sharpness=1.0) -> Encoder:
 def test_features_are_probabilities_of_labels_read_from_the_posterior():
     encoder = encoder_of()
     assert encoder.num_labels == 2
-    left = encoder.features(jnp.array([-1.0]))
+    left = features(encoder, jnp.array([-1.0]))
     np.testing.assert_allclose(left.sum(), 1.0, rtol=1e-6)
     assert left[0] > 0.99
-    sharper = encoder_of(2.0).features(jnp.array([-0.6]))
-    found = encoder.features(jnp.array([-0.6]))
+    sharper = features(encoder_of(2.0), jnp.array([-0.6]))
+    found = features(encoder, jnp.array([-0.6]))
     np.testing.assert_allclose(sharper, found**2 / np.sum(np.asarray(found) ** 2), rtol=1e-4)
 
 
 def test_calibration_finds_how_sharp_labels_are():
     encoder = encoder_of()
-    windows = jnp.concatenate([jnp.full((90, 1), -0.4), jnp.full((10, 1), -0.4)])
-    classes = jnp.repeat(jnp.array([0, 2]), jnp.array([90, 10]))
-    found = leave_one_out.calibrate(encoder, windows, classes)
+    windows = np.full((100, 1), -0.4, np.float32)
+    classes = np.repeat([0, 2], [90, 10])
+    found = jax.jit(leave_one_out.calibrate)(encoder, windows, classes)
     # Nine of ten looks like this one show the first label.
-    np.testing.assert_allclose(found.features(windows[0])[0], 0.9, atol=0.01)
+    np.testing.assert_allclose(features(found, windows[0])[0], 0.9, atol=0.01)

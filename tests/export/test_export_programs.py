@@ -1,65 +1,36 @@
-"""The exported file, run in processes that can import neither jaxsense nor JAX."""
+"""Exported programs, against jaxsense, in processes that can import neither jaxsense nor JAX."""
 
 import dataclasses
 import io
 import json
-import re
 import runpy
-import subprocess
-import sys
 import zipfile
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import onnx
 import pytest
-from smoke import error_line, save_models
+from exporting import ABSENT, CONFIG, EXAMPLE, run_alone, with_classes
+from smoke import save_models
 
 from benchmarks import exported
 from jaxsense import export
-from jaxsense.config import (
-    PRESETS,
-    DetectorConfig,
-    JmvaeConfig,
-    LocalisationConfig,
-    SearchConfig,
-)
+from jaxsense.config import PRESETS, LocalisationConfig, SearchConfig
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
 from jaxsense.dqn import observation, team_mdp
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.interfaces import robot_numpy, robot_onnx
 from jaxsense.interfaces.onboard import functions
-from jaxsense.models import init, make_in_place, make_jmvae, make_readout
+from jaxsense.models import init, make_jmvae, make_readout
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.sim import windows as windowing
 from jaxsense.vae import detectors, jmvae, latent
-from jaxsense.vae.novelty import Novelty
 
-EXAMPLE = Path(__file__).parent.parent / "examples" / "run_exported.py"
-CONFIG = dataclasses.replace(
-    PRESETS["smoke"],
-    detector=DetectorConfig(hidden=(8,)),
-    jmvae=JmvaeConfig(hidden=(8,)),
-)
 BATCH = 12
 SIZES = {"pois": 3, "robots": 2, "looks": 4}
-ALONE = f"""
-import runpy, sys
-
-class Only:
-    def find_spec(self, name, *_):
-        if name.partition(".")[0] in sys.argv[1].split(","):
-            raise ModuleNotFoundError(f"{{name}} is not here")
-
-sys.meta_path.insert(0, Only())
-del sys.argv[1]
-example = runpy.run_path({str(EXAMPLE)!r})
-"""
 RUN_ALL = """
 import importlib
 import numpy as np
@@ -75,53 +46,20 @@ for name, about in contents["programs"].items():
     found |= {f"{name}/{key}": np.stack([row[key] for row in rows]) for key in rows[0]}
 np.savez(sys.argv[4], **found)
 """
-ABSENT = {
-    "robot_numpy": "jaxsense,jax,jaxlib,onnx,onnxruntime",
-    "robot_onnx": "jaxsense,jax,jaxlib,onnx",
-}
 
 
-def run_alone(code, player, *arguments):
-    """Runs code where nothing is there but what a player needs."""
-    command = [sys.executable, "-I", "-c", ALONE + code, ABSENT[player], *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-@pytest.fixture(scope="module")
-def models():
-    return with_classes(init(jax.random.key(0), CONFIG), CONFIG)
-
-
-def with_classes(models, config):
-    """The models, with classes at random places in the latent space."""
-    means = jax.random.normal(jax.random.key(1), models.fusion.classes.mean.shape)
-    classes = Belief(means, jnp.ones_like(means))
-    return dataclasses.replace(
-        models,
-        fusion=make_in_place(config, models.jmvae, classes),
-        novelty=Novelty(jnp.array([5.0, 20.0]), jnp.array([0.3, 0.9])),
-    )
+def played(path, player, inputs, folder):
+    """What a player's programs give for `{NAME/KEY: array}`, alone."""
+    given, found = folder / "in.npz", folder / f"{player}.npz"
+    np.savez(given, **inputs)
+    done = run_alone(RUN_ALL, player, path, player, given, found)
+    assert done.returncode == 0, done.stderr
+    return dict(np.load(found))
 
 
 @pytest.fixture(scope="module")
-def run(models, tmp_path_factory):
-    """The directory of a run that trained nothing."""
-    path = tmp_path_factory.mktemp("runs") / "run"
-    with RunDirectory.create(path, Settings("smoke", 0, CONFIG)) as created:
-        save_models(created, models)
-    return path
-
-
-@pytest.fixture(scope="module")
-def file(run, tmp_path_factory):
-    path = tmp_path_factory.mktemp("exported") / "exported.zip"
-    export.main([str(run), "--out", str(path)])
-    return path
-
-
-@pytest.fixture(scope="module", params=[*ABSENT])
-def results(request, models, file, tmp_path_factory):
-    """`{NAME/KEY: array}` of what all programs were given, and of what they gave elsewhere."""
+def results(file, tmp_path_factory):
+    """`{NAME/KEY: array}` of what all programs were given, and what each player's gave."""
     rng, inputs = np.random.default_rng(0), {}
     for name, function in functions(CONFIG).items():
         for key, each in function.inputs.items():
@@ -134,21 +72,19 @@ def results(request, models, file, tmp_path_factory):
             drawn = rng.integers(0, 2, (BATCH, *shape)) if each.dtype == "int32" else drawn
             inputs[f"{name}/{key}"] = drawn.astype(each.dtype)
     folder = tmp_path_factory.mktemp("results")
-    np.savez(folder / "in.npz", **inputs)
-    player = request.param
-    done = run_alone(RUN_ALL, player, file, player, folder / "in.npz", folder / "out.npz")
-    assert done.returncode == 0, done.stderr
-    return inputs, dict(np.load(folder / "out.npz"))
+    return inputs, {player: played(file, player, inputs, folder) for player in ABSENT}
 
 
 def check(results, name, expected, *keys):
     """`expected(*inputs of one example) -> outputs`, for each of the batch."""
-    inputs, outputs = results
+    inputs, of_players = results
     given = [value for key, value in inputs.items() if key.startswith(f"{name}/")]
     for row in range(BATCH):
-        for key, value in zip(keys, expected(*(x[row] for x in given)), strict=True):
-            found = outputs[f"{name}/{key}"][row]
-            np.testing.assert_allclose(found, value, atol=1e-5, err_msg=f"{name}/{key}")
+        values = expected(*(x[row] for x in given))
+        for key, value in zip(keys, values, strict=True):
+            for player, outputs in of_players.items():
+                found, place = outputs[f"{name}/{key}"][row], f"{player}: {name}/{key}"
+                np.testing.assert_allclose(found, value, atol=1e-5, err_msg=place)
 
 
 @pytest.mark.parametrize("m", [0, 1])
@@ -156,19 +92,23 @@ def test_programs_of_a_sensor_give_what_jaxsense_gives(models, results, m):
     name = CONFIG.modalities[m]
     sensor = sensors.make(CONFIG)[m]
 
+    of_window = jax.jit(lambda window: detectors.detect(models.detectors[m], window))
+
     def detect(readings, bearing, distance):
         # The nearest window in the scan, ray by ray.
         centre = float(sensor.centre(bearing))
         first = round(centre - (sensor.window - 1) * sensor.stride / 2)
         rays = first + np.arange(sensor.window) * sensor.stride
         window = np.minimum(readings[rays], sensor.window_limit).reshape(-1)
-        features = detectors.detect(models.detectors[m], window)
+        features = np.asarray(of_window(window))
         return True, features.max() >= CONFIG.mission.least_confidence, features
 
+    @jax.jit
     def write(mean, std, seen, features, weight):
         belief = models.fusion.update(Belief(mean, std), seen, features, m, weight)
         return belief.mean, belief.std
 
+    @jax.jit
     def weigh(apart):
         return models.novelty.weight(apart, m), models.novelty.to_go(apart, m)
 
@@ -182,19 +122,21 @@ def test_decisions_are_those_of_the_policy_and_the_rules(models, results):
     classes, settings = models.fusion.classes, CONFIG.mission
     assert settings.auctions
 
+    apply = jax.jit(lambda params, belief: network.apply(params, observation(belief)))
+    seconds = jax.jit(lambda pose, place: team_mdp.travel_seconds(CONFIG.team.travel, pose, place))
+    means, stds = np.asarray(classes.mean), np.asarray(classes.std)
+
     def values_of(mean, std, present, m):
         # A mean over all classes that a PoI which is not present may have.
         of_each = [
-            network.apply(
+            apply(
                 models.q_networks[m],
-                observation(
-                    Belief(
-                        np.where(present[:, None], mean, classes.mean[c]),
-                        np.where(present[:, None], std, classes.std[c]),
-                    )
+                Belief(
+                    np.where(present[:, None], mean, means[c]),
+                    np.where(present[:, None], std, stds[c]),
                 ),
             )
-            for c in range(len(classes.mean))
+            for c in range(len(means))
         ]
         return np.where(np.append(present, True), np.mean(of_each, axis=0), -np.inf)
 
@@ -206,7 +148,7 @@ def test_decisions_are_those_of_the_policy_and_the_rules(models, results):
             alone = values_of(mean, std, only, modality[r])
             apart = np.linalg.norm(poses[r, :2] - looked_from[poi, modality[r]], axis=-1)
             way = models.novelty.to_go(apart, modality[r]) / CONFIG.team.travel.speed
-            there = team_mdp.travel_seconds(CONFIG.team.travel, poses[r], positions[poi][None])
+            there = seconds(poses[r], positions[poi][None])
             if only.any() and alone[poi] > alone[-1]:
                 bids[r, poi] = float(there[0] + way)
         of_robot = {poi: time for (r, poi), time in bids.items() if r == robot}
@@ -221,46 +163,41 @@ def test_decisions_are_those_of_the_policy_and_the_rules(models, results):
         return won.get(robot, nearest), values
 
     check(results, "decide", decide, "action", "values")
-    _, outputs = results
-    assert len(set(outputs["decide/action"].tolist())) > 1
+    for outputs in results[1].values():
+        assert len(set(outputs["decide/action"].tolist())) > 1
 
 
 @pytest.mark.parametrize("player", [*ABSENT])
-@pytest.mark.parametrize("m", [0, 1])
-def test_an_exported_detector_answers_what_is_not_there(file, tmp_path, m, player):
-    name = CONFIG.modalities[m]
-    inputs = functions(CONFIG)[f"detect_{name}"].inputs
-    scan = np.full(inputs["readings"].shape, 0.5, np.float32)
-    ahead = len(scan) // 2
-    at = {"bearing": 0.0, "distance": 1.0}
-    cases = [
-        (scan, at, True),
-        (np.where(scan > 0, np.nan, scan), at, False),
-        (scan.copy(), at, False),
-        (-scan, at, False),
-        # A beam without a return; no pixel is infinitely bright.
-        (np.where(scan > 0, np.inf, scan), at, sensors.make(CONFIG)[m].measures_distance),
-        *((scan, {**at, "bearing": b}, False) for b in (np.radians(121.0), -np.pi, np.nan)),
-        *((scan, {**at, "distance": d}, False) for d in (0.0, -1.0, np.inf, np.nan)),
-    ]
-    cases[2][0][ahead : ahead + 4] = np.nan  # the camera reads every fourth pixel
-    given = {
-        f"detect_{name}/readings": np.stack([readings for readings, _, _ in cases]),
-        **{f"detect_{name}/{key}": np.float32([x[key] for _, x, _ in cases]) for key in at},
-    }
-    np.savez(tmp_path / "in.npz", **given)
-    done = run_alone(RUN_ALL, player, file, player, tmp_path / "in.npz", tmp_path / "out.npz")
-    assert done.returncode == 0, done.stderr
-    found = np.load(tmp_path / "out.npz")
-    expected = [is_there for _, _, is_there in cases]
-    np.testing.assert_array_equal(found[f"detect_{name}/is_there"], expected)
-    features = found[f"detect_{name}/features"]
-    assert np.isfinite(features).all()
-    np.testing.assert_allclose(features[~np.array(expected)], 0.5)
+def test_an_exported_detector_answers_what_is_not_there(file, tmp_path, player):
+    given, expected = {}, {}
+    for sensor in sensors.make(CONFIG):
+        name = f"detect_{sensor.name}"
+        scan = np.full(functions(CONFIG)[name].inputs["readings"].shape, 0.5, np.float32)
+        ahead = len(scan) // 2
+        at = {"bearing": 0.0, "distance": 1.0}
+        cases = [
+            (scan, at, True),
+            (np.where(scan > 0, np.nan, scan), at, False),
+            (scan.copy(), at, False),
+            (-scan, at, False),
+            # A beam without a return; no pixel is infinitely bright.
+            (np.where(scan > 0, np.inf, scan), at, sensor.measures_distance),
+            *((scan, {**at, "bearing": b}, False) for b in (np.radians(121.0), -np.pi, np.nan)),
+            *((scan, {**at, "distance": d}, False) for d in (0.0, -1.0, np.inf, np.nan)),
+        ]
+        cases[2][0][ahead : ahead + 4] = np.nan  # the camera reads every fourth pixel
+        given[f"{name}/readings"] = np.stack([readings for readings, _, _ in cases])
+        given |= {f"{name}/{key}": np.float32([x[key] for _, x, _ in cases]) for key in at}
+        expected[name] = np.array([is_there for _, _, is_there in cases])
+    found = played(file, player, given, tmp_path)
+    for name, is_there in expected.items():
+        np.testing.assert_array_equal(found[f"{name}/is_there"], is_there)
+        features = found[f"{name}/features"]
+        assert np.isfinite(features).all()
+        np.testing.assert_allclose(features[~is_there], 0.5)
 
 
-@pytest.mark.parametrize("player", [*ABSENT])
-def test_encoders_of_scans_give_what_jaxsense_gives(tmp_path, player):
+def test_encoders_of_scans_give_what_jaxsense_gives(tmp_path):
     networks = dataclasses.replace(PRESETS["raw"].jmvae, hidden=(8, 8))
     config = dataclasses.replace(CONFIG, jmvae=networks)
     learned = init(jax.random.key(0), config)
@@ -271,35 +208,36 @@ def test_encoders_of_scans_give_what_jaxsense_gives(tmp_path, player):
     learned = dataclasses.replace(learned, detectors=encoders)
     with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as created:
         save_models(created, learned)
-    export.main([str(tmp_path / "run"), "--out", str(tmp_path / "exported.zip")])
+    path = tmp_path / "exported.zip"
+    export.main([str(tmp_path / "run"), "--out", str(path)])
     rng, given, expected = np.random.default_rng(0), {}, {}
-    for m, sensor in enumerate(sensors.make(config)):
-        shape = functions(config)[f"detect_{sensor.name}"].inputs["readings"].shape
+    for sensor, encoder in zip(sensors.make(config), encoders, strict=True):
+        name = f"detect_{sensor.name}"
+        shape = functions(config)[name].inputs["readings"].shape
         scans = rng.uniform(0.3, 0.9, (BATCH, *shape)).astype(np.float32)
+        bearings = rng.uniform(-0.3, 0.3, BATCH).astype(np.float32)
         given |= {
-            f"detect_{sensor.name}/readings": scans,
-            f"detect_{sensor.name}/bearing": rng.uniform(-0.3, 0.3, BATCH).astype(np.float32),
-            f"detect_{sensor.name}/distance": np.full(BATCH, 0.6, np.float32),
+            f"{name}/readings": scans,
+            f"{name}/bearing": bearings,
+            f"{name}/distance": np.full(BATCH, 0.6, np.float32),
         }
-        windows = [
-            windowing.cut_out(sensor, scan, bearing)
-            for scan, bearing in zip(scans, given[f"detect_{sensor.name}/bearing"], strict=True)
-        ]
-        expected[sensor.name] = jax.vmap(learned.detectors[m].features)(jnp.stack(windows))
-        assert np.ptp(np.asarray(expected[sensor.name]), axis=0).max() > 1e-3
-    np.savez(tmp_path / "in.npz", **given)
-    files = tmp_path / "in.npz", tmp_path / "out.npz"
-    done = run_alone(RUN_ALL, player, tmp_path / "exported.zip", player, *files)
-    assert done.returncode == 0, done.stderr
-    found = np.load(tmp_path / "out.npz")
-    for name, features in expected.items():
-        np.testing.assert_allclose(found[f"detect_{name}/features"], features, atol=1e-5)
+
+        def features(scan, bearing):
+            return encoder.features(windowing.cut_out(sensor, scan, bearing))  # noqa: B023
+
+        expected[name] = np.asarray(jax.jit(jax.vmap(features))(scans, bearings))
+        assert np.ptp(expected[name], axis=0).max() > 1e-3
+    for player in ABSENT:
+        found = played(path, player, given, tmp_path)
+        for name, each in expected.items():
+            np.testing.assert_allclose(found[f"{name}/features"], each, atol=1e-5)
 
 
 @pytest.mark.parametrize(
     ("name", "given"), [("camera", [0]), ("lidar", [1]), ("camera+lidar", [0, 1])]
 )
 def test_encoders_give_what_jaxsense_gives(models, results, name, given):
+    @jax.jit
     def encode(*features):
         of_each = [None, None]
         for m, x in zip(given, features, strict=True):
@@ -313,12 +251,12 @@ def test_encoders_give_what_jaxsense_gives(models, results, name, given):
 def test_the_map_is_read_as_jaxsense_reads_it(models, results):
     means = models.fusion.classes.mean
 
+    @jax.jit
+    @jax.vmap
     def classify(mean, std):
-        beliefs = [Belief(*each) for each in zip(mean, std, strict=True)]
-        probabilities = [models.fusion.class_probabilities(belief) for belief in beliefs]
-        most_likely = [models.fusion.most_likely_class(belief) for belief in beliefs]
-        told = [latent.plausible_classes(belief, means) for belief in beliefs]
-        return np.stack(probabilities), np.stack(most_likely), np.stack(told)
+        belief, fusion = Belief(mean, std), models.fusion
+        plausible = latent.plausible_classes(belief, means)
+        return fusion.class_probabilities(belief), fusion.most_likely_class(belief), plausible
 
     check(results, "classify", classify, "probabilities", "most_likely", "plausible")
 
@@ -412,7 +350,9 @@ def test_contents_describe_what_is_there(results, file):
         kernel = weights["q_networks/0/params/Dense_0/kernel"]
     others = {"contents.json", "programs.json", "weights.npz", "robot_numpy.py", "robot_onnx.py"}
     assert {f"{name}.onnx" for name in contents["programs"]} | others == names
-    for given, end in zip(results, ("inputs", "outputs"), strict=True):
+    inputs, of_players = results
+    ends = [("inputs", inputs), *(("outputs", outputs) for outputs in of_players.values())]
+    for end, given in ends:
         described = {
             f"{name}/{key}": ([BATCH, *(SIZES.get(n, n) for n in about["shape"])], about["dtype"])
             for name, program in contents["programs"].items()
@@ -427,92 +367,6 @@ def test_contents_describe_what_is_there(results, file):
         angles = contents["sensors"][sensor.name]["angles"]
         np.testing.assert_allclose(angles, sensor.angles, atol=1e-6)
     assert contents["versions"] == {"jaxsense": __version__}
-
-
-def test_onnx_files_name_what_they_take_and_give(file):
-    with zipfile.ZipFile(file) as files:
-        contents = json.loads(files.read("contents.json"))
-        for name, about in contents["programs"].items():
-            graph = onnx.load_model_from_string(files.read(f"{name}.onnx")).graph
-            for ends, key in ((graph.input, "inputs"), (graph.output, "outputs")):
-                shapes = {
-                    each.name: [n.dim_param or n.dim_value for n in each.type.tensor_type.shape.dim]
-                    for each in ends
-                }
-                assert shapes == {n: x["shape"] for n, x in about[key].items()}
-
-
-@pytest.mark.parametrize("variance", [20.0, 5.0])
-def test_contents_hold_the_belief_before_any_look(variance):
-    config = dataclasses.replace(
-        CONFIG, mdp=dataclasses.replace(CONFIG.mdp, unseen_variance=variance)
-    )
-    contents = export._description(config, init(jax.random.key(0), config))
-    assert contents["unseen"] == {"mean": [0.0, 0.0], "std": pytest.approx([variance**0.5] * 2)}
-
-
-@pytest.mark.parametrize("player", [*ABSENT])
-def test_the_example_plays_a_map_and_refuses_other_files(file, tmp_path, player):
-    options = ["--onnx"] if player == "robot_onnx" else []
-    done = run_alone("example['main']()", player, file, *options)
-    assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
-    assert [line for line in lines if line.startswith("PoI 2 is a red cube; the map says: ")]
-    (tmp_path / "text").write_text("no archive")
-    done = run_alone("example['main']()", player, tmp_path / "text", *options)
-    assert done.returncode == 1
-    assert "must be a file of `python -m jaxsense.export`" in done.stderr
-
-
-def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    line = error_line([str(run), "--out", str(tmp_path / "x.zip")], capsys, export)
-    assert line == "jaxsense.export: onnx is not installed: pip install 'jaxsense[export]'"
-    assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize("problem", ["run", "out", "folder"])
-def test_bad_input_is_one_line_and_overwrites_nothing(run, tmp_path, capsys, problem):
-    existing = tmp_path / "precious.zip"
-    existing.write_text("precious")
-    argv, expected = {
-        "run": ([str(tmp_path / "no_run")], "no_run is not a run directory: it has no config.json"),
-        "out": ([str(run), "--out", str(existing)], "out = .*already exists; must be a new file"),
-        "folder": ([str(run), "--out", str(tmp_path / "no" / "x.zip")], "out = .*cannot be writ"),
-    }[problem]
-    with pytest.raises(SystemExit) as stop:
-        export.main(argv)
-    message = capsys.readouterr().err
-    assert stop.value.code == 2
-    assert message.count("\n") == 1
-    assert message.startswith("jaxsense.export: ")
-    assert re.search(expected, message)
-    assert existing.read_text() == "precious"
-    assert list(tmp_path.iterdir()) == [existing]
-
-
-def test_a_file_that_appears_meanwhile_is_not_replaced(run, tmp_path, monkeypatch, capsys):
-    path = tmp_path / "x.zip"
-
-    def meanwhile(*_):
-        path.write_text("of another process", encoding="utf-8")
-        return b"ours"
-
-    monkeypatch.setattr(export, "archive", meanwhile)
-    line = error_line([str(run), "--out", str(path)], capsys, export)
-    assert "x.zip': already exists; must be a new file" in line
-    assert [*tmp_path.iterdir()] == [path]
-    assert path.read_text(encoding="utf-8") == "of another process"
-
-
-def test_an_export_that_is_stopped_leaves_nothing(run, tmp_path, monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(export, "archive", stop)
-    with pytest.raises(KeyboardInterrupt):
-        export.main([str(run), "--out", str(tmp_path / "x.zip")])
-    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("player", [robot_numpy, pytest.param(robot_onnx, marks=pytest.mark.slow)])
@@ -537,12 +391,16 @@ def test_an_exported_robot_searches_as_missions_do(models, player, tmp_path):
     _, programs = player.load(path)
     rng = np.random.default_rng(0)
     for m, sensor in enumerate(sensors.make(config)):
+
+        @jax.jit
+        def detect(*given):
+            return [models.detect(m, sensor, *given, *search) for search in ((errors,), ())]  # noqa: B023
+
         channels = () if sensor.channels == 1 else (sensor.channels,)
         for bearing, distance in ((0.1, 0.7), (-0.2, 0.4), (3.0, 0.5)):
             scan = rng.uniform(0.1, 1.0, (len(sensor.angles), *channels)).astype(np.float32)
             given = scan, np.float32(bearing), np.float32(distance)
-            searched = models.detect(m, sensor, *given, errors)
-            plain = models.detect(m, sensor, *given)
+            searched, plain = detect(*given)
             about = dict(zip(("readings", "bearing", "distance"), given, strict=True))
             found = programs[f"detect_{sensor.name}"](**about)
             assert found["is_there"] == searched.is_there == (bearing < 1)

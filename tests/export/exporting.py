@@ -1,0 +1,54 @@
+"""Settings and models for tests of exported files, and processes that play them."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
+from jaxsense.core.types import Belief
+from jaxsense.models import make_in_place
+from jaxsense.vae.novelty import Novelty
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "run_exported.py"
+CONFIG = dataclasses.replace(
+    PRESETS["smoke"],
+    detector=DetectorConfig(hidden=(8,)),
+    jmvae=JmvaeConfig(hidden=(8,)),
+)
+ALONE = f"""
+import runpy, sys
+
+class Only:
+    def find_spec(self, name, *_):
+        if name.partition(".")[0] in sys.argv[1].split(","):
+            raise ModuleNotFoundError(f"{{name}} is not here")
+
+sys.meta_path.insert(0, Only())
+del sys.argv[1]
+example = runpy.run_path({str(EXAMPLE)!r})
+"""
+ABSENT = {
+    "robot_numpy": "jaxsense,jax,jaxlib,onnx,onnxruntime",
+    "robot_onnx": "jaxsense,jax,jaxlib,onnx",
+}
+
+
+def run_alone(code, player, *arguments):
+    """Runs code where nothing is there but what a player needs."""
+    command = [sys.executable, "-I", "-c", ALONE + code, ABSENT[player], *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def with_classes(models, config):
+    """The models, with classes at random places in the latent space."""
+    means = jax.random.normal(jax.random.key(1), models.fusion.classes.mean.shape)
+    classes = Belief(means, jnp.ones_like(means))
+    return dataclasses.replace(
+        models,
+        fusion=make_in_place(config, models.jmvae, classes),
+        novelty=Novelty(jnp.array([5.0, 20.0]), jnp.array([0.3, 0.9])),
+    )
