@@ -238,7 +238,7 @@ def alone(num_pois: int, modality: Index) -> Team:
         poses=jnp.zeros((1, 3)),
         modality=jnp.reshape(jnp.asarray(modality, jnp.int32), (1,)),
         works=jnp.ones(1, bool),
-        target=jnp.full(1, num_pois),
+        target=jnp.full(1, num_pois, jnp.int32),
     )
 
 
@@ -283,7 +283,7 @@ def reset(key: Key, mdp: TeamMdp, modality: Int[Array, " R"] | None = None) -> T
         poses=jnp.where(alone, 0.0, poses),
         modality=modality,
         works=works,
-        target=jnp.full(num_robots, num_pois),
+        target=jnp.full(num_robots, num_pois, jnp.int32),
     )
     first = jnp.argmax(works).astype(jnp.int32)
     return TeamState(state, team, works, first, jnp.zeros(num_robots), jnp.float32(0.0))

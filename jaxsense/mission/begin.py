@@ -117,7 +117,9 @@ def start(
         belief=jax.tree.map(lambda x: jnp.tile(x, (num_pois, 1)), models.fusion.prior),
         log_posterior=jnp.tile(models.bayes.prior, (num_pois, 1)),
         times_seen=jnp.zeros((num_pois, len(config.modalities)), jnp.int32),
-        looked_from=jnp.full((num_pois, len(config.modalities), RECENT_LOOKS, 2), jnp.inf),
+        looked_from=jnp.full(
+            (num_pois, len(config.modalities), RECENT_LOOKS, 2), jnp.inf, jnp.float32
+        ),
         version=jnp.int32(0),
         memory=memory.empty(mission.modalities, num_classes) if own_maps else None,
         robots=_idle_robots(num_robots, num_pois, paths.is_free.shape[1]),

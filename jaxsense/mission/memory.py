@@ -192,7 +192,7 @@ def empty(modality: Int[Array, " R"], num_classes: int) -> Memory:
         poi=jnp.zeros(shape, jnp.int32),
         place=jnp.zeros((*shape, 2)),
         evidence=Evidence(nothing, nothing),
-        heard_at=jnp.full((len(modality), *shape), jnp.inf),
+        heard_at=jnp.full((len(modality), *shape), jnp.inf, jnp.float32),
     )
 
 

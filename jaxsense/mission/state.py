@@ -265,5 +265,5 @@ def make_mission(
 
 def no_faults(config: Config) -> Faults:
     """Robots that never fail."""
-    never = jnp.full(len(config.carried), jnp.inf)
+    never = jnp.full(len(config.carried), jnp.inf, jnp.float32)
     return Faults(never, never)

@@ -84,7 +84,7 @@ class Bayes:
     def prior(self) -> Float[Array, " C"]:
         """Logarithms of equal probabilities."""
         number = self.labels.shape[1]
-        return jnp.full(number, -jnp.log(number))
+        return jnp.full(number, -jnp.log(number), jnp.float32)
 
     def log_likelihoods(self, features: _Features, modality: int) -> Float[Array, " C"]:
         """Log-likelihood of each class given one look, see the function `log_likelihoods`.
