@@ -5,6 +5,7 @@ from collections.abc import Callable
 from benchmarks.dqn import dqn_live, dqn_rejax, dqn_sb3, dqn_seeds
 from benchmarks.jmvae import jmvae
 from benchmarks.measure import Options, Row
+from benchmarks.missions import missions, missions_many, resets_many
 from benchmarks.physics import physics, physics_contacts, physics_solver
 from benchmarks.rays import rays
 from benchmarks.team import team_mdp
@@ -16,6 +17,9 @@ ROWS: dict[str, Callable[[Options], Row]] = {
     "physics_contacts": physics_contacts,
     "physics_solver": physics_solver,
     "rays": rays,
+    "missions": missions,
+    "missions_many": missions_many,
+    "resets_many": resets_many,
     "jmvae": jmvae,
     "dqn_rejax": dqn_rejax,
     "dqn_sb3": dqn_sb3,

@@ -18,7 +18,7 @@ import rich.console
 import rich.table
 
 from benchmarks import measure
-from benchmarks.missions import Playing, playing
+from benchmarks.missions import Playing, of_many_pois, playing, untrained
 from jaxsense.config.checks import check_fields, limited
 from jaxsense.run import cli, devices
 
@@ -34,8 +34,8 @@ Parts: TypeAlias = dict[str, "Part"]
 class Arguments:
     """Count the kernels of a control step, part by part, and their microseconds."""
 
-    preset: str = "default"
-    """Settings of the missions."""
+    many_pois: bool = False
+    """16 PoIs in an arena of 6 m; by default the settings of `default`."""
     batch: int = limited(384, at_least=1)
     """Number of missions side by side."""
     policy: str = "naive"
@@ -64,7 +64,8 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     jax.config.update("jax_default_matmul_precision", "highest")
-    missions = playing(arguments.preset, arguments.policy, arguments.batch, arguments.steps)
+    config = of_many_pois() if arguments.many_pois else untrained("default")
+    missions = playing(config, arguments.policy, arguments.batch, arguments.steps)
     program = missions.compiled(devices.compiler_options())
     wall, parts = profile(program, missions)
     table = rich.table.Table("part", "kernels in a step", "us in a step")
@@ -79,7 +80,7 @@ def main(argv: list[str] | None = None) -> None:
     number = sum(part.kernels for part in parts.values()) / arguments.steps
     busy = sum(part.seconds for part in parts.values()) / arguments.steps
     console.print(
-        f"{arguments.preset}, {arguments.batch} missions, policy {arguments.policy}, "
+        f"{arguments.batch} missions of {config.arena.num_pois} PoIs, policy {arguments.policy}, "
         f"{jax.devices()[0].device_kind}: {1e3 * wall / arguments.steps:.3f} ms in a step, "
         f"{number:,.0f} kernels, {1e3 * busy:.3f} ms of them"
     )

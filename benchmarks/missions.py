@@ -5,14 +5,89 @@ import functools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
+from benchmarks import measure
+from benchmarks.measure import Options, Row, Side
 from jaxsense import PRESETS, init, mission
 from jaxsense.config import Config
 from jaxsense.mission import Mission, MissionState
 from jaxsense.mission.rollout import rollout_batch
 from jaxsense.models import Models
+from jaxsense.run import batches, devices
+from jaxsense.run.compilation import Compiler
+from jaxsense.run.missions import Played, Player
+from jaxsense.run.monitor import Monitor
 
+_UNIT = "control-steps/s"
 _PERIODS_BEFORE = 40  # 4 s of missions that last 14 s
+
+
+def missions(options: Options) -> Row:
+    """Missions of the policy `naive` with the settings of `default`, from begin to end."""
+    return _play("missions", options, untrained("default"), accelerator=16384)
+
+
+def missions_many(options: Options) -> Row:
+    """The same with 16 PoIs in an arena of 6 m."""
+    return _play("missions_many", options, of_many_pois(), accelerator=8192)
+
+
+def _play(name: str, options: Options, config: Config, accelerator: int) -> Row:
+    """As many missions as an accelerator plays at once; fewer on a CPU."""
+    (total,) = measure.batches(options, quick=4, cpu=(768,), accelerator=(accelerator,))
+    workers = devices.start(None)
+    # Until it is trained, a gate lets everything above minus infinity pass.
+    models = jax.tree.map(jnp.nan_to_num, init(jax.random.key(0), config))
+    scenario = mission.make_mission(config)
+    with Compiler(Monitor()) as compiler:
+        batch = batches.batch_of(config, total, workers)
+        player = Player(scenario, compiler, batch, workers, runs_long=True)
+        player.wait()
+        compile_s = compiler.monitor.seconds["mission"]["compile_s"]
+        cases = {"naive": mission.cases(config)["naive"]}
+
+        def run() -> Played:
+            return player.play(jax.random.key(1), models, cases, total)
+
+        side = Side(run, run().control_steps, batch, compile_s, workers.number)
+        return measure.compare(name, _UNIT, [side], [], options)
+
+
+def resets_many(options: Options) -> Row:
+    """The beginning of missions with 16 PoIs in an arena of 6 m."""
+    sizes = measure.batches(options, quick=2, cpu=(384,), accelerator=(8192,))
+    config = of_many_pois()
+    scenario, models = mission.make_mission(config), init(jax.random.key(0), config)
+
+    def reset(key: jax.Array) -> MissionState:
+        return mission.reset(key, scenario, models)
+
+    sides = [
+        measure.compiled(
+            jax.vmap(reset),
+            jax.random.split(jax.random.key(1), batch),
+            work=batch,
+            batch=batch,
+            workers=devices.start(None),
+        )
+        for batch in sizes
+    ]
+    return measure.compare("resets_many", "resets/s", sides, [], options)
+
+
+def untrained(preset: str) -> Config:
+    """Settings of missions in which untrained detectors count as confident."""
+    config = PRESETS[preset]
+    settings = dataclasses.replace(config.mission, least_confidence=0.0)
+    return dataclasses.replace(config, mission=settings)
+
+
+def of_many_pois() -> Config:
+    """Settings of two robots among 16 PoIs."""
+    config = untrained("team")
+    arena = dataclasses.replace(config.arena, num_pois=16, side=6.0)
+    return dataclasses.replace(config, arena=arena)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,17 +122,8 @@ class Playing:
         return jax.jit(self.go_on).lower(*self.args).compile(options)
 
 
-def untrained(preset: str) -> Config:
-    """Settings of missions in which untrained detectors count as confident."""
-    config = PRESETS[preset]
-    settings = dataclasses.replace(config.mission, least_confidence=0.0)
-    return dataclasses.replace(config, mission=settings)
-
-
-@functools.cache
-def playing(preset: str, policy: str, batch: int, steps: int) -> Playing:
+def playing(config: Config, policy: str, batch: int, steps: int) -> Playing:
     """Missions of untrained networks after their first seconds."""
-    config = untrained(preset)
     scenario = mission.make_mission(config)
     models = init(jax.random.key(0), config)
     number = scenario.policy(policy)
@@ -70,6 +136,6 @@ def playing(preset: str, policy: str, batch: int, steps: int) -> Playing:
     states = begin(jax.random.split(jax.random.key(1), batch))
     keys = jax.random.split(jax.random.key(2), batch)
     before = Playing(scenario, models, keys, states, _PERIODS_BEFORE)
-    states = before.compiled({"xla_backend_optimization_level": 1})(*before.args)
+    states = before.compiled(devices.compiler_options())(*before.args)
     keys = jax.random.split(jax.random.key(3), batch)
     return Playing(scenario, models, keys, states, steps)

@@ -98,13 +98,14 @@ def clearance(arena: ArenaConfig, layout: Layout, poses: Float[Array, "R 3"]) ->
 
 
 class _Arcs(NamedTuple):
-    """Arcs of `[S, 2]` commands at `[T]` times [s]: `[S, T]` x [m], y [m] and heading [rad]."""
+    """Arcs of `[S, 2]` commands at `[T]` times [s]: `[S, T]` x [m], y [m], and heading."""
 
-    commands: np.ndarray
+    commands: jax.Array
     times: jax.Array
     x: jax.Array
     y: jax.Array
-    heading: jax.Array
+    cos: jax.Array
+    sin: jax.Array
 
 
 class _Frame(NamedTuple):
@@ -162,8 +163,8 @@ def drive_to(
     """
     chex.assert_shape(waypoint, (2,), custom_message="waypoint")
     chex.assert_equal_shape_prefix([poses, commands], 1, custom_message="commands")
-    arcs = _arcs(settings)
     pose, present = poses[robot], commands[robot]
+    arcs = _arcs(settings, present[1], seconds)
     frame = _Frame(pose, jnp.cos(pose[2]), jnp.sin(pose[2]))
     map_room, map_room_now = _room_of_map(settings, arena, layout, frame, arcs)
     room, room_now = _room_beside(
@@ -235,13 +236,12 @@ def _arrival(
     goal_x, goal_y = frame.of(goal)
     to_x, to_y = goal_x - arcs.x, goal_y - arcs.y
     distance = jnp.hypot(to_x, to_y)
-    cos, sin = jnp.cos(arcs.heading), jnp.sin(arcs.heading)
-    turn = jnp.arctan2(jnp.abs(cos * to_y - sin * to_x), cos * to_x + sin * to_y)
+    ahead, beside = arcs.cos * to_x + arcs.sin * to_y, arcs.cos * to_y - arcs.sin * to_x
+    turn = jnp.arctan2(jnp.abs(beside), ahead)
     # The direction of a near waypoint is meaningless.
     turn *= jnp.clip(distance / 0.08 - 0.25, 0.0, 1.0)
     inflation = jnp.maximum(settings.inflation, 1e-6)
-    narrowest = jax.lax.cummin(room, axis=1)
-    cost = _INFLATION_COST * jnp.clip(1.0 - narrowest / inflation, 0.0, 1.0)
+    cost = _INFLATION_COST * jnp.clip(1.0 - jax.lax.cummin(room, axis=1) / inflation, 0.0, 1.0)
     return arcs.times[None] + turn / amiro.MAX_TURN_RATE + distance / amiro.MAX_SPEED + cost
 
 
@@ -253,11 +253,13 @@ def _best(
     may_start: Bool[Array, " S"],
 ) -> Float[Array, "2"]:
     """Command of minimum value within reach of the present one; 0 if no arc `may_start`."""
-    change = seconds * jnp.array([amiro.MAX_ACCELERATION, amiro.MAX_TURN_ACCELERATION]) + 1e-6
+    change = jnp.array(
+        [_change(a, seconds) for a in (amiro.MAX_ACCELERATION, amiro.MAX_TURN_ACCELERATION)]
+    )
     in_window = jnp.all(jnp.abs(arcs.commands - present[None]) <= change[None], axis=-1)
     value = jnp.where(in_window & may_start, value, jnp.inf)
     best = jnp.argmin(value)
-    return jnp.where(jnp.isfinite(value[best]), jnp.array(arcs.commands)[best], 0.0)
+    return jnp.where(jnp.isfinite(value[best]), arcs.commands[best], 0.0)
 
 
 @jax.named_scope("mission.sidestep")
@@ -318,17 +320,34 @@ def sidestep(
     return positions[last]
 
 
-def _arcs(settings: NavigationConfig) -> _Arcs:
-    """The arcs of all commands that the planner tries."""
+def _change(acceleration: float, seconds: float) -> float:
+    """How much a command may change within a time, with a margin for rounding."""
+    return seconds * acceleration + 1e-6
+
+
+def _arcs(settings: NavigationConfig, turn_rate: Float[Array, ""], seconds: float) -> _Arcs:
+    """The arcs of the commands that the planner tries, at the turn rates within reach."""
     forward = np.linspace(0.0, amiro.MAX_SPEED, _NUM_SPEEDS - 1)
+    speeds = np.concatenate([[-_BACKWARD_SPEED], forward]).astype(np.float32)
     turns = np.linspace(-amiro.MAX_TURN_RATE, amiro.MAX_TURN_RATE, _NUM_TURN_RATES)
-    speeds = np.concatenate([[-_BACKWARD_SPEED], forward])
-    samples = np.stack(np.meshgrid(speeds, turns, indexing="ij"), axis=-1).reshape(-1, 2)
-    samples = samples.astype(np.float32)
+    spacing, change = turns[1] - turns[0], _change(amiro.MAX_TURN_ACCELERATION, seconds)
+    number = min(_NUM_TURN_RATES, 1 + int(2 * change / spacing))
+    first = jnp.ceil((turn_rate - change - turns[0]) / spacing).astype(jnp.int32)
+    first = jnp.clip(first, 0, _NUM_TURN_RATES - number)
+
     times = settings.horizon * jnp.array(_SAMPLE_TIMES, jnp.float32)
-    v, w = jnp.array(samples[:, :1]), jnp.array(samples[:, 1:])
+    w = jnp.array(turns, jnp.float32)[:, None]
     heading = w * times[None]
-    # sin(h) / w and (1 - cos(h)) / w, also where w is 0.
-    x = v * times[None] * jnp.sinc(heading / np.pi)
-    y = v * times[None] * jnp.sin(heading / 2) * jnp.sinc(heading / (2 * np.pi))
-    return _Arcs(samples, times, x, y, heading)
+    # At a speed of 1 m/s, sin(h) / w and (1 - cos(h)) / w, also where w is 0.
+    x = times[None] * jnp.sinc(heading / np.pi)
+    y = times[None] * jnp.sin(heading / 2) * jnp.sinc(heading / (2 * np.pi))
+
+    def in_reach(of_turns: jax.Array, factor: np.ndarray) -> jax.Array:
+        """Rows of all speeds, times a factor, and the turn rates in reach."""
+        rows = jax.lax.dynamic_slice_in_dim(of_turns, first, number)[None]
+        return (factor[:, None, None] * rows).reshape(len(speeds) * number, -1)
+
+    once = np.ones_like(speeds)
+    commands = jnp.concatenate([in_reach(jnp.ones_like(w), speeds), in_reach(w, once)], axis=1)
+    cos, sin = (in_reach(of_turns, once) for of_turns in (jnp.cos(heading), jnp.sin(heading)))
+    return _Arcs(commands, times, in_reach(x, speeds), in_reach(y, speeds), cos, sin)

@@ -30,26 +30,36 @@ def command_to():
     return command
 
 
-def test_arcs_are_those_of_a_unicycle():
-    samples, times, x, y, heading = navigation._arcs(SETTINGS)
+arcs_of = jax.jit(functools.partial(navigation._arcs, SETTINGS), static_argnums=1)
+
+
+@pytest.mark.parametrize("turn_rate", [-0.97, 0.0, 0.35])
+def test_arcs_are_those_of_a_unicycle(turn_rate):
+    commands, times, x, y, cos, sin = (np.array(of_arcs) for of_arcs in arcs_of(turn_rate, PERIOD))
     # Shares 0.1, 0.2, 0.3, 0.5, 0.75 and 1 of 2 s.
     np.testing.assert_allclose(times, [0.2, 0.4, 0.6, 1.0, 1.5, 2.0], atol=1e-6)
     expected = []
-    for forward, turn in samples.astype(np.float64):
+    for forward, turn in commands.astype(np.float64):
         middles = turn * (np.arange(2000) + 0.5) * 1e-3
         path = forward * 1e-3 * np.cumsum([np.cos(middles), np.sin(middles)], axis=1)
         at = np.round(times * 1000).astype(int) - 1
-        expected.append([*path[:, at], turn * times])
-    np.testing.assert_allclose(np.stack([x, y, heading], axis=1), expected, atol=1e-6)
+        expected.append([*path[:, at], np.cos(turn * times), np.sin(turn * times)])
+    np.testing.assert_allclose(np.stack([x, y, cos, sin], axis=1), expected, atol=1e-6)
 
 
-def test_arcs_are_a_grid_of_all_speeds_and_turn_rates():
-    samples = navigation._arcs(SETTINGS)[0]
-    assert samples.shape == (6 * 21, 2)
+@pytest.mark.parametrize("seconds", [0.05, 0.1, 0.2])
+def test_arcs_are_a_grid_of_all_speeds_and_the_turn_rates_within_reach(seconds):
     # One speed backwards and five of 0 to 0.2 m/s; 21 turn rates of -1 to 1 rad/s.
-    np.testing.assert_allclose(np.unique(samples[:, 0]), [-0.1, 0, 0.05, 0.1, 0.15, 0.2], atol=1e-6)
-    np.testing.assert_allclose(samples[:21, 1], 0.1 * np.arange(-10, 11), atol=1e-6)
-    assert len(np.unique(samples, axis=0)) == 126
+    speeds, turn_rates = [-0.1, 0, 0.05, 0.1, 0.15, 0.2], 0.1 * np.arange(-10, 11)
+    for present in np.linspace(-1.05, 1.05, 43):
+        samples = np.array(arcs_of(present, seconds)[0])
+        # Twice 3.2 rad/s^2 for 0.05, 0.1 and 0.2 s hold 0.32, 0.64 and 1.28 rad/s.
+        assert len(samples) == 6 * {0.05: 4, 0.1: 7, 0.2: 13}[seconds]
+        np.testing.assert_allclose(np.unique(samples[:, 0]), speeds, atol=1e-6)
+        tried = np.unique(samples[:, 1])
+        assert len(np.unique(samples, axis=0)) == 6 * len(tried) == len(samples)
+        in_reach = turn_rates[np.abs(turn_rates - present) <= 3.2 * seconds + 1e-6]
+        assert all(np.abs(tried - turn_rate).min() < 1e-6 for turn_rate in in_reach)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])

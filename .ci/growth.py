@@ -1,0 +1,128 @@
+"""Fails if a run needs much more than in the last baseline: in pairs, on this machine.
+
+Trains the preset `smoke` with this tree and with that of `.ci/baseline.json`, in turn and each with
+an empty cache. Whoever lets a figure grow on purpose renews the baseline and says why.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import pickle
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from jax import export
+
+from jaxsense.run import files
+
+_ROOT = Path(__file__).parents[1]
+_BASELINE = _ROOT / ".ci" / "baseline.json"
+_MOST = 1.1  # times the baseline
+_OPERATION = re.compile(r"^\s*(%[\w:#, %]+ = |return)", re.MULTILINE)
+
+
+@dataclasses.dataclass(frozen=True)
+class Needs:
+    """What a run needs.
+
+    Attributes:
+      cpu_s: seconds of all cores.
+      memory_mib: at the peak.
+      operations: of each traced program, by its name.
+    """
+
+    cpu_s: float
+    memory_mib: float
+    operations: dict[str, int]
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Each figure by its name."""
+        return {
+            "CPU seconds": self.cpu_s,
+            "peak memory [MiB]": self.memory_mib,
+            "programs": len(self.operations),
+            "operations of all programs": sum(self.operations.values()),
+        }
+
+
+def train(tree: Path, place: Path) -> Needs:
+    """Trains once in a tree of the source."""
+    command = [sys.executable, "-m", "jaxsense.train", "--preset", "smoke", "--quiet"]
+    command += ["--cache", str(place / "cache"), "--out", str(place / "run")]
+    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    process = subprocess.Popen(command, cwd=place, env=environment, stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        sys.exit(f"the training in {tree} has failed")
+    programs = (place / "cache" / "traced").glob("*.stablehlo")
+    operations = {path.name.rpartition("-")[0]: _operations(path) for path in programs}
+    return Needs(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, operations)
+
+
+def _operations(path: Path) -> int:
+    """Number of operations of a cached program, see `jaxsense.run.compilation.Kept`."""
+    _, flat = pickle.loads(files.without_digest(path.read_bytes()))
+    return len(_OPERATION.findall(export.deserialize(bytearray(flat)).mlir_module()))
+
+
+def least(runs: list[Needs]) -> Needs:
+    """The smallest figures of several runs of the same tree, as noise only adds to them."""
+    return Needs(
+        min(run.cpu_s for run in runs), min(run.memory_mib for run in runs), runs[0].operations
+    )
+
+
+def compare(before: Needs, now: Needs) -> list[str]:
+    """Prints both, program by program, and returns the names of the figures that have grown."""
+    for name in sorted(before.operations.keys() | now.operations.keys()):
+        old, new = (needs.operations.get(name, 0) for needs in (before, now))
+        print(f"{name:40} {old:10,} {new:10,} operations")
+    grown = []
+    for name, new in now.figures.items():
+        old = before.figures[name]
+        print(f"{name:40} {old:10,.0f} {new:10,.0f} {new / old:8.2f} x")
+        if new > _MOST * old:
+            grown.append(name)
+    return grown
+
+
+def main() -> None:
+    """The program."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--pairs", type=int, default=2, help="runs of each tree")
+    pairs = parser.parse_args().pairs
+    baseline = json.loads(_BASELINE.read_text(encoding="utf-8"))
+    commit = baseline["commit"]
+    has_commit = ["git", "-C", str(_ROOT), "cat-file", "-e", f"{commit}^{{commit}}"]
+    if subprocess.run(has_commit, capture_output=True, check=False).returncode:
+        print(f"this checkout does not hold {commit}, the baseline: nothing is compared")
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        old = place / "baseline"
+        old.mkdir()
+        archive = subprocess.run(
+            ["git", "-C", str(_ROOT), "archive", commit], capture_output=True, check=True
+        )
+        subprocess.run(["tar", "x", "-C", str(old)], input=archive.stdout, check=True)
+        runs: dict[Path, list[Needs]] = {old: [], _ROOT: []}
+        for i in range(pairs):
+            for j, (tree, needs) in enumerate(runs.items()):
+                (place / f"{i}-{j}").mkdir()
+                needs.append(train(tree, place / f"{i}-{j}"))
+    print(f"{'':40} {commit[:10]:>10} {'now':>10}")
+    grown = compare(least(runs[old]), least(runs[_ROOT]))
+    if grown:
+        sys.exit(
+            f"{', '.join(grown)}: more than {_MOST} times that of {commit[:10]}; renew "
+            f"{_BASELINE.relative_to(_ROOT)} and say why, or find the cause"
+        )
+
+
+if __name__ == "__main__":
+    main()
