@@ -25,7 +25,7 @@ from jaxsense.config.options import Name
 from jaxsense.interfaces import robot_numpy, robot_onnx
 from jaxsense.interfaces.onboard import Function, functions
 from jaxsense.mission import decide
-from jaxsense.mission.choice import choose
+from jaxsense.mission.choice import ask, choose
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
 from jaxsense.models import Models
 from jaxsense.run import cli, devices, rundir
@@ -164,7 +164,7 @@ def _observer(
         known = decide.known_to(scenario, models, state, index)
         return is_due, {
             "inputs": inputs,
-            "action": choose(key, config.mission, policy, models, known),
+            "action": choose(config.mission, ask(key, policy, models, known), known),
             "seen": state.seen,
             "poi": poi,
             "readings": readings,

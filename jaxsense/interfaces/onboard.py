@@ -10,7 +10,7 @@ from jaxsense.config import Config
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
 from jaxsense.dqn.team_mdp import Team
-from jaxsense.mission.choice import choose, times_to_new_looks
+from jaxsense.mission.choice import ask, choose, times_to_new_looks
 from jaxsense.models import Models, make_agent, make_jmvae
 from jaxsense.sim import sensors
 from jaxsense.vae import jmvae
@@ -207,10 +207,8 @@ def _decide(config: Config) -> Function:
             times=times_to_new_looks(config.team.travel, models.novelty, team, apart),
             robot=robot,
         )
-        return {
-            "action": choose(key, settings, policy, models, known),
-            "values": policy.values(key, models, known),
-        }
+        opinion = ask(key, policy, models, known)
+        return {"action": choose(settings, opinion, known), "values": opinion.values}
 
     pois: int | str = config.arena.num_pois
     if make_agent(config).plays(pois + 1):

@@ -1,10 +1,12 @@
 """Driving to a viewpoint, turning to the PoI, scanning it, and updating the map."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+from mujoco import mjx
 
 from jaxsense.core.types import Index, Key, call, others, pytree
 from jaxsense.mission import navigation, roadmap
@@ -77,7 +79,7 @@ def approach(
     poi, view = _target(mission, own), jnp.minimum(own.view, num_views - 1)
     position, standing = state.believed_poses[robot, :2], state.standing_robots(robot)
     length, waypoint = roadmap.next_waypoint(
-        config, state.scene.layout, state.roadmap, position, standing, poi, view
+        config, state.scene.layout, state.roadmap, own.to_view, position, standing, poi, view
     )
     to_goal = jnp.linalg.norm(state.roadmap.viewpoints[poi, view] - position)
     is_here = own.view == num_views
@@ -242,16 +244,21 @@ def scan(
     evidence = None if states.memory is None else Evidence(log_posterior, log_posterior)
     nothing = _Look(jnp.zeros(len(keys), bool), Learned(belief, log_posterior, evidence))
 
-    def look(i: int) -> _Look:
-        def look_in(rows: tuple[MissionState, _Aim], _) -> _Look:
-            look_one = lambda state, aim: _look(mission, models, robot, carried[i], state, aim)  # noqa: E731
-            return jax.vmap(look_one)(*rows)
-
-        return where_due(aims.scans & ~states.done, look_in, nothing, (states, aims), parts)
-
-    # The choice of the sensor outside the batch: inside, it would be traced over and over.
+    # The choice of the sensor outside the batch: inside, all would scan.
     which = jnp.array([carried.index(modality) for modality in of_robot])[robot]
-    looks = call(look, which, len(carried))
+
+    def look(rows: tuple[MissionState, _Aim], _) -> _Look:
+        states, aims = rows
+        place = lambda scene: arenas.place(mission.world.arena, scene.layout, scene.poses)  # noqa: E731
+        placed = jax.vmap(place)(states.scene)
+
+        def look_with(i: int) -> _Look:
+            look_one = functools.partial(_look, mission, models, robot, carried[i])
+            return jax.vmap(look_one)(states, aims, placed)
+
+        return call(look_with, which, len(carried))
+
+    looks = where_due(aims.scans & ~states.done, look, nothing, (states, aims), parts)
     write = jax.vmap(lambda state, aim, look: _write(mission, state, aim, look, robot))
     return write(states, aims, looks)
 
@@ -291,16 +298,16 @@ def _look(
     modality: int,
     state: MissionState,
     aim: _Aim,
+    placed: mjx.Data,
 ) -> _Look:
     """Simulates a scan; it detects a PoI that is there if the detector is confident enough."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
     search = mission.config.mission.localisation.search
     wide = tuple(searching.widened(each, search) for each in world.sensors)
     world = dataclasses.replace(world, sensors=wide)
-    data = arenas.place(world.arena, scene.layout, scene.poses)
     time = mission.time(state)
     readings = worlds.scan_around(
-        aim.noise_key, world, scene, data, robot, aim.bearing, modality, time
+        aim.noise_key, world, scene, placed, robot, aim.bearing, modality, time
     )
     is_blind = time >= state.faults.blind_at[robot]
     readings = jnp.where(is_blind, sensor.blind, readings)

@@ -122,7 +122,7 @@ def start(
         ),
         version=jnp.int32(0),
         memory=memory.empty(mission.modalities, num_classes) if own_maps else None,
-        robots=_idle_robots(num_robots, num_pois, paths.is_free.shape[1]),
+        robots=_idle_robots(num_robots, paths),
         steps=jnp.int32(0),
         contacts=jnp.int32(0),
         min_clearance=jnp.float32(jnp.inf),
@@ -139,14 +139,16 @@ def _check_faults(faults: Faults, num_robots: int) -> None:
         checks.require(f"faults.{name}", times, lambda x: x >= 0, expected)
 
 
-def _idle_robots(num_robots: int, num_pois: int, num_views: int) -> Robots:
+def _idle_robots(num_robots: int, paths: Roadmap) -> Robots:
     """Robots before their first decision."""
+    num_pois, num_views, num_nodes = paths.is_next.shape
     number = jnp.zeros(num_robots, jnp.int32)
     seconds = jnp.zeros(num_robots)
     return Robots(
         phase=jnp.full(num_robots, IDLE, jnp.int32),
         target=number + num_pois,
         view=number,
+        to_view=jnp.zeros((num_robots, num_nodes)),
         command=jnp.zeros((num_robots, 2)),
         wanted=jnp.zeros((num_robots, 2)),
         decided_on=number,

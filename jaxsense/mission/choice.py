@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import MissionConfig, TravelConfig
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import rules, team_mdp
 from jaxsense.dqn.policies import Known, Policy
 from jaxsense.dqn.team_mdp import Team
@@ -20,35 +20,62 @@ from jaxsense.vae.novelty import Novelty
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 
 
-@jax.named_scope("mission.choose")
-def choose(
-    key: Key,
-    settings: MissionConfig,
-    policy: Policy,
-    models: Models,
-    known: Known,
-) -> Int[Array, ""]:
-    """PoI that a robot's policy chooses, N for NOP, or -1 if any value is NaN.
+@pytree
+class Opinion:
+    """What a policy says to a robot that chooses.
+
+    Attributes:
+      values: `[A]` of the A = N + 1 actions, NOP's last.
+      gains: `[R, N]` of each robot's look at each PoI: above 0 if it pays.
+      counts_time: `[]` bool, see `Policy`.
+      is_unordered: `[]` bool, see `Policy`; without it, the gains are 0.
+    """
+
+    values: Float[Array, " A"]
+    gains: Float[Array, "R N"]
+    counts_time: Bool[Array, ""]
+    is_unordered: Bool[Array, ""]
+
+
+@jax.named_scope("mission.ask")
+def ask(key: Key, policy: Policy, models: Models, known: Known) -> Opinion:
+    """Asks a policy.
 
     Args:
       key: random key.
-      settings: the rules.
-      policy: what values looks.
+      policy: the policy.
       models: trained models.
+      known: what the robot knows.
+    """
+    of_robot = lambda robot: policy.gains(key, models, dataclasses.replace(known, robot=robot))  # noqa: E731
+    num_robots, num_pois = known.times.shape
+    gains = jnp.zeros((num_robots, num_pois))
+    return Opinion(
+        values=policy.values(key, models, known),
+        gains=jax.vmap(of_robot)(jnp.arange(num_robots)) if policy.is_unordered else gains,
+        counts_time=jnp.bool_(policy.counts_time(models.agent)),
+        is_unordered=jnp.bool_(policy.is_unordered),
+    )
+
+
+@jax.named_scope("mission.choose")
+def choose(settings: MissionConfig, opinion: Opinion, known: Known) -> Int[Array, ""]:
+    """PoI that a robot chooses, N for NOP, or -1 if any value is NaN.
+
+    Args:
+      settings: the rules.
+      opinion: of the robot's policy.
       known: what the robot knows; PoIs that are not present are never chosen.
     """
-    values, present = policy.values(key, models, known), known.team.present
+    values, present = opinion.values, known.team.present
     # Values that include travel time need no order.
-    counts_time = policy.counts_time(models.agent)
-    tolerance = jnp.where(counts_time, 0.0, settings.equal_values)
+    tolerance = jnp.where(opinion.counts_time, 0.0, settings.equal_values)
     of_pois, of_nop = jnp.where(present, values[:-1], -jnp.inf), values[-1]
     is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > of_nop)
-    choice = _by_values(settings, known, is_best)
-    if policy.is_unordered:
-        gains = _gains(key, policy, models, known)
-        by_auction = jnp.argmax(rules.auction(gains, known.times, known.team, known.robot))
-        is_auction = settings.auctions & jnp.logical_not(counts_time)
-        choice = jnp.where(is_auction, by_auction, choice)
+    by_values = _by_values(settings, known, is_best)
+    by_auction = jnp.argmax(rules.auction(opinion.gains, known.times, known.team, known.robot))
+    is_auction = settings.auctions & opinion.is_unordered & ~opinion.counts_time
+    choice = jnp.where(is_auction, by_auction, by_values)
     is_nan = jnp.any(jnp.isnan(of_pois)) | jnp.isnan(of_nop)
     return jnp.where(is_nan, -1, choice).astype(jnp.int32)
 
@@ -84,9 +111,3 @@ def _by_values(settings: MissionConfig, known: Known, is_best: Bool[Array, " N"]
     rank += _KEPT * heads[robot] + _HEADED_FOR * (is_others & settings.avoids_targets)
     poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
     return jnp.where(jnp.any(is_best), poi, pois.shape[0])
-
-
-def _gains(key: Key, policy: Policy, models: Models, known: Known) -> Float[Array, "R N"]:
-    """Expected gain of each robot's look at each PoI, by its policy: above 0 if it pays."""
-    of_robot = lambda robot: policy.gains(key, models, dataclasses.replace(known, robot=robot))  # noqa: E731
-    return jax.vmap(of_robot)(jnp.arange(known.team.poses.shape[0]))

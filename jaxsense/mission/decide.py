@@ -1,5 +1,7 @@
 """The choice of the PoI that a robot looks at next, and of the viewpoint."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -8,7 +10,7 @@ from jaxsense.core.types import Index, Key, call, pytree
 from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.mission import roadmap
-from jaxsense.mission.choice import choose, times_to_new_looks
+from jaxsense.mission.choice import Opinion, ask, choose, times_to_new_looks
 from jaxsense.mission.maps import map_of
 from jaxsense.mission.state import (
     BACKING,
@@ -50,8 +52,7 @@ def decide(
 ) -> MissionState:
     """Asks a robot's policy if a decision is due, and sets out for a viewpoint of the PoI.
 
-    If a value is NaN, the robot fails, with -1 for its target. For many missions, `decide_alike` is
-    faster than a `vmap` of this.
+    For many missions, `choices` and `set_out` are faster than a `vmap` of this.
 
     Args:
       key: random key.
@@ -61,20 +62,20 @@ def decide(
       robot: index of the robot.
     """
     alone = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
-    after = decide_alike(key[None], mission, models, alone, robot, alone.policy[0])
-    return jax.tree.map(lambda x: x[0], after)
+    chosen = choices(key[None], mission, models, alone, robot, alone.policy[0])[0]
+    return set_out(mission, models, state, robot, chosen)
 
 
-@jax.named_scope("mission.decide")
-def decide_alike(
+@jax.named_scope("mission.choices")
+def choices(
     keys: Key,
     mission: Mission,
     models: Models,
     states: MissionState,
     robot: Index,
     policy: Int[Array, ""],
-) -> MissionState:
-    """Decides as `decide` does, in B missions that have the same policy.
+) -> Int[Array, " B"]:
+    """What a robot chooses in each of B missions that have the same policy.
 
     Args:
       keys: `[B]` random keys.
@@ -85,25 +86,32 @@ def decide_alike(
       policy: `[]` int32 index into `mission.policies`.
 
     Returns:
-      The `[B]` next states.
+      `[B]` PoIs, see `choice.choose`.
     """
     policies, settings = [*mission.policies.values()], mission.config.mission
     known = jax.vmap(lambda state: known_to(mission, models, state, robot))(states)
 
-    def choices(index: int) -> Int[Array, " B"]:
-        chosen = lambda key, known: choose(key, settings, policies[index], models, known)  # noqa: E731
-        return jax.vmap(chosen)(keys, known)
+    def opinions_of(index: int) -> Opinion:
+        return jax.vmap(lambda key, known: ask(key, policies[index], models, known))(keys, known)
 
     # The choice of the policy outside the batch: inside, all would be asked.
-    actions = call(choices, policy, len(policies))
-    set_out = lambda state, action: _set_out(mission, models, state, robot, action)  # noqa: E731
-    return jax.vmap(set_out)(states, actions)
+    opinions = call(opinions_of, policy, len(policies))
+    return jax.vmap(functools.partial(choose, settings))(opinions, known)
 
 
-def _set_out(
+@jax.named_scope("mission.set_out")
+def set_out(
     mission: Mission, models: Models, state: MissionState, robot: Index, chosen: Int[Array, ""]
 ) -> MissionState:
-    """Sets out for a viewpoint of the PoI that a robot has chosen, if a decision is due."""
+    """Sets out for a viewpoint of the PoI that a robot has chosen, if a decision is due.
+
+    Args:
+      mission: the mission.
+      models: trained models.
+      state: the current state.
+      robot: index of the robot.
+      chosen: `[]` int32 PoI, N for NOP, or -1: then the robot fails, with -1 for its target.
+    """
     own, config = state.robot(robot), mission.config
     is_idle, decides = own.phase == IDLE, is_due(mission, state, robot)
     action = jnp.where(decides, chosen, own.target)
@@ -134,6 +142,7 @@ def _set_out(
     # Looks from the current position are not goals; an unreachable PoI is a missed goal.
     num_views = state.roadmap.viewpoints.shape[1]
     is_goal = (sets_out_now & (view < num_views)) | gives_up
+    to_view = state.roadmap.to_viewpoint(poi, jnp.minimum(view, num_views - 1))
     was_needless = decides & is_new & (own.phase == DRIVING) & (own.view < num_views)
     return state.with_robot(
         robot,
@@ -144,6 +153,7 @@ def _set_out(
         ),
         target=action,
         view=jnp.where(sets_out_now, view, own.view),
+        to_view=jnp.where(sets_out_now, to_view, own.to_view),
         decided_on=jnp.where(decides, map_of(mission, state, robot).version, own.decided_on),
         excluded=found.excluded,
         attempts=attempts,

@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Int, Shaped
 
 Row = TypeVar("Row")
 Result = TypeVar("Result")
@@ -40,37 +40,44 @@ def where_due(
     Returns:
       `[B, ...]` rows.
     """
-    kind_of_row = jnp.zeros(len(due), jnp.int32) if kinds is None else kinds
-    due, kind_of_row, before, inputs = jax.tree.map(
-        lambda x: x.reshape(parts, -1, *x.shape[1:]), (due, kind_of_row, before, inputs)
-    )
+    of_row = jnp.zeros(len(due), jnp.int32) if kinds is None else kinds
+    due, of_row = due.reshape(parts, -1), of_row.reshape(parts, -1)
     total, number = due.shape[1], jnp.sum(due, axis=1)
     size = min(total, max(_MIN_ROWS, total // 16))
-    order = jnp.argsort(jnp.where(due, kind_of_row, _NO_KIND), axis=1)
-
-    def rows_from(index: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Rows of each part at an index into its order, and their kinds."""
-        row = jnp.take_along_axis(order, jnp.minimum(index, total - 1), axis=1)
-        is_due = index < number[:, None]
-        return row, jnp.where(is_due, jnp.take_along_axis(kind_of_row, row, axis=1), _NO_KIND)
+    order = jnp.argsort(jnp.where(due, of_row, _NO_KIND), axis=1)
 
     def advance(carry: tuple[jax.Array, Result]) -> tuple[jax.Array, Result]:
         first, after = carry
-        row, kinds = rows_from(first[:, None] + jnp.arange(size)[None])
-        kind = jnp.min(kinds[:, 0])
-        taken = jax.tree.map(lambda x: jax.vmap(lambda x, row: x[row])(x, row), inputs)
-        new = function(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), taken), kind)
-        is_new = kinds == kind
+        index = first[:, None] + jnp.arange(size)[None]
+        row = jnp.take_along_axis(order, jnp.minimum(index, total - 1), axis=1)
+        kind_of = jnp.take_along_axis(of_row, row, axis=1)
+        kind_of = jnp.where(index < number[:, None], kind_of, _NO_KIND)
+        kind = jnp.min(kind_of[:, 0])
+        is_new = kind_of == kind
+        new = function(jax.tree.map(lambda x: _rows_of(x, row), inputs), kind)
         kept = jnp.where(is_new, row, total)  # drops the others
-
-        def put(rows: jax.Array, new: jax.Array) -> jax.Array:
-            new = new.reshape(parts, size, *new.shape[1:])
-            return jax.vmap(lambda rows, kept, new: rows.at[kept].set(new, mode="drop"))(
-                rows, kept, new
-            )
-
-        return first + jnp.sum(is_new, axis=1), jax.tree.map(put, after, new)
+        after = jax.tree.map(lambda x, new: _with_rows(x, kept, new), after, new)
+        return first + jnp.sum(is_new, axis=1), after
 
     some_left = lambda carry: jnp.any(carry[0] < number)  # noqa: E731
-    _, after = jax.lax.while_loop(some_left, advance, (jnp.zeros(parts, jnp.int32), before))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), after)
+    return jax.lax.while_loop(some_left, advance, (jnp.zeros(parts, jnp.int32), before))[1]
+
+
+def _rows_of(x: Shaped[Array, "B ..."], row: Int[Array, "P S"]) -> Shaped[Array, "PS ..."]:
+    """Rows of each of P parts of an array."""
+    get = lambda x, row: x.at[row].get(mode="promise_in_bounds", wrap_negative_indices=False)  # noqa: E731
+    if len(row) == 1:
+        return get(x, row[0])
+    of_parts = jax.vmap(get)(x.reshape(len(row), -1, *x.shape[1:]), row)
+    return of_parts.reshape(-1, *x.shape[1:])
+
+
+def _with_rows(
+    x: Shaped[Array, "B ..."], row: Int[Array, "P S"], new: Shaped[Array, "PS ..."]
+) -> Shaped[Array, "B ..."]:
+    """An array with new rows in each of P parts, except for those beyond the part's end."""
+    put = lambda x, row, new: x.at[row].set(new, mode="drop", wrap_negative_indices=False)  # noqa: E731
+    if len(row) == 1:
+        return put(x, row[0], new)
+    x_of, new_of = (each.reshape(len(row), -1, *each.shape[1:]) for each in (x, new))
+    return jax.vmap(put)(x_of, row, new_of).reshape(x.shape)

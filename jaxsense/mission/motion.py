@@ -1,13 +1,14 @@
 """Physics of one control period, in MJX."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
-from jaxsense.config import ArenaConfig
+from jaxsense.config import ArenaConfig, Config
 from jaxsense.core.types import pytree
 from jaxsense.mission import navigation
 from jaxsense.mission.groups import where_due
@@ -51,9 +52,7 @@ def move(
     poses = states.scene.poses
     far = jnp.full(poses.shape[0], jnp.inf)
     motion = _Motion(poses, states.velocity, states.warmstart, robots.command, far)
-    # For two robots that drive at each other, with a margin for the lag of the wheels.
-    reach = 2 * amiro.MAX_SPEED * config.mission.control_period + 0.005
-    is_near = (_clearance(config.arena, layout, poses) < reach) & ~states.done
+    is_near = _is_near(config, layout, poses) & ~states.done
     inputs = motion, robots.wanted, layout
     free = _integrate(mission, mission.free_arena, *inputs)
     among = lambda rows, _: _integrate(mission, mission.world.arena, *rows)  # noqa: E731
@@ -68,6 +67,15 @@ def move(
         min_clearance=jnp.minimum(states.min_clearance, motion.clearance),
     )
     return states, motion.clearance
+
+
+def _is_near(config: Config, layout: Layout, poses: Float[Array, "B R 3"]) -> Bool[Array, " B"]:
+    """Whether any robot can touch anything within the period."""
+    # Two robots may drive at each other; with a margin for the lag of the wheels.
+    reach, lag = amiro.MAX_SPEED * config.mission.control_period, 0.005
+    around = functools.partial(navigation.clearances, config.arena)
+    to_fixed, to_robot = jax.vmap(around)(layout, poses)
+    return jnp.any((to_fixed < reach + lag) | (to_robot < 2 * reach + lag), axis=-1)
 
 
 @jax.named_scope("mission.clearance")

@@ -75,6 +75,22 @@ def clearance(arena: ArenaConfig, layout: Layout, poses: Float[Array, "R 3"]) ->
     Returns:
       `[R]` metres from a robot's outline to the nearest wall, PoI or robot; negative inside one.
     """
+    return jnp.minimum(*clearances(arena, layout, poses))
+
+
+def clearances(
+    arena: ArenaConfig, layout: Layout, poses: Float[Array, "R 3"]
+) -> tuple[Float[Array, " R"], Float[Array, " R"]]:
+    """Free distance around each robot as in `clearance`, to what stands and to other robots.
+
+    Args:
+      arena: its sizes.
+      layout: the PoIs.
+      poses: `[R, 3]` of the robots.
+
+    Returns:
+      `[R]` metres to the nearest wall or PoI, and `[R]` to the nearest robot.
+    """
     chex.assert_shape(poses, (None, 3), custom_message="poses")
     x, y = poses[:, :1], poses[:, 1:2]
     to_wall = arena.side / 2 - jnp.max(jnp.abs(poses[:, :2]), axis=-1)
@@ -94,7 +110,7 @@ def clearance(arena: ArenaConfig, layout: Layout, poses: Float[Array, "R 3"]) ->
 
     apart = jnp.hypot(x - x.T, y - y.T) - amiro.BODY_RADIUS
     to_robot = jnp.min(jnp.where(jnp.eye(len(poses), dtype=bool), jnp.inf, apart), axis=-1)
-    return jnp.minimum(jnp.minimum(to_wall, to_poi), to_robot) - amiro.BODY_RADIUS
+    return jnp.minimum(to_wall, to_poi) - amiro.BODY_RADIUS, to_robot - amiro.BODY_RADIUS
 
 
 class _Arcs(NamedTuple):
@@ -345,7 +361,7 @@ def _arcs(settings: NavigationConfig, turn_rate: Float[Array, ""], seconds: floa
     def in_reach(of_turns: jax.Array, factor: np.ndarray) -> jax.Array:
         """Rows of all speeds, times a factor, and the turn rates in reach."""
         rows = jax.lax.dynamic_slice_in_dim(of_turns, first, number)[None]
-        return (factor[:, None, None] * rows).reshape(len(speeds) * number, -1)
+        return (jnp.asarray(factor)[:, None, None] * rows).reshape(len(speeds) * number, -1)
 
     once = np.ones_like(speeds)
     commands = jnp.concatenate([in_reach(jnp.ones_like(w), speeds), in_reach(w, once)], axis=1)

@@ -61,6 +61,18 @@ class Roadmap:
         apart = jnp.linalg.norm(places - nodes, axis=-1)
         return jnp.where(self.is_next[poi, view], apart, jnp.inf)
 
+    def to_viewpoint(self, poi: Index, view: Index) -> Float[Array, " K"]:
+        """Lengths of the shortest paths from the nodes to a viewpoint, in metres.
+
+        Args:
+          poi: index of the PoI.
+          view: index of the viewpoint.
+
+        Returns:
+          `[K]` metres; infinite where there is none.
+        """
+        return jnp.min(self.between + self.last(poi, view)[None], axis=1)
+
 
 def build(config: Config, layout: Layout) -> Roadmap:
     """Computes the viewpoints of a layout and the paths to them.
@@ -142,8 +154,9 @@ def next_waypoint(
     config: Config,
     layout: Layout,
     roadmap: Roadmap,
+    to_view: Float[Array, " K"],
     position: Float[Array, "2"],
-    others: Float[Array, "K 2"],
+    others: Float[Array, "S 2"],
     poi: Index,
     view: Index,
 ) -> tuple[Float[Array, ""], Float[Array, "2"]]:
@@ -153,8 +166,9 @@ def next_waypoint(
       config: all settings.
       layout: the PoIs.
       roadmap: of the layout.
+      to_view: `[K]` lengths from the nodes, see `Roadmap.to_viewpoint`.
       position: `[2]` of a robot in metres, see `lengths`.
-      others: `[K, 2]` positions of standing robots, in metres, which cannot be waypoints.
+      others: `[S, 2]` positions of standing robots, in metres, which cannot be waypoints.
       poi: index of the PoI.
       view: index of the viewpoint.
 
@@ -168,8 +182,7 @@ def next_waypoint(
     apart = jnp.linalg.norm(ends[:, None] - others[None], axis=-1)
     is_taken = jnp.any(apart < 2 * config.navigation.robot_radius, axis=-1)
     # Of two nodes on one path the farther one, or a robot that has reached a node would stay there.
-    remaining = jnp.min(roadmap.between + roadmap.last(poi, view)[None], axis=1)
-    remaining = jnp.append(0.0, 1.001 * remaining)
+    remaining = jnp.append(0.0, 1.001 * to_view)
     total = first + jnp.where(roadmap.is_free[poi, view], remaining, jnp.inf)
     total = jnp.where(is_taken, jnp.inf, total)
     best = jnp.argmin(total)

@@ -154,17 +154,20 @@ def _act(
 ) -> tuple[MissionState, Course]:
     """Decides, sets a course and scans for one robot of each of B missions."""
 
-    def choose(rows: tuple[Key, MissionState], policy: Int[Array, ""]) -> Robots:
+    def choose(rows: tuple[Key, MissionState], policy: Int[Array, ""]) -> Int[Array, " B"]:
         keys, states = rows
-        return decide.decide_alike(keys, mission, models, states, robot, policy).robots
+        return decide.choices(keys, mission, models, states, robot, policy)
+
+    def set_out(rows: tuple[MissionState, Int[Array, " B"]], _) -> Robots:
+        alone = lambda state, chosen: decide.set_out(mission, models, state, robot, chosen)  # noqa: E731
+        return jax.vmap(alone)(*rows).robots
 
     choice_keys, scan_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     states = jax.vmap(lambda state: _fail(mission, state, robot))(states)
-    due = jax.vmap(lambda state: decide.is_due(mission, state, robot))(states)
-    inputs = choice_keys, states
-    robots = where_due(
-        due & ~states.done, choose, states.robots, inputs, parts, kinds=states.policy
-    )
+    due = jax.vmap(lambda state: decide.is_due(mission, state, robot))(states) & ~states.done
+    inputs, targets = (choice_keys, states), states.robots.target[:, robot]
+    chosen = where_due(due, choose, targets, inputs, parts, kinds=states.policy)
+    robots = where_due(due, set_out, states.robots, (states, chosen), parts)
     states = dataclasses.replace(states, robots=robots)
     states, course = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
     return act.scan(scan_keys, mission, models, states, robot, parts), course

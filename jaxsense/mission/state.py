@@ -46,6 +46,7 @@ class Robots:
       phase: int32, one of IDLE to FAILED.
       target: int32 PoI, N for none, or -1 if the policy's values were NaN.
       view: int32 viewpoint of the target, or V for the robot's current position.
+      to_view: `[R, K]` length of the path to it from each node of the roadmap, in metres.
       command: `[R, 2]` current speeds, see `navigation`.
       wanted: `[R, 2]` target speeds.
       decided_on: int32 version of the map at the last decision.
@@ -69,6 +70,7 @@ class Robots:
     phase: Int[Array, " R"]
     target: Int[Array, " R"]
     view: Int[Array, " R"]
+    to_view: Float[Array, "R K"]
     command: Float[Array, "R 2"]
     wanted: Float[Array, "R 2"]
     decided_on: Int[Array, " R"]

@@ -11,6 +11,10 @@ _CHUNK_TIME = 2.5  # s
 # Missions side by side on each thread of a CPU or on each accelerator.
 _LEAST_OF_CPU, _MOST_OF_CPU, _CACHE = 8, 192, 2**26  # bytes
 _MOST_OF_ACCELERATOR, _SHARE_OF_MEMORY = 32768, 0.05
+# A control step of so many missions takes an accelerator twice as long as that of a few. With T
+# missions, B of which play at once, the time is about (T / B + 1) * (1 + B / this): B squared is
+# this times T at its minimum.
+_AS_LONG_AS_NONE = 8192
 _MANY_POIS = 2**14  # of all missions; on a CPU, one takes some 3 ms of a core
 
 
@@ -28,8 +32,8 @@ def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
       workers: share the missions.
 
     Returns:
-      On a CPU fewer than all, since some last long, and no more than its caches hold; on an
-      accelerator as many as fit into a small part of its memory.
+      Fewer than all, since some last long: on a CPU no more than its caches hold; on an accelerator
+      more, the more there are, as far as they fit into a small part of its memory.
 
     Raises:
       ValueError: if `total` is not a number greater than 0.
@@ -40,7 +44,8 @@ def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
         most = min(_MOST_OF_CPU, max(_LEAST_OF_CPU, _CACHE // _bytes_of_state(config)))
         return min(most * workers.number, -(-total // 3))
     share = int(_SHARE_OF_MEMORY * memory) // _bytes_of_state(config)
-    return min(total, min(_MOST_OF_ACCELERATOR, share) * workers.number)
+    pays = math.isqrt(_AS_LONG_AS_NONE * total * workers.number)
+    return min(total, pays, min(_MOST_OF_ACCELERATOR, share) * workers.number)
 
 
 def _bytes_of_state(config: Config) -> int:

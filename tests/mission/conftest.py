@@ -50,7 +50,13 @@ def set_robot():
         robots = {name: np.array(getattr(state.robots, name)) for name in values}
         for name, value in values.items():
             robots[name][robot] = value
-        return replace(state, robots=replace(state.robots, **robots))
+        state = replace(state, robots=replace(state.robots, **robots))
+        if "view" not in values:
+            return state
+        ways, own = state.roadmap, state.robot(robot)
+        view = jnp.minimum(own.view, ways.is_free.shape[1] - 1)
+        to_view = state.robots.to_view.at[robot].set(ways.to_viewpoint(own.target, view))
+        return replace(state, robots=replace(state.robots, to_view=to_view))
 
     return change
 

@@ -62,7 +62,7 @@ def driven():
             waypoint = goal
             if by_map:
                 far = jnp.full((1, 2), 1e3)
-                args = poses[0, :2], far, poi, view
+                args = ways.to_viewpoint(poi, view), poses[0, :2], far, poi, view
                 _, waypoint = roadmap.next_waypoint(CONFIG, layout, ways, *args)
             args = poses, commands, 0, waypoint, PERIOD, jnp.bool_(False)
             wanted = navigation.drive_to(SETTINGS, ARENA, layout, *args)

@@ -93,7 +93,7 @@ def test_a_batch_moves_like_its_members(move, pushing):
 
 def test_where_nothing_can_be_touched_the_empty_arena_gives_the_same_motion(move, pushing):
     # The second robot could touch the PoI, but does not.
-    start = pushing(0.05, 0.04, 0.002)
+    start = pushing(0.05, 0.022, 0.002)
     empty, full, _ = way(start, move(start)[0])
     assert empty > 1e-3
     np.testing.assert_allclose(empty, full, atol=1e-6)

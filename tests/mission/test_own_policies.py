@@ -94,9 +94,8 @@ def test_every_policy_of_the_table_is_played(own, decides, models, arena_of):
     key, settings = jax.random.key(0), CONFIG.mission
     known = decide.known_to(own, models, state, 0)
     assert [*own.policies] == [*POLICIES, *OWN]
-    choose_all = jax.jit(
-        lambda: [choice.choose(key, settings, p, models, known) for p in own.policies.values()]
-    )
+    opinions = lambda: [choice.ask(key, p, models, known) for p in own.policies.values()]  # noqa: E731
+    choose_all = jax.jit(lambda: [choice.choose(settings, each, known) for each in opinions()])
     chosen = np.array(choose_all())
     played = [decides(replace(state, policy=jnp.int32(i))) for i in range(len(chosen))]
     np.testing.assert_array_equal([after.robots.target[0] for after in played], chosen)

@@ -29,13 +29,26 @@ RING = np.concatenate([np.zeros((1, 2)), 0.6 * np.stack([np.cos(ANGLES), np.sin(
 build = jax.jit(roadmap.build, static_argnums=0)
 lengths = jax.jit(roadmap.lengths, static_argnums=0)
 reachable = jax.jit(roadmap.reachable, static_argnums=0)
-next_waypoint = jax.jit(roadmap.next_waypoint, static_argnums=0)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def next_waypoint(config, layout, ways, position, others, poi, view):
+    to_view = ways.to_viewpoint(poi, view)
+    return roadmap.next_waypoint(config, layout, ways, to_view, position, others, poi, view)
 
 
 @jax.jit
 def last_parts(ways):
     """`[N, V, K]` lengths from nodes straight to viewpoints."""
     return jax.vmap(lambda poi: ways.last(poi, slice(None)))(jnp.arange(len(ways.viewpoints)))
+
+
+@jax.jit
+def to_viewpoints(ways):
+    """`[N, V, K]` lengths from nodes to viewpoints."""
+    of_views = jax.vmap(ways.to_viewpoint, (None, 0))
+    pois, views = (jnp.arange(number) for number in ways.is_free.shape)
+    return jax.vmap(of_views, (0, None))(pois, views)
 
 
 def planned(config, positions):
@@ -224,7 +237,7 @@ def followed():
         view = jnp.argmax(jnp.where(jnp.isfinite(length), draws, -1.0))
 
         def step(place, _):
-            left, waypoint = roadmap.next_waypoint(CONFIG, layout, ways, place, FAR_AWAY, poi, view)
+            left, waypoint = next_waypoint(CONFIG, layout, ways, place, FAR_AWAY, poi, view)
             away = waypoint - place
             share = jnp.minimum(0.02 / jnp.maximum(jnp.linalg.norm(away), 1e-9), 1.0)
             return place + share * away, (place, left)
@@ -324,8 +337,8 @@ def test_ways_are_the_shortest_that_dijkstra_finds(arena, seed):
     shortest = csgraph.dijkstra(graph, indices=np.arange(len(nodes), len(starts)))
     assert np.isfinite(edges[: len(nodes)]).mean() < 0.7
     expected = shortest[:, : len(nodes)]
-    between, last = (np.asarray(x) for x in (ways.between, last_parts(ways)))
-    found = np.min(last[ways.is_free][:, None] + between[None], axis=-1)
+    between, last = ways.between, np.asarray(last_parts(ways))
+    found = np.asarray(to_viewpoints(ways))[ways.is_free]
     np.testing.assert_allclose(found, expected, atol=1e-5)
     np.testing.assert_array_equal(last[~ways.is_free], np.inf)
     leads = np.isfinite(last[:, :, None] + between).any(axis=(1, 3))
@@ -425,7 +438,7 @@ def test_a_robot_that_is_alone_has_a_next_waypoint():
     [
         lambda plan, place: roadmap.lengths(*plan, place, 0),
         lambda plan, place: roadmap.reachable(*plan, place),
-        lambda plan, place: roadmap.next_waypoint(*plan, place, FAR_AWAY, 0, 0),
+        lambda plan, place: next_waypoint(*plan, place, FAR_AWAY, 0, 0),
     ],
     ids=["lengths", "reachable", "next_waypoint"],
 )
