@@ -1,7 +1,9 @@
 """What every row is measured with: compile time apart, both sides in turn, medians."""
 
 import dataclasses
+import datetime
 import importlib.metadata
+import os
 import platform
 import statistics
 import time
@@ -13,7 +15,7 @@ import jax
 from jax.sharding import NamedSharding, PartitionSpec
 from matplotlib.figure import Figure
 
-from jaxsense.run import cli, devices
+from jaxsense.run import cli, devices, version
 from jaxsense.run.devices import Workers
 from jaxsense.show.plots import png
 
@@ -88,11 +90,20 @@ class Row:
     is_bound: bool = False
 
     def as_json(self) -> dict[str, Any]:
-        """The public keys; the name of a peer that was stopped says so."""
+        """The public keys, and when, where and how it was measured.
+
+        The name of a peer that was stopped says so.
+        """
         values = dataclasses.asdict(self)
         if values.pop("is_bound"):
             values["peer"] = f"{self.peer} (stopped)"
-        return values
+        return {
+            **values,
+            "commit": version.commit(),
+            "date": datetime.date.today().isoformat(),
+            "cores": os.cpu_count(),
+            "command": f"python -m benchmarks {self.row}" + (" --peers" if self.peer else ""),
+        }
 
 
 def batches(
@@ -149,6 +160,7 @@ def compiled(
     work: float,
     batch: int,
     workers: Workers = devices.ALONE,
+    wide_vectors: bool = False,
 ) -> Side:
     """Compiles a function for its arguments; the side runs it on them and blocks on the outputs.
 
@@ -160,8 +172,9 @@ def compiled(
         args = jax.device_put(args, NamedSharding(workers.mesh, PartitionSpec(devices.AXIS)))
     threads = workers.threads
     parts = [devices.part(args, i, threads) for i in range(threads)]
+    options = devices.compiler_options(runs_long=True, wide_vectors=wide_vectors)
     begin = time.perf_counter()
-    program = jax.jit(function).lower(*parts[0]).compile(devices.compiler_options(runs_long=True))
+    program = jax.jit(function).lower(*parts[0]).compile(options)
     compile_s = time.perf_counter() - begin
 
     def run() -> list[Any]:

@@ -70,6 +70,7 @@ def resets_many(options: Options) -> Row:
             work=batch,
             batch=batch,
             workers=devices.start(None),
+            wide_vectors=True,
         )
         for batch in sizes
     ]

@@ -1,8 +1,10 @@
 """The loop that drives the stages of a training from the host."""
 
+import gc
 import signal
 import subprocess
 import sys
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -84,6 +86,31 @@ def test_stages_are_given_what_those_before_return(toy):
     np.testing.assert_array_equal(found.outputs["survey"]["y"], [13, 13])
     # 3 * 12 + 13
     np.testing.assert_array_equal(found.outputs["both"], [49, 49])
+
+
+def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, monkeypatch):
+    double = lambda key, config, x: 2 * x  # noqa: E731
+    stages = [
+        Stage("first", lambda key, config: jnp.ones(3), is_passing=True),
+        Stage("second", double, {"x": "first"}),
+        Stage("third", double, {"x": "second"}),
+        Stage("fourth", double, {"x": "third"}),
+    ]
+    begun, alive, begin = {}, {}, loop._Loop._begin
+
+    def watched(self, stage, inputs):
+        gc.collect()
+        alive[stage.name] = [name for name, output in begun.items() if output() is not None]
+        output = begin(self, stage, inputs)
+        begun[stage.name] = weakref.ref(output)
+        return output
+
+    monkeypatch.setattr(loop._Loop, "_begin", watched)
+    found, _, _ = toy(*stages)
+    assert alive["second"] == ["first"]
+    assert alive["fourth"] == ["second", "third"]
+    assert [*found.outputs] == ["second", "third", "fourth"]
+    np.testing.assert_array_equal(found.outputs["fourth"], [8, 8, 8])
 
 
 def test_what_was_saved_is_not_trained_again(toy):

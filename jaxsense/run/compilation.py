@@ -246,18 +246,18 @@ class Program:
         self,
         function: Function,
         *args: PyTree,
-        runs_long: bool = False,
         workers: Workers = ALONE,
         whole: tuple[int, ...] = (),
+        **options: bool,
     ) -> PyTree[jax.ShapeDtypeStruct]:
         """Traces a function, unless its trace is cached, and starts to compile it.
 
         Args:
           function: what to compile.
           *args: arguments or their shapes, for example the result of another program's `compile`.
-          runs_long: see `devices.compiler_options`.
           workers: share the rows of the arguments; their number must divide the rows.
           whole: positions of arguments that every worker gets undivided.
+          **options: see `devices.compiler_options`.
 
         Returns:
           Shapes and dtypes of the results.
@@ -276,8 +276,7 @@ class Program:
         def compile_lowered() -> None:
             begin = time.perf_counter()
             try:
-                options = devices.compiler_options(runs_long=runs_long)
-                compiled = lowered.compile(compiler_options=options)
+                compiled = lowered.compile(compiler_options=devices.compiler_options(**options))
             except Exception as error:
                 self.fail(error)
                 return

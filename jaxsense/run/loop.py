@@ -1,6 +1,7 @@
 """Drives a training from the host: stage after stage, chunk after chunk."""
 
 import dataclasses
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -24,7 +25,7 @@ class Trained:
     """The results of a training.
 
     Attributes:
-      outputs: of every stage, by its name.
+      outputs: by the name of the stage, but of none that only passes it on.
       curves: of every stage with steps: `[steps]` of each metric, and `seconds` of each chunk.
     """
 
@@ -65,6 +66,33 @@ def train(
             raise
 
 
+class _Held:
+    """The output of a stage, until all stages that need it are done."""
+
+    def __init__(self, users: int, is_passing: bool):
+        self.output: Output = None
+        self._users, self._is_passing = users, is_passing
+        self._lock = threading.Lock()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nobody needs the output any longer."""
+        return self._is_passing and self._users == 0
+
+    def put(self, output: Output) -> None:
+        """Holds the output, if anybody needs it."""
+        with self._lock:
+            if not self.is_over:
+                self.output = output
+
+    def used(self) -> None:
+        """Notes that one of the stages that need the output is done."""
+        with self._lock:
+            self._users -= 1
+            if self.is_over:
+                self.output = None
+
+
 class _Loop:
     """One training."""
 
@@ -82,10 +110,15 @@ class _Loop:
         self._checkpoints, self._saver = checkpoints, saver
         self._saving: list[Future[None]] = []
         self._curves: dict[str, Curves] = {}
+        stages = programs.stages
+        self._held = {
+            stage.name: _Held(sum(stage.name in each.sources for each in stages), stage.is_passing)
+            for stage in stages
+        }
 
     def run(self) -> Trained:
         """Runs all stages."""
-        stages, done = self._programs.stages, dict[str, Future[Output]]()
+        stages, done = self._programs.stages, dict[str, Future[None]]()
         with ThreadPoolExecutor(len(stages)) as threads:
             for stage in stages:
                 before = {name: done[name] for name in stage.sources}
@@ -93,7 +126,9 @@ class _Loop:
             # A wait without timeout may not notice Ctrl-C.
             while wait(done.values(), timeout=0.2).not_done:
                 pass
-        outputs = {name: future.result() for name, future in done.items()}
+        for future in done.values():
+            future.result()
+        outputs = {name: held.output for name, held in self._held.items() if not held.is_over}
         self._monitor.check_stop()
         self.wait_for_saving()
         return Trained(outputs, self._curves)
@@ -103,13 +138,23 @@ class _Loop:
         for each in self._saving:
             each.result()
 
-    def _run_stage(self, stage: Stage, before: dict[str, Future[Output]]) -> Output:
+    def _run_stage(self, stage: Stage, before: dict[str, Future[None]]) -> None:
+        """Finds the output of a stage, and lets go of those that no other stage needs."""
+        try:
+            self._held[stage.name].put(self._output(stage, before))
+        finally:
+            for name in before:
+                self._held[name].used()
+
+    def _output(self, stage: Stage, before: dict[str, Future[None]]) -> Output:
         """The output of a stage, loaded if it was saved."""
         try:
             found = self._load(stage) if is_saved(stage) else None
             if found is not None:
                 return found
-            inputs = stage.select({name: future.result() for name, future in before.items()})
+            for future in before.values():
+                future.result()
+            inputs = stage.select({name: self._held[name].output for name in before})
             self._monitor.check_stop()
             output = self._begin(stage, inputs)
             if stage.chunks:

@@ -200,6 +200,7 @@ class Player:
             workers=together,
             whole=whole,
             runs_long=runs_long,
+            wide_vectors=runs_long,
         )
         self._go_on = Program(compiler, "mission", "go_on")
         _, self._found, _ = self._go_on.compile(
@@ -213,6 +214,7 @@ class Player:
             workers=together,
             whole=whole,
             runs_long=runs_long,
+            wide_vectors=runs_long,
         )
 
     def wait(self) -> None:

@@ -15,6 +15,8 @@ from jaxsense.training import histories
 from jaxsense.training.perception import Detections
 from jaxsense.vae import calibration, latent
 
+_HISTORIES_AT_ONCE = 512
+
 
 def detector_metrics(
     key: Key, config: Config, *, detections: Detections
@@ -213,12 +215,16 @@ def beliefs(
         found = jnp.log(fusion.class_probabilities(belief))
         return (belief, log_posterior, seen), (found, log_posterior, jnp.linalg.norm(belief.std))
 
-    def history(key: Key, true_class: jax.Array):
+    def history(drawn: tuple[Key, jax.Array]):
         start = fusion.prior, exact.prior, jnp.zeros(len(bank), bool)
-        return jax.lax.scan(look, start, histories.draw(key, bank, true_class))[1]
+        return jax.lax.scan(look, start, histories.draw(drawn[0], bank, drawn[1]))[1]
 
     truth = jnp.arange(num_histories) % number
-    found, log_posterior, norms = jax.vmap(history)(jax.random.split(key, num_histories), truth)
+    # All at once would take a third of a run's memory. Groups of one size are traced once.
+    sizes = [s for s in range(1, _HISTORIES_AT_ONCE + 1) if num_histories % s == 0]
+    found, log_posterior, norms = jax.lax.map(
+        history, (jax.random.split(key, num_histories), truth), batch_size=sizes[-1]
+    )
     right = jnp.arange(number)[None, None] == truth[:, None, None]
     entropy = -jnp.sum(jnp.exp(log_posterior) * log_posterior, axis=-1)
 

@@ -59,6 +59,8 @@ class Stage:
       steps: number of steps.
       chunks: number of calls of `advance`; the last one may have fewer steps.
       is_optional: whether the stage may diverge, because a later one picks a finite one of several.
+      is_passing: whether only other stages need the output, so that a run holds it no longer than
+        they do.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Stage:
     steps: int = 0
     chunks: int = 0
     is_optional: bool = False
+    is_passing: bool = False
 
     @property
     def sources(self) -> tuple[str, ...]:

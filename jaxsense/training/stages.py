@@ -39,9 +39,9 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
         for m, name in enumerate(config.modalities)
     }
     return [
-        Stage("scenes", perception.draw_scenes),
+        Stage("scenes", perception.draw_scenes, is_passing=True),
         perception.survey_stage(arena),
-        Stage("examples", perception.split_examples, {"surveys": "survey"}),
+        Stage("examples", perception.split_examples, {"surveys": "survey"}, is_passing=True),
         *_LEARNS_FROM[config.jmvae.learns_from](config, arena),
         Stage("detector_metrics", measures.detector_metrics, detections),
         *fusions.make_stages(config),

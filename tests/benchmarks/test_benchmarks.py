@@ -17,6 +17,7 @@ from jaxsense.run import devices
 QUICK = ("rays", "jmvae")
 KEYS = {
     "row", "unit", "ours", "peer", "theirs", "ratio", "compile_s", "device", "batch", "versions",
+    "commit", "date", "cores", "command",
 }  # fmt: skip
 PEERS = {
     "jmvae": "multivae",
