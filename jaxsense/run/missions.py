@@ -240,6 +240,8 @@ class Player:
             self._monitor.check_finite("mission", "models", models)
             self.wait()
             begin = time.perf_counter()
+            # Loaded models lie on the host, and every chunk would transfer them again.
+            models = jax.device_put(models)
             call = _Call(key, models, played, episodes, self._found.metrics)
             devices.side_by_side(lambda lane: self._play(call, lane), self._workers.threads)
             self._monitor.add("mission", "run_s", time.perf_counter() - begin)
