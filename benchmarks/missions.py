@@ -56,7 +56,7 @@ def _play(name: str, options: Options, config: Config, accelerator: int) -> Row:
 
 def resets_many(options: Options) -> Row:
     """The beginning of missions with 16 PoIs in an arena of 6 m."""
-    sizes = measure.batches(options, quick=2, cpu=(384,), accelerator=(8192,))
+    sizes = measure.batches(options, quick=2, cpu=(64, 384), accelerator=(8192,))
     config = of_many_pois()
     scenario, models = mission.make_mission(config), init(jax.random.key(0), config)
 
