@@ -29,9 +29,10 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("run", type=Path, help="directory of a run, for the sizes of PoIs")
     parser.add_argument("recording", type=Path, help="new file of NumPy's format .npz")
     parser.add_argument("--logs", type=Path, default=rawlog.DIRECTORY, help="directory of the logs")
+    parser.add_argument("--trust", action="store_true", help="import the run's own sensors")
     arguments = parser.parse_args(argv)
     try:
-        config, _ = jaxsense.load(arguments.run)
+        config, _ = jaxsense.load(arguments.run, arguments.trust)
         scans = rawlog.read_logs(arguments.logs)
         errors = sim.recorded.errors(config, scans.angles, scans.ranges)
 

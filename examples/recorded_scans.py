@@ -9,7 +9,7 @@ Your own recording can come from anywhere. It must hold, for C PoIs:
 
     places      [C, 2]       their positions, in metres
     NAME_poses  [C, 3]       from where the sensor NAME looked: x, y in metres and yaw in radians
-    NAME_scans  [C, B, ...]  what all its B rays read
+    NAME_scans  [C, B, ...]  what all its B rays read: metres, or linear RGB from 0 to 1
     NAME_angles [B]          their directions in radians, if they are not those of the run
 
 A sensor may be missing. Scans along other rays are resampled; `laser_logs.py` makes some of real
@@ -49,6 +49,10 @@ def read(config: jaxsense.Config, models: jaxsense.Models, looks: RecordedLooks)
                 print(f"  {sensor.name}: nothing there")
                 continue
             features = detection.features
+            # Missions keep such a look off the map.
+            if features.max() < config.mission.least_confidence:
+                print(f"  {sensor.name}: uncertain, {features.max():.2f} at most")
+                continue
 
             # What it says alone, and with the looks of other sensors before it.
             alone = fusion.together({m: features})

@@ -45,6 +45,24 @@ def test_bearing_and_distance_follow_from_poses(write):
     np.testing.assert_allclose(bearing, expected, atol=1e-6)
 
 
+def test_the_bytes_of_an_image_are_not_taken_for_brightness(write):
+    pixels = np.full((3, *sim.sensors.make(CONFIG)[0].angles.shape, 3), 200, np.uint8)
+    path = write(camera_poses=POSES, camera_scans=pixels)
+    with pytest.raises(ValueError, match=r"^camera_scans holds whole numbers \(uint8\); must be "):
+        recordings.read(CONFIG, path)
+    recordings.read(CONFIG, write(camera_poses=POSES, camera_scans=pixels / 255))
+
+
+def test_a_recording_that_was_compressed_and_damaged_is_named(tmp_path):
+    path = tmp_path / "recorded.npz"
+    np.savez_compressed(path, places=np.random.default_rng(0).normal(size=(500, 2)))
+    content = bytearray(path.read_bytes())
+    content[200:400] = bytes(200)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"is not a whole file of NumPy's format \.npz"):
+        recordings.read(CONFIG, path)
+
+
 def test_a_sensor_may_be_missing_and_have_other_rays(write):
     looks = recordings.read(CONFIG, write())
     assert [*looks.scans] == [*looks.poses] == ["lidar"]

@@ -9,6 +9,7 @@ import dataclasses
 import gzip
 import re
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +57,11 @@ def read(path: Path | str) -> LaserScans:
         several scanners.
     """
     content = Path(path).read_bytes()
-    while content.startswith(b"\x1f\x8b"):
-        content = gzip.decompress(content)
+    try:
+        while content.startswith(b"\x1f\x8b"):
+            content = gzip.decompress(content)
+    except (EOFError, zlib.error) as error:
+        raise ValueError(f"{path} is not a whole file of gzip: {error}") from None
     try:
         scans = [_scan(content, found) for found in _SCAN.finditer(content)]
     except (struct.error, ValueError) as error:

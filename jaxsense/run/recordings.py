@@ -2,6 +2,7 @@
 
 import dataclasses
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
 
         places       [C, 2]       their positions, in metres
         NAME_poses   [C, 3]       from where the sensor NAME looked: x, y in metres, yaw in radians
-        NAME_scans   [C, A, ...]  what all its A rays read
+        NAME_scans   [C, A, ...]  what all its A rays read: metres, or linear RGB from 0 to 1
         NAME_angles  [A]          their directions in radians, if they are not those of the run
 
     A sensor may be missing, but not all. Scans along other rays are resampled, see
@@ -63,7 +64,7 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
     try:
         with np.load(file, allow_pickle=False) as content:
             found = dict(content)
-    except (zipfile.BadZipFile, TypeError, EOFError):
+    except (zipfile.BadZipFile, zlib.error, TypeError, EOFError, ValueError):
         raise ValueError(f"{file} is not a whole file of NumPy's format .npz") from None
     made = sensors.make(config)
     parts = [f"{sensor.name}_{part}" for sensor in made for part in ("poses", "scans")]
@@ -83,6 +84,9 @@ def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
     _require_shape(found, f"{sensor.name}_poses", ("C", 3))
     name, angles = f"{sensor.name}_scans", f"{sensor.name}_angles"
     channels = () if sensor.channels == 1 else (sensor.channels,)
+    if name in found and sensor.channels == 3 and found[name].dtype.kind in "iu":
+        expected = "linear RGB from 0 to 1: divide bytes by 255 and undo their gamma"
+        raise ValueError(f"{name} holds whole numbers ({found[name].dtype}); must be {expected}")
     if angles not in found:
         others = f"; of other rays, {angles} must hold the angles, in radians"
         _require_shape(found, name, ("C", len(sensor.angles), *channels), others)

@@ -254,7 +254,14 @@ def retrain(
 
     Returns:
       The detector with other parameters; its gate is the same.
+
+    Raises:
+      TypeError: if the detector is an encoder of scans, which learns without labels.
     """
+    if not isinstance(detector, Classifier):
+        kind = type(detector).__name__
+        raise TypeError(f"detector is a {kind}; must be a Classifier, which learns from labels")
+    windows, labels = jnp.asarray(windows), jnp.asarray(labels)
     chex.assert_equal_shape_prefix([windows, labels], 1)
     number = config.num_training(len(labels))
     problem = Fitting(config, detector, windows[:number], labels[:number])

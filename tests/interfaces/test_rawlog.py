@@ -80,3 +80,11 @@ def test_logs_of_debian_hold_704_scans():
     np.testing.assert_allclose(100 * ranges, np.round(100 * ranges), atol=0.01)
     assert 0.1 <= ranges.min() < ranges.max() < 82.0
     assert 0.9 < ranges.size / found.ranges.size < 1.0
+
+
+@pytest.mark.parametrize("damage", [lambda x: x[:-9], lambda x: x[:20] + b"\xff" * 30 + x[50:]])
+def test_a_log_that_is_not_whole_is_named(log, damage):
+    path = log(scan(np.ones(300), np.ones(300)))
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ValueError, match=f"{path} is not a whole file of gzip: "):
+        rawlog.read(path)

@@ -206,3 +206,15 @@ def test_retraining_moves_no_farther_than_serves_windows_kept_from_it(trained):
     wrong = jnp.where(jnp.arange(200) < 150, 1 - labels, labels)
     same = retrain(jax.random.key(9), detector, windows, wrong)
     assert accuracy(same, windows, labels) >= accuracy(detector, windows, labels) - 0.01
+
+
+def test_windows_and_labels_to_retrain_with_may_be_those_of_numpy(trained):
+    windows, labels = synthetic_windows(jax.random.key(5), 40)
+    config = replace(CONFIG, steps=2)
+    of_numpy, of_jax = (
+        detectors.retrain(jax.random.key(7), trained[1], *data, config)
+        for data in ((np.array(windows), np.array(labels)), (windows, labels))
+    )
+    jax.tree.map(np.testing.assert_array_equal, of_numpy.params, of_jax.params)
+    with pytest.raises(TypeError, match="detector is a Gate; must be a Classifier"):
+        detectors.retrain(jax.random.key(7), trained[1].gate, windows, labels, config)
