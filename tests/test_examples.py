@@ -236,7 +236,7 @@ def test_laser_logs(example, trained_recorded_scans, trained_runs, tmp_path, mon
 
 def test_laser_logs_names_a_missing_log(example, runs, tmp_path, monkeypatch):
     load = jaxsense.load
-    monkeypatch.setattr(jaxsense, "load", lambda run: load(run, True))
+    monkeypatch.setattr(jaxsense, "load", lambda run, trust=False: load(run, True))
     argv = [str(runs / "thermal"), str(tmp_path / "scans.npz"), "--logs", str(tmp_path)]
     with pytest.raises(SystemExit, match=r"^laser_logs: .*SENA_Telecom") as stop:
         example("laser_logs").main(argv)
