@@ -1,9 +1,10 @@
 """`python -m benchmarks.imperfect RUN`: missions of robots that are misplaced or hear badly.
 
-Plays the same arenas with errors of pose and heading, and, where looks add up, with maps by each
-robot between which messages are lost and late. All rows are compared, arena by arena, with robots
-that know their poses and share one map. Errors and messages of one arena are drawn alike for all
-sizes, so that a curve is smooth. `break` is the size at which the accuracy has fallen by .01.
+Plays the same arenas with errors of pose and heading, constant or growing while the robots drive,
+and, where looks add up, with maps by each robot between which messages are lost and late. All rows
+are compared, arena by arena, with robots that know their poses and share one map. Errors and
+messages of one arena are drawn alike for all sizes, so that a curve is smooth. `break` is the size
+at which the accuracy has fallen by .01.
 """
 
 import dataclasses
@@ -59,6 +60,11 @@ class Arguments:
     """Errors of the position in metres."""
     headings: tuple[float, ...] = (1.0, 2.0, 3.0, 5.0, 10.0)
     """Errors of the heading in degrees; a sweep of both takes them in pairs."""
+    position_drifts: tuple[float, ...] = (0.005, 0.01, 0.02, 0.03, 0.05)
+    """Errors of the position that driving adds, in metres after the first metre."""
+    heading_drifts: tuple[float, ...] = (0.5, 1.0, 2.0, 3.0, 5.0)
+    """Errors of the heading that driving adds, in degrees after the first metre; a sweep of both
+    takes them in pairs."""
     losses: tuple[float, ...] = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9)
     """Shares of the messages that are lost."""
     delays: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0, 10.0)
@@ -73,8 +79,9 @@ class Arguments:
     def __post_init__(self):
         check_fields(self, bits=64)
         require(self.episodes >= 2, self, "episodes", "must be at least 2")
-        is_paired = len(self.headings) == len(self.positions)
-        require(is_paired, self, "headings", "must be as many as positions")
+        for at, to in (("positions", "headings"), ("position_drifts", "heading_drifts")):
+            is_paired = len(getattr(self, at)) == len(getattr(self, to))
+            require(is_paired, self, to, f"must be as many as {at}")
         self.search  # noqa: B018
 
     @property
@@ -120,18 +127,26 @@ class Imperfect(Curves):
 
 
 def poses(arguments: Arguments) -> list[Sweep]:
-    """Errors of position, of heading, and of both.
+    """Constant errors of position, of heading and of both, then those that driving adds.
 
     Args:
       arguments: of the program.
     """
     at, to, search = arguments.positions, arguments.headings, arguments.search
+    moves, turns = arguments.position_drifts, arguments.heading_drifts
     of = lambda **errors: {"localisation": LocalisationConfig(search=search, **errors)}  # noqa: E731
-    both = zip(at, to, strict=True)
+    both, drifts = zip(at, to, strict=True), zip(moves, turns, strict=True)
     return [
         Sweep("position [m]", at, tuple(of(position_error=x) for x in at)),
         Sweep("heading [deg]", to, tuple(of(heading_error=x) for x in to)),
         Sweep("both [m]", at, tuple(of(position_error=x, heading_error=y) for x, y in both)),
+        Sweep("position drift [m]", moves, tuple(of(position_drift=x) for x in moves)),
+        Sweep("heading drift [deg]", turns, tuple(of(heading_drift=x) for x in turns)),
+        Sweep(
+            "both drifts [m]",
+            moves,
+            tuple(of(position_drift=x, heading_drift=y) for x, y in drifts),
+        ),
     ]
 
 

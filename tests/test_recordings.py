@@ -13,6 +13,8 @@ from jaxsense import sim
 from jaxsense.config import PRESETS
 from jaxsense.run import recordings
 from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.show import scan_plots
+from jaxsense.show.pairs import Pairs
 
 CONFIG = replace(PRESETS["smoke"], arena=replace(PRESETS["smoke"].arena, side=4.0))
 LIDAR = sim.sensors.make(CONFIG)[1]
@@ -176,7 +178,9 @@ def test_recorded_windows_are_compared_with_simulated_ones(run, write, few):
     # Each beam is off by .01 m, and so is each of the windows that it is compared with.
     assert found.of_sensors["lidar"].recorded == pytest.approx(0.0125, abs=0.003)
     assert found.picture == path.with_name("recorded.npz.png")
-    assert found.picture.read_bytes().startswith(b"\x89PNG")
+    assert found.residuals == path.with_name("recorded.npz.residuals.png")
+    for picture in (found.picture, found.residuals):
+        assert picture.read_bytes().startswith(b"\x89PNG")
     camera, lidar = str(found).splitlines()
     assert camera.startswith("camera: 8 recorded windows are 0.0")
     assert lidar.startswith(
@@ -184,6 +188,11 @@ def test_recorded_windows_are_compared_with_simulated_ones(run, write, few):
     )
     with pytest.raises(FileExistsError, match=r"recorded\.npz\.png"):
         jaxsense.compare_scans(run, path)
+    # One of the two is not written without the other.
+    found.picture.unlink()
+    with pytest.raises(FileExistsError, match=r"recorded\.npz\.residuals\.png"):
+        jaxsense.compare_scans(run, path)
+    assert not found.picture.exists()
 
 
 def test_another_scanner_is_farther_from_simulated_windows(run, write, few, tmp_path):
@@ -195,10 +204,30 @@ def test_another_scanner_is_farther_from_simulated_windows(run, write, few, tmp_
     content = {name: x for name, x in content.items() if not name.startswith("camera")}
     found = jaxsense.compare_scans(run, write(**content), tmp_path / "picture.png")
     assert (tmp_path / "picture.png").exists()
+    assert (tmp_path / "picture.residuals.png").exists()
     assert [*found.of_sensors] == ["lidar"]
     assert found.of_sensors["lidar"].looks == number - 3
     assert 0.13 < found.of_sensors["lidar"].recorded < 0.22
     content["lidar_poses"][:-3, 2] += np.pi
     with pytest.raises(ValueError, match="lidar_scans: no window around a place was recorded"):
         jaxsense.compare_scans(run, write(**content), tmp_path / "another.png")
-    assert not (tmp_path / "another.png").exists()
+    assert not list(tmp_path.glob("another*"))
+
+
+def test_residuals_are_drawn_as_they_are():
+    """Three of four rays at the PoI, the other one elsewhere."""
+    recorded = np.float32([[0.01, -0.03, 0.02, np.nan]])
+    simulated = np.float32([[0.01, 0.01, -0.01, np.nan]])
+    window = np.zeros((1, 4), np.float32)
+    similar = sim.similar.Similar(window, recorded, simulated)
+    pairs = Pairs(LIDAR, window, np.ones(1), similar)
+    histogram, sizes = scan_plots.residuals([pairs]).axes
+    assert [text.get_text() for text in histogram.get_legend().get_texts()] == [
+        "recorded, median +0.0100",
+        "simulated, median +0.0100",
+    ]
+    assert histogram.get_xlabel() == "residual of lidar [m]"
+    # All have at least the smallest size, a third of them the largest.
+    lines = [line.get_xydata() for line in sizes.lines]
+    np.testing.assert_allclose(lines[0], [[0.01, 1], [0.02, 2 / 3], [0.03, 1 / 3]], rtol=1e-5)
+    np.testing.assert_allclose(lines[1], [[0.01, 1], [0.01, 2 / 3], [0.01, 1 / 3]], rtol=1e-5)

@@ -1,4 +1,4 @@
-"""Recorded windows, and simulated ones to draw next to them."""
+"""Recorded windows, and the simulated ones that are nearest, to draw."""
 
 import dataclasses
 
@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsense.sim.sensors import Sensor
+from jaxsense.sim.similar import Similar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,11 +16,11 @@ class Pairs:
     Attributes:
       sensor: the sensor.
       recorded: `[L, F]` inputs of its detector.
-      simulated: `[L, F]` the same, simulated.
       distances: `[L]` of the PoIs, in metres.
+      similar: for each the nearest simulated one, and the residuals.
     """
 
     sensor: Sensor
     recorded: Float[np.ndarray, "L F"]
-    simulated: Float[np.ndarray, "L F"]
     distances: Float[np.ndarray, " L"]
+    similar: Similar

@@ -1,19 +1,22 @@
-"""Pictures of recorded windows above the simulated ones that are nearest."""
+"""Pictures of recorded windows and of the simulated ones that are nearest."""
 
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxsense.show import plots
 from jaxsense.show.colours import as_srgb
 from jaxsense.show.pairs import Pairs
 
 _COLUMNS = 6
+_BINS = 61
+_OUTSIDE = 0.002  # of all residuals, beyond the ends of the histogram
+_SMALLEST = 0.02  # of the histogram's end, where the sizes begin
 
 
-def png(of_sensors: Sequence[Pairs]) -> bytes:
-    """Draws evenly chosen looks of each sensor, as a PNG file.
+def windows(of_sensors: Sequence[Pairs]) -> Figure:
+    """Recorded windows above simulated ones, of evenly chosen looks by each sensor.
 
     Args:
       of_sensors: the windows of each sensor.
@@ -24,10 +27,10 @@ def png(of_sensors: Sequence[Pairs]) -> bytes:
     for pair, found in enumerate(of_sensors):
         number = min(_COLUMNS, len(found.recorded))
         chosen = np.linspace(0, len(found.recorded) - 1, number).astype(int)
-        for kind, windows in enumerate((found.recorded, found.simulated)):
-            row, readings = axes[2 * pair + kind], found.sensor.from_left(windows[chosen])
+        for kind, readings in enumerate((found.recorded, found.similar.window)):
+            row, shown = axes[2 * pair + kind], found.sensor.from_left(readings[chosen])
             row[0].set_ylabel(("recorded", "simulated")[kind])
-            for ax, values, distance in zip(row, readings, found.distances[chosen], strict=False):
+            for ax, values, distance in zip(row, shown, found.distances[chosen], strict=False):
                 if kind == 0:
                     ax.set_title(f"{found.sensor.name} at {distance:.2f} m", fontsize=9)
                 if found.sensor.channels == 3:  # an image
@@ -35,7 +38,46 @@ def png(of_sensors: Sequence[Pairs]) -> bytes:
                     ax.set(yticks=[], xticks=[])
                 else:
                     ax.plot(values, ".", color=f"C{kind}", markersize=2)
-                    ax.set_ylim(0, 1.05 * max(windows.max(), 1e-6))
+                    ax.set_ylim(0, 1.05 * max(readings.max(), 1e-6))
             for ax in row[number:]:
                 ax.set_axis_off()
-    return plots.png(figure)
+    return figure
+
+
+def residuals(of_sensors: Sequence[Pairs]) -> Figure:
+    """Residuals of recorded and of simulated windows, over the rays that hit a PoI.
+
+    To the left, how often each residual is. To the right, the share of residuals of at least a
+    size, whatever their sign.
+
+    Args:
+      of_sensors: the windows of each sensor.
+    """
+    figure = Figure(figsize=(9.6, 3.4 * len(of_sensors)), layout="constrained")
+    axes = figure.subplots(len(of_sensors), 2, squeeze=False)
+    for (histogram, sizes), found in zip(axes, of_sensors, strict=True):
+        _draw_residuals(histogram, sizes, found)
+    return figure
+
+
+def _draw_residuals(histogram: Axes, sizes: Axes, found: Pairs) -> None:
+    kinds = {"recorded": found.similar.recorded, "simulated": found.similar.simulated}
+    kinds = {name: x[np.isfinite(x)] for name, x in kinds.items()}
+    every = np.concatenate([*kinds.values()])
+    end = max(np.quantile(np.abs(every), 1 - _OUTSIDE), 1e-6)
+    unit = " [m]" if found.sensor.measures_distance else ""
+    for i, (name, each) in enumerate(kinds.items()):
+        median = round(float(np.median(each)), 4) + 0.0  # no -0
+        style = {"color": f"C{i}", "label": f"{name}, median {median:+.4f}"}
+        bins = np.linspace(-end, end, _BINS)
+        weights = np.full(len(each), 1 / len(each))
+        histogram.hist(each, bins.tolist(), weights=weights, histtype="step", **style)
+        size = np.sort(np.abs(each))
+        sizes.plot(size, 1 - np.arange(len(size)) / len(size), color=f"C{i}", label=name)
+    reading = f"residual of {found.sensor.name}{unit}"
+    histogram.set(xlabel=reading, ylabel="share of rays", yscale="log")
+    sizes.set(xlabel=f"size of the {reading}", ylabel="share of rays of at least this size")
+    sizes.set(xscale="log", yscale="log", xlim=(_SMALLEST * end, None))
+    for axis in (histogram, sizes):
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8)

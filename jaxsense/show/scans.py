@@ -41,10 +41,12 @@ class Comparison:
     Attributes:
       of_sensors: of each recorded sensor; print the comparison to read it.
       picture: PNG file with recorded windows above the nearest simulated ones.
+      residuals: PNG file with the distributions of their differences.
     """
 
     of_sensors: Mapping[str, Apart]
     picture: Path
+    residuals: Path
 
     def __str__(self) -> str:
         """One line for each sensor."""
@@ -58,7 +60,7 @@ class Comparison:
 def compare_scans(
     run: Path | str, file: Path | str, picture: Path | str | None = None, trust: bool = False
 ) -> Comparison:
-    """Draws recorded windows above simulated ones, and states how far apart they are.
+    """Draws recorded windows, simulated ones and residuals, and states how far apart they are.
 
     Every recorded look is compared with simulated ones at the same bearing and distance, see
     `sim.similar.nearest`.
@@ -66,15 +68,16 @@ def compare_scans(
     Args:
       run: directory of a finished run.
       file: a recording, see `run.recordings.read`.
-      picture: PNG file to write; by default it is named after `file`.
+      picture: PNG file to write; by default it is named after `file`. The residuals are drawn in
+        another one next to it, whose name ends in `.residuals.png`.
       trust: whether the run may import its custom sensors, see `load`.
 
     Raises:
-      FileExistsError: if the picture exists.
+      FileExistsError: if a picture exists.
       OSError: if a file cannot be read or written.
       ValueError: if the directory is not a finished run, or the recording does not fit its sensors.
     """
-    from jaxsense.show import scan_plots  # noqa: PLC0415 (matplotlib takes long to import)
+    from jaxsense.show import plots, scan_plots  # noqa: PLC0415 (matplotlib takes long to import)
 
     config, _ = load(run, trust)
     looks = recordings.read(config, file)
@@ -84,10 +87,11 @@ def compare_scans(
         for m, name in enumerate(config.modalities)
         if name in looks.scans
     }
-    content = scan_plots.png([of_sensor for _, of_sensor in found.values()])
-    with files.new(path) as written:
-        written.write(content)
-    return Comparison({name: apart for name, (apart, _) in found.items()}, path)
+    pairs, beside = [each for _, each in found.values()], path.with_suffix(".residuals.png")
+    with files.new(path) as drawn, files.new(beside) as residuals:
+        drawn.write(plots.png(scan_plots.windows(pairs)))
+        residuals.write(plots.png(scan_plots.residuals(pairs)))
+    return Comparison({name: apart for name, (apart, _) in found.items()}, path, beside)
 
 
 def _compare(config: Config, modality: int, looks: RecordedLooks) -> tuple[Apart, Pairs]:
@@ -117,5 +121,7 @@ def _compare(config: Config, modality: int, looks: RecordedLooks) -> tuple[Apart
     keys = jax.random.split(jax.random.key(0), len(cut))
     each = [nearest(*look) for look in zip(keys, cut, bearings, distances, strict=True)]
     found = jax.tree.map(lambda *x: np.stack(x), *each)
-    apart = Apart(float(np.median(found.apart)), float(np.median(found.usual)), len(cut))
-    return apart, Pairs(sensor, cut, found.window, distances)
+    recorded, simulated = (
+        float(np.median(similar.root_mean_square(x))) for x in (found.recorded, found.simulated)
+    )
+    return Apart(recorded, simulated, len(cut)), Pairs(sensor, cut, distances, found)

@@ -24,16 +24,27 @@ _MAX_SIDE = 100.0  # m
 class Similar:
     """The simulated window that is nearest to a recorded one.
 
+    Residuals are those of the rays at the PoI, NaN elsewhere, in the unit of the readings.
+
     Attributes:
       window: `[F]` the simulated input of the detector.
-      apart: `[]` its distance from the recorded one: the root mean square over the rays at the PoI,
-        in the unit of the readings.
-      usual: `[]` the same distance from another simulated window in place of the recorded one.
+      recorded: `[F]` residuals of the recorded window, less the simulated one.
+      simulated: `[F]` those of another simulated window in place of the recorded one, less the one
+        that is nearest to that.
     """
 
-    window: Float[Array, " F"]
-    apart: Float[Array, ""]
-    usual: Float[Array, ""]
+    window: Float[Array, "*S F"]
+    recorded: Float[Array, "*S F"]
+    simulated: Float[Array, "*S F"]
+
+
+def root_mean_square(residuals: Float[Array, "*S F"]) -> Float[Array, "*S"]:
+    """Root mean square of the residuals of each window, over those that are numbers.
+
+    Args:
+      residuals: `[..., F]` see `Similar`.
+    """
+    return jnp.sqrt(jnp.nanmean(residuals**2, axis=-1))
 
 
 def make_world(config: Config, distance: float) -> World:
@@ -117,8 +128,10 @@ def nearest(
     limit = jnp.maximum(half_width - jnp.radians(world.viewpoint.bearing_error), off.min())
     is_at_poi = jnp.repeat(off <= limit, sensor.channels)
 
-    def apart(one: jax.Array) -> jax.Array:
-        return jnp.sqrt(jnp.mean((many[1:] - one[None]) ** 2, axis=1, where=is_at_poi[None]))
+    def nearest_to(one: jax.Array) -> tuple[jax.Array, jax.Array]:
+        residuals = jnp.where(is_at_poi[None], one[None] - many[1:], jnp.nan)
+        chosen = jnp.argmin(root_mean_square(residuals))
+        return many[1 + chosen], residuals[chosen]
 
-    of_window = apart(window)
-    return Similar(many[1 + jnp.argmin(of_window)], of_window.min(), apart(other).min())
+    (found, recorded), (_, usual) = nearest_to(window), nearest_to(other)
+    return Similar(found, recorded, usual)

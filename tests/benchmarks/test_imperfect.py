@@ -49,14 +49,22 @@ def test_break_points_have_intervals_of_arenas():
 
 
 def test_sweeps_change_one_thing_or_two():
-    position, heading, both = imperfect.poses(ARGUMENTS)
-    config = imperfect.changed(PRESETS["noisy"], both.changes[2])
-    errors = config.mission.localisation
-    assert (errors.position_error, errors.heading_error) == (0.03, 3.0)
-    errors = imperfect.changed(PRESETS["noisy"], position.changes[2]).mission.localisation
-    assert (errors.position_error, errors.heading_error) == (0.03, 0.0)
-    errors = imperfect.changed(PRESETS["noisy"], heading.changes[2]).mission.localisation
-    assert (errors.position_error, errors.heading_error) == (0.0, 3.0)
+    expected = {  # of the third size: constant errors of position and heading, then their drifts
+        "position [m]": (0.03, 0.0, 0.0, 0.0),
+        "heading [deg]": (0.0, 3.0, 0.0, 0.0),
+        "both [m]": (0.03, 3.0, 0.0, 0.0),
+        "position drift [m]": (0.0, 0.0, 0.02, 0.0),
+        "heading drift [deg]": (0.0, 0.0, 0.0, 2.0),
+        "both drifts [m]": (0.0, 0.0, 0.02, 2.0),
+    }
+    found = {}
+    for sweep in imperfect.poses(ARGUMENTS):
+        errors = imperfect.changed(PRESETS["noisy"], sweep.changes[2]).mission.localisation
+        constant = errors.position_error, errors.heading_error
+        found[sweep.name] = (*constant, errors.position_drift, errors.heading_drift)
+        assert len(sweep.sizes) == len(sweep.changes)
+        assert sweep.sizes[2] in found[sweep.name]
+    assert found == expected
     for sweep in imperfect.messages(ARGUMENTS):
         assert len(sweep.sizes) == len(sweep.changes)
         for size, change in zip(sweep.sizes, sweep.changes, strict=True):
@@ -92,3 +100,5 @@ def test_other_arenas_and_robots():
         imperfect.elsewhere(ARGUMENTS, PRESETS["team"], MODELS)
     with pytest.raises(ConfigError, match=r"headings .*: must be as many as positions"):
         imperfect.Arguments(run=Path("latest"), headings=(1.0,))
+    with pytest.raises(ConfigError, match=r"heading_drifts .*: must be as many as position_drifts"):
+        imperfect.Arguments(run=Path("latest"), heading_drifts=(1.0,))

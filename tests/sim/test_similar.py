@@ -57,10 +57,26 @@ def test_a_window_is_as_far_from_simulated_ones_as_it_is_off(world):
 
     keys = jax.random.split(jax.random.key(3), 8)
     found = jax.tree.map(lambda *x: np.stack(x), *(compare(key, 0.0) for key in keys))
-    assert np.median(found.apart) < 0.01
-    assert np.median(found.usual) < 0.01
+    apart = similar.root_mean_square
+    assert np.median(apart(found.recorded)) < 0.01
+    assert np.median(apart(found.simulated)) < 0.01
     off = jax.tree.map(lambda *x: np.stack(x), *(compare(key, -0.2) for key in keys))
     # A cube's corner is nearer by .04 m than its side, which makes up for a part.
-    assert 0.14 < np.median(off.apart) < 0.2
-    np.testing.assert_array_equal(off.usual, found.usual)
+    assert 0.14 < np.median(apart(off.recorded)) < 0.2
+    np.testing.assert_array_equal(off.simulated, found.simulated)
     assert found.window.shape == (8, 128)
+    # What was recorded is the simulated window and the residuals, nearer and at the PoI alone.
+    is_at_poi = np.isfinite(off.recorded)
+    np.testing.assert_array_equal(is_at_poi, np.isfinite(off.simulated))
+    assert -0.21 < np.median(off.recorded[is_at_poi]) < -0.14
+    # Both edges of a PoI of any shape, less the error of the bearing to either side.
+    within = np.degrees(np.arcsin(0.1 / 0.8)) - 1
+    np.testing.assert_allclose(is_at_poi.sum(axis=1), 2 * within / (240 / 682), atol=1.5)
+    whole = off.window + off.recorded
+    assert 0.4 < whole[is_at_poi].min() < whole[is_at_poi].max() < 0.7
+
+
+def test_root_mean_squares_are_of_the_rays_at_the_poi():
+    residuals = jnp.array([[jnp.nan, 0.3, -0.4, jnp.nan], [0.2, 0.2, 0.2, 0.2]])
+    # sqrt((.09 + .16) / 2), sqrt(.04).
+    np.testing.assert_allclose(similar.root_mean_square(residuals), [0.125**0.5, 0.2], rtol=1e-6)
