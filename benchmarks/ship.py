@@ -15,7 +15,6 @@ import jax
 
 import jaxsense
 from jaxsense import Config
-from jaxsense.run import rundir
 from jaxsense.tasks import PRETRAINED, Origin, pretrained, registry
 
 _KEY = 20261126

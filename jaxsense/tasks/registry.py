@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError, as_plain, from_plain, require_32_bits
@@ -13,8 +14,17 @@ from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
 from jaxsense.tasks import archive
+from jaxsense.tasks.archive import Arrays
 from jaxsense.tasks.pretrained import DATA, Origin
-from jaxsense.tasks.task import MapTask, Scaling, Task, TeamTask
+from jaxsense.tasks.task import (
+    EPISODES,
+    SEEDS,
+    MapTask,
+    Scaling,
+    Task,
+    TeamTask,
+    reference_returns,
+)
 from jaxsense.training.mdp import models_of
 
 TASKS = ("map-v0", "many-v0", "noisy-v0", "team-v0")
@@ -22,6 +32,7 @@ TASKS = ("map-v0", "many-v0", "noisy-v0", "team-v0")
 
 _STATES, _STEPS = 1024, 12  # from which observations are scaled
 _LEAST_SPREAD = 1e-6  # below which a feature is constant
+_NONE = np.zeros((0, 0))
 _TEAM = "team"
 
 
@@ -55,7 +66,8 @@ def make(name: str, agent: str | None = None) -> Task:
     values = archive.fill(arrays, "look_values", shapes.look_values)
     looks = Bank(tuple(jnp.asarray(arrays[f"looks/{m}"]) for m in range(len(config.modalities))))
     scaling = Scaling(jnp.asarray(arrays["scaling/offset"]), jnp.asarray(arrays["scaling/scale"]))
-    return _made(name, agent, config, models_of(config, fusion, values), looks, scaling)
+    parts = models_of(config, fusion, values)
+    return _made(name, agent, config, parts, looks, scaling, arrays)
 
 
 def freeze(
@@ -72,32 +84,50 @@ def freeze(
       looks: for each modality `[C, S, D_m]` features of held-out looks.
       made: what made the models.
     """
-    parts = models_of(config, trained.fusion, trained.look_values)
+    parts, bank = models_of(config, trained.fusion, trained.look_values), Bank(looks)
     unscaled = Scaling(jnp.zeros(1), jnp.ones(1))
-    scaling = _scaling(key, _made(name, None, config, parts, Bank(looks), unscaled))
+    scaling = _scaling(key, _made(name, None, config, parts, bank, unscaled, {}))
+
+    def returns(agent: str) -> np.ndarray:
+        task = _made(name, agent, config, parts, bank, scaling, {})
+        return np.stack([*reference_returns(task, SEEDS, EPISODES).values()])
+
+    agents = (_TEAM,) if config.dqn.task == _TEAM else config.modalities
     trees = {
         "fusion": trained.fusion,
         "look_values": trained.look_values,
         "looks": looks,
         "scaling": {"offset": scaling.offset, "scale": scaling.scale},
+        "returns": {agent: returns(agent) for agent in agents},
     }
     archive.write(file, trees, {"config": as_plain(config), "origin": dataclasses.asdict(made)})
 
 
 def _made(
-    name: str, agent: str | None, config: Config, parts: Models, looks: Bank, scaling: Scaling
+    name: str,
+    agent: str | None,
+    config: Config,
+    parts: Models,
+    looks: Bank,
+    scaling: Scaling,
+    arrays: Arrays,
 ) -> Task:
-    """The task of some settings, networks and looks."""
+    """The task of some settings, networks and looks; `arrays` hold returns of references."""
+
+    def returns(agent: str) -> jax.Array:
+        return jnp.asarray(arrays.get(f"returns/{agent}", _NONE))
+
     mdp = make_mdp(config, parts, looks)
     if isinstance(mdp, TeamMdp):
         if agent not in (None, _TEAM):
             raise ConfigError("agent", agent, f"must be {_TEAM}: one policy for all robots")
         robots = jnp.array(config.modality_of_robot, jnp.int32)
-        return TeamTask(mdp, parts, scaling, robots, name)
+        return TeamTask(mdp, parts, scaling, returns(_TEAM), robots, name)
     agent = config.modalities[0] if agent is None else agent
     if agent not in config.modalities:
         raise ConfigError("agent", agent, f"must be one of {', '.join(config.modalities)}")
-    return MapTask(mdp, parts, scaling, config.modalities.index(agent), name, agent)
+    modality = config.modalities.index(agent)
+    return MapTask(mdp, parts, scaling, returns(agent), modality, name, agent)
 
 
 def _scaling(key: Key, task: Task) -> Scaling:

@@ -4,12 +4,12 @@ A task is an MDP with frozen networks whose looks are drawn from stored detectio
 part of its name and changes with anything that changes a score.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
@@ -24,8 +24,14 @@ from jaxsense.models import Models
 
 M = TypeVar("M")
 
+SEEDS = 10
+"""Seeds of a score."""
+EPISODES = 1024
+"""Episodes with each seed."""
 CLIP = 10.0
 """Observations are within plus and minus this."""
+
+_FIRST_SEED = 2**31  # far from those that anybody trains with
 
 Act = Callable[[Key, M, jax.Array], tuple[jax.Array, M]]
 """`(key, memory, observation [S]) -> []` int32 action, and the memory after it."""
@@ -76,7 +82,13 @@ class Task(Protocol):
       references: names of the policies that `play_reference` plays; the first one is the best.
       has_optimum: whether the first one is optimal.
       scaling: of observations.
+      returns: `[R, seeds]` mean return of each reference with each seed of a score.
     """
+
+    @property
+    def returns(self) -> jax.Array:
+        """`[R, seeds]`, see `reference_returns`."""
+        ...
 
     @property
     def scaling(self) -> Scaling:
@@ -158,12 +170,12 @@ class Task(Protocol):
         """
         ...
 
-    def play_reference(self, key: Key, which: Int[Array, ""]) -> Float[Array, ""]:
+    def play_reference(self, key: Key, name: str) -> Float[Array, ""]:
         """Plays an episode with a policy to compare with.
 
         Args:
           key: random key, see `play`.
-          which: `[]` int32 index of `references`.
+          name: one of `references`; static.
         """
         ...
 
@@ -176,6 +188,7 @@ class MapTask:
       mdp: the MDP.
       models: frozen networks, of which only those that the references read are there.
       scaling: of observations.
+      returns: `[R, seeds]` see `Task`.
       modality: index of the agent's sensor.
       name: with its version.
       agent: name of the agent's sensor.
@@ -184,6 +197,7 @@ class MapTask:
     mdp: MapMdp
     models: Models
     scaling: Scaling
+    returns: jax.Array
     modality: int = struct.field(pytree_node=False)
     name: str = struct.field(pytree_node=False)
     agent: str = struct.field(pytree_node=False)
@@ -237,7 +251,7 @@ class MapTask:
         exact, (start, key) = self.models.bayes, self._start(key)
         return episodes.run_recurrent(key, self.mdp, exact, choose, memory, start, self.modality)[0]
 
-    def play_reference(self, key: Key, which: Int[Array, ""]) -> Float[Array, ""]:
+    def play_reference(self, key: Key, name: str) -> Float[Array, ""]:
         """Plays an episode with one of `references`, see `Task.play_reference`."""
         exact, (start, key) = self.models.bayes, self._start(key)
         # The same in every episode, so that it is simulated once.
@@ -245,10 +259,9 @@ class MapTask:
         best = reference(table_key, self.mdp, self.modality, self.models, exact.labels)
 
         def choose(key: Key, known: Known) -> jax.Array:
-            others = [policies.POLICIES[name].values for name in self.references[1:]]
-            of_each = [functools.partial(values, key, self.models, known) for values in others]
-            optimal = functools.partial(best, known, start.state.classes)
-            return policies.best(jax.lax.switch(which, [optimal, *of_each]))
+            if name == self.references[0]:
+                return policies.best(best(known, start.state.classes))
+            return policies.best(policies.POLICIES[name].values(key, self.models, known))
 
         return episodes.run_episode(key, self.mdp, exact, choose, start, self.modality)[0]
 
@@ -268,6 +281,7 @@ class TeamTask:
       mdp: the MDP.
       models: frozen networks, of which only those that the references read are there.
       scaling: of observations.
+      returns: `[R, seeds]` see `Task`.
       robots: `[R]` int32 index of each robot's sensor.
       name: with its version.
     """
@@ -275,6 +289,7 @@ class TeamTask:
     mdp: TeamMdp
     models: Models
     scaling: Scaling
+    returns: jax.Array
     robots: jax.Array
     name: str = struct.field(pytree_node=False)
 
@@ -345,15 +360,13 @@ class TeamTask:
 
         return self._play(key, choose, memory)
 
-    def play_reference(self, key: Key, which: Int[Array, ""]) -> Float[Array, ""]:
+    def play_reference(self, key: Key, name: str) -> Float[Array, ""]:
         """Plays an episode with one of `references`, see `Task.play_reference`."""
 
         def choose(
             key: Key, state: TeamState, known: Known, memory: tuple[()]
         ) -> tuple[jax.Array, tuple[()]]:
-            rules = [policies.POLICIES[name].values for name in self.references]
-            of_each = [functools.partial(rule, key, self.models, known) for rule in rules]
-            values = jax.lax.switch(which, of_each)
+            values = policies.POLICIES[name].values(key, self.models, known)
             values = jnp.where(self.action_mask(state), values, -jnp.inf)
             return policies.best(values), memory
 
@@ -370,6 +383,34 @@ class TeamTask:
         num_pois = self.mdp.map.num_pois
         is_absent = jnp.any(~state.team.present & (jnp.arange(num_pois) == action))
         return jnp.where(is_absent, num_pois, action)
+
+
+def key_of_seed(seed: int) -> Key:
+    """The key of the episodes of a score with a seed, from 0; no training has it."""
+    return jax.random.key(_FIRST_SEED + seed)
+
+
+def reference_returns(task: Task, seeds: int, episodes: int) -> dict[str, np.ndarray]:
+    """Mean returns of the policies to compare with.
+
+    Args:
+      task: the task.
+      seeds: number of seeds.
+      episodes: with each seed.
+
+    Returns:
+      By name, `[seeds]`.
+    """
+
+    def mean(name: str) -> np.ndarray:
+        @jax.jit
+        def play(key: Key) -> jax.Array:
+            keys = jax.random.split(key, episodes)
+            return jnp.mean(jax.vmap(lambda key: task.play_reference(key, name))(keys))
+
+        return np.array([float(play(key_of_seed(seed))) for seed in range(seeds)])
+
+    return {name: mean(name) for name in task.references}
 
 
 def _of_belief(belief: Belief) -> Float[Array, "N F"]:
