@@ -64,9 +64,8 @@ class Score:
       task: name of the task.
       agent: who acts.
       returns: `[seeds]` mean return of an episode, without discount, with each seed.
-      references: by name, `[seeds]` the same of known policies from the same starts; the first is
-        the best of them.
-      has_optimum: whether the best of them is optimal.
+      references: by name, `[seeds]` the same of known policies from the same starts.
+      has_optimum: whether the first of them is optimal.
     """
 
     task: str
@@ -77,8 +76,10 @@ class Score:
 
     @property
     def best(self) -> str:
-        """Name of the best reference."""
-        return next(iter(self.references))
+        """The reference to measure against: the optimum, or else that with the highest return."""
+        if self.has_optimum:
+            return next(iter(self.references))
+        return max(self.references, key=lambda name: self.references[name].mean())
 
     @property
     def mean_return(self) -> Estimate:
@@ -89,8 +90,9 @@ class Score:
     def fraction_of_optimal(self) -> Estimate:
         """Return over that of `best`, from the same starts.
 
-        Where no optimum is known (`has_optimum` is False) `best` is a hand-written rule, and the
-        fraction may exceed 1.
+        The optimum is that of exact Bayes. Rewards are read from the map, whose probabilities are
+        not quite exact, so a fraction may exceed 1 by a few thousandths. Where no optimum is known
+        (`has_optimum` is False), `best` is a hand-written rule, and any fraction is possible.
         """
         return estimate(self.returns / self.references[self.best])
 

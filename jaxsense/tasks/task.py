@@ -51,7 +51,8 @@ class Scaling:
 
     def __call__(self, features: Float[Array, "N F"]) -> Float[Array, " S"]:
         """`[N * F]` scaled from `[N, F]`, PoI by PoI."""
-        return jnp.clip((features - self.offset) / self.scale, -CLIP, CLIP).reshape(-1)
+        scaled = (features - self.offset[None]) / self.scale[None]
+        return jnp.clip(scaled, -CLIP, CLIP).reshape(-1)
 
 
 @pytree
@@ -79,7 +80,7 @@ class Task(Protocol):
       agent: who acts.
       num_actions: A; the last action is NOP, which ends the agent's work.
       observation_size: S.
-      references: names of the policies that `play_reference` plays; the first one is the best.
+      references: names of the policies that `play_reference` plays.
       has_optimum: whether the first one is optimal.
       scaling: of observations.
       returns: `[R, seeds]` mean return of each reference with each seed of a score.
@@ -312,8 +313,8 @@ class TeamTask:
 
     @property
     def references(self) -> tuple[str, ...]:
-        """Rules of `dqn.POLICIES`, of which `rollout` is the best."""
-        return "rollout", "auction", "nearest", "naive", "random"
+        """Rules of `dqn.POLICIES`."""
+        return "nearest", "auction", "rollout", "naive", "random"
 
     @property
     def has_optimum(self) -> bool:
