@@ -54,3 +54,21 @@ def test_examples_of_single_functions_run(capsys):
     assert of_all[2] < 0
     assert 0.5 < paths["lengths"].min() < 4
     assert memory["batch"].s_t.shape == (3, 128)
+
+
+def test_examples_of_the_tasks_run(capsys):
+    page = ROOT / "docs" / "tasks.md"
+    assert np.isfinite(run_example(page, 0)["seen"].reward)
+    run_example(page, 1)
+    printed = capsys.readouterr().out
+    assert "noisy-v0, camera: return" in printed
+    assert run_example(page, 2)["models"].tours
+    assert "--preset team --seed 0" in capsys.readouterr().out
+
+
+def test_returns_of_references_are_those_of_the_files():
+    from benchmarks import references
+
+    text = (ROOT / "docs" / "tasks.md").read_text()
+    for cells in references.rows():
+        assert f"| {' | '.join(cells)} |" in text

@@ -1,4 +1,4 @@
-"""Scores of policies in frozen tasks, beside policies whose scores are known."""
+"""Scores of policies in frozen tasks, compared with policies whose scores are known."""
 
 import dataclasses
 from collections.abc import Callable, Sequence

@@ -35,7 +35,7 @@ def test_a_random_policy_reaches_what_the_random_reference_does(of_uniform):
 
 
 def test_no_look_earns_nothing():
-    found = jaxsense.score(NAME, nop, episodes=8)
+    found = jaxsense.score(NAME, nop)
     np.testing.assert_array_equal(found.returns, 0)
     assert found.fraction_of_optimal == tasks.Estimate(0, 0, 0)
 
@@ -49,8 +49,8 @@ def test_a_policy_on_the_host_plays_the_same_episodes():
         widths = observations[:, 2::4]
         return np.where(widths.max(axis=1) > 1.5, widths.argmax(axis=1), 3)
 
-    one = jaxsense.score(NAME, lambda key, seen: first_unknown(seen), episodes=16)
-    other = jaxsense.score(NAME, tasks.on_host(on_host), episodes=16)
+    one = jaxsense.score(NAME, [lambda key, seen: first_unknown(seen)])
+    other = jaxsense.score(NAME, [tasks.on_host(on_host)])
     np.testing.assert_allclose(one.returns, other.returns)
     assert one.mean_return.value > 0
 
@@ -60,7 +60,7 @@ def test_a_policy_that_remembers_looks_at_each_poi_once():
         return memory, memory + 1
 
     naive = tasks.Recurrent(act, jnp.int32(0))
-    found = jaxsense.score(NAME, naive, episodes=64)
+    found = jaxsense.score(NAME, [naive])
     # As naive exploration, which however leaves out what it has seen before the episode.
     assert found.fraction_of_optimal.high < 1
     assert (found.returns < found.references["naive"]).all()
@@ -73,6 +73,7 @@ def test_policies_of_several_trainings_play_a_seed_each(of_uniform):
     np.testing.assert_array_equal(found.references["optimal"], of_uniform.references["optimal"][:2])
 
 
+@pytest.mark.slow
 def test_references_are_played_where_they_are_not_stored():
     stored = jaxsense.score(NAME, nop).references["naive"][0]
     fewer = jaxsense.score(NAME, [nop], episodes=64).references["naive"][0]
