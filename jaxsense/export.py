@@ -101,7 +101,7 @@ def _description(config: Config, models: Models) -> dict[str, object]:
 def _of_sensor(sensor: Sensor) -> dict[str, object]:
     """How a scan is given to `detect`."""
     return {
-        "readings": "distances in metres, infinite for none"
+        "readings": "distances in metres, infinite or 0 for none"
         if sensor.measures_distance
         else "linear RGB from 0 to 1"
         if sensor.channels == 3
