@@ -5,9 +5,25 @@ from collections.abc import Callable
 from benchmarks.dqn import dqn_live, dqn_rejax, dqn_sb3, dqn_seeds
 from benchmarks.jmvae import jmvae
 from benchmarks.measure import Options, Row
-from benchmarks.missions import missions, missions_many, resets_many
-from benchmarks.physics import physics, physics_contacts, physics_solver
-from benchmarks.rays import rays
+from benchmarks.missions import (
+    missions,
+    missions_devices,
+    missions_many,
+    missions_many_devices,
+    resets_many,
+)
+from benchmarks.physics import (
+    physics,
+    physics_batch,
+    physics_contacts,
+    physics_contacts_warp,
+    physics_devices,
+    physics_solver,
+    physics_solver_batch,
+    physics_solver_warp,
+    physics_warp,
+)
+from benchmarks.rays import rays, rays_warp, rays_warp_bvh
 from benchmarks.team import team_mdp
 from benchmarks.time_to_optimal import time_to_optimal_rejax, time_to_optimal_sb3
 from benchmarks.train import train, train_warm
@@ -16,9 +32,19 @@ ROWS: dict[str, Callable[[Options], Row]] = {
     "physics": physics,
     "physics_contacts": physics_contacts,
     "physics_solver": physics_solver,
+    "physics_batch": physics_batch,
+    "physics_solver_batch": physics_solver_batch,
+    "physics_warp": physics_warp,
+    "physics_contacts_warp": physics_contacts_warp,
+    "physics_solver_warp": physics_solver_warp,
+    "physics_devices": physics_devices,
     "rays": rays,
+    "rays_warp": rays_warp,
+    "rays_warp_bvh": rays_warp_bvh,
     "missions": missions,
+    "missions_devices": missions_devices,
     "missions_many": missions_many,
+    "missions_many_devices": missions_many_devices,
     "resets_many": resets_many,
     "jmvae": jmvae,
     "dqn_rejax": dqn_rejax,

@@ -84,6 +84,8 @@ def _print_table(console: rich.console.Console, rows: list[Row]) -> None:
             row.device,
             str(row.batch),
         )
+        for unit, value in row.also.items():
+            table.add_row("", unit, _number(value))
     console.print(table)
     versions = {name: version for row in rows for name, version in row.versions.items()}
     console.print(", ".join(f"{name} {version}" for name, version in versions.items()))

@@ -75,6 +75,7 @@ class Row:
       batch: how many of ours were done side by side.
       versions: of Python, packages and the peer.
       is_bound: the peer was stopped before it was done: `theirs` and `ratio` are lower bounds.
+      also: ours in other units.
     """
 
     row: str
@@ -88,6 +89,7 @@ class Row:
     batch: int
     versions: dict[str, str]
     is_bound: bool = False
+    also: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """The public keys, and when, where and how it was measured.

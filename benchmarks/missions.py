@@ -1,5 +1,6 @@
 """How fast missions begin and run, as `python -m jaxsense.evaluate` plays them."""
 
+import contextlib
 import dataclasses
 import functools
 from typing import Any
@@ -16,42 +17,65 @@ from jaxsense.mission.rollout import rollout_batch
 from jaxsense.models import Models
 from jaxsense.run import batches, devices
 from jaxsense.run.compilation import Compiler
+from jaxsense.run.devices import Workers
 from jaxsense.run.missions import Played, Player
 from jaxsense.run.monitor import Monitor
 
 _UNIT = "control-steps/s"
+# For each accelerator.
+_MISSIONS, _MISSIONS_OF_MANY = 16384, 8192
 _PERIODS_BEFORE = 40  # 4 s of missions that last 14 s
 
 
 def missions(options: Options) -> Row:
     """Missions of the policy `naive` with the settings of `default`, from begin to end."""
-    return _play("missions", options, untrained("default"), accelerator=16384)
+    return _play("missions", options, untrained("default"), _MISSIONS)
 
 
 def missions_many(options: Options) -> Row:
     """The same with 16 PoIs in an arena of 6 m."""
-    return _play("missions_many", options, of_many_pois(), accelerator=8192)
+    return _play("missions_many", options, of_many_pois(), _MISSIONS_OF_MANY)
 
 
-def _play(name: str, options: Options, config: Config, accelerator: int) -> Row:
-    """As many missions as an accelerator plays at once; fewer on a CPU."""
-    (total,) = measure.batches(options, quick=4, cpu=(768,), accelerator=(accelerator,))
-    workers = devices.start(None)
+def missions_devices(options: Options) -> Row:
+    """`missions` on all devices, against one of them that plays the same ones."""
+    return _play("missions_devices", options, untrained("default"), _MISSIONS, against_one=True)
+
+
+def missions_many_devices(options: Options) -> Row:
+    """`missions_many` on all devices, against one of them that plays the same ones."""
+    config = of_many_pois()
+    return _play("missions_many_devices", options, config, _MISSIONS_OF_MANY, against_one=True)
+
+
+def _play(
+    name: str, options: Options, config: Config, accelerator: int, against_one: bool = False
+) -> Row:
+    """As many missions as each accelerator plays at once; fewer on a CPU."""
+    devices_of_sides = [devices.start(None)] + [devices.start(1)] * against_one
+    number = jax.device_count() if jax.default_backend() != "cpu" else 1
+    (total,) = measure.batches(options, quick=4, cpu=(768,), accelerator=(number * accelerator,))
     # Until it is trained, a gate lets everything above minus infinity pass.
     models = jax.tree.map(jnp.nan_to_num, init(jax.random.key(0), config))
-    scenario = mission.make_mission(config)
-    with Compiler(Monitor()) as compiler:
+    scenario, cases = mission.make_mission(config), {"naive": mission.cases(config)["naive"]}
+
+    def side(compiler: Compiler, workers: Workers) -> Side:
         batch = batches.batch_of(config, total, workers)
         player = Player(scenario, compiler, batch, workers, runs_long=True)
         player.wait()
-        compile_s = compiler.monitor.seconds["mission"]["compile_s"]
-        cases = {"naive": mission.cases(config)["naive"]}
 
         def run() -> Played:
             return player.play(jax.random.key(1), models, cases, total)
 
-        side = Side(run, run().control_steps, batch, compile_s, workers.number)
-        return measure.compare(name, _UNIT, [side], [], options)
+        compile_s = compiler.monitor.seconds["mission"]["compile_s"]
+        return Side(run, run().control_steps, batch, compile_s, workers.number)
+
+    with contextlib.ExitStack() as stack:
+        ours, *theirs = (
+            side(stack.enter_context(Compiler(Monitor())), workers) for workers in devices_of_sides
+        )
+        peer = "one device" if against_one else None
+        return measure.compare(name, _UNIT, [ours], theirs, options, peer=peer)
 
 
 def resets_many(options: Options) -> Row:

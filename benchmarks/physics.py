@@ -1,9 +1,10 @@
-"""Physics steps of two robots among three points of interest, against C MuJoCo's `rollout`."""
+"""Physics steps of two robots among three points of interest, against others who make them."""
 
 import dataclasses
 import functools
 import os
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 from flax import struct
 from mujoco import mjx
 
-from benchmarks import measure
+from benchmarks import measure, peers
 from benchmarks.measure import Options, Row, Side
 from benchmarks.peers import native
 from jaxsense import PRESETS, Config, init, mission
@@ -19,12 +20,12 @@ from jaxsense.mission import Mission, MissionState, navigation
 from jaxsense.mission.motion import move
 from jaxsense.mission.rollout import step as mission_step
 from jaxsense.run import devices
+from jaxsense.run.devices import Workers
 from jaxsense.sim import amiro
 from jaxsense.sim import arena as arenas
 from jaxsense.sim.arena import Arena, Layout
 
 _UNIT = "steps/s"
-_PEER = {"peer": "mujoco.rollout", "packages": ("mujoco",)}
 _FREE_TOLERANCE = 1e-3  # m and rad over 1 s, float32 against float64
 _CONTACT_TOLERANCE = 5e-3  # m and rad, for all but one in a hundred, see the tests of the arena
 _PERIODS_BEFORE = 40  # 4 s of missions that last 14 s
@@ -55,51 +56,149 @@ class Drives:
     wheel_speeds: jax.Array
 
 
-def physics(options: Options) -> Row:
+Sides: TypeAlias = Callable[[Arena, Drives], list[Side]]
+"""A peer's ways to make the steps of drives, each of which returns the last poses first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Peer:
+    """Somebody else who makes physics steps.
+
+    Attributes:
+      name: of its function.
+      packages: distributions that it needs.
+      load: returns its ways, or None if it is missing or not asked for.
+    """
+
+    name: str
+    packages: tuple[str, ...]
+    load: Callable[[Options], Sides | None]
+
+    def compare(
+        self,
+        row: str,
+        options: Options,
+        arena: Arena,
+        drives: Sequence[Drives],
+        ours: Sequence[Side],
+        tolerance: float,
+        share: float,
+    ) -> Row:
+        """The row, after a check that both make the same steps.
+
+        Args:
+          row: its name.
+          options: whether peers are asked for.
+          arena: in which the peer drives.
+          drives: of each of our sides.
+          ours: our sides.
+          tolerance: of poses, in m and rad.
+          share: of the drives that must agree.
+        """
+        sides = self.load(options)
+        theirs = [] if sides is None else [side for some in drives for side in sides(arena, some)]
+        if theirs:
+            _check(ours[0], theirs[0], tolerance, share)
+        names = {"peer": self.name, "packages": self.packages}
+        return measure.compare(row, _UNIT, ours, theirs, options, **names)
+
+
+def _native(simulate: Callable[..., Callable[[], Any]], options: Options) -> Sides | None:
+    return functools.partial(_native_sides, simulate) if options.peers else None
+
+
+def _warp(options: Options) -> Sides | None:
+    warp = peers.load("mujoco_warp", options)
+    if warp is None:
+        return None
+
+    def sides(arena: Arena, drives: Drives) -> list[Side]:
+        others = warp.arenas(arena, batch=len(drives.poses))
+        # As our pipeline does it, and as MJX's own examples do.
+        return [
+            _drive_side(other, drives, devices.ALONE, keeps_data)
+            for other in others
+            for keeps_data in (False, True)
+        ]
+
+    return sides
+
+
+_ROLLOUT = Peer("mujoco.rollout", ("mujoco",), functools.partial(_native, native.rollout))
+_BATCH = Peer("mujoco.batch", ("mujoco",), functools.partial(_native, native.batch))
+_WARP = Peer('MJX impl="warp"', ("mujoco-mjx", "warp-lang"), _warp)
+
+
+def physics(options: Options, row: str = "physics", peer: Peer = _ROLLOUT) -> Row:
     """Without contacts: random poses and wheel speeds in an empty arena, as missions have it."""
+    arena, drives = _free_drives(options)
+    ours = [_drive_side(arena, some, devices.start(None)) for some in drives]
+    return peer.compare(row, options, arena, drives, ours, _FREE_TOLERANCE, share=1.0)
+
+
+def physics_contacts(options: Options, row: str = "physics_contacts", peer: Peer = _ROLLOUT) -> Row:
+    """As in the mission, where the contact solver runs only while a robot is near something."""
+    scenario, states = _mid_mission(options)
+    arena, drives = scenario.world.arena, [_as_drives(some) for some in states]
+    ours = [_move_side(scenario, some) for some in states]
+    return peer.compare(row, options, arena, drives, ours, _CONTACT_TOLERANCE, share=0.99)
+
+
+def physics_solver(options: Options, row: str = "physics_solver", peer: Peer = _ROLLOUT) -> Row:
+    """From the same states, with the contact solver in every step."""
+    scenario, states = _mid_mission(options)
+    arena, drives = scenario.world.arena, [_as_drives(some) for some in states]
+    ours = [_drive_side(arena, some, devices.start(None)) for some in drives]
+    return peer.compare(row, options, arena, drives, ours, _CONTACT_TOLERANCE, share=0.99)
+
+
+def physics_batch(options: Options) -> Row:
+    """`physics` against `mujoco.batch`."""
+    return physics(options, "physics_batch", _BATCH)
+
+
+def physics_solver_batch(options: Options) -> Row:
+    """`physics_solver` against `mujoco.batch`."""
+    return physics_solver(options, "physics_solver_batch", _BATCH)
+
+
+def physics_warp(options: Options) -> Row:
+    """`physics` against MJX on Warp."""
+    return physics(options, "physics_warp", _WARP)
+
+
+def physics_contacts_warp(options: Options) -> Row:
+    """`physics_contacts` against MJX on Warp, which solves contacts in every step."""
+    return physics_contacts(options, "physics_contacts_warp", _WARP)
+
+
+def physics_solver_warp(options: Options) -> Row:
+    """`physics_solver` against MJX on Warp."""
+    return physics_solver(options, "physics_solver_warp", _WARP)
+
+
+def physics_devices(options: Options) -> Row:
+    """`physics` on all devices, against one of them."""
+    arena, drives = _free_drives(options)
+    workers = devices.start(None), devices.start(1)
+    ours, theirs = ([_drive_side(arena, some, on) for some in drives] for on in workers)
+    return measure.compare("physics_devices", _UNIT, ours, theirs, options, peer="one device")
+
+
+def _free_drives(options: Options) -> tuple[Arena, list[Drives]]:
+    """The empty arena, and drives in it for each size of a batch."""
     batches = measure.batches(options, quick=64, cpu=(256, 1024, 4096), accelerator=(32768, 262144))
     steps = 10 if options.quick else 100
     arena = arenas.build(_UNTRAINED.arena, (False, True), obstacles=False)
-    ours, theirs = [], []
-    for batch in batches:
-        drives = _random_drives(jax.random.key(0), _UNTRAINED, batch, steps)
-        ours.append(_drive_side(arena, drives))
-        if options.peers and batch == batches[0]:
-            theirs = _native_sides(arena, drives)
-            _check(devices.joined(ours[-1].run()), theirs[0].run(), _FREE_TOLERANCE, share=1.0)
-    return measure.compare("physics", _UNIT, ours, theirs, options, **_PEER)
+    key = jax.random.key(0)
+    return arena, [_random_drives(key, _UNTRAINED, batch, steps) for batch in batches]
 
 
-def physics_contacts(options: Options) -> Row:
-    """As in the mission, where the contact solver runs only while a robot is near something."""
-    batches, periods = _mission_sizes(options)
-    scenario, states = _mid_mission(batches[-1], periods)
-    ours = [_move_side(scenario, _first(states, batch)) for batch in batches]
-    theirs = []
-    if options.peers:
-        theirs = _native_sides(scenario.world.arena, _as_drives(states))
-        _check(devices.joined(ours[-1].run()), theirs[0].run(), _CONTACT_TOLERANCE, share=0.99)
-    return measure.compare("physics_contacts", _UNIT, ours, theirs, options, **_PEER)
-
-
-def physics_solver(options: Options) -> Row:
-    """From the same states, with the contact solver in every step."""
-    batches, periods = _mission_sizes(options)
-    team, states = _mid_mission(batches[-1], periods)
-    arena, drives = team.world.arena, _as_drives(states)
-    ours = [_drive_side(arena, _first(drives, batch * periods)) for batch in batches]
-    theirs = _native_sides(arena, drives) if options.peers else []
-    return measure.compare("physics_solver", _UNIT, ours, theirs, options, **_PEER)
-
-
-def _mission_sizes(options: Options) -> tuple[tuple[int, ...], int]:
-    """Numbers of missions side by side, and control periods of each."""
+def _mid_mission(options: Options) -> tuple[Mission, list[MissionState]]:
+    """States `[B, P]` of missions under way, for each size of a batch."""
     batches = measure.batches(options, quick=16, cpu=(64, 384), accelerator=(8192, 65536))
-    return batches, 2 if options.quick else 8
-
-
-def _first(tree: Any, number: int) -> Any:
-    return jax.tree.map(lambda x: x[:number], tree)
+    scenario, states = _played(batches[-1], periods=2 if options.quick else 8)
+    return scenario, [jax.tree.map(lambda x: x[:batch], states) for batch in batches]  # noqa: B023
 
 
 def _random_drives(key: jax.Array, config: Config, batch: int, steps: int) -> Drives:
@@ -123,7 +222,7 @@ def _random_drives(key: jax.Array, config: Config, batch: int, steps: int) -> Dr
 
 
 @functools.cache
-def _mid_mission(batch: int, periods: int) -> tuple[Mission, MissionState]:
+def _played(batch: int, periods: int) -> tuple[Mission, MissionState]:
     """`[B, P]` states that the physics was given in P successive periods of naive missions."""
     scenario = mission.make_mission(_UNTRAINED)
     networks = init(jax.random.key(0), scenario.config)
@@ -177,25 +276,30 @@ def _as_drives(states: MissionState) -> Drives:
     )
 
 
-def _drive_side(arena: Arena, drives: Drives) -> Side:
-    """Our physics, `arena.drive`, on all devices."""
+def _drive_side(arena: Arena, drives: Drives, workers: Workers, keeps_data: bool = False) -> Side:
+    """Our physics, `arena.drive`; between two steps it keeps the whole data of MJX or the state."""
 
     def drive(drives: Drives) -> tuple[jax.Array, jax.Array]:
         is_empty = not np.any(arena.poi_of_geom >= 0)
         still = arena.data if is_empty else arenas.put(arena, drives.layout, drives.poses)
 
-        def step(carry, wheel_speeds: jax.Array):
-            qpos, qvel, warmstart = carry
-            data: mjx.Data = still.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-            data = arenas.drive(arena, data, wheel_speeds)
-            return (data.qpos, data.qvel, data.qacc_warmstart), None
+        def kept(data: mjx.Data) -> Any:
+            return data if keeps_data else (data.qpos, data.qvel, data.qacc_warmstart)
 
-        start = drives.poses.reshape(-1), drives.velocity.reshape(-1), drives.warmstart
-        (qpos, qvel, _), _ = jax.lax.scan(step, start, drives.wheel_speeds)
-        return qpos, qvel
+        def step(state: Any, wheel_speeds: jax.Array) -> tuple[Any, None]:
+            names = ("qpos", "qvel", "qacc_warmstart")
+            data = state if keeps_data else still.replace(**dict(zip(names, state, strict=True)))
+            return kept(arenas.drive(arena, data, wheel_speeds)), None
+
+        start = still.replace(
+            qpos=drives.poses.reshape(-1),
+            qvel=drives.velocity.reshape(-1),
+            qacc_warmstart=drives.warmstart,
+        )
+        end = jax.lax.scan(step, kept(start), drives.wheel_speeds)[0]
+        return (end.qpos, end.qvel) if keeps_data else end[:2]
 
     batch, steps = drives.wheel_speeds.shape[:2]
-    workers = devices.start(None)
     return measure.compiled(
         jax.vmap(drive), drives, work=batch * steps, batch=batch, workers=workers
     )
@@ -217,8 +321,10 @@ def _move_side(scenario: Mission, states: MissionState) -> Side:
     return measure.compiled(periods, states, work=work, batch=batch, workers=workers)
 
 
-def _native_sides(arena: Arena, drives: Drives) -> list[Side]:
-    """C MuJoCo on the same drives, with one thread and more."""
+def _native_sides(
+    simulate: Callable[..., Callable[[], Any]], arena: Arena, drives: Drives
+) -> list[Side]:
+    """C MuJoCo on the same drives, with a thread for each core and twice as many."""
     put = jax.jit(jax.vmap(lambda layout, poses: arenas.put(arena, layout, poses)))
     placed = put(drives.layout, drives.poses)
     control = jax.vmap(jax.vmap(arenas.as_control))(drives.wheel_speeds)
@@ -233,15 +339,21 @@ def _native_sides(arena: Arena, drives: Drives) -> list[Side]:
     )
     cores = os.cpu_count() or 1
     return [
-        Side(native.rollout(arena.mj_model, inputs, threads), batch * steps, batch)
-        for threads in sorted({1, cores, 2 * cores})
+        Side(simulate(arena.mj_model, inputs, threads), batch * steps, batch)
+        for threads in (cores, 2 * cores)
     ]
 
 
-def _check(ours: tuple[jax.Array, jax.Array], theirs, tolerance: float, share: float) -> None:
+def _check(ours: Side, theirs: Side, tolerance: float, share: float) -> None:
     """Raises a `RuntimeError` if fewer than `share` of the last poses agree."""
-    poses = np.asarray(ours[0]).reshape(-1)
-    error = np.abs(poses - theirs[0].reshape(-1)).reshape(-1, 3).max(axis=-1)
-    worst = float(np.quantile(error, share))
+    # Ours come in parts, one of each thread; so do a peer's in JAX.
+    poses, others = (
+        np.asarray(found[0]).reshape(-1, 3)
+        for found in (
+            devices.joined(found) if isinstance(found, list) else found
+            for found in (ours.run(), theirs.run())
+        )
+    )
+    worst = float(np.quantile(np.abs(poses - others).max(axis=-1), share))
     if not worst <= tolerance:
-        raise RuntimeError(f"physics differs from C MuJoCo's by {worst} m or rad")
+        raise RuntimeError(f"physics differs from the peer's by {worst} m or rad")

@@ -40,7 +40,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         theirs = row["theirs"] is not None
         cells = [
             f"`{row['row']}`",
-            f"{number(row['ours'])} {row['unit']}",
+            _ours(row),
             row["peer"] or "" if theirs else "",
             number(row["theirs"]) if theirs else "",
             f"{number(row['ratio'])} x" if theirs else "",
@@ -48,6 +48,12 @@ def table(rows: list[dict[str, Any]]) -> str:
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join([*lines, "", _about(rows)])
+
+
+def _ours(row: dict[str, Any]) -> str:
+    """Our figure, in all its units."""
+    units = {row["unit"]: row["ours"], **row["also"]}
+    return ", ".join(f"{number(value)} {unit}" for unit, value in units.items())
 
 
 def _about(rows: list[dict[str, Any]]) -> str:

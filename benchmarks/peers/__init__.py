@@ -25,8 +25,7 @@ def load(name: str, options: Options) -> Any:
         return importlib.import_module(f"benchmarks.peers.{name}")
     except (ImportError, RuntimeError) as error:  # the latter where torchvision does not fit torch
         reason = str(error).splitlines()[0]
-        print(
-            f"benchmarks: peer {name} is left out: {reason} (pip install -e '.[bench]')",
-            file=sys.stderr,
-        )
+        if isinstance(error, ImportError):
+            reason += " (pip install -e '.[bench]')"
+        print(f"benchmarks: peer {name} is left out: {reason}", file=sys.stderr)
         return None

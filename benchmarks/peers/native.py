@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
+from mujoco import batch as mujoco_batch
 from mujoco import rollout as mujoco_rollout
 
 
@@ -70,6 +71,39 @@ def rollout(
         )
         last = state[:, -1]
         return last[:, 1 : 1 + model.nq], last[:, 1 + model.nq :]
+
+    return run
+
+
+def batch(
+    model: "mujoco.MjModel",  # pyright: ignore[reportAttributeAccessIssue]
+    inputs: RolloutInputs,
+    threads: int,
+) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+    """A call that makes the same steps with `mujoco.batch`, one step of all trajectories at a time.
+
+    A call of several steps would hold the control constant. The call returns the last `[B, nq]`
+    positions and `[B, nv]` velocities.
+    """
+    size, steps = inputs.control.shape[:2]
+    simulations = mujoco_batch.Batch(model, nsim=size, nthread=threads)
+    start = {
+        "qpos": inputs.qpos,
+        "qvel": inputs.qvel,
+        "qacc_warmstart": inputs.warmstart,
+        "mocap_pos": inputs.mocap_pos.reshape(size, model.nmocap, 3),
+        "mocap_quat": inputs.mocap_quat.reshape(size, model.nmocap, 4),
+    }
+    controls = np.ascontiguousarray(inputs.control.swapaxes(0, 1), np.float64)
+    control, qpos, qvel = (simulations.bind(name) for name in ("ctrl", "qpos", "qvel"))
+
+    def run() -> tuple[np.ndarray, np.ndarray]:
+        for name, values in start.items():
+            simulations.bind(name)[:] = values
+        for step in range(steps):
+            control[:] = controls[step]
+            simulations.step()
+        return qpos.copy(), qvel.copy()
 
     return run
 

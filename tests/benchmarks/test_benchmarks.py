@@ -7,6 +7,7 @@ import json
 import math
 import subprocess
 import sys
+import types
 
 import pytest
 
@@ -14,11 +15,19 @@ from benchmarks import ROWS, __main__, peers
 from benchmarks.measure import Options, Side, compare, make_row
 from jaxsense.run import devices
 
-QUICK = ("rays", "jmvae")
+QUICK = ("physics_batch", "rays", "rays_warp", "jmvae")
 KEYS = {
     "row", "unit", "ours", "peer", "theirs", "ratio", "compile_s", "device", "batch", "versions",
-    "commit", "date", "cores", "command",
+    "commit", "date", "cores", "command", "also",
 }  # fmt: skip
+# Without a CUDA device, Warp is left out even where it is installed.
+WARP = (
+    "physics_warp",
+    "physics_contacts_warp",
+    "physics_solver_warp",
+    "rays_warp",
+    "rays_warp_bvh",
+)
 PEERS = {
     "jmvae": "multivae",
     "dqn_rejax": "rejax",
@@ -71,16 +80,24 @@ def has_package(name):
     return True
 
 
+def has_peer(name):
+    if name in WARP or name.startswith(("train", "resets", "team")):
+        return False
+    if name.startswith(("physics", "rays")) or name.endswith("_devices"):
+        return True
+    return name in PEERS and has_package(PEERS[name])
+
+
 def check_rows(rows):
     for name, row in rows.items():
-        package = "mujoco" if name.startswith(("physics", "rays")) else PEERS.get(name)
-        check_row(row, package is not None and has_package(package))
+        check_row(row, has_peer(name))
         assert row["unit"] == "s" or not name.startswith("train")
 
 
 def check_printed(rows, output, errors):
     for name in rows:
         assert name in output
+    assert "peer mujoco_warp is left out" in errors or not rows.keys() & set(WARP)
     for name, package in PEERS.items():
         if name not in rows:
             continue
@@ -93,6 +110,7 @@ def test_quick_rows_with_a_table_and_the_names_of_missing_peers(quick):
     assert tuple(quick[0]) == QUICK
     check_rows(quick[0])
     check_printed(*quick)
+    assert 1 < quick[0]["rays"]["also"]["ray-geom tests/s"] / quick[0]["rays"]["ours"] < 50
 
 
 @pytest.mark.slow  # compiles missions and whole trainings for minutes; before a release
@@ -114,6 +132,17 @@ def test_missing_peer_is_named_and_left_out(monkeypatch, capsys):
     message = capsys.readouterr().err
     assert message.count("\n") == 1
     assert "peer rejax is left out" in message
+
+
+def test_warp_without_a_cuda_device_is_left_out(monkeypatch, capsys):
+    for name in ("warp", "mujoco.mjx.third_party.mujoco_warp"):
+        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
+    package = types.ModuleType("mujoco.mjx.third_party")
+    package.__dict__["mujoco_warp"] = sys.modules["mujoco.mjx.third_party.mujoco_warp"]
+    monkeypatch.setitem(sys.modules, "mujoco.mjx.third_party", package)
+    assert peers.load("mujoco_warp", Options(peers=True)) is None
+    message = capsys.readouterr().err
+    assert message == "benchmarks: peer mujoco_warp is left out: needs a CUDA device\n"
 
 
 def test_peers_are_not_loaded_unless_asked_for(monkeypatch, capsys):

@@ -8,14 +8,14 @@ ROW = {
     "row": "rays", "unit": "rays/s", "ours": 1234567.8, "peer": "mujoco", "theirs": 45678.9,
     "ratio": 27.03, "compile_s": 1.0, "device": "cpu", "batch": 2048, "commit": "0123456789abcdef",
     "versions": {"python": "3.11.7", "jax": "0.10.2"}, "date": "2026-11-26", "cores": 2,
-    "command": "python -m benchmarks rays --peers",
+    "command": "python -m benchmarks rays --peers", "also": {},
 }  # fmt: skip
 
 
 def test_a_table_shows_what_was_measured_where_and_when():
     alone = {**ROW, "row": "missions", "theirs": None, "ratio": None, "ours": 12.345}
-    lines = results.table([ROW, alone]).splitlines()
-    assert lines[2] == "| `rays` | 1,234,568 rays/s | mujoco | 45,679 | 27 x | 2,048 |"
+    lines = results.table([{**ROW, "also": {"tests/s": 7.0}}, alone]).splitlines()
+    assert lines[2] == "| `rays` | 1,234,568 rays/s, 7 tests/s | mujoco | 45,679 | 27 x | 2,048 |"
     assert lines[3] == "| `missions` | 12.3 rays/s |  |  |  | 2,048 |"
     assert lines[-1] == (
         "`python -m benchmarks rays missions --peers`: cpu with 2 cores; commit 0123456789 on "
