@@ -18,6 +18,7 @@ from jaxsense.run import batches, devices
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.missions import Played, Player
 from jaxsense.run.monitor import Monitor
+from jaxsense.summary import profile
 
 _UNIT = "control-steps/s"
 _PERIODS_BEFORE = 40  # 4 s of missions that last 14 s
@@ -44,7 +45,7 @@ def _play(name: str, options: Options, config: Config, accelerator: int) -> Row:
         batch = batches.batch_of(config, total, workers)
         player = Player(scenario, compiler, batch, workers, runs_long=True)
         player.wait()
-        compile_s = compiler.monitor.seconds["mission"]["compile_s"]
+        compile_s = profile.of_stages(compiler.monitor.clock.spans)["mission"]["compile_s"]
         cases = {"naive": mission.cases(config)["naive"]}
 
         def run() -> Played:

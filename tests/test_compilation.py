@@ -1,6 +1,7 @@
 """Programs that compile in the background, and those that are kept."""
 
 import dataclasses
+import itertools
 import os
 import stat
 import subprocess
@@ -21,9 +22,11 @@ from jaxsense.config import PRESETS, SensorConfig
 from jaxsense.core.types import Belief, pytree
 from jaxsense.run import cli, files
 from jaxsense.run import kept as kept_programs
+from jaxsense.run.clock import Clock
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.kept import Kept
 from jaxsense.run.monitor import Monitor
+from jaxsense.summary import profile
 
 
 def test_compiling_and_running_are_timed_apart_and_reported():
@@ -33,8 +36,13 @@ def test_compiling_and_running_are_timed_apart_and_reported():
     shape = program.compile(lambda x: 2 * x, jnp.float32(3))
     assert (shape.shape, shape.dtype) == ((), jnp.float32)
     assert program(jnp.float32(3)) == 6
-    assert set(monitor.seconds["stage"]) == {"compile_s", "run_s"}
-    assert all(seconds > 0 for seconds in monitor.seconds["stage"].values())
+    spans = [span for span in monitor.clock.spans if span.kind != "wait_program"]
+    assert [span.kind for span in spans] == ["trace", "lower", "compile", "run"]
+    assert {(span.stage, span.program) for span in spans} == {("stage", "run")}
+    assert all(before.end_s <= after.start_s for before, after in itertools.pairwise(spans))
+    seconds = profile.of_stages(spans)["stage"]
+    assert seconds["run_s"] == spans[-1].seconds > 0
+    assert seconds["compile_s"] == pytest.approx(sum(span.seconds for span in spans[:-1]))
     monitor.report("stage", 2, 4, np.array([1.0, 3.0]), epsilon=0.5)
     heard = [report for report in heard if report[2]]  # it may have been compiled in time
     assert heard == [("stage", 2, 4, {"loss": 2.0, "epsilon": 0.5})]
@@ -312,7 +320,7 @@ def test_programs_of_all_stages_are_forgotten(tmp_path, monkeypatch):
     kept, x = Kept(tmp_path), jnp.ones(1)
     names = "mission-go_on", "detector_Wärme-begin", "policies_lidar-begin", "jmvae-advance"
     for name in names:
-        assert kept.find_or_trace(name, lambda x: x, (x,)) is not None
+        assert kept.find_or_trace(name, lambda x: x, (x,), Clock().record) is not None
     assert len(list(kept.path.iterdir())) == 4
     monkeypatch.setattr(kept_programs, "_MAX_KEPT", 1)
     Kept(tmp_path)

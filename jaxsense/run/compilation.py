@@ -1,7 +1,8 @@
 """Compiles programs in the background."""
 
 import contextlib
-import time
+import functools
+import threading
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor, wait
 from types import TracebackType
@@ -14,22 +15,36 @@ from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.kept import Function, Kept, shapes_of
 from jaxsense.run.monitor import Monitor
 
+_LOADED = "/jax/compilation_cache/cache_hits"
+
 
 class Compiler:
     """Compiles the programs of a run in its own threads.
 
     Attributes:
-      monitor: receives compile times.
+      monitor: its clock records compile times.
       kept: cache of traced programs, if any.
     """
 
     def __init__(self, monitor: Monitor, kept: Kept | None = None):
         self.monitor, self.kept = monitor, kept
-        self._threads = ThreadPoolExecutor(devices.NUM_THREADS)
+        self._threads = ThreadPoolExecutor(devices.NUM_THREADS, "compile")
         self._is_closed = False
+        self._loaded = threading.local()
 
     def __enter__(self) -> "Compiler":
+        jax.monitoring.register_event_listener(self._notice)
         return self
+
+    def _notice(self, event: str, **_: str | int) -> None:
+        """Notices that JAX has loaded the program that this thread asked it to compile."""
+        if event == _LOADED:
+            self._loaded.programs = 1 + getattr(self._loaded, "programs", 0)
+
+    @property
+    def num_loaded(self) -> int:
+        """Number of programs that JAX has loaded from its cache in this thread."""
+        return getattr(self._loaded, "programs", 0)
 
     def __exit__(
         self,
@@ -39,6 +54,7 @@ class Compiler:
     ) -> None:
         """Cancels pending work, which would keep the process alive."""
         self._is_closed = True
+        jax.monitoring.unregister_event_listener(self._notice)
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     def check_open(self) -> None:
@@ -70,7 +86,8 @@ class Program:
           name: unique within the stage.
         """
         self._compiler, self._monitor = compiler, compiler.monitor
-        self._stage, self._name = stage, name
+        self._stage, self._name, self._clock = stage, name, compiler.monitor.clock
+        self._record = functools.partial(self._clock.record, stage=stage, program=name)
         self._compiled: Future[Function] = Future()
         self._workers, self._whole = ALONE, ()
 
@@ -98,21 +115,20 @@ class Program:
           CancelledError: if the run is over.
         """
         self._compiler.check_open()
-        begin = time.perf_counter()
         self._workers, self._whole = workers, whole
         function = devices.spread(function, workers.mesh, whole)
         args = devices.part(args, 0, workers.threads, whole)
         lowered, results = self._lower(function, args)
-        self._monitor.add(self._stage, "compile_s", time.perf_counter() - begin)
 
         def compile_lowered() -> None:
-            begin = time.perf_counter()
+            begin, loaded = self._clock.now, self._compiler.num_loaded
             try:
                 compiled = lowered.compile(compiler_options=devices.compiler_options(**options))
             except Exception as error:
                 self.fail(error)
                 return
-            self._monitor.add(self._stage, "compile_s", time.perf_counter() - begin)
+            is_new = self._compiler.num_loaded == loaded
+            self._clock.add("compile" if is_new else "load", self._stage, self._name, since=begin)
             with contextlib.suppress(InvalidStateError):  # `fail` was called before
                 self._compiled.set_result(compiled)
 
@@ -124,12 +140,16 @@ class Program:
         kept = self._compiler.kept
         # A program split over devices cannot be called from one that is not.
         if kept is not None and self._workers.mesh is None:
-            found = kept.find_or_trace(f"{self._stage}-{self._name}", function, args)
+            name = f"{self._stage}-{self._name}"
+            found = kept.find_or_trace(name, function, args, self._record)
             if found is not None:
-                return jax.jit(found.__call__).lower(*shapes_of(args)), found.results
+                with self._record("lower"):
+                    return jax.jit(found.__call__).lower(*shapes_of(args)), found.results
         places = self._places(len(args)) if self._is_of_many else None
-        traced = jax.jit(function, in_shardings=places).trace(*args)
-        return traced.lower(), traced.out_info
+        with self._record("trace"):
+            traced = jax.jit(function, in_shardings=places).trace(*args)
+        with self._record("lower"):
+            return traced.lower(), traced.out_info
 
     @property
     def _is_of_many(self) -> bool:
@@ -158,9 +178,10 @@ class Program:
         """
         if not self._compiled.done():
             self._monitor.announce(self._stage)
-        while not self._compiled.done():
-            self._monitor.check_stop()
-            wait((self._compiled,), timeout=0.2)
+            with self._record("wait_program"):
+                while not self._compiled.done():
+                    self._monitor.check_stop()
+                    wait((self._compiled,), timeout=0.2)
         return self._compiled.result()
 
     def run(self, *args: PyTree) -> PyTree[jax.Array]:
@@ -173,16 +194,13 @@ class Program:
     def __call__(self, *args: PyTree) -> PyTree:
         """Runs the program, and blocks until its results are ready."""
         compiled = self.wait()
-        begin, number = time.perf_counter(), self._workers.threads
-
-        if self._is_of_many:
-            args = devices.put(args, self._places(len(args)))
+        number = self._workers.threads
 
         def run(i: int) -> PyTree:
             return jax.block_until_ready(compiled(*devices.part(args, i, number, self._whole)))
 
-        output = devices.joined(devices.side_by_side(run, number))
-        if self._is_of_many:
-            output = devices.fetched(output)
-        self._monitor.add(self._stage, "run_s", time.perf_counter() - begin)
-        return output
+        with self._record("run"):
+            if self._is_of_many:
+                args = devices.put(args, self._places(len(args)))
+            output = devices.joined(devices.side_by_side(run, number))
+            return devices.fetched(output) if self._is_of_many else output

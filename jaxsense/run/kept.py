@@ -17,6 +17,7 @@ from jax import export
 from jaxtyping import PyTree
 
 from jaxsense.run import files
+from jaxsense.run.clock import Recorder
 from jaxsense.run.version import versions
 
 Function: TypeAlias = Callable[..., PyTree]
@@ -119,18 +120,22 @@ class Kept:
             return found
         return None
 
-    def find_or_trace(self, name: str, function: Function, args: PyTree) -> Traced | None:
+    def find_or_trace(
+        self, name: str, function: Function, args: PyTree, record: Recorder
+    ) -> Traced | None:
         """Finds a cached program, or traces and caches a new one.
 
         Args:
           name: of the program.
           function: what to trace.
           args: its arguments or their shapes.
+          record: what is recorded: "load", and if the program is new, "trace" and "lower".
 
         Returns:
           The program; None if it cannot be exported or written.
         """
-        found = self.find(name, args)
+        with record("load"):
+            found = self.find(name, args)
         if found is not None:
             return found
         leaves, structure = jax.tree.flatten(args)
@@ -144,9 +149,14 @@ class Kept:
         # A run must not end because the next one will be slower: on a full disk, or where a
         # program calls something that JAX cannot export.
         with contextlib.suppress(Exception):
-            traced = Traced(export.export(jax.jit(flat))(*shapes_of(leaves)), results[-1])
-            content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
-            files.write(self._file(name, args), files.with_digest(content), mode=0o600)
+            jitted, shapes = jax.jit(flat), shapes_of(leaves)
+            # Exporting would trace too; JAX does so once.
+            with record("trace"):
+                jitted.trace(*shapes)
+            with record("lower"):
+                traced = Traced(export.export(jitted)(*shapes), results[-1])
+                content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
+                files.write(self._file(name, args), files.with_digest(content), mode=0o600)
             return traced
         return None
 
