@@ -6,8 +6,7 @@ import itertools
 import shlex
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
@@ -23,15 +22,17 @@ from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, read_some
 from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
+from jaxsense.run.clock import Clock, process_start
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.pipeline import RunResult
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory, Settings
-from jaxsense.show import animation, page, plots, tables, tensorboard
+from jaxsense.show import plots, report, tables, tensorboard
+from jaxsense.show.report import Pictures
 from jaxsense.show.terminal import Display, print_table, say
-from jaxsense.summary import compare, statistics
+from jaxsense.summary import compare, profile, statistics
 from jaxsense.summary.blocks import Header
 
 PROGRAM = "jaxsense.train"
@@ -107,7 +108,9 @@ def main(
       change: changes a preset in your own program, before the other options do.
       policies: custom policies by name; missions play those that `config.mission.policies` names.
     """
-    begin = time.perf_counter()
+    # The process may have run others before, unless its own command line asks for this.
+    clock = Clock(process_start() if argv is None else None)
+    clock.add_rest("import")
     arguments = parse(sys.argv[1:] if argv is None else argv, change, policies)
     is_quiet, is_first = arguments.quiet, not arguments.process_index
     if not is_first:
@@ -126,7 +129,7 @@ def main(
                 begins=lambda: None if is_quiet else say(waits),
             )
             workers = devices.start(arguments.devices)
-            _train(begin, arguments, run, workers, console, policies)
+            _train(clock, arguments, run, workers, console, policies)
         processes.leave()
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
@@ -228,7 +231,7 @@ def _discarded(settings: Settings) -> Iterator[RunDirectory]:
 
 
 def _train(
-    begin: float,
+    clock: Clock,
     arguments: Arguments,
     run: RunDirectory,
     workers: Workers,
@@ -238,7 +241,7 @@ def _train(
     """Trains all seeds with the same programs, and writes their results."""
     settings, failed = run.settings, dict[int, str]()
     kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config, has_own_code=bool(policies))
-    monitor = Monitor(warn=_warn)
+    monitor = Monitor(warn=_warn, clock=clock)
 
     def stop() -> None:
         monitor.stop()
@@ -261,8 +264,8 @@ def _train(
                         opened.enter_context(seeds.open_run(run, seed, path))
                         for seed, path in left[first : first + size]
                     ]
-                    failed |= _train_together(begin, arguments, runs, programs, monitor, console)
-                begin = time.perf_counter()
+                    failed |= _train_together(arguments, runs, programs, monitor, console)
+                clock.restart()
     except Stopped:
         if jax.process_index() == 0:
             again = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}"
@@ -280,7 +283,6 @@ def _train(
 
 
 def _train_together(
-    begin: float,
     arguments: Arguments,
     runs: list[RunDirectory],
     programs: Programs,
@@ -310,19 +312,25 @@ def _train_together(
         finally:
             programs.trainings.leave()
 
+    clock = monitor.clock
+    clock.add_rest("start")
     with displays[0]:
         monitor.begin(displays[0].show)
         results = devices.side_by_side(train, len(runs))
-        timing = statistics.timing(time.perf_counter() - begin, monitor.seconds, len(runs))
         failed: dict[int, str] = {}
+        drawn = list[tuple[RunDirectory, RunResult, Pictures]]()
         for run, result in zip(runs, results, strict=True):
-            try:
-                if isinstance(result, StageError):
-                    raise result
-                _write(run, result, timing, monitor)
-            except StageError as error:
-                failed[run.settings.seed] = str(error)
-                _warn(f"{error}; earlier checkpoints are in {run.path}")
+            if isinstance(result, StageError):
+                failed[run.settings.seed] = str(result)
+                _warn(f"{result}; earlier checkpoints are in {run.path}")
+                continue
+            monitor.check_stop()
+            with clock.record("draw", "report"):
+                drawn.append((run, result, report.draw(run.settings.config, result)))
+        stages = profile.of_stages(clock.spans)
+        timing = statistics.timing(clock.now - clock.begin, stages, len(runs))
+        for run, result, pictures in drawn:
+            _write(run, result, pictures, timing, monitor)
     return failed
 
 
@@ -334,7 +342,7 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
     curves = seeds.rewards(paths, run.settings.config, _warn)
-    _write_page(run, plots.of_seeds(curves, means), found)
+    report.write(run, plots.of_seeds(curves, means), found)
     rundir.write_json(run.path / "summary.json", found)
 
 
@@ -343,30 +351,18 @@ def _warn(text: str) -> None:
     cli.complain(f"{PROGRAM}: {text}")
 
 
-def _write(run: RunDirectory, result: RunResult, timing: summary.Timing, monitor: Monitor) -> None:
-    """Writes plots, the report and last the summary, which marks the run as finished."""
-    config, recording = run.settings.config, result.recording
-    monitor.check_stop()
-    pictures = plots.of_run(
-        config, result.results, result.posteriors, result.windows, result.reliability
-    )
-    pictures |= plots.of_seeds(result.rewards, result.results)
-    title = f"{config.mission.policies[0]} policy".replace("_", " ")
-    fusion, fields_of_view = result.models.fusion, result.fields_of_view
-    film = animation.draw(config, recording.records, recording.end, fusion, fields_of_view, title)
+def _write(
+    run: RunDirectory,
+    result: RunResult,
+    pictures: Pictures,
+    timing: summary.Timing,
+    monitor: Monitor,
+) -> None:
+    """Writes the report and last the summary, which marks the run as finished."""
     found: summary.Summary = {**_header(run), "timing": timing, **result.results}
-    _write_page(run, {**pictures, "mission.svg": film}, found)
+    report.write(run, pictures, found, monitor.clock)
     monitor.check_stop()
     rundir.write_json(run.path / "summary.json", found)
-
-
-def _write_page(
-    run: RunDirectory, pictures: Mapping[str, bytes | str], found: summary.Summary
-) -> None:
-    """Writes pictures, and then the page that shows them."""
-    for name, content in pictures.items():
-        files.write(run.path / name, content)
-    files.write(run.path / "report.html", page.render(run.path, run.settings.config, found))
 
 
 def _header(run: RunDirectory) -> Header:

@@ -11,8 +11,8 @@ from typing import NoReturn, TypeVar
 import jax
 
 from jaxsense.config import Config, ConfigError, options, require_32_bits
-from jaxsense.run import compilation
-from jaxsense.run.compilation import Kept
+from jaxsense.run import kept
+from jaxsense.run.kept import Kept
 
 T = TypeVar("T")
 
@@ -160,7 +160,7 @@ def keep_programs(
     try:
         directory = directory.expanduser()
         if config.sensors or has_own_code:
-            compilation.use_cache(directory)
+            kept.use_cache(directory)
             return None
         return Kept(directory, jax.tree.structure(config))
     except (OSError, RuntimeError) as error:

@@ -14,8 +14,9 @@ from jaxsense.dqn.reference import has_optimum
 from jaxsense.models import Models
 from jaxsense.run import missions
 from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.compilation import Compiler, Kept
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.kept import Kept
 from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import OwnPolicies, Programs, compile_programs
@@ -107,7 +108,9 @@ def run(
     checkpoints = checkpoints or Checkpoints()
     trained = train(key, config, programs, monitor, checkpoints)
     networks = models(trained.outputs, config)
-    player, episodes = programs.player.result(), config.mission.episodes
+    with monitor.clock.record("wait_program", "mission"):
+        player = programs.player.result()
+    episodes = config.mission.episodes
     cases = mission.cases(config, player.mission.policies)
     played = {name: cases[name] for name in config.mission.policies}
     found = player.play(mission_key(key), networks, played, episodes)
@@ -117,7 +120,7 @@ def run(
     sensors = player.mission.world.sensors
     beliefs = summary.beliefs(trained.outputs["beliefs"])
     is_sound = compare.unsound(beliefs) is None
-    return RunResult(
+    result = RunResult(
         models=networks,
         windows={
             sensor.name: sensor.from_left(windows[:, 0])
@@ -143,6 +146,8 @@ def run(
             "mission": summary.missions(player.mission, found.metrics),
         },
     )
+    monitor.clock.add_rest("summarise")
+    return result
 
 
 def _grouped(trained: Trained) -> dict[str, object]:

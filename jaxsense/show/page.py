@@ -5,7 +5,7 @@ import contextlib
 import json
 import operator
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import jinja2
@@ -13,13 +13,18 @@ import jinja2
 from jaxsense.config import PRESETS, Config, as_plain, parse_json
 from jaxsense.show import tables
 from jaxsense.show.mission_plots import counted
-from jaxsense.summary import Evaluation, Missions, Summary, cases, compare, traffic
+from jaxsense.summary import Evaluation, Missions, Summary, cases, compare, profile, traffic
 from jaxsense.summary.metrics import mean
+from jaxsense.summary.profile import Span
 from jaxsense.summary.read import EVALUATIONS
 
 
 def render(
-    run: Path, config: Config, summary: Summary, evaluations: Mapping[str, Evaluation] | None = None
+    run: Path,
+    config: Config,
+    summary: Summary,
+    evaluations: Mapping[str, Evaluation] | None = None,
+    spans: Sequence[Span] = (),
 ) -> str:
     """Writes the page of a run, or of several seeds, as text.
 
@@ -28,6 +33,7 @@ def render(
       config: its settings.
       summary: its summary.
       evaluations: further missions, by the names of their files.
+      spans: when the run did what, if it is known.
 
     Raises:
       OSError: if a picture cannot be read.
@@ -63,6 +69,7 @@ def render(
         ],
         paper=tables.paper(summary),
         times=tables.times(summary, summary["timing"]),
+        profile=profile.verdict(spans),
         devices={kind: summary["devices"].count(kind) for kind in summary["devices"]},
         commit=_commit(run),
         changed=_changed(config, summary["preset"]),
