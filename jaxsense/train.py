@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, cast
 
 import jax
@@ -26,11 +27,10 @@ from jaxsense.run.clock import Clock, process_start
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.pipeline import RunResult
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory, Settings
-from jaxsense.show import plots, report, tables, tensorboard
-from jaxsense.show.report import Pictures
+from jaxsense.show import tables, tensorboard
+from jaxsense.show.artist import Artist
 from jaxsense.show.terminal import Display, print_table, say
 from jaxsense.summary import compare, profile, statistics
 from jaxsense.summary.blocks import Header
@@ -299,38 +299,42 @@ def _train_together(
 
     displays = [display(run) for run in runs]
     programs.trainings.begin(len(runs))
+    clock, artist = monitor.clock, Artist(monitor.clock)
 
-    def train(i: int) -> RunResult | StageError:
-        key = jax.random.key(runs[i].settings.seed)
+    def train(i: int) -> summary.Results | StageError:
+        run, config = runs[i], runs[i].settings.config
+        key, checkpoints = jax.random.key(run.settings.seed), run.checkpoints
         of_seed = monitor if len(runs) == 1 else monitor.beside(displays[i].show)
         try:
-            return pipeline.run(
-                key, runs[i].settings.config, programs, of_seed, runs[i].checkpoints
-            )
+            learned = pipeline.learn(key, config, programs, of_seed, checkpoints)
+            artist.draw(run.path, lambda: _report().of_training(config, learned))
+            played = pipeline.play(key, config, programs, of_seed, learned, checkpoints)
+            artist.draw(run.path, lambda: _report().of_missions(config, learned, played))
+            return {**learned.results, "mission": played.missions}
         except StageError as error:
             return error
         finally:
             programs.trainings.leave()
 
-    clock = monitor.clock
     clock.add_rest("start")
-    with displays[0]:
+    failed: dict[int, str] = {}
+    with displays[0], artist:
         monitor.begin(displays[0].show)
         results = devices.side_by_side(train, len(runs))
-        failed: dict[int, str] = {}
-        drawn = list[tuple[RunDirectory, RunResult, Pictures]]()
+        drawn = artist.finished()
+        stages = profile.of_stages(clock.spans)
+        timing = statistics.timing(clock.now - clock.begin, stages, len(runs))
         for run, result in zip(runs, results, strict=True):
             if isinstance(result, StageError):
                 failed[run.settings.seed] = str(result)
                 _warn(f"{result}; earlier checkpoints are in {run.path}")
                 continue
             monitor.check_stop()
-            with clock.record("draw", "report"):
-                drawn.append((run, result, report.draw(run.settings.config, result)))
-        stages = profile.of_stages(clock.spans)
-        timing = statistics.timing(clock.now - clock.begin, stages, len(runs))
-        for run, result, pictures in drawn:
-            _write(run, result, pictures, timing, monitor)
+            found: summary.Summary = {**_header(run), "timing": timing, **result}
+            _report().write(run, drawn[run.path], found, clock)
+            monitor.check_stop()
+            # Last, for it marks the run as finished.
+            rundir.write_json(run.path / "summary.json", found)
     return failed
 
 
@@ -342,27 +346,20 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
     curves = seeds.rewards(paths, run.settings.config, _warn)
-    report.write(run, plots.of_seeds(curves, means), found)
+    _report().write(run, _report().of_seeds(curves, means), found)
     rundir.write_json(run.path / "summary.json", found)
+
+
+def _report() -> ModuleType:
+    """The module that draws and writes pages, imported when the first picture is drawn."""
+    from jaxsense.show import report  # noqa: PLC0415 (matplotlib takes long to import)
+
+    return report
 
 
 def _warn(text: str) -> None:
     """Prints a warning."""
     cli.complain(f"{PROGRAM}: {text}")
-
-
-def _write(
-    run: RunDirectory,
-    result: RunResult,
-    pictures: Pictures,
-    timing: summary.Timing,
-    monitor: Monitor,
-) -> None:
-    """Writes the report and last the summary, which marks the run as finished."""
-    found: summary.Summary = {**_header(run), "timing": timing, **result.results}
-    report.write(run, pictures, found, monitor.clock)
-    monitor.check_stop()
-    rundir.write_json(run.path / "summary.json", found)
 
 
 def _header(run: RunDirectory) -> Header:

@@ -123,13 +123,11 @@ def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     config, titles = dataclasses.replace(PRESETS["smoke"], mission=first), []
     draw = lambda *inputs: titles.append(inputs[-1]) or ""  # noqa: E731
     monkeypatch.setattr(report.animation, "draw", draw)
-    for name in ("of_run", "of_seeds"):
-        monkeypatch.setattr(report.plots, name, lambda *inputs: {})
-    names = ("posteriors", "windows", "fields_of_view", "reliability", "rewards")
-    recorded = SimpleNamespace(records=None, end=None)
-    models = SimpleNamespace(fusion=None)
-    result = SimpleNamespace(models=models, recording=recorded, results={}, **dict.fromkeys(names))
-    assert [*report.draw(config, result)] == ["mission.svg"]  # pyright: ignore
+    monkeypatch.setattr(report.plots, "of_missions", lambda missions: {})
+    learned = SimpleNamespace(models=SimpleNamespace(fusion=None), fields_of_view=None)
+    played = SimpleNamespace(recording=SimpleNamespace(records=None, end=None), missions={})
+    found = report.of_missions(config, learned, played)  # pyright: ignore
+    assert [*found] == ["mission.svg"]
     assert titles == ["naive 2 policy"]
 
 

@@ -1,35 +1,52 @@
 """Draws and writes what people see of a finished run: plots, the film, the page."""
 
-from collections.abc import Mapping
-
 from jaxsense.config import Config
 from jaxsense.run import files
 from jaxsense.run.clock import Clock
-from jaxsense.run.pipeline import RunResult
+from jaxsense.run.pipeline import Learned, Played
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.show import animation, page, plots, timeline
-from jaxsense.summary import Summary, profile
-
-Pictures = Mapping[str, bytes | str]
-"""The content of plots and films, by the names of their files."""
+from jaxsense.show.artist import Pictures
+from jaxsense.summary import Results, Summary, profile
 
 
-def draw(config: Config, result: RunResult) -> Pictures:
-    """Draws the plots and the film of a run.
+def of_training(config: Config, learned: Learned) -> Pictures:
+    """Draws the plots of a training.
 
     Args:
       config: its settings.
-      result: of the run.
+      learned: its results.
     """
-    recording = result.recording
     pictures = plots.of_run(
-        config, result.results, result.posteriors, result.windows, result.reliability
+        config, learned.results, learned.posteriors, learned.windows, learned.reliability
     )
-    pictures |= plots.of_seeds(result.rewards, result.results)
+    return {**pictures, **plots.of_learning(learned.rewards, learned.results)}
+
+
+def of_missions(config: Config, learned: Learned, played: Played) -> Pictures:
+    """Draws the plots and the film of missions.
+
+    Args:
+      config: settings of the run.
+      learned: results of its training.
+      played: results of its missions.
+    """
     title = f"{config.mission.policies[0]} policy".replace("_", " ")
-    fusion, fields_of_view = result.models.fusion, result.fields_of_view
-    film = animation.draw(config, recording.records, recording.end, fusion, fields_of_view, title)
-    return {**pictures, "mission.svg": film}
+    recording, fusion = played.recording, learned.models.fusion
+    film = animation.draw(
+        config, recording.records, recording.end, fusion, learned.fields_of_view, title
+    )
+    return {**plots.of_missions(played.missions), "mission.svg": film}
+
+
+def of_seeds(curves: plots.Curves, results: Results) -> Pictures:
+    """Draws the plots of several seeds together.
+
+    Args:
+      curves: see `plots.rewards`.
+      results: means and intervals.
+    """
+    return {**plots.of_learning(curves, results), **plots.of_missions(results["mission"])}
 
 
 def write(

@@ -112,7 +112,9 @@ def parts(spans: Sequence[Span]) -> dict[tuple[Kind, str], float]:
         now = [span for span in spans if span.start_s <= start and end <= span.end_s]
         if now:
             first = min(map(_rank, now))
-            sharing = {(span.kind, span.stage) for span in now if _rank(span) == first}
+            sharing: set[tuple[Kind, str]] = {
+                (span.kind, span.stage) for span in now if _rank(span) == first
+            }
             for part in sharing:
                 found[part] += (end - start) / len(sharing)
     return dict(sorted(found.items(), key=lambda part: (-part[1], part[0])))
