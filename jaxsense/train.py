@@ -9,7 +9,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -21,7 +20,7 @@ import rich.table
 from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
-from jaxsense.config.options import Name, OptionError, read_some
+from jaxsense.config.options import Name, OptionError, command, read_some
 from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
@@ -144,7 +143,7 @@ def main(
     # A quiet run prints only these two lines.
     say(f"Results are in {run.path}. Start with {run.path / 'report.html'}.")
     trust = " --trust" if arguments.config.sensors else ""
-    say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
+    say(f"Next: {command('jaxsense.evaluate')} {shlex.quote(str(first))} --animate{trust}")
 
 
 def parse(
@@ -212,8 +211,7 @@ def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:
         return _discarded(arguments.settings)
     if arguments.resume is not None:
         return RunDirectory.resume(arguments.resume, arguments.trust)
-    name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
-    path = arguments.out or rundir.unused(Path("runs") / name)
+    path = arguments.out or rundir.dated(arguments.preset)
     return RunDirectory.create(path, arguments.settings)
 
 
@@ -265,7 +263,7 @@ def _train(
                 begin = time.perf_counter()
     except Stopped:
         if jax.process_index() == 0:
-            again = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}"
+            again = f"{command(PROGRAM)} --resume {shlex.quote(str(run.path))}"
             again += " --trust" if settings.config.sensors else ""
             again += " with the same processes" if jax.process_count() > 1 else ""
             cli.complain(f"Stopped; all training so far is saved. To resume: {again}")
@@ -340,7 +338,7 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
 
 def _warn(text: str) -> None:
     """Prints a warning."""
-    cli.complain(f"{PROGRAM}: {text}")
+    cli.warn(PROGRAM, text)
 
 
 def _write(run: RunDirectory, result: RunResult, timing: summary.Timing, monitor: Monitor) -> None:
