@@ -128,7 +128,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         found.recording.records,
         found.recording.end,
         models.fusion,
-        {sensor.name: sensor.field_of_view for sensor in scenario.world.sensors},
+        scenario.fields_of_view,
     )
     try:
         written = _write(arguments, trained, config, block, draw)

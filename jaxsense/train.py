@@ -8,7 +8,6 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from datetime import datetime
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, cast
@@ -21,7 +20,7 @@ import rich.table
 from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
-from jaxsense.config.options import Name, OptionError, read_some
+from jaxsense.config.options import Name, OptionError, command, read_some
 from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
 from jaxsense.run.clock import Clock, process_start
 from jaxsense.run.devices import Workers
@@ -147,7 +146,7 @@ def main(
     # A quiet run prints only these two lines.
     say(f"Results are in {run.path}. Start with {run.path / 'report.html'}.")
     trust = " --trust" if arguments.config.sensors else ""
-    say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
+    say(f"Next: {command('jaxsense.evaluate')} {shlex.quote(str(first))} --animate{trust}")
 
 
 def parse(
@@ -215,8 +214,7 @@ def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:
         return _discarded(arguments.settings)
     if arguments.resume is not None:
         return RunDirectory.resume(arguments.resume, arguments.trust)
-    name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
-    path = arguments.out or rundir.unused(Path("runs") / name)
+    path = arguments.out or rundir.dated(arguments.preset)
     return RunDirectory.create(path, arguments.settings)
 
 
@@ -268,7 +266,7 @@ def _train(
                 clock.restart()
     except Stopped:
         if jax.process_index() == 0:
-            again = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}"
+            again = f"{command(PROGRAM)} --resume {shlex.quote(str(run.path))}"
             again += " --trust" if settings.config.sensors else ""
             again += " with the same processes" if jax.process_count() > 1 else ""
             cli.complain(f"Stopped; all training so far is saved. To resume: {again}")
@@ -359,7 +357,7 @@ def _report() -> ModuleType:
 
 def _warn(text: str) -> None:
     """Prints a warning."""
-    cli.complain(f"{PROGRAM}: {text}")
+    cli.warn(PROGRAM, text)
 
 
 def _header(run: RunDirectory) -> Header:

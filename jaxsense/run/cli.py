@@ -91,6 +91,16 @@ def complain(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
+def warn(program: str, message: str) -> None:
+    """Prints a line about a program to standard error.
+
+    Args:
+      program: module that runs.
+      message: the rest of the line.
+    """
+    complain(f"{options.command(program).removeprefix('python -m ')}: {message}")
+
+
 def fail(program: str, message: str) -> NoReturn:
     """Ends a program with one line about an error that the user can correct.
 
@@ -101,7 +111,7 @@ def fail(program: str, message: str) -> NoReturn:
     Raises:
       SystemExit: with status 2.
     """
-    complain(f"{program}: {' '.join(message.splitlines())}")
+    warn(program, " ".join(message.splitlines()))
     sys.exit(2)
 
 
@@ -169,5 +179,5 @@ def keep_programs(
             return None
         return Kept(directory, jax.tree.structure(config))
     except (OSError, RuntimeError) as error:
-        complain(f"{program}: programs cannot be kept in {directory} ({error})")
+        warn(program, f"programs cannot be kept in {directory} ({error})")
         return None

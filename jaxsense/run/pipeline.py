@@ -129,7 +129,7 @@ def learn(
             sensor.name: sensor.from_left(windows[:, 0])
             for sensor, windows in zip(sensors, detections.windows, strict=True)
         },
-        fields_of_view={sensor.name: sensor.field_of_view for sensor in sensors},
+        fields_of_view=player.mission.fields_of_view,
         reliability=reliability(config, detections.held_out),
         posteriors=posteriors,
         rewards={

@@ -4,6 +4,8 @@ from jaxsense.tasks.pretrained import PRETRAINED as PRETRAINED
 from jaxsense.tasks.pretrained import Origin as Origin
 from jaxsense.tasks.pretrained import load_pretrained as load_pretrained
 from jaxsense.tasks.pretrained import origin as origin
+from jaxsense.tasks.registry import about as about
+from jaxsense.tasks.registry import agents as agents
 from jaxsense.tasks.registry import make as make
 from jaxsense.tasks.registry import registered as registered
 from jaxsense.tasks.score import Estimate as Estimate
@@ -12,5 +14,7 @@ from jaxsense.tasks.score import Score as Score
 from jaxsense.tasks.score import estimate as estimate
 from jaxsense.tasks.score import on_host as on_host
 from jaxsense.tasks.score import score as score
+from jaxsense.tasks.task import EPISODES as EPISODES
+from jaxsense.tasks.task import SEEDS as SEEDS
 from jaxsense.tasks.task import Task as Task
 from jaxsense.tasks.task import TimeStep as TimeStep

@@ -27,8 +27,13 @@ from jaxsense.tasks.task import (
 )
 from jaxsense.training.mdp import models_of
 
-TASKS = ("map-v0", "many-v0", "noisy-v0", "team-v0")
-"""Names of the frozen tasks."""
+TASKS = {
+    "map-v0": "the paper's map of three PoIs, whose looks are almost certain",
+    "many-v0": "eight PoIs of sixteen classes, of which a sensor tells four labels apart",
+    "noisy-v0": "looks are uncertain and beliefs accumulate them",
+    "team-v0": "a camera and a LiDAR drive among three to eight PoIs, and time has a price",
+}
+"""The frozen tasks, and what is special in each."""
 
 _STATES, _STEPS = 1024, 12  # from which observations are scaled
 _LEAST_SPREAD = 1e-6  # below which a feature is constant
@@ -38,7 +43,28 @@ _TEAM = "team"
 
 def registered() -> tuple[str, ...]:
     """Names of all tasks, for `make`."""
-    return TASKS
+    return tuple(TASKS)
+
+
+def about(name: str) -> str:
+    """What is special in a task, in a few words.
+
+    Args:
+      name: one of `registered()`.
+    """
+    return TASKS[name]
+
+
+def agents(name: str) -> tuple[str, ...]:
+    """The agents of a task, for `make`.
+
+    Args:
+      name: one of `registered()`.
+
+    Raises:
+      ConfigError: if there is no such task.
+    """
+    return _agents(from_plain(_read(name)[1]["config"]))
 
 
 def make(name: str, agent: str | None = None) -> Task:
@@ -56,11 +82,9 @@ def make(name: str, agent: str | None = None) -> Task:
     Raises:
       ConfigError: if there is no such task or agent, or if JAX computes in 64 bits.
     """
-    if name not in TASKS:
-        raise ConfigError("name", name, f"must be one of {', '.join(TASKS)}")
+    arrays, words = _read(name)
     require_32_bits()
-    arrays, about = archive.read(DATA / f"{name}.npz")
-    config = from_plain(about["config"])
+    config = from_plain(words["config"])
     shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
     fusion = archive.fill(arrays, "fusion", shapes.fusion)
     values = archive.fill(arrays, "look_values", shapes.look_values)
@@ -92,15 +116,26 @@ def freeze(
         task = _made(name, agent, config, parts, bank, scaling, {})
         return np.stack([*reference_returns(task, SEEDS, EPISODES).values()])
 
-    agents = (_TEAM,) if config.dqn.task == _TEAM else config.modalities
     trees = {
         "fusion": trained.fusion,
         "look_values": trained.look_values,
         "looks": looks,
         "scaling": {"offset": scaling.offset, "scale": scaling.scale},
-        "returns": {agent: returns(agent) for agent in agents},
+        "returns": {agent: returns(agent) for agent in _agents(config)},
     }
     archive.write(file, trees, {"config": as_plain(config), "origin": dataclasses.asdict(made)})
+
+
+def _read(name: str) -> tuple[Arrays, dict[str, object]]:
+    """What a task's file holds, see `archive.read`."""
+    if name not in TASKS:
+        raise ConfigError("name", name, f"must be one of {', '.join(TASKS)}")
+    return archive.read(DATA / f"{name}.npz")
+
+
+def _agents(config: Config) -> tuple[str, ...]:
+    """Who acts in a task with some settings."""
+    return (_TEAM,) if config.dqn.task == _TEAM else config.modalities
 
 
 def _made(
