@@ -1,5 +1,7 @@
 """Trained models, frozen tasks and scores that travel with the package."""
 
+from jaxsense.tasks.environment import Environment as Environment
+from jaxsense.tasks.environment import TimeStep as TimeStep
 from jaxsense.tasks.pretrained import PRETRAINED as PRETRAINED
 from jaxsense.tasks.pretrained import Origin as Origin
 from jaxsense.tasks.pretrained import load_pretrained as load_pretrained
@@ -17,4 +19,3 @@ from jaxsense.tasks.score import score as score
 from jaxsense.tasks.task import EPISODES as EPISODES
 from jaxsense.tasks.task import SEEDS as SEEDS
 from jaxsense.tasks.task import Task as Task
-from jaxsense.tasks.task import TimeStep as TimeStep

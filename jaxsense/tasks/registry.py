@@ -15,16 +15,9 @@ from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
 from jaxsense.tasks import archive
 from jaxsense.tasks.archive import Arrays
+from jaxsense.tasks.environment import Scaling
 from jaxsense.tasks.pretrained import DATA, Origin
-from jaxsense.tasks.task import (
-    EPISODES,
-    SEEDS,
-    MapTask,
-    Scaling,
-    Task,
-    TeamTask,
-    reference_returns,
-)
+from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, reference_returns
 from jaxsense.training.mdp import models_of
 
 TASKS = {
@@ -92,6 +85,23 @@ def make(name: str, agent: str | None = None) -> Task:
     scaling = Scaling(jnp.asarray(arrays["scaling/offset"]), jnp.asarray(arrays["scaling/scale"]))
     parts = models_of(config, fusion, values)
     return _made(name, agent, config, parts, looks, scaling, arrays)
+
+
+def as_task(task: Task | str, agent: str | None = None) -> Task:
+    """A task, by its name or as it is.
+
+    Args:
+      task: from `make`, or its name.
+      agent: see `make`; only with a name.
+
+    Raises:
+      ConfigError: if there is no such task or agent.
+    """
+    if isinstance(task, str):
+        return make(task, agent)
+    if agent is not None:
+        raise ConfigError("agent", agent, "goes with a name; make(name, agent) has one already")
+    return task
 
 
 def freeze(

@@ -13,7 +13,7 @@ from scipy import stats
 from jaxsense.config import ConfigError
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.tasks.registry import make
+from jaxsense.tasks.registry import as_task
 from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, key_of_seed, reference_returns
 
 _RESAMPLES = 2000
@@ -129,10 +129,7 @@ def score(
       ValueError: if a policy's actions are no scalar integers, or do not exist.
     """
     checks.require_number("episodes", episodes)
-    if isinstance(task, str):
-        task = make(task, agent)
-    elif agent is not None:
-        raise ConfigError("agent", agent, "goes with a name; make(name, agent) has one already")
+    task = as_task(task, agent)
     policies = [policy] * SEEDS if not isinstance(policy, Sequence) else list(policy)
     if not policies:
         raise ConfigError("policy", "[]", "must be one policy or several")

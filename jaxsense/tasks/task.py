@@ -21,6 +21,7 @@ from jaxsense.dqn.policies import Known
 from jaxsense.dqn.reference import reference
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.models import Models
+from jaxsense.tasks.environment import CLIP, Environment, Scaling, TimeStep
 
 M = TypeVar("M")
 
@@ -28,8 +29,6 @@ SEEDS = 10
 """Seeds of a score."""
 EPISODES = 1024
 """Episodes with each seed."""
-CLIP = 10.0
-"""Observations are within plus and minus this."""
 
 _FIRST_SEED = 2**31  # far from those that anybody trains with
 
@@ -37,49 +36,12 @@ Act = Callable[[Key, M, jax.Array], tuple[jax.Array, M]]
 """`(key, memory, observation [S]) -> []` int32 action, and the memory after it."""
 
 
-@pytree
-class Scaling:
-    """Brings the numbers of an observation to about the same size, the same way for every PoI.
-
-    Attributes:
-      offset: `[F]` means over states that random looks lead to.
-      scale: `[F]` their standard deviations.
-    """
-
-    offset: jax.Array
-    scale: jax.Array
-
-    def __call__(self, features: Float[Array, "N F"]) -> Float[Array, " S"]:
-        """`[N * F]` scaled from `[N, F]`, PoI by PoI."""
-        scaled = (features - self.offset[None]) / self.scale[None]
-        return jnp.clip(scaled, -CLIP, CLIP).reshape(-1)
-
-
-@pytree
-class TimeStep:
-    """What a step of a task returns besides the next state.
-
-    Attributes:
-      observation: `[S]` float32 after the action.
-      reward: `[]` float32.
-      terminated: `[]` bool, the agent has ended the episode.
-      truncated: `[]` bool, the episode has reached its limit of steps.
-    """
-
-    observation: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-
-
-class Task(Protocol):
+class Task(Environment, Protocol):
     """A frozen task; a pytree.
 
     Attributes:
       name: with its version.
       agent: who acts.
-      num_actions: A; the last action is NOP, which ends the agent's work.
-      observation_size: S.
       references: names of the policies that `play_reference` plays.
       has_optimum: whether the first one is optimal.
       scaling: of observations.
@@ -107,16 +69,6 @@ class Task(Protocol):
         ...
 
     @property
-    def num_actions(self) -> int:
-        """A."""
-        ...
-
-    @property
-    def observation_size(self) -> int:
-        """S."""
-        ...
-
-    @property
     def references(self) -> tuple[str, ...]:
         """Names of the policies to compare with."""
         ...
@@ -128,34 +80,6 @@ class Task(Protocol):
 
     def features(self, state: Any) -> Float[Array, "N F"]:
         """`[N, F]` what an observation holds of each PoI, not yet scaled."""
-        ...
-
-    def reset(self, key: Key) -> tuple[Float[Array, " S"], Any]:
-        """Starts an episode.
-
-        Args:
-          key: random key.
-
-        Returns:
-          `[S]` observation, and the state.
-        """
-        ...
-
-    def action_mask(self, state: Any) -> Bool[Array, " A"]:
-        """`[A]` bool, the actions that exist in a state."""
-        ...
-
-    def step(self, key: Key, state: Any, action: Int[Array, ""]) -> tuple[Any, TimeStep]:
-        """Takes an action. An episode that has ended is not restarted.
-
-        Args:
-          key: random key.
-          state: from `reset` or `step`.
-          action: `[]` int32.
-
-        Returns:
-          The next state, and what the agent sees of it.
-        """
         ...
 
     def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
@@ -214,6 +138,16 @@ class MapTask:
         return 2 * self.mdp.num_pois * self.mdp.fusion.prior.mean.size
 
     @property
+    def bound(self) -> float:
+        """Observations are clipped there."""
+        return CLIP
+
+    @property
+    def max_steps(self) -> int:
+        """Actions in an episode, at most."""
+        return self.mdp.config.max_steps
+
+    @property
     def references(self) -> tuple[str, ...]:
         """The optimum, and policies of `dqn.POLICIES`."""
         return "optimal", "greedy", "naive", "random"
@@ -230,7 +164,11 @@ class MapTask:
     def reset(self, key: Key) -> tuple[Float[Array, " S"], MapState]:
         """Starts an episode, see `Task.reset`."""
         state = map_mdp.reset(key, self.mdp)
-        return self.scaling(self.features(state)), state
+        return self.observe(state), state
+
+    def observe(self, state: MapState) -> Float[Array, " S"]:
+        """What the agent sees: the map."""
+        return self.scaling(self.features(state))
 
     def action_mask(self, state: MapState) -> Bool[Array, " A"]:
         """`[A]` bool: all actions exist."""
@@ -240,7 +178,7 @@ class MapTask:
     def step(self, key: Key, state: MapState, action: Int[Array, ""]) -> tuple[MapState, TimeStep]:
         """Takes an action, see `Task.step`."""
         after, outcome = map_mdp.step(key, self.mdp, state, action, self.modality)
-        seen = self.scaling(self.features(after))
+        seen = self.observe(after)
         return after, TimeStep(seen, outcome.reward, outcome.terminated, outcome.truncated)
 
     def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
@@ -312,6 +250,16 @@ class TeamTask:
         return number * self.mdp.map.num_pois
 
     @property
+    def bound(self) -> float:
+        """Observations are clipped there."""
+        return CLIP
+
+    @property
+    def max_steps(self) -> int:
+        """Actions in an episode, at most."""
+        return self.mdp.config.max_steps
+
+    @property
     def references(self) -> tuple[str, ...]:
         """Rules of `dqn.POLICIES`."""
         return "nearest", "auction", "rollout", "naive", "random"
@@ -330,7 +278,11 @@ class TeamTask:
     def reset(self, key: Key) -> tuple[Float[Array, " S"], TeamState]:
         """Starts an episode, see `Task.reset`."""
         state = team_mdp.reset(key, self.mdp, self.robots)
-        return self.scaling(self.features(state)), state
+        return self.observe(state), state
+
+    def observe(self, state: TeamState) -> Float[Array, " S"]:
+        """What the robot sees whose turn it is."""
+        return self.scaling(self.features(state))
 
     def action_mask(self, state: TeamState) -> Bool[Array, " A"]:
         """`[A]` bool: the PoIs that are present, and NOP."""
@@ -347,8 +299,7 @@ class TeamTask:
         action = self._existing(state, action)
         after, outcome = team_mdp.step(key, self.mdp, state, action)
         price = self.mdp.time_price(after.team, jnp.asarray(outcome.seconds))
-        seen = self.scaling(self.features(after))
-        reward = outcome.reward - price
+        seen, reward = self.observe(after), outcome.reward - price
         return after, TimeStep(seen, reward, outcome.terminated, outcome.truncated)
 
     def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
@@ -356,7 +307,7 @@ class TeamTask:
 
         def choose(key: Key, state: TeamState, known: Known, memory: M) -> tuple[jax.Array, M]:
             del known
-            action, memory = act(key, memory, self.scaling(self.features(state)))
+            action, memory = act(key, memory, self.observe(state))
             return self._existing(state, action), memory
 
         return self._play(key, choose, memory)
