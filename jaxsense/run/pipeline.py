@@ -118,7 +118,7 @@ def learn(
     """
     trained = train(key, config, programs, monitor, checkpoints)
     with monitor.clock.record("wait_program", "mission"):
-        sensors = programs.player.result().mission.world.sensors
+        scenario = programs.player.result().mission
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
     beliefs = summary.beliefs(trained.outputs["beliefs"])
@@ -127,9 +127,9 @@ def learn(
         models=models(trained.outputs, config),
         windows={
             sensor.name: sensor.from_left(windows[:, 0])
-            for sensor, windows in zip(sensors, detections.windows, strict=True)
+            for sensor, windows in zip(scenario.world.sensors, detections.windows, strict=True)
         },
-        fields_of_view=player.mission.fields_of_view,
+        fields_of_view=scenario.fields_of_view,
         reliability=reliability(config, detections.held_out),
         posteriors=posteriors,
         rewards={
