@@ -1,4 +1,4 @@
-"""Pages that need no other file, from the templates beside this module."""
+"""Pages that need no other file, from the templates in this directory."""
 
 import base64
 
