@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import gc
 import os
 import sys
 import webbrowser
@@ -59,6 +60,8 @@ def main(argv: list[str] | None = None) -> None:
     """
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     console = rich.console.Console()
+    # Tracing makes and drops millions of objects, and each collection looks through all that lives.
+    gc.disable()
     try:
         devices.start(1)
         config, models = load_pretrained(arguments.preset)
