@@ -42,3 +42,4 @@ from jaxsense.config.stored import from_plain as from_plain
 from jaxsense.config.stored import parse_json as parse_json
 from jaxsense.config.stored import require_trust as require_trust
 from jaxsense.config.whole import Config as Config
+from jaxsense.config.whole import names_of_robots as names_of_robots

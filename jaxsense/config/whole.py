@@ -1,7 +1,7 @@
 """All sections together, and the checks between them."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from jaxsense.config.checks import ConfigError, limited, require
 from jaxsense.config.frozen import FrozenDict
@@ -235,14 +235,7 @@ class Config(Section):
     @property
     def robot_names(self) -> tuple[str, ...]:
         """Names of the robots: the modality, numbered if several robots share it."""
-        return tuple(
-            modality if self.carried.count(modality) == 1 else f"{modality}_{number}"
-            for modality, number in zip(self.carried, self._numbers(), strict=True)
-        )
-
-    def _numbers(self) -> list[int]:
-        """For each robot, its number among those that share its modality, from 1."""
-        return [self.carried[: r + 1].count(modality) for r, modality in enumerate(self.carried)]
+        return names_of_robots(self.carried)
 
     @property
     def modality_of_robot(self) -> tuple[int, ...]:
@@ -261,6 +254,20 @@ class Config(Section):
     def label_of_class(self, modality: str) -> tuple[int, ...]:
         """For each class, the index of its label in a modality."""
         return self.arena.label_of_class(self.attribute(modality))
+
+
+def names_of_robots(carried: Sequence[str]) -> tuple[str, ...]:
+    """Names of robots: the modality, numbered from 1 if several robots share it.
+
+    Args:
+      carried: modality of each robot.
+    """
+
+    def name(robot: int, modality: str) -> str:
+        number = carried[: robot + 1].count(modality)
+        return modality if carried.count(modality) == 1 else f"{modality}_{number}"
+
+    return tuple(name(robot, modality) for robot, modality in enumerate(carried))
 
 
 class _MapTask:

@@ -1,4 +1,7 @@
-"""The team MDP as an environment of jaxmarl 0.2: `pip install 'jaxsense[jaxmarl]'`."""
+"""A team as an environment of jaxmarl 0.2: `pip install 'jaxsense[jaxmarl]'`.
+
+`make("team-v0")` makes a task; the names that `jaxmarl.make` knows are fixed.
+"""
 
 import functools
 from typing import Any
@@ -12,6 +15,7 @@ from jaxsense.core.types import Key
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import team
 from jaxsense.interfaces.extras import extra, quietly
+from jaxsense.tasks.task import TeamTask
 
 with extra("jaxmarl"), quietly():
     from jaxmarl.environments import multi_agent_env, spaces  # pyright: ignore[reportMissingImports]
@@ -31,27 +35,25 @@ class TeamEnvState(multi_agent_env.State):
 
 
 class TeamEnv(multi_agent_env.MultiAgentEnv):
-    """The team MDP: each robot of `Config.robots` is an agent of its name.
+    """A task of a team, or the team MDP: each robot is an agent of its name.
 
     Robots take turns, see `jaxsense.interfaces.team`. The methods are jaxmarl's.
     """
 
-    def __init__(self, mdp: TeamMdp, config: Config):
+    def __init__(self, mdp: TeamMdp | TeamTask, config: Config | None = None):
         """Makes the environment.
 
         Args:
-          mdp: the MDP, of a team, see `jaxsense.make_mdp`.
-          config: the settings, which name the robots.
+          mdp: a task of a team from `jaxsense.make`, or the MDP of one, see `jaxsense.make_mdp`.
+          config: the settings, which name the robots; only with an MDP.
 
         Raises:
           ValueError: if the MDP has other sensors than the settings.
         """
-        team.check_team(mdp, config)
-        super().__init__(len(config.robot_names))
-        self.mdp = mdp
-        self.config = config
-        self.agents = list(config.robot_names)
-        observation, action = team.team_spaces(spaces, mdp)
+        self.robots = team.robots_of(mdp, config)
+        super().__init__(len(self.robots.names))
+        self.agents = list(self.robots.names)
+        observation, action = self.robots.spaces(spaces)
         self.observation_spaces = dict.fromkeys(self.agents, observation)
         self.action_spaces = dict.fromkeys(self.agents, action)
 
@@ -59,7 +61,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
     @functools.partial(jax.jit, static_argnums=0)
     def reset(self, key: Key) -> tuple[dict[str, jax.Array], TeamEnvState]:
         """Starts an episode."""
-        start = team.start(key, self.mdp, self.config)
+        start = self.robots.start(key)
         state = TeamEnvState(done=jnp.bool_(False), step=start.map.steps, team=start)  # pyright: ignore
         return self.get_obs(state), state
 
@@ -88,7 +90,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
           ValueError: if an action is no integer, or does not exist and is not traced.
         """
         chosen = jnp.stack([jnp.asarray(actions[agent]) for agent in self.agents])
-        after, outcome = team.step(key, self.mdp, state.team, chosen)
+        after, outcome = team.step(key, self.robots.mdp, state.team, chosen)
         dones = outcome.terminated | outcome.truncated
         ended = jnp.all(dones)
         state = TeamEnvState(done=ended, step=after.map.steps, team=after)  # pyright: ignore
@@ -97,8 +99,8 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         return self.get_obs(state), state, self._named(outcome.rewards), of_each, infos
 
     def get_obs(self, state: TeamEnvState) -> dict[str, jax.Array]:  # pyright: ignore
-        """Observation of each robot, `[F * N]`, see `team_mdp.observation`."""
-        return self._named(team.observations(self.mdp, state.team))
+        """Observation of each robot, `[S]`, see `team_mdp.observation`."""
+        return self._named(self.robots.observations(state.team))
 
     @functools.partial(jax.jit, static_argnums=0)
     def get_avail_actions(self, state: TeamEnvState) -> dict[str, jax.Array]:
@@ -114,10 +116,22 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
     def agent_classes(self) -> dict[str, list[str]]:
         """Robots of each modality."""
         classes: dict[str, list[str]] = {}
-        for agent, modality in zip(self.agents, self.config.carried, strict=True):
+        for agent, modality in zip(self.agents, self.robots.modality, strict=True):
             classes.setdefault(modality, []).append(agent)
         return classes
 
     def _named(self, of_robots: jax.Array) -> dict[str, jax.Array]:
         """`[R, ...]` by the names of the robots."""
         return dict(zip(self.agents, of_robots, strict=True))
+
+
+def make(name: str) -> TeamEnv:
+    """The environment of a task, see `jaxsense.make`.
+
+    Args:
+      name: of the task.
+
+    Raises:
+      ConfigError: if there is no such task, or it is not of a team.
+    """
+    return TeamEnv(team.team_task(name))

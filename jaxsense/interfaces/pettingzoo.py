@@ -1,4 +1,7 @@
-"""The team MDP as environments of PettingZoo: `pip install 'jaxsense[pettingzoo]'`."""
+"""A team as environments of PettingZoo: `pip install 'jaxsense[pettingzoo]'`.
+
+`make("team-v0")` and `make_parallel("team-v0")` make a task.
+"""
 
 from typing import Any
 
@@ -10,7 +13,8 @@ from jaxsense.core.types import Key
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import team
 from jaxsense.interfaces.extras import extra
-from jaxsense.interfaces.team import TeamOutcome
+from jaxsense.interfaces.team import Robots, TeamOutcome
+from jaxsense.tasks.task import TeamTask
 
 with extra("pettingzoo"):
     from gymnasium import error, spaces  # pyright: ignore[reportMissingImports]
@@ -22,30 +26,29 @@ Infos = dict[str, dict[str, Any]]
 class _Team:
     """An episode of a team, one robot at a time: the base of both environments."""
 
-    def __init__(self, mdp: TeamMdp, config: Config):
+    def __init__(self, mdp: TeamMdp | TeamTask, config: Config | None = None):
         """Makes the environment; `reset` must be called before the first step.
 
         Args:
-          mdp: the MDP of a team, see `jaxsense.make_mdp`.
-          config: the settings, which name the robots.
+          mdp: a task of a team from `jaxsense.make`, or the MDP of one, see `jaxsense.make_mdp`.
+          config: the settings, which name the robots; only with an MDP.
 
         Raises:
           ValueError: if the MDP has other sensors than the settings.
         """
-        team.check_team(mdp, config)
+        self._robots = team.robots_of(mdp, config)
         self.metadata = {"name": "jaxsense_team_v0", "render_modes": []}
         self.render_mode = None
-        self.possible_agents = list(config.robot_names)
+        self.possible_agents = list(self._robots.names)
         self.agents: list[str] = []
-        observation, action = team.team_spaces(spaces, mdp)
+        observation, action = self._robots.spaces(spaces)
         self.observation_spaces = dict.fromkeys(self.possible_agents, observation)
         self.action_spaces = dict.fromkeys(self.possible_agents, action)
         self._state: TeamState | None = None
         self._key: Key | None = None
-        self._mdp, self._config = mdp, config
 
     def observation_space(self, agent: str) -> Any:
-        """Space of a robot's observations, `[F * N]`."""
+        """Space of a robot's observations, `[S]`."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
@@ -57,7 +60,7 @@ class _Team:
         if seed is not None or self._key is None:
             (word,) = np.random.SeedSequence(seed).generate_state(1)
             self._key = jax.random.key(int(word))
-        self._key, self._state, observations, available = _start(self._key, self._mdp, self._config)
+        self._key, self._state, observations, available = _start(self._key, self._robots)
         self.agents = list(self.possible_agents)
         return self._named(observations), self._infos(0.0, available)
 
@@ -67,7 +70,7 @@ class _Team:
         """Takes the action of the robot whose turn it is; results by the names of `agents`."""
         chosen = np.full(len(self.possible_agents), action, np.int32)
         self._key, self._state, observations, outcome, available = _step(
-            self._key, self._mdp, self._state, chosen
+            self._key, self._robots, self._state, chosen
         )
         return (
             self._named(observations),
@@ -102,7 +105,7 @@ class _Team:
 
 
 class TeamAECEnv(_Team, AECEnv):
-    """The team MDP, in which agents take turns: each robot of `Config.robots` is an agent.
+    """A team whose robots take turns: each of them is an agent.
 
     `agent_selection` is the robot that chooses; it earns the reward of its look before its next
     turn. The methods are PettingZoo's. `seconds` in the infos is the duration of the last action,
@@ -126,7 +129,7 @@ class TeamAECEnv(_Team, AECEnv):
         self.agent_selection = self._turn()
 
     def observe(self, agent: str) -> np.ndarray:
-        """A robot's observation, `[F * N]` float32."""
+        """A robot's observation, `[S]` float32."""
         return self._observations[agent].copy()
 
     def step(self, action: Any) -> None:
@@ -153,7 +156,7 @@ class TeamAECEnv(_Team, AECEnv):
 
 
 class TeamParallelEnv(_Team, ParallelEnv):
-    """The team MDP for libraries that step all agents together: see `TeamAECEnv`.
+    """A team for libraries that step all agents together: see `TeamAECEnv`.
 
     In each step only the action of the robot whose turn it is counts. The methods are PettingZoo's.
     """
@@ -168,7 +171,7 @@ class TeamParallelEnv(_Team, ParallelEnv):
           options: ignored.
 
         Returns:
-          For each robot `[F * N]` float32, and infos as in `step`.
+          For each robot `[S]` float32, and infos as in `step`.
         """
         del options
         return self._begin(seed)
@@ -204,19 +207,43 @@ class TeamParallelEnv(_Team, ParallelEnv):
         return result
 
 
+def make(name: str) -> TeamAECEnv:
+    """The environment of a task, see `jaxsense.make`.
+
+    Args:
+      name: of the task.
+
+    Raises:
+      ConfigError: if there is no such task, or it is not of a team.
+    """
+    return TeamAECEnv(team.team_task(name))
+
+
+def make_parallel(name: str) -> TeamParallelEnv:
+    """The environment of a task that steps all agents together, see `make`.
+
+    Args:
+      name: of the task.
+
+    Raises:
+      ConfigError: if there is no such task, or it is not of a team.
+    """
+    return TeamParallelEnv(team.team_task(name))
+
+
 @jax.jit
-def _start(key: Key, mdp: TeamMdp, config: Config) -> tuple[Key, TeamState, jax.Array, jax.Array]:
-    """Next key, state, `[R, F * N]` observations and `[R, N + 1]` actions that robots have."""
+def _start(key: Key, robots: Robots) -> tuple[Key, TeamState, jax.Array, jax.Array]:
+    """Next key, state, `[R, S]` observations and `[R, N + 1]` actions that robots have."""
     next_key, key = jax.random.split(key)
-    state = team.start(key, mdp, config)
-    return next_key, state, team.observations(mdp, state), team.available(state)
+    state = robots.start(key)
+    return next_key, state, robots.observations(state), team.available(state)
 
 
 @jax.jit
 def _step(
-    key: Key, mdp: TeamMdp, state: TeamState, actions: jax.Array
+    key: Key, robots: Robots, state: TeamState, actions: jax.Array
 ) -> tuple[Key, TeamState, jax.Array, TeamOutcome, jax.Array]:
     """Next key, state, observations, outcome and actions that robots have."""
     next_key, key = jax.random.split(key)
-    after, outcome = team.step(key, mdp, state, actions)
-    return next_key, after, team.observations(mdp, after), outcome, team.available(after)
+    after, outcome = team.step(key, robots.mdp, state, actions)
+    return next_key, after, robots.observations(after), outcome, team.available(after)

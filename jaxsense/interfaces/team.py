@@ -11,17 +11,18 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import Config
+from jaxsense.config import Config, ConfigError, names_of_robots
 from jaxsense.core import checks
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import team_mdp
-from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import common
+from jaxsense.tasks import make
+from jaxsense.tasks.environment import Scaling
+from jaxsense.tasks.task import TeamTask
 
 
 @struct.dataclass
@@ -41,63 +42,114 @@ class TeamOutcome:
     seconds: Float[Array, ""]
 
 
-def check_team(mdp: MapMdp | TeamMdp, config: Config) -> None:
-    """Checks that an MDP is that of a team with the sensors of the settings.
+@pytree
+class Unscaled:
+    """Leaves the numbers of an observation as `team_mdp.observation` has them, row by row."""
+
+    @property
+    def bound(self) -> float:
+        """None: infinity."""
+        return float("inf")
+
+    def __call__(self, features: Float[Array, "N F"]) -> Float[Array, " S"]:
+        """`[F * N]` from `[N, F]`."""
+        return features.T.reshape(-1)
+
+
+@pytree
+class Robots:
+    """A team, each robot of which is an agent.
+
+    Attributes:
+      mdp: the MDP.
+      sensors: `[R]` int32 index of each robot's sensor.
+      scaling: of observations.
+      names: of the robots.
+      modality: names of their sensors.
+    """
+
+    mdp: TeamMdp
+    sensors: jax.Array
+    scaling: Scaling | Unscaled
+    names: tuple[str, ...] = struct.field(pytree_node=False)
+    modality: tuple[str, ...] = struct.field(pytree_node=False)
+
+    def spaces(self, spaces: Any) -> tuple[Any, Any]:
+        """Spaces of what a robot knows, `[S]`, and of its actions, see `common.spaces_of`.
+
+        Args:
+          spaces: another library's module, with `Box` and `Discrete`.
+        """
+        of_map = self.mdp.map
+        features = team_mdp.num_features(of_map.fusion.prior.mean.size, of_map.num_modalities)
+        size, num_actions = features * of_map.num_pois, of_map.num_pois + 1
+        return common.spaces_of(spaces, size, num_actions, self.scaling.bound)
+
+    def start(self, key: Key) -> TeamState:
+        """Starts an episode of all robots.
+
+        Args:
+          key: random key.
+        """
+        return team_mdp.reset(key, self.mdp, self.sensors)
+
+    def observations(self, state: TeamState) -> Float[Array, "R S"]:
+        """What each robot knows, see `team_mdp.observation`.
+
+        Args:
+          state: the current state.
+
+        Returns:
+          `[R, S]`.
+        """
+        belief, number = state.map.belief, self.mdp.map.num_modalities
+        travel = self.mdp.config.travel
+
+        def observation(robot: jax.Array) -> jax.Array:
+            return self.scaling(team_mdp.observation(travel, belief, state.team, robot, number).T)
+
+        return jax.vmap(observation)(jnp.arange(len(self.names)))
+
+
+def robots_of(mdp: TeamMdp | TeamTask, config: Config | None) -> Robots:
+    """What an interface for several agents plays.
 
     Args:
-      mdp: the MDP.
-      config: the settings.
+      mdp: a task of a team, see `jaxsense.make`, or the MDP of a team, see `jaxsense.make_mdp`.
+      config: the settings, which name the robots; only with an MDP.
 
     Raises:
-      ValueError: if it is not.
+      ValueError: if the MDP is not that of a team with the sensors of the settings, or a task has
+        its own.
     """
-    if mdp.modalities != config.modalities:
-        reason = f"must be a TeamMdp with {config.modalities}, as config.modalities are"
+    if isinstance(mdp, TeamTask):
+        if config is not None:
+            raise ValueError("config: goes with a TeamMdp; a task has its robots")
+        modality = tuple(mdp.mdp.modalities[m] for m in mdp.robots.tolist())
+        return Robots(mdp.mdp, mdp.robots, mdp.scaling, names_of_robots(modality), modality)
+    if config is None or mdp.modalities != config.modalities:
+        sensors = None if config is None else config.modalities
+        reason = f"must be a TeamMdp with {sensors}, as config.modalities are"
         made = "from jaxsense.make_mdp with dqn.task = 'team'"
         found = f"{type(mdp).__name__} with modalities {mdp.modalities}"
         raise ValueError(f"mdp = {found}: {reason}, {made}")
+    indices = jnp.array(config.modality_of_robot, jnp.int32)
+    return Robots(mdp, indices, Unscaled(), config.robot_names, config.carried)
 
 
-def team_spaces(spaces: Any, mdp: TeamMdp) -> tuple[Any, Any]:
-    """Spaces of what a robot knows, `[F * N]`, and of its actions, see `common.spaces_of`.
-
-    Args:
-      spaces: another library's module, with `Box` and `Discrete`.
-      mdp: the MDP.
-    """
-    features = team_mdp.num_features(mdp.map.fusion.prior.mean.size, mdp.map.num_modalities)
-    number = mdp.map.num_pois
-    return common.spaces_of(spaces, features * number, number + 1, np.inf)
-
-
-def start(key: Key, mdp: TeamMdp, config: Config) -> TeamState:
-    """Starts an episode of the robots of `Config.robots`.
+def team_task(name: str) -> TeamTask:
+    """A task of a team, see `jaxsense.make`.
 
     Args:
-      key: random key.
-      mdp: the MDP.
-      config: the settings, which name the robots.
+      name: of the task.
+
+    Raises:
+      ConfigError: if there is no such task, or it is not of a team.
     """
-    return team_mdp.reset(key, mdp, jnp.array(config.modality_of_robot, jnp.int32))
-
-
-def observations(mdp: TeamMdp, state: TeamState) -> Float[Array, "R S"]:
-    """What each robot knows, see `team_mdp.observation`.
-
-    Args:
-      mdp: the MDP.
-      state: the current state.
-
-    Returns:
-      `[R, F * N]`.
-    """
-
-    def observation(robot: jax.Array) -> jax.Array:
-        belief, number = state.map.belief, mdp.map.num_modalities
-        travel = mdp.config.travel
-        return team_mdp.observation(travel, belief, state.team, robot, number).reshape(-1)
-
-    return jax.vmap(observation)(jnp.arange(len(state.team.works)))
+    task = make(name)
+    if not isinstance(task, TeamTask):
+        raise ConfigError("name", name, "must be a task of a team, such as team-v0")
+    return task
 
 
 def available(state: TeamState) -> Bool[Array, "R A"]:

@@ -11,7 +11,7 @@ from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.team_mdp import TeamMdp
 
 CLIP = 10.0
-"""Observations are within plus and minus this."""
+"""Scaled observations are within plus and minus this."""
 
 
 @pytree
@@ -25,6 +25,11 @@ class Scaling:
 
     offset: jax.Array
     scale: jax.Array
+
+    @property
+    def bound(self) -> float:
+        """Observations are within plus and minus this."""
+        return CLIP
 
     def __call__(self, features: Float[Array, "N F"]) -> Float[Array, " S"]:
         """`[N * F]` scaled from `[N, F]`, PoI by PoI."""

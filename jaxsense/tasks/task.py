@@ -21,7 +21,7 @@ from jaxsense.dqn.policies import Known
 from jaxsense.dqn.reference import reference
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.models import Models
-from jaxsense.tasks.environment import CLIP, Environment, Scaling, TimeStep
+from jaxsense.tasks.environment import Environment, Scaling, TimeStep
 
 M = TypeVar("M")
 
@@ -140,7 +140,7 @@ class MapTask:
     @property
     def bound(self) -> float:
         """Observations are clipped there."""
-        return CLIP
+        return self.scaling.bound
 
     @property
     def max_steps(self) -> int:
@@ -252,7 +252,7 @@ class TeamTask:
     @property
     def bound(self) -> float:
         """Observations are clipped there."""
-        return CLIP
+        return self.scaling.bound
 
     @property
     def max_steps(self) -> int:

@@ -32,7 +32,7 @@ def env(team_env):
 
 @pytest.fixture(scope="module")
 def mdp_step(env):
-    return jax.jit(lambda key, state, action: team_mdp.step(key, env.mdp, state, action))
+    return jax.jit(lambda key, state, action: team_mdp.step(key, small.team(), state, action))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_the_whole_team_starts_and_is_never_alone(env):
     @jax.vmap
     def start(key):
         observations, state = env.reset(key)
-        known = env.mdp.config.travel, state.team.map.belief, state.team.team
+        known = small.team().config.travel, state.team.map.belief, state.team.team
         expected = [team_mdp.observation(*known, r, 2).reshape(-1) for r in range(3)]
         return observations, state, dict(zip(AGENTS, expected, strict=True))
 
@@ -133,7 +133,7 @@ def test_every_step_equals_the_mdps(env, mdp_step, step_env):
     looks = 0
     observe = jax.jit(
         lambda state, r: team_mdp.observation(
-            env.mdp.config.travel, state.map.belief, state.team, r, 2
+            small.team().config.travel, state.map.belief, state.team, r, 2
         ).reshape(-1)
     )
     for i in range(11):

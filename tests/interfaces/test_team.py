@@ -15,7 +15,7 @@ from jaxsense.interfaces import team
 NOP = 4
 
 
-start = jax.jit(lambda key, mdp: team.start(key, mdp, small.TEAM))
+start = jax.jit(lambda key, mdp: team.robots_of(mdp, small.TEAM).start(key))
 step = jax.jit(team.step)
 
 
