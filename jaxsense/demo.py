@@ -87,7 +87,7 @@ def main(argv: list[str] | None = None) -> None:
     say(f"The page is {path}.")
     say(f"Next: {command('jaxsense tasks')}")
     if arguments.browser and _has_display():
-        webbrowser.open(path.resolve().as_uri())
+        webbrowser.open_new_tab(path.resolve().as_uri())
 
 
 def _play(

@@ -250,7 +250,7 @@ def test_a_demo_that_fails_leaves_no_directory(played, monkeypatch):
 @pytest.mark.parametrize("options", [[], ["--no-browser"]])
 def test_the_page_opens_only_where_somebody_can_see_it(played, monkeypatch, display, options):
     opened = []
-    monkeypatch.setattr(demo.webbrowser, "open", opened.append)
+    monkeypatch.setattr(demo.webbrowser, "open_new_tab", opened.append)
     monkeypatch.setattr(demo.sys, "platform", "linux")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setenv("DISPLAY", ":0" if display else "")

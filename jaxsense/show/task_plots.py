@@ -25,7 +25,7 @@ _TEN = 10
 
 
 def frame(task: Environment, state: MapState | TeamState, actions: Sequence[int]) -> np.ndarray:
-    """What is known in a state, beside the truth.
+    """What is known in a state, and the truth.
 
     Beliefs are 2-sigma ellipses in the two latent dimensions that show classes, which are numbered,
     farthest apart. Bars show class probabilities. Dots say which sensors have looked at a PoI, also
