@@ -65,7 +65,7 @@ def train(tree: Path, place: Path) -> Needs:
 
 
 def _operations(path: Path) -> int:
-    """Number of operations of a cached program, see `jaxsense.run.compilation.Kept`."""
+    """Number of operations of a cached program, see `jaxsense.run.kept.Kept`."""
     _, flat = pickle.loads(files.without_digest(path.read_bytes()))
     return len(_OPERATION.findall(export.deserialize(bytearray(flat)).mlir_module()))
 

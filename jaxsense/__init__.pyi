@@ -2,6 +2,7 @@ from . import dqn as dqn
 from . import interfaces as interfaces
 from . import mission as mission
 from . import sim as sim
+from . import tasks as tasks
 from . import vae as vae
 from .config import PRESETS as PRESETS
 from .config import Attribute as Attribute
@@ -26,4 +27,8 @@ from .models import make_jmvae as make_jmvae
 from .run.rundir import load as load
 from .run.version import __version__ as __version__
 from .show.scans import compare_scans as compare_scans
+from .tasks import load_pretrained as load_pretrained
+from .tasks import make as make
+from .tasks import registered as registered
+from .tasks import score as score
 from .training import learn as learn

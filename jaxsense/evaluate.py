@@ -24,7 +24,7 @@ from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.programs import OwnPolicies
 from jaxsense.show import animation, mission_plots, page, plots, tables
 from jaxsense.show.terminal import Display, print_table, say
-from jaxsense.summary import compare
+from jaxsense.summary import compare, profile
 from jaxsense.summary.read import EVALUATIONS
 
 PROGRAM = "jaxsense.evaluate"
@@ -120,7 +120,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         except StageError as error:
             cli.fail(PROGRAM, str(error))
         seconds = time.perf_counter() - begin
-        compiling = compiler.monitor.seconds["mission"]["compile_s"]
+        compiling = profile.of_stages(compiler.monitor.clock.spans)["mission"]["compile_s"]
     block = summary.missions(scenario, found.metrics)
     draw = functools.partial(
         animation.draw,
@@ -128,7 +128,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         found.recording.records,
         found.recording.end,
         models.fusion,
-        {sensor.name: sensor.field_of_view for sensor in scenario.world.sensors},
+        scenario.fields_of_view,
     )
     try:
         written = _write(arguments, trained, config, block, draw)
@@ -187,7 +187,7 @@ def _report(run: Path, config: Config) -> Path:
     places = [_evaluation(config, own["mission"]), *found.values()]
     if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:
         files.write(run / "teams.png", plots.png(mission_plots.teams(places)))
-    files.write(path, page.render(run, config, own, found))
+    files.write(path, page.render(run, config, own, found, profile.read(run)))
     return path
 
 

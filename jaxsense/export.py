@@ -1,4 +1,4 @@
-"""`python -m jaxsense.export RUN_DIR`: a run's models as one file for robots without JAX.
+"""`python -m jaxsense.export RUN`: trained models as one file for robots without JAX.
 
 The file is a zip archive: each function as an ONNX file; weights as NumPy arrays in `weights.npz`,
 and in `programs.json` the functions as operators on them; a `contents.json` that describes inputs
@@ -28,8 +28,10 @@ from jaxsense.run import cli, files, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
+from jaxsense.tasks import load_pretrained
 
 PROGRAM = "jaxsense.export"
+_PRETRAINED = "pretrained:"
 ROBOTS = ("robot_numpy.py", "robot_onnx.py")
 """Files that run an archive on a robot, and are in it."""
 
@@ -101,7 +103,7 @@ def _description(config: Config, models: Models) -> dict[str, object]:
 def _of_sensor(sensor: Sensor) -> dict[str, object]:
     """How a scan is given to `detect`."""
     return {
-        "readings": "distances in metres, infinite for none"
+        "readings": "distances in metres, infinite or 0 for none"
         if sensor.measures_distance
         else "linear RGB from 0 to 1"
         if sensor.channels == 3
@@ -119,13 +121,14 @@ def _described(dtype: str, shape: tuple[int | str, ...], about: str) -> dict[str
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Writes a run's detectors, encoders and policies into one file for robots without JAX."""
+    """Writes detectors, encoders and policies of a run into one file for robots without JAX."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
-    newest one in `runs/`."""
+    newest one in `runs/`, or `pretrained:PRESET` for models that travel with jaxsense."""
     out: Path | None = None
-    """File to write; it must not exist yet. By default `exported.zip` in the run's directory."""
+    """File to write; it must not exist yet. By default `exported.zip` in the run's directory, or
+    `PRESET.zip` here."""
     trust: bool = False
     """Run the code of custom sensors that the run's `config.json` names."""
 
@@ -138,9 +141,14 @@ def main(argv: list[str] | None = None) -> None:
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     path = arguments.out
     try:
-        run = cli.find_run(arguments.run)
-        path = path or run / "exported.zip"
-        config, models = rundir.load(run, arguments.trust)
+        if (given := str(arguments.run)).startswith(_PRETRAINED):
+            preset = given.removeprefix(_PRETRAINED)
+            path = path or Path(f"{preset}.zip")
+            config, models = load_pretrained(preset)
+        else:
+            run = cli.find_run(arguments.run)
+            path = path or run / "exported.zip"
+            config, models = rundir.load(run, arguments.trust)
         with files.new(path) as file:
             file.write(content := archive(config, models))
     except FileExistsError:

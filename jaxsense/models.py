@@ -79,8 +79,8 @@ class Models:
         """What a look says, from a whole scan.
 
         It says that nothing is there if the window shows no PoI, if the bearing is outside the
-        field of view, or if a reading of the window is negative, NaN or an infinite brightness. An
-        infinite distance counts as `sensor.window_limit`, as for a beam without a return.
+        field of view, or if a reading of the window is negative, NaN or an infinite brightness. A
+        distance that is infinite or 0, of a beam without a return, counts as `sensor.window_limit`.
 
         Args:
           modality: index of the sensor; static.

@@ -6,11 +6,10 @@ import itertools
 import shlex
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from datetime import datetime
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, cast
 
 import jax
@@ -21,17 +20,18 @@ import rich.table
 from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
-from jaxsense.config.options import Name, OptionError, read_some
+from jaxsense.config.options import Name, OptionError, command, read_some
 from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
+from jaxsense.run.clock import Clock, process_start
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.pipeline import RunResult
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory, Settings
-from jaxsense.show import animation, page, plots, tables, tensorboard
+from jaxsense.show import tables, tensorboard
+from jaxsense.show.artist import Artist
 from jaxsense.show.terminal import Display, print_table, say
-from jaxsense.summary import compare, statistics
+from jaxsense.summary import compare, profile, statistics
 from jaxsense.summary.blocks import Header
 
 PROGRAM = "jaxsense.train"
@@ -107,7 +107,9 @@ def main(
       change: changes a preset in your own program, before the other options do.
       policies: custom policies by name; missions play those that `config.mission.policies` names.
     """
-    begin = time.perf_counter()
+    # The process may have run others before, unless its own command line asks for this.
+    clock = Clock(process_start() if argv is None else None)
+    clock.add_rest("import")
     arguments = parse(sys.argv[1:] if argv is None else argv, change, policies)
     is_quiet, is_first = arguments.quiet, not arguments.process_index
     if not is_first:
@@ -126,7 +128,7 @@ def main(
                 begins=lambda: None if is_quiet else say(waits),
             )
             workers = devices.start(arguments.devices)
-            _train(begin, arguments, run, workers, console, policies)
+            _train(clock, arguments, run, workers, console, policies)
         processes.leave()
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
@@ -144,7 +146,7 @@ def main(
     # A quiet run prints only these two lines.
     say(f"Results are in {run.path}. Start with {run.path / 'report.html'}.")
     trust = " --trust" if arguments.config.sensors else ""
-    say(f"Next: python -m jaxsense.evaluate {shlex.quote(str(first))} --animate{trust}")
+    say(f"Next: {command('jaxsense.evaluate')} {shlex.quote(str(first))} --animate{trust}")
 
 
 def parse(
@@ -212,8 +214,7 @@ def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:
         return _discarded(arguments.settings)
     if arguments.resume is not None:
         return RunDirectory.resume(arguments.resume, arguments.trust)
-    name = f"{datetime.now():%Y%m%d-%H%M%S}-{arguments.preset}"
-    path = arguments.out or rundir.unused(Path("runs") / name)
+    path = arguments.out or rundir.dated(arguments.preset)
     return RunDirectory.create(path, arguments.settings)
 
 
@@ -228,7 +229,7 @@ def _discarded(settings: Settings) -> Iterator[RunDirectory]:
 
 
 def _train(
-    begin: float,
+    clock: Clock,
     arguments: Arguments,
     run: RunDirectory,
     workers: Workers,
@@ -238,7 +239,7 @@ def _train(
     """Trains all seeds with the same programs, and writes their results."""
     settings, failed = run.settings, dict[int, str]()
     kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config, has_own_code=bool(policies))
-    monitor = Monitor(warn=_warn)
+    monitor = Monitor(warn=_warn, clock=clock)
 
     def stop() -> None:
         monitor.stop()
@@ -261,11 +262,11 @@ def _train(
                         opened.enter_context(seeds.open_run(run, seed, path))
                         for seed, path in left[first : first + size]
                     ]
-                    failed |= _train_together(begin, arguments, runs, programs, monitor, console)
-                begin = time.perf_counter()
+                    failed |= _train_together(arguments, runs, programs, monitor, console)
+                clock.restart()
     except Stopped:
         if jax.process_index() == 0:
-            again = f"python -m {PROGRAM} --resume {shlex.quote(str(run.path))}"
+            again = f"{command(PROGRAM)} --resume {shlex.quote(str(run.path))}"
             again += " --trust" if settings.config.sensors else ""
             again += " with the same processes" if jax.process_count() > 1 else ""
             cli.complain(f"Stopped; all training so far is saved. To resume: {again}")
@@ -280,7 +281,6 @@ def _train(
 
 
 def _train_together(
-    begin: float,
     arguments: Arguments,
     runs: list[RunDirectory],
     programs: Programs,
@@ -297,32 +297,42 @@ def _train_together(
 
     displays = [display(run) for run in runs]
     programs.trainings.begin(len(runs))
+    clock, artist = monitor.clock, Artist(monitor.clock)
 
-    def train(i: int) -> RunResult | StageError:
-        key = jax.random.key(runs[i].settings.seed)
+    def train(i: int) -> summary.Results | StageError:
+        run, config = runs[i], runs[i].settings.config
+        key, checkpoints = jax.random.key(run.settings.seed), run.checkpoints
         of_seed = monitor if len(runs) == 1 else monitor.beside(displays[i].show)
         try:
-            return pipeline.run(
-                key, runs[i].settings.config, programs, of_seed, runs[i].checkpoints
-            )
+            learned = pipeline.learn(key, config, programs, of_seed, checkpoints)
+            artist.draw(run.path, lambda: _report().of_training(config, learned))
+            played = pipeline.play(key, config, programs, of_seed, learned, checkpoints)
+            artist.draw(run.path, lambda: _report().of_missions(config, learned, played))
+            return {**learned.results, "mission": played.missions}
         except StageError as error:
             return error
         finally:
             programs.trainings.leave()
 
-    with displays[0]:
+    clock.add_rest("start")
+    failed: dict[int, str] = {}
+    with displays[0], artist:
         monitor.begin(displays[0].show)
         results = devices.side_by_side(train, len(runs))
-        timing = statistics.timing(time.perf_counter() - begin, monitor.seconds, len(runs))
-        failed: dict[int, str] = {}
+        drawn = artist.finished()
+        stages = profile.of_stages(clock.spans)
+        timing = statistics.timing(clock.now - clock.begin, stages, len(runs))
         for run, result in zip(runs, results, strict=True):
-            try:
-                if isinstance(result, StageError):
-                    raise result
-                _write(run, result, timing, monitor)
-            except StageError as error:
-                failed[run.settings.seed] = str(error)
-                _warn(f"{error}; earlier checkpoints are in {run.path}")
+            if isinstance(result, StageError):
+                failed[run.settings.seed] = str(result)
+                _warn(f"{result}; earlier checkpoints are in {run.path}")
+                continue
+            monitor.check_stop()
+            found: summary.Summary = {**_header(run), "timing": timing, **result}
+            _report().write(run, drawn[run.path], found, clock)
+            monitor.check_stop()
+            # Last, for it marks the run as finished.
+            rundir.write_json(run.path / "summary.json", found)
     return failed
 
 
@@ -334,39 +344,20 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
     curves = seeds.rewards(paths, run.settings.config, _warn)
-    _write_page(run, plots.of_seeds(curves, means), found)
+    _report().write(run, _report().of_seeds(curves, means), found)
     rundir.write_json(run.path / "summary.json", found)
+
+
+def _report() -> ModuleType:
+    """The module that draws and writes pages, imported when the first picture is drawn."""
+    from jaxsense.show import report  # noqa: PLC0415 (matplotlib takes long to import)
+
+    return report
 
 
 def _warn(text: str) -> None:
     """Prints a warning."""
-    cli.complain(f"{PROGRAM}: {text}")
-
-
-def _write(run: RunDirectory, result: RunResult, timing: summary.Timing, monitor: Monitor) -> None:
-    """Writes plots, the report and last the summary, which marks the run as finished."""
-    config, recording = run.settings.config, result.recording
-    monitor.check_stop()
-    pictures = plots.of_run(
-        config, result.results, result.posteriors, result.windows, result.reliability
-    )
-    pictures |= plots.of_seeds(result.rewards, result.results)
-    title = f"{config.mission.policies[0]} policy".replace("_", " ")
-    fusion, fields_of_view = result.models.fusion, result.fields_of_view
-    film = animation.draw(config, recording.records, recording.end, fusion, fields_of_view, title)
-    found: summary.Summary = {**_header(run), "timing": timing, **result.results}
-    _write_page(run, {**pictures, "mission.svg": film}, found)
-    monitor.check_stop()
-    rundir.write_json(run.path / "summary.json", found)
-
-
-def _write_page(
-    run: RunDirectory, pictures: Mapping[str, bytes | str], found: summary.Summary
-) -> None:
-    """Writes pictures, and then the page that shows them."""
-    for name, content in pictures.items():
-        files.write(run.path / name, content)
-    files.write(run.path / "report.html", page.render(run.path, run.settings.config, found))
+    cli.warn(PROGRAM, text)
 
 
 def _header(run: RunDirectory) -> Header:

@@ -1,6 +1,7 @@
 """Programs that compile in the background, and those that are kept."""
 
 import dataclasses
+import itertools
 import os
 import stat
 import subprocess
@@ -19,9 +20,13 @@ from flax import struct
 import jaxsense
 from jaxsense.config import PRESETS, SensorConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.run import cli, compilation, files
-from jaxsense.run.compilation import Compiler, Kept, Program
+from jaxsense.run import cli, files
+from jaxsense.run import kept as kept_programs
+from jaxsense.run.clock import Clock
+from jaxsense.run.compilation import Compiler, Program
+from jaxsense.run.kept import Kept
 from jaxsense.run.monitor import Monitor
+from jaxsense.summary import profile
 
 
 def test_compiling_and_running_are_timed_apart_and_reported():
@@ -31,8 +36,13 @@ def test_compiling_and_running_are_timed_apart_and_reported():
     shape = program.compile(lambda x: 2 * x, jnp.float32(3))
     assert (shape.shape, shape.dtype) == ((), jnp.float32)
     assert program(jnp.float32(3)) == 6
-    assert set(monitor.seconds["stage"]) == {"compile_s", "run_s"}
-    assert all(seconds > 0 for seconds in monitor.seconds["stage"].values())
+    spans = [span for span in monitor.clock.spans if span.kind != "wait_program"]
+    assert [span.kind for span in spans] == ["trace", "lower", "compile", "run"]
+    assert {(span.stage, span.program) for span in spans} == {("stage", "run")}
+    assert all(before.end_s <= after.start_s for before, after in itertools.pairwise(spans))
+    seconds = profile.of_stages(spans)["stage"]
+    assert seconds["run_s"] == spans[-1].seconds > 0
+    assert seconds["compile_s"] == pytest.approx(sum(span.seconds for span in spans[:-1]))
     monitor.report("stage", 2, 4, np.array([1.0, 3.0]), epsilon=0.5)
     heard = [report for report in heard if report[2]]  # it may have been compiled in time
     assert heard == [("stage", 2, 4, {"loss": 2.0, "epsilon": 0.5})]
@@ -244,7 +254,8 @@ def two_processes(tmp_path_factory):
     path = tmp_path_factory.mktemp("kept")
     code = """if True:
         import sys, jax, jax.numpy as jnp
-        from jaxsense.run.compilation import Compiler, Kept, Program
+        from jaxsense.run.compilation import Compiler, Program
+        from jaxsense.run.kept import Kept
         from jaxsense.run.monitor import Monitor
         from pathlib import Path
         kept = Kept(Path(sys.argv[1]))
@@ -285,13 +296,13 @@ def test_the_oldest_programs_are_forgotten(tmp_path, monkeypatch):
     for age, path in enumerate(paths):
         os.utime(path, (age, age))
     assert kept.find("stage-run", (jnp.ones(0),)) is not None  # used just now
-    monkeypatch.setattr(compilation, "_MAX_KEPT", 2)
+    monkeypatch.setattr(kept_programs, "_MAX_KEPT", 2)
     Kept(tmp_path)
     assert [path.exists() for path in paths] == [True, False, False, True]
 
 
 def test_nothing_of_the_user_is_ever_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr(compilation, "_MAX_KEPT", 0)
+    monkeypatch.setattr(kept_programs, "_MAX_KEPT", 0)
     kept = Kept(tmp_path)
     name = f"stage-run-{32 * '0'}.stablehlo"
     theirs = [tmp_path / "mine" / name, kept.path / "mine" / name, kept.path / f"{name}.txt"]
@@ -309,9 +320,9 @@ def test_programs_of_all_stages_are_forgotten(tmp_path, monkeypatch):
     kept, x = Kept(tmp_path), jnp.ones(1)
     names = "mission-go_on", "detector_Wärme-begin", "policies_lidar-begin", "jmvae-advance"
     for name in names:
-        assert kept.find_or_trace(name, lambda x: x, (x,)) is not None
+        assert kept.find_or_trace(name, lambda x: x, (x,), Clock().record) is not None
     assert len(list(kept.path.iterdir())) == 4
-    monkeypatch.setattr(compilation, "_MAX_KEPT", 1)
+    monkeypatch.setattr(kept_programs, "_MAX_KEPT", 1)
     Kept(tmp_path)
     assert len(list(kept.path.iterdir())) == 1
 
@@ -321,7 +332,7 @@ def test_another_source_or_processor_is_another_program(tmp_path, monkeypatch):
         return Kept(tmp_path).find("stage-run", (jnp.float32(3),)) is not None
 
     processor = tmp_path / "cpuinfo"
-    monkeypatch.setattr(compilation, "_CPU_INFO", processor)
+    monkeypatch.setattr(kept_programs, "_CPU_INFO", processor)
     processor.write_text("model name : Abacus\ncpu MHz : 1\nflags : add\n")
     call(Kept(tmp_path), lambda x: 2 * x, jnp.float32(3))
     processor.write_text("model name : Abacus\ncpu MHz : 2\nflags : add\n")
@@ -331,16 +342,16 @@ def test_another_source_or_processor_is_another_program(tmp_path, monkeypatch):
         assert not is_there()
     processor.write_text("model name : Abacus\nflags : add\n")
     assert is_there()
-    (name, digest), *others = compilation._SOURCE
-    monkeypatch.setattr(compilation, "_SOURCE", [(name, digest[::-1]), *others])
+    (name, digest), *others = kept_programs._SOURCE
+    monkeypatch.setattr(kept_programs, "_SOURCE", [(name, digest[::-1]), *others])
     assert not is_there()
 
 
 def test_the_source_is_that_of_the_whole_package():
-    names = {name for name, _ in compilation._SOURCE}
-    assert {"compilation.py", "detectors.py", "__init__.py", "cli.py"} <= names
+    names = {name for name, _ in kept_programs._SOURCE}
+    assert {"kept.py", "detectors.py", "__init__.py", "cli.py"} <= names
     root = Path(jaxsense.__file__).parent
-    assert len(compilation._SOURCE) == len(list(root.rglob("*.py")))
+    assert len(kept_programs._SOURCE) == len(list(root.rglob("*.py")))
 
 
 def test_programs_of_custom_sensors_are_not_kept(tmp_path):

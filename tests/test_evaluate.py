@@ -134,7 +134,7 @@ def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):
 import sys
 from jaxsense import train
 from jaxsense.run import cli
-train._train = lambda begin, arguments, run, *more: (run.path / "summary.json").write_text(
+train._train = lambda clock, arguments, run, *more: (run.path / "summary.json").write_text(
     open(sys.argv[1], encoding="utf-8").read(), encoding="utf-8")
 cli.run(lambda: train.main(["--resume", sys.argv[2]]))
 """
@@ -234,7 +234,7 @@ def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(smoke_run
     for report, episodes, films in ((smoke_run, 4, 1), (path, 1, 2)):
         text = (report / "report.html").read_text()
         assert text.count("image/svg+xml") == 2 * films
-        assert text.count("image/png") == 4 + films  # policies for each set of arenas
+        assert text.count("image/png") == 5 + films  # policies for each set of arenas
         assert f"{episodes} missions of each policy" in text
 
 

@@ -37,3 +37,38 @@ def test_example_of_several_settings_runs(capsys):
     names = run_example(ROOT / "docs" / "getting-started.md", 0)
     assert capsys.readouterr().out == f"{names['metrics'].active_units}\n"
     assert names["metrics"].active_units.shape == (3,)
+
+
+SINGLE = ROOT / "docs" / "functions.md"
+
+
+def test_examples_of_single_functions_run(capsys):
+    rays, fusion, values, paths, memory = (run_example(SINGLE, i) for i in range(5))
+    np.testing.assert_allclose(rays["hit"].distance, [1.5, np.inf, 2.5], rtol=1e-6)
+    assert "[-1.  0.]" in capsys.readouterr().out.replace("[-1. 0.]", "[-1.  0.]")
+    models, belief = fusion["models"], fusion["belief"]
+    assert np.isclose(models.fusion.class_probabilities(belief).sum(), 1)
+    of_all = [values["values"].of_all(np.array([p, 1 - p]), True) for p in (0.5, 0.8, 0.99)]
+    # The first look gains log 2 less the entropy of a coin that is right four times in five, .193.
+    assert of_all[0] > 0.193 - 0.1
+    assert of_all[2] < 0
+    assert 0.5 < paths["lengths"].min() < 4
+    assert memory["batch"].s_t.shape == (3, 128)
+
+
+def test_examples_of_the_tasks_run(capsys):
+    page = ROOT / "docs" / "tasks.md"
+    assert np.isfinite(run_example(page, 0)["seen"].reward)
+    run_example(page, 1)
+    printed = capsys.readouterr().out
+    assert "noisy-v0, camera: return" in printed
+    assert run_example(page, 2)["models"].tours
+    assert "--preset team --seed 0" in capsys.readouterr().out
+
+
+def test_returns_of_references_are_those_of_the_files():
+    from benchmarks import references
+
+    text = (ROOT / "docs" / "tasks.md").read_text()
+    for cells in references.rows():
+        assert f"| {' | '.join(cells)} |" in text

@@ -80,9 +80,32 @@ def test_a_sensor_may_be_missing_and_have_other_rays(write):
     assert np.isinf(found[2, is_seen]).all()
 
 
+def test_a_distance_of_0_is_no_return(write):
+    """As an infinite one, along the run's rays and along others."""
+    for angles in (None, HALF_CIRCLE):
+        scans = np.full((3, 683 if angles is None else 361), 1.0)
+        scans[:, ::7] = np.inf
+        zeros = np.where(np.isinf(scans), 0.0, scans)
+        windows = []
+        for values in (scans, zeros):
+            looks = recordings.read(CONFIG, write(lidar_scans=values, lidar_angles=angles))
+            found = np.nan_to_num(looks.scans["lidar"], nan=1.0, posinf=np.inf)
+            windows.append(np.stack([sim.cut_out(LIDAR, scan, 0.0) for scan in found]))
+        np.testing.assert_array_equal(*windows)
+        np.testing.assert_allclose(np.unique(windows[1]), [1.0, float(LIDAR.window_limit)])
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
+        (
+            {"lidar_scans": EMPTY - 6.0},
+            r"^lidar_scans holds -1; must be at least 0, infinite or 0 without a return$",
+        ),
+        (
+            {"lidar_angles": HALF_CIRCLE, "lidar_scans": EMPTY[:, :361] - 6.5},
+            r"^lidar_scans holds -1\.5; must be at least 0, infinite or 0 without a return$",
+        ),
         ({"lidar_poses": None, "lidar_scans": None}, "camera_poses is missing; a recording holds"),
         ({"camera_poses": POSES}, "camera_scans is missing"),
         ({"lidar_poses": None}, "lidar_poses is missing"),
@@ -216,18 +239,19 @@ def test_another_scanner_is_farther_from_simulated_windows(run, write, few, tmp_
 
 def test_residuals_are_drawn_as_they_are():
     """Three of four rays at the PoI, the other one elsewhere."""
-    recorded = np.float32([[0.01, -0.03, 0.02, np.nan]])
-    simulated = np.float32([[0.01, 0.01, -0.01, np.nan]])
-    window = np.zeros((1, 4), np.float32)
-    similar = sim.similar.Similar(window, recorded, simulated)
-    pairs = Pairs(LIDAR, window, np.ones(1), similar)
+    recorded = np.array([[0.01, -0.03, 0.02, np.nan]])
+    simulated = np.array([[0.01, 0.01, -0.01, np.nan]])
+    window = np.zeros((1, 4))
+    pairs = Pairs(LIDAR, window, window, recorded, simulated, np.ones(1))
     histogram, sizes = scan_plots.residuals([pairs]).axes
-    assert [text.get_text() for text in histogram.get_legend().get_texts()] == [
+    legend = histogram.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == [
         "recorded, median +0.0100",
         "simulated, median +0.0100",
     ]
     assert histogram.get_xlabel() == "residual of lidar [m]"
     # All have at least the smallest size, a third of them the largest.
-    lines = [line.get_xydata() for line in sizes.lines]
+    lines = [np.asarray(line.get_xydata()) for line in sizes.lines]
     np.testing.assert_allclose(lines[0], [[0.01, 1], [0.02, 2 / 3], [0.03, 1 / 3]], rtol=1e-5)
     np.testing.assert_allclose(lines[1], [[0.01, 1], [0.01, 2 / 3], [0.01, 1 / 3]], rtol=1e-5)

@@ -83,7 +83,7 @@ def test_seeds_that_are_all_finished_are_only_summed_up(seeds, tmp_path, monkeyp
     path = tmp_path / "seeds"
     shutil.copytree(seeds, path)
     (path / "summary.json").unlink()  # as if killed just before it was written
-    monkeypatch.setattr(pipeline, "run", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(pipeline, "learn", lambda *_: pytest.fail("trained again"))
     train.main(["--resume", str(path), "--quiet", "--cache", "None"])
     assert (path / "summary.json").read_text() == (seeds / "summary.json").read_text()
 

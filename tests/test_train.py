@@ -1,6 +1,7 @@
 """The command `train`, run as a user runs it: in-process, with the smoke preset."""
 
 import dataclasses
+import itertools
 import json
 import re
 import subprocess
@@ -17,16 +18,18 @@ import jaxsense
 from jaxsense import evaluate, export, train
 from jaxsense.config import PRESETS, Config, Shape
 from jaxsense.run.compilation import Program
-from jaxsense.run.monitor import Monitor
 from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.show import report
+from jaxsense.summary import profile
 
 PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 
 
 def test_run_directory_holds_everything(smoke_run):
     names = {path.name for path in smoke_run.iterdir()} | {".lock"}  # which may be gone
-    plots = {"latent_space.png", "reward.png", "scanlines.png", "calibration.png", "policies.png"}
-    others = {"config.json", "metrics.jsonl", "summary.json", "checkpoints"}
+    names_of_plots = "latent_space", "reward", "scanlines", "calibration", "policies", "timing"
+    plots = {f"{name}.png" for name in names_of_plots}
+    others = {"config.json", "metrics.jsonl", "summary.json", "timing.json", "checkpoints"}
     assert names == {*others, *plots, "mission.svg", "report.html", ".lock"}
     for plot in plots:
         assert (smoke_run / plot).read_bytes()[:4] == b"\x89PNG"
@@ -95,20 +98,36 @@ def test_summary_keeps_its_contract(smoke_run):
     assert 1920 <= summary["mission"]["bytes_per_detection"]["raw"] <= 2732
 
 
-def test_the_film_is_named_after_the_policy_that_it_shows(tmp_path, monkeypatch):
+def test_the_time_of_a_run_adds_up(smoke_run):
+    spans = profile.read(smoke_run)
+    written = [(smoke_run / name).stat().st_mtime for name in ("config.json", "summary.json")]
+    wall = written[1] - written[0]
+    main = [span for span in spans if span.thread == profile.MAIN]
+    start = sum(span.seconds for span in main if span.kind in ("import", "start"))
+    # The settings are written while the run starts.
+    assert 0.95 * wall <= sum(span.seconds for span in main) <= 1.05 * (wall + start)
+    assert sum(profile.parts(spans).values()) == pytest.approx(
+        max(s.end_s for s in spans), rel=0.05
+    )
+    for thread in {span.thread for span in spans}:
+        of_thread = [span for span in spans if span.thread == thread]
+        for before, after in itertools.pairwise(of_thread):
+            assert before.start_s <= before.end_s <= after.start_s + 1e-4, (before, after)
+    kinds = {span.kind for span in spans}
+    assert {"start", "trace", "lower", "compile", "run", "save", "summarise", "draw"} <= kinds
+    assert {"detector_camera", "jmvae", "dqn", "mission"} <= {span.stage for span in spans}
+
+
+def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     first = dataclasses.replace(PRESETS["smoke"].mission, policies=("naive_2", "latent"))
     config, titles = dataclasses.replace(PRESETS["smoke"], mission=first), []
     draw = lambda *inputs: titles.append(inputs[-1]) or ""  # noqa: E731
-    monkeypatch.setattr(train.animation, "draw", draw)
-    for name in ("of_run", "of_seeds"):
-        monkeypatch.setattr(train.plots, name, lambda *inputs: {})
-    monkeypatch.setattr(train.page, "render", lambda *inputs: "")
-    names = ("posteriors", "windows", "fields_of_view", "reliability", "rewards")
-    recorded = SimpleNamespace(records=None, end=None)
-    models = SimpleNamespace(fusion=None)
-    result = SimpleNamespace(models=models, recording=recorded, results={}, **dict.fromkeys(names))
-    with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as run:
-        train._write(run, result, {}, Monitor())  # pyright: ignore
+    monkeypatch.setattr(report.animation, "draw", draw)
+    monkeypatch.setattr(report.plots, "of_missions", lambda missions: {})
+    learned = SimpleNamespace(models=SimpleNamespace(fusion=None), fields_of_view=None)
+    played = SimpleNamespace(recording=SimpleNamespace(records=None, end=None), missions={})
+    found = report.of_missions(config, learned, played)  # pyright: ignore
+    assert [*found] == ["mission.svg"]
     assert titles == ["naive 2 policy"]
 
 

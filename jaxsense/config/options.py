@@ -10,6 +10,7 @@ import inspect
 import itertools
 import re
 import shlex
+import sys
 import textwrap
 import types
 from collections.abc import Iterator, Mapping, Sequence
@@ -77,6 +78,18 @@ def read_some(arguments: type, argv: list[str], fields: Sequence[str]) -> dict[s
     return {field: value for (field,), value in values.items()}
 
 
+def command(program: str) -> str:
+    """The command line that runs a program, the way this process was started.
+
+    Args:
+      program: its module, for example "jaxsense.train".
+    """
+    # Where the console script is, no `python` may find the package.
+    if Path(sys.argv[0]).name == "jaxsense":
+        return program.replace(".", " ", 1)
+    return f"python -m {program}"
+
+
 def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
     """Returns the help, set for the width of the terminal.
 
@@ -88,7 +101,7 @@ def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
     shown = {option.name: option for option in _options(base)}
     words = [name for name in shown if not name.startswith("-")]
     parser = argparse.ArgumentParser(
-        usage=" ".join([f"python -m {program} [OPTIONS]", *words]),
+        usage=" ".join([f"{command(program)} [OPTIONS]", *words]),
         description=_plain(base.__doc__ or ""),
         epilog=f"--help-all lists all {len(shown)} options." if common else None,
         add_help=False,

@@ -3,7 +3,7 @@
 import itertools
 import random
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Index, Key, call, pytree
-from jaxsense.dqn import map_mdp
+from jaxsense.dqn import map_mdp, team_mdp
 from jaxsense.dqn.map_mdp import MapMdp, MapState
 from jaxsense.dqn.policies import Known
-from jaxsense.dqn.team_mdp import alone
+from jaxsense.dqn.team_mdp import TeamMdp, TeamState, alone
+
+M = TypeVar("M")
 
 MAX_STATES = 4096
 
@@ -93,6 +95,36 @@ def run_episode(
     Returns:
       `[]` total reward, without discount, and `[]` reward of the first action.
     """
+
+    def act_alike(key: Key, known: Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
+        return act(key, known), memory
+
+    return run_recurrent(key, mdp, exact, act_alike, (), start, modality)
+
+
+def run_recurrent(
+    key: Key,
+    mdp: MapMdp,
+    exact: LogLikelihoods,
+    act: Callable[[Key, Known, M], tuple[jax.Array, M]],
+    memory: M,
+    start: Start,
+    modality: Index,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Plays one episode with a policy that remembers, see `run_episode`.
+
+    Args:
+      key: random key.
+      mdp: the MDP.
+      exact: the exact Bayes filter.
+      act: `(key, known, memory) -> []` int32 action, and the memory after it.
+      memory: before the first action.
+      start: from `reset`.
+      modality: index of the agent's own sensor.
+
+    Returns:
+      See `run_episode`.
+    """
     num_pois, team = mdp.num_pois, alone(mdp.num_pois, modality)
     times = jnp.ones((1, num_pois))
     policy_key, looks_key = jax.random.split(key)
@@ -107,7 +139,8 @@ def run_episode(
             times,
             jnp.int32(0),
         )
-        action = act(jax.random.fold_in(policy_key, state.steps), known)
+        policy = jax.random.fold_in(policy_key, state.steps)
+        action, memory = act(policy, known, carry.memory)
         own = carry.own_looks[action]
         look_key = jax.random.fold_in(jax.random.fold_in(looks_key, action), own)
         poi = jnp.minimum(action, num_pois - 1)
@@ -125,6 +158,7 @@ def run_episode(
             looks=looks.at[action, modality].add(1),
             own_looks=carry.own_looks.at[action].add(1),
             log_likelihood=carry.log_likelihood.at[poi].add(found),
+            memory=memory,
             done=outcome.terminated | outcome.truncated,
             total=carry.total + outcome.reward,
             first=jnp.where(is_first, outcome.reward, carry.first),
@@ -136,12 +170,86 @@ def run_episode(
         looks=looks.astype(jnp.int32),
         own_looks=jnp.zeros(num_pois + 1, jnp.int32),
         log_likelihood=start.log_likelihood,
+        memory=memory,
         done=jnp.bool_(False),
         total=jnp.float32(0.0),
         first=jnp.float32(0.0),
     )
     end = jax.lax.while_loop(lambda carry: ~carry.done, play, carry)
     return end.total, end.first
+
+
+def run_team(
+    key: Key,
+    mdp: TeamMdp,
+    act: Callable[[Key, TeamState, Known, M], tuple[jax.Array, M]],
+    memory: M,
+    start: TeamState,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Plays one episode of a team, whose robots share one policy.
+
+    Args:
+      key: random key.
+      mdp: the MDP of the team.
+      act: `(key, state, known, memory) -> []` int32 choice of robot `state.agent`, and the memory
+        after it. What is known holds no posterior: classes are equally likely in it.
+      memory: before the first choice.
+      start: from `team_mdp.reset`.
+
+    Returns:
+      `[]` rewards of all looks less the price of all robots' time, and `[]` seconds.
+    """
+    policy_key, looks_key = jax.random.split(key)
+    num_pois = mdp.map.num_pois
+    uniform = jnp.zeros((num_pois, mdp.map.num_classes)) - jnp.log(mdp.map.num_classes)
+
+    def play(carry: _TeamCarry) -> _TeamCarry:
+        state, step = carry.state, carry.state.map.steps
+        times = team_mdp.travel_times(mdp.config.travel, state.team)
+        known = Known(state.map.belief, carry.looks, uniform, state.team, times, state.agent)
+        action, memory = act(jax.random.fold_in(policy_key, step), state, known, carry.memory)
+        after, outcome = team_mdp.step(jax.random.fold_in(looks_key, step), mdp, state, action)
+        target = state.team.target.at[state.agent].set(action)[after.agent]
+        # Choices take no time, looks do; NOP, beyond the last row, is no look.
+        seconds = jnp.asarray(outcome.seconds)
+        own = after.team.modality[after.agent]
+        reward = outcome.reward - mdp.time_price(after.team, seconds)
+        return _TeamCarry(
+            state=after,
+            looks=carry.looks.at[target, own].add(seconds > 0, mode="drop"),
+            memory=memory,
+            done=outcome.terminated | outcome.truncated,
+            total=carry.total + reward,
+        )
+
+    begin = _TeamCarry(
+        state=start,
+        looks=start.map.seen.astype(jnp.int32),
+        memory=memory,
+        done=jnp.bool_(False),
+        total=jnp.float32(0.0),
+    )
+    end = jax.lax.while_loop(lambda carry: ~carry.done, play, begin)
+    return end.total, end.state.seconds
+
+
+@pytree
+class _TeamCarry:
+    """An episode of a team under way.
+
+    Attributes:
+      state: before a choice.
+      looks: `[N, M]` int32 looks at each PoI.
+      memory: of the policy.
+      done: `[]` bool.
+      total: `[]` return so far.
+    """
+
+    state: TeamState
+    looks: jax.Array
+    memory: Any
+    done: jax.Array
+    total: jax.Array
 
 
 @pytree
@@ -153,6 +261,7 @@ class _Carry:
       looks: `[N + 1, M]` int32 looks at each PoI, and choices of NOP.
       own_looks: `[N + 1]` int32 actions in this episode.
       log_likelihood: `[N, C]` see `Start`.
+      memory: of the policy.
       done: `[]` bool.
       total: `[]` reward so far.
       first: `[]` reward of the first action.
@@ -162,6 +271,7 @@ class _Carry:
     looks: jax.Array
     own_looks: jax.Array
     log_likelihood: jax.Array
+    memory: Any
     done: jax.Array
     total: jax.Array
     first: jax.Array

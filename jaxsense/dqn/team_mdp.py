@@ -91,6 +91,15 @@ class TeamMdp:
     places: Places
     modalities: Names = struct.field(pytree_node=False)
 
+    def time_price(self, team: Team, seconds: Float[Array, ""]) -> Float[Array, ""]:
+        """What all robots that work pay together for some time.
+
+        Args:
+          team: after the time has passed.
+          seconds: `[]` that passed.
+        """
+        return self.config.second_cost * seconds * jnp.sum(team.works)
+
 
 def travel_seconds(
     config: TravelConfig, pose: Float[Array, "3"], places: Float[Array, "N 2"]

@@ -1,51 +1,115 @@
-"""Spaces and the map MDP of one agent, shared by the interfaces."""
+"""Spaces, starts and the map MDP of one agent, shared by the interfaces."""
 
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core import checks
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import map_mdp
+from jaxsense.dqn.map_agent import observation
 from jaxsense.dqn.map_mdp import MapMdp, MapState
+from jaxsense.tasks.environment import Environment, TimeStep
 
 
-def check_modality(mdp: MapMdp, modality: int) -> None:
-    """Checks that the MDP has a sensor.
+@pytree
+class OneAgent:
+    """The map MDP of one agent, whose observations are not scaled; see `Environment`.
+
+    Attributes:
+      mdp: the MDP.
+      modality: index of the agent's own sensor.
+    """
+
+    mdp: MapMdp
+    modality: int = struct.field(pytree_node=False)
+
+    @property
+    def num_actions(self) -> int:
+        """A look at each PoI, and NOP."""
+        return self.mdp.num_pois + 1
+
+    @property
+    def observation_size(self) -> int:
+        """Mean and standard deviation of each PoI's belief."""
+        return 2 * self.mdp.num_pois * self.mdp.fusion.prior.mean.size
+
+    @property
+    def bound(self) -> float:
+        """None: infinity."""
+        return float("inf")
+
+    @property
+    def max_steps(self) -> int:
+        """Actions in an episode, at most."""
+        return self.mdp.config.max_steps
+
+    def reset(self, key: Key) -> tuple[Float[Array, " S"], MapState]:
+        """Starts an episode, see `Environment.reset`."""
+        state = map_mdp.reset(key, self.mdp)
+        return self.observe(state), state
+
+    def observe(self, state: MapState) -> Float[Array, " S"]:
+        """The map, `[N * 2D]`, see `dqn.observation`."""
+        return observation(state.belief)
+
+    def action_mask(self, state: MapState) -> Bool[Array, " A"]:
+        """`[A]` bool: all actions exist."""
+        del state
+        return jnp.ones(self.num_actions, bool)
+
+    def step(self, key: Key, state: MapState, action: Int[Array, ""]) -> tuple[MapState, TimeStep]:
+        """Takes an action, see `Environment.step`."""
+        after, outcome = map_mdp.step(key, self.mdp, state, action, self.modality)
+        seen = self.observe(after)
+        return after, TimeStep(seen, outcome.reward, outcome.terminated, outcome.truncated)
+
+
+def environment(mdp: MapMdp | Environment, modality: int | None) -> Environment:
+    """What an interface of one agent plays.
 
     Args:
-      mdp: the MDP.
-      modality: index of the sensor.
+      mdp: a task, see `jaxsense.make`, or the map MDP of one agent, see `jaxsense.make_mdp`.
+      modality: index of the agent's own sensor; only with an MDP.
 
     Raises:
-      ValueError: if there is no such sensor.
+      ValueError: if there is no such sensor, or a task has one already.
     """
-    checks.require_index("modality", modality, mdp.num_modalities)
+    if isinstance(mdp, MapMdp):
+        checks.require_index("modality", modality, mdp.num_modalities)
+        return OneAgent(mdp, modality)  # pyright: ignore[reportArgumentType]
+    if modality is not None:
+        raise ValueError(f"modality = {modality}: goes with a MapMdp; a task has its agent")
+    return mdp
 
 
-def spaces_of(spaces: Any, size: int, num_pois: int) -> tuple[Any, Any]:
+def spaces_of(spaces: Any, size: int, num_actions: int, bound: float) -> tuple[Any, Any]:
     """Spaces of observations and of actions.
 
     Args:
       spaces: another library's module, with `Box` and `Discrete`.
       size: numbers in an observation.
-      num_pois: N; there is an action for each PoI, and NOP.
+      num_actions: a look at each PoI, and NOP.
+      bound: observations are within plus and minus this.
     """
-    return spaces.Box(-np.inf, np.inf, (size,), np.float32), spaces.Discrete(num_pois + 1)
+    return spaces.Box(-bound, bound, (size,), np.float32), spaces.Discrete(num_actions)
 
 
-def map_spaces(spaces: Any, mdp: MapMdp) -> tuple[Any, Any]:
-    """Spaces of the map, `[N * 2D]`, and of the actions, see `spaces_of`.
+def environment_spaces(spaces: Any, played: Environment) -> tuple[Any, Any]:
+    """Spaces of an environment of one policy, see `spaces_of`.
 
     Args:
       spaces: another library's module, with `Box` and `Discrete`.
-      mdp: the MDP.
+      played: the environment.
     """
-    return spaces_of(spaces, 2 * mdp.num_pois * mdp.fusion.prior.mean.size, mdp.num_pois)
+    return spaces_of(spaces, played.observation_size, played.num_actions, played.bound)
 
 
-def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
+def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> Any:
     """Random states, `[number]`, for episodes to start from.
 
     A start looks at everything it has seen, which costs several steps; a draw from a few thousand
@@ -53,26 +117,33 @@ def prepared_starts(key: Key, mdp: MapMdp, number: int) -> MapState:
 
     Args:
       key: random key.
-      mdp: the MDP.
+      mdp: a task or a map MDP.
       number: of states.
 
     Raises:
       ValueError: if `number` is not positive.
     """
     checks.require_number("number", number)
-    reset = jax.vmap(map_mdp.reset, (0, None))
-    return jax.jit(lambda key, mdp: reset(jax.random.split(key, number), mdp))(key, mdp)
+    # A start is the same for all sensors.
+    played = OneAgent(mdp, 0) if isinstance(mdp, MapMdp) else mdp
+    reset = jax.vmap(lambda key, played: played.reset(key)[1], (0, None))
+    return jax.jit(lambda key, played: reset(jax.random.split(key, number), played))(key, played)
 
 
-def start(key: Key, mdp: MapMdp, starts: MapState | None) -> MapState:
+def start(key: Key, played: Environment, starts: Any) -> tuple[Float[Array, " S"], Any]:
     """Starts an episode.
 
     Args:
       key: random key.
-      mdp: the MDP.
-      starts: `[S]` from `prepared_starts`, to pick a random one; by default the start is new.
+      played: the environment.
+      starts: `[S]` from `prepared_starts`, to pick a random one; None for a new start.
+
+    Returns:
+      `[S]` observation, and the state.
     """
     if starts is None:
-        return map_mdp.reset(key, mdp)
-    row = jax.random.randint(key, (), 0, starts.steps.shape[0])
-    return jax.tree.map(lambda x: x[row], starts)
+        return played.reset(key)
+    rows = len(jax.tree.leaves(starts)[0])
+    row = jax.random.randint(key, (), 0, rows)
+    state = jax.tree.map(lambda x: x[row], starts)
+    return played.observe(state), state

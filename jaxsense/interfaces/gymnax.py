@@ -1,5 +1,9 @@
-"""The map MDP as an environment of gymnax 1.x: `pip install 'jaxsense[gymnax]'`."""
+"""Tasks and the map MDP in gymnax 1.x: `pip install 'jaxsense[gymnax]'`.
 
+The import registers every task by its name, for `gymnax.make("noisy-v0", agent="camera")`.
+"""
+
+import functools
 from typing import Any
 
 import jax
@@ -7,13 +11,13 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxsense.core.types import Key
-from jaxsense.dqn import map_mdp
-from jaxsense.dqn.map_agent import observation
-from jaxsense.dqn.map_mdp import MapMdp, MapState
+from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.interfaces import common
 from jaxsense.interfaces.extras import extra
+from jaxsense.tasks import Environment, make, registered
 
 with extra("gymnax"):
+    from gymnax import register, registered_envs  # pyright: ignore[reportMissingImports]
     from gymnax.environments import environment, spaces  # pyright: ignore[reportMissingImports]
 
 
@@ -23,11 +27,11 @@ class MapEnvState(environment.EnvState):
 
     Attributes:
       time: `[]` int32 actions so far.
-      map: the state of the MDP.
+      map: the state of the MDP; of a team, its `map` is that of the map.
       terminated: `[]` bool, the last action was NOP.
     """
 
-    map: MapState
+    map: Any
     terminated: jax.Array
 
 
@@ -37,39 +41,39 @@ class MapEnvParams(environment.EnvParams):
 
     Attributes:
       max_steps_in_episode: actions after which an episode is truncated.
-      starts: `[S]` from `interfaces.prepared_starts`, to start each episode from a random one; None
-        for new starts, which are slow: gymnax makes one in every step.
+      starts: from `interfaces.prepared_starts`, to start each episode from a random one; None for
+        new starts, which are slow: gymnax makes one in every step.
     """
 
     max_steps_in_episode: int = 20
-    starts: MapState | None = None
+    starts: Any = None
 
 
 class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
-    """The map MDP of one agent.
+    """A task, or the map MDP of one agent.
 
-    An observation is the `[N * 2D]` map, see `dqn.observation`. Action n < N looks at PoI n; action
-    N is NOP and terminates the episode. The methods are gymnax's.
+    One policy chooses, for a team for the robot whose turn it is. Observations of the map MDP are
+    the `[N * 2D]` map, see `dqn.observation`. Action n < N looks at PoI n; action N is NOP.
+    `action_mask` in the infos, `[N + 1]` bool, are the actions that exist after the step, before
+    the next episode. The methods are gymnax's.
     """
 
-    def __init__(self, mdp: MapMdp, modality: int):
+    def __init__(self, mdp: MapMdp | Environment, modality: int | None = None):
         """Makes the environment.
 
         Args:
-          mdp: the MDP, of one agent, see `jaxsense.make_mdp`.
-          modality: index of the agent's own sensor.
+          mdp: a task from `jaxsense.make`, or the MDP of one agent, see `jaxsense.make_mdp`.
+          modality: index of the agent's own sensor; only with an MDP.
 
         Raises:
           ValueError: if there is no such sensor.
         """
-        common.check_modality(mdp, modality)
-        self.mdp = mdp
-        self.modality = modality
+        self.played = common.environment(mdp, modality)
 
     @property
     def default_params(self) -> MapEnvParams:
         """Parameters with the MDP's episode length and a new start for each episode."""
-        return MapEnvParams(max_steps_in_episode=self.mdp.config.max_steps)
+        return MapEnvParams(max_steps_in_episode=self.played.max_steps)
 
     def prepared_params(self, key: Key, number: int) -> MapEnvParams:
         """Default parameters with prepared starts, which make training far faster.
@@ -78,7 +82,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
           key: random key.
           number: of starts.
         """
-        starts = common.prepared_starts(key, self.mdp, number)
+        starts = common.prepared_starts(key, self.played, number)
         return self.default_params.replace(starts=starts)  # pyright: ignore
 
     def reset_env(self, key: Key, params: MapEnvParams) -> tuple[jax.Array, MapEnvState]:
@@ -88,9 +92,8 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
           key: random key.
           params: of the environment.
         """
-        start = common.start(key, self.mdp, params.starts)
-        state = MapEnvState(time=start.steps, map=start, terminated=jnp.bool_(False))  # pyright: ignore
-        return self.observe(key, state, None, params), state
+        seen, start = common.start(key, self.played, params.starts)
+        return seen, MapEnvState(time=jnp.int32(0), map=start, terminated=jnp.bool_(False))  # pyright: ignore
 
     def step_env(
         self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams
@@ -109,14 +112,21 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         Raises:
           ValueError: if the action is no integer, or does not exist and is not traced.
         """
-        after, outcome = map_mdp.step(key, self.mdp, state.map, jnp.asarray(action), self.modality)
-        state = MapEnvState(time=after.steps, map=after, terminated=outcome.terminated)  # pyright: ignore
-        info = {"discount": self.discount(state, params)}
-        observation = self.observe(key, state, action, params)
-        return observation, state, outcome.reward, outcome.terminated, info
+        after, found = self.played.step(key, state.map, jnp.asarray(action))
+        state = MapEnvState(time=state.time + 1, map=after, terminated=found.terminated)  # pyright: ignore
+        info = {"discount": self.discount(state, params), "action_mask": self.action_mask(state)}
+        return found.observation, state, found.reward, found.terminated, info
+
+    def action_mask(self, state: MapEnvState) -> jax.Array:
+        """`[N + 1]` bool, the actions that exist.
+
+        Args:
+          state: the current state.
+        """
+        return self.played.action_mask(state.map)
 
     def observe(self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams) -> jax.Array:
-        """The map, `[N * 2D]`.
+        """What the policy sees of a state.
 
         Args:
           key: not used.
@@ -125,7 +135,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
           params: not used.
         """
         del key, action, params
-        return observation(state.map.belief)
+        return self.played.observe(state.map)
 
     def is_terminated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
         """Whether the last action was NOP, `[]` bool.
@@ -154,14 +164,32 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     @property
     def num_actions(self) -> int:
         """Number of actions: a look at each PoI, and NOP."""
-        return self.mdp.num_pois + 1
+        return self.played.num_actions
 
     def action_space(self, params: MapEnvParams | None = None) -> spaces.Discrete:
         """Space of the actions: a look at each PoI, and NOP."""
         del params
-        return common.map_spaces(spaces, self.mdp)[1]
+        return common.environment_spaces(spaces, self.played)[1]
 
     def observation_space(self, params: MapEnvParams | None = None) -> spaces.Box:
-        """Space of the map."""
+        """Space of the observations."""
         del params
-        return common.map_spaces(spaces, self.mdp)[0]
+        return common.environment_spaces(spaces, self.played)[0]
+
+
+def make_env(name: str, agent: str | None = None) -> MapEnv:
+    """The environment of a task, see `jaxsense.make`.
+
+    Args:
+      name: of the task.
+      agent: whose sensor looks.
+
+    Raises:
+      ConfigError: if there is no such task or agent.
+    """
+    return MapEnv(make(name, agent))
+
+
+for _name in registered():
+    if _name not in registered_envs:
+        register(_name, functools.partial(make_env, _name))

@@ -1,4 +1,4 @@
-"""The map MDP as rejax 0.1.3 trains it: `pip install 'jaxsense[rejax]'`."""
+"""Tasks and the map MDP as rejax 0.1.3 trains them: `pip install 'jaxsense[rejax]'`."""
 
 from typing import Any
 

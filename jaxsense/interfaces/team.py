@@ -11,6 +11,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
@@ -65,7 +66,8 @@ def team_spaces(spaces: Any, mdp: TeamMdp) -> tuple[Any, Any]:
       mdp: the MDP.
     """
     features = team_mdp.num_features(mdp.map.fusion.prior.mean.size, mdp.map.num_modalities)
-    return common.spaces_of(spaces, features * mdp.map.num_pois, mdp.map.num_pois)
+    number = mdp.map.num_pois
+    return common.spaces_of(spaces, features * number, number + 1, np.inf)
 
 
 def start(key: Key, mdp: TeamMdp, config: Config) -> TeamState:

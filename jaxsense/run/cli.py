@@ -1,6 +1,7 @@
 """Runs command lines: options, exit statuses, and user errors in one line."""
 
 import contextlib
+import gc
 import io
 import os
 import sys
@@ -11,8 +12,8 @@ from typing import NoReturn, TypeVar
 import jax
 
 from jaxsense.config import Config, ConfigError, options, require_32_bits
-from jaxsense.run import compilation
-from jaxsense.run.compilation import Kept
+from jaxsense.run import kept
+from jaxsense.run.kept import Kept
 
 T = TypeVar("T")
 
@@ -20,6 +21,7 @@ CACHE = Path("~/.cache/jaxsense")
 # Exit statuses, as in shells.
 INTERRUPTED = 130
 _CLOSED = 141
+_RARELY = 100_000, 50, 50  # see `gc.set_threshold`
 
 
 def parse(
@@ -58,6 +60,9 @@ def parse(
 
 def run(main: Callable[[], None]) -> None:
     """Runs a program; Ctrl-C ends it without a traceback."""
+    # Tracing makes and drops millions of small objects; by default, looking for circles among them
+    # takes a sixth of its time.
+    gc.set_threshold(*_RARELY)
     if isinstance(sys.stdout, io.TextIOWrapper):
         # The terminal may be unable to show the name of a directory.
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -86,6 +91,16 @@ def complain(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
+def warn(program: str, message: str) -> None:
+    """Prints a line about a program to standard error.
+
+    Args:
+      program: module that runs.
+      message: the rest of the line.
+    """
+    complain(f"{options.command(program).removeprefix('python -m ')}: {message}")
+
+
 def fail(program: str, message: str) -> NoReturn:
     """Ends a program with one line about an error that the user can correct.
 
@@ -96,7 +111,7 @@ def fail(program: str, message: str) -> NoReturn:
     Raises:
       SystemExit: with status 2.
     """
-    complain(f"{program}: {' '.join(message.splitlines())}")
+    warn(program, " ".join(message.splitlines()))
     sys.exit(2)
 
 
@@ -160,9 +175,9 @@ def keep_programs(
     try:
         directory = directory.expanduser()
         if config.sensors or has_own_code:
-            compilation.use_cache(directory)
+            kept.use_cache(directory)
             return None
         return Kept(directory, jax.tree.structure(config))
     except (OSError, RuntimeError) as error:
-        complain(f"{program}: programs cannot be kept in {directory} ({error})")
+        warn(program, f"programs cannot be kept in {directory} ({error})")
         return None

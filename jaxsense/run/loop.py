@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager
 
 import jax
 import numpy as np
@@ -14,7 +15,8 @@ from jaxsense.config import Config
 from jaxsense.core.types import Key
 from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.programs import Programs, has_rows, is_saved, padded
+from jaxsense.run.programs import Programs, has_rows, is_saved, padded, program_name
+from jaxsense.summary.profile import Kind
 from jaxsense.training.stage import Output, Progress, Stage
 
 _SAVE_PERIOD = 60.0  # s
@@ -56,7 +58,7 @@ def train(
       Stopped: if the monitor was asked to stop; trainings under way are saved.
       OSError: if a checkpoint cannot be written.
     """
-    with ThreadPoolExecutor(1) as saver:
+    with ThreadPoolExecutor(1, "save") as saver:
         loop = _Loop(key, config, programs, monitor, checkpoints or Checkpoints(), saver)
         try:
             return loop.run()
@@ -106,7 +108,7 @@ class _Loop:
         saver: ThreadPoolExecutor,
     ):
         self._key, self._config = key, config
-        self._programs, self._monitor = programs, monitor
+        self._programs, self._monitor, self._clock = programs, monitor, monitor.clock
         self._checkpoints, self._saver = checkpoints, saver
         self._saving: list[Future[None]] = []
         self._curves: dict[str, Curves] = {}
@@ -119,13 +121,14 @@ class _Loop:
     def run(self) -> Trained:
         """Runs all stages."""
         stages, done = self._programs.stages, dict[str, Future[None]]()
-        with ThreadPoolExecutor(len(stages)) as threads:
+        with ThreadPoolExecutor(len(stages), "stage") as threads:
             for stage in stages:
                 before = {name: done[name] for name in stage.sources}
                 done[stage.name] = threads.submit(self._run_stage, stage, before)
             # A wait without timeout may not notice Ctrl-C.
-            while wait(done.values(), timeout=0.2).not_done:
-                pass
+            with self._clock.record("wait_stages"):
+                while wait(done.values(), timeout=0.2).not_done:
+                    pass
         for future in done.values():
             future.result()
         outputs = {name: held.output for name, held in self._held.items() if not held.is_over}
@@ -135,8 +138,13 @@ class _Loop:
 
     def wait_for_saving(self) -> None:
         """Waits until all is saved, and raises the first error."""
-        for each in self._saving:
-            each.result()
+        with self._clock.record("wait_saving"):
+            for each in self._saving:
+                each.result()
+
+    def _record(self, kind: Kind, stage: Stage) -> AbstractContextManager[None]:
+        """Records what is done for a stage, under the name of its programs."""
+        return self._clock.record(kind, program_name(stage))
 
     def _run_stage(self, stage: Stage, before: dict[str, Future[None]]) -> None:
         """Finds the output of a stage, and lets go of those that no other stage needs."""
@@ -152,8 +160,9 @@ class _Loop:
             found = self._load(stage) if is_saved(stage) else None
             if found is not None:
                 return found
-            for future in before.values():
-                future.result()
+            with self._record("wait_stages", stage):
+                for future in before.values():
+                    future.result()
             inputs = stage.select({name: self._held[name].output for name in before})
             self._monitor.check_stop()
             output = self._begin(stage, inputs)
@@ -230,7 +239,8 @@ class _Loop:
                 return None
             self._curves[stage.name] = {name: x.tolist() for name, x in curves.items()}
         output = self._programs.of(stage).shapes.result().output
-        return self._checkpoints.load_or_forget(stage.name, output)
+        with self._record("load", stage):
+            return self._checkpoints.load_or_forget(stage.name, output)
 
     def _no_curves(self, stage: Stage) -> Curves:
         """The curves of a failed training."""
@@ -246,10 +256,11 @@ class _Loop:
             return
 
         def save() -> None:
-            if stage.chunks:
-                curves = _as_arrays(self._curves[stage.name])
-                self._checkpoints.save(f"curves_{stage.name}", curves)
-            self._checkpoints.save(stage.name, output)
+            with self._record("save", stage):
+                if stage.chunks:
+                    curves = _as_arrays(self._curves[stage.name])
+                    self._checkpoints.save(f"curves_{stage.name}", curves)
+                self._checkpoints.save(stage.name, output)
 
         self._saving.append(self._saver.submit(save))
 
@@ -312,7 +323,8 @@ def run_chunks(
             curves.setdefault(name, []).extend(values)
         is_late = time.monotonic() - saved > _SAVE_PERIOD
         if is_late or monitor.is_stopping:
-            checkpoints.save_unfinished(stage, Unfinished(chunk + 1, state, curves))
+            with monitor.clock.record("save", stage):
+                checkpoints.save_unfinished(stage, Unfinished(chunk + 1, state, curves))
             saved = time.monotonic()
         if chunk + 1 < number:
             monitor.check_stop()

@@ -2,7 +2,6 @@
 
 import dataclasses
 import threading
-import time
 from typing import TypeAlias
 
 import jax
@@ -239,13 +238,12 @@ class Player:
         with self._lock:  # one call uses the whole machine
             self._monitor.check_finite("mission", "models", models)
             self.wait()
-            begin = time.perf_counter()
-            # Loaded models lie on the host, and every chunk would transfer them again.
-            models = jax.device_put(models)
-            call = _Call(key, models, played, episodes, self._found.metrics)
-            devices.side_by_side(lambda lane: self._play(call, lane), self._workers.threads)
-            self._monitor.add("mission", "run_s", time.perf_counter() - begin)
-            return call.result()
+            with self._monitor.clock.record("run", "mission"):
+                # Loaded models lie on the host, and every chunk would transfer them again.
+                models = jax.device_put(models)
+                call = _Call(key, models, played, episodes, self._found.metrics)
+                devices.side_by_side(lambda lane: self._play(call, lane), self._workers.threads)
+                return call.result()
 
     def _play(self, call: "_Call", lane: int) -> None:
         """Plays the missions of one of the threads."""

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from jaxsense.run.clock import Clock
+
 Listener = Callable[[str, int, int, dict[str, float]], None]
 """`(stage, done, total, metrics)`, called from the host between two chunks of work."""
 
@@ -30,34 +32,35 @@ class Monitor:
     """The clock and the listener that the stages of a run share.
 
     Attributes:
-      seconds: for each stage, `{"compile_s": ..., "run_s": ...}` so far.
+      clock: records when they did what.
     """
 
     def __init__(
         self,
         listener: Listener = lambda stage, done, total, metrics: None,
         warn: Callable[[str], None] = lambda text: None,
+        clock: Clock | None = None,
     ):
         """Begins a run.
 
         Args:
           listener: receives progress.
           warn: receives a line about a failure that does not end the run.
+          clock: of the run; a new one by default.
         """
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self.warn = warn
+        self.warn, self.clock = warn, clock or Clock()
         self.begin(listener)
 
     def begin(self, listener: Listener) -> None:
-        """Begins another run: resets the times and replaces the listener."""
-        self.seconds: dict[str, dict[str, float]] = {}
+        """Begins another run: forgets a failure and replaces the listener."""
         self._failure: StageError | None = None
         self._one_listener = listener
 
     def beside(self, listener: Listener) -> "Monitor":
-        """Returns a monitor for a concurrent run that shares this one's stop flag."""
-        other = Monitor(listener, self.warn)
+        """Returns a monitor for a concurrent run that shares this one's clock and stop flag."""
+        other = Monitor(listener, self.warn, self.clock)
         other._stop = self._stop
         return other
 
@@ -147,15 +150,3 @@ class Monitor:
             raise StageError(f"{stage}: loss = {losses[bad[0]]} at step {step} of {total}")
         self.check_finite(stage, f"parameters after step {done} of {total}", params)
         self._listener(stage, done, total, {"loss": float(np.mean(losses)), **metrics})
-
-    def add(self, stage: str, kind: str, seconds: float) -> None:
-        """Adds to the time of a stage.
-
-        Args:
-          stage: its name.
-          kind: "compile_s" or "run_s".
-          seconds: to add.
-        """
-        with self._lock:
-            entry = self.seconds.setdefault(stage, {"compile_s": 0.0, "run_s": 0.0})
-            entry[kind] += seconds

@@ -14,8 +14,9 @@ from jaxsense.dqn.reference import has_optimum
 from jaxsense.models import Models
 from jaxsense.run import missions
 from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.compilation import Compiler, Kept
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.kept import Kept
 from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import OwnPolicies, Programs, compile_programs
@@ -27,8 +28,8 @@ from jaxsense.training.stages import mission_key, models
 
 
 @dataclasses.dataclass(frozen=True)
-class RunResult:
-    """The results of a run.
+class Learned:
+    """The results of a training.
 
     Attributes:
       models: the trained networks.
@@ -39,8 +40,7 @@ class RunResult:
       rewards: for each Q-network, named by its modality or `team`, the `[epochs]` mean total reward
         of the episodes that ended, `reward`, and of the learned policy of a robot that is alone on
         the map, `evaluation`; NaN in other epochs.
-      recording: the first mission of the first of `config.mission.policies`.
-      results: the blocks of `summary.json`.
+      results: the blocks of `summary.json` about it.
     """
 
     models: Models
@@ -49,8 +49,20 @@ class RunResult:
     reliability: dict[str, Reliability]
     posteriors: dict[str, Belief]
     rewards: dict[str, dict[str, np.ndarray]]
+    results: summary.Learned
+
+
+@dataclasses.dataclass(frozen=True)
+class Played:
+    """The results of the missions that follow a training.
+
+    Attributes:
+      recording: the first mission of the first of `config.mission.policies`.
+      missions: the block `mission` of `summary.json`.
+    """
+
     recording: missions.Recording
-    results: summary.Results
+    missions: summary.Missions
 
 
 def check(config: Config, policies: OwnPolicies | None = None) -> None:
@@ -85,14 +97,14 @@ def compiled(
         yield compile_programs(config, compiler, workers, num_seeds, policies)
 
 
-def run(
+def learn(
     key: Key,
     config: Config,
     programs: Programs,
     monitor: Monitor,
     checkpoints: Checkpoints | None = None,
-) -> RunResult:
-    """Trains everything, plays the missions and summarises.
+) -> Learned:
+    """Trains everything and summarises it.
 
     Args:
       key: the only source of randomness.
@@ -104,26 +116,20 @@ def run(
     Raises:
       StageError, Stopped, OSError: see `loop.train`.
     """
-    checkpoints = checkpoints or Checkpoints()
     trained = train(key, config, programs, monitor, checkpoints)
-    networks = models(trained.outputs, config)
-    player, episodes = programs.player.result(), config.mission.episodes
-    cases = mission.cases(config, player.mission.policies)
-    played = {name: cases[name] for name in config.mission.policies}
-    found = player.play(mission_key(key), networks, played, episodes)
-    checkpoints.forget_unfinished()
+    with monitor.clock.record("wait_program", "mission"):
+        scenario = programs.player.result().mission
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
-    sensors = player.mission.world.sensors
     beliefs = summary.beliefs(trained.outputs["beliefs"])
     is_sound = compare.unsound(beliefs) is None
-    return RunResult(
-        models=networks,
+    learned = Learned(
+        models=models(trained.outputs, config),
         windows={
             sensor.name: sensor.from_left(windows[:, 0])
-            for sensor, windows in zip(sensors, detections.windows, strict=True)
+            for sensor, windows in zip(scenario.world.sensors, detections.windows, strict=True)
         },
-        fields_of_view={sensor.name: sensor.field_of_view for sensor in sensors},
+        fields_of_view=scenario.fields_of_view,
         reliability=reliability(config, detections.held_out),
         posteriors=posteriors,
         rewards={
@@ -132,7 +138,6 @@ def run(
             }
             for network in (learner(config, n) for n in config.modalities)
         },
-        recording=found.recording,
         results={
             "detectors": jax.tree.map(
                 lambda x: np.asarray(x).tolist(), trained.outputs["detector_metrics"]
@@ -140,9 +145,41 @@ def run(
             "jmvae": summary.jmvae(vars(latent) | _grouped(trained)),
             "belief": beliefs,
             "dqn": {name: _agent(config, name, trained, is_sound) for name in config.modalities},
-            "mission": summary.missions(player.mission, found.metrics),
         },
     )
+    monitor.clock.add_rest("summarise")
+    return learned
+
+
+def play(
+    key: Key,
+    config: Config,
+    programs: Programs,
+    monitor: Monitor,
+    learned: Learned,
+    checkpoints: Checkpoints | None = None,
+) -> Played:
+    """Plays the missions of a run and summarises them.
+
+    Args:
+      key: as in `learn`.
+      config: as in `learn`.
+      programs: as in `learn`.
+      monitor: as in `learn`.
+      learned: from `learn`.
+      checkpoints: as in `learn`; forgets unfinished trainings.
+
+    Raises:
+      StageError, Stopped: see `missions.Player.play`.
+    """
+    player, episodes = programs.player.result(), config.mission.episodes
+    cases = mission.cases(config, player.mission.policies)
+    played = {name: cases[name] for name in config.mission.policies}
+    found = player.play(mission_key(key), learned.models, played, episodes)
+    (checkpoints or Checkpoints()).forget_unfinished()
+    results = Played(found.recording, summary.missions(player.mission, found.metrics))
+    monitor.clock.add_rest("summarise")
+    return results
 
 
 def _grouped(trained: Trained) -> dict[str, object]:

@@ -52,7 +52,7 @@ def _runs_long(stage: Stage, config: Config) -> bool:
     return _on_cpu() and not is_live
 
 
-def _program_name(stage: Stage) -> str:
+def program_name(stage: Stage) -> str:
     """The name of a stage's programs, which stages with the same functions share."""
     kind = stage.name.partition("_")[0]
     return kind if kind in _SHARED else stage.name
@@ -112,7 +112,7 @@ class Programs:
 
     def of(self, stage: Stage) -> StagePrograms:
         """The programs of a stage."""
-        return self.of_stages[_program_name(stage)]
+        return self.of_stages[program_name(stage)]
 
     def fail(self, error: BaseException) -> None:
         """Raises an error wherever a program is awaited, now or later."""
@@ -143,7 +143,7 @@ def compile_programs(
     found, trainings = stages(config), Trainings(num_seeds)
 
     def program(stage: Stage, part: str) -> Program | SharedProgram:
-        alone = Program(compiler, _program_name(stage), part)
+        alone = Program(compiler, program_name(stage), part)
         is_shared = num_seeds > 1 and not has_rows(stage)
         return SharedProgram(alone, trainings, workers) if is_shared else alone
 
@@ -151,7 +151,7 @@ def compile_programs(
         config=config,
         stages=found,
         of_stages={
-            _program_name(stage): StagePrograms(
+            program_name(stage): StagePrograms(
                 begin=program(stage, "begin"),
                 advance=program(stage, "advance"),
                 finish=program(stage, "finish"),
@@ -165,7 +165,7 @@ def compile_programs(
         policies=policies,
     )
 
-    thread = ThreadPoolExecutor(1)
+    thread = ThreadPoolExecutor(1, "trace")
     thread.submit(_trace, programs, compiler)
     thread.shutdown(wait=False)
     return programs
@@ -199,8 +199,9 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
 def _trace_missions(programs: Programs, compiler: Compiler) -> None:
     config = programs.config
     number, workers = len(config.mission.policies) * config.mission.episodes, programs.workers
-    batch = batches.batch_of(config, number, workers)
-    scenario = mission.make_mission(config, programs.policies)
+    with compiler.monitor.clock.record("trace", "mission"):
+        batch = batches.batch_of(config, number, workers)
+        scenario = mission.make_mission(config, programs.policies)
     programs.player.set_result(missions.Player(scenario, compiler, batch, workers))
 
 

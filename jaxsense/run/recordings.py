@@ -50,7 +50,8 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
         NAME_scans   [C, A, ...]  what all its A rays read: metres, or linear RGB from 0 to 1
         NAME_angles  [A]          their directions in radians, if they are not those of the run
 
-    A sensor may be missing, but not all. Scans along other rays are resampled, see
+    A distance is infinite or 0 for a ray without a return, and any reading NaN for a ray that was
+    not recorded. A sensor may be missing, but not all. Scans along other rays are resampled, see
     `sim.recorded.resample`.
 
     Args:
@@ -59,7 +60,8 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
 
     Raises:
       OSError: if the file cannot be read.
-      ValueError: if it lacks something or has another shape, or its rays do not suffice.
+      ValueError: if it lacks something or has another shape, if a reading is negative, or if its
+        rays do not suffice.
     """
     try:
         with np.load(file, allow_pickle=False) as content:
@@ -90,10 +92,21 @@ def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
     if angles not in found:
         others = f"; of other rays, {angles} must hold the angles, in radians"
         _require_shape(found, name, ("C", len(sensor.angles), *channels), others)
+        _require_not_negative(found[name], sensor)
         return found[name]
     _require_shape(found, angles, ("A",))
     _require_shape(found, name, ("C", len(found[angles]), *channels))
+    _require_not_negative(found[name], sensor)
     return recorded.resample(sensor, found[angles], found[name])
+
+
+def _require_not_negative(scans: np.ndarray, sensor: Sensor) -> None:
+    """Raises `ValueError` if a reading is negative."""
+    is_negative = scans < 0
+    if is_negative.any():
+        returns = ", infinite or 0 without a return" if sensor.measures_distance else ""
+        found = f"{sensor.name}_scans holds {scans[is_negative][0]:g}"
+        raise ValueError(f"{found}; must be at least 0{returns}")
 
 
 def _require_shape(

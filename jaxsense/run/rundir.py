@@ -7,6 +7,7 @@ import hashlib
 import itertools
 import json
 from collections.abc import Iterator, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import TypeAlias
 
@@ -115,8 +116,7 @@ class RunDirectory:
                 _check_empty(path)
                 write_json(path / "config.json", content)
             except OSError as error:
-                reason = f"cannot be written ({error.strerror}); must be a new directory"
-                raise ConfigError("out", str(path), reason) from None
+                raise _unwritable(path, error) from None
             try:
                 yield run
             except (ConfigError, KeyboardInterrupt):
@@ -212,6 +212,45 @@ def unused(path: Path) -> Path:
     except OSError as error:
         raise ConfigError("out", str(path), f"cannot be made ({error.strerror})") from None
     return path
+
+
+def dated(name: str) -> Path:
+    """Makes a new directory `runs/DATE-TIME-NAME`, see `unused`.
+
+    Args:
+      name: what is in it.
+    """
+    return unused(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{name}")
+
+
+@contextlib.contextmanager
+def begun(path: Path | None, name: str) -> Iterator[Path]:
+    """Makes a directory for other results than a run's, and removes it if it stays empty.
+
+    Args:
+      path: a new or empty directory; by default `dated(name)`.
+      name: what is in it.
+
+    Raises:
+      ConfigError: if the directory is not empty or cannot be made.
+    """
+    try:
+        path = path or dated(name)
+        path.mkdir(parents=True, exist_ok=True)
+        _check_empty(path)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+    try:
+        yield path
+    finally:
+        with contextlib.suppress(OSError):
+            path.rmdir()
+
+
+def _unwritable(path: Path | None, error: OSError) -> ConfigError:
+    """The error about a directory of results that cannot be written."""
+    reason = f"cannot be written ({error.strerror}); must be a new directory"
+    return ConfigError("out", str(path), reason)
 
 
 def _check_empty(path: Path) -> None:

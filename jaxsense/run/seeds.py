@@ -87,7 +87,7 @@ def rewards(
       warn: called with a line about each checkpoint that is damaged or missing.
 
     Returns:
-      `[K, epochs]` rewards as in `RunResult.rewards`, without those of such checkpoints.
+      `[K, epochs]` rewards as in `pipeline.Learned.rewards`, without those of such checkpoints.
     """
     shapes = {
         "reward": np.zeros(config.dqn.epochs, np.float32),

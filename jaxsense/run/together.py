@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from jaxsense.run.compilation import Program, shapes_of
+from jaxsense.run.compilation import Program
 from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.kept import shapes_of
 
 _PATIENCE = 0.5  # s; then a call goes ahead without the trainings that have not made it yet
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 __version__ = "0.4.0"
 _ROOT = Path(__file__).parents[2]
+_PLACE = str(Path(__file__).relative_to(_ROOT))
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
@@ -21,13 +22,18 @@ def commit(source: Path = _ROOT) -> str | None:
 
     Args:
       source: the root of the tree, by default the one this package was imported from.
+
+    Returns:
+      The commit; None also if the package only lies in a repository that does not hold it.
     """
     if not (source / ".git").exists():
         return None
-    command = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=40"]
-    command += ["--exclude", "*"]
+    git = ["git", "-C", str(source)]
+    ours = [*git, "ls-files", "--error-unmatch", _PLACE]
+    describe = [*git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"]
     try:
-        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        subprocess.run(ours, capture_output=True, timeout=10, check=True)
+        found = subprocess.run(describe, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
     return found.stdout.strip()

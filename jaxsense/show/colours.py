@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxsense.config import ArenaConfig
+from jaxsense.summary.profile import Kind
 
 RGB = tuple[float, float, float]
 MARKERS = "oDs^"
@@ -17,6 +18,16 @@ _POLICY_COLOURS = {
     "auction": "C5", "rollout": "C6", "naive": "0.35", "naive_2": "0.5", "naive_3": "0.65",
     "random": "0.75",
 }  # fmt: skip
+_OWN = "starting, summing up", "0.45"
+_TRACING = "tracing, lowering", "#d9a400"
+_SAVING = "saving", "#7d8a12"
+ACTIVITIES: dict[Kind, tuple[str, str]] = {
+    "import": _OWN, "start": _OWN, "summarise": _OWN, "trace": _TRACING, "lower": _TRACING,
+    "compile": ("compiling", "#c8443c"), "load": ("loading", "#8250c8"),
+    "wait_program": ("waiting for a program", "0.85"), "run": ("running", "#1558b0"),
+    "save": _SAVING, "draw": ("drawing", "#0891a8"),
+}  # fmt: skip
+"""Name and colour of what a run does; the others are not drawn."""
 _APART = 0.25  # in RGB, which the eye distinguishes at a glance
 _TOGETHER = 0.05  # latent distance of classes that a picture cannot separate
 _DARKEST, _LIGHTEST = -0.75, 0.6

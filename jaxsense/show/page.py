@@ -1,25 +1,27 @@
 """The report of a run: one page that needs no other file."""
 
-import base64
 import contextlib
 import json
 import operator
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-import jinja2
-
 from jaxsense.config import PRESETS, Config, as_plain, parse_json
-from jaxsense.show import tables
+from jaxsense.show import html, tables
 from jaxsense.show.mission_plots import counted
-from jaxsense.summary import Evaluation, Missions, Summary, cases, compare, traffic
+from jaxsense.summary import Evaluation, Missions, Summary, cases, compare, profile, traffic
 from jaxsense.summary.metrics import mean
+from jaxsense.summary.profile import Span
 from jaxsense.summary.read import EVALUATIONS
 
 
 def render(
-    run: Path, config: Config, summary: Summary, evaluations: Mapping[str, Evaluation] | None = None
+    run: Path,
+    config: Config,
+    summary: Summary,
+    evaluations: Mapping[str, Evaluation] | None = None,
+    spans: Sequence[Span] = (),
 ) -> str:
     """Writes the page of a run, or of several seeds, as text.
 
@@ -28,24 +30,19 @@ def render(
       config: its settings.
       summary: its summary.
       evaluations: further missions, by the names of their files.
+      spans: when the run did what, if it is known.
 
     Raises:
       OSError: if a picture cannot be read.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("jaxsense.show", "."),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
     stem = operator.attrgetter("stem")  # so that the run's own film comes first
     here = _missions(f"{summary['preset']} preset", summary["mission"], run / "policies.png")
     elsewhere = [
         _missions(_title(found), found["mission"], run / EVALUATIONS / f"{name}.png")
         for name, found in (evaluations or {}).items()
     ]
-    return environment.get_template("report.html.jinja").render(
+    return html.render(
+        "report.html.jinja",
         run=run,
         argument=lambda path: shlex.quote(str(path)),
         trust=" --trust" if config.sensors else "",
@@ -63,12 +60,12 @@ def render(
         ],
         paper=tables.paper(summary),
         times=tables.times(summary, summary["timing"]),
+        profile=profile.verdict(spans),
         devices={kind: summary["devices"].count(kind) for kind in summary["devices"]},
         commit=_commit(run),
         changed=_changed(config, summary["preset"]),
         config=json.dumps(as_plain(config), indent=2),
         plot=lambda name: _data(run / f"{name}.png"),
-        # In an image, a browser runs no scripts and loads no other files, so any film is safe.
         films={path.stem: _data(path) for path in sorted(run.glob("mission*.svg"), key=stem)},
     )
 
@@ -100,8 +97,7 @@ def _data(path: Path) -> str | None:
     """A picture as a data URI; None if there is no such file."""
     if not path.exists():
         return None
-    kind = {".svg": "svg+xml", ".png": "png"}[path.suffix]
-    return f"data:image/{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+    return html.picture(path.suffix[1:], path.read_bytes())
 
 
 def _commit(run: Path) -> str | None:

@@ -26,7 +26,7 @@ from jaxsense.show.colours import (
     plane,
     policy_colour,
 )
-from jaxsense.summary.blocks import AGENTS, Agent, Beliefs, Results
+from jaxsense.summary.blocks import AGENTS, Agent, Beliefs, Learned, Missions
 from jaxsense.summary.compare import bounds
 from jaxsense.summary.metrics import mean
 
@@ -47,7 +47,7 @@ _FAR = 0.2  # from the median of its class, in sigma; detections further away ar
 
 def of_run(
     config: Config,
-    results: Results,
+    results: Learned,
     posteriors: dict[str, Belief],
     windows: Arrays,
     reliability: Mapping[str, Reliability],
@@ -68,17 +68,23 @@ def of_run(
     }
 
 
-def of_seeds(curves: Curves, results: Results) -> dict[str, bytes]:
-    """Draws the plots that a run and several seeds share, as PNG files by name.
+def of_learning(curves: Curves, results: Learned) -> dict[str, bytes]:
+    """Draws the plots of a training that a run and several seeds share, as PNG files by name.
 
     Args:
       curves: see `rewards`.
       results: the blocks of the summary.
     """
-    return {
-        "reward.png": png(rewards(curves, results["dqn"])),
-        "policies.png": png(mission_plots.policies(results["mission"])),
-    }
+    return {"reward.png": png(rewards(curves, results["dqn"]))}
+
+
+def of_missions(missions: Missions) -> dict[str, bytes]:
+    """Draws the plots of missions that a run and several seeds share, as PNG files by name.
+
+    Args:
+      missions: the block `mission` of the summary.
+    """
+    return {"policies.png": png(mission_plots.policies(missions))}
 
 
 def png(figure: Figure) -> bytes:

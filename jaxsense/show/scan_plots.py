@@ -27,7 +27,7 @@ def windows(of_sensors: Sequence[Pairs]) -> Figure:
     for pair, found in enumerate(of_sensors):
         number = min(_COLUMNS, len(found.recorded))
         chosen = np.linspace(0, len(found.recorded) - 1, number).astype(int)
-        for kind, readings in enumerate((found.recorded, found.similar.window)):
+        for kind, readings in enumerate((found.recorded, found.simulated)):
             row, shown = axes[2 * pair + kind], found.sensor.from_left(readings[chosen])
             row[0].set_ylabel(("recorded", "simulated")[kind])
             for ax, values, distance in zip(row, shown, found.distances[chosen], strict=False):
@@ -61,17 +61,19 @@ def residuals(of_sensors: Sequence[Pairs]) -> Figure:
 
 
 def _draw_residuals(histogram: Axes, sizes: Axes, found: Pairs) -> None:
-    kinds = {"recorded": found.similar.recorded, "simulated": found.similar.simulated}
+    kinds = {"recorded": found.residuals, "simulated": found.usual}
     kinds = {name: x[np.isfinite(x)] for name, x in kinds.items()}
     every = np.concatenate([*kinds.values()])
     end = max(np.quantile(np.abs(every), 1 - _OUTSIDE), 1e-6)
     unit = " [m]" if found.sensor.measures_distance else ""
     for i, (name, each) in enumerate(kinds.items()):
         median = round(float(np.median(each)), 4) + 0.0  # no -0
-        style = {"color": f"C{i}", "label": f"{name}, median {median:+.4f}"}
+        label = f"{name}, median {median:+.4f}"
         bins = np.linspace(-end, end, _BINS)
         weights = np.full(len(each), 1 / len(each))
-        histogram.hist(each, bins.tolist(), weights=weights, histtype="step", **style)
+        histogram.hist(
+            each, bins.tolist(), weights=weights, histtype="step", color=f"C{i}", label=label
+        )
         size = np.sort(np.abs(each))
         sizes.plot(size, 1 - np.arange(len(size)) / len(size), color=f"C{i}", label=name)
     reading = f"residual of {found.sensor.name}{unit}"

@@ -124,4 +124,12 @@ def _compare(config: Config, modality: int, looks: RecordedLooks) -> tuple[Apart
     recorded, simulated = (
         float(np.median(similar.root_mean_square(x))) for x in (found.recorded, found.simulated)
     )
-    return Apart(recorded, simulated, len(cut)), Pairs(sensor, cut, distances, found)
+    pairs = Pairs(
+        sensor=sensor,
+        recorded=cut,
+        simulated=np.asarray(found.window),
+        residuals=np.asarray(found.recorded),
+        usual=np.asarray(found.simulated),
+        distances=distances,
+    )
+    return Apart(recorded, simulated, len(cut)), pairs

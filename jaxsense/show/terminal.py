@@ -123,7 +123,7 @@ class Display:
             return
         self._last[stage] = now
         parts = [f"{done} of {total}", rate, left]
-        progress = "done" if total == 1 else ", ".join(part for part in parts if part)
+        progress = "done" if done == total == 1 else ", ".join(part for part in parts if part)
         say(f"{clock}: {progress}  {text}".rstrip())
 
 

@@ -35,7 +35,8 @@ def resample(
     """Turns scans along other rays into scans along the rays of a sensor.
 
     Between two recorded rays, readings are interpolated; distances only on one surface, otherwise
-    the nearest ray counts. The last ray of a full circle has the first as its neighbour.
+    the nearest ray counts. A distance of 0 is no return and becomes infinite. The last ray of a
+    full circle has the first as its neighbour.
 
     Args:
       sensor: the sensor.
@@ -60,6 +61,8 @@ def resample(
     # The last ray also comes before the first one, and this after the last.
     circle = np.concatenate([turned[-1:] - 2 * np.pi, turned, turned[:1] + 2 * np.pi])
     scans = np.asarray(readings, np.float32)[:, np.concatenate([order[-1:], order, order[:1]])]
+    if sensor.measures_distance:
+        scans = _with_returns(scans)
     targets = _within_a_turn(sensor.angles.astype(np.float64))
     left = np.searchsorted(circle, targets, side="right") - 1
     gap = circle[left + 1] - circle[left]
@@ -86,6 +89,11 @@ def resample(
     found = np.where(is_between & is_same, between, nearest).astype(np.float32)
     found[:, ~is_recorded] = np.nan
     return found
+
+
+def _with_returns(ranges: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
+    """Distances in metres, infinite instead of 0 where a beam has no return."""
+    return np.where(ranges == 0, np.inf, ranges)
 
 
 def _within_a_turn(angles: Float[np.ndarray, " A"]) -> Float[np.ndarray, " A"]:
@@ -163,11 +171,12 @@ def fit_noise(
     Args:
       config: other settings of the scanner.
       angles: directions of the beams, in radians, in order.
-      ranges: `[S, A]` distances in metres, infinite without a return.
+      ranges: `[S, A]` distances in metres, infinite or 0 without a return.
 
     Raises:
       ValueError: if the scans show too few straight walls or edges.
     """
+    ranges = _with_returns(ranges)
     residuals, distances = wall_residuals(angles, ranges)
     free = _BEAMS - 2  # a line has two parameters
     unbiased = np.sqrt(scipy.special.chdtri(free, 0.5) / free)
@@ -229,7 +238,7 @@ def errors(
     Args:
       config: all settings.
       angles: directions of the beams, in radians, in order.
-      ranges: `[S, A]` distances in metres, infinite without a return.
+      ranges: `[S, A]` distances in metres, infinite or 0 without a return.
 
     Raises:
       ValueError: if the scans show too few straight walls or edges.

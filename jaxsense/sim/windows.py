@@ -109,7 +109,10 @@ def as_window(sensor: Sensor, readings: Float[Array, "window *channels"]) -> Flo
       readings: readings of the rays that the detector reads.
 
     Returns:
-      The readings as one vector, limited to `sensor.window_limit`.
+      The readings as one vector, limited to `sensor.window_limit`. A distance of 0 counts as no
+      return, that is as infinite: drivers of laser scanners write it for one.
     """
     chex.assert_axis_dimension(readings, 0, sensor.window, custom_message="readings")
+    if sensor.measures_distance:
+        readings = jnp.where(readings == 0, jnp.inf, readings)
     return jnp.minimum(readings, sensor.window_limit).reshape(-1)

@@ -256,13 +256,18 @@ Missions = dict[str, Case | Traffic]
 """`mission`: a `Case` for each policy, and `bytes_per_detection`."""
 
 
-class Results(TypedDict):
-    """The blocks of a summary that come from a training and its missions."""
+class Learned(TypedDict):
+    """The blocks of a summary that come from a training."""
 
     detectors: dict[str, Detector]
     jmvae: Jmvae
     belief: Beliefs
     dqn: dict[str, Agent]
+
+
+class Results(Learned):
+    """The blocks of a summary that come from a training and its missions."""
+
     mission: Missions
 
 

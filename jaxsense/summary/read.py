@@ -8,6 +8,7 @@ from typing import Annotated, NotRequired, Union, cast, get_args, get_origin, ge
 from typing import is_typeddict as is_block
 
 from jaxsense.config import ConfigError, parse_json
+from jaxsense.config.options import command
 from jaxsense.summary.blocks import Evaluation, Results, Summary
 
 EVALUATIONS = "evaluations"
@@ -47,7 +48,7 @@ class NotFinishedError(ConfigError):
     """A run that has not finished."""
 
     def __init__(self, run: Path):
-        resume = f"python -m jaxsense.train --resume {shlex.quote(str(run))}"
+        resume = f"{command('jaxsense.train')} --resume {shlex.quote(str(run))}"
         self.expected = f"is not finished: it has no summary.json; continue it with {resume}"
         ValueError.__init__(self, f"{run} {self.expected}")
 

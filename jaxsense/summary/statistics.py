@@ -5,12 +5,12 @@ from typing import cast
 
 import numpy as np
 
-from jaxsense.summary.blocks import Results, Summary, Timing
+from jaxsense.summary.blocks import Results, StageTiming, Summary, Timing
 from jaxsense.summary.compare import interval
 from jaxsense.summary.read import RESULTS
 
 
-def timing(total: float, stages: dict[str, dict[str, float]], number: int) -> Timing:
+def timing(total: float, stages: dict[str, StageTiming], number: int) -> Timing:
     """Divides the time of concurrent runs equally among them.
 
     Args:

@@ -361,7 +361,7 @@ def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsy
 
     compiled = SimpleNamespace(trainings=Trainings(1))
     monkeypatch.setattr(pipeline, "compiled", lambda *_: contextlib.nullcontext(compiled))
-    monkeypatch.setattr(pipeline, "run", fails)
+    monkeypatch.setattr(pipeline, "learn", fails)
     argv = ["--preset", "smoke", "--quiet", "--cache", "None", "--out", str(tmp_path / "run")]
     with pytest.raises(SystemExit) as stop:
         train.main(argv)

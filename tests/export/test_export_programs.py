@@ -182,6 +182,7 @@ def test_an_exported_detector_answers_what_is_not_there(file, tmp_path, player):
             (-scan, at, False),
             # A beam without a return; no pixel is infinitely bright.
             (np.where(scan > 0, np.inf, scan), at, sensor.measures_distance),
+            (np.zeros_like(scan), at, True),
             *((scan, {**at, "bearing": b}, False) for b in (np.radians(121.0), -np.pi, np.nan)),
             *((scan, {**at, "distance": d}, False) for d in (0.0, -1.0, np.inf, np.nan)),
         ]

@@ -59,6 +59,9 @@ class Mocked:
     def __getitem__(self, key):
         return Mocked()
 
+    def __contains__(self, key):
+        return False
+
 
 PARTS = (
     "gymnasium", "gymnasium.vector", "gymnasium.vector.utils", "gymnax", "gymnax.environments",

@@ -41,12 +41,15 @@ class OneEnv(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.state = self.start
-        return self.observation(), {}
+        return self.observation(), self.info()
 
     def step(self, action):
         self.state, outcome = self.mdp_step(jax.random.key(0), self.state, jnp.int32(action))
         ends = bool(outcome.terminated), bool(outcome.truncated)
-        return self.observation(), float(outcome.reward), *ends, {}
+        return self.observation(), float(outcome.reward), *ends, self.info()
+
+    def info(self):
+        return {"action_mask": np.ones(4, np.int8)}
 
 
 def test_every_step_equals_the_mdps(starts):
@@ -84,7 +87,7 @@ def assert_same(ours, theirs):
                 if mine is not None:
                     np.testing.assert_allclose(mine, reference, atol=1e-5)
         else:
-            np.testing.assert_array_equal(ours[4][name], value)
+            jax.tree.map(np.testing.assert_array_equal, ours[4][name], value)
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])

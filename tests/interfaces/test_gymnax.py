@@ -31,8 +31,8 @@ def assert_trees_equal(actual, expected):
 def test_every_step_equals_the_mdps(env):
     params = env.default_params
     obs, state = env.reset(jax.random.key(0), params)
-    expected = jax.jit(lambda key: map_mdp.reset(key, env.mdp))(jax.random.key(0))
-    mdp_step = jax.jit(lambda k, s, a: map_mdp.step(k, env.mdp, s, a, LIDAR))
+    expected = jax.jit(lambda key: map_mdp.reset(key, small.small_mdp()))(jax.random.key(0))
+    mdp_step = jax.jit(lambda k, s, a: map_mdp.step(k, small.small_mdp(), s, a, LIDAR))
     for i, action in enumerate([0, 1, 0, 2, 3]):
         np.testing.assert_allclose(obs, observation(expected.belief), rtol=1e-6)
         assert_trees_equal(state.map.seen, expected.seen)

@@ -125,6 +125,34 @@ def test_messages_leave_known_what_a_protocol_with_counters_does():
     assert overtaken > 5
 
 
+def test_a_message_that_comes_twice_or_after_a_newer_one_changes_no_map(own_models):
+    """Robot 0 tells of its first look, which arrives late, and then of both looks, twice."""
+    rng, sends = np.random.default_rng(0), jnp.array([True, False, False])
+    of_look = lambda: Evidence(jnp.asarray(rng.normal(size=3), jnp.float32), jnp.zeros(3))  # noqa: E731
+    first, second = of_look(), of_look()
+    late = CommunicationConfig(own_maps=True, delay=4.0)
+    held = looked(memory.empty(MODALITY, 3), 0, seconds=1.0, evidence=first)
+    held = tell(held, jax.random.key(0), late, jnp.float32(1.0), sends)
+    arrives = np.asarray(held.heard_at[1, 0, 0])
+    assert 3.0 < arrives < 9.0
+    held = looked(held, 0, seconds=2.0, evidence=second)
+    newer = tell(held, jax.random.key(1), OWN, jnp.float32(2.0), sends)
+    again = tell(newer, jax.random.key(2), late, jnp.float32(2.0), sends)
+    read = jax.jit(
+        lambda held, seconds: OwnMap(held, held.known_to(1, seconds), 2).read(own_models)
+    )
+    nothing, both = (read(again, np.float32(seconds)) for seconds in (1.9, 2.0))
+    expected = memory.belief_of(own_models.fusion, first.log_likelihood + second.log_likelihood)
+    np.testing.assert_array_equal(nothing.times_seen, 0)
+    np.testing.assert_array_equal(both.times_seen[0], [2, 0])
+    np.testing.assert_allclose(both.belief.mean[0], expected.mean, atol=1e-6)
+    # When the late one has come, and the copy, and before they have.
+    for told in (newer, again):
+        for seconds in (2.0, arrives - 0.01, arrives, 20.0):
+            after = read(told, np.float32(seconds))
+            jax.tree.map(np.testing.assert_array_equal, after, both)
+
+
 def test_without_losses_and_delay_all_know_all_at_once():
     held = looked(looked(memory.empty(MODALITY, 3), 0, seconds=1.0), 2, seconds=3.0)
     held = tell(held, jax.random.key(0), OWN, jnp.float32(3.0), jnp.array([1, 0, 1], bool))

@@ -21,7 +21,7 @@ def degrees(*values):
 
 
 def test_the_rays_of_a_sensor_read_what_was_recorded_along_them():
-    readings = np.arange(18.0).reshape(2, 9)
+    readings = 1 + np.arange(18.0).reshape(2, 9)
     np.testing.assert_allclose(recorded.resample(LIDAR, LIDAR.angles, readings), readings)
 
 
@@ -39,7 +39,7 @@ def test_distances_are_interpolated_on_a_surface_and_nearest_at_an_edge():
 
 
 def test_rays_may_come_in_any_order_and_turn():
-    readings = np.arange(9.0)[None]
+    readings = 1 + np.arange(9.0)[None]
     turned = LIDAR.angles.astype(float) % (2 * np.pi)  # 0 to 360 degrees, as some drivers count
     np.testing.assert_allclose(recorded.resample(LIDAR, turned, readings), readings, atol=1e-5)
     back = recorded.resample(LIDAR, LIDAR.angles[::-1], readings[:, ::-1])
@@ -62,8 +62,8 @@ def test_a_full_circle_is_closed():
     # From 0 on, as some drivers count, and with a ray at both ends.
     turned = recorded.resample(AROUND, angles % (2 * np.pi), readings)[0]
     np.testing.assert_allclose(turned, found, rtol=1e-6)
-    twice = np.arange(37.0)[None]
-    twice[0, -1] = 0.0
+    twice = 1 + np.arange(37.0)[None]
+    twice[0, -1] = 1.0
     np.testing.assert_allclose(
         recorded.resample(AROUND, AROUND.angles, twice)[0], twice[0], atol=1e-4
     )
@@ -172,6 +172,8 @@ def test_noise_is_fitted_to_scans(measured):
     assert replace(noise, range_noise=0.01) == replace(
         found, range_noise=0.01, range_noise_growth=0.001, mixed_pixels=0.1, dropout=0.01
     )
+    # Some drivers write 0 for no return.
+    assert recorded.fit_noise(LidarConfig(), ANGLES, np.where(np.isinf(ranges), 0, ranges)) == found
 
 
 def test_noise_is_fitted_without_bias():

@@ -1,0 +1,59 @@
+"""`jaxsense COMMAND`, or `python -m jaxsense COMMAND`: the commands of the package."""
+
+import importlib
+import sys
+from typing import NoReturn
+
+from jaxsense.run.version import __version__
+
+COMMANDS = {
+    "demo": ("jaxsense.demo", "plays a mission of trained robots and opens a page with its film"),
+    "tasks": ("jaxsense.task_list", "lists the frozen tasks and what known policies reach in them"),
+    "train": ("jaxsense.train", "trains the whole pipeline, from scanlines to policies"),
+    "evaluate": ("jaxsense.evaluate", "plays missions with the policies of a finished run"),
+    "export": ("jaxsense.export", "writes trained models as one file for robots without JAX"),
+}
+"""The module of each command, and what it does."""
+
+
+def main() -> None:
+    """Runs the command that the process's command line names."""
+    match sys.argv[1:]:
+        case [] | ["-h" | "--help", *_]:
+            print(_help())
+        case ["--version", *_]:
+            print(f"jaxsense {__version__}")
+        case [name, *_] if name in COMMANDS:
+            _run(name)
+        case [name, *_]:
+            _fail(name)
+
+
+def _run(name: str) -> None:
+    """Runs a command, which reads the rest of the command line."""
+    # Here: JAX takes seconds to import.
+    from jaxsense.run import cli  # noqa: PLC0415
+
+    del sys.argv[1]
+    module, _ = COMMANDS[name]
+    cli.run(importlib.import_module(module).main)
+
+
+def _help() -> str:
+    """A line for each command."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:{width}}  {about}" for name, (_, about) in COMMANDS.items()]
+    begin = "usage: jaxsense COMMAND [OPTIONS]\n\ncommands:"
+    end = "\n`jaxsense COMMAND --help` lists its options, `jaxsense --version` the version."
+    return "\n".join([begin, *lines, end])
+
+
+def _fail(name: str) -> NoReturn:
+    """Ends the process with one line about a command that does not exist."""
+    known = ", ".join(COMMANDS)
+    print(f"jaxsense: command = {name[:80]!r}: must be one of {known}", file=sys.stderr)
+    sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""`jaxsense demo`: plays a mission of trained robots and opens a page with its films."""
+
+import contextlib
+import dataclasses
+import gc
+import os
+import sys
+import webbrowser
+from pathlib import Path
+
+import jax
+import rich.console
+
+from jaxsense import mission, summary
+from jaxsense.config import ConfigError
+from jaxsense.config.checks import check_fields, require
+from jaxsense.config.options import command
+from jaxsense.models import Models
+from jaxsense.run import cli, devices, files, missions, rundir
+from jaxsense.run.compilation import Compiler
+from jaxsense.run.missions import Played
+from jaxsense.run.monitor import Monitor, StageError
+from jaxsense.show import animation, html, tables
+from jaxsense.show.terminal import Display, print_table, say
+from jaxsense.tasks import PRETRAINED, load_pretrained
+
+PROGRAM = "jaxsense.demo"
+_REFERENCE = "naive"
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Plays a mission of trained robots, and again with naive exploration, on one page."""
+
+    preset: str = "noisy"
+    """Settings that the robots were trained with: `default`, `noisy`, `many`, `raw` or `team`."""
+    policy: str = "latent"
+    """Policy to compare with naive exploration: `latent`, which was learned, `greedy`, `bayes`,
+    `optimal`, `naive_2`, `naive_3`, `random`, `nearest`, `auction` or `rollout`."""
+    seed: int = 0
+    """Seed of the arena and of all noise, from 0 to 2^32 - 1."""
+    out: Path | None = None
+    """Directory of the page; a new or empty one. By default `runs/DATE-TIME-demo-PRESET`."""
+    browser: bool = True
+    """Open the page in a browser, if there is a display."""
+    cache: Path | None = cli.CACHE
+    """Directory in which to cache compiled programs; `none` for no cache."""
+
+    def __post_init__(self):
+        check_fields(self, bits=64)
+        require(0 <= self.seed < 2**32, self, "seed", "must be from 0 to 2^32 - 1")
+        cli.require_directory("cache", self.cache)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Runs the program.
+
+    Args:
+      argv: the command line without the program; by default the process's own.
+    """
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    console = rich.console.Console()
+    # Tracing makes and drops millions of objects, and each collection looks through all that lives.
+    gc.disable()
+    try:
+        devices.start(1)
+        config, models = load_pretrained(arguments.preset)
+        scenario = mission.make_mission(config)
+        scenario.policy(arguments.policy)
+        # Before a minute of work.
+        with rundir.begun(arguments.out, f"demo-{arguments.preset}") as place:
+            kept = cli.keep_programs(PROGRAM, arguments.cache, config)
+            with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
+                played = _play(arguments, scenario, models, compiler)
+            block = summary.missions(
+                scenario, {name: each.metrics[name] for name, each in played.items()}
+            )
+            table = tables.missions(block, "One mission of each policy, in the same arena")
+            path = place / "demo.html"
+            files.write(path, _page(arguments, scenario, models, played, table))
+    except (ConfigError, StageError) as error:
+        cli.fail(PROGRAM, str(error))
+    except OSError as error:
+        cli.fail(PROGRAM, f"{cli.reason(error)}")
+    with contextlib.suppress(OSError):  # as in `say`
+        print_table(console, table)
+    say(f"The page is {path}.")
+    say(f"Next: {command('jaxsense tasks')}")
+    if arguments.browser and _has_display():
+        webbrowser.open(path.resolve().as_uri())
+
+
+def _play(
+    arguments: Arguments, scenario: mission.Mission, models: Models, compiler: Compiler
+) -> dict[str, Played]:
+    """A mission of each policy, in the same arena."""
+    player, key = missions.Player(scenario, compiler, batch=1), jax.random.key(arguments.seed)
+    cases = mission.cases(scenario.config, scenario.policies)
+    names = dict.fromkeys((arguments.policy, _REFERENCE))
+    return {name: player.play(key, models, {name: cases[name]}, episodes=1) for name in names}
+
+
+def _page(
+    arguments: Arguments,
+    scenario: mission.Mission,
+    models: Models,
+    played: dict[str, Played],
+    table: tables.Table,
+) -> str:
+    """The page, with the films in it."""
+
+    def film(name: str) -> str:
+        recording, title = played[name].recording, f"{name} policy".replace("_", " ")
+        drawn = animation.draw(
+            scenario.config,
+            recording.records,
+            recording.end,
+            models.fusion,
+            scenario.fields_of_view,
+            title,
+        )
+        return html.picture("svg", drawn.encode())
+
+    return html.render(
+        "demo.html.jinja",
+        preset=arguments.preset,
+        seed=arguments.seed,
+        other=next(name for name in PRETRAINED if name != arguments.preset),
+        films={name: film(name) for name in played},
+        table=table,
+        sentence=_sentence(arguments.policy, len(scenario.config.carried)),
+    )
+
+
+def _sentence(policy: str, robots: int) -> str:
+    """What the films show."""
+    naive = f"under naive exploration each of the {robots} robots looks at every PoI (point of "
+    naive += "interest) once"
+    if policy == _REFERENCE:
+        return f"{naive[0].upper()}{naive[1:]}, and what it sees goes into the shared map."
+    chooses = {"latent": "a learned policy asks the shared map which look is worth most"}
+    how = chooses.get(policy, f"the policy {policy} chooses which look comes next")
+    return f"In the first film {how}, and ends when none pays; {naive}."
+
+
+def _has_display() -> bool:
+    """Whether a browser could open a window; without one it would take over the terminal."""
+    names = "DISPLAY", "WAYLAND_DISPLAY"
+    return sys.platform == "darwin" or any(os.environ.get(name) for name in names)
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,68 @@
+"""`jaxsense tasks`: the frozen tasks, and what known policies reach in them."""
+
+import contextlib
+import dataclasses
+import sys
+
+import numpy as np
+import rich.console
+
+from jaxsense import tasks
+from jaxsense.run import cli
+from jaxsense.show.tables import Table
+from jaxsense.show.terminal import print_table, say
+from jaxsense.tasks import Task
+
+PROGRAM = "jaxsense tasks"
+SCOREBOARD = "docs/tasks.md"
+"""The page with the scores of policies."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Lists the frozen tasks of `jaxsense.make`, and the returns of policies to compare with."""
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Runs the program.
+
+    Args:
+      argv: the command line without the program; by default the process's own.
+    """
+    cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    found = [tasks.make(name, agent) for name in tasks.registered() for agent in tasks.agents(name)]
+    with contextlib.suppress(OSError):  # as in `say`
+        print_table(rich.console.Console(), _table(found))
+    for name in tasks.registered():
+        say(f"{name}: {tasks.about(name)}.")
+    say(
+        f"Returns are interquartile means over {tasks.SEEDS} seeds of {tasks.EPISODES:,} episodes, "
+        f"from the files of the tasks. Other policies: {SCOREBOARD}."
+    )
+    say('Next, in Python: jaxsense.score("noisy-v0", policy)')
+
+
+def _table(found: list[Task]) -> Table:
+    """A row for each task and agent."""
+    others = "naive", "random"
+
+    def row(task: Task) -> tuple[str, list[str]]:
+        known = {
+            name: f"{tasks.estimate(returns).value:.3f}"
+            for name, returns in zip(task.references, np.asarray(task.returns), strict=True)
+        }
+        best = next(iter(known))
+        sizes = str(task.observation_size), str(task.num_actions)
+        return task.name, [
+            task.agent,
+            *sizes,
+            f"{known[best]} {best}",
+            *(known[name] for name in others),
+        ]
+
+    columns = ["agent", "observation", "actions", "best known return", *others]
+    return Table("Tasks of jaxsense.make(name, agent)", columns, [row(task) for task in found])
+
+
+if __name__ == "__main__":
+    cli.run(main)

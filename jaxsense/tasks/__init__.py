@@ -1,0 +1,21 @@
+"""Trained models, frozen tasks and scores that travel with the package."""
+
+from jaxsense.tasks.environment import Environment as Environment
+from jaxsense.tasks.environment import TimeStep as TimeStep
+from jaxsense.tasks.pretrained import PRETRAINED as PRETRAINED
+from jaxsense.tasks.pretrained import Origin as Origin
+from jaxsense.tasks.pretrained import load_pretrained as load_pretrained
+from jaxsense.tasks.pretrained import origin as origin
+from jaxsense.tasks.registry import about as about
+from jaxsense.tasks.registry import agents as agents
+from jaxsense.tasks.registry import make as make
+from jaxsense.tasks.registry import registered as registered
+from jaxsense.tasks.score import Estimate as Estimate
+from jaxsense.tasks.score import Recurrent as Recurrent
+from jaxsense.tasks.score import Score as Score
+from jaxsense.tasks.score import estimate as estimate
+from jaxsense.tasks.score import on_host as on_host
+from jaxsense.tasks.score import score as score
+from jaxsense.tasks.task import EPISODES as EPISODES
+from jaxsense.tasks.task import SEEDS as SEEDS
+from jaxsense.tasks.task import Task as Task

@@ -1,0 +1,197 @@
+"""The frozen tasks by name, and how one is frozen."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsense import models
+from jaxsense.config import Config, ConfigError, as_plain, from_plain, require_32_bits
+from jaxsense.core.types import Key, Samples
+from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.looks import Bank, make_mdp
+from jaxsense.models import Models
+from jaxsense.tasks import archive
+from jaxsense.tasks.archive import Arrays
+from jaxsense.tasks.environment import Scaling
+from jaxsense.tasks.pretrained import DATA, Origin
+from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, reference_returns
+from jaxsense.training.mdp import models_of
+
+TASKS = {
+    "map-v0": "the paper's map of three PoIs, whose looks are almost certain",
+    "many-v0": "eight PoIs of sixteen classes, of which a sensor tells four labels apart",
+    "noisy-v0": "looks are uncertain and beliefs accumulate them",
+    "team-v0": "a camera and a LiDAR drive among three to eight PoIs, and time has a price",
+}
+"""The frozen tasks, and what is special in each."""
+
+_STATES, _STEPS = 1024, 12  # from which observations are scaled
+_LEAST_SPREAD = 1e-6  # below which a feature is constant
+_NONE = np.zeros((0, 0))
+_TEAM = "team"
+
+
+def registered() -> tuple[str, ...]:
+    """Names of all tasks, for `make`."""
+    return tuple(TASKS)
+
+
+def about(name: str) -> str:
+    """What is special in a task, in a few words.
+
+    Args:
+      name: one of `registered()`.
+    """
+    return TASKS[name]
+
+
+def agents(name: str) -> tuple[str, ...]:
+    """The agents of a task, for `make`.
+
+    Args:
+      name: one of `registered()`.
+
+    Raises:
+      ConfigError: if there is no such task.
+    """
+    return _agents(from_plain(_read(name)[1]["config"]))
+
+
+def make(name: str, agent: str | None = None) -> Task:
+    """Makes a frozen task.
+
+    `map-v0` is the paper's map MDP, whose looks are almost certain. In `noisy-v0` they are not, and
+    beliefs accumulate. `many-v0` has eight PoIs of sixteen classes. In `team-v0`, a camera and a
+    LiDAR drive among three to eight PoIs, and time has a price.
+
+    Args:
+      name: one of `registered()`.
+      agent: whose sensor looks, `camera` or `lidar`, by default the first; a team has one policy
+        for all of its robots, and its agent is `team`.
+
+    Raises:
+      ConfigError: if there is no such task or agent, or if JAX computes in 64 bits.
+    """
+    arrays, words = _read(name)
+    require_32_bits()
+    config = from_plain(words["config"])
+    shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
+    fusion = archive.fill(arrays, "fusion", shapes.fusion)
+    values = archive.fill(arrays, "look_values", shapes.look_values)
+    looks = Bank(tuple(jnp.asarray(arrays[f"looks/{m}"]) for m in range(len(config.modalities))))
+    scaling = Scaling(jnp.asarray(arrays["scaling/offset"]), jnp.asarray(arrays["scaling/scale"]))
+    parts = models_of(config, fusion, values)
+    return _made(name, agent, config, parts, looks, scaling, arrays)
+
+
+def as_task(task: Task | str, agent: str | None = None) -> Task:
+    """A task, by its name or as it is.
+
+    Args:
+      task: from `make`, or its name.
+      agent: see `make`; only with a name.
+
+    Raises:
+      ConfigError: if there is no such task or agent.
+    """
+    if isinstance(task, str):
+        return make(task, agent)
+    if agent is not None:
+        raise ConfigError("agent", agent, "goes with a name; make(name, agent) has one already")
+    return task
+
+
+def freeze(
+    key: Key, file: Path, name: str, config: Config, trained: Models, looks: Samples, made: Origin
+) -> None:
+    """Writes the file of a task.
+
+    Args:
+      key: random key of the states from which observations are scaled.
+      file: a new file; its name ends in `.npz`.
+      name: of the task.
+      config: settings of the task.
+      trained: models with these settings.
+      looks: for each modality `[C, S, D_m]` features of held-out looks.
+      made: what made the models.
+    """
+    parts, bank = models_of(config, trained.fusion, trained.look_values), Bank(looks)
+    unscaled = Scaling(jnp.zeros(1), jnp.ones(1))
+    scaling = _scaling(key, _made(name, None, config, parts, bank, unscaled, {}))
+
+    def returns(agent: str) -> np.ndarray:
+        task = _made(name, agent, config, parts, bank, scaling, {})
+        return np.stack([*reference_returns(task, SEEDS, EPISODES).values()])
+
+    trees = {
+        "fusion": trained.fusion,
+        "look_values": trained.look_values,
+        "looks": looks,
+        "scaling": {"offset": scaling.offset, "scale": scaling.scale},
+        "returns": {agent: returns(agent) for agent in _agents(config)},
+    }
+    archive.write(file, trees, {"config": as_plain(config), "origin": dataclasses.asdict(made)})
+
+
+def _read(name: str) -> tuple[Arrays, dict[str, object]]:
+    """What a task's file holds, see `archive.read`."""
+    if name not in TASKS:
+        raise ConfigError("name", name, f"must be one of {', '.join(TASKS)}")
+    return archive.read(DATA / f"{name}.npz")
+
+
+def _agents(config: Config) -> tuple[str, ...]:
+    """Who acts in a task with some settings."""
+    return (_TEAM,) if config.dqn.task == _TEAM else config.modalities
+
+
+def _made(
+    name: str,
+    agent: str | None,
+    config: Config,
+    parts: Models,
+    looks: Bank,
+    scaling: Scaling,
+    arrays: Arrays,
+) -> Task:
+    """The task of some settings, networks and looks; `arrays` hold returns of references."""
+
+    def returns(agent: str) -> jax.Array:
+        return jnp.asarray(arrays.get(f"returns/{agent}", _NONE))
+
+    mdp = make_mdp(config, parts, looks)
+    if isinstance(mdp, TeamMdp):
+        if agent not in (None, _TEAM):
+            raise ConfigError("agent", agent, f"must be {_TEAM}: one policy for all robots")
+        robots = jnp.array(config.modality_of_robot, jnp.int32)
+        return TeamTask(mdp, parts, scaling, returns(_TEAM), robots, name)
+    agent = config.modalities[0] if agent is None else agent
+    if agent not in config.modalities:
+        raise ConfigError("agent", agent, f"must be one of {', '.join(config.modalities)}")
+    modality = config.modalities.index(agent)
+    return MapTask(mdp, parts, scaling, returns(agent), modality, name, agent)
+
+
+def _scaling(key: Key, task: Task) -> Scaling:
+    """Means and standard deviations of features over states after random looks."""
+
+    def visit(key: Key) -> jax.Array:
+        reset_key, walk_key = jax.random.split(key)
+        _, state = task.reset(reset_key)
+
+        def look(state, key: Key):
+            choice_key, step_key = jax.random.split(key)
+            chances = task.action_mask(state).at[-1].set(False)
+            action = jax.random.choice(choice_key, len(chances), p=chances / chances.sum())
+            after, _ = task.step(step_key, state, action)
+            return after, task.features(state)
+
+        return jax.lax.scan(look, state, jax.random.split(walk_key, _STEPS))[1]
+
+    found = jax.jit(jax.vmap(visit))(jax.random.split(key, _STATES))
+    found = found.reshape(-1, found.shape[-1])
+    spread = jnp.std(found, axis=0)
+    return Scaling(jnp.mean(found, axis=0), jnp.where(spread > _LEAST_SPREAD, spread, 1.0))

@@ -1,0 +1,217 @@
+"""Scores of policies in frozen tasks, compared with policies whose scores are known."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import stats
+
+from jaxsense.config import ConfigError
+from jaxsense.core import checks
+from jaxsense.core.types import Key
+from jaxsense.tasks.registry import as_task
+from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, key_of_seed, reference_returns
+
+_RESAMPLES = 2000
+_LEVEL = 0.95
+
+Policy = Callable[[Key, jax.Array], Any]
+"""`(key, observation [S]) -> []` action, an integer; a pure function that JAX can trace, or one
+from `on_host`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Recurrent:
+    """A policy that remembers.
+
+    Attributes:
+      act: `(key, memory, observation [S]) -> ([] action, memory)`.
+      memory: before the first action of an episode; a pytree of arrays.
+    """
+
+    act: Act[Any]
+    memory: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """A mean over seeds with its interval.
+
+    Attributes:
+      value: interquartile mean over seeds (Agarwal et al. 2021, Deep RL at the edge of the
+        statistical precipice, Sec. 4).
+      low: lower end of the 95 % interval, by a bootstrap over seeds.
+      high: upper end.
+    """
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self):
+        return f"{self.value:.3f} ({self.low:.3f} to {self.high:.3f})"
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """What a policy reaches in a task.
+
+    Attributes:
+      task: name of the task.
+      agent: who acts.
+      returns: `[seeds]` mean return of an episode, without discount, with each seed.
+      references: by name, `[seeds]` the same of known policies from the same starts.
+      has_optimum: whether the first of them is optimal.
+    """
+
+    task: str
+    agent: str
+    returns: np.ndarray
+    references: dict[str, np.ndarray]
+    has_optimum: bool
+
+    @property
+    def best(self) -> str:
+        """The reference to measure against: the optimum, or else that with the highest return."""
+        if self.has_optimum:
+            return next(iter(self.references))
+        return max(self.references, key=lambda name: self.references[name].mean())
+
+    @property
+    def mean_return(self) -> Estimate:
+        """Return of an episode."""
+        return estimate(self.returns)
+
+    @property
+    def fraction_of_optimal(self) -> Estimate:
+        """Return over that of `best`, from the same starts.
+
+        The optimum is that of exact Bayes. Rewards are read from the map, whose probabilities are
+        not quite exact, so a fraction may exceed 1 by a few thousandths. Where no optimum is known
+        (`has_optimum` is False), `best` is a hand-written rule, and any fraction is possible.
+        """
+        return estimate(self.returns / self.references[self.best])
+
+    def __str__(self):
+        lines = [f"{self.task}, {self.agent}: return {self.mean_return}"]
+        known = "optimum" if self.has_optimum else f"best rule, {self.best}"
+        lines += [f"fraction of the {known}: {self.fraction_of_optimal}"]
+        lines += [f"{name}: {estimate(found)}" for name, found in self.references.items()]
+        return "\n  ".join(lines)
+
+
+def score(
+    task: Task | str,
+    policy: Policy | Recurrent | Sequence[Policy | Recurrent],
+    *,
+    agent: str | None = None,
+    episodes: int = EPISODES,
+) -> Score:
+    """Plays a task with a policy, and with policies whose scores are known.
+
+    Args:
+      task: from `make`, or its name.
+      policy: the policy; or several, one for each seed that they were trained with, so that the
+        interval covers the spread of trainings. One policy plays with `SEEDS` seeds, and its
+        interval covers the spread of starts and looks alone.
+      agent: see `make`; only with a name.
+      episodes: with each seed.
+
+    Returns:
+      The score. Its starts and looks are always the same, and no training should see them.
+
+    Raises:
+      ConfigError: if there is no such task or agent.
+      ValueError: if a policy's actions are no scalar integers, or do not exist.
+    """
+    checks.require_number("episodes", episodes)
+    task = as_task(task, agent)
+    policies = [policy] * SEEDS if not isinstance(policy, Sequence) else list(policy)
+    if not policies:
+        raise ConfigError("policy", "[]", "must be one policy or several")
+    seeds = len(policies)
+    keys = [key_of_seed(seed) for seed in range(seeds)]
+    played = {id(each): _player(task, each, episodes) for each in policies}
+    returns = [played[id(each)](key) for each, key in zip(policies, keys, strict=True)]
+    if episodes == EPISODES and seeds <= SEEDS:
+        known = np.asarray(task.returns)[:, :seeds]
+        references = dict(zip(task.references, known, strict=True))
+    else:
+        references = reference_returns(task, seeds, episodes)
+    return Score(task.name, task.agent, np.array(returns), references, task.has_optimum)
+
+
+def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
+    """A policy that JAX cannot trace, for example of another library.
+
+    Args:
+      act: `[B, S]` float32 observations to `[B]` integer actions.
+    """
+
+    def policy(key: Key, observation: jax.Array) -> jax.Array:
+        del key
+        shape = jax.ShapeDtypeStruct((), jnp.int32)
+
+        def call(observations: Any) -> np.ndarray:
+            batch = np.asarray(observations)
+            chosen = np.asarray(act(batch.reshape(-1, batch.shape[-1])))
+            return chosen.astype(np.int32).reshape(batch.shape[:-1])
+
+        return jax.pure_callback(call, shape, observation, vmap_method="broadcast_all")
+
+    return policy
+
+
+def estimate(values: Float[np.ndarray, " seeds"]) -> Estimate:
+    """Interquartile mean of some seeds, with the interval of a bootstrap.
+
+    Args:
+      values: `[seeds]`.
+    """
+
+    def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
+        return stats.trim_mean(values, 0.25, axis=axis)
+
+    value = float(middle(values))
+    if len(values) < 2:
+        return Estimate(value, value, value)
+    draws = np.random.default_rng(0).integers(len(values), size=(_RESAMPLES, len(values)))
+    tails = [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2]
+    low, high = np.quantile(middle(values[draws]), tails)
+    return Estimate(value, float(low), float(high))
+
+
+def _player(task: Task, policy: Policy | Recurrent, episodes: int) -> Callable[[Key], float]:
+    """Mean return of some episodes as a function of a key."""
+    recurrent = policy if isinstance(policy, Recurrent) else _forgetful(policy)
+
+    def act(key: Key, memory: Any, observation: jax.Array) -> tuple[jax.Array, Any]:
+        action, memory = recurrent.act(key, memory, observation)
+        action = jnp.asarray(action)
+        if action.shape or not jnp.issubdtype(action.dtype, jnp.integer):
+            found = f"{action.dtype}{list(action.shape)}"
+            raise ValueError(f"action = {found}: must be an integer of shape []")
+        return action.astype(jnp.int32), memory
+
+    def play(key: Key) -> Float[Array, ""]:
+        keys = jax.random.split(key, episodes)
+        return jnp.mean(jax.vmap(lambda key: task.play(key, act, recurrent.memory))(keys))
+
+    compiled = jax.jit(play)
+
+    def checked(key: Key) -> float:
+        found = float(compiled(key))
+        if np.isnan(found):
+            raise ValueError(f"action: must be from 0 to {task.num_actions - 1}")
+        return found
+
+    return checked
+
+
+def _forgetful(policy: Policy) -> Recurrent:
+    """A policy without memory."""
+    return Recurrent(lambda key, memory, observation: (policy(key, observation), memory), ())

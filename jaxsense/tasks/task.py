@@ -1,0 +1,370 @@
+"""Tasks that stay as they are, so that scores of different people compare.
+
+A task is an MDP with frozen networks whose looks are drawn from stored detections. Its version is
+part of its name and changes with anything that changes a score.
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsense.core.types import Belief, Key, pytree
+from jaxsense.dqn import episodes, map_agent, map_mdp, policies, team_mdp
+from jaxsense.dqn.episodes import Start
+from jaxsense.dqn.map_mdp import MapMdp, MapState
+from jaxsense.dqn.policies import Known
+from jaxsense.dqn.reference import reference
+from jaxsense.dqn.team_mdp import TeamMdp, TeamState
+from jaxsense.models import Models
+from jaxsense.tasks.environment import CLIP, Environment, Scaling, TimeStep
+
+M = TypeVar("M")
+
+SEEDS = 10
+"""Seeds of a score."""
+EPISODES = 1024
+"""Episodes with each seed."""
+
+_FIRST_SEED = 2**31  # far from those that anybody trains with
+
+Act = Callable[[Key, M, jax.Array], tuple[jax.Array, M]]
+"""`(key, memory, observation [S]) -> []` int32 action, and the memory after it."""
+
+
+class Task(Environment, Protocol):
+    """A frozen task; a pytree.
+
+    Attributes:
+      name: with its version.
+      agent: who acts.
+      references: names of the policies that `play_reference` plays.
+      has_optimum: whether the first one is optimal.
+      scaling: of observations.
+      returns: `[R, seeds]` mean return of each reference with each seed of a score.
+    """
+
+    @property
+    def returns(self) -> jax.Array:
+        """`[R, seeds]`, see `reference_returns`."""
+        ...
+
+    @property
+    def scaling(self) -> Scaling:
+        """Of observations."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """The name with its version."""
+        ...
+
+    @property
+    def agent(self) -> str:
+        """Who acts."""
+        ...
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Names of the policies to compare with."""
+        ...
+
+    @property
+    def has_optimum(self) -> bool:
+        """Whether the first reference is optimal."""
+        ...
+
+    def features(self, state: Any) -> Float[Array, "N F"]:
+        """`[N, F]` what an observation holds of each PoI, not yet scaled."""
+        ...
+
+    def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
+        """Plays an episode with a policy.
+
+        Args:
+          key: random key; with the same one all policies start from the same state.
+          act: the policy.
+          memory: before the first action.
+
+        Returns:
+          `[]` total reward, without discount.
+        """
+        ...
+
+    def play_reference(self, key: Key, name: str) -> Float[Array, ""]:
+        """Plays an episode with a policy to compare with.
+
+        Args:
+          key: random key, see `play`.
+          name: one of `references`; static.
+        """
+        ...
+
+
+@pytree
+class MapTask:
+    """A task in the map MDP: one agent looks at PoIs until it has seen enough.
+
+    Attributes:
+      mdp: the MDP.
+      models: frozen networks, of which only those that the references read are there.
+      scaling: of observations.
+      returns: `[R, seeds]` see `Task`.
+      modality: index of the agent's sensor.
+      name: with its version.
+      agent: name of the agent's sensor.
+    """
+
+    mdp: MapMdp
+    models: Models
+    scaling: Scaling
+    returns: jax.Array
+    modality: int = struct.field(pytree_node=False)
+    name: str = struct.field(pytree_node=False)
+    agent: str = struct.field(pytree_node=False)
+
+    @property
+    def num_actions(self) -> int:
+        """A look at each PoI, and NOP."""
+        return self.mdp.num_pois + 1
+
+    @property
+    def observation_size(self) -> int:
+        """Mean and standard deviation of each PoI's belief."""
+        return 2 * self.mdp.num_pois * self.mdp.fusion.prior.mean.size
+
+    @property
+    def bound(self) -> float:
+        """Observations are clipped there."""
+        return CLIP
+
+    @property
+    def max_steps(self) -> int:
+        """Actions in an episode, at most."""
+        return self.mdp.config.max_steps
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """The optimum, and policies of `dqn.POLICIES`."""
+        return "optimal", "greedy", "naive", "random"
+
+    @property
+    def has_optimum(self) -> bool:
+        """True: dynamic programming finds it, see `dqn.reference`."""
+        return True
+
+    def features(self, state: MapState) -> Float[Array, "N F"]:
+        """`[N, 2D]` mean and standard deviation of each PoI's belief, not yet scaled."""
+        return _of_belief(state.belief)
+
+    def reset(self, key: Key) -> tuple[Float[Array, " S"], MapState]:
+        """Starts an episode, see `Task.reset`."""
+        state = map_mdp.reset(key, self.mdp)
+        return self.observe(state), state
+
+    def observe(self, state: MapState) -> Float[Array, " S"]:
+        """What the agent sees: the map."""
+        return self.scaling(self.features(state))
+
+    def action_mask(self, state: MapState) -> Bool[Array, " A"]:
+        """`[A]` bool: all actions exist."""
+        del state
+        return jnp.ones(self.num_actions, bool)
+
+    def step(self, key: Key, state: MapState, action: Int[Array, ""]) -> tuple[MapState, TimeStep]:
+        """Takes an action, see `Task.step`."""
+        after, outcome = map_mdp.step(key, self.mdp, state, action, self.modality)
+        seen = self.observe(after)
+        return after, TimeStep(seen, outcome.reward, outcome.terminated, outcome.truncated)
+
+    def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
+        """Plays an episode, see `Task.play`; the k-th look at a PoI shows the same to all."""
+
+        def choose(key: Key, known: Known, memory: M) -> tuple[jax.Array, M]:
+            return act(key, memory, self.scaling(_of_belief(known.belief)))
+
+        exact, (start, key) = self.models.bayes, self._start(key)
+        return episodes.run_recurrent(key, self.mdp, exact, choose, memory, start, self.modality)[0]
+
+    def play_reference(self, key: Key, name: str) -> Float[Array, ""]:
+        """Plays an episode with one of `references`, see `Task.play_reference`."""
+        exact, (start, key) = self.models.bayes, self._start(key)
+        # The same in every episode, so that it is simulated once.
+        table_key = jax.random.key(0)
+        best = reference(table_key, self.mdp, self.modality, self.models, exact.labels)
+
+        def choose(key: Key, known: Known) -> jax.Array:
+            if name == self.references[0]:
+                return policies.best(best(known, start.state.classes))
+            return policies.best(policies.POLICIES[name].values(key, self.models, known))
+
+        return episodes.run_episode(key, self.mdp, exact, choose, start, self.modality)[0]
+
+    def _start(self, key: Key) -> tuple[Start, Key]:
+        """The first state, and a key of what follows."""
+        start_key, play_key = jax.random.split(key)
+        return episodes.reset(start_key, self.mdp, self.models.bayes), play_key
+
+
+@pytree
+class TeamTask:
+    """A task in the team MDP: robots choose in turn, drive and look, and time has a price.
+
+    One policy chooses for all robots; each observation is what the robot knows whose turn it is.
+
+    Attributes:
+      mdp: the MDP.
+      models: frozen networks, of which only those that the references read are there.
+      scaling: of observations.
+      returns: `[R, seeds]` see `Task`.
+      robots: `[R]` int32 index of each robot's sensor.
+      name: with its version.
+    """
+
+    mdp: TeamMdp
+    models: Models
+    scaling: Scaling
+    returns: jax.Array
+    robots: jax.Array
+    name: str = struct.field(pytree_node=False)
+
+    @property
+    def agent(self) -> str:
+        """All robots."""
+        return "team"
+
+    @property
+    def num_actions(self) -> int:
+        """A look at each PoI, and NOP."""
+        return self.mdp.map.num_pois + 1
+
+    @property
+    def observation_size(self) -> int:
+        """What a robot knows of each PoI, see `team_mdp.observation`."""
+        latent_size = self.mdp.map.fusion.prior.mean.size
+        number = team_mdp.num_features(latent_size, self.mdp.map.num_modalities)
+        return number * self.mdp.map.num_pois
+
+    @property
+    def bound(self) -> float:
+        """Observations are clipped there."""
+        return CLIP
+
+    @property
+    def max_steps(self) -> int:
+        """Actions in an episode, at most."""
+        return self.mdp.config.max_steps
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Rules of `dqn.POLICIES`."""
+        return "nearest", "auction", "rollout", "naive", "random"
+
+    @property
+    def has_optimum(self) -> bool:
+        """False: nobody knows it."""
+        return False
+
+    def features(self, state: TeamState) -> Float[Array, "N F"]:
+        """`[N, F]` what the robot knows whose turn it is, not yet scaled."""
+        belief, team, agent = state.map.belief, state.team, state.agent
+        number = self.mdp.map.num_modalities
+        return team_mdp.observation(self.mdp.config.travel, belief, team, agent, number).T
+
+    def reset(self, key: Key) -> tuple[Float[Array, " S"], TeamState]:
+        """Starts an episode, see `Task.reset`."""
+        state = team_mdp.reset(key, self.mdp, self.robots)
+        return self.observe(state), state
+
+    def observe(self, state: TeamState) -> Float[Array, " S"]:
+        """What the robot sees whose turn it is."""
+        return self.scaling(self.features(state))
+
+    def action_mask(self, state: TeamState) -> Bool[Array, " A"]:
+        """`[A]` bool: the PoIs that are present, and NOP."""
+        return jnp.append(state.team.present, True)
+
+    def step(
+        self, key: Key, state: TeamState, action: Int[Array, ""]
+    ) -> tuple[TeamState, TimeStep]:
+        """Lets the robot choose whose turn it is, see `Task.step`.
+
+        A PoI that is not present counts as NOP. The reward is that of the look, if there was one,
+        less the price of the time of all robots.
+        """
+        action = self._existing(state, action)
+        after, outcome = team_mdp.step(key, self.mdp, state, action)
+        price = self.mdp.time_price(after.team, jnp.asarray(outcome.seconds))
+        seen, reward = self.observe(after), outcome.reward - price
+        return after, TimeStep(seen, reward, outcome.terminated, outcome.truncated)
+
+    def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
+        """Plays an episode, see `Task.play`."""
+
+        def choose(key: Key, state: TeamState, known: Known, memory: M) -> tuple[jax.Array, M]:
+            del known
+            action, memory = act(key, memory, self.observe(state))
+            return self._existing(state, action), memory
+
+        return self._play(key, choose, memory)
+
+    def play_reference(self, key: Key, name: str) -> Float[Array, ""]:
+        """Plays an episode with one of `references`, see `Task.play_reference`."""
+
+        def choose(
+            key: Key, state: TeamState, known: Known, memory: tuple[()]
+        ) -> tuple[jax.Array, tuple[()]]:
+            values = policies.POLICIES[name].values(key, self.models, known)
+            values = jnp.where(self.action_mask(state), values, -jnp.inf)
+            return policies.best(values), memory
+
+        return self._play(key, choose, ())
+
+    def _play(self, key: Key, choose: Callable[..., tuple[jax.Array, M]], memory: M) -> jax.Array:
+        """`[]` total reward."""
+        start_key, play_key = jax.random.split(key)
+        start = team_mdp.reset(start_key, self.mdp, self.robots)
+        return episodes.run_team(play_key, self.mdp, choose, memory, start)[0]
+
+    def _existing(self, state: TeamState, action: jax.Array) -> jax.Array:
+        """The action, or NOP in place of a PoI that is not present."""
+        num_pois = self.mdp.map.num_pois
+        is_absent = jnp.any(~state.team.present & (jnp.arange(num_pois) == action))
+        return jnp.where(is_absent, num_pois, action)
+
+
+def key_of_seed(seed: int) -> Key:
+    """The key of the episodes of a score with a seed, from 0; no training has it."""
+    return jax.random.key(_FIRST_SEED + seed)
+
+
+def reference_returns(task: Task, seeds: int, episodes: int) -> dict[str, np.ndarray]:
+    """Mean returns of the policies to compare with.
+
+    Args:
+      task: the task.
+      seeds: number of seeds.
+      episodes: with each seed.
+
+    Returns:
+      By name, `[seeds]`.
+    """
+
+    def mean(name: str) -> np.ndarray:
+        @jax.jit
+        def play(key: Key) -> jax.Array:
+            keys = jax.random.split(key, episodes)
+            return jnp.mean(jax.vmap(lambda key: task.play_reference(key, name))(keys))
+
+        return np.array([float(play(key_of_seed(seed))) for seed in range(seeds)])
+
+    return {name: mean(name) for name in task.references}
+
+
+def _of_belief(belief: Belief) -> Float[Array, "N F"]:
+    """`[N, 2D]` mean and standard deviation of each PoI's belief."""
+    return map_agent.observation(belief).reshape(len(belief.mean), -1)

@@ -1,0 +1,70 @@
+"""Trained models that travel with the package."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsense
+from jaxsense import tasks
+from jaxsense.config import ConfigError
+
+
+@pytest.mark.parametrize("preset", tasks.PRETRAINED)
+def test_models_have_the_settings_of_their_preset(preset):
+    config, models = jaxsense.load_pretrained(preset)
+    assert config == jaxsense.PRESETS[preset]
+    expected = jax.eval_shape(lambda: jaxsense.init(jax.random.key(0), config))
+    assert jax.tree.structure(models) == jax.tree.structure(expected)
+    made = tasks.origin(preset)
+    assert made.command == f"python -m jaxsense.train --preset {preset} --seed {made.seed}"
+    assert len(made.commit) == 40
+    assert {"jaxsense", "jax", "python"} <= set(made.versions)
+
+
+@pytest.mark.parametrize(
+    "preset",
+    [p if p == "noisy" else pytest.param(p, marks=pytest.mark.slow) for p in tasks.PRETRAINED],
+)
+def test_models_tell_classes_apart(preset):
+    """Looks by all sensors at a PoI of each class, from the detectors to the map."""
+    config, models = jaxsense.load_pretrained(preset)
+    looks = jaxsense.detections(jax.random.key(1), config, models, 16)
+    number = len(config.arena.classes)
+
+    @jax.jit
+    def correct(looks):
+        def of_look(c, features):
+            belief, seen = models.fusion.prior, jnp.zeros(len(looks), bool)
+            for m, each in enumerate(features):
+                belief = models.fusion.update(belief, seen, each, m)
+                seen = seen.at[m].set(True)
+            return models.fusion.most_likely_class(belief) == c
+
+        by_class = jax.vmap(jax.vmap(of_look, (None, 0)), (0, 0))
+        return by_class(jnp.arange(number), looks).mean()
+
+    least = {"many": 0.55, "noisy": 0.75}.get(preset, 0.97)
+    assert correct(looks) > least
+
+
+def test_unknown_models_are_refused():
+    with pytest.raises(ConfigError, match="preset = 'smoke': must be one of default, noisy"):
+        jaxsense.load_pretrained("smoke")
+    with pytest.raises(ConfigError, match="preset = 'x': must be one of"):
+        tasks.origin("x")
+
+
+@pytest.mark.slow
+def test_a_training_repeats_the_models_that_travel(tmp_path):
+    from jaxsense import train
+
+    made = tasks.origin("default")
+    train.main(["--seed", str(made.seed), "--quiet", "--out", str(tmp_path / "run")])
+    config, again = jaxsense.load(tmp_path / "run")
+    there, models = jaxsense.load_pretrained("default")
+    assert config == there
+    # Other processors and versions round otherwise: what is learned is the same, not each digit.
+    np.testing.assert_allclose(again.fusion.classes.mean, models.fusion.classes.mean, atol=0.3)
+    for one, other in zip(again.look_values, models.look_values, strict=True):
+        np.testing.assert_allclose(one.q, other.q, atol=0.05)

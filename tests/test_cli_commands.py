@@ -1,0 +1,312 @@
+"""`jaxsense COMMAND`: which command runs, what it says of itself, and the demo's page."""
+
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from recordings import CONFIG, FUSION, recording
+from smoke import error_line
+
+import jaxsense
+from jaxsense import __main__ as commands
+from jaxsense import demo, export, mission, task_list, tasks, train
+from jaxsense.config import ConfigError, options
+from jaxsense.run import rundir
+from jaxsense.run.missions import Played
+from jaxsense.summary.read import NotFinishedError
+
+ROOT = Path(__file__).parents[1]
+
+
+def call(*argv, as_module=True):
+    """Runs the command in a process of its own, in which imports are told."""
+    start = [sys.executable, "-X", "importtime", "-m", "jaxsense", *argv]
+    return subprocess.run(start, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [("--version", f"jaxsense {jaxsense.__version__}\n"), ("--help", "usage: jaxsense COMMAND")],
+)
+def test_version_and_help_import_no_jax(option, told):
+    done = call(option)
+    assert done.returncode == 0
+    assert done.stdout.startswith(told)
+    imported = set(re.findall(r"\| +([\w.]+)$", done.stderr, re.MULTILINE))
+    assert "jaxsense.run.version" in imported
+    assert not {"jax", "numpy", "mujoco", "rich"} & imported
+
+
+def run(monkeypatch, *argv, name="jaxsense"):
+    """Runs the command in this process, as the console script does."""
+    monkeypatch.setattr(sys, "argv", [f"/some/bin/{name}", *argv])
+    commands.main()
+
+
+def test_help_has_a_line_for_each_command(monkeypatch, capsys):
+    run(monkeypatch)
+    alone = capsys.readouterr().out
+    run(monkeypatch, "--help")
+    text = capsys.readouterr().out
+    assert text == alone
+    for name, (_, about) in commands.COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(about)}$", text, re.MULTILINE)
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_an_unknown_command_is_refused_in_one_line(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run(monkeypatch, "trian", "--seed", "1")
+    assert stop.value.code == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    known = "demo, tasks, train, evaluate, export"
+    assert told.err == f"jaxsense: command = 'trian': must be one of {known}\n"
+
+
+@pytest.mark.parametrize("name", [*commands.COMMANDS])
+def test_a_command_gets_the_rest_of_the_command_line(name, monkeypatch):
+    module, given = importlib.import_module(commands.COMMANDS[name][0]), []
+    monkeypatch.setattr(module, "main", lambda: given.append(sys.argv[1:]))
+    run(monkeypatch, name, "--help", "x")
+    assert given == [["--help", "x"]]
+
+
+@pytest.mark.parametrize("name", [*commands.COMMANDS])
+@pytest.mark.parametrize("script", ["jaxsense", "train.py"])
+def test_a_command_names_itself_as_it_was_started(name, script, monkeypatch, capsys):
+    module = importlib.import_module(commands.COMMANDS[name][0])
+    monkeypatch.setattr(sys, "argv", [f"/some/bin/{script}"])
+    expected = f"jaxsense {name}"
+    if script != "jaxsense":
+        expected = f"python -m {module.PROGRAM}"
+    with pytest.raises(SystemExit):
+        module.main(["--help"])
+    assert capsys.readouterr().out.startswith(f"usage: {expected} [OPTIONS]")
+    line = error_line(["--nonsense"], capsys, module)
+    assert line.startswith(f"{expected.removeprefix('python -m ')}: unknown option --nonsense")
+
+
+def test_the_next_commands_are_those_of_the_same_installation(monkeypatch, tmp_path):
+    assert "python -m jaxsense.train --resume" in str(NotFinishedError(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["/some/bin/jaxsense", "evaluate"])
+    assert "continue it with jaxsense train --resume" in str(NotFinishedError(tmp_path))
+    assert options.command(train.PROGRAM) == "jaxsense train"
+
+
+def test_tasks_are_listed_with_the_returns_of_their_files(capsys):
+    task_list.main([])
+    text = capsys.readouterr().out
+    for name in tasks.registered():
+        assert f"{name}: {tasks.about(name)}." in text
+        for agent in tasks.agents(name):
+            task = jaxsense.make(name, agent)
+            assert task.agent == agent
+            best, *_ = np.asarray(task.returns)
+            cells = f"{agent} +{task.observation_size} +{task.num_actions} "
+            cells += rf" +{tasks.estimate(best).value:.3f} {task.references[0]} "
+            assert re.search(cells, text)
+
+
+def test_a_wrong_agent_of_an_unknown_task_is_refused():
+    with pytest.raises(ConfigError, match="name = 'map': must be one of map-v0"):
+        tasks.agents("map")
+
+
+def test_trained_models_are_exported_by_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(export, "archive", lambda config, models: repr(config).encode())
+    monkeypatch.chdir(tmp_path)
+    export.main(["pretrained:noisy"])
+    assert (tmp_path / "noisy.zip").read_text() == repr(jaxsense.PRESETS["noisy"])
+    assert "noisy.zip" in capsys.readouterr().out
+    line = error_line(["pretrained:paper"], capsys, export)
+    assert "preset = 'paper': must be one of default" in line
+    line = error_line(["pretrained:noisy"], capsys, export)
+    assert "out = 'noisy.zip': already exists" in line
+    assert [path.name for path in tmp_path.iterdir()] == ["noisy.zip"]
+
+
+MEASURED = {
+    "classes": np.array([[0, 1, 2]]),
+    "is_right": np.array([[True, True, False]]),
+    "ambiguous": np.array([[False, False, False]]),
+    "seen": np.array([[True, True, True]]),
+    "confidence": np.array([[0.9, 0.8, 0.4]]),
+    "nll": np.array([[0.1, 0.2, 1.5]]),
+    "told": {"camera": np.array([2 / 3]), "lidar": np.array([1 / 3])},
+    "observations_per_poi": np.array([1.5]),
+    "time_s": np.array([12.5]),
+    "collisions": np.array([0]),
+    "goals": np.array([4]),
+    "goals_reached": np.array([4]),
+    "information": np.array([5.0]),
+    "detections": np.array([[2, 3]]),
+    "reason": np.array([1]),
+}
+
+
+class Player:
+    """Plays a mission that was never played, in place of `missions.Player`."""
+
+    def __init__(self, scenario, compiler, batch):
+        assert batch == 1
+
+    def play(self, key, models, played, episodes):
+        (name,) = played
+        assert episodes == 1
+        return Played({name: MEASURED}, recording(), 60)
+
+
+@pytest.fixture
+def played(monkeypatch, tmp_path):
+    """Directory in which the demo plays missions of `smoke` that cost nothing."""
+    models = jaxsense.init(jax.random.key(0), CONFIG)
+    models = jax.tree_util.tree_map(lambda x: x, models)
+
+    def load(preset):
+        jaxsense.load_pretrained(preset)
+        return CONFIG, Shown(models)
+
+    monkeypatch.setattr(demo, "load_pretrained", load)
+    monkeypatch.setattr(demo.missions, "Player", Player)
+    monkeypatch.setattr(demo.gc, "disable", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+class Shown:
+    """Models whose map is that of the recording."""
+
+    def __init__(self, models):
+        self.models, self.fusion = models, FUSION
+
+    def __getattr__(self, name):
+        return getattr(self.models, name)
+
+
+NO_CACHE = ["--cache", "none", "--no-browser"]
+
+
+def test_the_demo_writes_one_page_with_both_films(played, capsys):
+    demo.main(NO_CACHE)
+    (page,) = played.glob("runs/*/*")
+    assert re.fullmatch(r"runs/\d{8}-\d{6}-demo-noisy/demo\.html", str(page.relative_to(played)))
+    text = page.read_text()
+    assert text.count("data:image/svg+xml;base64,") == 2 * 2  # both halves of each film
+    assert "python -m jaxsense.demo --preset noisy --seed 1" in text
+    assert "load_pretrained(&#34;noisy&#34;)" in text or 'load_pretrained("noisy")' in text
+    assert re.search(r'<th scope="row">latent</th>\s*<td>.*0\.667', text)
+    assert re.search(r'<th scope="row">naive</th>', text)
+    told = capsys.readouterr().out
+    assert f"The page is {page.relative_to(played)}.\n" in told
+    assert "Next: python -m jaxsense tasks\n" in told
+    demo.main(NO_CACHE)
+    assert len([*played.glob("runs/*/demo.html")]) == 2
+
+
+@pytest.mark.parametrize(("policy", "films"), [("greedy", 2), ("naive", 1)])
+def test_the_demo_compares_any_policy_with_naive_exploration(played, policy, films):
+    demo.main([*NO_CACHE, "--policy", policy, "--out", "here", "--seed", "7"])
+    text = (played / "here" / "demo.html").read_text()
+    assert text.count("data:image/svg+xml;base64,") == 2 * films
+    assert f'<th scope="row">{policy}</th>' in text
+    assert "--seed 8" in text
+
+
+@pytest.mark.parametrize(
+    ("argv", "error"),
+    [
+        (["--preset", "paper"], "preset = 'paper': must be one of default, noisy"),
+        (["--policy", "best"], "policy = 'best': must be one of latent"),
+        (["--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
+        (["--out", "full"], "out = 'full': is not empty; must be a new or empty directory"),
+        (["--out", "full/file"], "out = 'full/file': cannot be written"),
+        (["--cache", "full/file"], "cache = 'full/file': must be a directory"),
+    ],
+)
+def test_the_demo_refuses_what_it_cannot_do_and_changes_nothing(played, capsys, argv, error):
+    (played / "full").mkdir()
+    (played / "full" / "file").write_text("precious")
+    assert f"jaxsense.demo: {error}" in error_line([*NO_CACHE, *argv], capsys, demo)
+    assert sorted(path.name for path in played.rglob("*")) == ["file", "full"]
+
+
+def test_a_demo_that_fails_leaves_no_directory(played, monkeypatch):
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Player, "play", fail)
+    with pytest.raises(KeyboardInterrupt):
+        demo.main(NO_CACHE)
+    assert not [*(played / "runs").iterdir()]
+
+
+@pytest.mark.parametrize("display", [True, False])
+@pytest.mark.parametrize("options", [[], ["--no-browser"]])
+def test_the_page_opens_only_where_somebody_can_see_it(played, monkeypatch, display, options):
+    opened = []
+    monkeypatch.setattr(demo.webbrowser, "open", opened.append)
+    monkeypatch.setattr(demo.sys, "platform", "linux")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":0" if display else "")
+    demo.main(["--cache", "none", "--out", "here", *options])
+    page = (played / "here" / "demo.html").as_uri()
+    assert opened == ([page] if display and not options else [])
+
+
+def test_results_go_to_a_directory_that_is_new(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with rundir.begun(None, "x") as first, rundir.begun(None, "x") as second:
+        (first / "file").touch()
+        assert first != second
+    assert first.exists()
+    assert not second.exists()
+
+
+def test_a_mission_names_the_fields_of_view_of_its_sensors():
+    assert mission.make_mission(CONFIG).fields_of_view == {"camera": 60.0, "lidar": 240.0}
+
+
+@pytest.mark.slow  # compiles the programs of missions
+def test_the_demo_plays_a_mission_of_trained_robots(tmp_path):
+    command = [sys.executable, "-m", "jaxsense", "demo", "--no-browser", "--out", "here"]
+    command += ["--preset", "default", "--cache", str(tmp_path / "cache")]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    text = (tmp_path / "here" / "demo.html").read_text()
+    assert re.search(r'<th scope="row">latent</th>\s*<td>(<b>)?1\.000', text)
+
+
+@pytest.mark.slow  # installs hatchling, from a package index
+def test_wheel_and_sdist_run_without_the_source(tmp_path):
+    place = tmp_path / "environment"
+
+    def run(*command, **options):
+        done = subprocess.run(command, capture_output=True, text=True, check=False, **options)
+        assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+        return done.stdout
+
+    run(sys.executable, "-m", "venv", str(place))
+    python = str(place / "bin" / "python")
+    run(python, "-m", "pip", "install", "--quiet", "hatchling")
+    run(python, "-m", "hatchling", "build", "-d", str(tmp_path / "dist"), cwd=ROOT)
+    files = sorted((tmp_path / "dist").iterdir())
+    assert [re.sub(r"[\d.]+", "-", file.name, count=1) for file in files]
+    for file in files:
+        target = tmp_path / file.suffix[1:]
+        install = [python, "-m", "pip", "install", "--quiet", "--no-deps", "--target"]
+        run(*install, str(target), str(file))
+        assert (target / "jaxsense" / "__init__.pyi").exists()
+        code = "import jaxsense; print(jaxsense.__file__, jaxsense.make('noisy-v0').name)"
+        away = {"cwd": tmp_path, "env": {"PYTHONPATH": str(target), "JAX_PLATFORMS": "cpu"}}
+        assert run(sys.executable, "-c", code, **away) == (
+            f"{target}/jaxsense/__init__.py noisy-v0\n"
+        )
+        version = f"jaxsense {jaxsense.__version__}\n"
+        assert run(sys.executable, "-m", "jaxsense", "--version", **away) == version
+        assert run(sys.executable, str(target / "bin" / "jaxsense"), "--version", **away) == version
