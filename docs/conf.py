@@ -34,7 +34,7 @@ nitpicky = True
 # Type variables have no page.
 nitpick_ignore_regex = [
     ("py:.*", r"(?!jaxsense).*"),
-    ("py:(class|obj)", r".*\.([DST]|Row|Result|Annotated)"),
+    ("py:(class|obj)", r".*\.([DMST]|Row|Result|Annotated)"),
 ]
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
