@@ -53,12 +53,8 @@ def _table(found: list[Task]) -> Table:
         }
         best = next(iter(known))
         sizes = str(task.observation_size), str(task.num_actions)
-        return task.name, [
-            task.agent,
-            *sizes,
-            f"{known[best]} {best}",
-            *(known[name] for name in others),
-        ]
+        returns = f"{known[best]} {best}", *(known[name] for name in others)
+        return task.name, [task.agent, *sizes, *returns]
 
     columns = ["agent", "observation", "actions", "best known return", *others]
     return Table("Tasks of jaxsense.make(name, agent)", columns, [row(task) for task in found])

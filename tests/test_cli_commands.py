@@ -23,7 +23,7 @@ from jaxsense.summary.read import NotFinishedError
 ROOT = Path(__file__).parents[1]
 
 
-def call(*argv, as_module=True):
+def call(*argv):
     """Runs the command in a process of its own, in which imports are told."""
     start = [sys.executable, "-X", "importtime", "-m", "jaxsense", *argv]
     return subprocess.run(start, capture_output=True, text=True, check=False)
@@ -166,7 +166,6 @@ class Player:
 def played(monkeypatch, tmp_path):
     """Directory in which the demo plays missions of `smoke` that cost nothing."""
     models = jaxsense.init(jax.random.key(0), CONFIG)
-    models = jax.tree_util.tree_map(lambda x: x, models)
 
     def load(preset):
         jaxsense.load_pretrained(preset)
@@ -199,7 +198,7 @@ def test_the_demo_writes_one_page_with_both_films(played, capsys):
     text = page.read_text()
     assert text.count("data:image/svg+xml;base64,") == 2 * 2  # both halves of each film
     assert "python -m jaxsense.demo --preset noisy --seed 1" in text
-    assert "load_pretrained(&#34;noisy&#34;)" in text or 'load_pretrained("noisy")' in text
+    assert 'load_pretrained("noisy")' in text
     assert re.search(r'<th scope="row">latent</th>\s*<td>.*0\.667', text)
     assert re.search(r'<th scope="row">naive</th>', text)
     told = capsys.readouterr().out
@@ -237,7 +236,8 @@ def test_the_demo_refuses_what_it_cannot_do_and_changes_nothing(played, capsys, 
 
 
 def test_a_demo_that_fails_leaves_no_directory(played, monkeypatch):
-    def fail(*_):
+    def fail(*_, episodes):
+        del episodes
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Player, "play", fail)
@@ -269,7 +269,8 @@ def test_results_go_to_a_directory_that_is_new(tmp_path, monkeypatch):
 
 
 def test_a_mission_names_the_fields_of_view_of_its_sensors():
-    assert mission.make_mission(CONFIG).fields_of_view == {"camera": 60.0, "lidar": 240.0}
+    found = mission.make_mission(CONFIG).fields_of_view
+    assert found == {"camera": pytest.approx(80, abs=0.1), "lidar": 240.0}
 
 
 @pytest.mark.slow  # compiles the programs of missions
@@ -296,7 +297,7 @@ def test_wheel_and_sdist_run_without_the_source(tmp_path):
     run(python, "-m", "pip", "install", "--quiet", "hatchling")
     run(python, "-m", "hatchling", "build", "-d", str(tmp_path / "dist"), cwd=ROOT)
     files = sorted((tmp_path / "dist").iterdir())
-    assert [re.sub(r"[\d.]+", "-", file.name, count=1) for file in files]
+    assert [file.suffix for file in files] == [".gz", ".whl"]
     for file in files:
         target = tmp_path / file.suffix[1:]
         install = [python, "-m", "pip", "install", "--quiet", "--no-deps", "--target"]
@@ -304,9 +305,8 @@ def test_wheel_and_sdist_run_without_the_source(tmp_path):
         assert (target / "jaxsense" / "__init__.pyi").exists()
         code = "import jaxsense; print(jaxsense.__file__, jaxsense.make('noisy-v0').name)"
         away = {"cwd": tmp_path, "env": {"PYTHONPATH": str(target), "JAX_PLATFORMS": "cpu"}}
-        assert run(sys.executable, "-c", code, **away) == (
-            f"{target}/jaxsense/__init__.py noisy-v0\n"
-        )
+        told = run(sys.executable, "-c", code, **away)
+        assert told == f"{target}/jaxsense/__init__.py noisy-v0\n"
         version = f"jaxsense {jaxsense.__version__}\n"
-        assert run(sys.executable, "-m", "jaxsense", "--version", **away) == version
-        assert run(sys.executable, str(target / "bin" / "jaxsense"), "--version", **away) == version
+        for start in (["-m", "jaxsense"], [str(target / "bin" / "jaxsense")]):
+            assert run(sys.executable, *start, "--version", **away) == version
