@@ -25,6 +25,13 @@ def test_example_of_the_readme_runs(capsys):
     assert np.isfinite(names["outcomes"].reward).all()
 
 
+def test_first_example_of_the_readme_runs(capsys):
+    names = run_example(ROOT / "README.md", 0)
+    assert capsys.readouterr().out == f"(12,) {names['seen'].reward!s}\n"
+    # A look costs 0.1 nats, and tells at most which of three classes it is: log 3 = 1.10.
+    assert -0.1 <= float(names["seen"].reward) < 1.0
+
+
 def test_example_of_the_first_steps_runs(capsys):
     belief = run_example(ROOT / "docs" / "getting-started.md")["belief"]
     assert capsys.readouterr().out == "(64, 2) (64, 2)\n"
