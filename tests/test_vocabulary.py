@@ -99,8 +99,9 @@ def test_scripts_avoid_what_contributing_lists(path):
     assert not hits(prose_of_source(path.read_text(encoding="utf-8")))
 
 
-def test_the_report_avoids_what_contributing_lists():
-    path = PACKAGE / "show" / "report.html.jinja"
+@pytest.mark.parametrize("name", ["report", "demo", "parts"])
+def test_templates_avoid_what_contributing_lists(name):
+    path = PACKAGE / "show" / f"{name}.html.jinja"
     assert not hits(prose_of_template(path.read_text(encoding="utf-8")))
 
 
