@@ -21,6 +21,7 @@ _SIZE = 4.0  # inches, of each part
 _DPI = 100
 _ARROW = 0.6  # m, from a robot to where it looks
 _MARGIN = 0.8  # m, around places
+_AROUND = 0.75  # of how far classes lie apart
 _TEN = 10
 
 
@@ -98,16 +99,21 @@ def _draw_beliefs(
     for place, colour, c in zip(places, colours, range(len(places)), strict=True):
         ax.plot(place[0], place[1], "s", color=colour, markersize=14, alpha=0.35, markeredgewidth=0)
         ax.text(place[0], place[1], str(c + 1), ha="center", va="center", color="0.25")
-    for n in np.flatnonzero(present):
+    low, high = places.min(axis=0), places.max(axis=0)
+    # Wider beliefs, such as those before any look, would make all else small.
+    margin = _AROUND * max(np.max(high - low), 1e-3)
+    tops: dict[tuple[int, ...], list[int]] = {}
+    for n in np.flatnonzero(present).tolist():
         width, height = 4 * std[n]
         ax.add_patch(Ellipse(mean[n], width, height, facecolor="none", edgecolor=nearest[n]))
         top = mean[n] + (0.0, 2 * std[n, 1])
-        ax.annotate(f"PoI {n}", top, color=nearest[n], weight="bold", ha="center", va="bottom")
-    low = np.minimum((mean - 2 * std)[present].min(axis=0), places.min(axis=0))
-    high = np.maximum((mean + 2 * std)[present].max(axis=0), places.max(axis=0))
-    margin = 0.1 * np.maximum(high - low, 1e-3)
-    ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]))
-    ax.set(ylim=(low[1] - margin[1], high[1] + margin[1]))
+        tops.setdefault(tuple(np.round(top / (margin / 4)).astype(int)), []).append(n)
+    for pois in tops.values():
+        top = mean[pois[0]] + (0.0, 2 * std[pois[0], 1])
+        words = "PoI " + ", ".join(map(str, pois))
+        style = {"color": nearest[pois[0]], "weight": "bold", "ha": "center", "va": "bottom"}
+        ax.text(top[0], top[1], words, clip_on=True, **style)
+    ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     ax.set_title("beliefs and classes")
     ax.set_xlabel(f"latent {dimensions[0] + 1}")
     ax.set_ylabel(f"latent {(*dimensions, 1)[1] + 1}")

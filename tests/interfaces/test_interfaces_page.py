@@ -18,7 +18,7 @@ from jaxsense.vae import gate
 from jaxsense.vae.detectors import Classifier
 
 PAGE = Path(__file__).parent.parent.parent / "docs" / "interfaces.md"
-FIRST, *OTHERS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
 PACKAGES = (
     "gymnax",
     "rejax",
@@ -28,8 +28,11 @@ PACKAGES = (
     "pettingzoo",
     "onnx",
 )
+OF_TASKS = ("gymnasium", "gymnax", "rejax", "stable_baselines3", "jaxmarl", "pettingzoo")
+FIRST, *OTHERS = SNIPPETS[len(OF_TASKS) :]
 TEAM = OTHERS.pop(4)
 EXAMPLES = dict(zip(PACKAGES, OTHERS, strict=True))
+TASKS = dict(zip(OF_TASKS, SNIPPETS, strict=False))
 
 
 def colour_detector():
@@ -73,6 +76,18 @@ def test_examples_run(names, package, tmp_path, monkeypatch, capsys):
         monkeypatch.delitem(sys.modules, "robot_numpy", raising=False)
     exec(compile(example, PAGE.name, "exec"), dict(names))
     (printed,) = re.findall(r"^print\(.*\)  # (.*)$", example, re.MULTILINE)
+    assert capsys.readouterr().out == f"{printed}\n"
+
+
+@pytest.mark.slow  # the tests of each interface take the same steps
+@pytest.mark.parametrize("package", TASKS)
+def test_examples_of_tasks_run(package, capsys):
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package}: needs the extra that the page names")
+    if package == "stable_baselines3":
+        importlib.import_module("torch").set_num_threads(1)
+    exec(compile(TASKS[package], PAGE.name, "exec"), {})
+    (printed,) = re.findall(r"^print\(.*\)  # ([^;\n]*)", TASKS[package], re.MULTILINE)
     assert capsys.readouterr().out == f"{printed}\n"
 
 
