@@ -134,7 +134,9 @@ def test_a_vector_of_gymnasium_is_one_program(gymnasium, name):
     nop = task.num_actions - 1
     for _ in range(4):
         assert envs.observation_space.contains(observations)
-        assert infos["action_mask"].shape == (4, task.num_actions)
+        expected = jax.vmap(task.action_mask)(envs._states)
+        np.testing.assert_array_equal(infos["action_mask"], expected)
+        assert infos["action_mask"].dtype == np.int8
         first = infos["action_mask"].argmax(axis=1)
         actions = np.array([nop, first[1], first[2], first[3]])
         observations, _, terminations, _, infos = envs.step(actions)
