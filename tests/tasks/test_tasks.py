@@ -12,7 +12,8 @@ import jaxsense
 from jaxsense.config import ConfigError
 from jaxsense.dqn import map_mdp, team_mdp
 from jaxsense.tasks import registry
-from jaxsense.tasks.task import CLIP, EPISODES, SEEDS, key_of_seed
+from jaxsense.tasks.environment import CLIP
+from jaxsense.tasks.task import EPISODES, SEEDS, key_of_seed
 
 KEY = jax.random.key(3)
 NAMES = jaxsense.registered()
