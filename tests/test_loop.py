@@ -262,3 +262,14 @@ def test_nan_on_a_full_disk_tells_of_both(monkeypatch, tmp_path):
 
     with pytest.raises(StageError, match=r"nan at step 1 of 4; .* No space left on device"):
         run_chunks("jmvae", np.float32(0), 4, run, Monitor(), checkpoints)
+
+
+def test_saving_counts_for_the_programs_that_stages_share(tmp_path):
+    monitor = Monitor()
+
+    def run(chunk, state):
+        monitor.stop()
+        return state, {"chunk": [chunk]}
+
+    run_chunks("dqn_camera", np.float32(0), 1, run, monitor, Checkpoints(tmp_path))
+    assert [(span.kind, span.stage) for span in monitor.clock.spans] == [("save", "dqn")]

@@ -144,7 +144,7 @@ class _Loop:
 
     def _record(self, kind: Kind, stage: Stage) -> AbstractContextManager[None]:
         """Records what is done for a stage, under the name of its programs."""
-        return self._clock.record(kind, program_name(stage))
+        return self._clock.record(kind, program_name(stage.name))
 
     def _run_stage(self, stage: Stage, before: dict[str, Future[None]]) -> None:
         """Finds the output of a stage, and lets go of those that no other stage needs."""
@@ -323,7 +323,7 @@ def run_chunks(
             curves.setdefault(name, []).extend(values)
         is_late = time.monotonic() - saved > _SAVE_PERIOD
         if is_late or monitor.is_stopping:
-            with monitor.clock.record("save", stage):
+            with monitor.clock.record("save", program_name(stage)):
                 checkpoints.save_unfinished(stage, Unfinished(chunk + 1, state, curves))
             saved = time.monotonic()
         if chunk + 1 < number:

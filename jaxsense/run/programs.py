@@ -52,10 +52,10 @@ def _runs_long(stage: Stage, config: Config) -> bool:
     return _on_cpu() and not is_live
 
 
-def program_name(stage: Stage) -> str:
+def program_name(stage: str) -> str:
     """The name of a stage's programs, which stages with the same functions share."""
-    kind = stage.name.partition("_")[0]
-    return kind if kind in _SHARED else stage.name
+    kind = stage.partition("_")[0]
+    return kind if kind in _SHARED else stage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Programs:
 
     def of(self, stage: Stage) -> StagePrograms:
         """The programs of a stage."""
-        return self.of_stages[program_name(stage)]
+        return self.of_stages[program_name(stage.name)]
 
     def fail(self, error: BaseException) -> None:
         """Raises an error wherever a program is awaited, now or later."""
@@ -143,7 +143,7 @@ def compile_programs(
     found, trainings = stages(config), Trainings(num_seeds)
 
     def program(stage: Stage, part: str) -> Program | SharedProgram:
-        alone = Program(compiler, program_name(stage), part)
+        alone = Program(compiler, program_name(stage.name), part)
         is_shared = num_seeds > 1 and not has_rows(stage)
         return SharedProgram(alone, trainings, workers) if is_shared else alone
 
@@ -151,7 +151,7 @@ def compile_programs(
         config=config,
         stages=found,
         of_stages={
-            program_name(stage): StagePrograms(
+            program_name(stage.name): StagePrograms(
                 begin=program(stage, "begin"),
                 advance=program(stage, "advance"),
                 finish=program(stage, "finish"),
