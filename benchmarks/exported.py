@@ -26,6 +26,8 @@ from jaxsense.interfaces import robot_numpy, robot_onnx
 from jaxsense.interfaces.onboard import Function, functions
 from jaxsense.mission import decide
 from jaxsense.mission.choice import ask, choose
+from jaxsense.mission.maps import OwnMap, SharedMap, map_of
+from jaxsense.mission.memory import Memory
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
 from jaxsense.models import Models
 from jaxsense.run import cli, devices, rundir
@@ -71,6 +73,7 @@ class Choice:
       readings: a whole scan.
       bearing: of the nearest PoI, in radians.
       distance: of the nearest PoI, in metres.
+      sums: `[R, N, C]` of the looks of each robot that this one knows of; None for a shared map.
     """
 
     inputs: Inputs
@@ -80,6 +83,7 @@ class Choice:
     readings: np.ndarray
     bearing: np.ndarray
     distance: np.ndarray
+    sums: np.ndarray | None
 
 
 def choices(config: Config, models: Models, number: int, seed: int = 0) -> list[Choice]:
@@ -148,10 +152,14 @@ def _observer(
             sensor.directions,
             scenario.time(state),
         )
+        known = decide.known_to(scenario, models, state, index)
+        looked_from, sums = state.looked_from, None
+        if state.memory is not None:
+            looked_from, sums = _remembered(scenario, state.memory, map_of(scenario, state, index))
         inputs = {
-            "mean": state.belief.mean,
-            "std": state.belief.std,
-            "looked_from": state.looked_from,
+            "mean": known.belief.mean,
+            "std": known.belief.std,
+            "looked_from": looked_from,
             "robot": index,
             "positions": position,
             "present": ~given_up[robot],
@@ -161,7 +169,6 @@ def _observer(
             "target": robots.target,
         }
         is_due = decide.is_due(scenario, state, index) & ~state.done
-        known = decide.known_to(scenario, models, state, index)
         return is_due, {
             "inputs": inputs,
             "action": choose(config.mission, ask(key, policy, models, known), known),
@@ -170,9 +177,30 @@ def _observer(
             "readings": readings,
             "bearing": viewpoints.bearing(scene.poses[robot], position[poi]),
             "distance": away[poi],
+            "sums": sums,
         }
 
     return observe
+
+
+def _remembered(
+    scenario: Mission, memory: Memory, own: SharedMap | OwnMap
+) -> tuple[jax.Array, jax.Array]:
+    """Places of the looks in a robot's own map, `[N, M, R L, 2]`, and `[R, N, C]` their sums."""
+    assert isinstance(own, OwnMap)
+    pois, robots = jnp.arange(own.num_pois), jnp.arange(len(memory.modality))
+
+    def places(poi: jax.Array, modality: jax.Array) -> jax.Array:
+        is_of = own.is_known & (memory.poi == poi) & (memory.modality == modality)[:, None]
+        return jnp.where(is_of[..., None], memory.place, jnp.inf).reshape(-1, 2)
+
+    def of_robot(robot: jax.Array) -> jax.Array:
+        is_own = own.is_known & (robots == robot)[:, None]
+        return memory.total(is_own, own.num_pois).log_likelihood
+
+    modalities = jnp.arange(len(scenario.config.modalities))
+    looked_from = jax.vmap(jax.vmap(places, (None, 0)), (0, None))(pois, modalities)
+    return looked_from, jax.vmap(of_robot)(robots)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -245,14 +273,14 @@ def _given(
         apart = np.linalg.norm(x["poses"][robot, None, :2] - x["looked_from"][poi, m], axis=-1)
         features = detect[f"detect_{sensor}"](models, *look.values())["features"]
         weight = weigh[f"weigh_{sensor}"](models, apart)["weight"]
-        write = {
-            "mean": x["mean"][poi],
-            "std": x["std"][poi],
-            "seen": choice.seen[poi],
-            "features": np.asarray(features),
-            "weight": np.asarray(weight),
-        }
-        of_sensor = {"detect": look, "weigh": {"apart": apart}, "write": write}
+        new = {"features": np.asarray(features), "weight": np.asarray(weight)}
+        of_sensor = {"detect": look, "weigh": {"apart": apart}}
+        if choice.sums is None:
+            belief = {"mean": x["mean"][poi], "std": x["std"][poi]}
+            of_sensor["write"] = {**belief, "seen": choice.seen[poi], **new}
+        else:
+            of_sensor["tell"] = new
+            given.setdefault("merge", []).append({"sums": choice.sums})
         for name, inputs in of_sensor.items():
             given.setdefault(f"{name}_{sensor}", []).append(inputs)
     return given

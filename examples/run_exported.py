@@ -6,7 +6,8 @@
 lets a run's robots explore the points of interest (PoIs) of one map: each asks its policy where to
 look, and updates the map with what its sensor detects there. Real robots run `detect` on their
 scans; here the features are made up. The functions are in `robot_numpy.py` and `robot_onnx.py`,
-which are in the file; copy one of them to a robot.
+which are in the file; copy one of them to a robot. Robots with maps of their own tell each other
+what they have seen; half of the messages are lost.
 """
 
 import argparse
@@ -35,13 +36,9 @@ def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) ->
       A line for each look, and one for each PoI at the end.
     """
     num_pois, modalities, robots = len(classes), contents["modalities"], contents["robots"]
-    number, remembered = len(robots), contents["remembered_looks"]
+    number, has_own_maps = len(robots), "merge" in programs
     angles = 2 * np.pi * np.arange(num_pois) / num_pois
-    seen = np.zeros((num_pois, len(modalities)), bool)
-    known = {
-        "mean": np.tile(np.float32(contents["unseen"]["mean"]), (num_pois, 1)),
-        "std": np.tile(np.float32(contents["unseen"]["std"]), (num_pois, 1)),
-        "looked_from": np.full((num_pois, len(modalities), remembered, 2), np.inf, np.float32),
+    team = {
         # On a circle around the robots.
         "positions": 2 * np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32),
         "present": np.ones(num_pois, bool),
@@ -50,38 +47,107 @@ def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) ->
         "works": np.ones(number, bool),
         "target": np.full(number, num_pois, np.int32),
     }
-    mean, std, looked_from = known["mean"], known["std"], known["looked_from"]
-    looks = np.zeros((num_pois, len(modalities)), int)
+    maps = [empty(contents, num_pois) for _ in range(number if has_own_maps else 1)]
     lines = []
-    while known["works"].any() and len(lines) < 20 * num_pois:
-        for robot in np.flatnonzero(known["works"]):
-            name, m = robots[robot], known["modality"][robot]
-            poi = int(programs["decide"](**known, robot=robot)["action"])
+    while team["works"].any() and len(lines) < 20 * num_pois:
+        for robot in np.flatnonzero(team["works"]).tolist():
+            name, m = robots[robot], team["modality"][robot]
+            known = maps[robot if has_own_maps else 0]
+            poi = int(programs["decide"](**known, **team, robot=robot)["action"])
             if poi in (num_pois, -1):
-                known["works"][robot] = False
+                team["works"][robot] = False
                 continue
             # It arrives at once, and looks at the PoI from 0.9 m.
-            place = known["poses"][robot, :2] = 0.55 * known["positions"][poi]
-            label = contents["label_of_class"][name][classes[poi]]
+            place = team["poses"][robot, :2] = 0.55 * team["positions"][poi]
             labels = contents["labels"][name]
-            apart = np.linalg.norm(place - looked_from[poi, m], axis=1)
-            belief = programs[f"write_{name}"](
-                mean=mean[poi],
-                std=std[poi],
-                seen=seen[poi],
-                features=np.eye(len(labels))[label],
-                weight=programs[f"weigh_{name}"](apart=apart)["weight"],
-            )
-            mean[poi], std[poi] = belief["new_mean"], belief["new_std"]
-            looked_from[poi, m, looks[poi, m] % remembered] = place
-            looks[poi, m] += 1
-            seen[poi, m] = True
+            label = contents["label_of_class"][name][classes[poi]]
+            apart = np.linalg.norm(place - known["looked_from"][poi, m], axis=1)
+            look = {
+                "features": np.eye(len(labels))[label],
+                "weight": programs[f"weigh_{name}"](apart=apart)["weight"],
+            }
+            if has_own_maps:
+                known["sums"][robot, poi] += programs[f"tell_{name}"](**look)["evidence"]
+                known.update(programs["merge"](sums=known["sums"]))
+            else:
+                write(programs[f"write_{name}"], known, poi, m, look)
+            remember(contents, known, robot, poi, m, place)
+            # Every second message is lost: the next one makes up for it.
+            if has_own_maps and len(lines) % 2 == 0:
+                tell(contents, programs, maps, robot)
             told = ", ".join(plausible(contents, programs, known)[poi])
             lines.append(f"{name} looks at PoI {poi}: {labels[label]}; it may be: {told}")
-    for poi, told in enumerate(plausible(contents, programs, known)):
+    if has_own_maps:  # back together, the robots tell each other everything
+        for robot in range(number):
+            tell(contents, programs, maps, robot)
+    for poi, told in enumerate(plausible(contents, programs, maps[0])):
         name = contents["classes"][classes[poi]]
         lines.append(f"PoI {poi} is a {name}; the map says: {', '.join(told)}")
     return lines
+
+
+def empty(contents: dict[str, Any], num_pois: int) -> dict[str, np.ndarray]:
+    """A map before the first look.
+
+    `sums` holds what each robot has said of its own looks, `number` how many looks that are, and
+    `looked_from` their places, for each robot as many as it remembers.
+    """
+    number, modalities = len(contents["robots"]), contents["modalities"]
+    remembered = number * contents["remembered_looks"]
+    return {
+        "mean": np.tile(np.float32(contents["unseen"]["mean"]), (num_pois, 1)),
+        "std": np.tile(np.float32(contents["unseen"]["std"]), (num_pois, 1)),
+        "seen": np.zeros((num_pois, len(modalities)), bool),
+        "looked_from": np.full((num_pois, len(modalities), remembered, 2), np.inf, np.float32),
+        "sums": np.zeros((number, num_pois, len(contents["classes"])), np.float32),
+        "number": np.zeros(number, int),
+    }
+
+
+def write(
+    program: Callable[..., dict[str, np.ndarray]],
+    known: dict[str, np.ndarray],
+    poi: int,
+    m: int,
+    look: dict[str, np.ndarray],
+) -> None:
+    """Updates the map that all robots share by a look."""
+    belief = program(**{key: known[key][poi] for key in ("mean", "std", "seen")}, **look)
+    known["mean"][poi], known["std"][poi] = belief["new_mean"], belief["new_std"]
+    known["seen"][poi, m] = True
+
+
+def remember(
+    contents: dict[str, Any],
+    known: dict[str, np.ndarray],
+    robot: int,
+    poi: int,
+    m: int,
+    place: np.ndarray,
+) -> None:
+    """Keeps from where a robot has looked, in place of its oldest look if there is no room."""
+    remembered = contents["remembered_looks"]
+    slot = robot * remembered + known["number"][robot] % remembered
+    known["looked_from"][:, :, slot] = np.inf
+    known["looked_from"][poi, m, slot] = place
+    known["number"][robot] += 1
+
+
+def tell(
+    contents: dict[str, Any], programs: Programs, maps: list[dict[str, np.ndarray]], robot: int
+) -> None:
+    """A robot tells the others all that it has seen itself: sums, places and number of its looks.
+
+    A receiver keeps the message of most looks: nothing counts twice.
+    """
+    own, remembered = maps[robot], contents["remembered_looks"]
+    places = slice(robot * remembered, (robot + 1) * remembered)
+    for known in maps:
+        if own["number"][robot] > known["number"][robot]:
+            known["number"][robot] = own["number"][robot]
+            known["sums"][robot] = own["sums"][robot]
+            known["looked_from"][:, :, places] = own["looked_from"][:, :, places]
+            known.update(programs["merge"](sums=known["sums"]))
 
 
 def plausible(

@@ -22,6 +22,7 @@ from jaxsense.interfaces import onboard
 from jaxsense.interfaces.graph import OPSET, Constants, as_onnx
 from jaxsense.interfaces.onboard import functions
 from jaxsense.interfaces.translate import arrays_of, program
+from jaxsense.mission.memory import MOST_LOOKS
 from jaxsense.mission.state import RECENT_LOOKS
 from jaxsense.models import Models
 from jaxsense.run import cli, files, rundir
@@ -94,7 +95,7 @@ def _description(config: Config, models: Models) -> dict[str, object]:
         "unseen": {name: np.asarray(x).tolist() for name, x in vars(prior).items()},
         "sensors": {sensor.name: _of_sensor(sensor) for sensor in sensors.make(config)},
         "mission": {"attempts": int(mission.attempts), "redecides": bool(mission.redecides)},
-        "remembered_looks": RECENT_LOOKS,
+        "remembered_looks": MOST_LOOKS if mission.communication.own_maps else RECENT_LOOKS,
         "opset": OPSET,
         "versions": {"jaxsense": __version__},
     }

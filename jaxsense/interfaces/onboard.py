@@ -10,6 +10,7 @@ from jaxsense.config import Config
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
 from jaxsense.dqn.team_mdp import Team
+from jaxsense.mission import maps, memory
 from jaxsense.mission.choice import ask, choose, times_to_new_looks
 from jaxsense.models import Models, make_agent, make_jmvae
 from jaxsense.sim import sensors
@@ -53,20 +54,22 @@ class Function:
 def functions(config: Config) -> dict[str, Function]:
     """All functions, by name.
 
-    For each modality M `detect_M`, `weigh_M` and `write_M`; for each encoder of the JMVAE an
+    For each modality M `detect_M`, `weigh_M` and, for a map that all share, `write_M`; where each
+    robot has a map of its own, `tell_M` in its place, and `merge`; for each encoder of the JMVAE an
     `encode_M`, for example `encode_camera+lidar`, if it reads features; `classify`; and `decide`.
 
     Args:
       config: all settings.
     """
-    model = make_jmvae(config)
+    model, own_maps = make_jmvae(config), config.mission.communication.own_maps
     found = {}
     for m, name in enumerate(model.modalities):
-        found |= {
-            f"detect_{name}": _detect(config, m),
-            f"weigh_{name}": _weigh(m),
-            f"write_{name}": _write(config, m),
-        }
+        found |= {f"detect_{name}": _detect(config, m), f"weigh_{name}": _weigh(m)}
+        found |= (
+            {f"tell_{name}": _tell(config, m)} if own_maps else {f"write_{name}": _write(config, m)}
+        )
+    if own_maps:
+        found["merge"] = _merge(config)
     for subset in () if config.jmvae.reads_scans else model.subsets:
         found[f"encode_{model.encoder_name(subset)}"] = _encode(config, subset)
     return {**found, "classify": _classify(config), "decide": _decide(config)}
@@ -149,6 +152,32 @@ def _write(config: Config, m: int) -> Function:
     return Function("The belief about a PoI after a look.", inputs, outputs, apply)
 
 
+def _tell(config: Config, m: int) -> Function:
+    def apply(models: Models, features: jax.Array, weight: jax.Array) -> dict[str, jax.Array]:
+        return {"evidence": maps.log_likelihood(models, features, m, weight)}
+
+    inputs = {
+        "features": Input((make_jmvae(config).feature_sizes[m],), "from `detect`"),
+        "weight": Input((), "from `weigh`"),
+    }
+    outputs = {"evidence": "logarithm of each class's likelihood given the look, up to a constant"}
+    return Function("What a look adds to the sum of a robot's own looks.", inputs, outputs, apply)
+
+
+def _merge(config: Config) -> Function:
+    def apply(models: Models, sums: jax.Array) -> dict[str, jax.Array]:
+        of_poi = jax.vmap(lambda total: memory.belief_of(models.fusion, total))
+        return vars(of_poi(jnp.sum(sums, axis=0)))
+
+    sums = Input(
+        ("robots", "pois", len(config.arena.classes)),
+        "sum of the evidence of each robot's own looks at each PoI, from `tell`, as far as this "
+        "robot knows: its own sums, and the latest that it has received; 0 for no looks",
+    )
+    about = "A robot's map, from what each robot has said of its own looks."
+    return Function(about, {"sums": sums}, _BELIEF, apply)
+
+
 def _encode(config: Config, subset: tuple[int, ...]) -> Function:
     model = make_jmvae(config)
 
@@ -219,7 +248,8 @@ def _decide(config: Config) -> Function:
         "looked_from": Input(
             (pois, len(config.modalities), "looks", 2),
             f"places of earlier looks by each sensor at each PoI, x and y in metres {frame}; "
-            "infinite for none; missions remember the last 32",
+            "infinite for none; missions remember the last 32, and in a robot's own map all that "
+            "it knows of",
         ),
         "robot": Input((), "index of the robot that chooses", "int32"),
         "positions": Input((pois, 2), f"of the PoIs, x and y in metres, {frame}"),

@@ -167,19 +167,33 @@ class OwnMap:
           modality: index of the sensor; static.
           weight: `[]` share of the look that is new evidence, see `vae.novelty`.
         """
-        fusion, nobody = models.fusion, jnp.zeros(len(models.detectors), bool)
-        alone = fusion.update(fusion.prior, nobody, features, modality, weight)
         found = Evidence(
-            log_likelihood=jnp.log(fusion.class_probabilities(alone)),
+            log_likelihood=log_likelihood(models, features, modality, weight),
             exact=weight * models.bayes.log_likelihoods(features, modality),
         )
         before = self.memory.total(self.memory.taken(), self.num_pois)
         after: Evidence = jax.tree.map(lambda rows, new: rows[poi] + new, before, found)
         return Learned(
-            belief=memory.belief_of(fusion, after.log_likelihood),
+            belief=memory.belief_of(models.fusion, after.log_likelihood),
             log_posterior=jax.nn.log_softmax(models.bayes.prior + after.exact),
             evidence=found,
         )
+
+
+def log_likelihood(
+    models: Models, features: Float[Array, " D_m"], modality: int, weight: Float[Array, ""]
+) -> Float[Array, " C"]:
+    """Log-likelihoods of the classes given one look, up to a constant.
+
+    Args:
+      models: trained models; their fusion must accumulate looks.
+      features: `[D_m]` probabilities of the labels.
+      modality: index of the sensor; static.
+      weight: `[]` share of the look that is new evidence, see `vae.novelty`.
+    """
+    fusion, nobody = models.fusion, jnp.zeros(len(models.detectors), bool)
+    alone = fusion.update(fusion.prior, nobody, features, modality, weight)
+    return jnp.log(fusion.class_probabilities(alone))
 
 
 def map_of(mission: Mission, state: MissionState, robot: Index) -> SharedMap | OwnMap:

@@ -1,0 +1,140 @@
+"""Exported robots with maps of their own, against the merge of missions."""
+
+import dataclasses
+import io
+import runpy
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from exporting import CONFIG, EXAMPLE
+
+import jaxsense
+from benchmarks import exported
+from jaxsense import export
+from jaxsense.config import CommunicationConfig
+from jaxsense.core import networks
+from jaxsense.core.networks import MLP
+from jaxsense.core.types import Belief
+from jaxsense.interfaces import robot_numpy, robot_onnx
+from jaxsense.mission import memory
+from jaxsense.mission.maps import OwnMap
+from jaxsense.vae import readout
+from jaxsense.vae.filter import Filter
+
+OWN = dataclasses.replace(
+    CONFIG,
+    jmvae=dataclasses.replace(CONFIG.jmvae, fusion="filter"),
+    mission=dataclasses.replace(
+        CONFIG.mission, communication=CommunicationConfig(own_maps=True, loss=0.3, delay=1.0)
+    ),
+)
+PLAYERS = [robot_numpy, robot_onnx]
+
+
+@pytest.fixture(scope="module")
+def models():
+    """Models with a filter that says different things of different features."""
+    found = jaxsense.init(jax.random.key(0), OWN)
+    classes = Belief(jnp.array([[1.5, 0.0], [-1.0, 1.2], [-0.8, -1.4]]), jnp.full((3, 2), 0.3))
+    fusion = found.fusion
+    assert isinstance(fusion, Filter)
+    read = readout.make(classes, readout.directions(fusion.model.feature_sizes))
+    network = MLP(fusion.hidden, read.of_classes.shape[1])
+    sizes = zip(fusion.model.modalities, fusion.model.feature_sizes, strict=True)
+    params = {
+        name: networks.scale_last(network, networks.init(jax.random.key(i), network, size), 0.3)
+        for i, (name, size) in enumerate(sizes)
+    }
+    fusion = dataclasses.replace(fusion, classes=classes, readout=read, networks=params)
+    return dataclasses.replace(found, fusion=fusion)
+
+
+@pytest.fixture(scope="module")
+def archive(models):
+    return export.archive(OWN, models)
+
+
+@pytest.mark.parametrize("player", PLAYERS)
+def test_maps_are_merged_as_missions_merge_them(models, archive, player):
+    """Three robots look at five PoIs; the first one has heard of some looks of the others."""
+    _, programs = player.load(io.BytesIO(archive))
+    assert not {"write_camera", "write_lidar"} & {*programs}
+    rng, modality = np.random.default_rng(0), np.array([0, 1, 1], np.int32)
+    held, sums = memory.empty(jnp.asarray(modality), 3), np.zeros((3, 5, 3), np.float32)
+
+    @jax.jit
+    def remember(held, robot, poi, evidence):
+        nowhere, now, applies = jnp.zeros(2), jnp.float32(0), jnp.bool_(True)
+        return held.with_look(robot, poi, nowhere, evidence, now, applies)
+
+    learn = jax.jit(
+        lambda held, poi, look, m, weight: OwnMap(held, held.taken(), 5).learn(
+            models, poi, look, m, weight
+        ),
+        static_argnums=3,
+    )
+    hears_of = np.array([9, 3, 0])  # looks of each robot that the first one knows of
+    for look in range(18):
+        robot, poi = look % 3, int(rng.integers(4))  # nobody looks at the last PoI
+        m, weight = int(modality[robot]), np.float32(rng.uniform(0.2, 1.0))
+        features = np.float32(rng.dirichlet([0.5, 0.5]))
+        found = learn(held, np.int32(poi), features, m, weight).evidence
+        held = remember(held, np.int32(robot), np.int32(poi), found)
+        told = programs[f"tell_{OWN.modalities[m]}"](features=features, weight=weight)["evidence"]
+        np.testing.assert_allclose(told, found.log_likelihood, atol=1e-5)
+        if look // 3 < hears_of[robot]:
+            sums[robot, poi] += told
+    is_known = held.taken() & (jnp.arange(memory.MOST_LOOKS)[None] < hears_of[:, None])
+    expected = jax.jit(lambda held: OwnMap(held, is_known, 5).read(models).belief)(held)
+    merged = programs["merge"](sums=sums)
+    np.testing.assert_allclose(merged["mean"], expected.mean, atol=1e-5)
+    np.testing.assert_allclose(merged["std"], expected.std, atol=1e-5)
+    assert np.abs(merged["mean"][:4]).max() > 0.3
+    np.testing.assert_array_equal(merged["std"][4], models.fusion.prior.std)
+
+
+@pytest.mark.parametrize("player", PLAYERS)
+def test_the_example_plays_robots_with_maps_of_their_own(archive, player):
+    example = runpy.run_path(str(EXAMPLE))
+    contents, programs = player.load(io.BytesIO(archive))
+    assert contents["remembered_looks"] == memory.MOST_LOOKS
+    lines = example["explore"](contents, programs, [0, 1, 2])
+    assert [line.split(" is a ")[0] for line in lines[-3:]] == [f"PoI {n}" for n in range(3)]
+    assert any("looks at PoI" in line for line in lines)
+
+
+@pytest.mark.parametrize("player", [robot_numpy])
+def test_a_message_that_comes_twice_is_counted_once(archive, player):
+    example = runpy.run_path(str(EXAMPLE))
+    contents, programs = player.load(io.BytesIO(archive))
+    maps = [example["empty"](contents, 3) for _ in range(2)]
+    place = np.array([0.5, 0.2], np.float32)
+    maps[0]["sums"][0, 1] = [0.0, -2.0, -3.0]
+    example["remember"](contents, maps[0], 0, 1, 0, place)
+    example["tell"](contents, programs, maps, 0)
+    once = {name: x.copy() for name, x in maps[1].items()}
+    assert np.abs(once["mean"][1]).max() > 0.1
+    np.testing.assert_array_equal(once["looked_from"][1, 0, 0], place)
+    example["tell"](contents, programs, maps, 0)
+    # An older one, of no look.
+    example["tell"](contents, programs, [example["empty"](contents, 3), maps[1]], 0)
+    jax.tree.map(np.testing.assert_array_equal, maps[1], once)
+
+
+@pytest.mark.slow
+def test_decisions_by_own_maps_are_those_of_missions(models, archive):
+    found = exported.choices(OWN, models, 60)
+    _, programs = robot_numpy.load(io.BytesIO(archive))
+    for choice in found:
+        merged = programs["merge"](sums=choice.sums)
+        np.testing.assert_allclose(merged["mean"], choice.inputs["mean"], atol=1e-5)
+        np.testing.assert_allclose(merged["std"], choice.inputs["std"], atol=1e-5)
+    assert any(np.any(choice.sums != 0) for choice in found)
+    for each in exported.compare(OWN, models, archive, found).values():
+        assert {"decide", "merge", "tell_camera", "tell_lidar"} < {*each}
+        assert all(program.different == 0 for program in each.values())
+        # The class probabilities of a belief after one look are read with rounding, see the page.
+        limits = {name: 1e-4 if name.startswith("tell") else 1e-5 for name in each}
+        assert all(program.error < limits[name] for name, program in each.items())
