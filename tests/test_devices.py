@@ -296,3 +296,24 @@ def test_programs_side_by_side_do_not_wait_for_each_other_for_ever():
     # Cholesky decompositions as in the physics of six robots.
     environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
     subprocess.run([sys.executable, "-c", DECOMPOSED], env=environment, check=True, timeout=120)
+
+
+def test_parts_are_joined_where_jax_can_take_them_over():
+    shapes = (jax.ShapeDtypeStruct((6, 5), jnp.float32), jax.ShapeDtypeStruct((6,), jnp.bool_))
+    rows = lambda i: (np.full((2, 5), i, np.float32), np.full(2, i == 1))  # noqa: E731
+    whole = devices.joined(rows, 3, 2, shapes)
+    np.testing.assert_array_equal(whole[0][:, 0], [0, 0, 1, 1, 2, 2])
+    np.testing.assert_array_equal(whole[1], [0, 0, 1, 1, 0, 0])
+    for x in whole:
+        taken = jax.device_put(x)
+        assert taken.unsafe_buffer_pointer() == x.ctypes.data
+
+
+@pytest.mark.parametrize("error", [None, OSError, AttributeError])
+def test_freed_memory_is_given_back_wherever_that_can_be_done(error, monkeypatch):
+    def load(name):
+        raise error(name)
+
+    if error is not None:
+        monkeypatch.setattr(devices.ctypes, "CDLL", load)
+    devices.give_back_freed()

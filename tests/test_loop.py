@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaxsense.config import PRESETS
-from jaxsense.run import loop, pipeline, programs
+from jaxsense.run import devices, loop, pipeline, programs
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -111,6 +111,44 @@ def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, monkeyp
     assert alive["fourth"] == ["second", "third"]
     assert [*found.outputs] == ["second", "third", "fourth"]
     np.testing.assert_array_equal(found.outputs["fourth"], [8, 8, 8])
+
+
+def test_the_first_state_of_a_training_is_held_no_longer_than_its_first_chunk(toy, monkeypatch):
+    begun, alive, begin, report = [], [], loop._Loop._begin, loop._Loop._report
+
+    def watched(self, stage, inputs):
+        state = begin(self, stage, inputs)
+        begun.append(weakref.ref(state))
+        return state
+
+    def reported(self, *args):
+        gc.collect()
+        alive.append(begun[0]() is not None)
+        return report(self, *args)
+
+    monkeypatch.setattr(loop._Loop, "_begin", watched)
+    monkeypatch.setattr(loop._Loop, "_report", reported)
+    toy(counting("count"))
+    # It is saved if the first chunk fails.
+    assert alive == [True, False, False]
+
+
+@pytest.mark.parametrize("number", [3, 512, 513, 1300])
+def test_rows_are_the_same_in_parts(toy, monkeypatch, number):
+    calls, part = [], devices.part
+
+    def counted(args, i, *rest):
+        calls.append(i)
+        return part(args, i, *rest)
+
+    monkeypatch.setattr(devices, "part", counted)
+    first = Stage("first", lambda key, config: jnp.arange(2.0 * number).reshape(number, 2))
+    survey = Stage("survey", lambda key, config, x: (x + 1, x.sum(axis=1)), {"x": "first"})
+    found, _, _ = toy(first, survey)
+    x = np.arange(2.0 * number).reshape(number, 2)
+    np.testing.assert_array_equal(found.outputs["survey"][0], x + 1)
+    np.testing.assert_array_equal(found.outputs["survey"][1], x.sum(axis=1))
+    assert max(calls) == -(-number // 512) - 1
 
 
 def test_what_was_saved_is_not_trained_again(toy):

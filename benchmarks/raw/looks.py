@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsense import PRESETS, Key, learn
-from jaxsense.training import perception, scans
+from jaxsense.training import scans
 
 TOGETHER = 8
 """Looks by each sensor at a PoI; variants learn from groups of 1, 2, 4 or all of them."""
@@ -87,8 +87,7 @@ def simulate(key: Key, number: int) -> Looks:
     @jax.jit
     def looks(key: Key) -> tuple[Seen, Seen, jax.Array, jax.Array]:
         outputs = learn(key, config, until="views").outputs
-        num_train = perception.num_scenes(config)[0]
-        surveys = jax.tree.map(lambda x: x[:num_train], outputs["survey"])
+        surveys = outputs["survey"].training
         light = surveys.scenes.light
         shown = jnp.column_stack([light.direction, light.diffuse, light.ambient])
         each = jnp.broadcast_to(shown[:, None], (*surveys.classes.shape, shown.shape[1]))

@@ -92,7 +92,10 @@ def statistics(
       Their `[F]` mean, and the `[]` overall standard deviation from it, which is never 0.
     """
     offset = jnp.mean(inputs, axis=0)
-    return offset, jnp.std(inputs - offset[None]) + 1e-6
+    # `jnp.std` would hold all of the differences.
+    mean = jnp.mean(inputs - offset[None])
+    deviation = inputs - (offset + mean)[None]
+    return offset, jnp.sqrt(jnp.mean(jnp.square(deviation))) + 1e-6
 
 
 def scale_last(network: MLP, params: Params, factor: float | jax.Array) -> Params:

@@ -89,7 +89,7 @@ class Program:
         self._stage, self._name, self._clock = stage, name, compiler.monitor.clock
         self._record = functools.partial(self._clock.record, stage=stage, program=name)
         self._compiled: Future[Function] = Future()
-        self._workers, self._whole = ALONE, ()
+        self._workers, self._whole, self._results = ALONE, (), None
 
     def compile(
         self,
@@ -104,7 +104,7 @@ class Program:
         Args:
           function: what to compile.
           *args: arguments or their shapes, for example the result of another program's `compile`.
-          workers: share the rows of the arguments; their number must divide the rows.
+          workers: share the rows of the arguments; their parts must divide the rows.
           whole: positions of arguments that every worker gets undivided.
           **options: see `devices.compiler_options`.
 
@@ -117,8 +117,9 @@ class Program:
         self._compiler.check_open()
         self._workers, self._whole = workers, whole
         function = devices.spread(function, workers.mesh, whole)
-        args = devices.part(args, 0, workers.threads, whole)
+        args = devices.part(args, 0, workers.parts, whole)
         lowered, results = self._lower(function, args)
+        self._results = devices.of_all_parts(results, workers.parts)
 
         def compile_lowered() -> None:
             begin, loaded = self._clock.now, self._compiler.num_loaded
@@ -131,9 +132,10 @@ class Program:
             self._clock.add("compile" if is_new else "load", self._stage, self._name, since=begin)
             with contextlib.suppress(InvalidStateError):  # `fail` was called before
                 self._compiled.set_result(compiled)
+            devices.give_back_freed()
 
         self._compiler.submit(compile_lowered)
-        return devices.of_all_parts(results, workers.threads)
+        return self._results
 
     def _lower(self, function: Function, args: PyTree) -> tuple[jax.stages.Lowered, PyTree]:
         """A function ready to be compiled, and the shapes of its results; see `compile`."""
@@ -194,7 +196,7 @@ class Program:
     def __call__(self, *args: PyTree) -> PyTree:
         """Runs the program, and blocks until its results are ready."""
         compiled = self.wait()
-        number = self._workers.threads
+        number = self._workers.parts
 
         def run(i: int) -> PyTree:
             return jax.block_until_ready(compiled(*devices.part(args, i, number, self._whole)))
@@ -202,5 +204,5 @@ class Program:
         with self._record("run"):
             if self._is_of_many:
                 args = devices.put(args, self._places(len(args)))
-            output = devices.joined(devices.side_by_side(run, number))
+            output = devices.joined(run, number, self._workers.threads, self._results)
             return devices.fetched(output) if self._is_of_many else output

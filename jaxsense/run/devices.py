@@ -1,7 +1,10 @@
 """Spreads work over the cores of a CPU and over accelerators."""
 
+import contextlib
+import ctypes
 import dataclasses
 import functools
+import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -24,6 +27,7 @@ Options: TypeAlias = dict[str, Any]  # JAX declares fewer types than it takes
 AXIS = "devices"
 NUM_THREADS = min(os.cpu_count() or 1, 8)
 _MAX_DEVICES = 256
+_ALIGNED = 64  # bytes
 
 
 def compiler_options(*, runs_long: bool = False, wide_vectors: bool = False) -> Options:
@@ -69,17 +73,24 @@ class Workers:
     """Threads of a CPU, or devices of a mesh, that share the rows of a batch.
 
     Attributes:
-      threads: number of threads, each with its own call of a program; 1 with a mesh.
+      threads: number of threads, each with its own calls of a program; 1 with a mesh.
       mesh: from `make_mesh`; None for a single device.
+      calls: of each thread, one after the other, each with a part of its rows.
     """
 
     threads: int = 1
     mesh: Mesh | None = None
+    calls: int = 1
 
     @property
     def number(self) -> int:
-        """Number of parts of a batch."""
+        """Number of workers."""
         return self.threads if self.mesh is None else self.mesh.size
+
+    @property
+    def parts(self) -> int:
+        """Number of parts of a batch, each of which takes a call."""
+        return self.threads * self.calls
 
 
 ALONE = Workers()
@@ -231,19 +242,20 @@ def spread(
     return partitioned
 
 
-def side_by_side(function: Callable[[int], T], number: int) -> list[T]:
-    """Calls a function with 0, 1 and so on, each in a thread of its own, to use all cores.
+def side_by_side(function: Callable[[int], T], number: int, threads: int | None = None) -> list[T]:
+    """Calls a function with 0, 1 and so on, in several threads, to use all cores.
 
     Args:
       function: of an index.
       number: of calls.
+      threads: how many calls run at once; all by default.
 
     Returns:
       The results, in order.
     """
     if number == 1:
         return [function(0)]
-    with ThreadPoolExecutor(number) as executor:
+    with ThreadPoolExecutor(threads or number) as executor:
         futures = [executor.submit(function, i) for i in range(number)]
         # A wait without timeout may not notice Ctrl-C.
         while wait(futures, timeout=0.2).not_done:
@@ -295,8 +307,42 @@ def fetched(values: PyTree[jax.Array]) -> PyTree[np.ndarray]:
     return jax.device_get(values)
 
 
-def joined(parts: list[PyTree]) -> PyTree:
-    """Joins the results of parts, on the host if there are several."""
-    if len(parts) == 1:
-        return parts[0]
-    return jax.tree.map(lambda *x: np.concatenate([np.asarray(each) for each in x]), *parts)
+def joined(
+    run: Callable[[int], PyTree], number: int, threads: int, shapes: PyTree[jax.ShapeDtypeStruct]
+) -> PyTree[np.ndarray]:
+    """Joins the results of parts, on the host if there are several, each once it is there.
+
+    Args:
+      run: computes the part with an index.
+      number: of parts.
+      threads: how many parts run at once.
+      shapes: of the joined results, see `of_all_parts`.
+    """
+    if number == 1:
+        return run(0)
+    whole = jax.tree.map(lambda x: _empty(x.shape, x.dtype), shapes)
+
+    def put(i: int) -> None:
+        for rows, new in zip(jax.tree.leaves(whole), jax.tree.leaves(run(i)), strict=True):
+            rows[i * len(new) : (i + 1) * len(new)] = new
+
+    side_by_side(put, number, threads)
+    return whole
+
+
+def _empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An array without values that JAX can take over on a CPU, where it would copy others."""
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.empty(size + _ALIGNED, np.uint8)
+    first = -memory.ctypes.data % _ALIGNED
+    return memory[first : first + size].view(dtype).reshape(shape)
+
+
+def give_back_freed() -> None:
+    """Gives memory that is free back to the system.
+
+    The compiler frees hundreds of megabytes in pieces, which glibc would keep for later.
+    """
+    # Other systems have no such function, or need none.
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").malloc_trim(0)

@@ -9,13 +9,12 @@ from contextlib import AbstractContextManager
 
 import jax
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jaxsense.config import Config
 from jaxsense.core.types import Key
 from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.programs import Programs, has_rows, is_saved, padded, program_name
+from jaxsense.run.programs import Programs, has_rows, is_saved, padded, program_name, workers_for
 from jaxsense.summary.profile import Kind
 from jaxsense.training.stage import Output, Progress, Stage
 
@@ -165,9 +164,7 @@ class _Loop:
                     future.result()
             inputs = stage.select({name: self._held[name].output for name in before})
             self._monitor.check_stop()
-            output = self._begin(stage, inputs)
-            if stage.chunks:
-                output = self._train(stage, output, inputs)
+            output = (self._train if stage.chunks else self._begin)(stage, inputs)
             if not stage.is_optional:
                 self._monitor.check_finite(stage.name, "results", output)
             if is_saved(stage):
@@ -182,14 +179,16 @@ class _Loop:
         key = stage.key(self._key)
         program, config = self._programs.of(stage).begin, self._config
         if not has_rows(stage):
-            return program(key, config, inputs)
+            return stage.divide(config, program(key, config, inputs))
         number = len(jax.tree.leaves(inputs)[0])
-        found = program(key, config, padded(inputs, self._programs.workers.number))
+        workers = workers_for(number, self._programs.workers)
+        found = program(key, config, padded(inputs, workers))
+        output = stage.divide(config, jax.tree.map(lambda x: x[:number], found))
         # Joined parts lie on the host, and every program would transfer them again.
-        return jax.device_put(jax.tree.map(lambda x: x[:number], found))
+        return jax.device_put(output)
 
-    def _train(self, stage: Stage, state: Output, inputs: dict[str, Output]) -> Output:
-        """The output of a stage with steps, from its first state."""
+    def _train(self, stage: Stage, inputs: dict[str, Output]) -> Output:
+        """The output of a stage with steps."""
         programs, config = self._programs.of(stage), self._config
         keys = stage.chunk_keys(self._key)
         # The rate must not include compilation.
@@ -204,14 +203,21 @@ class _Loop:
             return state, {**curves, "seconds": [seconds]}
 
         try:
+            # Nobody but `run_chunks` holds the first state, so that it can let go of it.
             state, curves = run_chunks(
-                stage.name, state, stage.chunks, advance, self._monitor, self._checkpoints
+                stage.name,
+                self._begin(stage, inputs),
+                stage.chunks,
+                advance,
+                self._monitor,
+                self._checkpoints,
             )
         except StageError as error:
             if not stage.is_optional:
                 raise
             self._monitor.warn(f"{error}: left out")
-            state, curves = _failed(state), self._no_curves(stage)
+            self._curves[stage.name] = self._no_curves(stage)
+            return _failed(self._programs.of(stage).shapes.result().output)
         self._curves[stage.name] = curves
         return programs.finish(config, state, inputs)
 
@@ -269,14 +275,13 @@ def _as_arrays(curves: Curves) -> dict[str, np.ndarray]:
     return {name: np.array(values, np.float32) for name, values in curves.items()}
 
 
-def _failed(state: Output) -> Output:
-    """The state of a failed training: every float is NaN."""
+def _failed(shapes: Output) -> Output:
+    """The output of a failed training: every float is NaN, everything else 0."""
 
-    def fail(x: ArrayLike) -> np.ndarray:
-        x = np.asarray(x)
-        return np.full_like(x, np.nan) if np.issubdtype(x.dtype, np.floating) else x
+    def fail(x: jax.ShapeDtypeStruct) -> np.ndarray:
+        return np.full(x.shape, np.nan if np.issubdtype(x.dtype, np.floating) else 0, x.dtype)
 
-    return jax.tree.map(fail, state)
+    return jax.tree.map(fail, shapes)
 
 
 def run_chunks(

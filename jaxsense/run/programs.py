@@ -5,6 +5,7 @@ compiled programs already run. Shapes come from tracing: a stage's outputs are l
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import suppress
@@ -27,6 +28,7 @@ OwnPolicies = Mapping[str, Values | Policy]
 """Policies of a user, by name, see `dqn.policies.table`."""
 _ROWS = ("survey",)
 """Stages whose inputs and output have independent rows, so that devices can share them."""
+_ROWS_AT_ONCE = 512  # of each thread; their results take up little memory besides those of all
 _SAVED = ("novelty", "best_jmvae", "class_beliefs", "fusion", "look_values")
 """Stages without chunks whose output a run saves; it saves that of every stage with chunks."""
 _SHARED = ("jmvae", "dqn", "policies", "numbers")
@@ -226,18 +228,18 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
     def finish(config: Config, state: Output, inputs: dict[str, Output]) -> Output:
         return stage.finish(config, state, **inputs)
 
+    divided = functools.partial(jax.eval_shape, functools.partial(stage.divide, config))
     if isinstance(compiled.begin, Program) and has_rows(stage):
-        split = padded(inputs, programs.workers.number)
-        output = compiled.begin.compile(
-            begin, key, config, split, workers=programs.workers, whole=(0, 1)
-        )
-        number = len(jax.tree.leaves(outputs)[0])
+        number = len(jax.tree.leaves(inputs)[0])
+        workers = workers_for(number, programs.workers)
+        split = padded(inputs, workers)
+        output = compiled.begin.compile(begin, key, config, split, workers=workers, whole=(0, 1))
         output = jax.tree.map(lambda x: x.update(shape=(number, *x.shape[1:])), output)
-        compiled.shapes.set_result(Shapes(output))
+        compiled.shapes.set_result(Shapes(divided(output)))
         return
     state = compiled.begin.compile(begin, key, config, inputs, whole=(1,))
     if not stage.chunks:
-        compiled.shapes.set_result(Shapes(state))
+        compiled.shapes.set_result(Shapes(divided(state)))
         return
     runs_long = _runs_long(stage, programs.config)
     _, progress = compiled.advance.compile(
@@ -247,13 +249,26 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
     compiled.shapes.set_result(Shapes(output, tuple(progress.metrics)))
 
 
-def padded(inputs: PyTree, number: int) -> PyTree:
-    """Repeats the first rows of inputs until `number` divides their count.
+def workers_for(rows: int, workers: Workers) -> Workers:
+    """Workers for the rows of a stage: threads take a few rows at a time, devices all at once.
+
+    Args:
+      rows: their number.
+      workers: share the rows.
+    """
+    if not _on_cpu() or workers.mesh is not None:
+        return workers
+    return dataclasses.replace(workers, calls=-(-rows // (workers.threads * _ROWS_AT_ONCE)))
+
+
+def padded(inputs: PyTree, workers: Workers) -> PyTree:
+    """Repeats the first rows of inputs until every call of the workers has equally many.
 
     Args:
       inputs: arrays or their shapes.
-      number: of parts.
+      workers: share the rows.
     """
+    number = workers.number * workers.calls
 
     def pad(x: jax.Array | jax.ShapeDtypeStruct) -> jax.Array | jax.ShapeDtypeStruct:
         rows = -(-x.shape[0] // number) * number

@@ -24,15 +24,15 @@ _ELSEWHERE = 0.5, 2.0  # of the distance, outside of which a PoI is not where it
 class Examples:
     """What a detector and its gate are trained on.
 
+    The windows of the looks at PoIs stay in the surveys, since they fill a lot of memory.
+
     Attributes:
-      windows: `[L, F]` windows of looks at PoIs.
-      labels: `[L]` int32 their labels.
+      labels: `[L]` int32 labels of the looks at PoIs.
       distances: `[L]` expected distances of the PoIs, in metres.
       nothing: looks that show no PoI, in random order.
       checks: other looks at PoIs, for the gate's threshold.
     """
 
-    windows: Float[Array, "L F"]
     labels: Int[Array, " L"]
     distances: Float[Array, " L"]
     nothing: gates.Looks
@@ -48,7 +48,6 @@ def first(examples: Examples, number: int) -> Examples:
     """
     return dataclasses.replace(
         examples,
-        windows=examples.windows[:number],
         labels=examples.labels[:number],
         distances=examples.distances[:number],
     )
@@ -95,15 +94,18 @@ def nothing(
     return jax.tree.map(lambda x: x[order], together)
 
 
-def of_gate(config: DetectorConfig, gate: Gate, examples: Examples) -> gates.Fitting:
+def of_gate(
+    config: DetectorConfig, gate: Gate, examples: Examples, windows: Float[Array, "L F"]
+) -> gates.Fitting:
     """Problem of fitting a gate, without the looks of `checks_of`.
 
     Args:
       config: of the fit.
       gate: untrained.
       examples: of one modality.
+      windows: of the looks at PoIs.
     """
-    shown = gates.Looks(examples.windows, examples.distances)
+    shown = gates.Looks(windows, examples.distances)
     nothing = jax.tree.map(lambda x: x[_num_checks(examples) :], examples.nothing)
     return gates.Fitting(config, gate, shown, nothing)
 

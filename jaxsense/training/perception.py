@@ -29,7 +29,7 @@ _SHARE_OF_EMPTY = 8  # one empty scene for so many to train detectors with; rays
 
 
 @pytree
-class Surveys:
+class Survey:
     """Looks by every robot at every PoI of S scenes.
 
     Attributes:
@@ -43,6 +43,30 @@ class Surveys:
     scenes: Scene
     windows: tuple[Float[Array, "S N F"], ...]
     distances: Float[Array, "S M N"]
+
+    def looks(self, modality: int) -> gates.Looks:
+        """All looks by one modality, scene after scene.
+
+        Args:
+          modality: index of the sensor.
+        """
+        windows = self.windows[modality]
+        # XLA would fold the reshape into sums over the looks, which then round otherwise.
+        flat = jax.lax.optimization_barrier(windows.reshape(-1, windows.shape[-1]))
+        return gates.Looks(flat, self.distances[:, modality].reshape(-1))
+
+
+@pytree
+class Surveys:
+    """Surveys of all scenes.
+
+    Attributes:
+      training: of the scenes to train detectors with.
+      others: of those for the bank, to measure on, and empty ones, in this order.
+    """
+
+    training: Survey
+    others: Survey
 
 
 @pytree
@@ -144,37 +168,47 @@ def survey_stage(arena: Arena) -> Stage:
     It may get a part of the scenes, and knows nothing of their number.
     """
 
-    def survey(key: Key, config: Config, *, scenes: Scenes) -> Surveys:
+    def survey(key: Key, config: Config, *, scenes: Scenes) -> Survey:
         del key
         keys, classes, is_empty, places = scenes
         world = make_world(config, arena=arena)
         seen, windows, distances = looks.surveys(keys, world, classes, is_empty, places)
-        return Surveys(classes, seen, windows, distances)
+        return Survey(classes, seen, windows, distances)
 
-    return Stage("survey", survey, {"scenes": "scenes"}, is_passing=True)
+    return Stage("survey", survey, {"scenes": "scenes"}, divide=divide, is_passing=True)
+
+
+def divide(config: Config, survey: Survey) -> Surveys:
+    """Divides the survey of all scenes by what it is for.
+
+    Args:
+      config: all settings.
+      survey: of all scenes.
+    """
+    number = num_scenes(config)[0]
+    return Surveys(_rows(survey, slice(number)), _rows(survey, slice(number, None)))
+
+
+def _rows(survey: Survey, part: slice) -> Survey:
+    """The survey of some of the scenes."""
+    return jax.tree.map(lambda x: x[part], survey)
 
 
 def split_examples(key: Key, config: Config, *, surveys: Surveys) -> tuple[Examples, ...]:
-    """What to train each detector and its gate on.
+    """What to train each detector and its gate on, besides the windows of the surveys.
 
     Args:
       key: random key of the windows that are spoilt by hand.
       config: all settings.
       surveys: of all scenes.
     """
-    num_train, num_bank, _, num_empty = num_scenes(config)
-
-    def looks_of(m: int, part: slice) -> gates.Looks:
-        windows, distances = surveys.windows[m][part], surveys.distances[part, m]
-        return gates.Looks(windows.reshape(-1, windows.shape[-1]), distances.reshape(-1))
+    _, num_bank, _, num_empty = num_scenes(config)
 
     def of_modality(key: Key, m: int, name: str, sensor: Sensor) -> Examples:
-        shown = looks_of(m, slice(num_train))
-        classes = surveys.classes[:num_train].reshape(-1)
-        empty = looks_of(m, slice(-num_empty, None))
-        checks = looks_of(m, slice(num_train, num_train + num_bank))
+        shown, classes = surveys.training.looks(m), surveys.training.classes.reshape(-1)
+        empty = _rows(surveys.others, slice(-num_empty, None)).looks(m)
+        checks = _rows(surveys.others, slice(num_bank)).looks(m)
         return Examples(
-            windows=shown.windows,
             labels=jnp.array(config.label_of_class(name))[classes],
             distances=shown.distances,
             nothing=gating.nothing(key, config.viewpoint, sensor, shown, empty),
@@ -196,37 +230,46 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
     """
 
     def untrained(
-        key: Key, config: Config, *, examples: tuple[Examples, ...]
+        key: Key, config: Config, *, surveys: Surveys, examples: tuple[Examples, ...]
     ) -> tuple[Classifier, tuple[Params, Params]]:
         num_labels = len(config.labels(config.modalities[modality]))
-        windows = _for_training(config, examples[modality]).windows
+        number = _num_training(config, examples[modality])
+        windows = surveys.training.looks(modality).windows[:number]
         is_range = sensors.make(config)[modality].measures_distance
         detector = detectors.init(key, windows, num_labels, config.detector, is_range)
         return detector, (detector.params, detector.gate.params)
 
     def problem(
-        config: Config, detector: Classifier, *, examples: tuple[Examples, ...]
+        config: Config, detector: Classifier, *, surveys: Surveys, examples: tuple[Examples, ...]
     ) -> gating.FittingBoth:
-        given = _for_training(config, examples[modality])
+        number = _num_training(config, examples[modality])
+        given = gating.first(examples[modality], number)
+        windows = surveys.training.looks(modality).windows[:number]
         return gating.FittingBoth(
-            detectors.Fitting(config.detector, detector, given.windows, given.labels),
-            gating.of_gate(config.detector, detector.gate, given),
+            detectors.Fitting(config.detector, detector, windows, given.labels),
+            gating.of_gate(config.detector, detector.gate, given, windows),
         )
 
     def trained(
-        config: Config, detector: Classifier, fit: FitState, *, examples: tuple[Examples, ...]
+        config: Config,
+        detector: Classifier,
+        fit: FitState,
+        *,
+        surveys: Surveys,
+        examples: tuple[Examples, ...],
     ) -> Classifier:
         given = examples[modality]
         number = _num_training(config, given)
         params, of_gate = fit.params
         gate = gates.fitted(of_gate, gating.checks_of(config.detector, detector.gate, given))
         found = dataclasses.replace(detector, params=params, gate=gate)
-        windows, labels = given.windows[number:], given.labels[number:]
+        windows = surveys.training.looks(modality).windows[number:]
+        labels = given.labels[number:]
         return detectors.calibrate(found, windows, labels) if len(labels) else found
 
     return fit_stage(
         name,
-        {"examples": "examples"},
+        {"surveys": "survey", "examples": "examples"},
         config,
         settings=lambda config: config.detector,
         untrained=untrained,
@@ -238,11 +281,6 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
 def _num_training(config: Config, examples: Examples) -> int:
     """How many examples train the detector; the others calibrate it."""
     return config.detector.num_training(len(examples.labels))
-
-
-def _for_training(config: Config, examples: Examples) -> Examples:
-    """The examples without those that calibrate the detector."""
-    return gating.first(examples, _num_training(config, examples))
 
 
 def detect(
@@ -264,8 +302,8 @@ def detect(
         ones.
     """
     del key
-    num_train, num_bank, _, num_empty = num_scenes(config)
-    others = jax.tree.map(lambda x: x[num_train:-num_empty], surveys)
+    _, num_bank, _, num_empty = num_scenes(config)
+    others = _rows(surveys.others, slice(-num_empty))
     features = looks.detect_all(trained, others.windows)
 
     def by_class(

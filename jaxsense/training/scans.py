@@ -22,7 +22,7 @@ from jaxsense.sim.arena import Arena
 from jaxsense.training import gating, perception, repeats
 from jaxsense.training.fits import fit_stage, jmvae_restarts
 from jaxsense.training.gating import Examples
-from jaxsense.training.perception import Detections, Scenes, Surveys
+from jaxsense.training.perception import Detections, Scenes, Survey, Surveys
 from jaxsense.training.repeats import Repeated
 from jaxsense.training.stage import Stage
 from jaxsense.vae import clusters, frames, leave_one_out
@@ -92,7 +92,7 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
     del key
     number = _num_training(config)
     found, scalings = [], []
-    for sensor, windows in zip(sensors.make(config), surveys.windows, strict=True):
+    for sensor, windows in zip(sensors.make(config), surveys.training.windows, strict=True):
         groups = grouped(windows[:number], config)
         flat = groups.reshape(-1, groups.shape[-1])
         scaling, seen = frames.scaled(make_frame(config, sensor), flat)
@@ -160,7 +160,7 @@ def class_beliefs(
     """
     number, num_classes = _num_training(config), len(config.arena.classes)
     found = _posteriors(params, config, views.groups)
-    truth = surveys.classes[: number : config.jmvae.num_together].reshape(-1)
+    truth = surveys.training.classes[: number : config.jmvae.num_together].reshape(-1)
     centres = clusters.centres(key, found.mean[:_CLUSTERED], num_classes)
     members = clusters.nearest(found.mean, centres)
     of_class = clusters.named(members, truth, num_classes)
@@ -179,15 +179,17 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
         key: Key,
         config: Config,
         *,
+        surveys: Surveys,
         examples: tuple[Examples, ...],
         params: Params,
         views: Views,
         classes: Belief,
         shown: Shown,
     ) -> tuple[Encoder, Params]:
+        del examples
         sensor, number = config.modalities[modality], num_looks(config)
-        given = gating.first(examples[modality], number)
-        offset, scale = networks.statistics(given.windows)
+        windows = surveys.training.looks(modality).windows
+        offset, scale = networks.statistics(windows[:number])
         is_range = sensors.make(config)[modality].measures_distance
         encoder = Encoder(
             params=params["encoders"][sensor],
@@ -200,16 +202,23 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
             shape=make_shape(config),
             label_of_class=config.label_of_class(sensor),
         )
-        others, taken_for = examples[modality].windows[number:], shown.calibrating.reshape(-1)
+        others, taken_for = windows[number:], shown.calibrating.reshape(-1)
         if len(others):
             encoder = leave_one_out.calibrate(encoder, others, taken_for)
         return encoder, encoder.gate.params
 
     def problem(
-        config: Config, encoder: Encoder, *, examples: tuple[Examples, ...], **_: object
+        config: Config,
+        encoder: Encoder,
+        *,
+        surveys: Surveys,
+        examples: tuple[Examples, ...],
+        **_: object,
     ) -> gates.Fitting:
-        given = gating.first(examples[modality], num_looks(config))
-        return gating.of_gate(config.detector, encoder.gate, given)
+        number = num_looks(config)
+        given = gating.first(examples[modality], number)
+        windows = surveys.training.looks(modality).windows[:number]
+        return gating.of_gate(config.detector, encoder.gate, given, windows)
 
     def trained(
         config: Config,
@@ -225,6 +234,7 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
     return fit_stage(
         name,
         {
+            "surveys": "survey",
             "examples": "examples",
             "params": "best_jmvae",
             "views": "views",
@@ -255,15 +265,17 @@ def shown(
     del key
     num_train, num_bank, _, _ = perception.num_scenes(config)
 
-    def of_scenes(part: slice) -> jax.Array:
+    def of_scenes(survey: Survey, part: slice) -> jax.Array:
         if part.start == part.stop:
             return jnp.zeros((0, config.arena.num_pois), jnp.int32)
-        of_groups = _shown(config, params, views, classes, surveys, part)
+        of_groups = _shown(config, params, views, classes, survey, part)
         of_groups = of_groups.reshape(-1, config.arena.num_pois)
         return jnp.repeat(of_groups, config.jmvae.num_together, axis=0)
 
     calibrating = slice(_num_training(config), num_train)
-    return Shown(of_scenes(calibrating), of_scenes(slice(num_train, num_train + num_bank)))
+    return Shown(
+        of_scenes(surveys.training, calibrating), of_scenes(surveys.others, slice(0, num_bank))
+    )
 
 
 def detect(
@@ -308,14 +320,14 @@ def _shown(
     params: Params,
     views: Views,
     classes: Belief,
-    surveys: Surveys,
+    survey: Survey,
     part: slice,
     first: int | None = None,
 ) -> jax.Array:
     """`[P]` int32 classes that the first looks by each sensor, or all, show together."""
     groups = tuple(
         jax.lax.map(jax.vmap(scaling), grouped(x[part], config)[:, :first], batch_size=512)
-        for scaling, x in zip(views.scalings, surveys.windows, strict=True)
+        for scaling, x in zip(views.scalings, survey.windows, strict=True)
     )
     return clusters.nearest(_posteriors(params, config, groups).mean, classes.mean)
 
@@ -337,13 +349,12 @@ def accuracies(
       `pair` after one look by each sensor, and `all_looks` after `jmvae.looks` by each.
     """
     del key
-    num_train, num_bank, num_held_out, _ = perception.num_scenes(config)
-    start = num_train + num_bank
-    part = slice(start, start + num_held_out)
-    truth = surveys.classes[part][:: config.jmvae.num_together].reshape(-1)
+    _, num_bank, num_held_out, _ = perception.num_scenes(config)
+    part = slice(num_bank, num_bank + num_held_out)
+    truth = surveys.others.classes[part][:: config.jmvae.num_together].reshape(-1)
 
     def share(first: int | None) -> jax.Array:
-        shown = _shown(config, params, views, classes, surveys, part, first)
+        shown = _shown(config, params, views, classes, surveys.others, part, first)
         return jnp.mean(shown == truth)
 
     return {"pair": share(1), "all_looks": share(None)}

@@ -39,6 +39,12 @@ def _no_progress(*_: Output, **__: Output) -> tuple[Output, Progress]:
     raise TypeError("a stage without steps does not advance")
 
 
+def _whole(config: Config, output: Output) -> Output:
+    """`divide` of a stage whose output stays as it is."""
+    del config
+    return output
+
+
 def _state(config: Config, state: Output, **_: Output) -> Output:
     """`finish` of a stage whose output is its state."""
     del config
@@ -61,6 +67,8 @@ class Stage:
       is_optional: whether the stage may diverge, because a later one picks a finite one of several.
       is_passing: whether only other stages need the output, so that a run holds it no longer than
         they do.
+      divide: `(config, output of begin) -> output`, for stages without chunks. It only slices rows,
+        and a run calls it on the host, where slices are no copies.
     """
 
     name: str
@@ -72,6 +80,7 @@ class Stage:
     chunks: int = 0
     is_optional: bool = False
     is_passing: bool = False
+    divide: Callable[[Config, Output], Output] = _whole
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -126,7 +135,7 @@ def compose(key: Key, config: Config, stages: Sequence[Stage]) -> Learned:
     finite = [jnp.bool_(True)]
     for stage in stages:
         inputs = stage.select(outputs)
-        state = stage.begin(stage.key(key), config, **inputs)
+        state = stage.divide(config, stage.begin(stage.key(key), config, **inputs))
         if stage.chunks:
 
             def advance(state: Output, key: Key) -> tuple[Output, Progress]:

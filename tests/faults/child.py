@@ -31,7 +31,7 @@ from jaxsense.dqn.training import DqnState
 from jaxsense.run import cli
 from jaxsense.run.compilation import Program
 from jaxsense.show import plots
-from jaxsense.training.perception import Surveys
+from jaxsense.training.perception import Survey
 from jaxsense.training.stage import Progress
 
 NAN_STEP = 17
@@ -79,7 +79,7 @@ def with_nan(output: Any, number: int) -> Any:
     if isinstance(output, tuple) and isinstance(output[-1], Progress):
         state, progress = output
         return with_bad_params(state, number), progress
-    if isinstance(output, Surveys):
+    if isinstance(output, Survey):
         return dataclasses.replace(output, windows=poisoned(output.windows, number))
     return poisoned(output, number)
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jaxsense.core.types import Belief
 from jaxsense.sim.world import make_world
 from jaxsense.training import perception
 from jaxsense.training.gating import Examples
-from jaxsense.training.perception import Detections, Surveys
+from jaxsense.training.perception import Detections, Survey, Surveys
 from jaxsense.vae import detectors, gate, jmvae
 
 
@@ -27,10 +27,14 @@ def bank_of(bank) -> Detections:
     return Detections(bank, nothing, nothing, nothing)
 
 
-def examples_of(windows, labels) -> Examples:
-    """Examples whose looks at nothing are those at PoIs."""
-    looks = gate.Looks(windows, jnp.ones(len(windows)))
-    return Examples(windows, labels, looks.distances, looks, looks)
+def given_to_detectors(windows, labels):
+    """Inputs of a detector's stage, of one PoI a scene; looks at nothing are those at PoIs."""
+    looks, nothing = gate.Looks(windows, jnp.ones(len(windows))), cast("Any", ())
+    examples = Examples(labels, looks.distances, looks, looks)
+    survey = Survey(
+        labels[:, None], nothing, (windows[:, None],) * 2, jnp.ones((len(labels), 2, 1))
+    )
+    return {"surveys": Surveys(survey, nothing), "examples": (examples, examples)}
 
 
 @pytest.mark.parametrize(("share", "trained_on"), [(0.0, 10), (0.1, 9), (0.25, 7), (0.5, 5)])
@@ -39,7 +43,7 @@ def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, m
     config = dataclasses.replace(TINY, detector=config)
     # Of .25 of ten looks, three calibrate.
     windows, labels = jnp.arange(20.0).reshape(10, 2), jnp.arange(10) % 2
-    examples, used = (examples_of(windows, labels),) * 2, {}
+    given, used = given_to_detectors(windows, labels), {}
 
     def fit(key, state, problem, number):
         used["train"], used["labels"] = problem.detector.windows, problem.detector.labels
@@ -54,9 +58,9 @@ def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, m
     monkeypatch.setattr(supervised, "fit", fit)
     monkeypatch.setattr(detectors, "calibrate", calibrate)
     stage = stage_of("detector_lidar", config)
-    state = stage.begin(KEY, config, examples=examples)
-    state, _ = stage.advance(KEY, config, state, examples=examples)
-    found = stage.finish(config, state, examples=examples)
+    state = stage.begin(KEY, config, **given)
+    state, _ = stage.advance(KEY, config, state, **given)
+    found = stage.finish(config, state, **given)
     np.testing.assert_allclose(state[0].offset, windows[:trained_on].mean(axis=0))
     np.testing.assert_array_equal(used["train"], windows[:trained_on])
     np.testing.assert_array_equal(used["shown"], windows[:trained_on])
@@ -71,17 +75,17 @@ def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, m
 @pytest.mark.slow
 def test_without_calibration_a_detector_is_what_was_trained():
     windows, labels = jax.random.normal(KEY, (48, 6)), jnp.arange(48) % 2
-    examples, config = (examples_of(windows, labels),) * 2, TINY.detector
+    given, config = given_to_detectors(windows, labels), TINY.detector
     assert config.calibration == 0
     stage = stage_of("detector_camera")
-    state = stage.begin(KEY, TINY, examples=examples)
+    state = stage.begin(KEY, TINY, **given)
     detector = detectors.init(KEY, windows, 2, config)
     problem = detectors.Fitting(config, detector, windows, labels)
     fit = supervised.start(detector.params, config)
     for key in stage.chunk_keys(KEY)[:2]:
-        state, _ = stage.advance(key, TINY, state, examples=examples)
+        state, _ = stage.advance(key, TINY, state, **given)
         fit, _ = supervised.fit(key, fit, problem, 3)
-    found = stage.finish(TINY, state, examples=examples)
+    found = stage.finish(TINY, state, **given)
     # Its gate, which learns in the same steps, leaves it as it is.
     expected = dataclasses.replace(detector, params=fit.params, gate=found.gate)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
@@ -150,8 +154,8 @@ def test_of_inexact_restarts_the_most_exact_is_kept():
 
 
 @pytest.fixture
-def surveys(monkeypatch) -> Surveys:
-    """Surveys whose windows, and scenes, hold the key that the scene was simulated with."""
+def surveys(monkeypatch) -> Survey:
+    """A survey whose windows, and scenes, hold the key that the scene was simulated with."""
 
     def survey(keys, world, classes, is_empty, places):
         key = jax.random.key_data(keys)[:, -1].astype(jnp.uint32)
@@ -202,21 +206,24 @@ def used(arrays):
 
 def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeypatch):
     assert len(used(surveys.scenes)) == sum(perception.num_scenes(MEASURED))  # no key twice
-    trained_on = []
+    trained_on, shown_to_gates = [], []
 
     def fit(key, state, problem, number):
         trained_on.append(np.asarray(problem.detector.windows))
+        shown_to_gates.append(np.asarray(problem.gate.shown.windows))
         return state, jnp.zeros(number)
 
     listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
     monkeypatch.setattr(supervised, "fit", fit)
     monkeypatch.setattr(detectors, "detect", lambda detector, window: window)
-    examples = jax.jit(listed["examples"].begin)(KEY, MEASURED, surveys=surveys)
+    divided = listed["survey"].divide(MEASURED, surveys)
+    examples = jax.jit(listed["examples"].begin)(KEY, MEASURED, surveys=divided)
+    given = {"surveys": divided, "examples": examples}
     for name in ("detector_camera", "detector_lidar"):
-        state = listed[name].begin(KEY, MEASURED, examples=examples)
-        listed[name].advance(KEY, MEASURED, state, examples=examples)
+        state = listed[name].begin(KEY, MEASURED, **given)
+        listed[name].advance(KEY, MEASURED, state, **given)
     detections = jax.jit(listed["detections"].begin)
-    found = detections(KEY, MEASURED, surveys=surveys, trained=(None, None))
+    found = detections(KEY, MEASURED, surveys=divided, trained=(None, None))
 
     seen, bank, held_out = used(trained_on), used(found.bank), used(found.held_out)
     starts, plotted = used(found.starts.scenes), used(found.windows)
@@ -227,8 +234,8 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
     # All of them were looked at.
     assert len(seen) >= 31 / 3
     # Gates learn from the same scenes, and from empty ones that nothing else uses.
-    shown, checks = used(examples[0].windows), used(examples[0].checks.windows)
-    assert shown == seen
+    checks = used(examples[0].checks.windows)
+    assert used(shown_to_gates) == seen
     assert checks <= bank | starts
     assert set(examples[0].distances.tolist()) == {1.0}
     is_empty = np.asarray(surveys.distances[:, 0, 0]) == 2

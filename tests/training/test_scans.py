@@ -1,7 +1,7 @@
 """A JMVAE that learns from scans: groups of looks, and labels that only name what it has found."""
 
 import dataclasses
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -109,7 +109,9 @@ def test_groups_hold_all_looks_at_one_poi():
 def test_no_label_enters_the_training(learned):
     """Other labels of the same scenes change names, and nothing that is learned."""
     surveys = learned.outputs["survey"]
-    other = dataclasses.replace(surveys, classes=(surveys.classes + 1) % 3)
+    training = surveys.training
+    training = dataclasses.replace(training, classes=(training.classes + 1) % 3)
+    other = dataclasses.replace(surveys, training=training)
     both = surveys, other
     views = [begun(stages_of(TINY)["views"], TINY, {"survey": s}) for s in both]
     for one, two in zip(*map(jax.tree.leaves, views), strict=True):
@@ -133,7 +135,7 @@ def test_encoders_are_detectors(learned):
         bank = outputs["detections"].bank[m]
         assert bank.shape == (3, 12, 2)
         np.testing.assert_allclose(bank.sum(axis=-1), 1, rtol=1e-5)
-        window = outputs["survey"].windows[m][0, 0]
+        window = outputs["survey"].others.windows[m][0, 0]
         assert jax.eval_shape(encoder.features, window).shape == (2,)
         assert np.isfinite(encoder.gate.threshold)
     grouped = outputs["grouped"]
@@ -174,7 +176,7 @@ def test_a_jmvae_of_scans_needs_a_filter():
 
 def test_what_all_looks_show_is_the_class_nearest_to_their_posterior(learned):
     outputs, shape = learned.outputs, make_shape(TINY)
-    num_train, num_bank, *_ = perception.num_scenes(TINY)
+    num_bank = perception.num_scenes(TINY)[1]
     classes = np.asarray(outputs["class_beliefs"].mean)
 
     posterior = jax.jit(lambda given: leave_one_out.posterior(outputs["best_jmvae"], shape, given))
@@ -185,27 +187,28 @@ def test_what_all_looks_show_is_the_class_nearest_to_their_posterior(learned):
         )
     )
 
-    def plain(scene, poi):
+    def plain(survey, scene, poi):
         """From the three looks by each sensor at a PoI, of which `scene` is the first."""
-        windows = [np.asarray(x)[scene : scene + 3, poi] for x in outputs["survey"].windows]
+        windows = [np.asarray(x)[scene : scene + 3, poi] for x in survey.windows]
         mean = posterior(in_frames(windows)).mean
         return np.argmin(np.sum((classes - np.asarray(mean)) ** 2, axis=1))
 
-    shown = outputs["shown"]
+    shown, surveys = outputs["shown"], outputs["survey"]
+    calibrating = jax.tree.map(lambda x: x[-12:], surveys.training)
     assert shown.bank.shape == (num_bank, 3)
     assert shown.calibrating.shape == (12, 3)
     for scene, poi in ((0, 0), (3, 2), (9, 1)):
-        for found, start in ((shown.bank, num_train), (shown.calibrating, num_train - 12)):
-            expected = plain(start + scene, poi)
+        for found, survey in ((shown.bank, surveys.others), (shown.calibrating, calibrating)):
+            expected = plain(survey, scene, poi)
             np.testing.assert_array_equal(found[scene : scene + 3, poi], expected)
 
 
 def test_encoders_are_calibrated_with_looks_that_nothing_learned_from(learned, monkeypatch):
     """A quarter of 14 groups of scenes, rounded up: 4 groups of 3."""
     outputs, stage = learned.outputs, stages_of(TINY)["detector_camera"]
-    num_train, size = perception.num_scenes(TINY)[0], outputs["survey"].windows[0].shape[-1]
-    assert num_train == 42
-    windows = np.asarray(outputs["survey"].windows[0][:42])
+    windows = np.asarray(outputs["survey"].training.windows[0])
+    num_train, _, size = windows.shape
+    assert num_train == perception.num_scenes(TINY)[0] == 42
     given = []
 
     def calibrate(encoder, *given_here):
@@ -248,9 +251,9 @@ def test_no_two_starts_of_live_episodes_show_the_same_pois(monkeypatch):
     total = num_train + num_bank + num_held_out + num_empty
     group = jnp.arange(total) // 3
     windows = tuple(jnp.zeros((total, 3, 1)) for _ in range(2))
-    surveyed: Any = perception.Surveys(
-        jnp.repeat(group[:, None], 3, axis=1) % 3, group, windows, jnp.ones((total, 2, 3))
-    )
+    classes, scenes = jnp.repeat(group[:, None], 3, axis=1) % 3, cast("Any", group)
+    survey = perception.Survey(classes, scenes, windows, jnp.ones((total, 2, 3)))
+    surveyed = perception.divide(config, survey)
     monkeypatch.setattr(looks, "detect_all", lambda trained, windows: windows)
     found = perception.detect(KEY, config, surveys=surveyed, trained=()).starts
     np.testing.assert_array_equal(found.scenes, num_train // 3 + np.arange(64))

@@ -58,7 +58,7 @@ def test_every_stage_of_learn_is_that_of_a_run(trained):
         begin_keys, chunk_keys = jax.vmap(stage.key)(keys), keys
         if has_rows(stage):
             inputs = jax.tree.map(lambda x: x[:2], inputs)
-            of_run = jax.tree.map(lambda x: x[:2], found.outputs[stage.name])
+            of_run = jax.tree.map(lambda x: x[:2], found.outputs[stage.name].training)
         elif stage.chunks:
             chunk_keys = jax.vmap(stage.chunk_keys)(keys)[:, 0]
             state = compiled.begin(begin_keys[0], config, inputs)
