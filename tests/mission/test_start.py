@@ -43,7 +43,7 @@ def started():
 
 
 def test_robots_start_at_the_first_places_with_room_and_ways_to_all_pois(started):
-    number = only_cut_off = only_too_close = 0
+    number = only_cut_off = only_too_close = latest = 0
     for candidates, room, has_ways, poses in zip(*started, strict=True):
         taken = np.full((1, 2), 9.0)
         for robot in range(2):
@@ -55,10 +55,11 @@ def test_robots_start_at_the_first_places_with_room_and_ways_to_all_pois(started
             first = np.argmax(is_right)
             np.testing.assert_allclose(poses[robot], candidates[robot, first], atol=1e-6)
             taken = np.append(taken, poses[robot][None, :2], axis=0)
-            number += 1
+            number, latest = number + 1, max(latest, first)
             only_cut_off += np.any((has_room & is_apart & ~has_ways[robot])[:first])
             only_too_close += np.any((has_room & has_ways[robot] & ~is_apart)[:first])
     assert number > 120
+    assert latest >= 2 * begin._CHECKED_AT_ONCE
     # All conditions matter.
     assert only_cut_off > 0
     assert only_too_close > 0
