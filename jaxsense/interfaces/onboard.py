@@ -161,7 +161,8 @@ def _tell(config: Config, m: int) -> Function:
         "weight": Input((), "from `weigh`"),
     }
     outputs = {"evidence": "logarithm of each class's likelihood given the look, up to a constant"}
-    return Function("What a look adds to the sum of a robot's own looks.", inputs, outputs, apply)
+    about = "The evidence of a look, for the sum of a robot's own looks."
+    return Function(about, inputs, outputs, apply)
 
 
 def _merge(config: Config) -> Function:

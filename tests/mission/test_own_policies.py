@@ -17,6 +17,7 @@ from jaxsense.dqn.policies import Policy
 from jaxsense.mission import choice, decide
 from jaxsense.mission.state import DRIVING, FAILED
 from jaxsense.run import cli, pipeline, programs
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import ALONE
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.sim import arena as arenas
@@ -207,7 +208,8 @@ def test_own_policies_reach_the_missions_of_a_run(team, monkeypatch):
     played = lambda mission, compiler, batch, workers: mission  # noqa: E731
     monkeypatch.setattr(programs.missions, "Player", played)
     run = SimpleNamespace(config=CONFIG, policies=OWN, workers=ALONE, player=Future())
-    programs._trace_missions(run, None)  # pyright: ignore[reportArgumentType]
+    with Compiler(Monitor()) as compiler:
+        programs._trace_missions(run, compiler)  # pyright: ignore[reportArgumentType]
     assert [*run.player.result().policies] == [*POLICIES, *OWN]
 
 
