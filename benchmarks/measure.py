@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
+from jaxtyping import PyTree
 from matplotlib.figure import Figure
 
 from jaxsense.run import cli, devices, version
@@ -229,6 +231,11 @@ def compare(
         batch=sides[0].batch,
         num_devices=sides[0].num_devices,
     )
+
+
+def joined(parts: list[PyTree]) -> PyTree:
+    """The results of several threads as one batch, on the host."""
+    return jax.tree.map(lambda *x: np.concatenate([np.asarray(each) for each in x]), *parts)
 
 
 def seconds(run: Callable[[], Any]) -> float:

@@ -350,7 +350,7 @@ def _check(ours: Side, theirs: Side, tolerance: float, share: float) -> None:
     poses, others = (
         np.asarray(found[0]).reshape(-1, 3)
         for found in (
-            devices.joined(found) if isinstance(found, list) else found
+            measure.joined(found) if isinstance(found, list) else found
             for found in (ours.run(), theirs.run())
         )
     )

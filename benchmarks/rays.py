@@ -193,7 +193,7 @@ def _warp_side(cast: Callable[..., Callable[[], Any]], world: World, placed: mjx
 
 def _check(ours: Side, theirs: Sequence[tuple[np.ndarray, ...]]) -> None:
     """Raises a `RuntimeError` if `[B, rays]` distances or geoms of a robot differ."""
-    for hits, (distance, geom) in zip(devices.joined(ours.run()), theirs, strict=True):
+    for hits, (distance, geom) in zip(measure.joined(ours.run()), theirs, strict=True):
         is_close = np.abs(np.asarray(hits.distance) - distance) <= _TOLERANCE
         is_right = (is_close & (np.asarray(hits.geom) == geom)).mean()
         if is_right < 1 - _GRAZING:
