@@ -1,0 +1,409 @@
+"""Figures of runs with different seeds: `python -m benchmarks.seeds RUN...`.
+
+Reads finished runs of presets and their evaluations, and writes `benchmarks/results/seeds.json`,
+from which `python -m benchmarks.results` makes the tables of README and of docs/figures.md.
+"""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from jaxsense import summary
+from jaxsense.config import ConfigError
+from jaxsense.config.checks import check_fields
+from jaxsense.config.options import Name
+from jaxsense.run import cli
+
+PROGRAM = "benchmarks.seeds"
+FILE = Path(__file__).parent / "results" / "seeds.json"
+
+Figures = Mapping[str, Any]
+"""Of one run, by name: numbers, or lists with one for each agent."""
+
+_PAPER = {
+    "camera": [True, False, False],
+    "lidar": [False, False, True],
+    "joint": [True, True, True],
+}
+"""Table I: which classes each encoder tells apart."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Gathers figures of runs that differ in their seeds."""
+
+    runs: Annotated[tuple[Path, ...], Name("RUN")]
+    """Directories of finished runs of presets."""
+    out: Path = FILE
+    """JSON file to write."""
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    found = gather(arguments.runs)
+    arguments.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+def gather(runs: Iterable[Path]) -> dict[str, Any]:
+    """Figures of runs, by preset and seed, and how they were made.
+
+    Args:
+      runs: their directories.
+
+    Raises:
+      ConfigError: if two runs have the same preset and seed, or one is not finished.
+    """
+    found: dict[str, Any] = {}
+    for run in runs:
+        written, own = json.loads((run / "config.json").read_text()), summary.read(run)
+        of_preset = found.setdefault(written["preset"], {})
+        if str(written["seed"]) in of_preset:
+            raise ConfigError("runs", str(run), "is a second run of its preset and seed")
+        of_preset[str(written["seed"])] = {
+            "commit": written["commit"],
+            "versions": own["versions"],
+            "devices": own["devices"],
+            "figures": of_summary(own),
+            "evaluations": {
+                name: _of_missions(each["mission"])
+                for name, each in summary.read_evaluations(run).items()
+            },
+        }
+    return {preset: dict(sorted(found[preset].items())) for preset in sorted(found)}
+
+
+def of_summary(own: Mapping[str, Any]) -> Figures:
+    """What tables show of a run.
+
+    Args:
+      own: its summary.
+    """
+    jmvae, agents = own["jmvae"], [*own["dqn"].values()]
+    found: dict[str, Any] = {"active_units": jmvae["active_units"]}
+    found["detectors"] = [each["accuracy"] for each in own["detectors"].values()]
+    if "unambiguous" in jmvae:
+        cells = [
+            (is_clear, sigma)
+            for name, clear in jmvae["unambiguous"].items()
+            for is_clear, sigma in zip(clear, jmvae["sigma_norm"][name], strict=True)
+        ]
+        found["table_one"] = sum(
+            is_clear == of_paper
+            for name, clear in jmvae["unambiguous"].items()
+            for is_clear, of_paper in zip(clear, _PAPER.get(name, ()), strict=False)
+        )
+        for name, wanted in ("unambiguous", True), ("ambiguous", False):
+            found[name] = [sigma for is_clear, sigma in cells if is_clear == wanted]
+    if "fusion" in jmvae:
+        found |= {f"fusion_{name}": value for name, value in jmvae["fusion"].items()}
+    for name in ("moment_matching_error", "consistent"):
+        if name in jmvae:
+            found[name] = jmvae[name]
+    found["grouped"] = jmvae.get("grouped")
+    if belief := own.get("belief"):
+        found["nll"] = belief["nll"]
+        found["nll_over_bayes"] = belief["nll"][-1] - belief["bayes_nll"][-1]
+    for name in ("return", "naive", "random", "fraction_of_optimal", "optimal_states"):
+        if all(name in agent for agent in agents):
+            found[name] = [agent[name] for agent in agents]
+    if all("optimal_permutations" in agent for agent in agents):
+        found["optimal_permutations"] = [agent["optimal_permutations"] for agent in agents]
+    return {**found, "mission": _of_missions(own["mission"])}
+
+
+def _of_missions(block: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Policies by name, with what is shown of their missions."""
+    shown = "accuracy", "observations_per_poi", "time_s", "mean_time_s", "collisions", "episodes"
+    return {
+        name: {key: each[key] for key in shown}
+        for name, each in block.items()
+        if isinstance(each, Mapping) and "accuracy" in each
+    }
+
+
+Value = Callable[[Figures], Any]
+"""Reads a number of a run, or one for each agent or policy; None if the run has none."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A row of a table that compares presets.
+
+    Attributes:
+      label: its first cell.
+      value: of a run: a number, one for each agent, or numbers of which the range is shown.
+      form: how a number is written.
+      paper: what the paper says.
+      fitted: whether the preset `paper` was fitted to it.
+      pooled: whether the numbers of a run belong to one range.
+    """
+
+    label: str
+    value: Value
+    form: str
+    paper: str = ""
+    fitted: bool = False
+    pooled: bool = False
+
+
+def _key(name: str) -> Value:
+    return lambda figures: figures[name]
+
+
+_TABLE_ONE = Row(
+    "what each sensor distinguishes, Table I", _key("table_one"), "{} of 9", paper="9 cells"
+)
+_SIGMAS = [
+    Row(
+        f"sigma norm, {name}, Fig. 4",
+        _key(name),
+        "{:.2f}",
+        paper=paper,
+        fitted=True,
+        pooled=True,
+    )
+    for name, paper in (("unambiguous", "from 1.05"), ("ambiguous", "to 1.25"))
+]
+_NEAREST = Row("fused beliefs nearest to the right class", _key("fusion_accuracy"), "{:.4f}")
+_STATES = [
+    Row("start states within 0.01 of the optimal return, of 1,728", _key("optimal_states"), "{:,}"),
+    Row("... of the 384 with different classes", _key("optimal_permutations"), "{}"),
+]
+_FRACTION = Row(
+    "reward of an episode, as a share of the optimal policy's",
+    _key("fraction_of_optimal"),
+    "{:.3f}",
+)
+OF_README = [_TABLE_ONE, *_SIGMAS, _NEAREST, _FRACTION, *_STATES]
+OF_FIGURES = [
+    _TABLE_ONE,
+    *_SIGMAS,
+    Row(
+        "latent dimensions in use, of 2",
+        _key("active_units"),
+        "{}",
+        paper="1, by the scale of Fig. 4",
+    ),
+    Row("detectors' accuracy on held-out scans", _key("detectors"), "{:.4f}"),
+    Row(
+        "moment-matching error of one sensor's posteriors",
+        _key("moment_matching_error"),
+        "{:.4f}",
+        paper="0 in theory",
+    ),
+    _NEAREST,
+    Row(
+        "distance of fused means from true pairs, in standard deviations",
+        _key("fusion_mean_error"),
+        "{:.4f}",
+    ),
+    Row("mean \\|log\\| of the ratio of their sigmas", _key("fusion_std_error"), "{:.4f}"),
+    _FRACTION,
+    Row("... DQN", _key("return"), "{:.3f}"),
+    Row("... naive exploration", _key("naive"), "{:.3f}"),
+    Row("... random", _key("random"), "{:.3f}"),
+    *_STATES,
+]
+
+
+def of_presets(found: Mapping[str, Any], rows: Iterable[Row], presets: tuple[str, ...]) -> str:
+    """A table of presets beside the paper, each cell from the minimum to the maximum of its seeds.
+
+    Args:
+      found: from `gather`.
+      rows: of the table.
+      presets: its columns.
+    """
+    names = [f"`{preset}` preset" for preset in presets]
+    lines = [_line("", "paper", *names), _line(*["---"] * (2 + len(presets)))]
+    for row in rows:
+        cells = [
+            _cell(row, [each["figures"] for each in found[preset].values()])
+            + (" (fitted)" if row.fitted and preset == "paper" else "")
+            for preset in presets
+        ]
+        lines.append(_line(row.label, row.paper, *cells))
+    command = "python -m jaxsense.train --preset PRESET --seed S"
+    return "\n".join([*lines, "", _about(found, presets, command)])
+
+
+def _cell(row: Row, runs: list[Figures]) -> str:
+    """From the minimum to the maximum over runs, for each agent if there are several."""
+    values = [row.value(figures) for figures in runs]
+    if values[0] is None:
+        return ""
+    if row.pooled:
+        return _range(row.form, [x for each in values for x in each])
+    if not isinstance(values[0], list):
+        return _range(row.form, values)
+    joint = "; " if "," in row.form else ", "
+    return joint.join(_range(row.form, list(of_agent)) for of_agent in zip(*values, strict=True))
+
+
+def _range(form: str, values: list[Any]) -> str:
+    low, high = form.format(min(values)), form.format(max(values))
+    unit = " s" if form.endswith(" s") else ""
+    return low if low == high else f"{low.removesuffix(unit)} to {high}"
+
+
+def _of_policy(key: str, *policies: str) -> Value:
+    return lambda figures: [figures["mission"][policy][key] for policy in policies]
+
+
+def _grouped(key: str) -> Value:
+    return lambda figures: figures["grouped"] and figures["grouped"][key]
+
+
+OF_RAW = [
+    Row(
+        "right at held-out PoIs, joint posterior of one look by each sensor",
+        _grouped("pair"),
+        "{:.4f}",
+    ),
+    Row("... of four looks by each", _grouped("all_looks"), "{:.4f}"),
+    _TABLE_ONE,
+    Row(
+        "least share of looks that leave the right classes open (`consistent`)",
+        lambda figures: min(x for each in figures["consistent"].values() for x in each),
+        "{:.3f}",
+    ),
+    Row("latent dimensions in use, of 2", _key("active_units"), "{}"),
+    Row("accuracy of single looks, camera, LiDAR", _key("detectors"), "{:.4f}"),
+    Row("NLL after six random looks less that of exact Bayes", _key("nll_over_bayes"), "{:.4f}"),
+    Row("accuracy of the finished map, latent", _of_policy("accuracy", "latent"), "{:.4f}"),
+    Row(
+        "looks per PoI, latent, naive",
+        _of_policy("observations_per_poi", "latent", "naive"),
+        "{:.2f}",
+    ),
+    Row("time, median, latent, naive", _of_policy("time_s", "latent", "naive"), "{:.1f} s"),
+]
+_OF_SUMMARY = (
+    ("accuracy of the finished map", "accuracy", "{:.4f}"),
+    ("looks per PoI", "observations_per_poi", "{:.2f}"),
+    ("time, median", "time_s", "{:.1f} s"),
+    ("time, mean", "mean_time_s", "{:.1f} s"),
+    ("collisions", "collisions", "{}"),
+)
+
+
+def of_missions(found: Mapping[str, Any], preset: str) -> str:
+    """Missions that trainings end with, policies side by side.
+
+    Args:
+      found: from `gather`.
+      preset: its name.
+    """
+    runs = [run["figures"]["mission"] for run in found[preset].values()]
+    policies = [*runs[0]]
+    lines = [_line("", *policies), _line(*["---"] * (1 + len(policies)))]
+    for label, key, form in _OF_SUMMARY:
+        cells = [_range(form, [run[policy][key] for run in runs]) for policy in policies]
+        lines.append(_line(label, *cells))
+    number = max(run["latent"]["episodes"] for run in runs)
+    command = f"python -m jaxsense.train --preset {preset} --seed S --mission.episodes {number}"
+    return "\n".join([*lines, "", _about(found, (preset,), command)])
+
+
+_POLICIES = {
+    "latent": "the learned policy",
+    "greedy": "highest expected gain on the map",
+    "bayes": "highest expected gain by exact Bayes",
+    "optimal": "dynamic programming",
+    "auction": "rule: an auction of PoIs",
+    "nearest": "rule: the nearest PoI worth a look",
+    "rollout": "rule: the best simulated order",
+    "naive": "one look by each robot",
+    "naive_2": "two looks by each robot",
+    "naive_3": "three looks by each robot",
+    "random": "any PoI",
+}
+_OF_MISSIONS = (
+    ("right", "accuracy", "{:.3f}"),
+    ("looks per PoI", "observations_per_poi", "{:.2f}"),
+    ("mean time", "mean_time_s", "{:.1f} s"),
+)
+
+
+def worth(found: Mapping[str, Any], names: Mapping[str, str]) -> str:
+    """Time of every policy as a multiple of the learned one's, and its wrong PoIs.
+
+    Args:
+      found: from `gather`.
+      names: of the columns, by the preset of their evaluations.
+    """
+    heads = [f"{name}: {what}" for name in names.values() for what in ("time", "wrong")]
+    lines = [_line("policy", *heads), _line(*["---"] * (1 + len(heads)))]
+    played = {preset: _evaluated(found[preset]) for preset in names}
+    for policy, what in _POLICIES.items():
+        cells = []
+        for of_seeds in played.values():
+            runs = [run for run in of_seeds if policy in run]
+            ratios = [run[policy]["mean_time_s"] / run["latent"]["mean_time_s"] for run in runs]
+            wrong = [100 * (1 - run[policy]["accuracy"]) for run in runs]
+            cells += (
+                [_range("{:.2f}", ratios), _range("{:.1f}", wrong) + " %"] if runs else ["", ""]
+            )
+        if any(cells):
+            lines.append(_line(f"`{policy}`, {what}", *cells))
+    command = "python -m jaxsense.evaluate RUN"
+    return "\n".join([*lines, "", _about(found, tuple(names), command)])
+
+
+def missions(found: Mapping[str, Any], preset: str) -> str:
+    """What every policy of a preset's evaluations reaches, over seeds.
+
+    Args:
+      found: from `gather`.
+      preset: its name.
+    """
+    heads = [head for head, _, _ in _OF_MISSIONS]
+    lines = [_line("policy", *heads), _line(*["---"] * (1 + len(heads)))]
+    runs = _evaluated(found[preset])
+    for policy in _POLICIES:
+        if shown := [run[policy] for run in runs if policy in run]:
+            cells = [_range(form, [x[key] for x in shown]) for _, key, form in _OF_MISSIONS]
+            lines.append(_line(f"`{policy}`", *cells))
+    command = f"python -m jaxsense.evaluate RUN` of `python -m jaxsense.train --preset {preset}"
+    return "\n".join([*lines, "", _about(found, (preset,), command)])
+
+
+def _evaluated(of_seeds: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """For each seed all policies of its evaluations."""
+    found = []
+    for run in of_seeds.values():
+        policies: dict[str, Any] = {}
+        for missions in run["evaluations"].values():
+            policies |= missions
+        if policies:
+            found.append(policies)
+    return found
+
+
+def _line(*cells: str) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _about(found: Mapping[str, Any], presets: tuple[str, ...], command: str) -> str:
+    """Command, seeds, commit, devices and versions of the runs of some presets."""
+    runs = [run for preset in presets for run in found[preset].values()]
+    seeds = sorted({int(seed) for preset in presets for seed in found[preset]})
+    commits = dict.fromkeys(run["commit"][:10] for run in runs)
+    kinds = dict.fromkeys(kind for run in runs for kind in run["devices"])
+    versions = runs[0]["versions"]
+    at = ", ".join(f"{name} {versions[name]}" for name in ("python", "jax", "mujoco"))
+    return (
+        f"`{command}`, seeds {seeds[0]} to {seeds[-1]}: {', '.join(kinds)}; commit "
+        f"{', '.join(commits)}; {at}."
+    )
+
+
+if __name__ == "__main__":
+    main()
