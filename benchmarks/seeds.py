@@ -7,6 +7,7 @@ from which `python -m benchmarks.results` makes the tables of README and of docs
 import dataclasses
 import json
 import sys
+from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -72,7 +73,7 @@ def gather(runs: Iterable[Path]) -> dict[str, Any]:
             "devices": own["devices"],
             "figures": of_summary(own),
             "evaluations": {
-                name: _of_missions(each["mission"])
+                name: {"num_pois": each["num_pois"], "mission": _of_missions(each["mission"])}
                 for name, each in summary.read_evaluations(run).items()
             },
         }
@@ -231,7 +232,8 @@ def of_presets(found: Mapping[str, Any], rows: Iterable[Row], presets: tuple[str
         ]
         lines.append(_line(row.label, row.paper, *cells))
     command = "python -m jaxsense.train --preset PRESET --seed S"
-    return "\n".join([*lines, "", _about(found, presets, command)])
+    runs = [each for preset in presets for each in found[preset].items()]
+    return "\n".join([*lines, "", _about(runs, command)])
 
 
 def _cell(row: Row, runs: list[Figures]) -> str:
@@ -309,7 +311,7 @@ def of_missions(found: Mapping[str, Any], preset: str) -> str:
         lines.append(_line(label, *cells))
     number = max(run["latent"]["episodes"] for run in runs)
     command = f"python -m jaxsense.train --preset {preset} --seed S --mission.episodes {number}"
-    return "\n".join([*lines, "", _about(found, (preset,), command)])
+    return "\n".join([*lines, "", _about(found[preset].items(), command)])
 
 
 _POLICIES = {
@@ -332,20 +334,20 @@ _OF_MISSIONS = (
 )
 
 
-def worth(found: Mapping[str, Any], names: Mapping[str, str]) -> str:
+def worth(found: Mapping[str, Any], names: Mapping[tuple[str, int], str]) -> str:
     """Time of every policy as a multiple of the learned one's, and its wrong PoIs.
 
     Args:
       found: from `gather`.
-      names: of the columns, by the preset of their evaluations.
+      names: of the columns, by preset and number of PoIs of their evaluations.
     """
     heads = [f"{name}: {what}" for name in names.values() for what in ("time", "wrong")]
     lines = [_line("policy", *heads), _line(*["---"] * (1 + len(heads)))]
-    played = {preset: _evaluated(found[preset]) for preset in names}
+    played = {of: _evaluated(found, *of) for of in names}
     for policy, what in _POLICIES.items():
         cells = []
         for of_seeds in played.values():
-            runs = [run for run in of_seeds if policy in run]
+            runs = [run for run in of_seeds.values() if policy in run]
             ratios = [run[policy]["mean_time_s"] / run["latent"]["mean_time_s"] for run in runs]
             wrong = [100 * (1 - run[policy]["accuracy"]) for run in runs]
             cells += (
@@ -354,55 +356,68 @@ def worth(found: Mapping[str, Any], names: Mapping[str, str]) -> str:
         if any(cells):
             lines.append(_line(f"`{policy}`, {what}", *cells))
     command = "python -m jaxsense.evaluate RUN"
-    return "\n".join([*lines, "", _about(found, tuple(names), command)])
+    used = [(seed, found[preset][seed]) for (preset, _), runs in played.items() for seed in runs]
+    return "\n".join([*lines, "", _about(used, command)])
 
 
-def missions(found: Mapping[str, Any], preset: str) -> str:
+def missions(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
     """What every policy of a preset's evaluations reaches, over seeds.
 
     Args:
       found: from `gather`.
       preset: its name.
+      num_pois: of the evaluations.
     """
     heads = [head for head, _, _ in _OF_MISSIONS]
     lines = [_line("policy", *heads), _line(*["---"] * (1 + len(heads)))]
-    runs = _evaluated(found[preset])
+    runs = _evaluated(found, preset, num_pois)
     for policy in _POLICIES:
-        if shown := [run[policy] for run in runs if policy in run]:
+        if shown := [run[policy] for run in runs.values() if policy in run]:
             cells = [_range(form, [x[key] for x in shown]) for _, key, form in _OF_MISSIONS]
             lines.append(_line(f"`{policy}`", *cells))
     command = f"python -m jaxsense.evaluate RUN` of `python -m jaxsense.train --preset {preset}"
-    return "\n".join([*lines, "", _about(found, (preset,), command)])
+    used = [(seed, found[preset][seed]) for seed in runs]
+    return "\n".join([*lines, "", _about(used, command)])
 
 
-def _evaluated(of_seeds: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """For each seed all policies of its evaluations."""
-    found = []
-    for run in of_seeds.values():
-        policies: dict[str, Any] = {}
-        for missions in run["evaluations"].values():
-            policies |= missions
-        if policies:
-            found.append(policies)
-    return found
+def _evaluated(found: Mapping[str, Any], preset: str, num_pois: int) -> dict[str, dict[str, Any]]:
+    """Policies and their missions by the seeds that were evaluated with so many PoIs."""
+    of_seeds = {
+        seed: [x["mission"] for x in run["evaluations"].values() if x["num_pois"] == num_pois]
+        for seed, run in found[preset].items()
+    }
+    return {seed: dict(ChainMap(*of_seed)) for seed, of_seed in of_seeds.items() if of_seed}
 
 
 def _line(*cells: str) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _about(found: Mapping[str, Any], presets: tuple[str, ...], command: str) -> str:
-    """Command, seeds, commit, devices and versions of the runs of some presets."""
-    runs = [run for preset in presets for run in found[preset].values()]
-    seeds = sorted({int(seed) for preset in presets for seed in found[preset]})
+def _about(of_seeds: Iterable[tuple[str, Any]], command: str) -> str:
+    """Command, seeds, commits, devices and versions of runs."""
+    seeds, runs = zip(*of_seeds, strict=True)
     commits = dict.fromkeys(run["commit"][:10] for run in runs)
     kinds = dict.fromkeys(kind for run in runs for kind in run["devices"])
-    versions = runs[0]["versions"]
-    at = ", ".join(f"{name} {versions[name]}" for name in ("python", "jax", "mujoco"))
+    at = ", ".join(
+        f"{name} {' and '.join(dict.fromkeys(run['versions'][name] for run in runs))}"
+        for name in ("python", "jax", "mujoco")
+    )
     return (
-        f"`{command}`, seeds {seeds[0]} to {seeds[-1]}: {', '.join(kinds)}; commit "
+        f"`{command}`, {_seeds(sorted({int(seed) for seed in seeds}))}: {', '.join(kinds)}; commit "
         f"{', '.join(commits)}; {at}."
     )
+
+
+def _seeds(numbers: list[int]) -> str:
+    """Seeds in words, those in a row from the first to the last."""
+    rows: list[list[int]] = []
+    for number in numbers:
+        if rows and rows[-1][-1] == number - 1:
+            rows[-1].append(number)
+        else:
+            rows.append([number])
+    parts = [f"{row[0]} to {row[-1]}" if len(row) > 1 else f"{row[0]}" for row in rows]
+    return f"seed{'s' if len(numbers) > 1 else ''} {', '.join(parts)}"
 
 
 if __name__ == "__main__":
