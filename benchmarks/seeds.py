@@ -123,7 +123,12 @@ def _of_missions(block: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Policies by name, with what is shown of their missions."""
     shown = "accuracy", "observations_per_poi", "time_s", "mean_time_s", "collisions", "episodes"
     return {
-        name: {key: each[key] for key in shown}
+        name: {
+            **{key: each[key] for key in shown},
+            "overconfidence": each["calibration"]["confidence"] - each["calibration"]["accuracy"],
+            "nll": each["calibration"]["nll"],
+            "longer": each.get("intervals", {}).get("time_s"),
+        }
         for name, each in block.items()
         if isinstance(each, Mapping) and "accuracy" in each
     }
@@ -330,7 +335,10 @@ _POLICIES = {
 _OF_MISSIONS = (
     ("right", "accuracy", "{:.3f}"),
     ("looks per PoI", "observations_per_poi", "{:.2f}"),
-    ("mean time", "mean_time_s", "{:.1f} s"),
+    ("time, median", "time_s", "{:.1f} s"),
+    ("time, mean", "mean_time_s", "{:.1f} s"),
+    ("confidence less accuracy", "overconfidence", "{:.3f}"),
+    ("NLL of the maps", "nll", "{:.3f}"),
 )
 
 
@@ -368,16 +376,21 @@ def missions(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
       preset: its name.
       num_pois: of the evaluations.
     """
-    heads = [head for head, _, _ in _OF_MISSIONS]
+    heads = [*(head for head, _, _ in _OF_MISSIONS), "seconds longer than `latent`, by seed"]
     lines = [_line("policy", *heads), _line(*["---"] * (1 + len(heads)))]
     runs = _evaluated(found, preset, num_pois)
     for policy in _POLICIES:
         if shown := [run[policy] for run in runs.values() if policy in run]:
             cells = [_range(form, [x[key] for x in shown]) for _, key, form in _OF_MISSIONS]
+            cells.append("; ".join(_interval(x["longer"]) for x in shown if x["longer"]))
             lines.append(_line(f"`{policy}`", *cells))
     command = f"python -m jaxsense.evaluate RUN` of `python -m jaxsense.train --preset {preset}"
     used = [(seed, found[preset][seed]) for seed in runs]
     return "\n".join([*lines, "", _about(used, command)])
+
+
+def _interval(of: Mapping[str, float]) -> str:
+    return f"{of['mean']:.1f} ({of['low']:.1f} to {of['high']:.1f})"
 
 
 def _evaluated(found: Mapping[str, Any], preset: str, num_pois: int) -> dict[str, dict[str, Any]]:

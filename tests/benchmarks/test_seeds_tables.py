@@ -69,7 +69,12 @@ def test_what_a_run_does_not_have_stays_empty(runs):
 
 def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     def evaluation(number, **times):
-        played = {name: {**CASE, "seed": 0, "mean_time_s": time} for name, time in times.items()}
+        longer = {"time_s": {"mean": 0.51, "low": -0.2, "high": 1.4}}
+        played = {
+            name: {**CASE, "seed": 0, "mean_time_s": time}
+            | ({"intervals": longer} if name == "auction" else {})
+            for name, time in times.items()
+        }
         return {**EVALUATION, "num_pois": number, "mission": {**EVALUATION["mission"], **played}}
 
     first = runs("many", 100, a=evaluation(8, latent=20.0, auction=19.0))
@@ -89,7 +94,10 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     assert cells(table, "`naive`") == ["0.80", "0.2 %", "1.50", "0.2 %"]
     assert "`random`" not in table
     shown = seeds.missions(found, "many", 8)
-    assert cells(shown, "`latent`") == ["0.998", "1.68", "10.0 to 20.0 s"]
+    assert cells(shown, "`latent`") == [
+        "0.998", "1.68", "13.8 s", "10.0 to 20.0 s", "-0.001", "0.013", "",
+    ]  # fmt: skip
+    assert cells(shown, "`auction`")[-1] == "0.5 (-0.2 to 1.4); 0.5 (-0.2 to 1.4)"
     assert "--preset many" in shown.splitlines()[-1]
 
 
