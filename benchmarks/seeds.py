@@ -109,8 +109,10 @@ def of_summary(own: Mapping[str, Any]) -> Figures:
             found[name] = jmvae[name]
     found["grouped"] = jmvae.get("grouped")
     if belief := own.get("belief"):
-        found["nll"] = belief["nll"]
-        found["nll_over_bayes"] = belief["nll"][-1] - belief["bayes_nll"][-1]
+        found["nll_over_bayes"] = [
+            map_ - bayes for map_, bayes in zip(belief["nll"], belief["bayes_nll"], strict=True)
+        ]
+        found["doubt_correlation"] = belief["doubt_correlation"]
     for name in ("return", "naive", "random", "fraction_of_optimal", "optimal_states"):
         if all(name in agent for agent in agents):
             found[name] = [agent[name] for agent in agents]
@@ -228,14 +230,16 @@ def of_presets(found: Mapping[str, Any], rows: Iterable[Row], presets: tuple[str
       presets: its columns.
     """
     names = [f"`{preset}` preset" for preset in presets]
-    lines = [_line("", "paper", *names), _line(*["---"] * (2 + len(presets)))]
+    rows = list(rows)
+    paper = ["paper"] if any(row.paper for row in rows) else []
+    lines = [_line("", *paper, *names), _line(*["---"] * (1 + len(paper) + len(presets)))]
     for row in rows:
-        cells = [
+        cells = [row.paper for _ in paper] + [
             _cell(row, [each["figures"] for each in found[preset].values()])
             + (" (fitted)" if row.fitted and preset == "paper" else "")
             for preset in presets
         ]
-        lines.append(_line(row.label, row.paper, *cells))
+        lines.append(_line(row.label, *cells))
     command = "python -m jaxsense.train --preset PRESET --seed S"
     runs = [each for preset in presets for each in found[preset].items()]
     return "\n".join([*lines, "", _about(runs, command)])
@@ -283,7 +287,11 @@ OF_RAW = [
     ),
     Row("latent dimensions in use, of 2", _key("active_units"), "{}"),
     Row("accuracy of single looks, camera, LiDAR", _key("detectors"), "{:.4f}"),
-    Row("NLL after six random looks less that of exact Bayes", _key("nll_over_bayes"), "{:.4f}"),
+    Row(
+        "NLL after six random looks less that of exact Bayes",
+        lambda figures: figures["nll_over_bayes"][-1],
+        "{:.4f}",
+    ),
     Row("accuracy of the finished map, latent", _of_policy("accuracy", "latent"), "{:.4f}"),
     Row(
         "looks per PoI, latent, naive",
@@ -291,6 +299,25 @@ OF_RAW = [
         "{:.2f}",
     ),
     Row("time, median, latent, naive", _of_policy("time_s", "latent", "naive"), "{:.1f} s"),
+]
+OF_MAPS = [
+    Row("accuracy of single looks, camera, LiDAR", _key("detectors"), "{:.3f}"),
+    Row(
+        "NLL of the map less that of exact Bayes, after one to six random looks",
+        _key("nll_over_bayes"),
+        "{:.3f}",
+        pooled=True,
+    ),
+    Row(
+        "correlation of sigma norm with the entropy of exact Bayes",
+        _key("doubt_correlation"),
+        "{:.3f}",
+    ),
+    Row(
+        "return of the Q-network over the optimum, camera, LiDAR",
+        _key("fraction_of_optimal"),
+        "{:.3f}",
+    ),
 ]
 _OF_SUMMARY = (
     ("accuracy of the finished map", "accuracy", "{:.4f}"),

@@ -69,7 +69,8 @@ def test_what_a_run_does_not_have_stays_empty(runs):
 
 def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     def evaluation(number, **times):
-        longer = {"time_s": {"mean": 0.51, "low": -0.2, "high": 1.4}}
+        gap = {"mean": 0.51, "low": -0.2, "high": 1.4}
+        longer = dict.fromkeys(("accuracy", "observations_per_poi", "time_s"), gap)
         played = {
             name: {**CASE, "seed": 0, "mean_time_s": time}
             | ({"intervals": longer} if name == "auction" else {})
