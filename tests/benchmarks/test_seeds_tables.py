@@ -5,7 +5,9 @@ import json
 import pytest
 from summaries import CASE, EVALUATION, GROUPED, OF_SCANS, SUMMARY
 
-from benchmarks import seeds
+from benchmarks.seeds import __main__ as program
+from benchmarks.seeds import tables
+from benchmarks.seeds.runs import gather
 from jaxsense.config import ConfigError
 
 
@@ -41,8 +43,8 @@ def test_cells_go_from_the_minimum_to_the_maximum_of_the_seeds(runs):
     low = with_jmvae(sigma_norm={name: [0.4, 1.1, 1.6] for name in ("joint", "camera", "lidar")})
     agent = {**SUMMARY["dqn"]["lidar"], "optimal_states": 1600}
     low["dqn"] = {"camera": SUMMARY["dqn"]["camera"], "lidar": agent}
-    found = seeds.gather([runs("paper", 100), runs("paper", 101, low), runs("default", 100)])
-    table = seeds.of_presets(found, seeds.OF_README, ("paper", "default"))
+    found = gather([runs("paper", 100), runs("paper", 101, low), runs("default", 100)])
+    table = tables.of_presets(found, tables.OF_README, ("paper", "default"))
     # The LiDAR of the summary tells the second class apart, and not the first.
     assert cells(table, "what each sensor") == ["9 cells", "8 of 9", "8 of 9"]
     assert cells(table, "sigma norm, unambiguous") == [
@@ -59,8 +61,8 @@ def test_what_a_run_does_not_have_stays_empty(runs):
     scans = {**OF_SCANS, "belief": {**OF_SCANS["belief"], "nll": [0.5, 0.25]}}
     scans["mission"] = {**scans["mission"], "naive": CASE}
     labelled = {**SUMMARY, "mission": scans["mission"]}
-    found = seeds.gather([runs("raw", 100, scans), runs("default", 100, labelled)])
-    table = seeds.of_presets(found, seeds.OF_RAW, ("raw", "default"))
+    found = gather([runs("raw", 100, scans), runs("default", 100, labelled)])
+    table = tables.of_presets(found, tables.OF_RAW, ("raw", "default"))
     assert cells(table, "right at held-out") == ["", f"{GROUPED['pair']:.4f}", ""]
     assert cells(table, "least share") == ["", "0.500", "0.500"]
     assert cells(table, "NLL after six")[1] == "-1.7500"
@@ -82,8 +84,8 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     second = runs("many", 101, a=evaluation(8, latent=10.0, auction=11.0, naive=8.0))
     # Another number of PoIs is another column; this one comes in two files.
     team = runs("team", 100, a=evaluation(16, latent=4.0), b=evaluation(16, latent=4.0, naive=6.0))
-    found = seeds.gather([first, second, team])
-    table = seeds.worth(found, {("many", 8): "`many`", ("team", 16): "`team`"})
+    found = gather([first, second, team])
+    table = tables.worth(found, {("many", 8): "`many`", ("team", 16): "`team`"})
     assert cells(table, "policy") == [
         "`many`: time",
         "`many`: wrong",
@@ -94,7 +96,7 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     assert cells(table, "`auction`") == ["0.95 to 1.10", "0.2 %", "", ""]
     assert cells(table, "`naive`") == ["0.80", "0.2 %", "1.50", "0.2 %"]
     assert "`random`" not in table
-    shown = seeds.missions(found, "many", 8)
+    shown = tables.missions(found, "many", 8)
     assert cells(shown, "`latent`") == [
         "0.998", "1.68", "13.8 s", "10.0 to 20.0 s", "-0.001", "0.013", "",
     ]  # fmt: skip
@@ -103,7 +105,7 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
 
 
 def test_missions_of_trainings_stand_side_by_side(runs):
-    table = seeds.of_missions(seeds.gather([runs("default", 100)]), "default")
+    table = tables.of_missions(gather([runs("default", 100)]), "default")
     assert cells(table, "time, mean") == ["14.5 s"]
     assert "--mission.episodes 128`" in table
 
@@ -111,10 +113,10 @@ def test_missions_of_trainings_stand_side_by_side(runs):
 def test_two_runs_of_a_seed_are_refused(runs, tmp_path):
     run = runs("paper", 100)
     with pytest.raises(ConfigError, match="is a second run of its preset and seed"):
-        seeds.gather([run, run])
+        gather([run, run])
 
 
 def test_the_program_writes_what_it_gathers(runs, tmp_path):
     run, out = runs("paper", 100), tmp_path / "seeds.json"
-    seeds.main([str(run), "--out", str(out)])
-    assert json.loads(out.read_text()) == json.loads(json.dumps(seeds.gather([run])))
+    program.main([str(run), "--out", str(out)])
+    assert json.loads(out.read_text()) == json.loads(json.dumps(gather([run])))

@@ -1,140 +1,11 @@
-"""Figures of runs with different seeds: `python -m benchmarks.seeds RUN...`.
-
-Reads finished runs of presets and their evaluations, and writes `benchmarks/results/seeds.json`,
-from which `python -m benchmarks.results` makes the tables of README and of docs/figures.md.
-"""
+"""Tables in Markdown of what `benchmarks.seeds.runs` has gathered."""
 
 import dataclasses
-import json
-import sys
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from jaxsense import summary
-from jaxsense.config import ConfigError
-from jaxsense.config.checks import check_fields
-from jaxsense.config.options import Name
-from jaxsense.run import cli
-
-PROGRAM = "benchmarks.seeds"
-FILE = Path(__file__).parent / "results" / "seeds.json"
-
-Figures = Mapping[str, Any]
-"""Of one run, by name: numbers, or lists with one for each agent."""
-
-_PAPER = {
-    "camera": [True, False, False],
-    "lidar": [False, False, True],
-    "joint": [True, True, True],
-}
-"""Table I: which classes each encoder tells apart."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Arguments:
-    """Gathers figures of runs that differ in their seeds."""
-
-    runs: Annotated[tuple[Path, ...], Name("RUN")]
-    """Directories of finished runs of presets."""
-    out: Path = FILE
-    """JSON file to write."""
-
-    def __post_init__(self):
-        check_fields(self)
-
-
-def main(argv: list[str] | None = None) -> None:
-    """The program."""
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    found = gather(arguments.runs)
-    arguments.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-
-
-def gather(runs: Iterable[Path]) -> dict[str, Any]:
-    """Figures of runs, by preset and seed, and how they were made.
-
-    Args:
-      runs: their directories.
-
-    Raises:
-      ConfigError: if two runs have the same preset and seed, or one is not finished.
-    """
-    found: dict[str, Any] = {}
-    for run in runs:
-        written, own = json.loads((run / "config.json").read_text()), summary.read(run)
-        of_preset = found.setdefault(written["preset"], {})
-        if str(written["seed"]) in of_preset:
-            raise ConfigError("runs", str(run), "is a second run of its preset and seed")
-        of_preset[str(written["seed"])] = {
-            "commit": written["commit"],
-            "versions": own["versions"],
-            "devices": own["devices"],
-            "figures": of_summary(own),
-            "evaluations": {
-                name: {"num_pois": each["num_pois"], "mission": _of_missions(each["mission"])}
-                for name, each in summary.read_evaluations(run).items()
-            },
-        }
-    return {preset: dict(sorted(found[preset].items())) for preset in sorted(found)}
-
-
-def of_summary(own: Mapping[str, Any]) -> Figures:
-    """What tables show of a run.
-
-    Args:
-      own: its summary.
-    """
-    jmvae, agents = own["jmvae"], [*own["dqn"].values()]
-    found: dict[str, Any] = {"active_units": jmvae["active_units"]}
-    found["detectors"] = [each["accuracy"] for each in own["detectors"].values()]
-    if "unambiguous" in jmvae:
-        cells = [
-            (is_clear, sigma)
-            for name, clear in jmvae["unambiguous"].items()
-            for is_clear, sigma in zip(clear, jmvae["sigma_norm"][name], strict=True)
-        ]
-        found["table_one"] = sum(
-            is_clear == of_paper
-            for name, clear in jmvae["unambiguous"].items()
-            for is_clear, of_paper in zip(clear, _PAPER.get(name, ()), strict=False)
-        )
-        for name, wanted in ("unambiguous", True), ("ambiguous", False):
-            found[name] = [sigma for is_clear, sigma in cells if is_clear == wanted]
-    if "fusion" in jmvae:
-        found |= {f"fusion_{name}": value for name, value in jmvae["fusion"].items()}
-    for name in ("moment_matching_error", "consistent"):
-        if name in jmvae:
-            found[name] = jmvae[name]
-    found["grouped"] = jmvae.get("grouped")
-    if belief := own.get("belief"):
-        found["nll_over_bayes"] = [
-            map_ - bayes for map_, bayes in zip(belief["nll"], belief["bayes_nll"], strict=True)
-        ]
-        found["doubt_correlation"] = belief["doubt_correlation"]
-    for name in ("return", "naive", "random", "fraction_of_optimal", "optimal_states"):
-        if all(name in agent for agent in agents):
-            found[name] = [agent[name] for agent in agents]
-    if all("optimal_permutations" in agent for agent in agents):
-        found["optimal_permutations"] = [agent["optimal_permutations"] for agent in agents]
-    return {**found, "mission": _of_missions(own["mission"])}
-
-
-def _of_missions(block: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Policies by name, with what is shown of their missions."""
-    shown = "accuracy", "observations_per_poi", "time_s", "mean_time_s", "collisions", "episodes"
-    return {
-        name: {
-            **{key: each[key] for key in shown},
-            "overconfidence": each["calibration"]["confidence"] - each["calibration"]["accuracy"],
-            "nll": each["calibration"]["nll"],
-            "longer": each.get("intervals", {}).get("time_s"),
-        }
-        for name, each in block.items()
-        if isinstance(each, Mapping) and "accuracy" in each
-    }
-
+from benchmarks.seeds.runs import Figures
 
 Value = Callable[[Figures], Any]
 """Reads a number of a run, or one for each agent or policy; None if the run has none."""
@@ -458,7 +329,3 @@ def _seeds(numbers: list[int]) -> str:
             rows.append([number])
     parts = [f"{row[0]} to {row[-1]}" if len(row) > 1 else f"{row[0]}" for row in rows]
     return f"seed{'s' if len(numbers) > 1 else ''} {', '.join(parts)}"
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,39 @@
+"""The program, see `benchmarks.seeds`."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from benchmarks.seeds.runs import gather
+from jaxsense.config.checks import check_fields
+from jaxsense.config.options import Name
+from jaxsense.run import cli
+
+PROGRAM = "benchmarks.seeds"
+FILE = Path(__file__).parents[1] / "results" / "seeds.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Gathers figures of runs that differ in their seeds."""
+
+    runs: Annotated[tuple[Path, ...], Name("RUN")]
+    """Directories of finished runs of presets."""
+    out: Path = FILE
+    """JSON file to write."""
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    found = gather(arguments.runs)
+    arguments.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
