@@ -1,31 +1,42 @@
-"""Writes the tables of `benchmarks/RESULTS.md`: `python -m benchmarks.results`.
+"""Writes the tables of README, `docs` and `benchmarks/RESULTS.md`: `python -m benchmarks.results`.
 
-Each table stands between two comments and shows one file of `benchmarks/results`, which
-`python -m benchmarks --json` has written.
+Each table stands between two comments, of which the first names a file of `benchmarks/results` and,
+if that file makes several, the table.
 """
 
 import json
 import re
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.seeds import tables
+
 _HERE = Path(__file__).parent
-PAGE = _HERE / "RESULTS.md"
 RESULTS = _HERE / "results"
-_BLOCK = re.compile(r"(<!-- (?P<name>[\w-]+)\.json -->\n).*?(<!-- end -->)", re.DOTALL)
+PAGES = (
+    _HERE.parent / "README.md",
+    _HERE.parent / "docs" / "figures.md",
+    _HERE / "RESULTS.md",
+)
+_BLOCK = re.compile(
+    r"(<!-- (?P<file>[\w-]+\.json)(?: (?P<table>[\w-]+))? -->\n).*?(<!-- end -->)", re.DOTALL
+)
 
 
 def main() -> None:
     """The program."""
-    PAGE.write_text(written(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in PAGES:
+        page.write_text(written(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 def written(page: str) -> str:
     """The page with tables of the present results."""
 
     def block(found: re.Match[str]) -> str:
-        rows = json.loads((RESULTS / f"{found['name']}.json").read_text(encoding="utf-8"))
-        return f"{found[1]}\n{table(rows)}\n\n{found[3]}"
+        content = json.loads((RESULTS / found["file"]).read_text(encoding="utf-8"))
+        return f"{found[1]}\n{TABLES[found['file']][found['table']](content)}\n\n{found[4]}"
 
     return _BLOCK.sub(block, page)
 
@@ -73,6 +84,22 @@ def _about(rows: list[dict[str, Any]]) -> str:
 def number(value: float) -> str:
     """Three digits and more, with thousands apart."""
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+TABLES: Mapping[str, Mapping[str | None, Callable[[Any], str]]] = {
+    **dict.fromkeys(("cpu.json", "h100.json", "h100x2.json"), {None: table}),
+    "seeds.json": {
+        "readme": partial(tables.of_presets, rows=tables.OF_README, presets=("paper", "default")),
+        "worth": partial(tables.worth, names=tables.EVALUATED),
+        "paper": partial(tables.of_presets, rows=tables.OF_FIGURES, presets=("paper", "default")),
+        "default": partial(tables.of_missions, preset="default"),
+        "raw": partial(tables.of_presets, rows=tables.OF_RAW, presets=("raw", "default")),
+        "noisy": partial(tables.missions, preset="noisy", num_pois=3),
+        "maps": partial(tables.of_presets, rows=tables.OF_MAPS, presets=("noisy", "many")),
+        "many": partial(tables.missions, preset="many", num_pois=8),
+    },
+}
+"""What makes each table of a file, by their names."""
 
 
 if __name__ == "__main__":

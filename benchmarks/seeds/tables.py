@@ -240,6 +240,15 @@ _OF_MISSIONS = (
 )
 
 
+EVALUATED = {
+    ("default", 3): "`default`",
+    ("noisy", 3): "`noisy`",
+    ("many", 8): "`many`",
+    ("team", 16): "`team`, 16 PoIs",
+}
+"""Columns of README's table, by preset and number of PoIs."""
+
+
 def worth(found: Mapping[str, Any], names: Mapping[tuple[str, int], str]) -> str:
     """Time of every policy as a multiple of the learned one's, and its wrong PoIs.
 

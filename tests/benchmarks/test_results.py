@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from benchmarks import ROWS, results
 
 ROW = {
@@ -23,15 +25,24 @@ def test_a_table_shows_what_was_measured_where_and_when():
     )
 
 
-def test_the_page_shows_the_stored_results():
-    page = results.PAGE.read_text(encoding="utf-8")
-    assert results.written(page) == page, "run python -m benchmarks.results"
+def test_pages_show_the_stored_results():
+    text = ""
+    for path in results.PAGES:
+        page = path.read_text(encoding="utf-8")
+        assert results.written(page) == page, "run python -m benchmarks.results"
+        text += page
     for path in results.RESULTS.glob("*.json"):
-        assert f"<!-- {path.name} -->" in page
-        rows = json.loads(path.read_text(encoding="utf-8"))
-        assert {row["row"] for row in rows} <= ROWS.keys()
-        for row in rows:
-            assert f"| `{row['row']}` |" in page
+        for name in results.TABLES[path.name]:
+            assert f"<!-- {path.name}{f' {name}' if name else ''} -->" in text
+
+
+@pytest.mark.parametrize("name", ["cpu", "h100", "h100x2"])
+def test_every_row_is_shown(name):
+    page = results.PAGES[-1].read_text(encoding="utf-8")
+    rows = json.loads((results.RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    assert {row["row"] for row in rows} <= ROWS.keys()
+    for row in rows:
+        assert f"| `{row['row']}` |" in page
 
 
 def test_other_text_of_the_page_stays(tmp_path, monkeypatch):
