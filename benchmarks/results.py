@@ -87,7 +87,7 @@ def number(value: float) -> str:
 
 
 TABLES: Mapping[str, Mapping[str | None, Callable[[Any], str]]] = {
-    **dict.fromkeys(("cpu.json", "h100.json", "h100x2.json"), {None: table}),
+    **{name: {None: table} for name in ("cpu.json", "h100.json", "h100x2.json")},
     "seeds.json": {
         "readme": partial(tables.of_presets, rows=tables.OF_README, presets=("paper", "default")),
         "worth": partial(tables.worth, names=tables.EVALUATED),

@@ -1,0 +1,62 @@
+"""Figures on pages come from JSON files; those that were typed by hand may only become fewer."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [
+    "README.md",
+    "benchmarks/RESULTS.md",
+    *sorted(f"docs/{x.name}" for x in (ROOT / "docs").glob("*.md")),
+]
+# Measured once, by commands that the page names, whose results no file holds. Lower a number when
+# a table of its page is made from JSON; never raise one.
+TYPED = {
+    "benchmarks/RESULTS.md": 45,
+    "docs/concepts.md": 30,
+    "docs/differences.md": 63,
+    "docs/extending.md": 12,
+    "docs/figures.md": 878,
+    "docs/getting-started.md": 24,
+    "docs/imperfect.md": 303,
+    "docs/interfaces.md": 51,
+    "docs/raw.md": 892,
+    "docs/recorded.md": 13,
+    "docs/tasks.md": 85,
+}
+# Tables from JSON, code, addresses, equations, and versions, which are no results.
+NOT_PROSE = [
+    re.compile(r"<!-- [\w-]+\.json(?: [\w-]+)? -->.*?<!-- end -->", re.DOTALL),
+    re.compile(r"```.*?```", re.DOTALL),
+    re.compile(r"^    .*$", re.MULTILINE),
+    re.compile(r"`[^`]*`"),
+    re.compile(r"\]\([^)]*\)"),
+    re.compile(r"\$[^$]*\$", re.DOTALL),
+    re.compile(r"(?:Python|JAX|mujoco|is at|Apache)[ -]\d+\.\d+(?:(?:,| and| or) \d+\.\d+)*"),
+    re.compile(r"95 %"),
+]
+FIGURE = re.compile(
+    r"(?<![\w.])-?\d+(?:,\d{3})*(?:\.\d+)?\s?(?:%|(?:s|ms|GiB|MiB)\b)|(?<![\w.])-?\d+\.\d+(?![\w.]*\d)"
+)
+
+
+def figures(page: str) -> list[str]:
+    for pattern in NOT_PROSE:
+        page = pattern.sub(" ", page)
+    return FIGURE.findall(page)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_figures_are_not_typed(page):
+    found = figures((ROOT / page).read_text(encoding="utf-8"))
+    assert len(found) <= TYPED.get(page, 0), found
+
+
+def test_what_counts_as_a_figure():
+    assert figures("takes 3.5 s, 12 %, 1,024 of 0.98 GiB") == ["3.5 s", "12 %", "0.98 GiB"]
+    assert figures("Python 3.11, 3.12 and 3.13; `--x 0.5`; $0.1$; a [link](0.4)") == []
+    assert figures(
+        "<!-- a.json b -->\n| 0.5 |\n<!-- end -->\n| 0.25 |\n```\n0.1\n```\n    0.2"
+    ) == ["0.25"]
