@@ -1,6 +1,7 @@
 """Tables in Markdown of what `benchmarks.seeds.runs` has gathered."""
 
 import dataclasses
+import re
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -129,8 +130,14 @@ def _cell(row: Row, runs: list[Figures]) -> str:
     return joint.join(_range(row.form, list(of_agent)) for of_agent in zip(*values, strict=True))
 
 
+def _written(form: str, value: Any) -> str:
+    """The number in words, without the sign of a zero."""
+    text = form.format(value)
+    return text if re.search("[1-9]", text) else text.removeprefix("-")
+
+
 def _range(form: str, values: list[Any]) -> str:
-    low, high = form.format(min(values)), form.format(max(values))
+    low, high = _written(form, min(values)), _written(form, max(values))
     unit = " s" if form.endswith(" s") else ""
     return low if low == high else f"{low.removesuffix(unit)} to {high}"
 
@@ -297,7 +304,8 @@ def missions(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
 
 
 def _interval(of: Mapping[str, float]) -> str:
-    return f"{of['mean']:.1f} ({of['low']:.1f} to {of['high']:.1f})"
+    mean, low, high = (_written("{:.1f}", of[name]) for name in ("mean", "low", "high"))
+    return f"{mean} ({low} to {high})"
 
 
 def _evaluated(found: Mapping[str, Any], preset: str, num_pois: int) -> dict[str, dict[str, Any]]:

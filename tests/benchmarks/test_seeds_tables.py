@@ -120,3 +120,9 @@ def test_the_program_writes_what_it_gathers(runs, tmp_path):
     run, out = runs("paper", 100), tmp_path / "seeds.json"
     program.main([str(run), "--out", str(out)])
     assert json.loads(out.read_text()) == json.loads(json.dumps(gather([run])))
+
+
+def test_a_zero_has_no_sign():
+    assert tables._range("{:.3f}", [-0.0001, 0.002]) == "0.000 to 0.002"
+    assert tables._range("{:.1f} s", [-0.01]) == "0.0 s"
+    assert tables._range("{:.1f}", [-0.06]) == "-0.1"
