@@ -94,7 +94,7 @@ OF_FIGURES = [
 
 
 def of_presets(found: Mapping[str, Any], rows: Iterable[Row], presets: tuple[str, ...]) -> str:
-    """A table of presets beside the paper, each cell from the minimum to the maximum of its seeds.
+    """A table of presets next to the paper, each cell from the minimum to the maximum of its seeds.
 
     Args:
       found: from `gather`.
