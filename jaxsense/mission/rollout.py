@@ -58,6 +58,7 @@ def rollout_batch(
     steps: int,
     every: int,
     parts: int = 1,
+    recorded: int = 1,
 ) -> tuple[MissionState, Record]:
     """Runs B missions side by side, and records some of them.
 
@@ -67,17 +68,21 @@ def rollout_batch(
       models: trained models.
       states: `[B]` first states.
       steps: number of control periods; static.
-      every: records the first of each group of this size; divides B. With one group per device,
-        no device waits for another's record.
+      every: records the first missions of each group of this size; divides B. With one group per
+        device, no device waits for another's record.
       parts: number of devices that share the batch, see `groups.where_due`.
+      recorded: how many of each group to record.
 
     Returns:
-      The `[B]` last states, and `[B / every, steps]` records.
+      The `[B]` last states, and `[recorded * B / every, steps]` records.
     """
+
+    def first(x: jax.Array) -> jax.Array:
+        return x.reshape(-1, every, *x.shape[1:])[:, :recorded].reshape(-1, *x.shape[1:])
 
     def go_on(states: MissionState, keys: Key):
         states, records = step(keys, mission, models, states, parts)
-        return states, jax.tree.map(lambda x: x.reshape(-1, every, *x.shape[1:])[:, 0], records)
+        return states, jax.tree.map(first, records)
 
     step_keys = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(keys)
     states, records = jax.lax.scan(go_on, states, step_keys)

@@ -16,7 +16,6 @@ from jaxsense.mission import (
     Faults,
     Mission,
     MissionState,
-    Record,
     make_mission,
     measure,
     no_faults,
@@ -24,27 +23,17 @@ from jaxsense.mission import (
     rollout_batch,
 )
 from jaxsense.models import Models, init
-from jaxsense.run import devices
+from jaxsense.run import devices, films
 from jaxsense.run.batches import chunk_of
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.films import Films, Recording
 from jaxsense.run.ledger import Ledger
 from jaxsense.run.monitor import StageError
 
 Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
 
-
-@pytree
-class Recording:
-    """A whole mission.
-
-    Attributes:
-      end: its last state.
-      records: `[steps]` records of all control periods; after the end, the last one repeats.
-    """
-
-    end: MissionState
-    records: Record
+_BESIDE = "naive"  # whose first mission is recorded beside that of the first case
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,11 +44,14 @@ class Played:
       metrics: `[episodes, ...]` metrics of each case; see `mission.measure`.
       recording: the first mission of the first case.
       control_steps: total number of control periods, until each mission's end.
+      beside: the same mission under naive exploration; None if it was not played or did not begin
+        together with the first one, for which there must be room.
     """
 
     metrics: dict[str, Measured]
     recording: Recording
     control_steps: int
+    beside: Recording | None = None
 
 
 def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
@@ -137,6 +129,7 @@ class Player:
         # Devices of a mesh run one program together; a thread sees only its own rows.
         together = Workers(mesh=workers.mesh)
         share, parts = self._share, together.number
+        recorded = min(films.AT_A_TIME, share)
         chunk = chunk_of(config)
         self._lock = threading.Lock()
 
@@ -174,10 +167,15 @@ class Player:
             keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(slots.episode)
             keys = jax.vmap(jax.random.fold_in)(keys, slots.chunks)
             states, records = rollout_batch(
-                keys, scenario, models, slots.states, chunk, share, parts
+                keys, scenario, models, slots.states, chunk, share, parts, recorded
             )
             slots = _Slots(slots.episode, slots.chunks + 1, states)
-            first = jax.tree.map(lambda x: x.reshape(parts, share, *x.shape[1:])[:, 0], states)
+
+            def first_of(x: jax.Array) -> jax.Array:
+                of_parts = x.reshape(parts, share, *x.shape[1:])[:, :recorded]
+                return of_parts.reshape(parts * recorded, *x.shape[1:])
+
+            first = jax.tree.map(first_of, states)
             return slots, _found(scenario, models, slots), Recording(first, records)
 
         key, number = jax.random.key(0), share * parts
@@ -248,7 +246,7 @@ class Player:
     def _play(self, call: "_Call", lane: int) -> None:
         """Plays the missions of one of the threads."""
         config, parts = self.mission.config, self._workers.number // self._workers.threads
-        missions = np.arange(call.total, dtype=np.int32)
+        missions = call.films.order(call.total, self._workers.number)
         lanes = [missions[lane * parts + p :: self._workers.number] for p in range(parts)]
         ledger = Ledger(lanes, self._share)
         slots: _Slots | None = None
@@ -265,9 +263,9 @@ class Player:
                     call.key, config, call.models, slots, reserve, taken
                 )
                 self._check(call, ledger, found := devices.fetched(found))
-                if lane == 0:
-                    call.record(first)
                 playing = ledger.playing.copy()
+                if lane == 0:
+                    call.films.record(playing, first)
                 ended = ledger.end(found.done)
                 call.end(playing[ended], jax.tree.map(lambda x: x[ended], found))  # noqa: B023
                 self._monitor.progress("mission", call.num_done, call.total)
@@ -309,21 +307,14 @@ class _Call:
         self._metrics = jax.tree.map(
             lambda x: np.zeros((self.total, *x.shape[1:]), x.dtype), metrics
         )
-        self._recordings = list[Recording]()
-        self._is_recorded = False
+        beside = [*played].index(_BESIDE) * episodes if _BESIDE in [*played][1:] else None
+        self.films = Films(beside)
         self._lock = threading.Lock()
 
     def begins(self, missions: Int[np.ndarray, " B"]) -> tuple[np.ndarray, np.ndarray, Faults]:
         """Episodes, policies and faults of missions."""
         faults = jax.tree.map(lambda x: x[missions], self._faults)
         return missions % self._episodes, self.policies[missions], faults
-
-    def record(self, first: Recording) -> None:
-        """Keeps a chunk of the first mission, which is in the first slot until it is done."""
-        if not self._is_recorded:
-            first = jax.tree.map(lambda x: np.array(x[0]), devices.fetched(first))
-            self._recordings.append(first)
-            self._is_recorded = bool(first.end.done)
 
     def end(self, missions: Int[np.ndarray, " E"], found: _Found) -> None:
         """Keeps the results of missions that are done."""
@@ -343,9 +334,8 @@ class _Call:
             name: jax.tree.map(lambda x: x[i * number : (i + 1) * number], self._metrics)  # noqa: B023
             for i, name in enumerate(self._cases)
         }
-        records = [each.records for each in self._recordings]
-        whole = jax.tree.map(lambda *chunks: np.concatenate(chunks), *records)
-        return Played(metrics, Recording(self._recordings[-1].end, whole), self._control_steps)
+        recording, *others = self.films.recordings()
+        return Played(metrics, recording, self._control_steps, *others)
 
 
 def _refilled(slots: _Slots, reserve: _Slots, taken: jax.Array, parts: int) -> _Slots:

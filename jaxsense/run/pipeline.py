@@ -58,10 +58,12 @@ class Played:
 
     Attributes:
       recording: the first mission of the first of `config.mission.policies`.
+      beside: the same mission under naive exploration, see `missions.Played`.
       missions: the block `mission` of `summary.json`.
     """
 
     recording: missions.Recording
+    beside: missions.Recording | None
     missions: summary.Missions
 
 
@@ -177,7 +179,8 @@ def play(
     played = {name: cases[name] for name in config.mission.policies}
     found = player.play(mission_key(key), learned.models, played, episodes)
     (checkpoints or Checkpoints()).forget_unfinished()
-    results = Played(found.recording, summary.missions(player.mission, found.metrics))
+    block = summary.missions(player.mission, found.metrics)
+    results = Played(found.recording, found.beside, block)
     monitor.clock.add_rest("summarise")
     return results
 

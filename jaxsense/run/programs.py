@@ -17,7 +17,7 @@ from jaxsense import mission
 from jaxsense.config import Config
 from jaxsense.core.types import Key
 from jaxsense.dqn.policies import Policy, Values
-from jaxsense.run import batches, missions
+from jaxsense.run import batches, films, missions
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.together import SharedProgram, Trainings
@@ -203,6 +203,8 @@ def _trace_missions(programs: Programs, compiler: Compiler) -> None:
     number, workers = len(config.mission.policies) * config.mission.episodes, programs.workers
     with compiler.monitor.clock.record("trace", "mission"):
         batch = batches.batch_of(config, number, workers)
+        # Room for the missions to record side by side.
+        batch = max(batch, min(number, films.AT_A_TIME * workers.number))
         scenario = mission.make_mission(config, programs.policies)
     programs.player.set_result(missions.Player(scenario, compiler, batch, workers))
 

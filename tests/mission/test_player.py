@@ -45,7 +45,7 @@ WORKERS = {
 
 @pytest.fixture
 def play(team, models, monkeypatch):
-    """Plays nine missions of the naive policy with `fake_step`, four at a time."""
+    """Plays nine missions of some policies with `fake_step`, four at a time."""
     state = jax.jit(lambda: mission.reset(KEY, team, models, NAIVE))()
 
     def fake_reset(key, team, models, policy, faults):
@@ -53,7 +53,8 @@ def play(team, models, monkeypatch):
         belief = jax.tree.map(lambda x: jnp.tile(x, (3, 1)), models.fusion.prior)
         scene = dataclasses.replace(state.scene, poses=poses)
         classes = jax.random.randint(key, state.classes.shape, 0, 4)
-        return dataclasses.replace(state, scene=scene, belief=belief, classes=classes)
+        changed = {"scene": scene, "belief": belief, "classes": classes, "policy": policy}
+        return dataclasses.replace(state, **changed)
 
     def measure(team, models, s):
         return {"steps": s.steps, "poses": s.scene.poses}
@@ -62,7 +63,7 @@ def play(team, models, monkeypatch):
     monkeypatch.setattr(missions, "reset", fake_reset)
     monkeypatch.setattr(missions, "measure", measure)
 
-    def run(workers, models=models, batch=4, episodes=9):
+    def run(workers, models=models, batch=4, episodes=9, policies=("naive",)):
         with Compiler(Monitor()) as compiler:
             player = missions.Player(team, compiler, batch, workers)
             waited = []
@@ -71,7 +72,8 @@ def play(team, models, monkeypatch):
                 patch.setattr(missions.Program, "wait", lambda p: (waited.append(p), wait(p)))
                 player.wait()
             assert len(set(waited)) == 2  # before anything is timed
-            return player.play(KEY, models, {"naive": mission.cases(CONFIG)["naive"]}, episodes)
+            cases = mission.cases(CONFIG)
+            return player.play(KEY, models, {name: cases[name] for name in policies}, episodes)
 
     return run
 
@@ -108,6 +110,24 @@ def test_the_whole_first_mission_is_recorded(split, play):
     np.testing.assert_array_equal(end.scene.poses, records.poses[-1])
     assert end.done
     assert played.control_steps == 9 * LAST
+
+
+@pytest.mark.parametrize("split", WORKERS)
+def test_naive_exploration_is_recorded_beside_the_first_mission(split, play, team):
+    played = play(WORKERS[split](), policies=("random", "latent", "naive"))
+    for recording, name in ((played.recording, "random"), (played.beside, "naive")):
+        walk = walk_of(0, recording.end.scene.poses.shape)
+        np.testing.assert_allclose(recording.records.poses[:LAST], walk, atol=1e-4)
+        np.testing.assert_array_equal(recording.end.scene.poses, recording.records.poses[-1])
+        assert [*team.policies][recording.end.policy] == name
+    for name in ("random", "latent", "naive"):
+        np.testing.assert_allclose(played.metrics[name]["poses"][0], walk[-1], atol=1e-4)
+
+
+def test_without_room_or_naive_exploration_one_mission_is_recorded(play):
+    assert play(Workers(), policies=("random", "naive"), batch=1, episodes=2).beside is None
+    assert play(Workers(), policies=("random", "latent"), episodes=2).beside is None
+    assert play(Workers(), policies=("naive", "random"), episodes=2).beside is None
 
 
 def test_events_of_a_mission_do_not_depend_on_when_it_is_played(play):
