@@ -108,8 +108,11 @@ def _page(
     table: tables.Table,
 ) -> str:
     """The page, with the films in it."""
+    lasts = max(
+        animation.duration_of(scenario.config, each.recording.end) for each in played.values()
+    )
 
-    def film(name: str) -> str:
+    def film(name: str) -> html.Film:
         recording, title = played[name].recording, f"{name} policy".replace("_", " ")
         drawn = animation.draw(
             scenario.config,
@@ -118,15 +121,17 @@ def _page(
             models.fusion,
             scenario.fields_of_view,
             title,
+            lasts,
         )
-        return html.picture("svg", drawn.encode())
+        return html.film(name, drawn.encode())
 
     return html.render(
         "demo.html.jinja",
         preset=arguments.preset,
         seed=arguments.seed,
         other=next(name for name in PRETRAINED if name != arguments.preset),
-        films={name: film(name) for name in played},
+        films=[[film(name) for name in played]],
+        policies=len(played),
         table=table,
         sentence=_sentence(arguments.policy, len(scenario.config.carried)),
     )

@@ -2,20 +2,35 @@
 
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxsense.config import PRESETS
-from jaxsense.core.types import Belief
+from jaxsense.core.types import Belief, pytree
 from jaxsense.mission.state import DRIVING, ENDED, FACING, Record
-from jaxsense.run.missions import Recording
+from jaxsense.run.films import Recording
 
 CONFIG = PRESETS["smoke"]
 CLASS_BELIEFS = Belief(
     np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]], np.float32), np.full((3, 2), 0.4, np.float32)
 )
 
-FUSION = SimpleNamespace(
-    classes=CLASS_BELIEFS, prior=Belief(np.zeros(2), np.full(2, np.sqrt(20.0), np.float32))
+
+@pytree
+class StubFusion:
+    """What an animation needs of the fusion: the nearer a class in sigma, the more likely."""
+
+    classes: Belief
+    prior: Belief
+
+    def class_probabilities(self, belief):
+        apart = (belief.mean[None] - self.classes.mean) / belief.std[None]
+        return jax.nn.softmax(-jnp.sum(apart**2, axis=-1))
+
+
+FUSION = StubFusion(
+    CLASS_BELIEFS, Belief(np.zeros(2, np.float32), np.full(2, np.sqrt(20.0), np.float32))
 )
 FIELDS_OF_VIEW = {"camera": 60.0, "lidar": 240.0}
 

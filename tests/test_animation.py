@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from recordings import CLASS_BELIEFS, CONFIG, FIELDS_OF_VIEW, FUSION, recording
+from recordings import CONFIG, FIELDS_OF_VIEW, FUSION, recording
 
 from jaxsense.core.types import Belief
 from jaxsense.show import animation
@@ -15,10 +15,10 @@ from jaxsense.show.colours import modality_colour
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def draw(config=CONFIG, played=None, fusion=FUSION, fields_of_view=FIELDS_OF_VIEW):
+def draw(config=CONFIG, played=None, fusion=FUSION, fields_of_view=FIELDS_OF_VIEW, lasts=0.0):
     played = played or recording()
     return animation.draw(
-        config, played.records, played.end, fusion, fields_of_view, "latent policy"
+        config, played.records, played.end, fusion, fields_of_view, "latent policy", lasts
     )
 
 
@@ -35,6 +35,19 @@ def part(picture, name):
 def tracks(element):
     """All animations of an element and what is in it."""
     return [e for e in element.iter() if e.tag in (f"{SVG}animate", f"{SVG}animateTransform")]
+
+
+def beliefs(picture):
+    """The ellipses of the PoIs."""
+    return [e for e in picture.iter(f"{SVG}ellipse") if e.get("fill") != "none"]
+
+
+def frames(element, attribute, number=60):
+    """`[number]` values of an attribute in the frames of a film of 6 s."""
+    found = [t for t in tracks(element) if t.get("attributeName") == attribute]
+    if not found:
+        return np.full(number, float(element.get(attribute)))
+    return np.array([value_at(found[0], (i + 0.5) * 0.05 / 6.0)[0] for i in range(number)])
 
 
 def value_at(track, share):
@@ -76,13 +89,87 @@ def test_robots_and_beliefs_are_where_they_were(picture):
     (turn,) = {t.get("values") for t in tracks(moving) if t.get("type") == "rotate"}
     assert np.ptp([float(v) for v in turn.split(";")]) == pytest.approx(np.degrees(0.083), abs=0.1)
 
-    ellipses = list(moving.iter(f"{SVG}ellipse"))
+    ellipses = beliefs(moving)
     assert len(ellipses) == 3
     radius = {t.get("attributeName"): t for t in tracks(ellipses[1])}["rx"]
     assert value_at(radius, 0.0) > 150
     # Class means reach to 1, ellipses 0.4 and a rim of 1 further: 2.4 for 170 px.
     assert value_at(radius, 1.0) == pytest.approx(0.4 * 170 / 2.4, abs=0.01)
     assert not [t for t in tracks(ellipses[0]) if t.get("attributeName") == "rx"]
+
+
+def test_bars_beside_each_poi_fill_with_the_probabilities_of_its_classes(picture):
+    moving = part(picture, "film-moving")
+    groups = [g for g in moving.iter(f"{SVG}g") if "scale(1 -1)" in g.get("transform", "")]
+    assert len(groups) == 3
+    for n, group in enumerate(groups):
+        back, *bars = group.iter(f"{SVG}rect")
+        full = float(back.get("height")) - 2
+        heights = np.array([frames(bar, "height") for bar in bars])
+        assert len(bars) == 3
+        # All classes are equally likely before any look, and at those that nobody looks at.
+        np.testing.assert_allclose(heights[:, :40], full / 3, atol=0.02)
+        # PoI 2 is seen in period 40, frame 41, and the bars fill in eight frames.
+        end = np.array([0, full, 0]) if n == 1 else np.full(3, full / 3)
+        np.testing.assert_allclose(heights[:, 50], end, atol=0.02)
+
+
+def test_what_nobody_has_seen_is_called_unknown(picture):
+    moving = part(picture, "film-moving")
+    texts = [t for t in moving.iter(f"{SVG}text") if t.text == "unknown"]
+    seen = np.array([frames(text, "opacity") for text in texts])
+    np.testing.assert_array_equal(seen[[0, 2]], 1)
+    np.testing.assert_array_equal(np.flatnonzero(seen[1] == 0), np.arange(41, 60))
+    # One ring in the map stands for all of them.
+    (ring,) = (e for e in moving.iter(f"{SVG}ellipse") if e.get("fill") == "none")
+    np.testing.assert_array_equal(frames(ring, "opacity"), 1)
+    shown = np.array([frames(ellipse, "opacity") for ellipse in beliefs(moving)])
+    np.testing.assert_array_equal(shown, 1 - seen)
+    lists = {t.text: t for t in moving.iter(f"{SVG}text") if (t.text or "").startswith("unknown:")}
+    assert set(lists) == {"unknown: 1, 2, 3", "unknown: 1, 3"}
+    np.testing.assert_array_equal(frames(lists["unknown: 1, 3"], "opacity"), 1 - seen[1])
+
+
+def test_pois_that_are_certain_are_listed_at_their_class():
+    # PoI 2 is told by one look in period 40, PoI 1 half, which leaves two classes.
+    played = recording()
+    played.records.seen[50:, 0, 1] = True
+    played.records.belief.mean[50:, 0] = [1.0, 0.0]
+    played.records.belief.std[50:, 0] = [0.4, 1.0]
+    moving = part(ElementTree.fromstring(draw(played=played)), "film-moving")
+    labels = {
+        t.text: t for t in moving.iter(f"{SVG}text") if t.get("class", "").startswith("film-label")
+    }
+    assert set(labels) == {"green cylinder", "red cylinder", "red cylinder: 2", "red cube"}
+    is_told = frames(labels["red cylinder: 2"], "opacity")
+    np.testing.assert_array_equal(np.flatnonzero(is_told), np.arange(41, 60))
+    np.testing.assert_array_equal(frames(labels["red cylinder"], "opacity"), 1 - is_told)
+    # Only what is seen and still open has a number in the map.
+    numbers = [t for t in moving.iter(f"{SVG}text") if t.text == "1"]
+    (in_map,) = (t for t in numbers if "film-on-light" in t.get("class"))
+    np.testing.assert_array_equal(np.flatnonzero(frames(in_map, "opacity")), np.arange(51, 60))
+    for never in ("2", "3"):
+        texts = [t for t in moving.iter(f"{SVG}text") if t.text == never]
+        (in_map,) = (t for t in texts if "film-on-light" in t.get("class"))
+        assert not frames(in_map, "opacity").any()
+
+
+def test_films_that_last_equally_long_stay_together():
+    long = ElementTree.fromstring(draw(played=recording(80)))
+    short = ElementTree.fromstring(draw(lasts=8.0))
+    durations = [{t.get("dur") for t in tracks(film)} for film in (long, short)]
+    assert durations[0] == durations[1] == {"7.00s"}
+    # The clock of the shorter one still stops at its own end.
+    texts = {t.text for t in part(short, "film-moving").iter(f"{SVG}text")}
+    assert "6.0 s" in texts
+    assert "7 s" not in texts
+
+
+def test_without_animations_the_last_frame_is_left():
+    left = ElementTree.fromstring(animation.still(draw().encode()))
+    assert not tracks(left)
+    texts = [t.text for t in left.iter(f"{SVG}text") if t.get("opacity", "1") == "1"]
+    assert {"camera: done", "6.0 s", "red cylinder: 2"} <= set(texts)
 
 
 def test_headings_tell_what_a_robot_does_and_the_time(picture):
@@ -148,7 +235,7 @@ def test_six_robots_are_drawn_and_named():
         assert np.all(np.diff(heights) > 20)
         assert heights[-1] < float(picture.get("viewBox").split()[3])
     fields = [p for p in part(picture, "film-still").iter(f"{SVG}path") if "A" in p.get("d")]
-    assert len(fields) == 6
+    assert len(fields) == 2 * 6  # in the arena and beside the names
 
 
 def test_a_film_of_one_kind_of_robots_names_no_other():
@@ -161,7 +248,8 @@ def test_a_field_of_view_is_that_of_the_sensor():
     # As with a sensor of one's own, the settings do not tell.
     picture = ElementTree.fromstring(draw(fields_of_view={"camera": 90.0, "lidar": 270.0}))
     fields = [p for p in part(picture, "film-still").iter(f"{SVG}path") if "A" in p.get("d")]
-    for field, is_wide, side in zip(fields, "01", (1, -1), strict=True):
+    # In the arena and beside the names.
+    for field, is_wide, side in zip(fields, "0101", (1, -1) * 2, strict=True):
         x, y = map(float, field.get("d").removeprefix("M0,0L").split("A")[0].split(","))
         assert x == pytest.approx(-side * y, abs=0.1)
         assert field.get("d").split()[1:3] == ["0", is_wide]
@@ -169,11 +257,15 @@ def test_a_field_of_view_is_that_of_the_sensor():
 
 def test_the_map_begins_with_the_prior_of_the_fusion():
     prior = Belief(np.array([1.0, -0.5]), np.array([0.25, 0.5]))
-    changed = SimpleNamespace(classes=CLASS_BELIEFS, prior=prior)
+    changed = dataclasses.replace(FUSION, prior=prior)
     moving = part(ElementTree.fromstring(draw(fusion=changed)), "film-moving")
-    ellipse = [*moving.iter(f"{SVG}ellipse")][1]  # its PoI is seen later
+    ellipse = beliefs(moving)[1]  # its PoI is seen later
     first = {t.get("attributeName"): value_at(t, 0.0)[0] for t in tracks(ellipse)}
     scale = 170 / 2.4  # as above
     assert first["cx"] == pytest.approx(170 + scale, abs=0.1)
     assert first["cy"] == pytest.approx(170 + scale * 0.5, abs=0.1)
     assert first["rx"] == pytest.approx(scale * 0.25, abs=0.1)
+    # The ring of all that are unknown stays there.
+    (ring,) = (e for e in moving.iter(f"{SVG}ellipse") if e.get("fill") == "none")
+    for name in ("cx", "cy", "rx"):
+        assert float(ring.get(name)) == pytest.approx(first[name], abs=0.1)

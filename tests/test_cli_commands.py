@@ -196,7 +196,9 @@ def test_the_demo_writes_one_page_with_both_films(played, capsys):
     (page,) = played.glob("runs/*/*")
     assert re.fullmatch(r"runs/\d{8}-\d{6}-demo-noisy/demo\.html", str(page.relative_to(played)))
     text = page.read_text()
-    assert text.count("data:image/svg+xml;base64,") == 2 * 2  # both halves of each film
+    # Both halves of each film, as they play and stopped.
+    assert text.count("data:image/svg+xml;base64,") == 2 * 2 * 2
+    assert '<div class="film pair">' in text
     assert "python -m jaxsense.demo --preset noisy --seed 1" in text
     assert 'load_pretrained("noisy")' in text
     assert re.search(r'<th scope="row">latent</th>\s*<td>.*0\.667', text)
@@ -212,7 +214,7 @@ def test_the_demo_writes_one_page_with_both_films(played, capsys):
 def test_the_demo_compares_any_policy_with_naive_exploration(played, policy, films):
     demo.main([*NO_CACHE, "--policy", policy, "--out", "here", "--seed", "7"])
     text = (played / "here" / "demo.html").read_text()
-    assert text.count("data:image/svg+xml;base64,") == 2 * films
+    assert text.count("data:image/svg+xml;base64,") == 2 * 2 * films
     assert f'<th scope="row">{policy}</th>' in text
     assert "--seed 8" in text
 

@@ -1,12 +1,39 @@
 """Pages that need no other file, from the templates in this directory."""
 
 import base64
+import dataclasses
 
 import jinja2
 
 from jaxsense.config.options import command
+from jaxsense.show import animation
 
 _KINDS = {"svg": "svg+xml", "png": "png"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Film:
+    """A film on a page.
+
+    Attributes:
+      name: of its file, without a suffix.
+      plays: source of an `img` that plays.
+      stopped: source of an `img` with the last frame.
+    """
+
+    name: str
+    plays: str
+    stopped: str
+
+
+def film(name: str, content: bytes) -> Film:
+    """A film for a page.
+
+    Args:
+      name: of its file, without a suffix.
+      content: of its file.
+    """
+    return Film(name, picture("svg", content), picture("svg", animation.still(content)))
 
 
 def render(template: str, **values: object) -> str:

@@ -15,6 +15,9 @@ from jaxsense.summary.metrics import mean
 from jaxsense.summary.profile import Span
 from jaxsense.summary.read import EVALUATIONS
 
+OWN_FILMS = ("mission", "mission-naive")
+"""Films of a run's own missions in one arena, without the suffix of their files."""
+
 
 def render(
     run: Path,
@@ -26,7 +29,7 @@ def render(
     """Writes the page of a run, or of several seeds, as text.
 
     Args:
-      run: its directory; the page shows plots `NAME.png` and films `mission*.svg` that lie there.
+      run: its directory; the page shows plots `NAME.svg` and films `mission*.svg` that lie there.
       config: its settings.
       summary: its summary.
       evaluations: further missions, by the names of their files.
@@ -35,10 +38,9 @@ def render(
     Raises:
       OSError: if a picture cannot be read.
     """
-    stem = operator.attrgetter("stem")  # so that the run's own film comes first
-    here = _missions(f"{summary['preset']} preset", summary["mission"], run / "policies.png")
+    here = _missions(f"{summary['preset']} preset", summary["mission"], run / "policies.svg")
     elsewhere = [
-        _missions(_title(found), found["mission"], run / EVALUATIONS / f"{name}.png")
+        _missions(_title(found), found["mission"], run / EVALUATIONS / f"{name}.svg")
         for name, found in (evaluations or {}).items()
     ]
     return html.render(
@@ -61,13 +63,30 @@ def render(
         paper=tables.paper(summary),
         times=tables.times(summary, summary["timing"]),
         profile=profile.verdict(spans),
-        devices={kind: summary["devices"].count(kind) for kind in summary["devices"]},
+        devices=_counted(summary["devices"]),
         commit=_commit(run),
         changed=_changed(config, summary["preset"]),
         config=json.dumps(as_plain(config), indent=2),
-        plot=lambda name: _data(run / f"{name}.png"),
-        films={path.stem: _data(path) for path in sorted(run.glob("mission*.svg"), key=stem)},
+        plot=lambda name: _data(run / f"{name}.svg"),
+        films=_films(run),
     )
+
+
+def _films(run: Path) -> list[list[html.Film]]:
+    """The films of a run, those of the same arena together, its own first."""
+    stem = operator.attrgetter("stem")
+    found = [
+        html.film(path.stem, path.read_bytes())
+        for path in sorted(run.glob("mission*.svg"), key=stem)
+    ]
+    own = [film for film in found if film.name in OWN_FILMS]
+    return [films for films in (own, *([film] for film in found if film not in own)) if films]
+
+
+def _counted(devices: Sequence[str]) -> str:
+    """Devices by kind; that a single one is single is not worth telling."""
+    numbers = {kind: devices.count(kind) for kind in devices}
+    return ", ".join(f"{n} \u00d7 {kind}" if n > 1 else kind for kind, n in numbers.items())
 
 
 def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:
@@ -94,10 +113,14 @@ def _title(found: Evaluation) -> str:
 
 
 def _data(path: Path) -> str | None:
-    """A picture as a data URI; None if there is no such file."""
-    if not path.exists():
-        return None
-    return html.picture(path.suffix[1:], path.read_bytes())
+    """A picture as a data URI; None if there is no such file.
+
+    Runs of earlier versions have plots as PNG files.
+    """
+    for each in (path, path.with_suffix(".png")):
+        if each.exists():
+            return html.picture(each.suffix[1:], each.read_bytes())
+    return None
 
 
 def _commit(run: Path) -> str | None:

@@ -10,27 +10,33 @@ import numpy as np
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Fusion
 from jaxsense.mission import MissionState, Record
-from jaxsense.show.animation.svg import Timeline, add
-from jaxsense.show.animation.views import SIZE, ArenaView, MapView
+from jaxsense.show.animation.arena import ArenaView
+from jaxsense.show.animation.latent_map import MapView
+from jaxsense.show.animation.svg import SIZE, Timeline, add, strip
 from jaxsense.show.colours import modality_colour
 
 WIDTH = 2 * SIZE + 40
 _SPEED = 2.0  # times real time
 _AFTER = 10  # frames shown after the mission's end
 _PAUSE = 2.5  # s that the last one stays
+_TINY = 1e-3  # s, less than a control period
 _TOP, _LINE = 38, 26
+_ICON = 14  # px, length of a field of view beside the name of a robot
 _PHASES = ("choosing", "driving to", "looking at", "backing off from", "done", "failed")
 _STYLE = """
-.film{--paper:#fff;--ink:#1d2129;--floor:#f2f4f7;color-scheme:light dark}
+.film{--paper:#fff;--ink:#1d2129;--soft:#59616e;--floor:#f2f4f7;color-scheme:light dark}
 .film text{font-family:system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
 .film-paper{fill:var(--paper)}.film-floor{fill:var(--floor);stroke:#9aa2ad}
 .film-title{fill:var(--ink);font-size:18px;font-weight:600}
 .film-line{fill:var(--ink);font-size:17px}.film-end{text-anchor:end}
 .film-number{font-size:15px;font-weight:700;text-anchor:middle}
 .film-label{font-size:14px;font-weight:600;text-anchor:middle}
+.film-note{fill:var(--soft);font-size:14px}
+.film-unknown{fill:#59616e;font-size:12px;text-anchor:middle}
 .film-on-light{stroke:var(--floor);stroke-width:3px;paint-order:stroke;stroke-linejoin:round}
 .film-still{display:none}
-@media (prefers-color-scheme:dark){.film{--paper:#16181d;--ink:#e6e8ec;--floor:#dfe2e8}}
+@media (prefers-color-scheme:dark){
+.film{--paper:#16181d;--ink:#e6e8ec;--soft:#a3abb8;--floor:#dfe2e8}}
 @media (prefers-reduced-motion:reduce){.film-moving{display:none}.film-still{display:inline}}
 """
 
@@ -42,6 +48,7 @@ def draw(
     fusion: Fusion,
     fields_of_view: Mapping[str, float],
     title: str,
+    lasts: float = 0.0,
 ) -> str:
     """Draws a mission as an animated SVG.
 
@@ -52,22 +59,31 @@ def draw(
       fusion: of the map, whose prior and classes are shown in it.
       fields_of_view: of each sensor, by its name, in degrees.
       title: what to call it.
+      lasts: seconds of the mission that the film shows at least, beyond its end. Films that last
+        equally long stay together while they repeat.
 
     Returns:
       The content of the file.
     """
-    record, seconds = _frames(config, records, fusion.prior, int(end.steps))
+    seconds = duration_of(config, end)
+    last = round(max(seconds, lasts) / config.mission.control_period)
+    record = _frames(config, records, fusion.prior, last)
+    probabilities = class_probabilities(fusion, record.belief)
     shown = np.asarray(record.time) / _SPEED
     duration = float(shown[-1]) + _PAUSE
-    views = ArenaView(config, end, fields_of_view), MapView(config, end, fusion.classes)
-    height = _TOP + SIZE + _LINE * max(2, len(config.carried)) + 16
+    views = (
+        ArenaView(config, end, fields_of_view, probabilities),
+        MapView(config, end, fusion, probabilities),
+    )
+    height = _TOP + SIZE + _LINE * (len(config.carried) + 1) + 16
     root = Element("svg", {"xmlns": "http://www.w3.org/2000/svg", "class": "film", "role": "img"})
     root.set("viewBox", f"0 0 {WIDTH} {height}")
     root.set("aria-labelledby", "title")
     robots = " and ".join(dict.fromkeys(config.carried))
     text = (
-        f"{title}: robots with {robots} look at {config.arena.num_pois} points of interest; the "
-        f"ellipses of the shared map shrink. It ends after {seconds:.1f} s."
+        f"{title}: robots with {robots} look at {config.arena.num_pois} points of interest; bars "
+        f"beside each fill with the probabilities of its classes, and the ellipses of the shared "
+        f"map shrink. It ends after {seconds:.1f} s."
     )
     add(root, "title", text, id="title")
     add(root, "style", _STYLE)
@@ -82,16 +98,30 @@ def draw(
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _frames(config: Config, records: Record, prior: Belief, steps: int) -> tuple[Record, float]:
-    """The frames from just before a mission until shortly after its end, and its length in s."""
-    period = config.mission.control_period
-    rows = np.minimum(np.arange(-1, steps + _AFTER).clip(0), len(records.time) - 1)
+def duration_of(config: Config, end: MissionState) -> float:
+    """Seconds from the beginning of a mission until its end."""
+    return config.mission.control_period * int(end.steps)
+
+
+def class_probabilities(fusion: Fusion, belief: Belief) -> np.ndarray:
+    """`[F, N, C]` class probabilities of `[F, N, D]` beliefs."""
+    return np.asarray(_class_probabilities(fusion, belief))
+
+
+@jax.jit
+def _class_probabilities(fusion: Fusion, belief: Belief) -> jax.Array:
+    return jax.vmap(jax.vmap(fusion.class_probabilities))(belief)
+
+
+def _frames(config: Config, records: Record, prior: Belief, last: int) -> Record:
+    """The frames from just before a mission until shortly after the `last` control period."""
+    rows = np.minimum(np.arange(-1, last + _AFTER).clip(0), len(records.time) - 1)
     record: Record = jax.tree.map(lambda x: np.array(np.asarray(x)[rows]), records)
-    record.time[:] = period * np.arange(len(rows))
+    record.time[:] = config.mission.control_period * np.arange(len(rows))
     record.seen[0], record.scanned[0], record.detected[0] = False, False, False
     record.phase[0], record.target[0] = 0, config.arena.num_pois
     record.belief.mean[0], record.belief.std[0] = prior.mean, prior.std
-    return record, steps * period
+    return record
 
 
 def _draw(
@@ -103,46 +133,62 @@ def _draw(
     heading: tuple[str, float],
 ) -> None:
     """Draws everything that moves, or the last frame."""
-    title, seconds = heading
-    for i, (view, name) in enumerate(zip(views, (title, "the shared map"), strict=True)):
-        half = add(parent, "g", transform=f"translate({10 + i * (SIZE + 20)} 0)")
-        add(half, "text", name, y=25, class_="film-title")
-        place = add(half, "g", transform=f"translate(0 {_TOP})")
-        add(place, "rect", class_="film-floor", width=SIZE, height=SIZE, rx=6)
-        view.draw(add(place, "g", clip_path="url(#view)"), timeline, record)
-        if i == 0:
-            clock = [f"{min(t, seconds):.0f} s" for t in np.floor(record.time)]
-            clock[-1] = f"{seconds:.1f} s"
-            _strip(half, timeline, clock, SIZE, 25, "film-title film-end")
-            for r, named in enumerate(config.robot_names):
-                robot = named.replace("_", " ")
-                y = _TOP + SIZE + 24 + _LINE * r
-                colour = modality_colour(config.modality_of_robot[r])
-                add(half, "circle", cx=8, cy=y - 6, r=7, fill=colour)
-                doing = [
-                    f"{robot}: {_doing(int(phase), int(target), config.arena.num_pois)}"
-                    for phase, target in zip(record.phase[:, r], record.target[:, r], strict=True)
-                ]
-                _strip(half, timeline, doing, 24, y, "film-line")
-        else:
-            y = _TOP + SIZE + 24
-            add(half, "text", "The belief in each numbered PoI:", y=y, class_="film-line")
-            add(
-                half,
-                "text",
-                "1-sigma ellipse; dotted: not seen yet",
-                y=y + _LINE,
-                class_="film-line",
-            )
+    (title, seconds), (arena, latent) = heading, views
+    below = _TOP + SIZE + 24
+    half = _half(parent, 0, title, timeline, record, arena)
+    whole = np.floor(record.time)
+    clock = np.where(
+        record.time < seconds - _TINY, [f"{t:.0f} s" for t in whole], f"{seconds:.1f} s"
+    )
+    strip(half, timeline, clock.tolist(), x=SIZE, y=25, class_="film-title film-end")
+    _draw_robots(half, timeline, arena, config, record, below)
+    note = "Bars: class probabilities; dots: who saw it."
+    add(half, "text", note, y=below + _LINE * len(config.carried), class_="film-note")
+    half = _half(parent, 1, "the shared map", timeline, record, latent)
+    notes = (
+        "Ellipse: 1-sigma belief in a numbered PoI.",
+        "PoIs that are certain stand at their class.",
+    )
+    for line, note in enumerate(notes):
+        add(half, "text", note, y=below + _LINE * line, class_="film-note")
 
 
-def _strip(
-    parent: Element, timeline: Timeline, texts: list[str], x: float, y: float, class_: str
+def _half(
+    parent: Element,
+    number: int,
+    name: str,
+    timeline: Timeline,
+    record: Record,
+    view: ArenaView | MapView,
+) -> Element:
+    """Draws a view under its name; returns the half of the picture that it is in."""
+    half = add(parent, "g", transform=f"translate({10 + number * (SIZE + 20)} 0)")
+    add(half, "text", name, y=25, class_="film-title")
+    place = add(half, "g", transform=f"translate(0 {_TOP})")
+    add(place, "rect", class_="film-floor", width=SIZE, height=SIZE, rx=6)
+    view.draw(add(place, "g", clip_path="url(#view)"), timeline, record)
+    return half
+
+
+def _draw_robots(
+    parent: Element,
+    timeline: Timeline,
+    view: ArenaView,
+    config: Config,
+    record: Record,
+    y: float,
 ) -> None:
-    """Draws a text that changes, `texts` frame by frame."""
-    for text in dict.fromkeys(texts):
-        element = add(parent, "text", text, x=x, y=y, class_=class_)
-        timeline.animate(element, "opacity", [float(t == text) for t in texts], jumps=True)
+    """Draws a line for each robot: its field of view, its name and what it does."""
+    for r, named in enumerate(config.robot_names):
+        colour = modality_colour(config.modality_of_robot[r])
+        icon = add(parent, "g", transform=f"translate(9 {y - 6 + _LINE * r})")
+        add(icon, "path", d=view.field_of_view(r, _ICON), fill=colour, opacity=0.4)
+        add(icon, "circle", r=5, fill=colour)
+        doing = [
+            f"{named.replace('_', ' ')}: {_doing(int(phase), int(target), config.arena.num_pois)}"
+            for phase, target in zip(record.phase[:, r], record.target[:, r], strict=True)
+        ]
+        strip(parent, timeline, doing, x=28, y=y + _LINE * r, class_="film-line")
 
 
 def _doing(phase: int, target: int, num_pois: int) -> str:

@@ -1,11 +1,16 @@
 """Elements of an SVG, and how they change while it plays (SMIL)."""
 
 import dataclasses
+import re
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+SIZE = 340
+"""Side of a view, in px."""
+_SMOOTHING = 8  # frames in which a shape comes to its new form
 
 
 def add(parent: Element, tag: str, text: str | None = None, **attributes: ArrayLike) -> Element:
@@ -81,6 +86,38 @@ class Timeline:
             repeatCount="3",
             **more,
         )
+
+
+def strip(parent: Element, timeline: Timeline, texts: list[str], **attributes: ArrayLike) -> None:
+    """Draws a text that changes.
+
+    Args:
+      parent: of the elements.
+      timeline: when the frames are shown.
+      texts: `[F]` the text of each frame; none is drawn for an empty one.
+      **attributes: see `add`.
+    """
+    for text in filter(None, dict.fromkeys(texts)):
+        element = add(parent, "text", text, **attributes)
+        timeline.animate(element, "opacity", [float(t == text) for t in texts], jumps=True)
+
+
+def still(film: bytes) -> bytes:
+    """The last frame of a film: what is left of it without animations.
+
+    Args:
+      film: content of its file.
+    """
+    return re.sub(rb"<animate[^<>]*>", b"", film)
+
+
+def smooth(values: np.ndarray) -> np.ndarray:
+    """`[F, K]` with each jump as a short way."""
+    before = np.repeat(values[:1], _SMOOTHING - 1, axis=0)
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.concatenate([before, values]), _SMOOTHING, axis=0
+    )
+    return windows.mean(axis=-1)
 
 
 def _turning_points(values: list[str], *, both_ends: bool) -> list[int]:

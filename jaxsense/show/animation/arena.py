@@ -1,4 +1,4 @@
-"""The two halves of the picture: the arena from above, and the shared map."""
+"""The left half of the picture: the arena from above."""
 
 from collections.abc import Mapping
 from xml.etree.ElementTree import Element
@@ -7,24 +7,36 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxsense.config import ROBOT_RADIUS, Config
-from jaxsense.core.types import Belief
 from jaxsense.mission import MissionState, Record
 from jaxsense.mission.state import ENDED, FACING
-from jaxsense.show.animation.svg import Timeline, add
-from jaxsense.show.colours import as_hex, class_colour, in_plane, modality_colour, plane
+from jaxsense.show.animation.svg import SIZE, Timeline, add, smooth
+from jaxsense.show.colours import as_hex, class_colour, modality_colour
 
-SIZE = 340  # px, of a view
 _FLASH = 6  # frames that a look is shown for
 _READABLE = 9.0  # px, radius of a PoI that its number fits into
-_MOST_ABREAST = 4  # numbers
-_SMOOTHING = 8  # frames in which an ellipse comes to its new shape
+_BARS, _BAR, _TALL = 26.0, 6.0, 24.0  # px: most of all bars abreast, most of one, and height
 
 
 class ArenaView:
-    """The arena from above: PoIs, robots, their trails, fields of view and looks."""
+    """The arena from above: PoIs with what is known, robots, their trails, views and looks."""
 
-    def __init__(self, config: Config, end: MissionState, fields_of_view: Mapping[str, float]):
+    def __init__(
+        self,
+        config: Config,
+        end: MissionState,
+        fields_of_view: Mapping[str, float],
+        probabilities: np.ndarray,
+    ):
+        """Prepares the view.
+
+        Args:
+          config: all settings.
+          end: the state in which the mission ended.
+          fields_of_view: of each sensor, by its name, in degrees.
+          probabilities: `[F, N, C]` of the classes, in the map.
+        """
         self._config, self._end, self._fields_of_view = config, end, fields_of_view
+        self._probabilities = probabilities
         self._scale = SIZE / config.arena.side
 
     def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
@@ -40,9 +52,14 @@ class ArenaView:
         fields = add(parent, "g")
         for n in range(self._config.arena.num_pois):
             self._draw_poi(parent, timeline, record, n)
+            self._draw_bars(parent, timeline, record, n)
         for r in range(len(self._config.carried)):
             self._draw_looks(parent, timeline, record, r)
             self._draw_robot(parent, fields, timeline, record, r)
+
+    def field_of_view(self, r: int, reach: float) -> str:
+        """A robot's field of view as a path around the x axis, `reach` px long."""
+        return _sector(reach, self._fields_of_view[self._config.carried[r]])
 
     def _colour(self, r: int) -> str:
         return modality_colour(self._config.modality_of_robot[r])
@@ -83,7 +100,7 @@ class ArenaView:
             turn = f"rotate({-np.degrees(float(layout.yaw[n])):.1f})"
             box = add(group, "rect", x=-u, y=-v, width=2 * u, height=2 * v, rx=1, fill=colour)
             box.set("transform", turn)
-        if radius < _READABLE:
+        if self._numbers_beside:
             beside = {"x": radius + 12, "fill": colour, "class_": "film-number film-on-light"}
         else:
             beside = {"x": 0, "fill": "#fff", "class_": "film-number"}
@@ -100,6 +117,50 @@ class ArenaView:
                 stroke="#fff",
             )
             timeline.animate(mark, "opacity", record.seen[:, n, m], jumps=True)
+
+    def _draw_bars(self, parent: Element, timeline: Timeline, record: Record, n: int) -> None:
+        """Bars beside a PoI, which fill with the probabilities of its classes."""
+        arena = self._config.arena
+        x, y = self._place(self._end.scene.layout.position[n])
+        width = min(_BAR, _BARS / len(arena.classes))
+        beside = self._scale * arena.poi_radius + (20 if self._numbers_beside else 5)
+        across = width * len(arena.classes)
+        left = x + beside if x + beside + across < SIZE else x - beside - across
+        # Upwards, so that only the height changes.
+        group = add(parent, "g", transform=f"translate({left:.1f} {y + _TALL / 2:.1f}) scale(1 -1)")
+        add(
+            group,
+            "rect",
+            x=-1,
+            y=-1,
+            width=across + 2,
+            height=_TALL + 2,
+            rx=2,
+            fill="#fff",
+            opacity=0.75,
+        )
+        heights = _TALL * smooth(self._probabilities[:, n])
+        for c, label in enumerate(arena.classes):
+            colour = as_hex(class_colour(arena, label))
+            bar = add(group, "rect", x=width * c, width=max(width - 1, 0.8 * width), fill=colour)
+            timeline.animate(bar, "height", heights[:, c])
+        below = self._scale * arena.poi_radius + 15
+        is_low = y + below > SIZE - 4
+        text = add(
+            parent,
+            "text",
+            "unknown",
+            x=np.clip(x, 26, SIZE - 26),
+            class_="film-unknown film-on-light",
+        )
+        text.set("y", f"{y - below + 8 if is_low else y + below:.1f}")
+        is_seen = record.seen[:, n].any(axis=-1)
+        timeline.animate(text, "opacity", 1.0 - is_seen, jumps=True)
+
+    @property
+    def _numbers_beside(self) -> bool:
+        """Whether PoIs are too small for their numbers."""
+        return self._scale * self._config.arena.poi_radius < _READABLE
 
     def _draw_looks(self, parent: Element, timeline: Timeline, record: Record, r: int) -> None:
         """Line from the robot to the PoI that it scans."""
@@ -130,8 +191,7 @@ class ArenaView:
         for group in (field, body):
             timeline.animate(group, "rotate", angles)
         reach = self._scale * self._config.navigation.view_range
-        shape = _sector(reach, self._fields_of_view[self._config.carried[r]])
-        view = add(field, "path", d=shape, fill=colour)
+        view = add(field, "path", d=self.field_of_view(r, reach), fill=colour)
         phase, is_blind = record.phase[:, r], record.time >= self._end.faults.blind_at[r]
         opacity = np.where(phase == FACING, 0.34, 0.16)
         timeline.animate(
@@ -141,88 +201,6 @@ class ArenaView:
         add(body, "path", d=f"M1,0H{radius:.1f}", stroke="#fff", stroke_width=2.5)
 
 
-class MapView:
-    """The latent space: the classes, and the belief of every PoI."""
-
-    def __init__(self, config: Config, end: MissionState, class_beliefs: Belief):
-        self._config, self._end = config, end
-        self._plane = plane(np.asarray(class_beliefs.mean))
-        self._means, self._stds = map(self._in_plane, (class_beliefs.mean, class_beliefs.std))
-        self._scale = SIZE / 2 / (1.0 + float(np.max(np.abs(self._means) + self._stds)))
-
-    def _in_plane(self, values: ArrayLike) -> np.ndarray:
-        """`[..., D]` as `[..., 2]`, in the dimensions that are shown."""
-        return in_plane(values, self._plane)
-
-    def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
-        """Adds the view.
-
-        Args:
-          parent: group whose origin is the view's upper left corner.
-          timeline: when the frames are shown.
-          record: `[F]` frames of the mission.
-        """
-        arena = self._config.arena
-        colours = [as_hex(class_colour(arena, label)) for label in arena.classes]
-        for colour, mean in zip(colours, self._means, strict=True):
-            x, y = self._place(mean)
-            add(parent, "circle", cx=x, cy=y, r=3, fill=colour)
-        numbers = add(parent, "g")
-        num_pois = self._config.arena.num_pois
-        # Before the first look, ellipses exceed the view; each is slightly smaller than the last.
-        step = min(4.0, SIZE / 4 / num_pois)
-        for n in range(num_pois):
-            mean = self._place(_smooth(self._in_plane(record.belief.mean[:, n])))
-            widest = SIZE / 2 - 5 - step * n
-            std = self._scale * self._in_plane(record.belief.std[:, n])
-            radii = _smooth(np.minimum(std, widest))
-            colour = colours[int(self._end.classes[n])]
-            ellipse = add(parent, "ellipse", fill=colour, stroke=colour)
-            ellipse.set("stroke-width", "2.5")
-            for name, values in zip(("cx", "cy", "rx", "ry"), (*mean.T, *radii.T), strict=True):
-                timeline.animate(ellipse, name, values)
-            is_seen = record.seen[:, n].any(axis=-1)
-            timeline.animate(
-                ellipse, "stroke-dasharray", np.where(is_seen, "1 0", "2 5").tolist(), jumps=True
-            )
-            timeline.animate(ellipse, "fill-opacity", 0.1 * is_seen, jumps=True)
-            # Numbers of PoIs at the same place in the map stand side by side.
-            number = add(numbers, "g")
-            timeline.animate(number, "translate", mean + _beside(n, num_pois))
-            add(number, "text", str(n + 1), class_="film-number film-on-light", fill=colour)
-        self._draw_labels(parent, colours)
-
-    def _draw_labels(self, parent: Element, colours: list[str]) -> None:
-        """The names of the classes, beyond the ellipses that are as small as they get."""
-        for label, colour, mean, std in zip(
-            self._config.arena.classes, colours, self._means, self._stds, strict=True
-        ):
-            x, y = self._place(mean)
-            side = -1 if mean[1] >= 0 else 1
-            add(
-                parent,
-                "text",
-                label,
-                x=np.clip(x, 60, SIZE - 60),
-                y=y + side * (self._scale * std[1] + 12) + 5,
-                fill=colour,
-                class_="film-label film-on-light",
-            )
-
-    def _place(self, mean: ArrayLike) -> np.ndarray:
-        """`[..., 2]` latent, upwards from the middle, in pixels, downwards from the corner."""
-        return SIZE / 2 + self._scale * np.asarray(mean) * (1, -1)
-
-
-def _beside(n: int, num_pois: int) -> np.ndarray:
-    """Where the number of a PoI stands from its place in the map: in rows of four at most."""
-    columns = min(num_pois, _MOST_ABREAST)
-    row, column = divmod(n, columns)
-    rows = -(-num_pois // columns)
-    width = 14 if num_pois < 10 else 20  # px, of one or two digits
-    return np.array([width * (column - (columns - 1) / 2), 15 * (row - (rows - 1) / 2) - 6])
-
-
 def _sector(radius: float, angle: float) -> str:
     """A sector around the x axis, as a path; the angle in degrees."""
     half = np.radians(min(angle, 359.9) / 2)
@@ -230,12 +208,3 @@ def _sector(radius: float, angle: float) -> str:
     return (
         f"M0,0L{x:.1f},{-y:.1f}A{radius:.1f},{radius:.1f} 0 {int(angle > 180)} 1 {x:.1f},{y:.1f}Z"
     )
-
-
-def _smooth(values: np.ndarray) -> np.ndarray:
-    """`[F, 2]` with each jump as a short way."""
-    before = np.repeat(values[:1], _SMOOTHING - 1, axis=0)
-    windows = np.lib.stride_tricks.sliding_window_view(
-        np.concatenate([before, values]), _SMOOTHING, axis=0
-    )
-    return windows.mean(axis=-1)
