@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from jaxsense.run import cli, devices, version
 from jaxsense.run.devices import Workers
-from jaxsense.show.plots import png
+from jaxsense.show.drawing import png
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
 

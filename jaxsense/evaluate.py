@@ -22,7 +22,7 @@ from jaxsense.run import batches, cli, devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.programs import OwnPolicies
-from jaxsense.show import animation, mission_plots, page, plots, tables
+from jaxsense.show import animation, drawing, mission_plots, page, tables
 from jaxsense.show.terminal import Display, print_table, say
 from jaxsense.summary import compare, profile
 from jaxsense.summary.read import EVALUATIONS
@@ -176,17 +176,18 @@ def _write(
         blocks = {**(before["mission"] if before else {}), **missions}
         found = _evaluation(config, compare.compared(blocks))
         rundir.write_json(path, found)
-        files.write(path.with_suffix(".png"), plots.png(mission_plots.policies(found["mission"])))
+        plot = mission_plots.policies(found["mission"], found["num_pois"])
+        files.write(path.with_suffix(".svg"), drawing.svg(plot))
         report = _report(run, trained)
     return [*written, f"The metrics are in {path}, and with all others in {report}."]
 
 
 def _report(run: Path, config: Config) -> Path:
-    """Writes the page of a run and `teams.png`; raises `ConfigError` if its figures are wrong."""
+    """Writes the page of a run and `teams.svg`; raises `ConfigError` if its figures are wrong."""
     own, found, path = summary.read(run), summary.read_evaluations(run), run / "report.html"
     places = [_evaluation(config, own["mission"]), *found.values()]
     if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:
-        files.write(run / "teams.png", plots.png(mission_plots.teams(places)))
+        files.write(run / "teams.svg", drawing.svg(mission_plots.teams(places)))
     files.write(path, page.render(run, config, own, found, profile.read(run)))
     return path
 

@@ -344,7 +344,7 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
     curves = seeds.rewards(paths, run.settings.config, _warn)
-    _report().write(run, _report().of_seeds(curves, means), found)
+    _report().write(run, _report().of_seeds(run.settings.config, curves, means), found)
     rundir.write_json(run.path / "summary.json", found)
 
 

@@ -71,7 +71,7 @@ def resumed(stopped, cache):
 def test_a_stopped_run_goes_on_and_ends_the_same(resumed, smoke_run):
     path, printed = resumed
     assert without_times(path) == without_times(smoke_run)
-    assert (path / "reward.png").read_bytes() == (smoke_run / "reward.png").read_bytes()
+    assert (path / "reward.svg").read_bytes() == (smoke_run / "reward.svg").read_bytes()
     assert not (path / "checkpoints" / "unfinished").exists()
     # Nothing was trained twice.
     for stage in ("detector_camera", "detector_lidar", "jmvae_1", "dqn_camera", "dqn_lidar"):

@@ -104,9 +104,9 @@ def test_seeds_are_summed_up_without_a_damaged_curve(seeds, tmp_path, capsys, da
     train.main(["--resume", str(path), "--quiet", "--cache", "None"])
     said = capsys.readouterr().err.splitlines()
     assert len(said) == (4 if damage == "all missing" else 1)
-    assert all("curves_dqn" in line and line.endswith("left out of reward.png") for line in said)
+    assert all("curves_dqn" in line and line.endswith("left out of reward.svg") for line in said)
     assert (path / "summary.json").read_text() == (seeds / "summary.json").read_text()
-    assert (path / "reward.png").exists()
+    assert (path / "reward.svg").exists()
 
 
 def test_a_seed_that_fails_leaves_the_others(seeds, cache, tmp_path, monkeypatch, capsys):

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import jax
 import jax.numpy as jnp
@@ -28,11 +29,12 @@ PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 def test_run_directory_holds_everything(smoke_run):
     names = {path.name for path in smoke_run.iterdir()} | {".lock"}  # which may be gone
     names_of_plots = "latent_space", "reward", "scanlines", "calibration", "policies", "timing"
-    plots = {f"{name}.png" for name in names_of_plots}
+    plots = {f"{name}.svg" for name in names_of_plots}
     others = {"config.json", "metrics.jsonl", "summary.json", "timing.json", "checkpoints"}
-    assert names == {*others, *plots, "mission.svg", "report.html", ".lock"}
-    for plot in plots:
-        assert (smoke_run / plot).read_bytes()[:4] == b"\x89PNG"
+    films = {"mission.svg", "mission-naive.svg"}
+    assert names == {*others, *plots, *films, "report.html", ".lock"}
+    for picture in plots | films:
+        assert ElementTree.parse(smoke_run / picture).getroot().tag.endswith("svg")
     stages = {json.loads(line)["stage"] for line in (smoke_run / "metrics.jsonl").open()}
     assert {"detector_camera", "detector_lidar", "jmvae_1", "dqn_camera", "dqn_lidar"} <= stages
 
@@ -120,15 +122,24 @@ def test_the_time_of_a_run_adds_up(smoke_run):
 
 def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     first = dataclasses.replace(PRESETS["smoke"].mission, policies=("naive_2", "latent"))
-    config, titles = dataclasses.replace(PRESETS["smoke"], mission=first), []
-    draw = lambda *inputs: titles.append(inputs[-1]) or ""  # noqa: E731
+    config, drawn = dataclasses.replace(PRESETS["smoke"], mission=first), []
+    draw = lambda *inputs: drawn.append(inputs[-2:]) or ""  # noqa: E731
     monkeypatch.setattr(report.animation, "draw", draw)
-    monkeypatch.setattr(report.plots, "of_missions", lambda missions: {})
+    monkeypatch.setattr(report.plots, "of_missions", lambda missions, num_pois: {})
     learned = SimpleNamespace(models=SimpleNamespace(fusion=None), fields_of_view=None)
-    played = SimpleNamespace(recording=SimpleNamespace(records=None, end=None), missions={})
+
+    def recording(steps):
+        return SimpleNamespace(records=None, end=SimpleNamespace(steps=steps))
+
+    played = SimpleNamespace(recording=recording(50), missions={}, beside=None)
     found = report.of_missions(config, learned, played)  # pyright: ignore
     assert [*found] == ["mission.svg"]
-    assert titles == ["naive 2 policy"]
+    assert drawn == [("naive 2 policy", pytest.approx(5.0))]
+    # Beside the film of naive exploration, both last as long as the longer one.
+    played = SimpleNamespace(recording=recording(50), missions={}, beside=recording(80))
+    found = report.of_missions(config, learned, played)  # pyright: ignore
+    assert [*found] == ["mission.svg", "mission-naive.svg"]
+    assert drawn[1:] == [("naive 2 policy", pytest.approx(8.0)), ("naive policy", drawn[1][1])]
 
 
 def test_a_finished_run_is_loaded_with_its_settings(smoke_run):

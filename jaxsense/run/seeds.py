@@ -79,7 +79,7 @@ def _settings_of(run: RunDirectory, seed: int) -> Settings:
 def rewards(
     runs: Sequence[Path], config: Config, warn: Callable[[str], None]
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Reads the curves of `reward.png` from the checkpoints of several runs.
+    """Reads the curves of `reward.svg` from the checkpoints of several runs.
 
     Args:
       runs: their directories.
@@ -101,10 +101,10 @@ def rewards(
         try:
             found = Checkpoints(directory).load(name, shapes)
         except ConfigError as error:
-            warn(f"{error}; left out of reward.png")
+            warn(f"{error}; left out of reward.svg")
             return []
         if found is None:
-            warn(f"{directory}: holds no {name}; left out of reward.png")
+            warn(f"{directory}: holds no {name}; left out of reward.svg")
             return []
         return [found]
 

@@ -11,13 +11,17 @@ from jaxsense.summary.profile import Kind
 
 RGB = tuple[float, float, float]
 MARKERS = "oDs^"
+SOFT = "#59616e"
+"""Colour of what stands beside the main things."""
 
 _ROBOT_COLOURS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
 _POLICY_COLOURS = {
-    "latent": "#1558b0", "greedy": "C1", "bayes": "C2", "optimal": "C3", "nearest": "C4",
-    "auction": "C5", "rollout": "C6", "naive": "0.35", "naive_2": "0.5", "naive_3": "0.65",
-    "random": "0.75",
+    "latent": "#1558b0", "greedy": "#b84300", "bayes": "#00805f", "optimal": "#5e0d2b",
+    "nearest": "#d95fbe", "auction": "#2fa4e7", "rollout": "#b59a00", "naive": "#404040",
+    "naive_2": "#5c5c5c", "naive_3": "#737373", "random": "#858585",
 }  # fmt: skip
+_MARKERS = "oDs^vPX<>pd"
+_OTHER_POLICY = "#0891a8", "*"  # a custom one
 _OWN = "starting, summing up", "0.45"
 _TRACING = "tracing, lowering", "#d9a400"
 _SAVING = "saving", "#7d8a12"
@@ -39,14 +43,22 @@ def modality_colour(modality: int) -> str:
 
 
 def policy_colour(name: str) -> str:
-    """The colour of a policy, the same in all plots; those to compare with are grey."""
-    return _POLICY_COLOURS.get(name, "C9")
+    """The colour of a policy, the same in all plots; the simplest ones are grey.
+
+    Those that are not grey differ also for those who see no red or no green.
+    """
+    return _POLICY_COLOURS.get(name, _OTHER_POLICY[0])
 
 
 def policy_marker(name: str) -> str:
     """The marker of a policy, the same in all plots."""
-    names = [*_POLICY_COLOURS]
-    return MARKERS[names.index(name) % len(MARKERS) if name in names else -1]
+    markers = dict(zip(_POLICY_COLOURS, _MARKERS, strict=True))
+    return markers.get(name, _OTHER_POLICY[1])
+
+
+def class_marker(index: int) -> str:
+    """The marker of a class, by its place in `arena.classes`."""
+    return _MARKERS[index % len(_MARKERS)]
 
 
 def class_colour(arena: ArenaConfig, label: str) -> RGB:

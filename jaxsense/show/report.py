@@ -5,7 +5,7 @@ from jaxsense.run import files
 from jaxsense.run.clock import Clock
 from jaxsense.run.pipeline import Learned, Played
 from jaxsense.run.rundir import RunDirectory
-from jaxsense.show import animation, page, plots, timeline
+from jaxsense.show import animation, drawing, page, plots, timeline
 from jaxsense.show.artist import Pictures
 from jaxsense.summary import Results, Summary, profile
 
@@ -24,29 +24,39 @@ def of_training(config: Config, learned: Learned) -> Pictures:
 
 
 def of_missions(config: Config, learned: Learned, played: Played) -> Pictures:
-    """Draws the plots and the film of missions.
+    """Draws the plots of missions and the film of one, also under naive exploration.
 
     Args:
       config: settings of the run.
       learned: results of its training.
       played: results of its missions.
     """
-    title = f"{config.mission.policies[0]} policy".replace("_", " ")
-    recording, fusion = played.recording, learned.models.fusion
-    film = animation.draw(
-        config, recording.records, recording.end, fusion, learned.fields_of_view, title
-    )
-    return {**plots.of_missions(played.missions), "mission.svg": film}
+    films = {f"{config.mission.policies[0]} policy": played.recording}
+    if played.beside is not None:
+        films["naive policy"] = played.beside
+    lasts = max(animation.duration_of(config, each.end) for each in films.values())
+    fusion, fields = learned.models.fusion, learned.fields_of_view
+    drawn = [
+        animation.draw(
+            config, film.records, film.end, fusion, fields, title.replace("_", " "), lasts
+        )
+        for title, film in films.items()
+    ]
+    names = (f"{name}.svg" for name in page.OWN_FILMS)
+    pictures = plots.of_missions(played.missions, config.arena.num_pois)
+    return {**pictures, **dict(zip(names, drawn, strict=False))}
 
 
-def of_seeds(curves: plots.Curves, results: Results) -> Pictures:
+def of_seeds(config: Config, curves: plots.Curves, results: Results) -> Pictures:
     """Draws the plots of several seeds together.
 
     Args:
-      curves: see `plots.rewards`.
+      config: their settings.
+      curves: see `learning_plots.rewards`.
       results: means and intervals.
     """
-    return {**plots.of_learning(curves, results), **plots.of_missions(results["mission"])}
+    missions = plots.of_missions(results["mission"], config.arena.num_pois)
+    return {**plots.of_learning(curves, results), **missions}
 
 
 def write(
@@ -70,7 +80,7 @@ def write(
     spans = clock.spans if has_chart else []
     with clock.record("draw", "report"):
         if has_chart:
-            files.write(run.path / "timing.png", plots.png(timeline.timeline(spans)))
+            files.write(run.path / "timing.svg", drawing.svg(timeline.timeline(spans)))
         rendered = page.render(run.path, run.settings.config, found, spans=spans)
     with clock.record("save", "report"):
         files.write(run.path / "report.html", rendered)

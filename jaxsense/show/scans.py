@@ -77,7 +77,7 @@ def compare_scans(
       OSError: if a file cannot be read or written.
       ValueError: if the directory is not a finished run, or the recording does not fit its sensors.
     """
-    from jaxsense.show import plots, scan_plots  # noqa: PLC0415 (matplotlib takes long to import)
+    from jaxsense.show import drawing, scan_plots  # noqa: PLC0415 (matplotlib takes long to import)
 
     config, _ = load(run, trust)
     looks = recordings.read(config, file)
@@ -89,8 +89,8 @@ def compare_scans(
     }
     pairs, beside = [each for _, each in found.values()], path.with_suffix(".residuals.png")
     with files.new(path) as drawn, files.new(beside) as residuals:
-        drawn.write(plots.png(scan_plots.windows(pairs)))
-        residuals.write(plots.png(scan_plots.residuals(pairs)))
+        drawn.write(drawing.png(scan_plots.windows(pairs)))
+        residuals.write(drawing.png(scan_plots.residuals(pairs)))
     return Comparison({name: apart for name, (apart, _) in found.items()}, path, beside)
 
 

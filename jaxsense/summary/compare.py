@@ -43,6 +43,15 @@ def interval(values: np.ndarray) -> Interval:
     return {"mean": float(values.mean()), "low": low, "high": high}
 
 
+def at_most(number: int) -> float:
+    """The share that an event has at most, with 95% confidence, if none of some trials showed it.
+
+    Args:
+      number: of trials, taken as independent.
+    """
+    return 1 - (1 - _CONFIDENCE) ** (1 / number)
+
+
 def differences(found: Measured, reference: Measured) -> Differences:
     """Mean differences of one case from another, arena by arena, with their 95% intervals.
 

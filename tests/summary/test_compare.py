@@ -19,6 +19,12 @@ def test_a_single_value_has_no_interval():
     assert compare.interval(np.array([3.0])) == {"mean": 3.0, "low": None, "high": None}
 
 
+def test_what_was_never_seen_is_rare_with_confidence():
+    # If .05 = (1 - share)^n: of one trial .95, of 384 some 3 / n.
+    assert compare.at_most(1) == pytest.approx(0.95)
+    assert compare.at_most(384) == pytest.approx(0.00777, abs=1e-5)
+
+
 def test_differences_are_taken_arena_by_arena():
     # Of two PoIs: half, both and both right, against none, half and half.
     found = {
