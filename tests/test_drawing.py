@@ -86,7 +86,7 @@ def test_names_beside_an_axis_do_not_cover_each_other():
     ax = made.subplots()
     ax.set_ylim(0, 1)
     names = [("low", 0.11, "C0"), ("lower", 0.1, "C1"), ("below", -3.0, "C2"), ("high", 0.9, "C3")]
-    drawing.beside(ax, names)
+    drawing.name_ends(ax, names)
     made.draw_without_rendering()
     assert [text.get_text() for text in ax.texts] == ["below", "lower", "low", "high"]
     boxes = [text.get_window_extent() for text in ax.texts]

@@ -131,12 +131,12 @@ def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     def recording(steps):
         return SimpleNamespace(records=None, end=SimpleNamespace(steps=steps))
 
-    played = SimpleNamespace(recording=recording(50), missions={}, beside=None)
+    played = SimpleNamespace(recording=recording(50), missions={}, naive=None)
     found = report.of_missions(config, learned, played)  # pyright: ignore
     assert [*found] == ["mission.svg"]
     assert drawn == [("naive 2 policy", pytest.approx(5.0))]
-    # Beside the film of naive exploration, both last as long as the longer one.
-    played = SimpleNamespace(recording=recording(50), missions={}, beside=recording(80))
+    # With the film of naive exploration, both last as long as the longer one.
+    played = SimpleNamespace(recording=recording(50), missions={}, naive=recording(80))
     found = report.of_missions(config, learned, played)  # pyright: ignore
     assert [*found] == ["mission.svg", "mission-naive.svg"]
     assert drawn[1:] == [("naive 2 policy", pytest.approx(8.0)), ("naive policy", drawn[1][1])]

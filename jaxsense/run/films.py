@@ -26,15 +26,15 @@ class Recording:
 
 
 class Films:
-    """Records the first mission, and another one if it begins beside it."""
+    """Records the first mission, and another one if both begin together."""
 
-    def __init__(self, beside: int | None):
+    def __init__(self, second: int | None):
         """Begins without recordings.
 
         Args:
-          beside: the other mission; None for no other.
+          second: the other mission; None for no other.
         """
-        self._wanted = (0,) if beside is None else (0, beside)
+        self._wanted = (0,) if second is None else (0, second)
         self._chunks = [list[Recording]() for _ in self._wanted]
 
     def order(self, total: int, stride: int) -> Int[np.ndarray, " E"]:

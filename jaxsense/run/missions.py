@@ -33,7 +33,7 @@ from jaxsense.run.monitor import StageError
 
 Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
 
-_BESIDE = "naive"  # whose first mission is recorded beside that of the first case
+_SECOND = "naive"  # whose first mission is recorded as well as that of the first case
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,14 +44,14 @@ class Played:
       metrics: `[episodes, ...]` metrics of each case; see `mission.measure`.
       recording: the first mission of the first case.
       control_steps: total number of control periods, until each mission's end.
-      beside: the same mission under naive exploration; None if it was not played or did not begin
+      naive: the same mission under naive exploration; None if it was not played or did not begin
         together with the first one, for which there must be room.
     """
 
     metrics: dict[str, Measured]
     recording: Recording
     control_steps: int
-    beside: Recording | None = None
+    naive: Recording | None = None
 
 
 def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
@@ -307,8 +307,8 @@ class _Call:
         self._metrics = jax.tree.map(
             lambda x: np.zeros((self.total, *x.shape[1:]), x.dtype), metrics
         )
-        beside = [*played].index(_BESIDE) * episodes if _BESIDE in [*played][1:] else None
-        self.films = Films(beside)
+        second = [*played].index(_SECOND) * episodes if _SECOND in [*played][1:] else None
+        self.films = Films(second)
         self._lock = threading.Lock()
 
     def begins(self, missions: Int[np.ndarray, " B"]) -> tuple[np.ndarray, np.ndarray, Faults]:

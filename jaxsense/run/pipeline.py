@@ -58,12 +58,12 @@ class Played:
 
     Attributes:
       recording: the first mission of the first of `config.mission.policies`.
-      beside: the same mission under naive exploration, see `missions.Played`.
+      naive: the same mission under naive exploration, see `missions.Played`.
       missions: the block `mission` of `summary.json`.
     """
 
     recording: missions.Recording
-    beside: missions.Recording | None
+    naive: missions.Recording | None
     missions: summary.Missions
 
 
@@ -180,7 +180,7 @@ def play(
     found = player.play(mission_key(key), learned.models, played, episodes)
     (checkpoints or Checkpoints()).forget_unfinished()
     block = summary.missions(player.mission, found.metrics)
-    results = Played(found.recording, found.beside, block)
+    results = Played(found.recording, found.naive, block)
     monitor.clock.add_rest("summarise")
     return results
 

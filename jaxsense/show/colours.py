@@ -12,7 +12,7 @@ from jaxsense.summary.profile import Kind
 RGB = tuple[float, float, float]
 MARKERS = "oDs^"
 SOFT = "#59616e"
-"""Colour of what stands beside the main things."""
+"""Colour of what matters less."""
 
 _ROBOT_COLOURS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
 _POLICY_COLOURS = {

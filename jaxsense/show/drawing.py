@@ -1,4 +1,4 @@
-"""Figures as files, and names beside what they name.
+"""Figures as files, and names next to what they name.
 
 SVG files follow the colour scheme of the page that shows them: each colour has a counterpart on a
 dark page. What is black or white in a figure becomes the ink and the paper of `style.css`.
@@ -21,7 +21,7 @@ _PAPER, _INK = "#16181d", "#e6e8ec"  # of a dark page, as in `style.css`
 _LEAST_CONTRAST = 4.0  # of a colour with dark paper
 _GREY = 0.1  # most difference between the parts of a colour without a hue
 _FONT = 'system-ui,-apple-system,"Segoe UI",Roboto,sans-serif'
-_GAP = 1.25  # lines of text, between the names beside an axis
+_GAP = 1.25  # lines of text, between the names next to an axis
 _INCH = 72.0  # points
 
 
@@ -93,7 +93,7 @@ def _luminance(colour: RGB) -> float:
     return float(np.dot((0.2126, 0.7152, 0.0722), [*parts]))
 
 
-def beside(
+def name_ends(
     ax: Axes, names: Sequence[tuple[str, float, str]], size: float = 9.0
 ) -> list[Annotation]:
     """Writes names to the right of an axis, at their heights or as close as there is room.

@@ -22,7 +22,7 @@ rewards: `reward` of the exploring policy, and `evaluation` of the learned polic
 NaN where it was not played."""
 
 Names = list[tuple[str, float, str]]
-"""Text, height and colour of names beside an axis."""
+"""Text, height and colour of names next to an axis."""
 
 _SMOOTHING = 20  # epochs
 _MIN_LOOKS = 20  # in a bin of the calibration
@@ -67,7 +67,7 @@ def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:
             ax.set_ylim(bottom, top)
     for ax, of_panel in zip(axes, names, strict=True):
         bottom = ax.get_ylim()[0]
-        drawing.beside(
+        drawing.name_ends(
             ax,
             [
                 (f"{text}: {y:.2f}, below" if y < bottom else text, y, colour)

@@ -165,4 +165,4 @@ def _draw_times(ax: Axes, places: list[Evaluation], key: str, reference: str | N
     ax.set(xlabel=label)
     ax.set_xticks(ticks, texts)
     ax.grid(alpha=0.3)
-    drawing.beside(ax, ends)
+    drawing.name_ends(ax, ends)

@@ -32,8 +32,8 @@ def of_missions(config: Config, learned: Learned, played: Played) -> Pictures:
       played: results of its missions.
     """
     films = {f"{config.mission.policies[0]} policy": played.recording}
-    if played.beside is not None:
-        films["naive policy"] = played.beside
+    if played.naive is not None:
+        films["naive policy"] = played.naive
     lasts = max(animation.duration_of(config, each.end) for each in films.values())
     fusion, fields = learned.models.fusion, learned.fields_of_view
     drawn = [

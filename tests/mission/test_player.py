@@ -113,9 +113,9 @@ def test_the_whole_first_mission_is_recorded(split, play):
 
 
 @pytest.mark.parametrize("split", WORKERS)
-def test_naive_exploration_is_recorded_beside_the_first_mission(split, play, team):
+def test_naive_exploration_is_recorded_with_the_first_mission(split, play, team):
     played = play(WORKERS[split](), policies=("random", "latent", "naive"))
-    for recording, name in ((played.recording, "random"), (played.beside, "naive")):
+    for recording, name in ((played.recording, "random"), (played.naive, "naive")):
         walk = walk_of(0, recording.end.scene.poses.shape)
         np.testing.assert_allclose(recording.records.poses[:LAST], walk, atol=1e-4)
         np.testing.assert_array_equal(recording.end.scene.poses, recording.records.poses[-1])
@@ -125,9 +125,9 @@ def test_naive_exploration_is_recorded_beside_the_first_mission(split, play, tea
 
 
 def test_without_room_or_naive_exploration_one_mission_is_recorded(play):
-    assert play(Workers(), policies=("random", "naive"), batch=1, episodes=2).beside is None
-    assert play(Workers(), policies=("random", "latent"), episodes=2).beside is None
-    assert play(Workers(), policies=("naive", "random"), episodes=2).beside is None
+    assert play(Workers(), policies=("random", "naive"), batch=1, episodes=2).naive is None
+    assert play(Workers(), policies=("random", "latent"), episodes=2).naive is None
+    assert play(Workers(), policies=("naive", "random"), episodes=2).naive is None
 
 
 def test_events_of_a_mission_do_not_depend_on_when_it_is_played(play):

@@ -103,7 +103,7 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
 
 def test_the_network_of_a_team_is_evaluated_with_its_first_sensor():
     team = dataclasses.replace(BANK, dqn=dataclasses.replace(BANK.dqn, task="team"))
-    # As its curve is titled, beside the optimum of that sensor, see `plots.rewards`.
+    # As its curve is titled, beside the optimum of that sensor, see `learning_plots.rewards`.
     assert stage_of("dqn_team", team).inputs["modality"] == 0
 
 

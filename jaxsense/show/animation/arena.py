@@ -100,7 +100,7 @@ class ArenaView:
             turn = f"rotate({-np.degrees(float(layout.yaw[n])):.1f})"
             box = add(group, "rect", x=-u, y=-v, width=2 * u, height=2 * v, rx=1, fill=colour)
             box.set("transform", turn)
-        if self._numbers_beside:
+        if self._is_small:
             beside = {"x": radius + 12, "fill": colour, "class_": "film-number film-on-light"}
         else:
             beside = {"x": 0, "fill": "#fff", "class_": "film-number"}
@@ -119,13 +119,13 @@ class ArenaView:
             timeline.animate(mark, "opacity", record.seen[:, n, m], jumps=True)
 
     def _draw_bars(self, parent: Element, timeline: Timeline, record: Record, n: int) -> None:
-        """Bars beside a PoI, which fill with the probabilities of its classes."""
+        """Bars next to a PoI, which fill with the probabilities of its classes."""
         arena = self._config.arena
         x, y = self._place(self._end.scene.layout.position[n])
         width = min(_BAR, _BARS / len(arena.classes))
-        beside = self._scale * arena.poi_radius + (20 if self._numbers_beside else 5)
+        gap = self._scale * arena.poi_radius + (20 if self._is_small else 5)
         across = width * len(arena.classes)
-        left = x + beside if x + beside + across < SIZE else x - beside - across
+        left = x + gap if x + gap + across < SIZE else x - gap - across
         # Upwards, so that only the height changes.
         group = add(parent, "g", transform=f"translate({left:.1f} {y + _TALL / 2:.1f}) scale(1 -1)")
         add(
@@ -158,7 +158,7 @@ class ArenaView:
         timeline.animate(text, "opacity", 1.0 - is_seen, jumps=True)
 
     @property
-    def _numbers_beside(self) -> bool:
+    def _is_small(self) -> bool:
         """Whether PoIs are too small for their numbers."""
         return self._scale * self._config.arena.poi_radius < _READABLE
 

@@ -21,7 +21,7 @@ _AFTER = 10  # frames shown after the mission's end
 _PAUSE = 2.5  # s that the last one stays
 _TINY = 1e-3  # s, less than a control period
 _TOP, _LINE = 38, 26
-_ICON = 14  # px, length of a field of view beside the name of a robot
+_ICON = 14  # px, length of a field of view next to the name of a robot
 _PHASES = ("choosing", "driving to", "looking at", "backing off from", "done", "failed")
 _STYLE = """
 .film{--paper:#fff;--ink:#1d2129;--soft:#59616e;--floor:#f2f4f7;color-scheme:light dark}
@@ -82,7 +82,7 @@ def draw(
     robots = " and ".join(dict.fromkeys(config.carried))
     text = (
         f"{title}: robots with {robots} look at {config.arena.num_pois} points of interest; bars "
-        f"beside each fill with the probabilities of its classes, and the ellipses of the shared "
+        f"next to each fill with the probabilities of its classes, and the ellipses of the shared "
         f"map shrink. It ends after {seconds:.1f} s."
     )
     add(root, "title", text, id="title")
