@@ -39,6 +39,7 @@ def test_every_colour_of_a_file_has_a_counterpart_on_a_dark_page():
 def test_words_stay_words_in_the_font_of_the_page_and_files_repeat():
     text = drawing.svg(figure()).decode()
     assert ">some words</text>" in text
+    assert "<style>text{font-family:system-ui," in text
     assert "DejaVu" not in text
     assert text == drawing.svg(figure()).decode()
     paths = re.findall(r' d="([^"]*)"', text)

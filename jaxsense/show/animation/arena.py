@@ -14,6 +14,7 @@ from jaxsense.show.colours import as_hex, class_colour, modality_colour
 
 _FLASH = 6  # frames that a look is shown for
 _READABLE = 9.0  # px, radius of a PoI that its number fits into
+_GAP = 4.0  # px, between a PoI and its bars
 _BARS, _BAR, _TALL = 26.0, 6.0, 24.0  # px: most of all bars abreast, most of one, and height
 
 
@@ -38,6 +39,11 @@ class ArenaView:
         self._config, self._end, self._fields_of_view = config, end, fields_of_view
         self._probabilities = probabilities
         self._scale = SIZE / config.arena.side
+        radius = self._scale * config.arena.poi_radius
+        # With its number, if that stands to the right of it.
+        reach = np.array([radius, radius, radius + 16 if self._is_small else radius, radius])
+        size = np.array([_width(len(config.arena.classes)) * len(config.arena.classes), _TALL])
+        self._bars_at = _corners(self._place(end.scene.layout.position), reach, size)
 
     def draw(self, parent: Element, timeline: Timeline, record: Record) -> None:
         """Adds the view.
@@ -121,38 +127,24 @@ class ArenaView:
     def _draw_bars(self, parent: Element, timeline: Timeline, record: Record, n: int) -> None:
         """Bars next to a PoI, which fill with the probabilities of its classes."""
         arena = self._config.arena
-        x, y = self._place(self._end.scene.layout.position[n])
-        width = min(_BAR, _BARS / len(arena.classes))
-        gap = self._scale * arena.poi_radius + (20 if self._is_small else 5)
-        across = width * len(arena.classes)
-        left = x + gap if x + gap + across < SIZE else x - gap - across
+        left, top = self._bars_at[n]
         # Upwards, so that only the height changes.
-        group = add(parent, "g", transform=f"translate({left:.1f} {y + _TALL / 2:.1f}) scale(1 -1)")
-        add(
-            group,
-            "rect",
-            x=-1,
-            y=-1,
-            width=across + 2,
-            height=_TALL + 2,
-            rx=2,
-            fill="#fff",
-            opacity=0.75,
-        )
+        place = f"translate({left:.1f} {top + _TALL:.1f}) scale(1 -1)"
+        group = add(parent, "g", transform=place)
+        width = _width(len(arena.classes))
+        across = width * len(arena.classes)
+        paper = {"width": across + 2, "height": _TALL + 2, "fill": "#fff", "opacity": 0.75}
+        add(group, "rect", x=-1, y=-1, rx=2, **paper)
         heights = _TALL * smooth(self._probabilities[:, n])
         for c, label in enumerate(arena.classes):
             colour = as_hex(class_colour(arena, label))
-            bar = add(group, "rect", x=width * c, width=max(width - 1, 0.8 * width), fill=colour)
+            bar = add(group, "rect", x=width * c, width=0.85 * width, fill=colour)
             timeline.animate(bar, "height", heights[:, c])
+        x, y = self._place(self._end.scene.layout.position[n])
         below = self._scale * arena.poi_radius + 15
         is_low = y + below > SIZE - 4
-        text = add(
-            parent,
-            "text",
-            "unknown",
-            x=np.clip(x, 26, SIZE - 26),
-            class_="film-unknown film-on-light",
-        )
+        text = add(parent, "text", "unknown", class_="film-unknown film-on-light")
+        text.set("x", f"{np.clip(x, 26, SIZE - 26):.1f}")
         text.set("y", f"{y - below + 8 if is_low else y + below:.1f}")
         is_seen = record.seen[:, n].any(axis=-1)
         timeline.animate(text, "opacity", 1.0 - is_seen, jumps=True)
@@ -199,6 +191,42 @@ class ArenaView:
         )
         add(body, "circle", r=radius + 2, fill=colour, stroke="#fff", stroke_width=1.5)
         add(body, "path", d=f"M1,0H{radius:.1f}", stroke="#fff", stroke_width=2.5)
+
+
+def _width(number: int) -> float:
+    """Width of each of a number of bars, in px."""
+    return min(_BAR, _BARS / number)
+
+
+def _corners(middles: np.ndarray, reach: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Where bars stand next to each PoI: `[N, 2]` upper left corners in px.
+
+    They stand to its right, left, below or above it, in the view and where they cover least of
+    other PoIs and of bars.
+
+    Args:
+      middles: `[N, 2]` of the PoIs.
+      reach: `[4]` of each PoI to the left, up, right and down.
+      size: `[2]` of the bars.
+    """
+    taken = np.concatenate([middles - reach[:2], middles + reach[2:]], axis=1)
+    found = []
+    for middle in middles:
+        to_left, up, to_right, down = reach + _GAP
+        places = middle + np.array(
+            [
+                (to_right, -size[1] / 2),
+                (-to_left - size[0], -size[1] / 2),
+                (-size[0] / 2, down),
+                (-size[0] / 2, -up - size[1]),
+            ]
+        )
+        low, high = np.maximum(places[:, None], taken[:, :2]), places[:, None] + size
+        covered = np.maximum(np.minimum(high, taken[:, 2:]) - low, 0).prod(axis=-1).sum(axis=-1)
+        outside = (places < 0).any(axis=-1) | (places + size > SIZE).any(axis=-1)
+        found.append(places[np.argmin(covered + SIZE**2 * outside)])
+        taken = np.concatenate([taken, [[*found[-1], *(found[-1] + size)]]])
+    return np.array(found)
 
 
 def _sector(radius: float, angle: float) -> str:

@@ -32,7 +32,7 @@ _STYLE = """
 .film-number{font-size:15px;font-weight:700;text-anchor:middle}
 .film-label{font-size:14px;font-weight:600;text-anchor:middle}
 .film-note{fill:var(--soft);font-size:14px}
-.film-unknown{fill:#59616e;font-size:12px;text-anchor:middle}
+.film-unknown{fill:#59616e;font-size:12px;text-anchor:middle}.film-start{text-anchor:start}
 .film-on-light{stroke:var(--floor);stroke-width:3px;paint-order:stroke;stroke-linejoin:round}
 .film-still{display:none}
 @media (prefers-color-scheme:dark){

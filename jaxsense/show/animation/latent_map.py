@@ -13,7 +13,7 @@ from jaxsense.show.colours import as_hex, class_colour, in_plane, plane
 
 _CERTAIN = 0.9  # probability of a class from which on a PoI stands at its name
 _MOST_ABREAST = 4  # numbers
-_LETTER = 3.9  # px, half a letter of a label
+_LETTER, _NEXT_LINE = 3.9, 16.0  # px, of a label: half a letter, and from line to line
 
 
 class MapView:
@@ -84,22 +84,25 @@ class MapView:
         ring.set("stroke-width", "1.5")
         ring.set("stroke-dasharray", "2 5")
         timeline.animate(ring, "opacity", ~is_seen.all(axis=1), jumps=True)
-        texts = [_listed("unknown", ~seen) for seen in is_seen]
-        strip(parent, timeline, texts, x=SIZE / 2, y=SIZE - 26, class_="film-unknown film-on-light")
+        numbers = [_listed(~seen) for seen in is_seen]
+        texts = [f"unknown: {each}" if each else "" for each in numbers]
+        strip(parent, timeline, texts, x=8, y=18, class_="film-unknown film-start film-on-light")
 
     def _draw_labels(
         self, parent: Element, timeline: Timeline, colours: list[str], is_certain: np.ndarray
     ) -> None:
-        """The names of the classes and of PoIs that are certain, beyond the smallest ellipses."""
+        """The classes and, beyond their names, the PoIs that are certain to be of them."""
         likeliest = self._probabilities.argmax(axis=-1)
         for c, (label, colour) in enumerate(zip(self._config.arena.classes, colours, strict=True)):
             x, y = self._place(self._means[c])
             side = -1 if self._means[c, 1] >= 0 else 1
             y += side * (self._scale * self._stds[c, 1] + 12) + 5
-            texts = [_listed(label, of_class, label) for of_class in is_certain & (likeliest == c)]
-            half = min(_LETTER * max(map(len, texts)), SIZE / 2)
-            place = {"x": np.clip(x, half, SIZE - half), "y": y}
-            strip(parent, timeline, texts, fill=colour, class_="film-label film-on-light", **place)
+            numbers = [_listed(of_class) for of_class in is_certain & (likeliest == c)]
+            half = min(_LETTER * max(map(len, [label, *numbers])), SIZE / 2)
+            style = {"x": np.clip(x, half, SIZE - half), "fill": colour}
+            style["class_"] = "film-label film-on-light"
+            add(parent, "text", label, y=y, **style)
+            strip(parent, timeline, numbers, y=y + side * _NEXT_LINE, **style)
 
     def _radii(self, std: ArrayLike) -> np.ndarray:
         """`[..., D]` standard deviations in px; before the first look they exceed the view."""
@@ -110,10 +113,9 @@ class MapView:
         return SIZE / 2 + self._scale * np.asarray(mean) * (1, -1)
 
 
-def _listed(word: str, chosen: np.ndarray, none: str = "") -> str:
-    """A word and the numbers of the chosen `[N]` PoIs."""
-    numbers = np.flatnonzero(chosen) + 1
-    return f"{word}: {', '.join(map(str, numbers))}" if len(numbers) else none
+def _listed(chosen: np.ndarray) -> str:
+    """The numbers of the chosen `[N]` PoIs."""
+    return ", ".join(str(n + 1) for n in np.flatnonzero(chosen))
 
 
 def _beside(n: int, num_pois: int) -> np.ndarray:
