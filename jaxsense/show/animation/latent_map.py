@@ -53,7 +53,7 @@ class MapView:
         for colour, mean in zip(colours, self._means, strict=True):
             x, y = self._place(mean)
             add(parent, "circle", cx=x, cy=y, r=3, fill=colour)
-        is_seen = np.asarray(record.seen).any(axis=-1)
+        is_seen = np.any(record.seen, axis=-1)
         is_certain = is_seen & (self._probabilities.max(axis=-1) >= _CERTAIN)
         self._draw_unknown(parent, timeline, is_seen)
         numbers = add(parent, "g")
