@@ -30,17 +30,17 @@ _REFERENCE = "naive"
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Plays a mission of trained robots, and again with naive exploration, on one page."""
+    """Plays a mission with trained robots, and again with naive exploration, on one page."""
 
     preset: str = "noisy"
-    """Settings that the robots were trained with: `default`, `noisy`, `many`, `raw` or `team`."""
+    """Preset with which the robots were trained: `default`, `noisy`, `many`, `raw` or `team`."""
     policy: str = "latent"
-    """Policy to compare with naive exploration: `latent`, which was learned, `greedy`, `bayes`,
+    """Policy to compare with naive exploration: `latent` (the learned policy), `greedy`, `bayes`,
     `optimal`, `naive_2`, `naive_3`, `random`, `nearest`, `auction` or `rollout`."""
     seed: int = 0
     """Seed of the arena and of all noise, from 0 to 2^32 - 1."""
     out: Path | None = None
-    """Directory of the page; a new or empty one. By default `runs/DATE-TIME-demo-PRESET`."""
+    """Directory for the page, new or empty; by default `runs/DATE-TIME-demo-PRESET`."""
     browser: bool = True
     """Open the page in a browser, if there is a display."""
     cache: Path | None = cli.CACHE

@@ -32,7 +32,7 @@ PROGRAM = "jaxsense.evaluate"
 
 @dataclasses.dataclass(frozen=True)
 class ArenaArguments:
-    """Another arena than the run's."""
+    """An arena that may differ from the run's."""
 
     PLACE = "arena"
     num_pois: int | None = None
@@ -56,10 +56,10 @@ class Arguments:
     seed: int = 0
     """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
     policy: str = "all"
-    """`latent`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3`, `random`, `nearest`,
-    `auction` or `rollout`, or all of these: `policies`. `ROBOT_alone`, `ROBOT_stops` or
-    `ROBOT_blind`, such as `camera_alone`, is the latent policy where that robot is alone, stops or
-    goes blind after 6 s. `all` plays everything."""
+    """What to play: `latent`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3`,
+    `random`, `nearest`, `auction` or `rollout`; `policies` for all of these; `ROBOT_alone`,
+    `ROBOT_stops` or `ROBOT_blind`, such as `camera_alone`, for the latent policy in missions in
+    which that robot is alone, stops or goes blind after 6 s; or `all` for everything."""
     arena: ArenaArguments = ArenaArguments()
     robots: tuple[str, ...] | None = None
     """Sensors of the robots, one per robot, for example `camera camera lidar`; the run's by
@@ -72,7 +72,7 @@ class Arguments:
     animate: bool = False
     """Also write an animation of the first mission, `mission-POLICY-SEED.svg`."""
     trust: bool = False
-    """Run the code of custom sensors that the run's `config.json` names."""
+    """Trust the run's `config.json`: run the code of custom sensors that it names."""
 
     def __post_init__(self):
         check_fields(self, bits=64)

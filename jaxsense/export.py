@@ -126,12 +126,12 @@ class Arguments:
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
-    newest one in `runs/`, or `pretrained:PRESET` for models that travel with jaxsense."""
+    newest one in `runs/`, or `pretrained:PRESET` for models that come with jaxsense."""
     out: Path | None = None
-    """File to write; it must not exist yet. By default `exported.zip` in the run's directory, or
-    `PRESET.zip` here."""
+    """File to write, which must not exist yet; by default `exported.zip` in the run's directory, or
+    `PRESET.zip` in the current directory."""
     trust: bool = False
-    """Run the code of custom sensors that the run's `config.json` names."""
+    """Trust the run's `config.json`: run the code of custom sensors that it names."""
 
     def __post_init__(self):
         check_fields(self)

@@ -56,16 +56,17 @@ class Arguments:
     seed: int = 0
     """Seed of all randomness, from 0 to 2^32 - 1."""
     out: Path | None = None
-    """New or empty directory to write. By default `runs/DATE-TIME-PRESET`."""
+    """Directory to write, new or empty; by default `runs/DATE-TIME-PRESET`."""
     num_seeds: int = 1
     """Number of seeds to train, starting from `--seed`. Each has its own directory within the run,
     which reports their means and 95 % confidence intervals."""
     file: Annotated[Path | None, Name("--config")] = None
-    """The `config.json` of a run. A new run starts from its preset, seed and settings."""
+    """The `config.json` of a run whose preset, seed and settings the new run starts from."""
     resume: Path | None = None
     """Directory of a stopped run to continue, with its own settings."""
     trust: bool = False
-    """Run the code of custom sensors that the `config.json` of `--config` or `--resume` names."""
+    """Trust the `config.json` of `--config` or `--resume`: run the code of custom sensors that it
+    names."""
     quiet: bool = False
     """Print only errors, the path of the results and the next command."""
     tensorboard: bool = False

@@ -22,12 +22,12 @@ class DetectorConfig(Section, place="detector"):
     """Simulated scans to train on, per modality."""
     calibration: float = limited(0.0, at_least=0, at_most=0.5)
     """Share of these scans that calibrates the detector instead, or the encoder if the JMVAE learns
-    from scans: their likelihood sets the temperature of its probabilities."""
+    from scans: the temperature of its probabilities maximises their likelihood."""
     num_held_out: int = limited(8192, at_least=1)
-    """Simulated scans that measure the accuracy."""
+    """Simulated scans for measuring the accuracy."""
     num_repeats: int = limited(0, at_least=0, at_most=1_000_000)
-    """Scenes in which each sensor looks at a PoI again and again, from which it is learned how much
-    of a look from near earlier ones is new, see `vae.novelty`. With 0, all of it counts."""
+    """Scenes in which each sensor looks at a PoI several times, to learn how much of a look near
+    earlier ones is new, see `vae.novelty`. With 0, every look counts in full."""
     steps: int = limited(4000, at_least=1)
     """Gradient steps."""
     batch: int = limited(512, at_least=1)
@@ -54,8 +54,8 @@ class JmvaeConfig(Section, place="jmvae"):
 
     learns_from: Literal["detections", "scans"] = "detections"
     """What the JMVAE learns from. `scans` needs neither detectors nor labels: looks are grouped by
-    the PoI that they show, and the encoders serve as detectors, see `jaxsense.vae.leave_one_out`.
-    The setting fusion must then be `filter`."""
+    PoI, and the encoders serve as detectors, see `jaxsense.vae.leave_one_out`. `jmvae.fusion` must
+    then be `filter`."""
     latent_size: int = limited(2, at_least=1, at_most=256)
     """Dimensions of the latent space, D_z."""
     hidden: tuple[int, ...] = limited((64, 64), at_least=1, min_items=1)
@@ -63,7 +63,7 @@ class JmvaeConfig(Section, place="jmvae"):
     alpha: Traced[float] = limited(0.1, at_least=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to each subset's."""
     alpha_start: Traced[float] = limited(0.0, at_least=0, at_most=1)
-    """Share of the training after which alpha sets in; only if the JMVAE learns from scans."""
+    """Share of the training after which alpha takes effect, if the JMVAE learns from scans."""
     beta: Traced[float] = limited(0.001, above=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to the prior."""
     initial_beta: Traced[float] = limited(0.7, above=0, at_most=_MAX_WEIGHT)
@@ -78,8 +78,9 @@ class JmvaeConfig(Section, place="jmvae"):
     """How a look updates a belief. `in_place`, as in the paper, replaces it. `filter` accumulates
     looks, see the section filter."""
     restarts: int = limited(3, at_least=1, at_most=1000)
-    """Trainings from different random parameters; the one with the lowest loss is kept, of those
-    from whose beliefs class probabilities are read exactly (which is not asked of one of scans)."""
+    """Trainings from different random parameters. The run keeps the one with the lowest loss among
+    those whose beliefs give class probabilities back exactly, or among all if the JMVAE learns from
+    scans."""
     looks: int = limited(4, at_least=2, at_most=100)
     """Looks by each sensor at a PoI, if the JMVAE learns from scans."""
     samples_per_class: int = limited(10000, at_least=1)
@@ -87,7 +88,8 @@ class JmvaeConfig(Section, place="jmvae"):
     steps: int = limited(3000, at_least=1)
     """Gradient steps."""
     batch: int = limited(256, at_least=1)
-    """Sets of detections, one of each modality, per gradient step; PoIs if it learns from scans."""
+    """Sets of detections, one of each modality, per gradient step; if the JMVAE learns from scans,
+    PoIs per gradient step."""
     learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
     """Initial learning rate of Adam; decays to zero along a cosine."""
 
@@ -136,7 +138,7 @@ class FilterConfig(Section, place="filter"):
     hidden: tuple[int, ...] = limited((32,), at_least=1, min_items=1)
     """Sizes of the hidden layers of each modality's network."""
     looks: int = limited(6, at_least=1, at_most=100)
-    """Looks in each sequence that it is trained on."""
+    """Looks in each training sequence."""
     steps: int = limited(2000, at_least=1)
     """Gradient steps."""
     batch: int = limited(256, at_least=1)
@@ -193,8 +195,8 @@ class ToursConfig(Section, place="team.tours"):
     walk: Traced[int] = limited(8, at_least=0, at_most=10_000)
     """Maximum number of choices before the state in which alternatives are tried."""
     steps: int = limited(3200, at_least=0)
-    """Gradient steps. With 0 no order is learned: an auction orders the looks that pay, as it does
-    for `task` = map."""
+    """Gradient steps. With 0, no order is learned, and an auction orders the looks that pay, as
+    with `dqn.task` = `map`."""
     batch: int = limited(1024, at_least=1)
     """States per gradient step."""
     learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
@@ -224,9 +226,9 @@ class TeamConfig(Section, place="team"):
     alone: Traced[float] = limited(0.25, at_least=0, at_most=1)
     """Share of episodes with one robot and no travel, as in the paper."""
     partly_seen: Traced[float] = limited(0.5, at_least=0, at_most=1)
-    """Share of the other episodes that start with some looks taken."""
+    """Share of the other episodes that start with some looks already taken."""
     second_cost: Traced[float] = limited(0.0, at_least=0)
-    """Cost of a second, in units of the reward."""
+    """Cost of each second in which a robot works, in units of the reward."""
     max_steps: Traced[int] = limited(300, at_least=1, at_most=100_000)
     """Maximum length of an episode, in choices."""
 
@@ -245,9 +247,9 @@ class DqnConfig(Section, place="dqn"):
     """The deep Q-network of each modality."""
 
     task: Literal["map", "team"] = "map"
-    """`map`: an agent looks alone at `arena.num_pois` PoIs and looks take no time, as in the paper;
-    a dense network for each modality. `team`: robots share the map, see the section team; one
-    network for any number of PoIs and robots."""
+    """`map`: a single agent looks at `arena.num_pois` PoIs, and looks take no time, as in the
+    paper; each modality has a dense network. `team`: robots share the map, see the section team;
+    one network serves any number of PoIs and robots."""
     observe: Literal["live", "bank"] = "live"
     """`live` casts a scan in the environment's own arena at every step; `bank` draws from stored
     detections."""
@@ -264,13 +266,13 @@ class DqnConfig(Section, place="dqn"):
     replay_capacity: int = limited(512000, at_least=1)
     """Capacity of the replay, in transitions; a multiple of num_envs."""
     discount: Traced[float] = limited(0.5, at_least=0, at_most=1)
-    """Discount factor, gamma: per step, or with `task` = team per second."""
+    """Discount factor, gamma: per step, or per second with `dqn.task` = `team`."""
     learning_rate: Traced[float] = limited(1e-3, above=0, at_most=1)
     """Initial learning rate of Adam."""
     final_learning_rate: Traced[float] = limited(1e-5, at_least=0, at_most=1)
     """Learning rate of the last epoch, reached along a cosine."""
     epsilon_start: Traced[float] = limited(1.0, at_least=0, at_most=1)
-    """Probability of a random action in the first epoch, epsilon."""
+    """Probability of a random action, epsilon, in the first epoch."""
     epsilon_min: Traced[float] = limited(0.01, at_least=0)
     """Minimum probability of a random action."""
     epsilon_decay: Traced[float] = limited(0.99, above=0, at_most=1)
@@ -328,7 +330,8 @@ class EvaluationConfig(Section, place="evaluation"):
     """Further numbers of PoIs for which a team's policy is compared with the optimum of the map
     MDP."""
     num_states: int = limited(4096, at_least=1, at_most=100_000)
-    """Maximum number of map states in which policies are compared; of more, a stratified sample."""
+    """Maximum number of map states in which policies are compared; if there are more, a stratified
+    sample of them."""
     value_points: int = limited(2048, at_least=1, at_most=100_000)
     """Maximum size of the grid on which look values are tabulated, see `dqn.optimum`."""
     value_looks: int = limited(32, at_least=1, at_most=10_000)

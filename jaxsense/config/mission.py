@@ -13,12 +13,12 @@ VIEW_SIDES = 16
 
 
 class NavigationConfig(Section, place="navigation"):
-    """Navigation of a robot: the paper's move_base, with the AMiRo's numbers."""
+    """Navigation of a robot: the paper's move_base, with the AMiRo's parameters."""
 
     horizon: Traced[float] = limited(2.0, at_least=1, at_most=60)
     """Length of a trajectory, in seconds."""
     robot_radius: Traced[float] = limited(0.1, above=ROBOT_RADIUS)
-    """Radius of a robot in planning, in metres; its body's is 0.05."""
+    """Radius of a robot in planning, in metres; that of its body is 0.05."""
     inflation: Traced[float] = limited(0.1, at_least=0)
     """Distance to obstacles below which a trajectory costs more, in metres."""
     view_distances: Traced[tuple[float, ...]] = limited(
@@ -35,18 +35,18 @@ class NavigationConfig(Section, place="navigation"):
 
 
 class SearchConfig(Section, place="mission.localisation.search"):
-    """How far a robot that may be misplaced searches its scan for a PoI; by default not at all.
+    """Search for a PoI in the scan of a robot that may be misplaced; off by default.
 
-    The gate judges all windows and distances that errors up to these explain. A robot also looks
-    from farther away than `viewpoint.min_distance`, by the error of its position.
+    The gate judges all windows and distances that errors up to these could explain. A robot also
+    keeps a distance of at least `viewpoint.min_distance` plus `position` from the PoI.
     """
 
     position: float = limited(0.0, at_least=0, at_most=0.3)
-    """Largest error of a robot's position to search for, in metres, for example three times
-    `position_error`."""
+    """Largest error of a robot's position that the search allows for, in metres, for example three
+    times `position_error`."""
     heading: float = limited(0.0, at_least=0, at_most=30)
-    """Largest error of a robot's heading to search for, in degrees, for example three times
-    `heading_error`."""
+    """Largest error of a robot's heading that the search allows for, in degrees, for example three
+    times `heading_error`."""
 
     @property
     def applies(self) -> bool:
@@ -55,40 +55,42 @@ class SearchConfig(Section, place="mission.localisation.search"):
 
 
 class LocalisationConfig(Section, place="mission.localisation"):
-    """Errors of the poses that robots believe they have; none in all presets.
+    """Errors of the poses that robots believe they have; 0 in all presets.
 
     All errors are normally distributed, and those of x and y are independent.
     """
 
     in_training: bool = False
-    """Whether the looks that detectors and policies learn from have the constant errors, too; never
-    those that driving adds."""
+    """Whether detectors and policies also learn from looks with the constant errors; they never
+    learn from errors that driving adds."""
     position_error: Traced[float] = limited(0.0, at_least=0, at_most=1)
     """Standard deviation of the constant error of a robot's x and y in a mission, in metres."""
     heading_error: Traced[float] = limited(0.0, at_least=0, at_most=180)
     """Standard deviation of the constant error of a robot's heading in a mission, in degrees."""
     position_drift: Traced[float] = limited(0.0, at_least=0, at_most=1)
-    """Standard deviation of what driving adds to the errors of x and y, in metres after one metre;
-    it grows with the square root of the distance."""
+    """Standard deviation of the errors of x and y that one metre of driving adds, in metres; it
+    grows with the square root of the distance."""
     heading_drift: Traced[float] = limited(0.0, at_least=0, at_most=180)
-    """Standard deviation of what driving adds to the error of the heading, in degrees after one
-    metre; it grows with the square root of the distance."""
+    """Standard deviation of the error of the heading that one metre of driving adds, in degrees; it
+    grows with the square root of the distance."""
     search: SearchConfig = SearchConfig()
-    """How far a robot searches its scan for a PoI, because it may be misplaced."""
+    """Search for a PoI in the scan of a robot that may be misplaced."""
 
 
 class CommunicationConfig(Section, place="mission.communication"):
-    """What robots tell each other of their looks, and how much of it arrives."""
+    """Messages between robots about their looks, which may be lost or late."""
 
     own_maps: bool = False
-    """Whether each robot decides by a map of its own, from its looks and from messages of the
-    others. Otherwise all share one map. Needs `jmvae.fusion` = `filter`, by which looks add up."""
+    """Whether each robot decides from its own map, which its looks and messages from the others
+    update; otherwise all robots share one map. Requires `jmvae.fusion` = `filter`, with which looks
+    add up."""
     loss: Traced[float] = limited(0.0, at_least=0, at_most=0.95)
-    """Share of the messages that are lost; only with `own_maps`."""
+    """Share of messages that are lost; only with `own_maps`."""
     delay: Traced[float] = limited(0.0, at_least=0, at_most=3600)
-    """Mean delay of a message, in seconds, from none to twice as much; only with `own_maps`."""
+    """Mean delay of a message, in seconds; each delay is drawn from 0 to twice the mean. Only with
+    `own_maps`."""
     period: Traced[float] = limited(1.0, above=0, at_most=3600)
-    """Seconds after which a robot repeats its message, which it also sends after each look."""
+    """Seconds after which a robot repeats its message; it also sends one after each look."""
 
     def check(self) -> None:
         """Checks that messages are sent if they are lost or late; raises `ConfigError`."""
@@ -101,9 +103,9 @@ class MissionConfig(Section, place="mission"):
     """The closed loop of all robots in one arena."""
 
     policies: tuple[str, ...] = limited(("latent", "naive", "random"), min_items=1)
-    """Policies that play missions at the end of a run, of `latent`, `greedy`, `bayes`, `optimal`,
-    `naive`, `naive_2`, `naive_3`, `random`, `nearest`, `auction`, `rollout` and custom ones;
-    `jaxsense.evaluate` plays all."""
+    """Policies that play missions at the end of a run: any of `latent`, `greedy`, `bayes`,
+    `optimal`, `naive`, `naive_2`, `naive_3`, `random`, `nearest`, `auction`, `rollout` and custom
+    policies. `jaxsense.evaluate` plays all of them."""
     episodes: int = limited(128, at_least=1, at_most=MAX_EPISODES)
     """Missions per policy at the end of a run."""
     time_limit: Traced[float] = limited(120.0, above=0, at_most=3600)
@@ -111,8 +113,8 @@ class MissionConfig(Section, place="mission"):
     control_period: float = 0.1
     """Seconds between a robot's decisions, and between its scans."""
     auctions: Traced[bool] = True
-    """Whether robots divide the PoIs that a policy finds worth a look by an auction of travel
-    times, where their order is free. Otherwise, they follow the values and the next three
+    """Whether robots divide the PoIs that their policy finds worth a look by an auction of travel
+    times, if the policy allows any order. Otherwise, they follow the values and the next three
     rules."""
     equal_values: Traced[float] = limited(0.1, at_least=0)
     """Actions whose values are this close to the best, in units of the reward, count as equally
@@ -122,16 +124,16 @@ class MissionConfig(Section, place="mission"):
     redecides: Traced[bool] = True
     """Whether a robot under way decides again when the map changes."""
     avoids_targets: Traced[bool] = True
-    """Whether a robot prefers, of equally good PoIs, those that no other robot heads for."""
+    """Whether a robot prefers, among equally good PoIs, those that no other robot heads for."""
     least_confidence: Traced[float] = limited(0.98, at_least=0, below=1)
     """Minimum probability of the most likely label for a scan to update the map."""
     attempts: Traced[int] = limited(3, at_least=1)
     """Failed looks or goals after which a robot gives up a PoI. Before it finishes, it retries PoIs
-    where it was stuck, with as many attempts."""
+    where it was stuck, with the same number of attempts."""
     localisation: LocalisationConfig = LocalisationConfig()
     """Errors of the poses that robots believe they have."""
     communication: CommunicationConfig = CommunicationConfig()
-    """What robots tell each other of their looks."""
+    """Messages between robots about their looks."""
 
     def check(self) -> None:
         """Checks the control period, and that no policy repeats; raises `ConfigError`."""

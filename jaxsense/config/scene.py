@@ -38,7 +38,7 @@ class ArenaConfig(Section, place="arena"):
     poi_gap: float = limited(0.3, above=0)
     """Smallest gap between two PoIs, in metres; a robot needs 0.1 to pass."""
     classes: tuple[str, ...] = limited(("green cylinder", "red cylinder", "red cube"), min_items=2)
-    """Equally likely classes of PoIs, each `"COLOUR SHAPE"` and a word for each of `attributes`."""
+    """Classes of PoIs, all equally likely: `"COLOUR SHAPE"` and a word for each of `attributes`."""
     colours: Mapping[str, tuple[float, float, float]] = limited(COLOURS, at_least=0, at_most=1)
     """Albedo of each colour, linear RGB in [0, 1]."""
     shapes: Mapping[str, Shape] = SHAPES
@@ -158,7 +158,7 @@ class LidarConfig(Section, place="lidar"):
     """Growth of that standard deviation with the distance, in metres per metre."""
     mixed_pixels: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam returns a distance between its surface and its neighbour's; at an
-    edge, it has no return."""
+    edge, no surface is there."""
     dropout: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam has no return."""
     window: int = limited(128, at_least=1)
@@ -166,7 +166,7 @@ class LidarConfig(Section, place="lidar"):
     stride: int = limited(1, at_least=1)
     """Step between the beams that the detector reads, in beams."""
     window_range: Traced[float] = limited(1.5, above=0)
-    """Longest distance in the detector's input, in metres: cuts off the background."""
+    """Longest distance in the detector's input, in metres; it cuts off the background."""
 
     def check(self) -> None:
         """Checks the order of distances, and the window; raises `ConfigError`."""
@@ -191,14 +191,15 @@ class CameraConfig(Section, place="camera"):
     colour_cast: float = limited(0.0, at_least=0, at_most=10)
     """Standard deviation of the natural logarithm of each channel's brightness in an image."""
     low_light: float = limited(0.0, at_least=0, at_most=1)
-    """Maximum share of the light that an image may lack, drawn uniformly from 0."""
+    """Maximum share of the light that may be missing in an image; the share is uniform from 0."""
     shadow: float = limited(0.0, at_least=0, at_most=1)
     """Probability of a shadow: on one side of a random pixel, only ambient light remains."""
     light_distance: Traced[float] = limited(0.5, above=0)
-    """Distance between two positions over which exposure, colour cast, low light and shadow
-    change, in metres: their correlation falls as a Gaussian function with this deviation."""
+    """Distance over which exposure, colour cast, low light and shadow change, in metres: their
+    correlation is a Gaussian function of the distance, with this standard deviation."""
     light_time: Traced[float] = limited(60.0, above=0)
-    """Time over which they change in the same way, in seconds."""
+    """Time over which they change, in seconds; their correlation is a Gaussian function of it,
+    too."""
     window: int = limited(80, at_least=1)
     """Pixels around the PoI's bearing that the detector reads."""
     stride: int = limited(4, at_least=1)
@@ -233,10 +234,10 @@ class SensorConfig(Checked, place="sensor"):
     """A custom sensor, carried like a camera or a LiDAR."""
 
     make: str
-    """Function of `Config` that makes the `sim.Sensor`, as `package.module:function`; a name, for
-    runs to store."""
+    """Function that makes the `sim.Sensor` from a `Config`, as `package.module:function`: a name,
+    so that runs can store it."""
     attribute: str
-    """Attribute that it distinguishes: `colour`, `shape` or one of `arena.attributes`."""
+    """Attribute that the sensor distinguishes: `colour`, `shape` or one of `arena.attributes`."""
 
     def check(self) -> None:
         """Checks that `make` can be the name of a function; raises `ConfigError`."""

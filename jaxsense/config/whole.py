@@ -35,15 +35,15 @@ _MAX_ROBOTS = 64
 
 
 class Config(Section):
-    """All settings of a run but its seed."""
+    """All settings of a run except its seed."""
 
     modalities: tuple[str, ...] = limited(
         ("camera", "lidar"), min_items=1, max_items=_MAX_MODALITIES
     )
     """The sensors that are trained."""
     robots: tuple[str, ...] | None = limited(None, min_items=1, max_items=_MAX_ROBOTS)
-    """The robots of missions: for each the modality of its sensor, which several may share. By
-    default one robot for each of `modalities`."""
+    """The robots of missions, each named by the modality of its sensor; several may share one. By
+    default, one robot for each of `modalities`."""
     sensors: Mapping[str, SensorConfig] = FrozenDict()
     """Custom sensors, by the name of their modality."""
     arena: ArenaConfig = ArenaConfig()
