@@ -30,7 +30,7 @@ from jaxsense.mission.maps import OwnMap, SharedMap, map_of
 from jaxsense.mission.memory import Memory
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
 from jaxsense.models import Models
-from jaxsense.run import cli, devices, rundir
+from jaxsense.run import cli, devices
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors, viewpoints
 
@@ -51,7 +51,7 @@ class Arguments:
     """Compare what an exported run says with the run itself, in states of missions."""
 
     run: Annotated[Path, Name("RUN")]
-    """The directory of a finished run."""
+    """The directory of a finished run, or `pretrained:PRESET`."""
     states: int = 1000
     """How many states of missions."""
     trust: bool = False
@@ -329,7 +329,7 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     devices.start(None)
-    config, models = rundir.load(cli.find_run(arguments.run), arguments.trust)
+    config, models, _ = export.load(arguments.run, arguments.trust)
     found = choices(config, models, arguments.states)
     table = rich.table.Table("program", "by", "states", "other answers", "error", "microseconds")
     for player, programs in compare(config, models, export.archive(config, models), found).items():

@@ -1,12 +1,10 @@
 """How Sphinx builds the site: `sphinx-build -W --keep-going -b html docs docs/_build/html`."""
 
-import importlib
 import importlib.util
-import inspect
 import pkgutil
 import re
 import sys
-from types import ModuleType
+from pathlib import Path
 
 from docutils import nodes
 from latex2mathml.converter import convert
@@ -14,6 +12,9 @@ from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
 import jaxsense
+
+sys.path.insert(0, str(Path(__file__).parent))
+import generate
 
 project = "jaxsense"
 author = "the jaxsense authors"
@@ -75,44 +76,26 @@ maximum_signature_line_length = 88
 html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"jaxsense {release}"
+html_logo = "_static/logo.svg"
+html_favicon = "_static/logo.svg"
 html_theme_options = {"navigation_with_keys": True}
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 
 
-def public_names(package: ModuleType) -> list[tuple[str, str]]:
-    """What a package exports: each name, and where it is defined and described."""
-    found = []
-    for name, value in vars(package).items():
-        if name.startswith("_"):
-            continue
-        if inspect.isclass(value) or inspect.isfunction(value):
-            home, defined = value.__module__, value.__name__
-        else:
-            home, defined = home_of_constant(name), name
-        if home != package.__name__ and home.startswith("jaxsense."):
-            found.append((f"{package.__name__}.{name}", f"{home}.{defined}"))
-    return sorted(found)
-
-
-def home_of_constant(name: str) -> str:
-    """The module of jaxsense that assigns a constant; empty if none does."""
-    assigns = re.compile(rf"^{re.escape(name)}(: .+)? = ", re.MULTILINE)
-    return next(
-        (
-            path
-            for path, module in sorted(sys.modules.items())
-            if path.startswith("jaxsense.") and assigns.search(inspect.getsource(module))
-        ),
-        "",
-    )
-
-
 packages = ["jaxsense"] + [
     module.name for module in pkgutil.walk_packages(jaxsense.__path__, "jaxsense.") if module.ispkg
 ]
+# Of each package, the names that it passes on, and where they are defined and described.
 autosummary_context = {
-    "public_names": {name: public_names(importlib.import_module(name)) for name in packages}
+    "public_names": {
+        package: sorted(
+            (f"{package}.{each.name}", each.home)
+            for each in generate.exports(package)
+            if not each.name.startswith("_")
+        )
+        for package in packages
+    }
 }
 
 
@@ -136,11 +119,20 @@ def block_math(translator: HTML5Translator, node: nodes.math_block) -> None:
 
 
 # A module or a package of jaxsense, as pages link to it for readers on GitHub.
-SOURCE = re.compile(r"\]\(\.\./(jaxsense(?:/\w+)*)(?:\.py)?\)")
+SOURCE = re.compile(r"\]\(\.\./(jaxsense(?:/(?!_)\w+)*)(?:\.py)?\)")
+# The same under the name of one of its classes or functions.
+NAMED = re.compile(r"(\[`(?:\w+\.)*(\w+)`\])\(\.\./(jaxsense(?:/\w+)+)\.py\)")
 
 
 def link_to_reference(app: Sphinx, name: str, source: list[str]) -> None:
-    """Links to the API reference where a page links to a source file."""
+    """Links to the reference where a page links to a source file."""
+
+    def to_definition(found: re.Match[str]) -> str:
+        text, name, module = found[1], found[2], found[3].replace("/", ".")
+        is_defined = name in (each.defined for each in generate.definitions(module))
+        return f"{text}(#{module}.{name})" if is_defined else found[0]
+
+    source[0] = NAMED.sub(to_definition, source[0])
     source[0] = SOURCE.sub(lambda found: f"](#{found[1].replace('/', '.')})", source[0])
 
 

@@ -2,12 +2,14 @@
 
 The file is a zip archive: each function as an ONNX file; weights as NumPy arrays in `weights.npz`,
 and in `programs.json` the functions as operators on them; a `contents.json` that describes inputs
-and outputs; and `robot_numpy.py` and `robot_onnx.py`, which run the functions.
+and outputs; `robot_numpy.py` and `robot_onnx.py`, which run the functions; and `resampling.py`,
+which turns the scans of other sensors into those that `detect` reads.
 """
 
 import dataclasses
 import io
 import json
+import math
 import sys
 import zipfile
 from pathlib import Path
@@ -27,14 +29,15 @@ from jaxsense.mission.state import RECENT_LOOKS
 from jaxsense.models import Models
 from jaxsense.run import cli, files, rundir
 from jaxsense.run.version import __version__
-from jaxsense.sim import sensors
+from jaxsense.sim import resampling, sensors
 from jaxsense.sim.sensors import Sensor
 from jaxsense.tasks import load_pretrained
 
 PROGRAM = "jaxsense.export"
 _PRETRAINED = "pretrained:"
-ROBOTS = ("robot_numpy.py", "robot_onnx.py")
-"""Files that run an archive on a robot, and are in it."""
+_PLAYERS = (Path(onboard.__file__).with_name(f"robot_{name}.py") for name in ("numpy", "onnx"))
+FILES = (*_PLAYERS, Path(resampling.__file__))
+"""Files for a robot, which each archive holds: they need neither JAX nor jaxsense."""
 
 
 def archive(config: Config, models: Models) -> bytes:
@@ -74,8 +77,8 @@ def archive(config: Config, models: Models) -> bytes:
         np.savez(packed := io.BytesIO(), allow_pickle=False, **weights)
         files.writestr("weights.npz", packed.getvalue())
         files.writestr("programs.json", json.dumps(graphs))
-        for name in ROBOTS:
-            files.writestr(name, (Path(onboard.__file__).parent / name).read_bytes())
+        for file in FILES:
+            files.writestr(file.name, file.read_bytes())
         contents = json.dumps({**_description(config, models), "programs": described}, indent=2)
         files.writestr("contents.json", contents + "\n")
     return content.getvalue()
@@ -83,7 +86,7 @@ def archive(config: Config, models: Models) -> bytes:
 
 def _description(config: Config, models: Models) -> dict[str, object]:
     """Everything a reader of the file needs except the programs."""
-    prior, mission = models.fusion.prior, config.mission
+    prior, mission, viewpoint = models.fusion.prior, config.mission, config.viewpoint
     return {
         "modalities": config.modalities,
         "robots": config.carried,
@@ -94,6 +97,13 @@ def _description(config: Config, models: Models) -> dict[str, object]:
         "num_pois": config.arena.num_pois,
         "unseen": {name: np.asarray(x).tolist() for name, x in vars(prior).items()},
         "sensors": {sensor.name: _of_sensor(sensor) for sensor in sensors.make(config)},
+        "viewpoint": {
+            "min_distance": float(viewpoint.min_distance),
+            "max_distance": float(viewpoint.max_distance),
+            "max_bearing": round(math.radians(float(viewpoint.max_bearing)), 6),
+            "about": "from where the detectors have learned to look at a PoI: distances of its "
+            "centre, in metres, and the largest bearing to either side, in radians",
+        },
         "mission": {"attempts": int(mission.attempts), "redecides": bool(mission.redecides)},
         "remembered_looks": MOST_LOOKS if mission.communication.own_maps else RECENT_LOOKS,
         "opset": OPSET,
@@ -110,8 +120,10 @@ def _of_sensor(sensor: Sensor) -> dict[str, object]:
         if sensor.channels == 3
         else "readings",
         "angles": [round(float(angle), 6) for angle in sensor.angles],
+        "height": float(sensor.height),
         "about": "one reading for each ray; `angles` are the rays' directions in the robot's frame "
-        "(x ahead, y left), in radians, positive to the left",
+        "(x ahead, y left), in radians, positive to the left; `height` is that of the rays above "
+        "the floor, in metres",
     }
 
 
@@ -137,19 +149,30 @@ class Arguments:
         check_fields(self)
 
 
+def load(run: Path, trust: bool = False) -> tuple[Config, Models, Path]:
+    """Settings and models of a run, and where its archive goes by default.
+
+    Args:
+      run: its directory, `latest`, or `pretrained:PRESET`.
+      trust: whether to run the code of custom sensors.
+
+    Raises:
+      ConfigError: if there is no such run, or no such models.
+    """
+    if (given := str(run)).startswith(_PRETRAINED):
+        preset = given.removeprefix(_PRETRAINED)
+        return *load_pretrained(preset), Path(f"{preset}.zip")
+    run = cli.find_run(run)
+    return *rundir.load(run, trust), run / "exported.zip"
+
+
 def main(argv: list[str] | None = None) -> None:
     """Runs the program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     path = arguments.out
     try:
-        if (given := str(arguments.run)).startswith(_PRETRAINED):
-            preset = given.removeprefix(_PRETRAINED)
-            path = path or Path(f"{preset}.zip")
-            config, models = load_pretrained(preset)
-        else:
-            run = cli.find_run(arguments.run)
-            path = path or run / "exported.zip"
-            config, models = rundir.load(run, arguments.trust)
+        config, models, by_default = load(arguments.run, arguments.trust)
+        path = path or by_default
         with files.new(path) as file:
             file.write(content := archive(config, models))
     except FileExistsError:

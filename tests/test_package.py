@@ -5,14 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from archives import imports_from_archives
+
+from jaxsense import export
 
 ROOT = Path(__file__).parent.parent
 
 
-def run_example(path: Path, which: int = -1) -> dict:
+def run_example(path: Path, which: int = -1, names: dict | None = None) -> dict:
     """Runs a Python example of a page, by default the last; gives the names that it leaves."""
+    names = {} if names is None else names
     examples = re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
-    names: dict = {}
     exec(compile(examples[which], path.name, "exec"), names)
     return names
 
@@ -71,6 +74,24 @@ def test_examples_of_the_tasks_run(capsys):
     assert "noisy-v0, camera: return" in printed
     assert run_example(page, 2)["models"].tours
     assert "--preset team --seed 0" in capsys.readouterr().out
+
+
+def test_examples_of_your_robot_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    export.main(["pretrained:noisy", "--out", "robot.zip"])
+    capsys.readouterr()
+    page, names = ROOT / "docs" / "robot.md", {}
+    with imports_from_archives():
+        run_example(page, 0, names)
+        assert capsys.readouterr().out == "False [0.5 0.5]\n"
+        run_example(page, 1, names)
+    assert names["scan"].shape == (683,)
+    assert capsys.readouterr().out.startswith("(683,) True [")
+
+
+def test_example_of_the_settings_runs():
+    config = run_example(ROOT / "docs" / "settings.md")["config"]
+    assert config.arena.num_pois == 4
 
 
 def test_returns_of_references_are_those_of_the_files():

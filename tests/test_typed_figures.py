@@ -26,9 +26,10 @@ TYPED = {
     "docs/recorded.md": 13,
     "docs/tasks.md": 85,
 }
-# Tables from JSON, code, addresses, equations, and versions, which are no results.
+# Tables from JSON and from the code, code, addresses, equations, and versions: no results.
 NOT_PROSE = [
     re.compile(r"<!-- [\w-]+\.json(?: [\w-]+)? -->.*?<!-- end -->", re.DOTALL),
+    re.compile(r"<!-- What follows is made by .*", re.DOTALL),
     re.compile(r"```.*?```", re.DOTALL),
     re.compile(r"^    .*$", re.MULTILINE),
     re.compile(r"`[^`]*`"),

@@ -158,8 +158,8 @@ class _Option:
     @property
     def help(self) -> str:
         """The field's docstring; of a word of a dictionary, that of the dictionary."""
-        docs = _docs(self.section)
-        return next((docs[field] for field in reversed(self.path) if field in docs), "")
+        known = docs(self.section)
+        return _plain(next((known[field] for field in reversed(self.path) if field in known), ""))
 
     def options(self) -> Iterator["_Option"]:
         """The options of a section or a dictionary; any other option itself."""
@@ -232,14 +232,18 @@ def _plain(text: str) -> str:
 
 
 @functools.cache
-def _docs(section: type) -> dict[str, str]:
-    """Docstrings of the fields of a dataclass, each as one line."""
+def docs(section: type) -> dict[str, str]:
+    """Docstrings of the fields of a dataclass, each as one line.
+
+    Args:
+      section: the dataclass; its source must be there.
+    """
     found: dict[str, str] = {}
     (node,) = ast.parse(textwrap.dedent(inspect.getsource(section))).body
     for pair in itertools.pairwise(getattr(node, "body", ())):
         match pair:
             case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                found[name] = " ".join(_plain(text).split())
+                found[name] = " ".join(text.split())
     return found
 
 

@@ -207,10 +207,13 @@ PRESETS: Mapping[str, Config] = FrozenDict(
         "smoke": _SMOKE,
     }
 )
-"""`default`: the best settings we know. `paper`: the paper's settings where it states them, otherwise
+"""Settings to start a run from, by name.
+
+`default`: the best settings we know. `paper`: the paper's settings where it states them, otherwise
 settings chosen to reproduce its figures, see `docs/differences.md`. `noisy`: detections that are
 often uncertain, and beliefs that accumulate looks. `many`: sixteen classes of four colours and four
 shapes, with the sensors of `noisy` and a team. `raw`: `default`, but the JMVAE learns from scans
 themselves, without detectors or labels. `team`: one policy for any number of PoIs and robots that
 takes travel time into account. `recorded`: `default` with the noise of a real laser scanner.
-`smoke`: the whole pipeline in seconds, for tests."""
+`smoke`: the whole pipeline in seconds, for tests.
+"""

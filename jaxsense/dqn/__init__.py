@@ -1,5 +1,6 @@
 """The shared map as a Markov decision process, and deep Q-learning on it."""
 
+from jaxsense.dqn import replay as replay
 from jaxsense.dqn.environments import MapEnvironment as MapEnvironment
 from jaxsense.dqn.environments import TeamEnvironment as TeamEnvironment
 from jaxsense.dqn.map_agent import MapAgent as MapAgent

@@ -7,6 +7,7 @@ errors of localisation, and maps of their own in place of the shared one. Most f
 one mission, for `vmap`; those that are faster for many take B missions.
 """
 
+from jaxsense.mission import roadmap as roadmap
 from jaxsense.mission.begin import reset as reset
 from jaxsense.mission.begin import start as start
 from jaxsense.mission.cases import Case as Case

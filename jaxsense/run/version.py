@@ -6,6 +6,7 @@ import subprocess
 from pathlib import Path
 
 __version__ = "0.4.0"
+"""Version of jaxsense."""
 _ROOT = Path(__file__).parents[2]
 _PLACE = str(Path(__file__).relative_to(_ROOT))
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")

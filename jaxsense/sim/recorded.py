@@ -15,10 +15,9 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import Config, LidarConfig, Shape
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
-from jaxsense.sim import raycast
+from jaxsense.sim import raycast, resampling
 from jaxsense.sim.sensors import Sensor
 
-_MAX_STEPS = 3.0  # of the sensor's rays, between two recorded ones
 _SURFACE = 0.1  # m; neighbouring beams that differ by more hit two surfaces
 _BEAMS = 15  # of a piece of wall
 _MIN_FACING = 0.5  # cosine of the angle at which a beam meets a wall
@@ -56,21 +55,8 @@ def resample(
     if readings.shape[1:2] != angles.shape:
         expected = f"must be {readings.shape[1:2]}, one for each ray of the scans"
         raise ValueError(f"angles of {sensor.name} have the shape {angles.shape}: {expected}")
-    turned, order = np.unique(_within_a_turn(angles), return_index=True)
-    step, window = _require_dense(sensor, turned)
-    # The last ray also comes before the first one, and this after the last.
-    circle = np.concatenate([turned[-1:] - 2 * np.pi, turned, turned[:1] + 2 * np.pi])
-    scans = np.asarray(readings, np.float32)[:, np.concatenate([order[-1:], order, order[:1]])]
-    if sensor.measures_distance:
-        scans = _with_returns(scans)
-    targets = _within_a_turn(sensor.angles.astype(np.float64))
-    left = np.searchsorted(circle, targets, side="right") - 1
-    gap = circle[left + 1] - circle[left]
-    share = (targets - circle[left]) / gap
-    is_between = gap < _MAX_STEPS * step
-    to_nearest = np.minimum(*np.abs(targets - circle[[left, left + 1]]))
-    is_recorded = is_between | (to_nearest < step / 2)
-    recorded = _longest(is_recorded)
+    window = _require_dense(sensor, angles)
+    recorded = _longest(resampling.covered(sensor.angles, angles))
     if len(recorded) < window:
         needed, found = (
             np.degrees(np.ptp(angles)) if len(angles) else 0.0
@@ -79,16 +65,13 @@ def resample(
         expected = f"must be at least {needed:.1f}, as wide as the window of its detector"
         part = f"recorded part of the field of view of {sensor.name}"
         raise ValueError(f"{part} = {found:.1f} degrees: {expected}")
-    of_rays = (-1, *[1] * (scans.ndim - 2))
-    share, is_between = share.reshape(of_rays), is_between.reshape(of_rays)
-    before, after = scans[:, left], scans[:, left + 1]
-    with np.errstate(invalid="ignore"):  # a beam without a return is infinitely long
-        between = before + share * (after - before)
-        is_same = np.abs(after - before) < _SURFACE if sensor.measures_distance else True
-    nearest = np.where(share < 0.5, before, after)
-    found = np.where(is_between & is_same, between, nearest).astype(np.float32)
-    found[:, ~is_recorded] = np.nan
-    return found
+    found = resampling.resample(
+        sensor.angles,
+        angles,
+        np.moveaxis(readings, 1, 0),
+        measures_distance=sensor.measures_distance,
+    )
+    return np.moveaxis(found, 0, 1)
 
 
 def _with_returns(ranges: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
@@ -96,25 +79,20 @@ def _with_returns(ranges: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
     return np.where(ranges == 0, np.inf, ranges)
 
 
-def _within_a_turn(angles: Float[np.ndarray, " A"]) -> Float[np.ndarray, " A"]:
-    """Angles in radians, turned to where they are from -pi to pi."""
-    return (angles + np.pi) % (2 * np.pi) - np.pi
+def _require_dense(sensor: Sensor, angles: Float[np.ndarray, " A"]) -> int:
+    """How many of the sensor's rays a window spans.
 
-
-def _require_dense(sensor: Sensor, turned: Float[np.ndarray, " A"]) -> tuple[float, int]:
-    """Median step between recorded rays, and the sensor's rays that a window spans.
-
-    Raises `ValueError` if there are too few rays, or they are too far apart.
+    Raises `ValueError` if there are too few recorded rays, or they are too far apart.
     """
     own = np.abs(np.diff(sensor.angles)).max() * sensor.stride
-    most = np.degrees(_MAX_STEPS * own)
-    step = np.median(np.diff(turned)) if len(turned) > 1 else np.inf
-    if step > _MAX_STEPS * own:
+    most = np.degrees(resampling.MAX_STEPS * own)
+    step = resampling.median_step(angles)
+    if step > resampling.MAX_STEPS * own:
         expected = f"must be at most {most:.2f} degrees"
         raise ValueError(
             f"step between the rays of {sensor.name} = {np.degrees(step):.2f} degrees: {expected}"
         )
-    return step, (sensor.window - 1) * sensor.stride + 1
+    return (sensor.window - 1) * sensor.stride + 1
 
 
 def _longest(is_recorded: Bool[np.ndarray, " B"]) -> Int[np.ndarray, " _"]:

@@ -100,3 +100,18 @@ def test_an_export_that_is_stopped_leaves_nothing(run, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         export.main([str(run), "--out", str(tmp_path / "x.zip")])
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_robot_resamples_scans_without_jaxsense(file):
+    code = """
+import numpy as np
+
+sys.path.insert(0, sys.argv[1])
+from resampling import resample
+
+angles, ranges = np.array([-0.1, 0.1]), np.array([1.0, 1.04])
+print(resample(np.array([0.05, 0.15, 1.0]), angles, ranges, measures_distance=True))
+"""
+    found = run_alone(code, "robot_numpy", file)
+    # Three quarters of the way between both beams; a quarter of a step beyond the second one.
+    assert (found.stdout, found.returncode) == ("[1.03 1.04  nan]\n", 0), found.stderr

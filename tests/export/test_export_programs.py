@@ -349,7 +349,8 @@ def test_contents_describe_what_is_there(results, file):
         contents, names = json.loads(files.read("contents.json")), {*files.namelist()}
         weights = np.load(io.BytesIO(files.read("weights.npz")))
         kernel = weights["q_networks/0/params/Dense_0/kernel"]
-    others = {"contents.json", "programs.json", "weights.npz", "robot_numpy.py", "robot_onnx.py"}
+    others = {"contents.json", "programs.json", "weights.npz", *(x.name for x in export.FILES)}
+    assert {"robot_numpy.py", "robot_onnx.py", "resampling.py"} < others
     assert {f"{name}.onnx" for name in contents["programs"]} | others == names
     inputs, of_players = results
     ends = [("inputs", inputs), *(("outputs", outputs) for outputs in of_players.values())]
@@ -367,6 +368,10 @@ def test_contents_describe_what_is_there(results, file):
     for sensor in sensors.make(CONFIG):
         angles = contents["sensors"][sensor.name]["angles"]
         np.testing.assert_allclose(angles, sensor.angles, atol=1e-6)
+        assert contents["sensors"][sensor.name]["height"] == sensor.height
+    limits = contents["viewpoint"]
+    assert (limits["min_distance"], limits["max_distance"]) == (0.3, 1.2)
+    assert limits["max_bearing"] == pytest.approx(np.radians(20), abs=1e-6)
     assert contents["versions"] == {"jaxsense": __version__}
 
 

@@ -1,0 +1,306 @@
+"""Writes what pages take from the code: `python docs/generate.py`.
+
+`settings.md` lists the fields of the settings, and `api.md` the names that packages export, below
+what people have written there. A test compares both with the code.
+"""
+
+import ast
+import dataclasses
+import functools
+import re
+import types
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Literal, get_args, get_origin, get_type_hints
+
+import jaxsense
+from jaxsense.config import PRESETS, Config, Shape
+from jaxsense.config.checks import Limits
+from jaxsense.config.options import docs
+from jaxsense.config.section import Section
+
+DOCS = Path(__file__).parent
+SOURCE = Path(jaxsense.__file__).parent
+MARK = "<!-- What follows is made by `python docs/generate.py`. -->"
+
+
+def settings() -> str:
+    """All settings, a table for each section, and what the presets change."""
+    parts = []
+    for name, section in _sections("", Config()):
+        title, about = f"`{name}`" if name else "Top level", _sentence_case(_text(section))
+        parts.append(f"## {title}\n\n{about}\n\n{_table_of_section(name, section)}")
+    parts.append("## Presets\n\nWhat each preset changes of `default`:\n")
+    for preset, config in PRESETS.items():
+        if rows := [*_changes("", PRESETS["default"], config)]:
+            table = _table(("setting", "value"), rows)
+            parts.append(f"### Preset `{preset}`\n\n{table}")
+    return "\n".join(parts)
+
+
+def _sections(name: str, section: Section) -> Iterator[tuple[str, Section]]:
+    """A section and those in it, each with its name."""
+    yield name, section
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        if isinstance(value, Section):
+            yield from _sections(f"{name}.{field.name}".lstrip("."), value)
+
+
+def _table_of_section(name: str, section: Section) -> str:
+    kinds, marks = get_type_hints(type(section)), type(section)._LEAVES
+    rows = []
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        if not isinstance(value, Section):
+            mark = " †" if field.name in marks else ""
+            allowed = _allowed(kinds[field.name], field.metadata.get("limits"))
+            about = docs(type(section))[field.name]
+            full = f"{name}.{field.name}".lstrip(".")
+            rows.append((f"`{full}`{mark}", _value(value), allowed, about))
+    return _table(("setting", "default", "allowed", "meaning"), rows)
+
+
+def _changes(name: str, default: Section, other: Section) -> Iterator[tuple[str, str]]:
+    """Settings, and sections in it, in which a section differs from its default."""
+    for field in dataclasses.fields(default):
+        full = f"{name}.{field.name}".lstrip(".")
+        old, new = getattr(default, field.name), getattr(other, field.name)
+        if isinstance(old, Section):
+            yield from _changes(full, old, new)
+        elif old != new:
+            yield f"`{full}`", _value(new)
+
+
+def _value(value: object) -> str:
+    """A value as people read it."""
+    match value:
+        case bool():
+            text = "on" if value else "off"
+        case Shape():
+            text = f"{value.primitive} {_value(value.half_sides)}"
+        case Mapping():
+            text = "; ".join(f"{name}: {_value(each)}" for name, each in value.items())
+        case tuple():
+            text = ", ".join(map(_value, value))
+        case int() if value >= 10_000:
+            text = f"{value:,}"
+        case float():
+            text = f"{value:g}"
+        case str():
+            text = f"`{value}`"
+        case _:
+            text = "" if value is None else str(value)
+    return text or "none"
+
+
+_ONE_AND_MANY = {
+    int: ("a whole number", "whole numbers"),
+    float: ("a number", "numbers"),
+    bool: ("on or off", "on or off"),
+    str: ("a name", "names"),
+}
+
+
+def _allowed(kind: object, limits: Limits | None) -> str:
+    """Type and limits of a setting."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return " or ".join(f"`{each}`" for each in inner)
+    if origin is types.UnionType:
+        given, none = inner
+        assert none is types.NoneType
+        return f"{_allowed(given, limits)}; or none"
+    if origin is tuple:
+        each = _ONE_AND_MANY[inner[0]][1]
+        words = each if ... in inner else f"{len(inner)} {each}"
+        if limits is not None and limits.min_items is not None:
+            most = "or more" if limits.max_items is None else f"to {limits.max_items}"
+            words = f"{limits.min_items} {most} {each}"
+        return f"{words}{_range(limits)}"
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        values = getattr(inner[1], "__name__", None)
+        words = f"`{values}`" if dataclasses.is_dataclass(inner[1]) else _allowed(inner[1], limits)
+        return f"for each name, {words}"
+    assert isinstance(kind, type)
+    return f"{_ONE_AND_MANY[kind][0]}{_range(limits)}"
+
+
+def _range(limits: Limits | None) -> str:
+    """Limits of numbers, after what they limit."""
+    if limits is None:
+        return ""
+    words = dataclasses.replace(limits, min_items=None, max_items=None).expected(0)
+    words = words.removeprefix("must be").rstrip()
+    return f",{words}" if words.startswith(" at least") else words
+
+
+def _text(section: object) -> str:
+    """A docstring as one line."""
+    return " ".join((type(section).__doc__ or "").split())
+
+
+def _sentence_case(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """A table in Markdown."""
+    # A bar would end the cell.
+    safe = [[cell.replace("|", r"\|") for cell in row] for row in rows]
+    return "".join(f"| {' | '.join(row)} |\n" for row in [head, ("---",) * len(head), *safe])
+
+
+PACKAGES = ("", "config", "sim", "vae", "dqn", "mission", "tasks", "interfaces")
+"""Packages whose names are public; the first is `jaxsense` itself."""
+_EXTRAS = "gymnasium", "gymnax", "rejax", "stable_baselines3", "jaxmarl", "pettingzoo", "rawlog"
+_DEFINITION = ast.FunctionDef | ast.ClassDef
+
+
+@dataclasses.dataclass(frozen=True)
+class Public:
+    """A name that a package exports.
+
+    Attributes:
+      name: in the package.
+      module: that defines it, such as "jaxsense.vae.jmvae".
+      defined: its name there; None if it is the module itself.
+      about: first sentence of its docstring.
+    """
+
+    name: str
+    module: str
+    defined: str | None
+    about: str
+
+    @property
+    def home(self) -> str:
+        """Its whole name where it is defined."""
+        return self.module if self.defined is None else f"{self.module}.{self.defined}"
+
+
+def api() -> str:
+    """All public names, a table for each package."""
+    parts = []
+    for package in PACKAGES:
+        name = f"jaxsense.{package}".rstrip(".")
+        about = _paragraph(ast.get_docstring(_parsed(name)))
+        names = exports(name)
+        for module in [each for each in names if each.defined is None and package]:
+            names += definitions(module.module, module.name)
+        for module in _EXTRAS if package == "interfaces" else ():
+            names += definitions(f"{name}.{module}", module)
+        rows = [(f"[`{each.name}`](../{_file(each.module)})", each.about) for each in names]
+        parts.append(f"## `{name}`\n\n{about}\n\n{_table(('name', 'what it is'), rows)}")
+    return "\n".join(parts)
+
+
+def exports(package: str) -> list[Public]:
+    """What a package exports, in the order in which it imports it.
+
+    Args:
+      package: its whole name.
+    """
+    found = []
+    for node in ast.walk(_parsed(package, stub=True)):
+        if isinstance(node, ast.ImportFrom):
+            base = ".".join([package] * node.level + [node.module or ""]).strip(".")
+            for alias in node.names:
+                if alias.asname and (alias.asname[0] != "_" or alias.asname == "__version__"):
+                    found.append(_public(alias.asname, base, alias.name))
+    return found
+
+
+def _public(name: str, module: str, defined: str) -> Public:
+    """What a module passes on or defines under a name."""
+    for node, following in _pairs(_parsed(module).body):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module != module:
+            for alias in node.names:
+                if (alias.asname or alias.name) == defined:
+                    return _public(name, node.module, alias.name)
+        if isinstance(node, _DEFINITION) and node.name == defined:
+            return Public(name, module, defined, _paragraph(ast.get_docstring(node)))
+        if defined in _assigned(node):
+            match following:
+                case ast.Expr(ast.Constant(str(text))):
+                    return Public(name, module, defined, _paragraph(text))
+    # A module of the package, unless the package passes on something of the same name.
+    inner = f"{module}.{defined}"
+    return Public(name, inner, None, _paragraph(ast.get_docstring(_parsed(inner))))
+
+
+def definitions(module: str, prefix: str = "") -> list[Public]:
+    """Public functions and classes of a module.
+
+    Args:
+      module: its whole name.
+      prefix: what precedes their names, with a dot.
+    """
+    names = [
+        node.name
+        for node in _parsed(module).body
+        if isinstance(node, _DEFINITION) and not node.name.startswith("_")
+    ]
+    return [_public(f"{prefix}.{name}".lstrip("."), module, name) for name in names]
+
+
+def _pairs(body: list[ast.stmt]) -> Iterator[tuple[ast.stmt, ast.stmt | None]]:
+    """Each statement and the next one."""
+    return zip(body, [*body[1:], None], strict=True)
+
+
+def _assigned(node: ast.stmt) -> list[str]:
+    """Names that a statement assigns."""
+    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+    return [target.id for target in targets if isinstance(target, ast.Name)]
+
+
+@functools.cache
+def _parsed(module: str, *, stub: bool = False) -> ast.Module:
+    """The source of a module; with `stub` its stub, if it has one."""
+    path = _path(module)
+    path = path / "__init__.py" if path.is_dir() else path
+    types_ = path.with_suffix(".pyi")
+    return ast.parse((types_ if stub and types_.exists() else path).read_text(encoding="utf-8"))
+
+
+def _path(module: str) -> Path:
+    """The file of a module, or the directory of a package."""
+    directory = SOURCE.parent.joinpath(*module.split("."))
+    return directory if directory.is_dir() else directory.with_suffix(".py")
+
+
+def _file(module: str) -> str:
+    """The path of a module in the repository."""
+    return _path(module).relative_to(SOURCE.parent).as_posix()
+
+
+def _paragraph(text: str | None) -> str:
+    """The first sentence of a docstring."""
+    first = " ".join((text or "").split("\n\n")[0].split())
+    found = re.match(r".*?[.](?=\s|$)", first)
+    return found[0] if found else first
+
+
+TABLES = {"settings.md": settings, "api.md": api}
+"""Each page, and what makes its tables."""
+
+
+def page(name: str) -> str:
+    """The text of a page, with new tables.
+
+    Args:
+      name: of its file.
+    """
+    written, mark, _ = (DOCS / name).read_text(encoding="utf-8").partition(MARK)
+    return f"{written}{mark}\n\n{TABLES[name]()}"
+
+
+def main() -> None:
+    """Writes the pages."""
+    for name in TABLES:
+        (DOCS / name).write_text(page(name), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,462 @@
+"""A ROS 2 node by which a robot takes part in a mission, with an exported run and NumPy alone.
+
+    jaxsense export pretrained:default --out robot.zip
+    python3 ros2_node.py robot.zip --robot 1 --pois 1.0,0.5 -1.2,0.8 0.3,-1.1
+
+Copy this file, `run_exported.py` and the archive to the robot. `--robot` says which robot of the
+run it is, `--pois` where the points of interest (PoIs) stand in the frame `map`. The node reads
+`scan` (sensor_msgs/LaserScan), or `image` and `camera_info` (sensor_msgs/Image, rectified), and the
+transforms between `map`, `base_link` and the sensor. It publishes from where to look as `goal_pose`
+(geometry_msgs/PoseStamped), to which Nav2 drives, and exchanges looks with the other robots on
+`team` (std_msgs/String, JSON).
+
+The functions and the class `Robot` do the work; they read messages by their fields alone, so that
+they run and are tested where there is no ROS. `main` connects them to topics.
+"""
+# ruff: noqa: PLC0415
+
+import argparse
+import collections
+import dataclasses
+import importlib
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from run_exported import Programs, empty, remember, write
+
+VIEW_DISTANCE = 0.9  # m, from the sensor to a PoI
+VIEW_SIDES = 16  # directions around a PoI that are tried
+CLEARANCE = 0.3  # m, from a viewpoint to other PoIs and robots, and to where a look has failed
+AT_GOAL = 0.3  # m, from a viewpoint within which the robot looks
+MAX_AGE = 0.3  # s, of a scan
+STILL = np.array([0.01, 0.01, 0.01])  # m, m and rad between two scans: the robot stands still
+SILENCE = 5.0  # s, after which a robot that tells nothing counts as failed
+PATIENCE = 60.0  # s, after which a robot that has not looked gives its viewpoint up
+NEW = 0.5  # share of a look that must be new
+
+_ENCODINGS = {"rgb8": [0, 1, 2], "rgba8": [0, 1, 2], "bgr8": [2, 1, 0], "bgra8": [2, 1, 0]}
+
+
+def beams(scan: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Angles, in radians, and distances, in metres, of a `sensor_msgs/LaserScan`.
+
+    Drivers write infinity, NaN, 0 or a distance out of range for a beam without a return; here it
+    is infinite. Minus infinity, for something too near to be measured, stays: where it covers the
+    PoI, a look shows nothing.
+    """
+    ranges = np.asarray(scan.ranges, np.float32)
+    has_return = (ranges >= scan.range_min) & (ranges <= scan.range_max)
+    ranges = np.where(has_return | np.isneginf(ranges), ranges, np.inf)
+    return scan.angle_min + scan.angle_increment * np.arange(len(ranges)), ranges
+
+
+def scanline(image: Any, info: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Angles, in radians, and linear RGB, from 0 to 1, of the row of a picture at the horizon.
+
+    Args:
+      image: a rectified `sensor_msgs/Image` of a level camera, with 8 bits for each channel.
+      info: its `sensor_msgs/CameraInfo`.
+
+    Raises:
+      ValueError: if the encoding is another.
+    """
+    if image.encoding not in _ENCODINGS:
+        expected = f"must be one of {', '.join(_ENCODINGS)}"
+        raise ValueError(f"encoding = {image.encoding!r}: {expected}")
+    focal_length, middle, row = info.k[0], info.k[2], round(info.k[5])
+    line = np.frombuffer(bytes(image.data), np.uint8)[row * image.step :][: image.step]
+    channels = len(image.encoding.removesuffix("8"))
+    pixels = line[: image.width * channels].reshape(-1, channels)[:, _ENCODINGS[image.encoding]]
+    # The inverse of sRGB's gamma.
+    value = pixels / 255
+    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    angles = np.arctan2(middle - np.arange(image.width), focal_length)
+    return angles, linear.astype(np.float32)
+
+
+def pose_of(transform: Any, is_optical: bool = False) -> tuple[np.ndarray, bool]:
+    """Pose in the plane of a `geometry_msgs/Transform`.
+
+    Args:
+      transform: of a frame.
+      is_optical: whether the frame looks along z, with x to the right, as those of cameras do;
+        otherwise along x, with y to the left.
+
+    Returns:
+      x and y, in metres, and yaw, in radians; and whether the frame is upside down.
+    """
+    q, place = transform.rotation, transform.translation
+    forward = {
+        False: (1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y + q.z * q.w)),
+        True: (2 * (q.x * q.z + q.y * q.w), 2 * (q.y * q.z - q.x * q.w)),
+    }[is_optical]
+    up = -2 * (q.y * q.z + q.x * q.w) if is_optical else 1 - 2 * (q.x**2 + q.y**2)
+    return np.array([place.x, place.y, math.atan2(forward[1], forward[0])]), up < 0
+
+
+def write_pose(message: Any, pose: np.ndarray) -> None:
+    """Writes x and y, in metres, and yaw, in radians, into a `geometry_msgs/Pose`."""
+    at, turned = message.position, message.orientation
+    at.x, at.y = float(pose[0]), float(pose[1])
+    turned.z, turned.w = math.sin(pose[2] / 2), math.cos(pose[2] / 2)
+
+
+def compose(frame: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """A pose in a frame, such as a sensor's on a robot, as a pose in the frame's own parent."""
+    (x, y, yaw), (ahead, left, turn) = frame, pose
+    sine, cosine = math.sin(yaw), math.cos(yaw)
+    return np.array(
+        [x + cosine * ahead - sine * left, y + sine * ahead + cosine * left, wrapped(yaw + turn)]
+    )
+
+
+def inverse(pose: np.ndarray) -> np.ndarray:
+    """The parent's pose in the frame of a pose."""
+    x, y, yaw = pose
+    sine, cosine = math.sin(yaw), math.cos(yaw)
+    return np.array([-cosine * x - sine * y, sine * x - cosine * y, -yaw])
+
+
+def wrapped(angle: float) -> float:
+    """An angle in radians, from -pi to pi."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+@dataclasses.dataclass(frozen=True)
+class Scan:
+    """What a sensor has read.
+
+    Attributes:
+      stamp: when, in seconds.
+      pose: where the robot was then, x and y in metres and yaw in radians, in the frame `map`.
+      angles: directions of the rays in the sensor's frame, in radians, positive to the left.
+      readings: distances in metres, or linear RGB, along these rays.
+    """
+
+    stamp: float
+    pose: np.ndarray
+    angles: np.ndarray
+    readings: np.ndarray
+
+
+class Robot:
+    """A robot in a mission: what it knows, which PoI it looks at next, and from where.
+
+    Attributes:
+      name: of its modality.
+      mounting: pose of the sensor on the robot, x and y in metres and yaw in radians.
+      is_upside_down: whether the sensor is.
+      target: the PoI that it looks at next; None before its first choice, and when it is done.
+      goal: pose from which it does so, in the frame `map`; None if it must choose.
+      team: what it knows of all robots and PoIs, as `decide` reads it.
+      known: the map.
+    """
+
+    def __init__(
+        self,
+        contents: dict[str, Any],
+        programs: Programs,
+        resample: Any,
+        robot: int,
+        positions: np.ndarray,
+    ):
+        """A robot before its first look.
+
+        Args:
+          contents: of the archive.
+          programs: of the archive.
+          resample: the function of this name in the archive's `resampling.py`.
+          robot: its index in the `robots` of the archive.
+          positions: `[N, 2]` of the PoIs in the frame `map`, in metres.
+
+        Raises:
+          ValueError: if the policy is for another number of PoIs, or robots have maps of their own.
+        """
+        number, pois, modalities = len(contents["robots"]), len(positions), contents["modalities"]
+        expected = contents["programs"]["decide"]["inputs"]["positions"]["shape"][0]
+        if expected not in ("pois", pois):
+            raise ValueError(f"{pois} PoIs: the policy of this archive is for {expected}")
+        if "merge" in programs:
+            raise ValueError("robots have maps of their own: see `tell` in run_exported.py")
+        self.contents, self.programs, self.resample = contents, programs, resample
+        self.robot = robot
+        self.name = contents["robots"][robot]
+        self.mounting, self.is_upside_down = np.zeros(3), False
+        self.target: int | None = None
+        self.goal: np.ndarray | None = None
+        self.team = {
+            "positions": np.asarray(positions, np.float32),
+            "present": np.ones(pois, bool),
+            "poses": np.zeros((number, 3), np.float32),
+            "modality": np.array([modalities.index(name) for name in contents["robots"]]),
+            "works": np.arange(number) == robot,
+            "target": np.full(number, pois, np.int32),
+        }
+        self.known = empty(contents, pois)
+        self._has_news, self._last_pose = True, np.full(3, np.inf)
+        self._heard_at = np.full(number, -np.inf)
+        self._failed_at: list[list[np.ndarray]] = [[] for _ in range(pois)]
+
+    @property
+    def is_done(self) -> bool:
+        """Whether it looks at nothing more."""
+        return not self.team["works"][self.robot]
+
+    def choose(self, now: float, pose: np.ndarray) -> None:
+        """Sets target and goal by the policy, if the map is new since the last choice.
+
+        Args:
+          now: time, in seconds.
+          pose: of the robot in the frame `map`.
+        """
+        self.team["poses"][self.robot] = pose
+        is_silent = now - self._heard_at > SILENCE
+        is_silent[self.robot] = False
+        self.team["works"] &= ~is_silent
+        if self.is_done or not self._has_news:
+            return
+        self._has_news, before = False, self.target
+        known = {name: self.known[name] for name in ("mean", "std", "looked_from")}
+        while True:
+            chosen = int(self.programs["decide"](**known, **self.team, robot=self.robot)["action"])
+            if chosen in (len(self.team["positions"]), -1):
+                self.target, self.goal = None, None
+                self.team["works"][self.robot] = False
+                break
+            # Under way to the same PoI, it keeps its viewpoint.
+            if chosen != before or self.goal is None:
+                self.goal = self._viewpoint(chosen)
+            if self.goal is not None:
+                self.target = chosen
+                break
+            self.team["present"][chosen] = False  # nowhere is left to look from
+        self.team["target"][self.robot] = self._heading()
+
+    def see(self, now: float, scan: Scan) -> dict[str, Any] | None:
+        """Looks at the target, if the robot stands still at its goal and the scan is recent.
+
+        Args:
+          now: time, in seconds.
+          scan: what the sensor has read.
+
+        Returns:
+          The look by which it has updated the map, for `report`; None if there was none.
+        """
+        is_still = (np.abs(scan.pose - self._last_pose) <= STILL).all()
+        self._last_pose = np.array(scan.pose)
+        if self.goal is None or not is_still or now - scan.stamp > MAX_AGE:
+            return None
+        sensor, limits = compose(scan.pose, self.mounting), self.contents["viewpoint"]
+        away = self.team["positions"][self.target] - sensor[:2]
+        distance, bearing = math.hypot(*away), wrapped(math.atan2(away[1], away[0]) - sensor[2])
+        is_there = np.linalg.norm(scan.pose[:2] - self.goal[:2]) <= AT_GOAL
+        is_there &= limits["min_distance"] <= distance <= limits["max_distance"]
+        if not is_there or abs(bearing) > limits["max_bearing"]:
+            return None
+        found = self.programs[f"detect_{self.name}"](
+            readings=self._along_own_rays(scan), bearing=bearing, distance=distance
+        )
+        if not found["detects"]:
+            self.fail(scan.pose)
+            return None
+        look = {
+            "poi": self.target,
+            "features": found["features"].tolist(),
+            "weight": self._weight(self.target, scan.pose),
+            "place": scan.pose[:2].tolist(),
+        }
+        self.goal = None
+        self._write(self.robot, look)
+        return look
+
+    def fail(self, pose: np.ndarray) -> None:
+        """Gives up the viewpoint, and after `attempts` failures the PoI.
+
+        Args:
+          pose: of the robot, from which it did not detect the PoI or where it is stuck.
+        """
+        if self.target is None:
+            return
+        self.goal, self._has_news = None, True
+        self._failed_at[self.target].append(pose[:2])
+        if len(self._failed_at[self.target]) >= self.contents["mission"]["attempts"]:
+            self.team["present"][self.target] = False
+
+    def report(self, look: dict[str, Any] | None = None) -> str:
+        """What the robot tells the others: its state, and a look that it has taken, once."""
+        pose = self.team["poses"][self.robot].tolist()
+        state = {"robot": self.robot, "pose": pose, "target": self._heading()}
+        return json.dumps({**state, "works": not self.is_done, "look": look})
+
+    def hear(self, now: float, report: str) -> None:
+        """Takes in what a robot tells; its own report is ignored.
+
+        Args:
+          now: time, in seconds.
+          report: see `report`.
+        """
+        told = json.loads(report)
+        if (robot := told["robot"]) == self.robot:
+            return
+        self._heard_at[robot] = now
+        for mine, theirs in (("poses", "pose"), ("target", "target"), ("works", "works")):
+            self.team[mine][robot] = told[theirs]
+        if told["look"] is not None:
+            self._write(robot, told["look"])
+
+    def _heading(self) -> int:
+        """The target, as `decide` reads it."""
+        return len(self.team["positions"]) if self.target is None else self.target
+
+    def _along_own_rays(self, scan: Scan) -> np.ndarray:
+        """The scan along the rays that `detect` reads."""
+        return self.resample(
+            np.array(self.contents["sensors"][self.name]["angles"]),
+            -scan.angles if self.is_upside_down else scan.angles,
+            scan.readings,
+            measures_distance=scan.readings.ndim == 1,
+        )
+
+    def _weight(self, poi: int, pose: np.ndarray) -> float:
+        """Share of a look from a pose that is new after the earlier ones by this sensor."""
+        earlier = self.known["looked_from"][poi, self.team["modality"][self.robot]]
+        apart = np.linalg.norm(earlier - pose[:2], axis=1)
+        return float(self.programs[f"weigh_{self.name}"](apart=apart)["weight"])
+
+    def _write(self, robot: int, look: dict[str, Any]) -> None:
+        """Updates the map by a look of any robot."""
+        name, m = self.contents["robots"][robot], self.team["modality"][robot]
+        given = {key: np.asarray(look[key], np.float32) for key in ("features", "weight")}
+        write(self.programs[f"write_{name}"], self.known, look["poi"], m, given)
+        remember(self.contents, self.known, robot, look["poi"], m, np.array(look["place"]))
+        self._has_news = True
+
+    def _viewpoint(self, poi: int) -> np.ndarray | None:
+        """The robot's nearest pose from which it has not failed and a look is new, if any."""
+        positions, here = self.team["positions"], self.team["poses"][self.robot, :2]
+        others = self.team["poses"][np.isfinite(self._heard_at), :2]
+        failed = np.reshape(self._failed_at[poi], (-1, 2))
+        avoided = np.concatenate([np.delete(positions, poi, axis=0), others, failed])
+        found, shortest = None, np.inf
+        for side in 2 * np.pi * np.arange(VIEW_SIDES) / VIEW_SIDES:
+            away = VIEW_DISTANCE * np.array([np.cos(side), np.sin(side)])
+            sensor = np.append(positions[poi] + away, wrapped(side + np.pi))
+            pose = compose(sensor, inverse(self.mounting))
+            way = np.linalg.norm(pose[:2] - here)
+            is_free = (np.linalg.norm(avoided - pose[:2], axis=1) >= CLEARANCE).all()
+            if way < shortest and is_free and self._weight(poi, pose) >= NEW:
+                found, shortest = pose, way
+        return found
+
+
+def load(archive: Path, robot: int, positions: np.ndarray) -> Robot:
+    """A robot of an archive.
+
+    Args:
+      archive: file of `jaxsense export`.
+      robot: its index in the `robots` of the archive.
+      positions: `[N, 2]` of the PoIs in the frame `map`, in metres.
+    """
+    sys.path.insert(0, str(archive))  # Python imports from an archive as from a folder
+    contents, programs = importlib.import_module("robot_numpy").load(archive)
+    resample = importlib.import_module("resampling").resample
+    return Robot(contents, programs, resample, robot, positions)
+
+
+def connect(node: Any, robot: Robot) -> Any:
+    """Connects a robot to topics and transforms.
+
+    Args:
+      node: of `rclpy`.
+      robot: what it plays.
+
+    Returns:
+      What must live as long as the node.
+    """
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.duration import Duration
+    from rclpy.qos import qos_profile_sensor_data
+    from rclpy.time import Time
+    from sensor_msgs.msg import CameraInfo, Image, LaserScan
+    from std_msgs.msg import String
+    from tf2_ros import Buffer, TransformException, TransformListener
+
+    buffer = Buffer()
+    goals = node.create_publisher(PoseStamped, "goal_pose", 1)
+    team = node.create_publisher(String, "team", 100)
+    set_out_at, infos = 0.0, collections.deque(maxlen=1)
+
+    def now() -> float:
+        return node.get_clock().now().nanoseconds * 1e-9
+
+    def transform(parent: str, child: str, when: Any) -> Any:
+        return buffer.lookup_transform(parent, child, when, Duration(seconds=0.1)).transform
+
+    def on_scan(scan: Any) -> None:
+        on_reading(scan.header, *beams(scan), is_optical=False)
+
+    def on_image(image: Any) -> None:
+        if infos:
+            on_reading(image.header, *scanline(image, infos[0]), is_optical=True)
+
+    def on_reading(header: Any, angles: Any, readings: Any, is_optical: bool) -> None:
+        nonlocal set_out_at
+        stamp = Time.from_msg(header.stamp)
+        try:
+            pose, _ = pose_of(transform("map", "base_link", stamp))
+            mounting = transform("base_link", header.frame_id, Time())
+        except TransformException as error:
+            node.get_logger().warning(f"no pose for a scan: {error}")
+            return
+        robot.mounting, robot.is_upside_down = pose_of(mounting, is_optical)
+        look = robot.see(now(), Scan(stamp.nanoseconds * 1e-9, pose, angles, readings))
+        if look is not None:
+            team.publish(String(data=robot.report(look)))
+        elif robot.goal is not None and now() - set_out_at > PATIENCE:
+            robot.fail(pose)
+        before = robot.goal
+        robot.choose(now(), pose)
+        if robot.goal is not None and robot.goal is not before:
+            set_out_at = now()
+            goal = PoseStamped()
+            goal.header.frame_id, goal.header.stamp = "map", node.get_clock().now().to_msg()
+            write_pose(goal.pose, robot.goal)
+            goals.publish(goal)
+
+    node.create_subscription(String, "team", lambda told: robot.hear(now(), told.data), 100)
+    if robot.name == "camera":
+        node.create_subscription(CameraInfo, "camera_info", infos.append, qos_profile_sensor_data)
+        node.create_subscription(Image, "image", on_image, qos_profile_sensor_data)
+    else:
+        node.create_subscription(LaserScan, "scan", on_scan, qos_profile_sensor_data)
+    node.create_timer(1.0, lambda: team.publish(String(data=robot.report())))
+    return TransformListener(buffer, node, spin_thread=True)
+
+
+def main() -> None:
+    """Runs the node."""
+    import rclpy
+    from rclpy.utilities import remove_ros_args
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("archive", type=Path, help="file of `jaxsense export`")
+    parser.add_argument("--robot", type=int, default=0, help="index of this robot in the run")
+    parser.add_argument(
+        "--pois", nargs="+", required=True, metavar="X,Y", help="positions of the PoIs, in metres"
+    )
+    arguments = parser.parse_args(remove_ros_args(sys.argv)[1:])
+    positions = np.array([[float(x) for x in poi.split(",")] for poi in arguments.pois])
+    robot = load(arguments.archive, arguments.robot, positions)
+    rclpy.init(args=sys.argv)
+    node = rclpy.create_node(f"jaxsense_{arguments.robot}")
+    listener = connect(node, robot)
+    rclpy.spin(node)
+    del listener
+
+
+if __name__ == "__main__":
+    main()

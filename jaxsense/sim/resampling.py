@@ -1,0 +1,95 @@
+"""Scans along other rays than they were recorded along, with NumPy alone.
+
+`python -m jaxsense.export` puts this file into each archive, so that robots have it without JAX.
+"""
+
+import numpy as np
+
+MAX_STEPS = 3.0
+"""A gap between two rays of more than this many median steps was not recorded."""
+_SURFACE = 0.1  # m; neighbouring beams that differ by more hit two surfaces
+
+
+def resample(
+    targets: np.ndarray, angles: np.ndarray, readings: np.ndarray, *, measures_distance: bool
+) -> np.ndarray:
+    """Readings along other rays.
+
+    Between two recorded rays, readings are interpolated; distances only on one surface, otherwise
+    the nearest ray counts. A distance of 0 is no return and becomes infinite. The last ray of a
+    full circle has the first as its neighbour.
+
+    Args:
+      targets: `[B]` directions of the rays to read along, in radians.
+      angles: `[A]` directions of the recorded rays in the same frame, in radians, in any order; two
+        or more.
+      readings: `[A, ...]` recorded distances in metres, or other readings of these rays.
+      measures_distance: whether readings are distances.
+
+    Returns:
+      `[B, ...]` readings along `targets`, NaN outside the recorded field of view.
+    """
+    right, left, share, is_between = _neighbours(targets, angles)
+    readings = np.asarray(readings, np.float32)
+    if measures_distance:
+        readings = np.where(readings == 0, np.inf, readings)
+    first, second = readings[right], readings[left]
+    # One number for each ray, next to readings of any shape.
+    of_rays = (-1, *[1] * (readings.ndim - 1))
+    share, is_between = share.reshape(of_rays), is_between.reshape(of_rays)
+    with np.errstate(invalid="ignore"):  # a beam without a return is infinitely long
+        between = first + share * (second - first)
+        is_same = np.abs(second - first) < _SURFACE if measures_distance else True
+    nearest = np.where(share < 0.5, first, second)
+    found = np.where(is_between & is_same, between, nearest).astype(np.float32)
+    found[~covered(targets, angles)] = np.nan
+    return found
+
+
+def covered(targets: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Which of some rays lie in the recorded field of view.
+
+    Args:
+      targets: `[B]` directions of these rays, in radians.
+      angles: `[A]` directions of the recorded rays, in radians, in any order; two or more.
+
+    Returns:
+      `[B]` bool: between two recorded rays, or within half a step of one.
+    """
+    *rays, _, is_between = _neighbours(targets, angles)
+    apart = [np.abs(within_a_turn(targets - np.asarray(angles)[ray])) for ray in rays]
+    return is_between | (np.minimum(*apart) < median_step(angles) / 2)
+
+
+def median_step(angles: np.ndarray) -> float:
+    """Median angle between neighbouring rays, in radians; infinite if there is only one.
+
+    Args:
+      angles: directions of the rays, in radians, in any order.
+    """
+    turned = np.unique(within_a_turn(angles))
+    return float(np.median(np.diff(turned))) if len(turned) > 1 else np.inf
+
+
+def within_a_turn(angles: np.ndarray) -> np.ndarray:
+    """Angles in radians, turned to where they are from -pi to pi."""
+    return (np.asarray(angles, np.float64) + np.pi) % (2 * np.pi) - np.pi
+
+
+def _neighbours(
+    targets: np.ndarray, angles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Recorded rays to the right and to the left of each target.
+
+    Returns their indices; how far the target is from one to the other, from 0 to 1; and whether
+    what lies between them was recorded.
+    """
+    turned, order = np.unique(within_a_turn(angles), return_index=True)
+    # The last ray also comes before the first one, and this after the last.
+    circle = np.concatenate([turned[-1:] - 2 * np.pi, turned, turned[:1] + 2 * np.pi])
+    order = np.concatenate([order[-1:], order, order[:1]])
+    targets = within_a_turn(targets)
+    right = np.searchsorted(circle, targets, side="right") - 1
+    gap = circle[right + 1] - circle[right]
+    share = (targets - circle[right]) / gap
+    return order[right], order[right + 1], share, gap < MAX_STEPS * median_step(angles)
