@@ -7,7 +7,7 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +156,36 @@ def versions(packages: tuple[str, ...] = ()) -> dict[str, str]:
     """Versions of Python, of the packages that all rows need, and of `packages`."""
     found = {package: importlib.metadata.version(package) for package in (*_PACKAGES, *packages)}
     return {"python": platform.python_version(), **found}
+
+
+def origin(command: str, packages: tuple[str, ...] = ()) -> dict[str, Any]:
+    """How, where and when results were measured, for a JSON file.
+
+    Args:
+      command: that measures them.
+      packages: distributions that it needs next to those of `versions`.
+    """
+    return {
+        "command": command,
+        "commit": version.commit(),
+        "date": datetime.date.today().isoformat(),
+        "device": jax.devices()[0].device_kind,
+        "cores": os.cpu_count(),
+        "versions": versions(packages),
+    }
+
+
+def describe(results: Mapping[str, Any]) -> str:
+    """A sentence of what `origin` says, to stand below a table.
+
+    Args:
+      results: with the keys of `origin`.
+    """
+    at = ", ".join(f"{name} {number}" for name, number in results["versions"].items())
+    return (
+        f"`{results['command']}`: {results['device']} with {results['cores']} cores; commit "
+        f"{str(results['commit'])[:10]} on {results['date']}; {at}."
+    )
 
 
 def compiled(

@@ -11,13 +11,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.digits import table as digits
+from benchmarks.fusions import table as fusions
 from benchmarks.seeds import tables
 
 _HERE = Path(__file__).parent
 RESULTS = _HERE / "results"
 PAGES = (
     _HERE.parent / "README.md",
-    _HERE.parent / "docs" / "figures.md",
+    *(_HERE.parent / "docs" / f"{name}.md" for name in ("figures", "jmvae", "fusion")),
     _HERE / "RESULTS.md",
 )
 _BLOCK = re.compile(
@@ -88,6 +90,8 @@ def number(value: float) -> str:
 
 TABLES: Mapping[str, Mapping[str | None, Callable[[Any], str]]] = {
     **{name: {None: table} for name in ("cpu.json", "h100.json", "h100x2.json")},
+    "digits.json": {None: digits.of_results},
+    "fusions.json": {None: fusions.of_results},
     "seeds.json": {
         "readme": partial(tables.of_presets, rows=tables.OF_README, presets=("paper", "default")),
         "worth": partial(tables.worth, names=tables.EVALUATED),

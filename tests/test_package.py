@@ -66,6 +66,21 @@ def test_examples_of_single_functions_run(capsys):
     assert memory["batch"].s_t.shape == (3, 128)
 
 
+def test_example_of_the_jmvae_on_own_data_runs(capsys):
+    names = run_example(ROOT / "docs" / "jmvae.md")
+    assert names["losses"][-50:].mean() < 0.5 * names["losses"][:50].mean()
+    shapes, share = capsys.readouterr().out.splitlines()
+    assert shapes == "(1000, 2) (1000, 2)"
+    assert float(share.split()[-1]) > 0.8
+
+
+def test_example_of_another_fusion_runs(capsys):
+    names = run_example(ROOT / "docs" / "fusion.md")
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    probabilities = names["models"].fusion.class_probabilities(names["belief"])
+    assert np.isclose(probabilities.sum(), 1)
+
+
 def test_examples_of_the_tasks_run(capsys):
     page = ROOT / "docs" / "tasks.md"
     assert np.isfinite(run_example(page, 0)["seen"].reward)

@@ -12,7 +12,7 @@ import rich.console
 
 from benchmarks.fusions.study import Each, Study, settings, sizes
 from benchmarks.fusions.table import Figures, as_markdown, means, summarise
-from benchmarks.measure import reserve, versions
+from benchmarks.measure import origin, reserve
 from jaxsense.config import ConfigError, PresetName
 from jaxsense.config.checks import check_fields, limited
 from jaxsense.run import cli, devices
@@ -28,8 +28,9 @@ class Arguments:
     """Settings of sensors, detectors and the JMVAE."""
     seeds: str = "100-109"
     """The first and the last seed, or one seed. Differences over one seed have no intervals."""
-    missions: int = limited(128, at_least=1, at_most=1024)
-    """Missions of each fusion and seed."""
+    missions: int = limited(128, at_least=0, at_most=1024)
+    """Missions of each fusion and seed. Without any, no policies are trained either: only the NLL
+    after looks is measured, in minutes."""
     out: Path | None = None
     """JSON file to write; must be new."""
 
@@ -44,6 +45,14 @@ class Arguments:
         if found is None or not (seeds := range(int(found[1]), int(found[2] or found[1]) + 1)):
             raise ConfigError("seeds", self.seeds, "must be as 100-109, or one seed")
         return seeds
+
+
+def _command(arguments: Arguments) -> str:
+    """The command that measures the same again."""
+    return (
+        f"python -m {PROGRAM} --preset {arguments.preset} --seeds {arguments.seeds} "
+        f"--missions {arguments.missions}"
+    )
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -67,12 +76,11 @@ def main(argv: list[str] | None = None) -> None:
         # The first seed alone, so that each program is compiled once, the fusions side by side.
         found = {first: measure(first, executor.map)}
         found |= zip(others, executor.map(measure, others), strict=True)
-    fusions, optimal = summarise(found, sizes(config)), means(found, "optimal")
+    fusions = summarise(found, sizes(config))
+    optimal = means(found, "optimal") if arguments.missions else {}
     if arguments.out is not None:
         results = {
-            "preset": arguments.preset,
-            "missions": arguments.missions,
-            "versions": versions(),
+            **origin(_command(arguments)),
             "optimal": optimal,
             "fusions": fusions,
             "seeds": found,

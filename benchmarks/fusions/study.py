@@ -110,18 +110,20 @@ class Study:
     """
 
     def __init__(self, config: Config, missions: int):
-        """Prepares the programs; `missions` of each fusion and seed."""
+        """Prepares the programs; `missions` of each fusion and seed, 0 for the NLL alone."""
         scenario = mission.make_mission(config)
         scenario = dataclasses.replace(scenario, policies={"latent": policies.POLICIES["latent"]})
         quick = devices.compiler_options()  # compiling takes longer than playing
         self.config = config
+        self._plays = missions > 0
         self._learn = jax.jit(functools.partial(_learned, config))
         self._optimal = jax.jit(functools.partial(_optimal, config))
+        self._nll = jax.jit(functools.partial(_nll, config))
         self._judge = jax.jit(functools.partial(_judge, config))
         self._play = jax.jit(functools.partial(_play, scenario, missions), compiler_options=quick)
 
     def measure(self, seed: int, each: Each = map) -> dict[str, Figures]:
-        """Figures of each fusion, and of `optimal`, whose only figures are returns.
+        """Figures of each fusion, and with missions of `optimal`, whose only figures are returns.
 
         Args:
           seed: of everything.
@@ -132,12 +134,17 @@ class Study:
 
         def of_kind(kind: Kind) -> Figures:
             fusion = kind.make(self.config, outputs)
-            figures, q_networks = self._judge(key, fusion, outputs)
-            models = _models(self.config, fusion, outputs, q_networks)
-            return _as_floats(figures | self._play(key, models))
+            figures = self._nll(key, fusion, outputs)
+            if self._plays:
+                returns, q_networks = self._judge(key, fusion, outputs)
+                models = _models(self.config, fusion, outputs, q_networks)
+                figures = figures | returns | self._play(key, models)
+            return _as_floats(figures)
 
         found = dict(zip(KINDS, each(of_kind, KINDS.values()), strict=True))
-        return {"optimal": _as_floats(self._optimal(key, outputs)), **found}
+        if self._plays:
+            found["optimal"] = _as_floats(self._optimal(key, outputs))
+        return found
 
 
 def _as_floats(figures: Mapping[str, jax.Array]) -> Figures:
@@ -186,13 +193,18 @@ def _mdp(config: Config, fusion: Audited, features: tuple[jax.Array, ...]) -> Ma
     return MapMdp(Bank(features), fusion, reward, config.mdp, config.arena.num_pois)
 
 
+def _nll(config: Config, key: Key, fusion: Fusion, outputs: Outputs) -> dict[str, jax.Array]:
+    """NLLs of a fusion, after the same looks for all fusions."""
+    detections = outputs["detections"]
+    found = measures.beliefs(key_of(key, "nll"), config, fusion=fusion, detections=detections)
+    return {f"nll {1 + k}": nll for k, nll in enumerate(found["nll"])}
+
+
 def _judge(
     config: Config, key: Key, fusion: Fusion, outputs: Outputs
 ) -> tuple[dict[str, jax.Array], tuple[PyTree, ...]]:
-    """NLLs and returns of a fusion, and the Q-networks that learned with it."""
+    """Returns of a fusion, and the Q-networks that learned with it."""
     detections = outputs["detections"]
-    found = measures.beliefs(key_of(key, "nll"), config, fusion=fusion, detections=detections)
-    figures = {f"nll {1 + k}": nll for k, nll in enumerate(found["nll"])}
     audited = Audited(fusion, make_bayes(config))
     agent = _agent(config, audited)
     mdp, held_out = (_mdp(config, audited, x) for x in (detections.bank, detections.held_out))
@@ -210,7 +222,7 @@ def _judge(
     # One after the other, by one program.
     returns, q_networks = jax.lax.map(train, jnp.arange(len(config.modalities)))
     of_each = [jax.tree.map(lambda x: x[m], q_networks) for m in range(len(config.modalities))]  # noqa: B023
-    return figures | _by_modality(config, returns), tuple(of_each)
+    return _by_modality(config, returns), tuple(of_each)
 
 
 def _optimal(config: Config, key: Key, outputs: Outputs) -> dict[str, jax.Array]:

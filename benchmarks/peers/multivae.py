@@ -59,9 +59,9 @@ def _make_training(
             beta=config.beta,
             warmup=1,
         ),
-        encoders={n: _Encoder(d, model) for n, d in zip(names, model.feature_sizes, strict=True)},
-        decoders={n: _Decoder(d, model) for n, d in zip(names, model.feature_sizes, strict=True)},
-        joint_encoder=_JointEncoder(model),
+        encoders={n: Encoder(d, model) for n, d in zip(names, model.feature_sizes, strict=True)},
+        decoders={n: Decoder(d, model) for n, d in zip(names, model.feature_sizes, strict=True)},
+        joint_encoder=JointEncoder(model),
     )
     network.train()
     optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
@@ -88,18 +88,23 @@ def _layers(inputs: int, hidden: tuple[int, ...], outputs: int) -> torch.nn.Sequ
     return torch.nn.Sequential(*layers, torch.nn.Linear(hidden[-1], outputs))
 
 
-class _Encoder(BaseEncoder):
+class Encoder(BaseEncoder):
+    """An encoder of one modality with our layers."""
+
     def __init__(self, size: int, model: Jmvae):
         super().__init__()
         self.latent_dim = model.latent_size
         self.layers = _layers(size, model.hidden, 2 * model.latent_size)
 
     def forward(self, x: torch.Tensor) -> ModelOutput:
+        """Posteriors given `[B, D_m]` features."""
         mean, log_var = self.layers(x).chunk(2, dim=-1)
         return ModelOutput(embedding=mean, log_covariance=log_var)
 
 
-class _JointEncoder(BaseJointEncoder):
+class JointEncoder(BaseJointEncoder):
+    """An encoder of all modalities with our layers."""
+
     def __init__(self, model: Jmvae):
         super().__init__()
         self.latent_dim = model.latent_size
@@ -107,15 +112,19 @@ class _JointEncoder(BaseJointEncoder):
         self.layers = _layers(sum(model.feature_sizes), model.hidden, 2 * model.latent_size)
 
     def forward(self, x: dict[str, torch.Tensor]) -> ModelOutput:
+        """Posteriors given the features of all modalities by name."""
         joined = torch.cat([x[name] for name in self.names], dim=-1)
         mean, log_var = self.layers(joined).chunk(2, dim=-1)
         return ModelOutput(embedding=mean, log_covariance=log_var)
 
 
-class _Decoder(BaseDecoder):
+class Decoder(BaseDecoder):
+    """A decoder of one modality with our layers."""
+
     def __init__(self, size: int, model: Jmvae):
         super().__init__()
         self.layers = _layers(model.latent_size, model.hidden, size)
 
     def forward(self, z: torch.Tensor) -> ModelOutput:
+        """Means of the features given `[B, D]` latents."""
         return ModelOutput(reconstruction=self.layers(z))

@@ -1,4 +1,4 @@
-"""Diagonal Gaussians: divergence, sampling and moment matching."""
+"""Diagonal Gaussians: divergence, sampling, products and moment matching."""
 
 import chex
 import jax.numpy as jnp
@@ -55,6 +55,28 @@ def sample(noise: _Columns, mean: _Columns, log_var: _Columns) -> Float[Array, "
     chex.assert_shape(log_var, mean.shape, custom_message="log_var")
     chex.assert_shape(noise, mean.shape, custom_message="noise")
     return mean + jnp.exp(0.5 * log_var) * noise
+
+
+def product(
+    means: Float[Array, "K D"], log_vars: Float[Array, "K D"]
+) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
+    """Posterior given several observations, `p(z) prod_k q_k(z) / p(z)` with a standard normal p.
+
+    It is exact if the observations are independent given z. No factor counts as wider than the
+    prior, because an observation cannot take away what others tell.
+
+    Args:
+      means: `[K, D]` of the posteriors given one observation each.
+      log_vars: `[K, D]` logarithms of their variances.
+
+    Returns:
+      `[D]` mean and `[D]` log-variance.
+    """
+    chex.assert_rank(means, 2, custom_message="means")
+    chex.assert_shape(log_vars, means.shape, custom_message="log_vars")
+    precisions = jnp.exp(-jnp.minimum(log_vars, 0.0))
+    precision = 1.0 + jnp.sum(precisions - 1.0, axis=0)
+    return jnp.sum(precisions * means, axis=0) / precision, -jnp.log(precision)
 
 
 def moment_match(

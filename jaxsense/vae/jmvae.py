@@ -1,9 +1,9 @@
 """The joint multi-modal VAE (JMVAE) for any tuple of modalities.
 
 Suzuki, Nakayama and Matsuo 2017, as used in Korthals et al. 2018, Sec. II. Every non-empty subset
-of the modalities has an encoder. The encoder of the full set is the joint encoder; a
-Kullback-Leibler divergence draws every other encoder to it. With two modalities these are the joint
-encoder and the two uni-modal encoders of the paper.
+of the modalities has an encoder, or only subsets up to a size and the full set. The encoder of the
+full set is the joint encoder; a Kullback-Leibler divergence draws every other encoder to it. With
+two modalities these are the joint encoder and the two uni-modal encoders of the paper.
 """
 
 import dataclasses
@@ -21,6 +21,8 @@ from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Features, Key, Samples, pytree
 from jaxsense.vae import gaussian
 
+_STEPS_AT_ONCE = 100  # whose draws are in memory together
+
 Drawn = tuple[jax.Array, tuple[jax.Array, ...]]
 """Noise `[steps, D, B]`, and for each modality features `[steps, D_m, B]`."""
 
@@ -34,12 +36,16 @@ class Jmvae:
       feature_sizes: D_m of each modality.
       latent_size: D.
       hidden: sizes of the hidden layers of every encoder and decoder.
+      max_subset: number of modalities up to which subsets have encoders, next to the full set; by
+        default every subset has one, which six modalities make 63. The posterior of another subset
+        is the product of those of its modalities.
     """
 
     modalities: tuple[str, ...]
     feature_sizes: tuple[int, ...]
     latent_size: int
     hidden: tuple[int, ...]
+    max_subset: int | None = None
 
     def __post_init__(self):
         if not self.modalities:
@@ -52,16 +58,19 @@ class Jmvae:
         if len(set(self.modalities)) < len(self.modalities):
             raise ValueError(f"modalities = {self.modalities}: must name none twice")
         checks.require_number("latent_size", self.latent_size)
+        if self.max_subset is not None:
+            checks.require_number("max_subset", self.max_subset)
         for name in ("feature_sizes", "hidden"):
             for size in getattr(self, name):
                 checks.require_number(name, size)
 
     @property
     def subsets(self) -> tuple[tuple[int, ...], ...]:
-        """Every non-empty subset of the modalities, the full set last."""
-        indices = range(len(self.modalities))
-        sizes = range(1, len(self.modalities) + 1)
-        return tuple(s for size in sizes for s in itertools.combinations(indices, size))
+        """The subsets of the modalities that have an encoder, the full set last."""
+        number = len(self.modalities)
+        largest = number - 1 if self.max_subset is None else min(self.max_subset, number - 1)
+        sizes = (*range(1, largest + 1), number)
+        return tuple(s for size in sizes for s in itertools.combinations(range(number), size))
 
     def encoder_name(self, subset: tuple[int, ...]) -> str:
         """Name of a subset's encoder, for example "camera+lidar"."""
@@ -98,6 +107,9 @@ def encode(
 ) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
     """Mean and log-variance of the posterior `q(z | present features)`.
 
+    Of a subset without an encoder it is the product of the posteriors of its modalities, in which
+    their prior N(0, I) counts once.
+
     Args:
       params: from `init` or `train`.
       model: the shape.
@@ -112,7 +124,10 @@ def encode(
     """
     _check_features(model, features)
     subset = tuple(m for m, feature in enumerate(features) if feature is not None)
-    return _encode(params, model, subset, features)
+    if subset in model.subsets:
+        return _encode(params, model, subset, features)
+    alone = [_encode(params, model, (m,), features) for m in subset]
+    return gaussian.product(*map(jnp.stack, zip(*alone, strict=True)))
 
 
 def _encode(
@@ -190,7 +205,8 @@ def loss(
 
     `-E[sum_m w_m log p(x_m|z)] + beta KL(q(z|all) || N(0, I)) + alpha sum_s KL(q(z|all) || q(z|s))`
     where z is one reparameterised draw from `q(z|all)`, p a Gaussian of unit variance without its
-    constant, and s every proper subset of the modalities.
+    constant, and s every proper subset of the modalities that has an encoder. A weight w_m is the
+    same as a variance of 1 / w_m.
 
     Args:
       key: random key of the draw.
@@ -338,8 +354,10 @@ def train(
       key: random key.
       params: from `init`.
       model: the shape.
-      bank: for each modality `[C, S, D_m]` features of looks at every class.
-      config: weights, batch, learning rate and number of steps.
+      bank: for each modality `[C, S, D_m]` features of looks at every class. Each example is a look
+        by every modality at one class. Rows that belong together, such as views of one object, are
+        classes with a look each: `[N, 1, D_m]`.
+      config: weights, batch, learning rate and number of steps; the other settings are not used.
 
     Returns:
       The parameters and the `[steps]` losses.
@@ -350,9 +368,14 @@ def train(
     checks.require_one_each("bank", bank, model.modalities)
     for features, size in zip(bank, model.feature_sizes, strict=True):
         chex.assert_shape(features, (bank[0].shape[0], None, size), custom_message="bank")
-    state = supervised.start(params, config)
-    state, losses = supervised.fit(key, state, Fitting(config, bank, model), config.steps)
-    return state.params, losses
+    problem, state = Fitting(config, bank, model), supervised.start(params, config)
+    number = min(config.steps, _STEPS_AT_ONCE)
+
+    def chunk(state: supervised.FitState, key: Key) -> tuple[supervised.FitState, jax.Array]:
+        return supervised.fit(key, state, problem, number)
+
+    state, losses = jax.lax.scan(chunk, state, jax.random.split(key, -(-config.steps // number)))
+    return state.params, losses.reshape(-1)[: config.steps]
 
 
 def annealed_beta(step: Int[Array, ""], config: JmvaeConfig) -> Float[Array, ""]:

@@ -190,6 +190,7 @@ FUNCTIONS = {
     "Jmvae sizes": (lambda w: vae.Jmvae(("a",), (0,), 2, (8,)), "feature_sizes = 0"),
     "Jmvae latent": (lambda w: vae.Jmvae(("a",), (2,), 0.5, (8,)), "latent_size = 0.5"),
     "Jmvae hidden": (lambda w: vae.Jmvae(("a",), (2,), 2, (-8,)), "hidden = -8"),
+    "Jmvae subset": (lambda w: vae.Jmvae(("a",), (2,), 2, (8,), 0), "max_subset = 0"),
     "encode none": (lambda w: vae.encode(w.params, w.model, (None, None)), "must hold one mod"),
     "encode shape": (
         lambda w: vae.encode(w.params, w.model, (jnp.zeros(3), None)),

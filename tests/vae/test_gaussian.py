@@ -81,6 +81,29 @@ def test_moment_match_minimises_the_mean_divergence_from_the_components():
         assert mean_kl(best + change) > mean_kl(best) + 1e-5
 
 
+def test_product_as_worked_by_hand():
+    # Precisions 2 and 4 hold the prior's 1 each: 1 + 1 + 3 = 5, mean (2 x 1 + 4 x 3) / 5.
+    means, log_vars = jnp.array([[1.0], [3.0]]), jnp.log(jnp.array([[0.5], [0.25]]))
+    mean, log_var = gaussian.product(means, log_vars)
+    np.testing.assert_allclose(mean, [14 / 5], rtol=1e-6)
+    np.testing.assert_allclose(log_var, [-np.log(5)], rtol=1e-6)
+    # One alone stays as it is, and one wider than the prior takes nothing away from another.
+    np.testing.assert_allclose(gaussian.product(means[:1], log_vars[:1]), ([1.0], [-np.log(2)]))
+    mean, log_var = gaussian.product(jnp.array([[1.0], [0.0]]), jnp.log(jnp.array([[0.5], [9.0]])))
+    np.testing.assert_allclose(mean, [1.0], rtol=1e-6)
+    np.testing.assert_allclose(log_var, [-np.log(2)], rtol=1e-6)
+
+
+def test_product_is_exact_for_independent_observations():
+    # z ~ N(0, 1) and x = z + noise of variance v: p(z | x) has precision 1 + 1 / v.
+    variances, x = np.array([0.5, 2.0, 1.0]), np.array([1.0, -0.3, 0.4])
+    alone = 1 / (1 + 1 / variances)
+    mean, log_var = gaussian.product((x / variances * alone)[:, None], np.log(alone)[:, None])
+    precision = 1 + np.sum(1 / variances)
+    np.testing.assert_allclose(log_var, [-np.log(precision)], rtol=1e-5)
+    np.testing.assert_allclose(mean, [np.sum(x / variances) / precision], rtol=1e-5)
+
+
 def test_sample_as_worked_by_hand():
     # Standard deviations 2 and 1/2: 2 + 2 x 1.5 = 5, -1 - .5 x 2 = -2; in a batch, -1 + .5 x 4.
     mean, log_var = jnp.array([2.0, -1.0]), jnp.array([LOG4, -LOG4])

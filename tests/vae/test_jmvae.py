@@ -57,6 +57,32 @@ def test_subsets_are_all_non_empty_ones_with_the_joint_one_last():
     assert THREE.subsets[-1] == (0, 1, 2)
 
 
+def test_subsets_up_to_a_size_and_the_full_set_have_encoders():
+    def subsets(number):
+        return Jmvae(THREE.modalities, (2, 3, 1), 4, (8,), max_subset=number).subsets
+
+    assert subsets(1) == ((0,), (1,), (2,), (0, 1, 2))
+    assert subsets(2) == subsets(3) == subsets(9) == THREE.subsets
+    assert Jmvae(("camera",), (2,), 4, (8,), max_subset=1).subsets == ((0,),)
+
+
+def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
+    model = Jmvae(THREE.modalities, THREE.feature_sizes, 1, (8,), max_subset=1)
+    params = zero_parameters(model)
+    params = with_output(params, "encoders", "camera", [1.0, np.log(0.5)])
+    params = with_output(params, "encoders", "lidar", [3.0, np.log(0.25)])
+    assert params["encoders"].keys() == {"camera", "lidar", "sonar", "camera+lidar+sonar"}
+    mean, log_var = encode(params, model, keep(some_features(model), (0, 1)))
+    # The prior has precision 1, camera adds 1 and LiDAR 3: (2 x 1 + 4 x 3) / (1 + 1 + 3).
+    np.testing.assert_allclose(mean, [14 / 5], rtol=1e-6)
+    np.testing.assert_allclose(log_var, [-np.log(5)], rtol=1e-6)
+    options = {"alpha": 1.0, "beta": 1.0, "reconstruction_weights": (1.0,) * 3}
+    _, parts = loss(jax.random.key(0), params, model, some_features(model), **options)
+    # KL(N(0, 1) || N(m, v)) = (1/v + m^2/v - 1 + ln v) / 2 for camera and LiDAR, 0 for the sonar.
+    expected = (2 + 2 - 1 - np.log(2)) / 2 + (4 + 36 - 1 - np.log(4)) / 2
+    np.testing.assert_allclose(parts["subsets"], expected, rtol=1e-5)
+
+
 @pytest.mark.parametrize("model", [TWO, THREE])
 def test_every_subset_has_an_encoder_of_its_own(model):
     params, features = init(jax.random.key(0), model), some_features(model)
@@ -214,12 +240,13 @@ def test_loss_is_that_of_encode_and_decode_with_the_keys_draw():
     np.testing.assert_allclose(total, expected, rtol=1e-5)
 
 
-def test_every_step_of_a_training_draws_anew():
-    config = JmvaeConfig(hidden=(8,), steps=20, batch=4, learning_rate=1e-12)
+@pytest.mark.parametrize("steps", [20, 230])
+def test_every_step_of_a_training_draws_anew(steps):
+    config = JmvaeConfig(hidden=(8,), steps=steps, batch=4, learning_rate=1e-12)
     bank = tuple(jax.random.uniform(k, (3, 50, 2)) for k in jax.random.split(jax.random.key(1)))
     params = init(jax.random.key(0), TWO)
     _, losses = jax.jit(jmvae.train, static_argnums=2)(jax.random.key(2), params, TWO, bank, config)
-    assert len(np.unique(losses)) == 20
+    assert len(np.unique(losses)) == len(losses) == steps
 
 
 def test_gradient_of_the_loss_agrees_with_finite_differences():

@@ -87,9 +87,9 @@ def test_every_term_is_that_of_multivae(example, monkeypatch):
     of_each = dict(zip(MODEL.modalities, MODEL.feature_sizes, strict=True))
     network = JMVAE(
         JMVAEConfig(2, MODEL.latent_size, {n: (size,) for n, size in of_each.items()}, warmup=1),
-        encoders={n: peer._Encoder(size, MODEL) for n, size in of_each.items()},
-        decoders={n: peer._Decoder(size, MODEL) for n, size in of_each.items()},
-        joint_encoder=peer._JointEncoder(MODEL),
+        encoders={n: peer.Encoder(size, MODEL) for n, size in of_each.items()},
+        decoders={n: peer.Decoder(size, MODEL) for n, size in of_each.items()},
+        joint_encoder=peer.JointEncoder(MODEL),
     )
     copies = {
         "camera+lidar": network.joint_encoder,
