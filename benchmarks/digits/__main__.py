@@ -3,13 +3,14 @@
 import dataclasses
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from benchmarks import measure, peers
 from benchmarks.digits import data, measures, table
 from benchmarks.digits.data import Digits
+from benchmarks.digits.measures import Figures
 from benchmarks.digits.models import OURS, Budget, Kind
 from jaxsense.config.checks import check_fields, limited
 from jaxsense.run import cli
@@ -55,35 +56,38 @@ def main(argv: list[str] | None = None) -> None:
         **measure.origin(command, ("mvlearn", *packages)),
         "budget": dataclasses.asdict(budget),
         "of_true_views": measures.of_true_views(digits),
-        "models": {},
+        "models": {name: [] for name in kinds},
     }
-    for name, kind in kinds.items():
-        results["models"][name] = trained(name, kind, digits, budget, arguments.seeds)
+    for rows in trained(kinds, digits, budget, arguments.seeds):
+        for name, figures in rows.items():
+            results["models"][name].append(figures)
         if arguments.json is not None:
-            # After each model, so that what was measured before a failure is kept.
+            # After each seed, so that what was measured before a failure is kept.
             text = json.dumps(results, indent=2)
             arguments.json.write_text(text + "\n", encoding="utf-8")
     print(table.of_results(results))
 
 
 def trained(
-    name: str, kind: Kind, digits: Digits, budget: Budget, seeds: int, samples: int = _SAMPLES
-) -> list[Mapping[str, float]]:
-    """Figures of a model, a row for each training.
+    kinds: Mapping[str, Kind], digits: Digits, budget: Budget, seeds: int, samples: int = _SAMPLES
+) -> Iterator[dict[str, Figures]]:
+    """Yields the figures of all models for each seed, trained in turn, so that noise hits all.
 
     Args:
-      name: of the model, for the progress on stderr.
-      kind: the model.
+      kinds: the models by name.
       digits: the data.
       budget: settings.
       seeds: number of trainings.
       samples: for the log-likelihood of each digit.
     """
-    found = []
-    for seed, run in enumerate(kind.runs(digits, budget, range(seeds))):
-        found.append(measures.measure(run, digits, budget, samples, seed))
-        print(f"{name}, seed {seed}: {run.seconds:.1f} s", file=sys.stderr)
-    return found
+    all_runs = {name: kind.runs(digits, budget, range(seeds)) for name, kind in kinds.items()}
+    for seed in range(seeds):
+        found = {}
+        for name, runs in all_runs.items():
+            run = next(runs)
+            print(f"{name}, seed {seed}: {run.seconds:.1f} s", file=sys.stderr)
+            found[name] = measures.measure(run, digits, budget, samples, seed)
+        yield found
 
 
 if __name__ == "__main__":

@@ -42,8 +42,9 @@ class Theirs:
 
     def runs(self, digits: Digits, budget: Budget, seeds: range) -> Iterator[Run]:
         """Trains once for each seed, with as many threads as are faster, see `Kind`."""
-        torch.set_num_threads(self._threads(digits, budget))
+        threads = self._threads(digits, budget)
         for seed in seeds:
+            torch.set_num_threads(threads)
             torch.manual_seed(seed)
             begin = time.perf_counter()
             network = self._network(digits, budget)
