@@ -70,7 +70,7 @@ def test_example_of_the_jmvae_on_own_data_runs(capsys):
     names = run_example(ROOT / "docs" / "jmvae.md")
     assert names["losses"][-50:].mean() < 0.5 * names["losses"][:50].mean()
     shapes, share = capsys.readouterr().out.splitlines()
-    assert shapes == "(1000, 2) (1000, 2)"
+    assert shapes == "(200, 2) (200, 2)"
     assert float(share.split()[-1]) > 0.8
 
 
