@@ -15,6 +15,8 @@ from jaxsense.config import JmvaeConfig
 from jaxsense.core.networks import Params
 from jaxsense.vae import Jmvae
 
+_LAST_SCALE = 0.1  # PyTorch's initial weights are also smaller than ours
+
 Subset = tuple[int, ...]
 """Indices of the views that are seen."""
 
@@ -134,7 +136,7 @@ class Ours:
 
         def train(key: jax.Array, bank: tuple[jax.Array, ...]) -> Params:
             init_key, train_key = jax.random.split(key)
-            params = vae.init(init_key, model)
+            params = vae.init(init_key, model, last_scale=_LAST_SCALE)
             return vae.train(train_key, params, model, bank, config)[0]
 
         bank = tuple(jax.device_put(x[:, None]) for x in digits.train)

@@ -77,26 +77,31 @@ class Jmvae:
         return "+".join(self.modalities[m] for m in subset)
 
 
-def init(key: Key, model: Jmvae) -> Params:
+def init(key: Key, model: Jmvae, *, last_scale: float = 1.0) -> Params:
     """Random parameters, `{"encoders": {NAME: ...}, "decoders": {NAME: ...}}`.
 
     Args:
       key: random key.
       model: the shape.
+      last_scale: factor on all last layers. With 0.1 outputs start near 0; then features of
+        hundreds of numbers need far fewer steps.
     """
+
+    def network(key: Key, inputs: int, outputs: int) -> Params:
+        shape = MLP(model.hidden, outputs)
+        return networks.scale_last(shape, networks.init(key, shape, inputs), last_scale)
+
     encoder_key, decoder_key = jax.random.split(key)
     encoder_keys = jax.random.split(encoder_key, len(model.subsets))
     decoder_keys = jax.random.split(decoder_key, len(model.modalities))
     encoders = {
-        model.encoder_name(subset): networks.init(
-            k,
-            MLP(model.hidden, 2 * model.latent_size),
-            sum(model.feature_sizes[m] for m in subset),
+        model.encoder_name(subset): network(
+            k, sum(model.feature_sizes[m] for m in subset), 2 * model.latent_size
         )
         for k, subset in zip(encoder_keys, model.subsets, strict=True)
     }
     decoders = {
-        name: networks.init(k, MLP(model.hidden, size), model.latent_size)
+        name: network(k, model.latent_size, size)
         for k, name, size in zip(decoder_keys, model.modalities, model.feature_sizes, strict=True)
     }
     return {"encoders": encoders, "decoders": decoders}

@@ -83,6 +83,16 @@ def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
     np.testing.assert_allclose(parts["subsets"], expected, rtol=1e-5)
 
 
+def test_a_small_last_layer_starts_near_zero_and_leaves_the_others():
+    params, small = (jmvae.init(jax.random.key(0), TWO, last_scale=x) for x in (1.0, 0.1))
+    for part in ("encoders", "decoders"):
+        for name, network in params[part].items():
+            layers, scaled = network["params"], small[part][name]["params"]
+            np.testing.assert_array_equal(scaled["Dense_0"]["kernel"], layers["Dense_0"]["kernel"])
+            expected = 0.1 * layers["Dense_1"]["kernel"]
+            np.testing.assert_allclose(scaled["Dense_1"]["kernel"], expected, rtol=1e-6)
+
+
 @pytest.mark.parametrize("model", [TWO, THREE])
 def test_every_subset_has_an_encoder_of_its_own(model):
     params, features = init(jax.random.key(0), model), some_features(model)
