@@ -51,7 +51,8 @@ def main(argv: list[str] | None = None) -> None:
     if peer is not None:
         kinds, packages = {**kinds, **peer.KINDS}, ("multivae", "torch")
     budget = Budget(steps=arguments.steps)
-    command = f"python -m {PROGRAM}" + (" --peers" if arguments.peers else "")
+    asked = " --peers" * arguments.peers
+    command = f"python -m {PROGRAM}{asked} --seeds {arguments.seeds} --steps {arguments.steps}"
     results: dict[str, Any] = {
         **measure.origin(command, ("mvlearn", *packages)),
         "budget": dataclasses.asdict(budget),
