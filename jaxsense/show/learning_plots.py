@@ -21,7 +21,7 @@ Curves = dict[str, Arrays]
 rewards: `reward` of the exploring policy, and `evaluation` of the learned policy alone on the map,
 NaN where it was not played."""
 
-Names = list[tuple[str, float, str]]
+_Names = list[tuple[str, float, str]]
 """Text, height and colour of names next to an axis."""
 
 _SMOOTHING = 20  # epochs
@@ -51,7 +51,7 @@ def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:
         panels.append((f"{name}: one {alone} robot alone on the map", evaluation, agent))
     figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    names: list[Names] = []
+    names: list[_Names] = []
     for ax, (title, of_panel, agent) in zip(axes, panels, strict=True):
         drawn = (_draw_rewards(ax, kind, np.atleast_2d(x)) for kind, x in of_panel.items())
         names.append([name for of_kind in drawn for name in of_kind])
@@ -84,7 +84,7 @@ def _bottom(agent: Agent) -> float:
     return min(naive, mean(agent["return"])) - max(0.5, optimal - naive)
 
 
-def _draw_rewards(ax: Axes, kind: str, values: np.ndarray) -> Names:
+def _draw_rewards(ax: Axes, kind: str, values: np.ndarray) -> _Names:
     """Draws `[K, epochs]` rewards: the mean, and of several seeds its 95% interval."""
     if len(values) == 0:
         return []
@@ -105,9 +105,9 @@ def _draw_rewards(ax: Axes, kind: str, values: np.ndarray) -> Names:
     return [(label, float(finite[-1]), colour)] if len(finite) else []
 
 
-def _draw_references(ax: Axes, agent: Agent) -> Names:
+def _draw_references(ax: Axes, agent: Agent) -> _Names:
     """Draws the policies that an agent is compared with, as lines."""
-    names: Names = []
+    names: _Names = []
     lines = {"optimal": _OPTIMAL_LINE, "naive": _NAIVE_LINE, "random": _RANDOM_LINE}
     for name, line in lines.items():
         if agent[name] is not None:
