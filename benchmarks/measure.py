@@ -103,10 +103,7 @@ class Row:
             values["peer"] = f"{self.peer} (stopped)"
         return {
             **values,
-            "commit": version.commit(),
-            "date": datetime.date.today().isoformat(),
-            "cores": os.cpu_count(),
-            "command": f"python -m benchmarks {self.row}" + (" --peers" if self.peer else ""),
+            **provenance(f"python -m benchmarks {self.row}" + (" --peers" if self.peer else "")),
         }
 
 
@@ -150,6 +147,16 @@ def make_row(
         versions=versions(packages if theirs is not None else ()),
         is_bound=is_bound,
     )
+
+
+def provenance(command: str) -> dict[str, Any]:
+    """Commit, day, number of cores and the command itself."""
+    return {
+        "commit": version.commit(),
+        "date": datetime.date.today().isoformat(),
+        "cores": os.cpu_count(),
+        "command": command,
+    }
 
 
 def versions(packages: tuple[str, ...] = ()) -> dict[str, str]:

@@ -107,11 +107,3 @@ def test_examples_of_your_robot_run(tmp_path, monkeypatch, capsys):
 def test_example_of_the_settings_runs():
     config = run_example(ROOT / "docs" / "settings.md")["config"]
     assert config.arena.num_pois == 4
-
-
-def test_returns_of_references_are_those_of_the_files():
-    from benchmarks import references
-
-    text = (ROOT / "docs" / "tasks.md").read_text()
-    for cells in references.rows():
-        assert f"| {' | '.join(cells)} |" in text

@@ -275,10 +275,12 @@ class TeamEnvironment:
     Attributes:
       agent: the learner.
       mdp: the MDP.
+      robots: `[R]` int32 index of each robot's sensor; None for a random team in each episode.
     """
 
     agent: Agent
     mdp: TeamMdp
+    robots: jax.Array | None = None
 
     @property
     def num_actions(self) -> int:
@@ -287,7 +289,7 @@ class TeamEnvironment:
 
     def reset(self, key: Key) -> SmdpState:
         """A random first state, in which no robot has set out."""
-        now = team_mdp.reset(key, self.mdp)
+        now = team_mdp.reset(key, self.mdp, self.robots)
         observed = self.agent.observe(now.map.belief, now.team, now.agent)
         num_robots, num_pois = len(now.team.works), self.mdp.map.num_pois
         nothing = jnp.zeros((num_robots, len(observed)))

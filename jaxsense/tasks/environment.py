@@ -36,6 +36,11 @@ class Scaling:
         scaled = (features - self.offset[None]) / self.scale[None]
         return jnp.clip(scaled, -CLIP, CLIP).reshape(-1)
 
+    def inverse(self, observation: Float[Array, " S"]) -> Float[Array, "N F"]:
+        """`[N, F]` from `[N * F]` scaled, but for what was clipped."""
+        scaled = observation.reshape(-1, self.offset.size)
+        return scaled * self.scale[None] + self.offset[None]
+
 
 @pytree
 class TimeStep:

@@ -17,7 +17,7 @@ from jaxsense.tasks import archive
 from jaxsense.tasks.archive import Arrays
 from jaxsense.tasks.environment import Scaling
 from jaxsense.tasks.pretrained import DATA, Origin
-from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, reference_returns
+from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, key_of_seed
 from jaxsense.training.mdp import models_of
 
 TASKS = {
@@ -134,6 +134,29 @@ def freeze(
         "returns": {agent: returns(agent) for agent in _agents(config)},
     }
     archive.write(file, trees, {"config": as_plain(config), "origin": dataclasses.asdict(made)})
+
+
+def reference_returns(task: Task, seeds: int, episodes: int) -> dict[str, np.ndarray]:
+    """Mean returns of the policies to compare with.
+
+    Args:
+      task: the task.
+      seeds: number of seeds.
+      episodes: with each seed.
+
+    Returns:
+      By name, `[seeds]`.
+    """
+
+    def mean(name: str) -> np.ndarray:
+        @jax.jit
+        def play(key: Key) -> jax.Array:
+            keys = jax.random.split(key, episodes)
+            return jnp.mean(jax.vmap(lambda key: task.play_reference(key, name))(keys))
+
+        return np.array([float(play(key_of_seed(seed))) for seed in range(seeds)])
+
+    return {name: mean(name) for name in task.references}
 
 
 def _read(name: str) -> tuple[Arrays, dict[str, object]]:

@@ -1,21 +1,24 @@
 """Scores of policies in frozen tasks, compared with policies whose scores are known."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 from scipy import stats
 
 from jaxsense.config import ConfigError
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.tasks.registry import as_task
-from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, key_of_seed, reference_returns
+from jaxsense.tasks.registry import as_task, reference_returns
+from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, key_of_seed
 
+_NUMBERS = jax.Array | np.ndarray | np.generic | float | int
 _RESAMPLES = 2000
 _LEVEL = 0.95
 
@@ -117,7 +120,8 @@ def score(
       task: from `make`, or its name.
       policy: the policy; or several, one for each seed that they were trained with, so that the
         interval covers the spread of trainings. One policy plays with `SEEDS` seeds, and its
-        interval covers the spread of starts and looks alone.
+        interval covers the spread of starts and looks alone. Policies that are pytrees of numbers,
+        such as a `jax.tree_util.Partial` of parameters, are compiled once for all.
       agent: see `make`; only with a name.
       episodes: with each seed.
 
@@ -135,8 +139,9 @@ def score(
         raise ConfigError("policy", "[]", "must be one policy or several")
     seeds = len(policies)
     keys = [key_of_seed(seed) for seed in range(seeds)]
-    played = {id(each): _player(task, each, episodes) for each in policies}
-    returns = [played[id(each)](key) for each, key in zip(policies, keys, strict=True)]
+    played = {id(each): _player(each) for each in policies}
+    pairs = zip(keys, policies, strict=True)
+    returns = [played[id(each)](key, task, episodes) for key, each in pairs]
     if episodes == EPISODES and seeds <= SEEDS:
         known = np.asarray(task.returns)[:, :seeds]
         references = dict(zip(task.references, known, strict=True))
@@ -185,26 +190,36 @@ def estimate(values: Float[np.ndarray, " seeds"]) -> Estimate:
     return Estimate(value, float(low), float(high))
 
 
-def _player(task: Task, policy: Policy | Recurrent, episodes: int) -> Callable[[Key], float]:
-    """Mean return of some episodes as a function of a key."""
-    recurrent = policy if isinstance(policy, Recurrent) else _forgetful(policy)
+def mean_return(key: Key, task: Task, policy: Policy | Recurrent, episodes: int) -> float:
+    """Plays a task with starts and looks of one's own, for example to draw a learning curve.
 
-    def act(key: Key, memory: Any, observation: jax.Array) -> tuple[jax.Array, Any]:
-        action, memory = recurrent.act(key, memory, observation)
-        action = jnp.asarray(action)
-        if action.shape or not jnp.issubdtype(action.dtype, jnp.integer):
-            found = f"{action.dtype}{list(action.shape)}"
-            raise ValueError(f"action = {found}: must be an integer of shape []")
-        return action.astype(jnp.int32), memory
+    Args:
+      key: random key; none is that of a score.
+      task: from `make`.
+      policy: see `score`; compiled anew in each call, unless it is a pytree of numbers.
+      episodes: number of episodes.
 
-    def play(key: Key) -> Float[Array, ""]:
-        keys = jax.random.split(key, episodes)
-        return jnp.mean(jax.vmap(lambda key: task.play(key, act, recurrent.memory))(keys))
+    Returns:
+      Mean return of an episode, without discount.
 
-    compiled = jax.jit(play)
+    Raises:
+      ValueError: if the policy's actions are no scalar integers, or do not exist.
+    """
+    return _player(policy)(key, task, episodes)
 
-    def checked(key: Key) -> float:
-        found = float(compiled(key))
+
+def _player(policy: Policy | Recurrent) -> Callable[[Key, Task, int], float]:
+    """`mean_return` of a policy, which is compiled once for all keys."""
+    if not isinstance(policy, Recurrent):
+        policy = Recurrent(Partial(_forget, policy), ())
+    act, memory, play = policy.act, policy.memory, _play_compiled
+    if not all(isinstance(leaf, _NUMBERS) for leaf in jax.tree.leaves(act)):
+        # A program of its own, which goes when the policy does.
+        own = functools.partial(_play, act)
+        play, act = jax.jit(lambda _, *rest: own(*rest), static_argnums=4), ()
+
+    def checked(key: Key, task: Task, episodes: int) -> float:
+        found = float(play(act, memory, key, task, episodes))
         if np.isnan(found):
             raise ValueError(f"action: must be from 0 to {task.num_actions - 1}")
         return found
@@ -212,6 +227,26 @@ def _player(task: Task, policy: Policy | Recurrent, episodes: int) -> Callable[[
     return checked
 
 
-def _forgetful(policy: Policy) -> Recurrent:
+def _play(act: Act[Any], memory: Any, key: Key, task: Task, episodes: int) -> Float[Array, ""]:
+    """Mean return of some episodes; NaN if there is no such action."""
+
+    def checked(key: Key, memory: Any, observation: jax.Array) -> tuple[jax.Array, Any]:
+        action, memory = act(key, memory, observation)
+        action = jnp.asarray(action)
+        if action.shape or not jnp.issubdtype(action.dtype, jnp.integer):
+            found = f"{action.dtype}{list(action.shape)}"
+            raise ValueError(f"action = {found}: must be an integer of shape []")
+        return action.astype(jnp.int32), memory
+
+    keys = jax.random.split(key, episodes)
+    return jnp.mean(jax.vmap(lambda key: task.play(key, checked, memory))(keys))
+
+
+_play_compiled = jax.jit(_play, static_argnums=4)
+
+
+def _forget(
+    policy: Policy, key: Key, memory: tuple[()], observation: jax.Array
+) -> tuple[jax.Array, tuple[()]]:
     """A policy without memory."""
-    return Recurrent(lambda key, memory, observation: (policy(key, observation), memory), ())
+    return policy(key, observation), memory

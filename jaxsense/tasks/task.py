@@ -9,12 +9,12 @@ from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Belief, Key, pytree
-from jaxsense.dqn import episodes, map_agent, map_mdp, policies, team_mdp
+from jaxsense.dqn import environments, episodes, map_agent, map_mdp, policies, team_mdp
+from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.episodes import Start
 from jaxsense.dqn.map_mdp import MapMdp, MapState
 from jaxsense.dqn.policies import Known
@@ -44,13 +44,19 @@ class Task(Environment, Protocol):
       agent: who acts.
       references: names of the policies that `play_reference` plays.
       has_optimum: whether the first one is optimal.
+      models: frozen networks, and the agent that learns in the preset of the task.
       scaling: of observations.
       returns: `[R, seeds]` mean return of each reference with each seed of a score.
     """
 
     @property
+    def models(self) -> Models:
+        """Frozen networks."""
+        ...
+
+    @property
     def returns(self) -> jax.Array:
-        """`[R, seeds]`, see `reference_returns`."""
+        """`[R, seeds]`, see `registry.reference_returns`."""
         ...
 
     @property
@@ -80,6 +86,22 @@ class Task(Environment, Protocol):
 
     def features(self, state: Any) -> Float[Array, "N F"]:
         """`[N, F]` what an observation holds of each PoI, not yet scaled."""
+        ...
+
+    def learning(self, agent: Agent) -> environments.Environment[Any]:
+        """What `dqn.train` learns in.
+
+        Args:
+          agent: the learner, as `models.agent` or with other settings.
+        """
+        ...
+
+    def inputs(self, observation: Float[Array, " S"]) -> Float[Array, " S"]:
+        """What an agent's Q-network reads, from an observation.
+
+        Args:
+          observation: `[S]` scaled, of the task.
+        """
         ...
 
     def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
@@ -160,6 +182,14 @@ class MapTask:
     def features(self, state: MapState) -> Float[Array, "N F"]:
         """`[N, 2D]` mean and standard deviation of each PoI's belief, not yet scaled."""
         return _of_belief(state.belief)
+
+    def learning(self, agent: Agent) -> environments.Environment[Any]:
+        """The map MDP, see `Task.learning`."""
+        return agent.environment(self.mdp, self.modality)
+
+    def inputs(self, observation: Float[Array, " S"]) -> Float[Array, " S"]:
+        """The map, see `Task.inputs`."""
+        return self.scaling.inverse(observation).reshape(-1)
 
     def reset(self, key: Key) -> tuple[Float[Array, " S"], MapState]:
         """Starts an episode, see `Task.reset`."""
@@ -275,6 +305,16 @@ class TeamTask:
         number = self.mdp.map.num_modalities
         return team_mdp.observation(self.mdp.config.travel, belief, team, agent, number).T
 
+    def learning(self, agent: Agent) -> environments.Environment[Any]:
+        """The team MDP with the robots of the task, see `Task.learning`."""
+        return environments.TeamEnvironment(agent, self.mdp, self.robots)
+
+    def inputs(self, observation: Float[Array, " S"]) -> Float[Array, " S"]:
+        """What the robot knows whose turn it is, see `Task.inputs`."""
+        features = self.scaling.inverse(observation).T
+        # Networks ask whether a PoI's presence is above 0, which rounding must not decide.
+        return features.at[-3].set(jnp.round(features[-3])).reshape(-1)
+
     def reset(self, key: Key) -> tuple[Float[Array, " S"], TeamState]:
         """Starts an episode, see `Task.reset`."""
         state = team_mdp.reset(key, self.mdp, self.robots)
@@ -340,29 +380,6 @@ class TeamTask:
 def key_of_seed(seed: int) -> Key:
     """The key of the episodes of a score with a seed, from 0; no training has it."""
     return jax.random.key(_FIRST_SEED + seed)
-
-
-def reference_returns(task: Task, seeds: int, episodes: int) -> dict[str, np.ndarray]:
-    """Mean returns of the policies to compare with.
-
-    Args:
-      task: the task.
-      seeds: number of seeds.
-      episodes: with each seed.
-
-    Returns:
-      By name, `[seeds]`.
-    """
-
-    def mean(name: str) -> np.ndarray:
-        @jax.jit
-        def play(key: Key) -> jax.Array:
-            keys = jax.random.split(key, episodes)
-            return jnp.mean(jax.vmap(lambda key: task.play_reference(key, name))(keys))
-
-        return np.array([float(play(key_of_seed(seed))) for seed in range(seeds)])
-
-    return {name: mean(name) for name in task.references}
 
 
 def _of_belief(belief: Belief) -> Float[Array, "N F"]:

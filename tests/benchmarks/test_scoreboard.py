@@ -1,0 +1,243 @@
+"""The scoreboard of the frozen tasks: learners, curves, tables and the page."""
+
+import dataclasses
+import functools
+import importlib
+import json
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.tree_util import Partial
+
+import jaxsense
+from benchmarks.tasks import __main__ as program
+from benchmarks.tasks import board, dqn, learner, learners, plot, record
+from benchmarks.tasks.board import Row
+from benchmarks.tasks.record import Point, Recorder
+
+make = functools.cache(jaxsense.make)
+ABOUT = {"device": "cpu", "commit": "0123456789abcdef", "date": "2026-11-26", "cores": 2,
+         "command": "python -m benchmarks.tasks", "versions": {"python": "3.11.7"}}  # fmt: skip
+ROW = Row(
+    *("map-v0", "camera", "mine"),
+    returns=(1.0, 1.0, 1.0, 1.0),
+    best="optimal",
+    best_returns=(2.0, 2.0, 2.0, 2.0),
+    steps=131072,
+    seconds=12.345,
+    wall_seconds=60.0,
+    settings={"discount": 0.9},
+    about=ABOUT,
+)
+
+
+def train(found, name, seeds=(20, 21)):
+    """What a learner reports of the shortest training, and what is known at the end of it."""
+    recorder = Recorder(make(name), found.name, 2.0, episodes=4)
+    found.train(make(name), seeds, 1, recorder)
+    assert [*recorder.policies] == [*seeds]
+    curves = [[p for p in recorder.points if p.seed == seed] for seed in seeds]
+    for curve in curves:
+        steps = [point.steps for point in curve]
+        assert steps[0] == 0
+        assert steps == sorted(steps)
+        assert curve[0].seconds == 0
+        assert curve[-1].seconds > 0
+        assert all(p.fraction == pytest.approx(p.mean_return / 2) for p in curve)
+    return recorder
+
+
+@pytest.mark.parametrize("name", ["map-v0", "team-v0"])
+def test_our_dqn_trains_in_every_kind_of_task(name):
+    small = dqn.Dqn(num_envs=32, updates=1, batch=32, replay=1024)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dqn, "NUM_STARTS", 32)
+        recorder = train(small, name)
+    # Ten points of one step of each environment.
+    assert max(point.steps for point in recorder.points) == 320
+    one, other = (jax.tree.leaves(each) for each in recorder.policies.values())
+    assert any((np.asarray(x) != np.asarray(y)).any() for x, y in zip(one, other, strict=True))
+
+
+def peer(module, package):
+    """A module with learners of another library."""
+    reason = f"{package}: needs the extra of jaxsense"
+    pytest.importorskip(package, reason=reason)
+    return pytest.importorskip(f"benchmarks.tasks.{module}", reason=reason)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_learners_of_rejax_train(number, monkeypatch):
+    rejax = peer("rejax", "rejax")
+    monkeypatch.setattr(rejax, "NUM_STARTS", 32)
+    train(dataclasses.replace(rejax.LEARNERS[number], num_envs=16), "map-v0")
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_learners_of_stable_baselines3_train(number, monkeypatch):
+    sb3 = peer("sb3", "stable_baselines3")
+    monkeypatch.setattr(sb3, "NUM_STARTS", 32)
+    train(dataclasses.replace(sb3.LEARNERS[number], num_envs=16), "map-v0", seeds=(20,))
+
+
+def test_networks_of_stable_baselines3_choose_as_they_do_in_jax():
+    sb3 = peer("sb3", "stable_baselines3")
+    # Only there if Stable-Baselines3 is.
+    gymnasium, torch = map(importlib.import_module, ("gymnasium", "torch"))
+
+    class Env(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-10, 10, (6,))
+        action_space = gymnasium.spaces.Discrete(5)
+
+    seen = np.random.default_rng(0).normal(size=(64, 6)).astype(np.float32)
+    on_policy, off_policy = (kind("MlpPolicy", Env()) for kind in (sb3.PPO, sb3.DQN))
+    network = on_policy.policy.mlp_extractor.policy_net, on_policy.policy.action_net
+    with torch.no_grad():
+        for linear in network[1], *network[0][::2]:
+            linear.bias.normal_()
+            linear.weight.mul_(20)
+    ours = {
+        on_policy: sb3.Greedy(sb3._layers(*network), jnp.tanh),
+        off_policy: sb3.Greedy(sb3._layers(off_policy.q_net.q_net), jax.nn.relu),
+    }
+    for model, policy in ours.items():
+        chosen = jax.vmap(lambda x: policy(None, x))(seen)  # noqa: B023
+        theirs = model.predict(seen, deterministic=True)[0]
+        np.testing.assert_array_equal(chosen, theirs)
+        assert len(set(theirs.tolist())) > 1
+
+
+def nop(key, observation):
+    return jnp.int32(3)
+
+
+def test_the_clock_stands_still_while_policies_play(monkeypatch):
+    times = iter([100.0, 101.0, 105.0, 106.0, 207.0, 209.0])
+    monkeypatch.setattr(record.time, "process_time", lambda: next(times))
+    recorder = Recorder(make("map-v0"), "mine", 1.0, episodes=2)
+    for steps in (0, 64, 128):
+        recorder(steps, {0: nop, 1: nop})
+    # From 101 to 105 s and from 106 to 207 s, shared by two seeds.
+    assert [p.seconds for p in recorder.points if p.seed == 1] == [0, 2, 2 + 101 / 2]
+    assert recorder.points[-1] == Point("map-v0", "camera", "mine", 1, 128, 52.5, 0.0, 0.0)
+
+
+def test_parts_of_a_training_fill_its_steps():
+    assert learner.part(131072, 128) == 102  # 10 x 102 x 128 = 130,560
+    assert learner.part(1, 1024) == 1
+
+
+def test_curves_are_read_as_they_were_written(tmp_path):
+    points = [Point("map-v0", "camera", "mine", 0, 64 * i, 0.5 * i, -1.0, -0.5) for i in range(3)]
+    record.write(tmp_path / "curves.csv", points)
+    lines = (tmp_path / "curves.csv").read_text().splitlines()
+    assert lines[0] == "task,agent,learner,seed,steps,seconds,mean_return,fraction"
+    assert lines[2] == "map-v0,camera,mine,0,64,0.5000,-1.0000,-0.5000"
+    assert record.read(tmp_path / "curves.csv") == points
+
+
+def test_rows_are_read_as_they_were_written(tmp_path):
+    board.write(tmp_path / "scores.json", [ROW])
+    assert board.read(tmp_path / "scores.json") == [ROW]
+    assert board.read(tmp_path / "none.json") == []
+
+
+def test_a_table_shows_what_policies_reach():
+    text = board.tables([ROW])
+    assert "### `map-v0`, `camera`" in text
+    half = "0.500 (0.500 to 0.500)"
+    assert f"| mine | 1.000 (1.000 to 1.000) | {half} | 131,072 | 12.3 |" in text
+    assert "- mine: discount 0.9" in text
+    assert "mine: cpu, commit 0123456789 on 2026-11-26; python 3.11.7." in text
+    # What the files of the tasks store.
+    returns = jaxsense.tasks.estimate(np.asarray(make("map-v0").returns)[0])
+    assert f"| `optimal` | {returns} | 1.000 (1.000 to 1.000) |  |  |" in text
+    assert "fraction of `nearest`" in text
+    other = dataclasses.replace(ROW, task="many-v0", settings={"discount": 0.5})
+    assert "- mine in `many-v0`: discount 0.5" in board.tables([ROW, other])
+
+
+def test_the_page_shows_the_stored_results():
+    page = board.PAGE.read_text(encoding="utf-8")
+    rows = board.read(board.FOLDER / "scores.json")
+    assert board.written(page, rows) == page, "run python -m benchmarks.tasks --page"
+    assert board.written("a\n<!-- scoreboard -->\nold\n<!-- end -->\nz", rows).startswith("a\n<!--")
+
+
+def test_the_picture_has_a_curve_of_each_learner():
+    points = [
+        Point(task, "camera", name, seed, steps, 1.0, 1.0, 0.9)
+        for task in ("map-v0", "noisy-v0")
+        for name in ("mine", "yours")
+        for seed in range(3)
+        for steps in (0, 64, 128)
+    ]
+    figure = plot.draw(points)
+    assert [axis.get_title() for axis in figure.axes] == ["map-v0, camera", "noisy-v0, camera"]
+    line, other = figure.axes[0].get_lines()[:2]
+    assert (line.get_label(), other.get_label()) == ("mine", "yours")
+    np.testing.assert_allclose(line.get_ydata(), 0.9)
+    assert list(line.get_xdata()) == [0, 64, 128]
+
+
+@dataclasses.dataclass(frozen=True)
+class Nop:
+    """Learns nothing."""
+
+    name = "nop"
+    packages = ()
+
+    def train(self, task, seeds, steps, report):
+        for seed in seeds:
+            report(0, {seed: Partial(nop)})
+            report(steps, {seed: Partial(nop)})
+
+
+def test_a_row_of_a_job_holds_all_seeds():
+    job = program.Job("map-v0", "camera", Nop(), (20, 21, 22), 64)
+    row, points = program.do(job, {"commit": "0", "date": "2026-11-26"})
+    assert row.place == ("map-v0", "camera", "nop")
+    assert row.returns == (0.0, 0.0, 0.0)
+    assert row.steps == 64
+    assert row.wall_seconds > row.seconds > 0
+    assert len(points) == 6
+    json.dumps(dataclasses.asdict(row), allow_nan=False)
+
+
+def test_results_of_other_learners_stay(tmp_path, monkeypatch):
+    """One job, without a process of its own."""
+    board.write(tmp_path / "scores.json", [ROW, dataclasses.replace(ROW, policy="nop")])
+    old = Point("map-v0", "camera", "nop", 5, 1, 0.0, 0.0, 0.0)
+    record.write(tmp_path / "curves.csv", [old, dataclasses.replace(old, learner="mine")])
+    monkeypatch.setattr(
+        program, "ProcessPoolExecutor", lambda number, *_: ThreadPoolExecutor(number)
+    )
+    job = program.Job("map-v0", "camera", Nop(), (20,), 64)
+    program.run([job], 1, tmp_path, "python -m benchmarks.tasks nop")
+    rows = {row.policy: row for row in board.read(tmp_path / "scores.json")}
+    assert rows["mine"] == ROW
+    assert rows["nop"].about["command"] == "python -m benchmarks.tasks nop"
+    assert [p.learner for p in record.read(tmp_path / "curves.csv")] == ["mine", "nop", "nop"]
+
+
+def test_learners_have_names_of_their_own_and_settings():
+    names = [each.name for each in learners.load()]
+    assert len(set(names)) == len(names)
+    assert all(dataclasses.asdict(each) for each in learners.load())
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["none"], "LEARNERS = ('none',): must be of our DQN"),
+        (["--only", "map-v1"], "only = ('map-v1',): must be of many-v0, map-v0"),
+        (["--quick"], "quick = True: needs out"),
+    ],
+)
+def test_wrong_options_are_told_in_one_line(argv, message, capsys):
+    with pytest.raises(SystemExit):
+        program.main(argv)
+    assert message in capsys.readouterr().err
