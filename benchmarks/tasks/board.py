@@ -19,6 +19,7 @@ FOLDER = results.RESULTS / "tasks"
 """Where the results are: `scores.json` and `curves.csv`."""
 
 _BLOCK = re.compile(r"(<!-- scoreboard -->\n).*?(<!-- end -->)", re.DOTALL)
+_PICTURE = "![Learning curves of all learners in all tasks](figures/tasks_curves.png)"
 _LAST = "naive", "random"
 
 
@@ -34,7 +35,7 @@ class Row:
       best: name of the policy to measure against: the optimum, or else the best rule.
       best_returns: `[seeds]` its returns from the same starts.
       steps: environment steps of a training; None without one, as all that follow.
-      seconds: of a training on one core, without compilation and evaluation, the mean over seeds.
+      seconds: CPU time of a training without compilation and evaluation, the mean over seeds.
       wall_seconds: of all trainings, with compilation and evaluation.
       settings: of the learner.
       about: when, where and how it was made.
@@ -95,7 +96,8 @@ def read(file: Path) -> list[Row]:
 
 def written(page: str, rows: Sequence[Row]) -> str:
     """The page with the tables of some rows between its two comments."""
-    return _BLOCK.sub(lambda found: f"{found[1]}\n{tables(rows)}\n\n{found[2]}", page)
+    shown = f"{_PICTURE}\n\n{tables(rows)}" if rows else tables(rows)
+    return _BLOCK.sub(lambda found: f"{found[1]}\n{shown}\n\n{found[2]}", page)
 
 
 def tables(rows: Sequence[Row]) -> str:
@@ -115,7 +117,7 @@ def _table(rows: Sequence[Row]) -> str:
     """The policies of a task."""
     best = rows[0].best
     share = "fraction of optimal" if best == "optimal" else f"fraction of `{best}`"
-    titles = ["policy", "return", share, "environment steps", "seconds"]
+    titles = ["policy", "return", share, "environment steps", "CPU seconds"]
     lines = [titles, ["---"] * len(titles)]
     for each in rows:
         is_learner = each.steps is not None
@@ -152,7 +154,10 @@ def _about(rows: Sequence[Row]) -> list[str]:
         versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
         text = f"{about['device']}, commit {about['commit'][:10]} on {about['date']}; {versions}"
         found.setdefault(text, []).append(each.policy)
-    return [f"{', '.join(dict.fromkeys(names))}: {text}." for text, names in found.items()]
+    lines = [f"{', '.join(dict.fromkeys(names))}: {text}." for text, names in found.items()]
+    minutes = round(sum(each.wall_seconds or 0.0 for each in rows) / 60)
+    took = f"All trainings, compilations and evaluations took {minutes} minute"
+    return [*lines, f"{took}{'s' if minutes != 1 else ''} of a core."] if rows else []
 
 
 def _with_tuples(content: dict[str, Any]) -> dict[str, Any]:

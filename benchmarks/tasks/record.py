@@ -28,7 +28,7 @@ class Point:
       learner: name of the learner.
       seed: of the training.
       steps: environment steps so far.
-      seconds: of training on one core so far, without compilation and evaluation.
+      seconds: CPU time of the training so far, without compilation and evaluation.
       mean_return: of an episode, without discount.
       fraction: of the mean return of the optimum, or of the best rule, from the same starts.
     """

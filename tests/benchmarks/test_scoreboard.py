@@ -152,6 +152,7 @@ def test_a_table_shows_what_policies_reach():
     assert f"| mine | 1.000 (1.000 to 1.000) | {half} | 131,072 | 12.3 |" in text
     assert "- mine: discount 0.9" in text
     assert "mine: cpu, commit 0123456789 on 2026-11-26; python 3.11.7." in text
+    assert "1 minute of a core" in text
     # What the files of the tasks store.
     returns = jaxsense.tasks.estimate(np.asarray(make("map-v0").returns)[0])
     assert f"| `optimal` | {returns} | 1.000 (1.000 to 1.000) |  |  |" in text
@@ -164,7 +165,9 @@ def test_the_page_shows_the_stored_results():
     page = board.PAGE.read_text(encoding="utf-8")
     rows = board.read(board.FOLDER / "scores.json")
     assert board.written(page, rows) == page, "run python -m benchmarks.tasks --page"
-    assert board.written("a\n<!-- scoreboard -->\nold\n<!-- end -->\nz", rows).startswith("a\n<!--")
+    other = board.written("a\n<!-- scoreboard -->\nold\n<!-- end -->\nz", [ROW])
+    assert other.startswith("a\n<!-- scoreboard -->\n\n![")
+    assert other.endswith("\n\n<!-- end -->\nz")
 
 
 def test_the_picture_has_a_curve_of_each_learner():
@@ -232,7 +235,7 @@ def test_learners_have_names_of_their_own_and_settings():
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["none"], "LEARNERS = ('none',): must be of our DQN"),
+        (["none"], "learners = ('none',): must be of our DQN"),
         (["--only", "map-v1"], "only = ('map-v1',): must be of many-v0, map-v0"),
         (["--quick"], "quick = True: needs out"),
     ],

@@ -10,8 +10,8 @@ from jax.tree_util import Partial
 
 import jaxsense
 from jaxsense import tasks
-from jaxsense.tasks import score
 from jaxsense.tasks.environment import CLIP, Scaling
+from jaxsense.tasks.score import _play_compiled
 
 make = functools.cache(jaxsense.make)
 
@@ -71,13 +71,13 @@ def above(bound, key, observation):
 
 def test_policies_of_one_kind_are_compiled_once():
     task = make("map-v0")
-    programs = score._play_compiled._cache_size()
+    programs = _play_compiled._cache_size()
     keys = jax.random.split(jax.random.key(0), 3)
     found = [
         tasks.mean_return(keys[0], task, Partial(above, jnp.float32(bound)), 32)
         for bound in (-20.0, 0.0, 20.0)
     ]
-    assert score._play_compiled._cache_size() == programs + 1
+    assert _play_compiled._cache_size() == programs + 1
     # The first looks at one PoI again and again, the last never.
     assert found[0] < 0 == found[2]
     # With another key, other starts; a function alone is a program of its own.
