@@ -14,12 +14,15 @@ from typing import Any
 from benchmarks.digits import table as digits
 from benchmarks.fusions import table as fusions
 from benchmarks.seeds import tables
+from benchmarks.tasks import board
 
 _HERE = Path(__file__).parent
 RESULTS = _HERE / "results"
 PAGES = (
     _HERE.parent / "README.md",
     *(_HERE.parent / "docs" / f"{name}.md" for name in ("figures", "jmvae", "fusion")),
+    _HERE.parent / "docs" / "figures.md",
+    _HERE.parent / "docs" / "tasks.md",
     _HERE / "RESULTS.md",
 )
 _BLOCK = re.compile(
@@ -102,6 +105,7 @@ TABLES: Mapping[str, Mapping[str | None, Callable[[Any], str]]] = {
         "maps": partial(tables.of_presets, rows=tables.OF_MAPS, presets=("noisy", "many")),
         "many": partial(tables.missions, preset="many", num_pois=8),
     },
+    "tasks.json": {None: board.tables},
 }
 """What makes each table of a file, by their names."""
 

@@ -1,6 +1,6 @@
 """`python -m benchmarks.tasks`: trains all learners in the frozen tasks and writes the scoreboard.
 
-Results go to `benchmarks/results/tasks`, the tables and the picture made of them to `docs`.
+Results go to `benchmarks/results`, the tables and the picture made of them to `docs`.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import jax
 import rich.console
 
-from benchmarks import measure
+from benchmarks import measure, results
 from benchmarks.tasks import board, learners, plot, record
 from benchmarks.tasks.board import Row
 from benchmarks.tasks.learner import Learner
@@ -29,6 +29,8 @@ from jaxsense.run import cli
 from jaxsense.show.plots import png
 
 PROGRAM = "benchmarks.tasks"
+SCORES, CURVES = "tasks.json", "tasks_curves.csv"
+"""Names of the results."""
 STEPS = {
     ("team-v0", "team"): 262144,
     ("many-v0", "camera"): 262144,
@@ -43,7 +45,7 @@ class Arguments:
     """Train in the frozen tasks, and write the scoreboard. Rows of other learners stay."""
 
     learners: Annotated[tuple[str, ...], Name("LEARNERS")] = ()
-    """Learners to train; all by default, none but the tables and the picture with `--page`."""
+    """Learners to train; all by default."""
     only: tuple[str, ...] = ()
     """Tasks to train in; all by default."""
     seeds: int = limited(10, at_least=1, at_most=10)
@@ -55,7 +57,7 @@ class Arguments:
     out: Path | None = None
     """Folder of results; by default the repository's, with the tables and the picture."""
     page: bool = False
-    """Train nothing; make the tables and the picture again."""
+    """Train nothing; make the picture and the tables again."""
     quick: bool = False
     """Take as few steps as possible, to check that everything runs. Needs `--out`."""
 
@@ -139,7 +141,7 @@ def run(jobs: Sequence[Job], number: int, folder: Path, command: str) -> None:
     """
     console = rich.console.Console(stderr=True)
     folder.mkdir(parents=True, exist_ok=True)
-    scores, curves = folder / "scores.json", folder / "curves.csv"
+    scores, curves = folder / SCORES, folder / CURVES
     rows = {row.place: row for row in board.read(scores)}
     points = record.read(curves) if curves.exists() else []
     # Before any result is written, which would be a change of the source tree.
@@ -182,23 +184,16 @@ def _take_core(cores: "Queue[int]") -> None:
     jax.config.update("jax_default_matmul_precision", "highest")
 
 
-def make_page() -> None:
-    """Writes the tables and the picture from the repository's results."""
-    rows = board.read(board.FOLDER / "scores.json")
-    text = board.PAGE.read_text(encoding="utf-8")
-    board.PAGE.write_text(board.written(text, rows), encoding="utf-8")
-    plot.PICTURE.write_bytes(png(plot.draw(record.read(board.FOLDER / "curves.csv"))))
-
-
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     argv = sys.argv[1:] if argv is None else argv
     arguments = cli.parse(PROGRAM, Arguments, argv)
     if not arguments.page:
         command = " ".join(["python -m benchmarks.tasks", *argv])
-        run(arguments.jobs_to_do, arguments.jobs, arguments.out or board.FOLDER, command)
+        run(arguments.jobs_to_do, arguments.jobs, arguments.out or results.RESULTS, command)
     if arguments.out is None:
-        make_page()
+        results.main()
+        plot.PICTURE.write_bytes(png(plot.draw(record.read(results.RESULTS / CURVES))))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,8 @@ from typing import Any
 import numpy as np
 
 import jaxsense
-from benchmarks import results
 from jaxsense.tasks import Score, Task, estimate
 
-_ROOT = Path(__file__).parents[2]
-PAGE = _ROOT / "docs" / "tasks.md"
-FOLDER = results.RESULTS / "tasks"
-"""Where the results are: `scores.json` and `curves.csv`."""
-
-_BLOCK = re.compile(r"(<!-- scoreboard -->\n).*?(<!-- end -->)", re.DOTALL)
 _PICTURE = "![Learning curves of all learners in all tasks](figures/tasks_curves.png)"
 _LAST = "naive", "random"
 
@@ -89,20 +81,17 @@ def write(file: Path, rows: Iterable[Row]) -> None:
 
 def read(file: Path) -> list[Row]:
     """The rows that `write` wrote; none if there is no such file."""
-    if not file.exists():
-        return []
-    return [Row(**_with_tuples(each)) for each in json.loads(file.read_text(encoding="utf-8"))]
+    return _rows(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else []
 
 
-def written(page: str, rows: Sequence[Row]) -> str:
-    """The page with the tables of some rows between its two comments."""
-    shown = f"{_PICTURE}\n\n{tables(rows)}" if rows else tables(rows)
-    return _BLOCK.sub(lambda found: f"{found[1]}\n{shown}\n\n{found[2]}", page)
+def tables(content: Sequence[dict[str, Any]]) -> str:
+    """A table for each task and agent, the learners' settings, and what made them, as Markdown.
 
-
-def tables(rows: Sequence[Row]) -> str:
-    """A table for each task and agent, the learners' settings, and what made them, as Markdown."""
-    found = []
+    Args:
+      content: of the JSON file.
+    """
+    rows = _rows(content)
+    found = [_PICTURE, ""] if rows else []
     for name in jaxsense.registered():
         for agent in jaxsense.tasks.agents(name):
             of_task = references(jaxsense.make(name, agent))
@@ -127,7 +116,7 @@ def _table(rows: Sequence[Row]) -> str:
                 str(estimate(np.array(each.returns))),
                 str(estimate(each.fractions)),
                 f"{each.steps:,}" if is_learner else "",
-                results.number(each.seconds) if each.seconds is not None else "",
+                f"{each.seconds:.3g}" if each.seconds is not None else "",
             ]
         )
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
@@ -160,6 +149,9 @@ def _about(rows: Sequence[Row]) -> list[str]:
     return [*lines, f"{took}{'s' if minutes != 1 else ''} of a core."] if rows else []
 
 
-def _with_tuples(content: dict[str, Any]) -> dict[str, Any]:
+def _rows(content: Sequence[dict[str, Any]]) -> list[Row]:
     """JSON knows no tuples."""
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in content.items()}
+    return [
+        Row(**{name: tuple(x) if isinstance(x, list) else x for name, x in each.items()})
+        for each in content
+    ]

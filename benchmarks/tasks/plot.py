@@ -7,12 +7,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.tasks.board import PAGE
 from benchmarks.tasks.record import Point
 from jaxsense.show.colours import MARKERS
 from jaxsense.tasks import estimate
 
-PICTURE: Path = PAGE.parent / "figures" / "tasks_curves.png"
+PICTURE = Path(__file__).parents[2] / "docs" / "figures" / "tasks_curves.png"
 
 _LOWEST = 0.5  # share of the optimum, below which curves only begin
 

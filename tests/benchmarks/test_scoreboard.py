@@ -132,21 +132,23 @@ def test_parts_of_a_training_fill_its_steps():
 
 def test_curves_are_read_as_they_were_written(tmp_path):
     points = [Point("map-v0", "camera", "mine", 0, 64 * i, 0.5 * i, -1.0, -0.5) for i in range(3)]
-    record.write(tmp_path / "curves.csv", points)
-    lines = (tmp_path / "curves.csv").read_text().splitlines()
+    record.write(tmp_path / program.CURVES, points)
+    lines = (tmp_path / program.CURVES).read_text().splitlines()
     assert lines[0] == "task,agent,learner,seed,steps,seconds,mean_return,fraction"
     assert lines[2] == "map-v0,camera,mine,0,64,0.5000,-1.0000,-0.5000"
-    assert record.read(tmp_path / "curves.csv") == points
+    assert record.read(tmp_path / program.CURVES) == points
 
 
 def test_rows_are_read_as_they_were_written(tmp_path):
-    board.write(tmp_path / "scores.json", [ROW])
-    assert board.read(tmp_path / "scores.json") == [ROW]
+    board.write(tmp_path / program.SCORES, [ROW])
+    assert board.read(tmp_path / program.SCORES) == [ROW]
     assert board.read(tmp_path / "none.json") == []
 
 
 def test_a_table_shows_what_policies_reach():
-    text = board.tables([ROW])
+    assert board.tables([]).startswith("### `map-v0`, `camera`")
+    text = board.tables([dataclasses.asdict(ROW)])
+    assert text.startswith("![Learning curves")
     assert "### `map-v0`, `camera`" in text
     half = "0.500 (0.500 to 0.500)"
     assert f"| mine | 1.000 (1.000 to 1.000) | {half} | 131,072 | 12.3 |" in text
@@ -158,16 +160,9 @@ def test_a_table_shows_what_policies_reach():
     assert f"| `optimal` | {returns} | 1.000 (1.000 to 1.000) |  |  |" in text
     assert "fraction of `nearest`" in text
     other = dataclasses.replace(ROW, task="many-v0", settings={"discount": 0.5})
-    assert "- mine in `many-v0`: discount 0.5" in board.tables([ROW, other])
-
-
-def test_the_page_shows_the_stored_results():
-    page = board.PAGE.read_text(encoding="utf-8")
-    rows = board.read(board.FOLDER / "scores.json")
-    assert board.written(page, rows) == page, "run python -m benchmarks.tasks --page"
-    other = board.written("a\n<!-- scoreboard -->\nold\n<!-- end -->\nz", [ROW])
-    assert other.startswith("a\n<!-- scoreboard -->\n\n![")
-    assert other.endswith("\n\n<!-- end -->\nz")
+    assert "- mine in `many-v0`: discount 0.5" in board.tables(
+        [*map(dataclasses.asdict, (ROW, other))]
+    )
 
 
 def test_the_picture_has_a_curve_of_each_learner():
@@ -212,18 +207,18 @@ def test_a_row_of_a_job_holds_all_seeds():
 
 def test_results_of_other_learners_stay(tmp_path, monkeypatch):
     """One job, without a process of its own."""
-    board.write(tmp_path / "scores.json", [ROW, dataclasses.replace(ROW, policy="nop")])
+    board.write(tmp_path / program.SCORES, [ROW, dataclasses.replace(ROW, policy="nop")])
     old = Point("map-v0", "camera", "nop", 5, 1, 0.0, 0.0, 0.0)
-    record.write(tmp_path / "curves.csv", [old, dataclasses.replace(old, learner="mine")])
+    record.write(tmp_path / program.CURVES, [old, dataclasses.replace(old, learner="mine")])
     monkeypatch.setattr(
         program, "ProcessPoolExecutor", lambda number, *_: ThreadPoolExecutor(number)
     )
     job = program.Job("map-v0", "camera", Nop(), (20,), 64)
     program.run([job], 1, tmp_path, "python -m benchmarks.tasks nop")
-    rows = {row.policy: row for row in board.read(tmp_path / "scores.json")}
+    rows = {row.policy: row for row in board.read(tmp_path / program.SCORES)}
     assert rows["mine"] == ROW
     assert rows["nop"].about["command"] == "python -m benchmarks.tasks nop"
-    assert [p.learner for p in record.read(tmp_path / "curves.csv")] == ["mine", "nop", "nop"]
+    assert [p.learner for p in record.read(tmp_path / program.CURVES)] == ["mine", "nop", "nop"]
 
 
 def test_learners_have_names_of_their_own_and_settings():
