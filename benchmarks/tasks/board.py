@@ -151,7 +151,5 @@ def _about(rows: Sequence[Row]) -> list[str]:
 
 def _rows(content: Sequence[dict[str, Any]]) -> list[Row]:
     """JSON knows no tuples."""
-    return [
-        Row(**{name: tuple(x) if isinstance(x, list) else x for name, x in each.items()})
-        for each in content
-    ]
+    returns = "returns", "best_returns"
+    return [Row(**{**each, **{name: tuple(each[name]) for name in returns}}) for each in content]
