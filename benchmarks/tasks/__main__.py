@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import jax
 import rich.console
 
+import jaxsense
 from benchmarks import measure, results
 from benchmarks.tasks import board, learners, plot, record
 from benchmarks.tasks.board import Row
@@ -32,10 +33,10 @@ PROGRAM = "benchmarks.tasks"
 SCORES, CURVES = "tasks.json", "tasks_curves.csv"
 """Names of the results."""
 STEPS = {
-    ("team-v0", "team"): 262144,
-    ("many-v0", "camera"): 262144,
+    ("team-v0", "team"): 131072,
+    ("many-v0", "camera"): 131072,
     ("noisy-v0", "camera"): 131072,
-    ("map-v0", "camera"): 131072,
+    ("map-v0", "camera"): 65536,
 }
 """Environment steps of each training, by task and agent; the longest first."""
 
@@ -112,7 +113,7 @@ def do(job: Job, provenance: dict[str, Any]) -> tuple[Row, list[Point]]:
     task, learner = tasks.make(job.task, job.agent), job.learner
     recorder = Recorder(task, learner.name, record.best_return(task))
     learner.train(task, job.seeds, job.steps, recorder)
-    found = tasks.score(task, [recorder.policies[seed] for seed in job.seeds])
+    found = jaxsense.score(task, [recorder.policies[seed] for seed in job.seeds])
     last = [[p for p in recorder.points if p.seed == seed][-1] for seed in job.seeds]
     row = board.row(
         found,
