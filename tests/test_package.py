@@ -87,7 +87,7 @@ def test_examples_of_the_tasks_run(capsys):
     run_example(page, 1)
     printed = capsys.readouterr().out
     assert "noisy-v0, camera: return" in printed
-    assert run_example(page, 2)["models"].tours
+    assert run_example(page, 3)["models"].tours
     assert "--preset team --seed 0" in capsys.readouterr().out
 
 

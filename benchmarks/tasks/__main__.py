@@ -33,7 +33,7 @@ PROGRAM = "benchmarks.tasks"
 SCORES, CURVES = "tasks.json", "tasks_curves.csv"
 """Names of the results."""
 STEPS = {
-    ("team-v0", "team"): 131072,
+    ("team-v0", "team"): 65536,
     ("many-v0", "camera"): 131072,
     ("noisy-v0", "camera"): 131072,
     ("map-v0", "camera"): 65536,

@@ -31,7 +31,7 @@ class Dqn:
 
     name = "our DQN"
     packages = ()
-    discount: float = 0.9
+    discount: float = 0.5
     num_envs: int = 128
     updates: int = 8
     batch: int = 256

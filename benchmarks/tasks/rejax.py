@@ -34,7 +34,7 @@ class RejaxDqn:
 
     name = "rejax DQN"
     packages = ("rejax",)
-    discount: float = 0.9
+    discount: float = 0.5
     num_envs: int = 128
     updates: int = 4
     batch: int = 256
@@ -70,7 +70,7 @@ class RejaxDqn:
 
 @dataclasses.dataclass(frozen=True)
 class RejaxPpo:
-    """rejax's PPO, whose most likely action counts.
+    """rejax's PPO, which draws its actions.
 
     Attributes:
       discount: of a step.
@@ -84,7 +84,7 @@ class RejaxPpo:
 
     name = "rejax PPO"
     packages = ("rejax",)
-    discount: float = 0.9
+    discount: float = 0.5
     num_envs: int = 64
     num_steps: int = 16
     epochs: int = 10
@@ -107,13 +107,7 @@ class RejaxPpo:
         )
 
         def act(params: Any, key: jax.Array, observation: jax.Array) -> jax.Array:
-            del key
-
-            def log_probability(action: jax.Array) -> jax.Array:
-                batch = observation[None], action[None]
-                return algorithm.actor.apply(params, *batch, method="log_prob_entropy")[0][0]
-
-            return jnp.argmax(jax.vmap(log_probability)(jnp.arange(task.num_actions)))
+            return algorithm.actor.apply(params, observation[None], key, method="act")[0]
 
         unit = self.num_envs * self.num_steps
         _train(algorithm, seeds, steps, unit, lambda state: state.actor_ts, act, report)

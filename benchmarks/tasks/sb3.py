@@ -42,7 +42,7 @@ class Sb3Dqn:
 
     name = "SB3 DQN"
     packages = ("stable-baselines3", "torch")
-    discount: float = 0.9
+    discount: float = 0.5
     num_envs: int = 128
     updates: int = 8
     batch: int = 256
@@ -72,15 +72,15 @@ class Sb3Dqn:
                 seed=seed,
             )
 
-        def policy(model: Any) -> "Greedy":
-            return Greedy(_layers(model.q_net.q_net), jax.nn.relu)
+        def policy(model: Any) -> "Dense":
+            return Dense(_layers(model.q_net.q_net), jax.nn.relu, best)
 
         _train(task, self.num_envs, make, policy, seeds, steps, report)
 
 
 @dataclasses.dataclass(frozen=True)
 class Sb3Ppo:
-    """Stable-Baselines3's PPO, whose most likely action counts.
+    """Stable-Baselines3's PPO, which draws its actions.
 
     Attributes:
       discount: of a step.
@@ -94,7 +94,7 @@ class Sb3Ppo:
 
     name = "SB3 PPO"
     packages = ("stable-baselines3", "torch")
-    discount: float = 0.9
+    discount: float = 0.5
     num_envs: int = 64
     num_steps: int = 16
     epochs: int = 10
@@ -120,32 +120,39 @@ class Sb3Ppo:
                 seed=seed,
             )
 
-        def policy(model: Any) -> "Greedy":
+        def policy(model: Any) -> "Dense":
             last = model.policy.mlp_extractor.policy_net, model.policy.action_net
-            return Greedy(_layers(*last), jnp.tanh)
+            return Dense(_layers(*last), jnp.tanh, jax.random.categorical)
 
         _train(task, self.num_envs, make, policy, seeds, steps, report)
 
 
+def best(key: jax.Array, values: jax.Array) -> jax.Array:
+    """`[]` action of the highest value, with any key."""
+    del key
+    return jnp.argmax(values)
+
+
 @pytree
-class Greedy:
-    """A policy by the highest output of a dense network, which JAX compiles.
+class Dense:
+    """A policy by the outputs of a dense network, which JAX compiles.
 
     Attributes:
       layers: weights `[in, out]` and biases `[out]`.
       activation: between them.
+      choose: `(key, outputs) -> action`.
     """
 
     layers: tuple[tuple[np.ndarray, np.ndarray], ...]
     activation: Callable[[jax.Array], jax.Array] = struct.field(pytree_node=False)
+    choose: Callable[[jax.Array, jax.Array], jax.Array] = struct.field(pytree_node=False)
 
     def __call__(self, key: jax.Array, observation: jax.Array) -> jax.Array:
         """`[]` action."""
-        del key
         *hidden, last = self.layers
         for weight, bias in hidden:
             observation = self.activation(observation @ weight + bias)
-        return jnp.argmax(observation @ last[0] + last[1])
+        return self.choose(key, observation @ last[0] + last[1])
 
 
 class _Points(BaseCallback):
@@ -181,7 +188,7 @@ def _train(
     task: Task,
     num_envs: int,
     make: Callable[[Any, int], Any],
-    policy: Callable[[Any], Greedy],
+    policy: Callable[[Any], Dense],
     seeds: Sequence[int],
     steps: int,
     report: Report,
