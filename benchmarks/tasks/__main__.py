@@ -27,7 +27,7 @@ from jaxsense import tasks
 from jaxsense.config.checks import check_fields, limited, require
 from jaxsense.config.options import Name
 from jaxsense.run import cli
-from jaxsense.show.plots import png
+from jaxsense.show.drawing import png
 
 PROGRAM = "benchmarks.tasks"
 SCORES, CURVES = "tasks.json", "tasks_curves.csv"
