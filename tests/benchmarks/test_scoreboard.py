@@ -14,7 +14,7 @@ from jax.tree_util import Partial
 
 import jaxsense
 from benchmarks.tasks import __main__ as program
-from benchmarks.tasks import board, dqn, learner, learners, plot, record
+from benchmarks.tasks import board, dqn, jobs, learner, learners, plot, record
 from benchmarks.tasks.board import Row
 from benchmarks.tasks.record import Point, Recorder
 
@@ -132,16 +132,16 @@ def test_parts_of_a_training_fill_its_steps():
 
 def test_curves_are_read_as_they_were_written(tmp_path):
     points = [Point("map-v0", "camera", "mine", 0, 64 * i, 0.5 * i, -1.0, -0.5) for i in range(3)]
-    record.write(tmp_path / program.CURVES, points)
-    lines = (tmp_path / program.CURVES).read_text().splitlines()
+    record.write(tmp_path / jobs.CURVES, points)
+    lines = (tmp_path / jobs.CURVES).read_text().splitlines()
     assert lines[0] == "task,agent,learner,seed,steps,seconds,mean_return,fraction"
     assert lines[2] == "map-v0,camera,mine,0,64,0.5000,-1.0000,-0.5000"
-    assert record.read(tmp_path / program.CURVES) == points
+    assert record.read(tmp_path / jobs.CURVES) == points
 
 
 def test_rows_are_read_as_they_were_written(tmp_path):
-    board.write(tmp_path / program.SCORES, [ROW])
-    assert board.read(tmp_path / program.SCORES) == [ROW]
+    board.write(tmp_path / jobs.SCORES, [ROW])
+    assert board.read(tmp_path / jobs.SCORES) == [ROW]
     assert board.read(tmp_path / "none.json") == []
 
 
@@ -195,8 +195,8 @@ class Nop:
 
 
 def test_a_row_of_a_job_holds_all_seeds():
-    job = program.Job("map-v0", "camera", Nop(), (20, 21, 22), 64)
-    row, points = program.do(job, {"commit": "0", "date": "2026-11-26"})
+    job = jobs.Job("map-v0", "camera", Nop(), (20, 21, 22), 64)
+    row, points = jobs.do(job, {"commit": "0", "date": "2026-11-26"})
     assert row.place == ("map-v0", "camera", "nop")
     assert row.returns == (0.0, 0.0, 0.0)
     assert row.steps == 64
@@ -207,18 +207,16 @@ def test_a_row_of_a_job_holds_all_seeds():
 
 def test_results_of_other_learners_stay(tmp_path, monkeypatch):
     """One job, without a process of its own."""
-    board.write(tmp_path / program.SCORES, [ROW, dataclasses.replace(ROW, policy="nop")])
+    board.write(tmp_path / jobs.SCORES, [ROW, dataclasses.replace(ROW, policy="nop")])
     old = Point("map-v0", "camera", "nop", 5, 1, 0.0, 0.0, 0.0)
-    record.write(tmp_path / program.CURVES, [old, dataclasses.replace(old, learner="mine")])
-    monkeypatch.setattr(
-        program, "ProcessPoolExecutor", lambda number, *_: ThreadPoolExecutor(number)
-    )
-    job = program.Job("map-v0", "camera", Nop(), (20,), 64)
-    program.run([job], 1, tmp_path, "python -m benchmarks.tasks nop")
-    rows = {row.policy: row for row in board.read(tmp_path / program.SCORES)}
+    record.write(tmp_path / jobs.CURVES, [old, dataclasses.replace(old, learner="mine")])
+    monkeypatch.setattr(jobs, "ProcessPoolExecutor", lambda number, *_: ThreadPoolExecutor(number))
+    job = jobs.Job("map-v0", "camera", Nop(), (20,), 64)
+    jobs.run([job], 1, tmp_path, "python -m benchmarks.tasks nop")
+    rows = {row.policy: row for row in board.read(tmp_path / jobs.SCORES)}
     assert rows["mine"] == ROW
     assert rows["nop"].about["command"] == "python -m benchmarks.tasks nop"
-    assert [p.learner for p in record.read(tmp_path / program.CURVES)] == ["mine", "nop", "nop"]
+    assert [p.learner for p in record.read(tmp_path / jobs.CURVES)] == ["mine", "nop", "nop"]
 
 
 def test_learners_have_names_of_their_own_and_settings():
