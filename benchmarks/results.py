@@ -20,9 +20,7 @@ _HERE = Path(__file__).parent
 RESULTS = _HERE / "results"
 PAGES = (
     _HERE.parent / "README.md",
-    *(_HERE.parent / "docs" / f"{name}.md" for name in ("figures", "jmvae", "fusion")),
-    _HERE.parent / "docs" / "figures.md",
-    _HERE.parent / "docs" / "tasks.md",
+    *(_HERE.parent / "docs" / f"{name}.md" for name in ("figures", "jmvae", "fusion", "tasks")),
     _HERE / "RESULTS.md",
 )
 _BLOCK = re.compile(
