@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from benchmarks.tasks.learner import NUM_STARTS, POINTS, Report, of_seeds, part
 from jaxsense.config import DqnConfig
 from jaxsense.dqn import training
+from jaxsense.dqn.environments import Agent
+from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.run import devices
 from jaxsense.tasks import Task, greedy
 
@@ -19,7 +21,8 @@ class Dqn:
     """`jaxsense.dqn.train`, with the network of the task's preset.
 
     Attributes:
-      discount: of a step, in a team of a second.
+      discount: of a step.
+      discount_of_a_second: in place of that of a step, in a team.
       num_envs: environments side by side.
       updates: gradient steps for each step of all environments.
       batch: transitions of one of them.
@@ -32,6 +35,7 @@ class Dqn:
     name = "our DQN"
     packages = ()
     discount: float = 0.5
+    discount_of_a_second: float = 0.99
     num_envs: int = 128
     updates: int = 8
     batch: int = 256
@@ -42,7 +46,7 @@ class Dqn:
 
     def train(self, task: Task, seeds: Sequence[int], steps: int, report: Report) -> None:
         """Trains all seeds in one program, see `Learner.train`."""
-        agent = dataclasses.replace(task.models.agent, discount=self.discount)  # pyright: ignore
+        agent = self._agent(task)
         chunk = part(steps, self.num_envs)
         epochs = POINTS * chunk
         settings = DqnConfig(
@@ -81,6 +85,13 @@ class Dqn:
             if i < POINTS:
                 states = compiled(keys[:, i], task, prepared, states)
                 jax.block_until_ready(states)
+
+    def _agent(self, task: Task) -> Agent:
+        """The agent of the task's preset, with our discount."""
+        agent = task.models.agent
+        if isinstance(agent, TeamAgent):
+            return dataclasses.replace(agent, discount=self.discount_of_a_second)
+        return dataclasses.replace(agent, discount=self.discount)  # pyright: ignore
 
 
 LEARNERS = (Dqn(),)
