@@ -18,10 +18,10 @@ from jaxsense.show.drawing import png
 
 PROGRAM = "benchmarks.tasks"
 STEPS = {
-    ("team-v0", "team"): 65536,
-    ("many-v0", "camera"): 131072,
-    ("noisy-v0", "camera"): 131072,
-    ("map-v0", "camera"): 65536,
+    ("team-v0", "team"): 32768,
+    ("many-v0", "camera"): 65536,
+    ("noisy-v0", "camera"): 65536,
+    ("map-v0", "camera"): 32768,
 }
 """Environment steps of each training, by task and agent; the longest first."""
 
