@@ -21,8 +21,6 @@ from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Features, Key, Samples, pytree
 from jaxsense.vae import gaussian
 
-_STEPS_AT_ONCE = 100  # whose draws are in memory together
-
 Drawn = tuple[jax.Array, tuple[jax.Array, ...]]
 """Noise `[steps, D, B]`, and for each modality features `[steps, D_m, B]`."""
 
@@ -374,12 +372,14 @@ def train(
     for features, size in zip(bank, model.feature_sizes, strict=True):
         chex.assert_shape(features, (bank[0].shape[0], None, size), custom_message="bank")
     problem, state = Fitting(config, bank, model), supervised.start(params, config)
-    number = min(config.steps, _STEPS_AT_ONCE)
+    number = min(config.steps, 100)  # whose draws are in memory together
+    chunks = -(-config.steps // number)
+    keys = jax.random.split(key, chunks) if chunks > 1 else key[None]
 
     def chunk(state: supervised.FitState, key: Key) -> tuple[supervised.FitState, jax.Array]:
         return supervised.fit(key, state, problem, number)
 
-    state, losses = jax.lax.scan(chunk, state, jax.random.split(key, -(-config.steps // number)))
+    state, losses = jax.lax.scan(chunk, state, keys)
     return state.params, losses.reshape(-1)[: config.steps]
 
 
