@@ -203,6 +203,7 @@ def test_recorded_scans_neither_invents_nor_replaces_a_recording(
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"precious"] * is_there
 
 
+@pytest.mark.slow  # trains a run with a thermal camera
 @pytest.mark.skipif(not rawlog.DIRECTORY.exists(), reason="mrpt-common is not installed")
 def test_laser_logs(example, trained_recorded_scans, trained_runs, tmp_path, monkeypatch, capsys):
     main, read_logs = example("laser_logs").main, rawlog.read_logs

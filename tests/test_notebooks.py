@@ -52,6 +52,7 @@ def test_the_tasks(tmp_path, monkeypatch, capsys):
     assert "noisy-v0, lidar: return" in printed
 
 
+@pytest.mark.slow  # the same functions run in the examples of pages
 def test_the_jmvae_and_fusion(tmp_path, monkeypatch, capsys):
     names = run(notebook("jmvae_and_fusion"), tmp_path, monkeypatch)
     printed = capsys.readouterr().out
@@ -63,6 +64,7 @@ def test_the_jmvae_and_fusion(tmp_path, monkeypatch, capsys):
     assert 0.6 < names["chances"].max() < 1
 
 
+@pytest.mark.slow  # as above
 def test_single_functions(tmp_path, monkeypatch, capsys):
     names = run(notebook("single_functions"), tmp_path, monkeypatch)
     np.testing.assert_allclose(names["place"], [0.2, -0.1], atol=2e-3)

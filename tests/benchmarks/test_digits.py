@@ -132,6 +132,7 @@ def found(digits):
     return [[row[name] for row in rows] for name in kinds]
 
 
+@pytest.mark.slow  # compiles all measures
 def test_figures_of_ours_at_tiny_size(digits, found):
     names = ["log-likelihood", "accuracy all", "accuracy noise", "accuracy a", "accuracy b"]
     names += ["accuracy, 1 missing", "accuracy, 2 missing", "coherence", "seconds"]
