@@ -87,7 +87,10 @@ def test_examples_of_the_tasks_run(capsys):
     run_example(page, 1)
     printed = capsys.readouterr().out
     assert "noisy-v0, camera: return" in printed
-    assert run_example(page, 3)["models"].tours
+    on_host = run_example(page, 2)["found"]
+    assert capsys.readouterr().out.endswith("(10,)\n")
+    assert 0 < on_host.fraction_of_optimal.low <= on_host.fraction_of_optimal.value <= 1
+    assert run_example(page, 4)["models"].tours
     assert "--preset team --seed 0" in capsys.readouterr().out
 
 

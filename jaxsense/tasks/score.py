@@ -19,6 +19,11 @@ from jaxsense.tasks.registry import as_task, reference_returns
 from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, key_of_seed
 
 _NUMBERS = jax.Array | np.ndarray | np.generic | float | int
+_UNTRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
 _RESAMPLES = 2000
 _LEVEL = 0.95
 
@@ -130,7 +135,8 @@ def score(
 
     Raises:
       ConfigError: if there is no such task or agent.
-      ValueError: if a policy's actions are no scalar integers, or do not exist.
+      ValueError: if a policy's actions are no scalar integers, or do not exist, or if JAX cannot
+        trace it.
     """
     checks.require_number("episodes", episodes)
     task = as_task(task, agent)
@@ -231,7 +237,11 @@ def _play(act: Act[Any], memory: Any, key: Key, task: Task, episodes: int) -> Fl
     """Mean return of some episodes; NaN if there is no such action."""
 
     def checked(key: Key, memory: Any, observation: jax.Array) -> tuple[jax.Array, Any]:
-        action, memory = act(key, memory, observation)
+        try:
+            action, memory = act(key, memory, observation)
+        except _UNTRACEABLE as error:
+            expected = "must be a function that JAX can trace; wrap others in tasks.on_host"
+            raise ValueError(f"policy: {expected}") from error
         action = jnp.asarray(action)
         if action.shape or not jnp.issubdtype(action.dtype, jnp.integer):
             found = f"{action.dtype}{list(action.shape)}"

@@ -4,3 +4,4 @@ from jaxsense.training.stage import Learned as Learned
 from jaxsense.training.stage import Progress as Progress
 from jaxsense.training.stage import Stage as Stage
 from jaxsense.training.stages import learn as learn
+from jaxsense.training.stages import models as models

@@ -115,3 +115,13 @@ def test_an_agent_goes_with_a_name():
     with pytest.raises(ConfigError, match="agent = 'lidar': goes with a name"):
         jaxsense.score(jaxsense.make(NAME), nop, agent="lidar")
     assert EPISODES > 1
+
+
+@pytest.mark.parametrize(
+    "act", [lambda x: np.asarray(x).argmax(), lambda x: int(x[0]), lambda x: x[0] > 0 and 1]
+)
+def test_a_policy_that_cannot_be_traced_is_told_what_to_do(act):
+    with pytest.raises(
+        ValueError, match=r"^policy: must be a function .* wrap others in tasks\.on_host"
+    ):
+        jaxsense.score(NAME, lambda key, observation: act(observation), episodes=1)
