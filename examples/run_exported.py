@@ -53,7 +53,8 @@ def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) ->
         for robot in np.flatnonzero(team["works"]).tolist():
             name, m = robots[robot], team["modality"][robot]
             known = maps[robot if has_own_maps else 0]
-            poi = int(programs["decide"](**known, **team, robot=robot)["action"])
+            of_map = {key: known[key] for key in ("mean", "std", "looked_from")}
+            poi = int(programs["decide"](**of_map, **team, robot=robot)["action"])
             if poi in (num_pois, -1):
                 team["works"][robot] = False
                 continue
