@@ -4,6 +4,7 @@ Traced values are unknown: their checks pass and cost nothing.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -124,3 +125,29 @@ def require_one_each(name: str, values: Sequence[object], modalities: Sequence[s
             f"{name} has {len(values)} entries: must be {len(modalities)}, one for each of "
             f"{tuple(modalities)}"
         )
+
+
+def require_bank(bank: Sequence[Any], modalities: Sequence[str], sizes: Sequence[int]) -> None:
+    """Checks that each modality has finite features of looks at the same classes, one or more.
+
+    Args:
+      bank: for each modality `[C, S, D_m]` features.
+      modalities: names of the modalities.
+      sizes: D_m of each.
+
+    Raises:
+      ValueError: names the first modality with something else.
+    """
+    require_one_each("bank", bank, modalities)
+    for name, size, features in zip(modalities, sizes, bank, strict=True):
+        of_modality, shape = f"bank of {name}", np.shape(features)
+        if features is None:
+            raise ValueError(f"{of_modality} = None: must be an array; leave out rows without it")
+        if len(shape) != 3 or shape[-1] != size or 0 in shape:
+            expected = f"must be [C, S, {size}]; give [N, {size}] as x[:, None]"
+            raise ValueError(f"{of_modality} has the shape {shape}: {expected}")
+        classes = np.shape(bank[0])[0]
+        if shape[0] != classes:
+            expected = f"must be {classes}, as many as of {modalities[0]}"
+            raise ValueError(f"{of_modality} has {shape[0]} classes or rows: {expected}")
+        require_finite(of_modality, features)

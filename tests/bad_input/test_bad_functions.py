@@ -323,7 +323,7 @@ FUNCTIONS = {
         lambda w: vae.loss(
             w.key, w.params, w.model, (w.x, w.x), alpha=1, beta=1, reconstruction_weights=(1,)
         ),
-        "reconstruction_weights = (1,)",
+        "reconstruction_weights has 1 entries",
     ),
     "train bank": (
         lambda w: vae.train(w.key, w.params, w.model, w.bank[:1], SMOKE.jmvae),
