@@ -54,7 +54,7 @@ def test_the_example_plays_a_map_and_refuses_other_files(file, tmp_path, player)
 def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnx", None)
     line = error_line([str(run), "--out", str(tmp_path / "x.zip")], capsys, export)
-    assert line == "jaxsense.export: onnx is not installed: pip install 'jaxsense[export]'"
+    assert line == "jaxsense.export: onnx is not installed: pip install -e '.[export]'"
     assert not [*tmp_path.iterdir()]
 
 
