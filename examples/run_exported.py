@@ -171,6 +171,8 @@ def main() -> None:
     try:
         contents, programs = importlib.import_module(name).load(path)
     except (OSError, zipfile.BadZipFile, json.JSONDecodeError, KeyError, ImportError) as error:
+        if isinstance(error, ImportError) and error.name == "onnxruntime":
+            sys.exit("--onnx needs onnxruntime: pip install onnxruntime")
         sys.exit(f"{path}: must be a file of `python -m jaxsense.export` ({error})")
     for name, program in contents["programs"].items():
         print(f"{name}({', '.join(program['inputs'])}): {program['about']}")
