@@ -95,6 +95,23 @@ def require_index(name: str, value: object, number: int) -> None:
     require(name, value, lambda x: (x >= 0) & (x < number), expected)
 
 
+def require_modality(modality: object, modalities: Sequence[str]) -> None:
+    """Checks that a modality is an index.
+
+    Args:
+      modality: the index.
+      modalities: names of the modalities.
+
+    Raises:
+      ValueError: lists the indices with their names.
+    """
+    try:
+        require_index("modality", modality, len(modalities))
+    except (TypeError, ValueError):
+        expected = " or ".join(f"{m} ({name})" for m, name in enumerate(modalities))
+        raise ValueError(f"modality = {modality!r}: must be {expected}") from None
+
+
 def require_number(name: str, value: object) -> None:
     """Checks that a value is one whole number greater than 0.
 
