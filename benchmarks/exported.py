@@ -1,9 +1,10 @@
 """How far exported programs are from ours, and how long they take: `python -m benchmarks.exported`.
 
-Plays missions of a run, and asks the programs of its archive, with NumPy and with onnxruntime on
-one core, what ours say in the same states.
+Plays missions of a run, and asks the programs of its archive, with NumPy and, if it is installed,
+with onnxruntime on one core, what ours say in the same states.
 """
 
+import contextlib
 import dataclasses
 import io
 import sys
@@ -22,7 +23,7 @@ from jaxsense import export, mission
 from jaxsense.config import Config
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
-from jaxsense.interfaces import robot_numpy, robot_onnx
+from jaxsense.interfaces import robot_numpy
 from jaxsense.interfaces.onboard import Function, functions
 from jaxsense.mission import decide
 from jaxsense.mission.choice import ask, choose
@@ -35,8 +36,12 @@ from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors, viewpoints
 
 PROGRAM = "benchmarks.exported"
-LOADERS = {"NumPy": robot_numpy.load, "onnxruntime": robot_onnx.load}
+LOADERS = {"NumPy": robot_numpy.load}
 """What plays an archive."""
+with contextlib.suppress(ModuleNotFoundError):
+    from jaxsense.interfaces import robot_onnx
+
+    LOADERS["onnxruntime"] = robot_onnx.load
 _MISSIONS = 16
 _TIMED = 200
 _CLOSED = 1e5  # above any value of an action that is open
@@ -337,6 +342,8 @@ def main(argv: list[str] | None = None) -> None:
             figures = each.states, each.different, f"{each.error:.1e}", f"{each.seconds * 1e6:.0f}"
             table.add_row(name, player, *map(str, figures))
     rich.console.Console().print(table)
+    if "onnxruntime" not in LOADERS:
+        print("NumPy alone: onnxruntime is not installed; pip install onnxruntime")
 
 
 if __name__ == "__main__":

@@ -19,9 +19,12 @@ import argparse
 import collections
 import dataclasses
 import importlib
+import itertools
 import json
 import math
+import re
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -174,9 +177,19 @@ class Robot:
           positions: `[N, 2]` of the PoIs in the frame `map`, in metres.
 
         Raises:
-          ValueError: if the policy is for another number of PoIs, or robots have maps of their own.
+          ValueError: if there is no such robot, positions are not of PoIs that stand apart, the
+            policy is for another number of PoIs, or robots have maps of their own.
         """
+        positions = np.asarray(positions, np.float32)
+        if positions.ndim != 2 or positions.shape[1] != 2 or not np.isfinite(positions).all():
+            raise ValueError(f"positions = {positions.tolist()}: must be two finite numbers each")
+        if len(np.unique(positions, axis=0)) < len(positions):
+            raise ValueError(f"positions = {positions.tolist()}: must differ from each other")
         number, pois, modalities = len(contents["robots"]), len(positions), contents["modalities"]
+        if not 0 <= robot < number:
+            raise ValueError(
+                f"robot = {robot}: must be one of {dict(enumerate(contents['robots']))}"
+            )
         expected = contents["programs"]["decide"]["inputs"]["positions"]["shape"][0]
         if expected not in ("pois", pois):
             raise ValueError(f"{pois} PoIs: the policy of this archive is for {expected}")
@@ -189,7 +202,7 @@ class Robot:
         self.target: int | None = None
         self.goal: np.ndarray | None = None
         self.team = {
-            "positions": np.asarray(positions, np.float32),
+            "positions": positions,
             "present": np.ones(pois, bool),
             "poses": np.zeros((number, 3), np.float32),
             "modality": np.array([modalities.index(name) for name in contents["robots"]]),
@@ -437,20 +450,40 @@ def connect(node: Any, robot: Robot) -> Any:
     return TransformListener(buffer, node, spin_thread=True)
 
 
+def point(text: str) -> list[float]:
+    """The numbers of `X,Y`, in metres."""
+    x, y = map(float, text.split(","))
+    return [x, y]
+
+
 def main() -> None:
     """Runs the node."""
-    import rclpy
-    from rclpy.utilities import remove_ros_args
-
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("archive", type=Path, help="file of `jaxsense export`")
     parser.add_argument("--robot", type=int, default=0, help="index of this robot in the run")
     parser.add_argument(
-        "--pois", nargs="+", required=True, metavar="X,Y", help="positions of the PoIs, in metres"
+        "--pois",
+        nargs="+",
+        required=True,
+        type=point,
+        metavar="X,Y",
+        help="positions of the PoIs, in metres",
     )
-    arguments = parser.parse_args(remove_ros_args(sys.argv)[1:])
-    positions = np.array([[float(x) for x in poi.split(",")] for poi in arguments.pois])
-    robot = load(arguments.archive, arguments.robot, positions)
+    own = itertools.takewhile(lambda each: each != "--ros-args", sys.argv[1:])
+    # With a space before it, argparse takes -1.2,0.8 for no option.
+    arguments = parser.parse_args(
+        [f" {each}" if re.match(r"-\.?\d", each) else each for each in own]
+    )
+    try:
+        robot = load(arguments.archive, arguments.robot, np.array(arguments.pois))
+    except (OSError, zipfile.BadZipFile, KeyError, ImportError) as error:
+        parser.error(f"{arguments.archive}: must be a file of `jaxsense export` ({error})")
+    except ValueError as error:
+        parser.error(str(error))
+    try:
+        import rclpy
+    except ImportError:
+        sys.exit("needs ROS 2: source /opt/ros/.../setup.bash")
     rclpy.init(args=sys.argv)
     node = rclpy.create_node(f"jaxsense_{arguments.robot}")
     listener = connect(node, robot)

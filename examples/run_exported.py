@@ -53,7 +53,8 @@ def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) ->
         for robot in np.flatnonzero(team["works"]).tolist():
             name, m = robots[robot], team["modality"][robot]
             known = maps[robot if has_own_maps else 0]
-            poi = int(programs["decide"](**known, **team, robot=robot)["action"])
+            of_map = {key: known[key] for key in ("mean", "std", "looked_from")}
+            poi = int(programs["decide"](**of_map, **team, robot=robot)["action"])
             if poi in (num_pois, -1):
                 team["works"][robot] = False
                 continue
@@ -170,6 +171,8 @@ def main() -> None:
     try:
         contents, programs = importlib.import_module(name).load(path)
     except (OSError, zipfile.BadZipFile, json.JSONDecodeError, KeyError, ImportError) as error:
+        if isinstance(error, ImportError) and error.name == "onnxruntime":
+            sys.exit("--onnx needs onnxruntime: pip install onnxruntime")
         sys.exit(f"{path}: must be a file of `python -m jaxsense.export` ({error})")
     for name, program in contents["programs"].items():
         print(f"{name}({', '.join(program['inputs'])}): {program['about']}")

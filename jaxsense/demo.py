@@ -26,13 +26,14 @@ from jaxsense.tasks import PRETRAINED, load_pretrained
 
 PROGRAM = "jaxsense.demo"
 _REFERENCE = "naive"
+_AVERAGES = "What learning is worth"  # section of the README
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
     """Plays a mission with trained robots, and again with naive exploration, on one page."""
 
-    preset: str = "noisy"
+    preset: str = "default"
     """Preset with which the robots were trained: `default`, `noisy`, `many`, `raw` or `team`."""
     policy: str = "latent"
     """Policy to compare with naive exploration: `latent` (the learned policy), `greedy`, `bayes`,
@@ -84,6 +85,7 @@ def main(argv: list[str] | None = None) -> None:
         cli.fail(PROGRAM, f"{cli.reason(error)}")
     with contextlib.suppress(OSError):  # as in `say`
         print_table(console, table)
+    say(f"This is one mission of many; averages: README, {_AVERAGES}.")
     say(f"The page is {path}.")
     say(f"Next: {command('jaxsense tasks')}")
     if arguments.browser and _has_display():
@@ -131,7 +133,7 @@ def _page(
         seed=arguments.seed,
         other=next(name for name in PRETRAINED if name != arguments.preset),
         films=[[film(name) for name in played]],
-        policies=len(played),
+        averages=_AVERAGES,
         table=table,
         sentence=_sentence(arguments.policy, len(scenario.config.carried)),
     )

@@ -194,16 +194,19 @@ NO_CACHE = ["--cache", "none", "--no-browser"]
 def test_the_demo_writes_one_page_with_both_films(played, capsys):
     demo.main(NO_CACHE)
     (page,) = played.glob("runs/*/*")
-    assert re.fullmatch(r"runs/\d{8}-\d{6}-demo-noisy/demo\.html", str(page.relative_to(played)))
+    assert re.fullmatch(r"runs/\d{8}-\d{6}-demo-default/demo\.html", str(page.relative_to(played)))
     text = page.read_text()
     # Both halves of each film, as they play and stopped.
     assert text.count("data:image/svg+xml;base64,") == 2 * 2 * 2
     assert '<div class="film pair">' in text
-    assert "python -m jaxsense.demo --preset noisy --seed 1" in text
-    assert 'load_pretrained("noisy")' in text
+    assert "python -m jaxsense.demo --preset default --seed 1" in text
+    assert 'load_pretrained("default")' in text
+    assert "one mission of many" in text
+    assert "under <i>What learning is worth</i>" in text
     assert re.search(r'<th scope="row">latent</th>\s*<td>.*0\.667', text)
     assert re.search(r'<th scope="row">naive</th>', text)
     told = capsys.readouterr().out
+    assert "This is one mission of many; averages: README, What learning is worth.\n" in told
     assert f"The page is {page.relative_to(played)}.\n" in told
     assert "Next: python -m jaxsense tasks\n" in told
     demo.main(NO_CACHE)

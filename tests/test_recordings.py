@@ -65,6 +65,18 @@ def test_a_recording_that_was_compressed_and_damaged_is_named(tmp_path):
         recordings.read(CONFIG, path)
 
 
+@pytest.mark.parametrize("changes", [{}, {"lidar_poses": None, "lidar_scans": None}])
+def test_an_unknown_sensor_is_named(write, changes):
+    with pytest.raises(ValueError, match=r"^radar_scans is of an unknown sensor; must be camera"):
+        recordings.read(CONFIG, write(radar_scans=EMPTY, **changes))
+
+
+def test_angles_in_degrees_are_refused(write):
+    path = write(lidar_angles=np.degrees(LIDAR.angles))
+    with pytest.raises(ValueError, match=r"angles of lidar = .*: must be .* \(in radians\?\)"):
+        recordings.read(CONFIG, path)
+
+
 def test_a_sensor_may_be_missing_and_have_other_rays(write):
     looks = recordings.read(CONFIG, write())
     assert [*looks.scans] == [*looks.poses] == ["lidar"]

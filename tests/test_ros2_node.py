@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -354,6 +355,60 @@ def test_an_archive_that_does_not_fit_is_named(ros2, stub):
     programs = {**stub.programs(), "merge": None}
     with pytest.raises(ValueError, match="maps of their own"):
         ros2.Robot(CONTENTS, programs, resampling.resample, 1, POSITIONS)
+
+
+@pytest.mark.parametrize("index", [-1, 2])
+def test_a_robot_that_the_archive_lacks_is_named(ros2, stub, index):
+    expected = f"robot = {index}: must be one of {{0: 'camera', 1: 'lidar'}}"
+    with pytest.raises(ValueError, match=re.escape(expected)):
+        ros2.Robot(CONTENTS, stub.programs(), resampling.resample, index, POSITIONS)
+
+
+@pytest.mark.parametrize(
+    ("positions", "expected"),
+    [
+        ([[0, 1], [1, 2], [math.nan, 0]], "must be two finite numbers each"),
+        ([[0, 1, 2], [1, 2, 2], [1, 0, 2]], "must be two finite numbers each"),
+        ([[0, 1], [1, 2], [0, 1]], "must differ from each other"),
+    ],
+)
+def test_places_of_no_pois_are_named(ros2, stub, positions, expected):
+    with pytest.raises(ValueError, match=rf"positions = \[\[0.0, 1.0.*: {expected}"):
+        ros2.Robot(CONTENTS, stub.programs(), resampling.resample, 1, np.array(positions))
+
+
+def run_node(ros2, monkeypatch, *argv):
+    """Why the program ends where there is no ROS, and with what it loads a robot."""
+    given = []
+    monkeypatch.setattr(ros2, "load", lambda *each: given.append(each))
+    monkeypatch.setattr(ros2.sys, "argv", ["ros2_node.py", *argv])
+    monkeypatch.setitem(ros2.sys.modules, "rclpy", None)
+    with pytest.raises(SystemExit) as stop:
+        ros2.main()
+    return stop.value.code, given
+
+
+def test_the_program_reads_its_command_before_it_needs_ros(ros2, monkeypatch):
+    pois = ["--pois", "1.0,0.5", "-1.2,0.8", "-.3,-1.1"]
+    ros = ["--ros-args", "-r", "scan:=/front/scan"]
+    ended, given = run_node(ros2, monkeypatch, "robot.zip", "--robot", "-1", *pois, *ros)
+    assert ended == "needs ROS 2: source /opt/ros/.../setup.bash"
+    ((archive, robot, positions),) = given
+    assert (archive, robot) == (Path("robot.zip"), -1)
+    np.testing.assert_array_equal(positions, [[1.0, 0.5], [-1.2, 0.8], [-0.3, -1.1]])
+
+
+@pytest.mark.parametrize("poi", ["1.0", "1,2,3", "1;2", "-1"])
+def test_the_program_refuses_what_is_no_place(ros2, monkeypatch, capsys, poi):
+    assert run_node(ros2, monkeypatch, "robot.zip", "--pois", poi, "0,1") == (2, [])
+    assert "argument --pois: invalid point value" in capsys.readouterr().err
+
+
+def test_the_program_refuses_what_is_no_archive(ros2, monkeypatch, capsys):
+    monkeypatch.setattr(ros2.sys, "argv", ["ros2_node.py", "nothing.zip", "--pois", "0,1"])
+    with imports_from_archives(), pytest.raises(SystemExit):
+        ros2.main()
+    assert "nothing.zip: must be a file of `jaxsense export`" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # compiles scans in a simulated arena

@@ -4,6 +4,7 @@ Traced values are unknown: their checks pass and cost nothing.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -94,6 +95,23 @@ def require_index(name: str, value: object, number: int) -> None:
     require(name, value, lambda x: (x >= 0) & (x < number), expected)
 
 
+def require_modality(modality: object, modalities: Sequence[str]) -> None:
+    """Checks that a modality is an index.
+
+    Args:
+      modality: the index.
+      modalities: names of the modalities.
+
+    Raises:
+      ValueError: lists the indices with their names.
+    """
+    try:
+        require_index("modality", modality, len(modalities))
+    except (TypeError, ValueError):
+        expected = " or ".join(f"{m} ({name})" for m, name in enumerate(modalities))
+        raise ValueError(f"modality = {modality!r}: must be {expected}") from None
+
+
 def require_number(name: str, value: object) -> None:
     """Checks that a value is one whole number greater than 0.
 
@@ -124,3 +142,29 @@ def require_one_each(name: str, values: Sequence[object], modalities: Sequence[s
             f"{name} has {len(values)} entries: must be {len(modalities)}, one for each of "
             f"{tuple(modalities)}"
         )
+
+
+def require_bank(bank: Sequence[Any], modalities: Sequence[str], sizes: Sequence[int]) -> None:
+    """Checks that each modality has finite features of looks at the same classes, one or more.
+
+    Args:
+      bank: for each modality `[C, S, D_m]` features.
+      modalities: names of the modalities.
+      sizes: D_m of each.
+
+    Raises:
+      ValueError: names the first modality with something else.
+    """
+    require_one_each("bank", bank, modalities)
+    for name, size, features in zip(modalities, sizes, bank, strict=True):
+        of_modality, shape = f"bank of {name}", np.shape(features)
+        if features is None:
+            raise ValueError(f"{of_modality} = None: must be an array; leave out rows without it")
+        if len(shape) != 3 or shape[-1] != size or 0 in shape:
+            expected = f"must be [C, S, {size}]; give [N, {size}] as x[:, None]"
+            raise ValueError(f"{of_modality} has the shape {shape}: {expected}")
+        classes = np.shape(bank[0])[0]
+        if shape[0] != classes:
+            expected = f"must be {classes}, as many as of {modalities[0]}"
+            raise ValueError(f"{of_modality} has {shape[0]} classes or rows: {expected}")
+        require_finite(of_modality, features)

@@ -96,7 +96,8 @@ def _detect(config: Config, m: int) -> Function:
     bright = "" if sensor.channels != 3 else ", linear RGB from 0 to 1"
     inputs = {
         "readings": Input(
-            (len(sensor.angles), *channels), f"{kind} of all rays of a scan, {order}{bright}"
+            (len(sensor.angles), *channels),
+            f"{kind} of all rays of a scan, {order}{bright}; resample other scans first",
         ),
         "bearing": Input(
             (),

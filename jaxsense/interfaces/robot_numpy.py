@@ -37,30 +37,67 @@ def load(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, Program
         graphs = json.loads(files.read("programs.json"))
         weights = dict(np.load(io.BytesIO(files.read("weights.npz"))))
     described = contents["programs"]
-    return contents, {name: _program(graphs[name], weights, described[name]) for name in graphs}
+    return contents, {
+        name: _program(name, graphs[name], weights, described[name]) for name in graphs
+    }
 
 
-def _program(graph: Mapping[str, Any], weights: Arrays, about: Mapping[str, Any]) -> Program:
+def checked(
+    program: str, inputs: Mapping[str, Any], unnamed: tuple[Any, ...], given: Mapping[str, Any]
+) -> Arrays:
+    """The inputs of a program as arrays of its types.
+
+    Args:
+      program: its name.
+      inputs: describes them by name, see `contents.json`; axes with a name have any size, the same
+        in all inputs.
+      unnamed: what is given without a name.
+      given: by name.
+
+    Raises:
+      TypeError: if an input is missing, unknown or unnamed.
+      ValueError: if one has another shape.
+    """
+    wrong = [f"{name} is none of them" for name in given if name not in inputs]
+    wrong += [f"{name} is missing" for name in inputs if name not in given and not unnamed]
+    if wrong or unnamed:
+        needs = f"{program} needs {', '.join(inputs)}"
+        raise TypeError("; ".join([f"{needs}, by name" if unnamed else needs, *wrong]))
+    arrays, sizes = {}, {}
+    for name, each in inputs.items():
+        arrays[name] = array = np.asarray(given[name], each["dtype"])
+        if array.ndim == len(each["shape"]):
+            for axis, size in zip(each["shape"], array.shape, strict=True):
+                if isinstance(axis, str):
+                    sizes.setdefault(axis, size)
+        expected = tuple(sizes.get(axis, axis) for axis in each["shape"])
+        if array.shape != expected:
+            must_be = f"must be {expected} ({each['about']})".replace("'", "")
+            raise ValueError(f"{program}: {name} has the shape {array.shape}: {must_be}")
+    return arrays
+
+
+def _program(
+    name: str, graph: Mapping[str, Any], weights: Arrays, about: Mapping[str, Any]
+) -> Program:
     known: dict[str, Any] = dict(weights)
     steps: list[Step] = []
     # What depends on weights alone is computed once.
     for node in graph["nodes"]:
         operator, inputs, *_ = node
         is_plain = operator not in ("Loop", "If")
-        if is_plain and all(name in known or not name for name in inputs):
+        if is_plain and all(each in known or not each for each in inputs):
             _play([_step(node)], known)
         else:
             steps.append(_step(node))
 
-    def program(**given: Any) -> Arrays:
-        values = dict(known)
-        for name, each in about["inputs"].items():
-            values[name] = np.asarray(given[name], each["dtype"])
+    def program(*unnamed: Any, **given: Any) -> Arrays:
+        values = {**known, **checked(name, about["inputs"], unnamed, given)}
         # As on other runtimes, infinity and NaN are no errors.
         with np.errstate(all="ignore"):
             _play(steps, values)
         names = zip(about["outputs"], graph["outputs"], strict=True)
-        return {name: np.asarray(values[output]) for name, output in names}
+        return {output: np.asarray(values[of_graph]) for output, of_graph in names}
 
     return program
 

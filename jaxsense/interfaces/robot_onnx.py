@@ -10,7 +10,7 @@ archive with `Ort::Session`, and give and take tensors of the same names, shapes
 
 import json
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,10 +34,47 @@ def load(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, Program
         contents = json.loads(files.read("contents.json"))
         models = {name: files.read(f"{name}.onnx") for name in contents["programs"]}
     described = contents["programs"]
-    return contents, {name: _program(model, described[name]) for name, model in models.items()}
+    return contents, {
+        name: _program(name, model, described[name]) for name, model in models.items()
+    }
 
 
-def _program(model: bytes, about: dict[str, Any]) -> Program:
+def checked(
+    program: str, inputs: Mapping[str, Any], unnamed: tuple[Any, ...], given: Mapping[str, Any]
+) -> Arrays:
+    """The inputs of a program as arrays of its types.
+
+    Args:
+      program: its name.
+      inputs: describes them by name, see `contents.json`; axes with a name have any size, the same
+        in all inputs.
+      unnamed: what is given without a name.
+      given: by name.
+
+    Raises:
+      TypeError: if an input is missing, unknown or unnamed.
+      ValueError: if one has another shape.
+    """
+    wrong = [f"{name} is none of them" for name in given if name not in inputs]
+    wrong += [f"{name} is missing" for name in inputs if name not in given and not unnamed]
+    if wrong or unnamed:
+        needs = f"{program} needs {', '.join(inputs)}"
+        raise TypeError("; ".join([f"{needs}, by name" if unnamed else needs, *wrong]))
+    arrays, sizes = {}, {}
+    for name, each in inputs.items():
+        arrays[name] = array = np.asarray(given[name], each["dtype"])
+        if array.ndim == len(each["shape"]):
+            for axis, size in zip(each["shape"], array.shape, strict=True):
+                if isinstance(axis, str):
+                    sizes.setdefault(axis, size)
+        expected = tuple(sizes.get(axis, axis) for axis in each["shape"])
+        if array.shape != expected:
+            must_be = f"must be {expected} ({each['about']})".replace("'", "")
+            raise ValueError(f"{program}: {name} has the shape {array.shape}: {must_be}")
+    return arrays
+
+
+def _program(name: str, model: bytes, about: Mapping[str, Any]) -> Program:
     options = onnxruntime.SessionOptions()
     # The programs are small: more threads than one would wait for each other.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -45,11 +82,8 @@ def _program(model: bytes, about: dict[str, Any]) -> Program:
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     outputs = [*about["outputs"]]
 
-    def program(**given: Any) -> Arrays:
-        inputs = {
-            name: np.asarray(given[name], each["dtype"]) for name, each in about["inputs"].items()
-        }
-        found = session.run(outputs, inputs)
-        return {name: np.asarray(x) for name, x in zip(outputs, found, strict=True)}
+    def program(*unnamed: Any, **given: Any) -> Arrays:
+        found = session.run(outputs, checked(name, about["inputs"], unnamed, given))
+        return {output: np.asarray(x) for output, x in zip(outputs, found, strict=True)}
 
     return program

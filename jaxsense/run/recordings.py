@@ -70,6 +70,11 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
         raise ValueError(f"{file} is not a whole file of NumPy's format .npz") from None
     made = sensors.make(config)
     parts = [f"{sensor.name}_{part}" for sensor in made for part in ("poses", "scans")]
+    known = {"places", *parts, *(f"{sensor.name}_angles" for sensor in made)}
+    for name in found:
+        if name not in known and name.endswith(("_poses", "_scans", "_angles")):
+            expected = f"must be {' or '.join(sensor.name for sensor in made)}"
+            raise ValueError(f"{name} is of an unknown sensor; {expected}")
     some = [s for s in made if {f"{s.name}_poses", f"{s.name}_scans"} & {*found}] or made
     needed = [f"{sensor.name}_{part}" for sensor in some for part in ("poses", "scans")]
     for name in ("places", *needed):

@@ -13,7 +13,6 @@ import scipy.special
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config, LidarConfig, Shape
-from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.sim import raycast, resampling
 from jaxsense.sim.sensors import Sensor
@@ -47,11 +46,12 @@ def resample(
       that nothing is there.
 
     Raises:
-      ValueError: if the recorded rays are too few or too far apart, or no part of the sensor's
-        field of view as wide as a window was recorded; it names what would fit.
+      ValueError: if an angle is no direction, the recorded rays are too few or too far apart, or no
+        part of the sensor's field of view as wide as a window was recorded; it names what would
+        fit.
     """
     angles = np.asarray(angles, np.float64)
-    checks.require_finite(f"angles of {sensor.name}", angles)
+    resampling.require_angles(f"angles of {sensor.name}", angles)
     if readings.shape[1:2] != angles.shape:
         expected = f"must be {readings.shape[1:2]}, one for each ray of the scans"
         raise ValueError(f"angles of {sensor.name} have the shape {angles.shape}: {expected}")

@@ -5,6 +5,7 @@
 
 import numpy as np
 
+_TURN = 2 * np.pi + 1e-3  # rad; drivers round the last angle
 MAX_STEPS = 3.0
 """A gap between two rays of more than this many median steps was not recorded."""
 _SURFACE = 0.1  # m; neighbouring beams that differ by more hit two surfaces
@@ -28,7 +29,14 @@ def resample(
 
     Returns:
       `[B, ...]` readings along `targets`, NaN outside the recorded field of view.
+
+    Raises:
+      ValueError: if angles are not finite or beyond a turn, or readings are not one for each.
     """
+    require_angles("angles", angles)
+    if np.shape(readings)[:1] != np.shape(angles):
+        expected = f"must be one for each of {np.size(angles)} angles"
+        raise ValueError(f"readings have the shape {np.shape(readings)}: {expected}")
     right, left, share, is_between = _neighbours(targets, angles)
     readings = np.asarray(readings, np.float32)
     if measures_distance:
@@ -44,6 +52,22 @@ def resample(
     found = np.where(is_between & is_same, between, nearest).astype(np.float32)
     found[~covered(targets, angles)] = np.nan
     return found
+
+
+def require_angles(name: str, angles: np.ndarray) -> None:
+    """Checks directions of rays.
+
+    Args:
+      name: of the array.
+      angles: the directions, in radians.
+
+    Raises:
+      ValueError: if one is not finite, or beyond a turn to either side.
+    """
+    wrong = np.asarray(angles)[~(np.abs(angles) <= _TURN)]
+    if wrong.size:
+        expected = "must be within 2 pi to either side (in radians?)"
+        raise ValueError(f"{name} = {wrong[0]:g}: {expected}")
 
 
 def covered(targets: np.ndarray, angles: np.ndarray) -> np.ndarray:

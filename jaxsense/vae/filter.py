@@ -81,7 +81,7 @@ class Filter:
         """
         del seen
         model = self.model
-        checks.require_index("modality", modality, len(model.modalities))
+        checks.require_modality(modality, model.modalities)
         name = f"features of {model.modalities[modality]}"
         chex.assert_shape(features, (model.feature_sizes[modality],), custom_message=name)
         checks.require_probabilities("features", features)

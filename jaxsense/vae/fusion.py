@@ -70,13 +70,15 @@ class InPlace:
           ValueError: if there is no such modality; see also `fuse`.
         """
         del weight
+        checks.require_modality(modality, self.model.modalities)
         number = len(self.model.modalities)
-        checks.require_index("modality", modality, number)
         of_all = tuple(features if m == modality else None for m in range(number))
         return fuse(self.params, self.model, belief, seen, of_all)
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """Posterior `q(z|x)` given looks by several sensors, `[D_m]` features by modality."""
+        for modality in looks:
+            checks.require_modality(modality, self.model.modalities)
         features = tuple(looks.get(m) for m in range(len(self.model.modalities)))
         return jmvae.posterior(self.params, self.model, features)
 

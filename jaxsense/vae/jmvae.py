@@ -269,11 +269,7 @@ def losses(
     Raises:
       ValueError: if a modality's weight is missing.
     """
-    if len(reconstruction_weights) != len(model.modalities):
-        raise ValueError(
-            f"reconstruction_weights = {reconstruction_weights}: must hold one weight for each of "
-            f"{model.modalities}"
-        )
+    checks.require_one_each("reconstruction_weights", reconstruction_weights, model.modalities)
     batch = noise.shape[-1]
     for x, size in zip(features, model.feature_sizes, strict=True):
         chex.assert_shape(x, (size, batch), custom_message="features")
@@ -366,11 +362,10 @@ def train(
       The parameters and the `[steps]` losses.
 
     Raises:
-      ValueError: if a modality has no features.
+      ValueError: if a modality has no features, or some of another shape or not finite; the last
+        is not checked under `jit`.
     """
-    checks.require_one_each("bank", bank, model.modalities)
-    for features, size in zip(bank, model.feature_sizes, strict=True):
-        chex.assert_shape(features, (bank[0].shape[0], None, size), custom_message="bank")
+    checks.require_bank(bank, model.modalities, model.feature_sizes)
     problem, state = Fitting(config, bank, model), supervised.start(params, config)
     number = min(config.steps, 100)  # whose draws are in memory together
     chunks = -(-config.steps // number)

@@ -225,23 +225,35 @@ FUNCTIONS = {
     ),
     "in place real": (
         lambda w: w.in_place.update(w.belief, w.seen, w.look, 0.0),
-        "modality of dtype float32: must be a whole number from 0 to 1",
+        "modality = 0.0: must be 0 (camera) or 1 (lidar)",
     ),
     "in place modality": (
         lambda w: w.in_place.update(w.belief, w.seen, w.x, 2),
-        "modality = 2: must be a whole number from 0 to 1",
+        "modality = 2: must be 0 (camera) or 1 (lidar)",
     ),
     "filter real": (
         lambda w: w.filter.update(w.belief, w.seen, w.look, 0.0),
-        "modality of dtype float32: must be a whole number from 0 to 1",
+        "modality = 0.0: must be 0 (camera) or 1 (lidar)",
     ),
     "filter bool": (
         lambda w: w.filter.update(w.belief, w.seen, w.look, True),
-        "modality of dtype bool: must be a whole number from 0 to 1",
+        "modality = True: must be 0 (camera) or 1 (lidar)",
     ),
     "filter negative": (
         lambda w: w.filter.update(w.belief, w.seen, w.look, -1),
-        "modality = -1: must be a whole number from 0 to 1",
+        "modality = -1: must be 0 (camera) or 1 (lidar)",
+    ),
+    "in place name": (
+        lambda w: w.in_place.update(w.belief, w.seen, w.look, "camera"),
+        "modality = 'camera': must be 0 (camera) or 1 (lidar)",
+    ),
+    "in place together": (
+        lambda w: w.in_place.together({"camera": w.look}),
+        "modality = 'camera': must be 0 (camera) or 1 (lidar)",
+    ),
+    "filter together": (
+        lambda w: w.filter.together({"camera": w.look}),
+        "modality = 'camera': must be 0 (camera) or 1 (lidar)",
     ),
     "filter features": (
         lambda w: w.filter.update(w.belief, w.seen, jnp.array([2.0, -1.0]), 0),
@@ -323,7 +335,7 @@ FUNCTIONS = {
         lambda w: vae.loss(
             w.key, w.params, w.model, (w.x, w.x), alpha=1, beta=1, reconstruction_weights=(1,)
         ),
-        "reconstruction_weights = (1,)",
+        "reconstruction_weights has 1 entries",
     ),
     "train bank": (
         lambda w: vae.train(w.key, w.params, w.model, w.bank[:1], SMOKE.jmvae),

@@ -22,13 +22,14 @@ CONFIG = dataclasses.replace(
 ALONE = f"""
 import runpy, sys
 
+absent = sys.argv.pop(1).split(",")
+
 class Only:
     def find_spec(self, name, *_):
-        if name.partition(".")[0] in sys.argv[1].split(","):
-            raise ModuleNotFoundError(f"{{name}} is not here")
+        if name.partition(".")[0] in absent:
+            raise ModuleNotFoundError(f"{{name}} is not here", name=name)
 
 sys.meta_path.insert(0, Only())
-del sys.argv[1]
 example = runpy.run_path({str(EXAMPLE)!r})
 """
 ABSENT = {

@@ -3,8 +3,10 @@
 import dataclasses
 import json
 import re
+import runpy
 import sys
 import zipfile
+from types import SimpleNamespace
 
 import jax
 import onnx
@@ -12,7 +14,8 @@ import pytest
 from exporting import ABSENT, CONFIG, run_alone
 from smoke import error_line
 
-from jaxsense import export
+from benchmarks import exported
+from jaxsense import export, interfaces
 from jaxsense.models import init
 
 
@@ -51,10 +54,30 @@ def test_the_example_plays_a_map_and_refuses_other_files(file, tmp_path, player)
     assert "must be a file of `python -m jaxsense.export`" in done.stderr
 
 
+def test_the_example_names_the_missing_onnxruntime(file):
+    done = run_alone("example['main']()", "robot_numpy", file, "--onnx")
+    assert done.returncode == 1
+    assert done.stderr == "--onnx needs onnxruntime: pip install onnxruntime\n"
+
+
+def test_the_comparison_needs_numpy_alone(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    monkeypatch.delitem(sys.modules, "jaxsense.interfaces.robot_onnx", raising=False)
+    monkeypatch.delattr(interfaces, "robot_onnx", raising=False)
+    names = runpy.run_path(exported.__file__)
+    assert [*names["LOADERS"]] == ["NumPy"]
+    main, stub = names["main"], SimpleNamespace(load=lambda *_: [None] * 3, archive=lambda *_: b"")
+    stubs = {"export": stub, "choices": lambda *_: [], "compare": lambda *_: {}}
+    for name, each in {**stubs, "devices": SimpleNamespace(start=lambda *_: None)}.items():
+        monkeypatch.setitem(main.__globals__, name, each)
+    main(["RUN"])
+    assert "NumPy alone: onnxruntime is not installed" in capsys.readouterr().out
+
+
 def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnx", None)
     line = error_line([str(run), "--out", str(tmp_path / "x.zip")], capsys, export)
-    assert line == "jaxsense.export: onnx is not installed: pip install 'jaxsense[export]'"
+    assert line == "jaxsense.export: onnx is not installed: pip install -e '.[export]'"
     assert not [*tmp_path.iterdir()]
 
 

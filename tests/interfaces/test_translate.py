@@ -23,11 +23,14 @@ def played(apply, inputs, *given):
     found = program(apply, WEIGHTS, inputs, constants)
     graph = json.loads(json.dumps(found.graph.as_json()))
     about = {
-        "inputs": {name: {"dtype": dtype} for name, (dtype, _) in inputs.items()},
+        "inputs": {
+            name: {"dtype": dtype, "shape": shape, "about": ""}
+            for name, (dtype, shape) in inputs.items()
+        },
         "outputs": found.outputs,
     }
     by_name = dict(zip(inputs, map(np.asarray, given), strict=True))
-    yield robot_numpy._program(graph, constants.arrays, about)(**by_name)
+    yield robot_numpy._program("apply", graph, constants.arrays, about)(**by_name)
     file = as_onnx("test", "", found.graph, constants.arrays, found.outputs)
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     yield dict(zip(found.outputs, session.run([*found.outputs], by_name), strict=True))

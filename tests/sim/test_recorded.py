@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsense.config import PRESETS, CameraConfig, LidarConfig
-from jaxsense.sim import disturbances, raycast, recorded, sensors
+from jaxsense.sim import disturbances, raycast, recorded, resampling, sensors
 
 LIDAR = sensors.lidar(LidarConfig(num_beams=9, field_of_view=80.0, window=3))  # every 10 degrees
 CAMERA = sensors.camera(CameraConfig(num_pixels=8, window=3, stride=1))
@@ -23,6 +23,21 @@ def degrees(*values):
 def test_the_rays_of_a_sensor_read_what_was_recorded_along_them():
     readings = 1 + np.arange(18.0).reshape(2, 9)
     np.testing.assert_allclose(recorded.resample(LIDAR, LIDAR.angles, readings), readings)
+
+
+@pytest.mark.parametrize(
+    ("angles", "ranges", "expected"),
+    [
+        ([0, 0.1], [1, 1, 1], r"readings have the shape \(3,\): must be one for each of 2 angles"),
+        ([0, np.nan], [1, 1], r"angles = nan: must be within 2 pi to either side \(in radians\?\)"),
+        ([-180, 180], [1, 1], "angles = -180: must be within 2 pi to either side"),
+    ],
+)
+def test_a_scan_along_no_directions_is_refused(angles, ranges, expected):
+    with pytest.raises(ValueError, match=expected):
+        resampling.resample(LIDAR.angles, angles, ranges, measures_distance=True)
+    whole = np.array([-2 * np.pi, 0, 2 * np.pi])
+    resampling.resample(LIDAR.angles, whole, np.ones(3), measures_distance=True)
 
 
 def test_distances_are_interpolated_on_a_surface_and_nearest_at_an_edge():
@@ -121,7 +136,7 @@ def test_the_widest_part_that_was_recorded_counts():
             degrees(*range(150, 211, 10)),
             r"recorded part of the field of view of lidar = 0.0 degrees: must",
         ),
-        (degrees(0, np.nan, 10), "angles of lidar = nan: must be finite"),
+        (degrees(0, np.nan, 10), "angles of lidar = nan: must be within 2 pi to either side"),
     ],
 )
 def test_scans_that_do_not_suffice_are_refused_with_what_would_fit(angles, reason):
