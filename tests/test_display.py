@@ -6,7 +6,8 @@ import re
 import pytest
 import rich.console
 
-from jaxsense.show.terminal import Display
+from jaxsense.show.tables import Table
+from jaxsense.show.terminal import Display, print_table
 
 
 def show(display):
@@ -47,3 +48,13 @@ def test_a_quiet_display_records_and_shows_nothing(capsys):
     show(Display(console, [lambda **figures: records.append(figures)], quiet=True))
     assert capsys.readouterr().out == ""
     assert records[1] == {"stage": "dqn_camera", "step": 200, "loss": 0.25, "reward": 1.0}
+
+
+def test_a_table_is_not_cut_without_a_terminal():
+    table = Table("caption", [f"column {n} " + "x" * 20 for n in range(9)], [("row", ["1"] * 9)])
+    text = io.StringIO()
+    print_table(rich.console.Console(file=text, width=80), table)
+    assert all(name in text.getvalue() for name in table.columns)
+    narrow = io.StringIO()
+    print_table(rich.console.Console(file=narrow, width=80, force_terminal=True), table)
+    assert not any(name in narrow.getvalue() for name in table.columns)

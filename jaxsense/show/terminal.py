@@ -14,6 +14,7 @@ from rich.table import Column
 from jaxsense.show.tables import Table
 
 _LINE_PERIOD = 5.0  # s
+_ENDLESS = 10_000  # columns of a file or a pipe, where nothing is cut
 _WIDE = 110  # columns of a terminal, enough for a bar
 
 
@@ -150,4 +151,6 @@ def print_table(console: rich.console.Console, table: Table) -> None:
             for i, value in enumerate(values)
         )
         drawn.add_row(rich.text.Text(name), *cells)
+    if not console.is_terminal:
+        console = rich.console.Console(file=console.file, width=_ENDLESS, quiet=console.quiet)
     console.print(drawn)
