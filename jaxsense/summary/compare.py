@@ -154,6 +154,8 @@ def verdict(played: dict[str, Case]) -> str | None:
 
     def against(name: str) -> str:
         percent = 100 * (mean(own["time_s"]) / mean(played[name]["time_s"]) - 1)
+        if abs(percent) < 100 * _AS_FAST:
+            return "as fast as "
         return f"{abs(percent):.0f} % {'faster' if percent < 0 else 'slower'} than "
 
     text = f"The latent policy is {against('naive')}naive exploration"

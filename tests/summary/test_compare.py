@@ -105,6 +105,12 @@ def test_ratios_are_computed_anew_beside_what_stays():
     assert compare.compared({"latent": latent}) == {"latent": block(0.97, 1.5, 30.0)}
 
 
+@pytest.mark.parametrize(("seconds", "told"), [(39.9, "as fast as"), (40.4, "1 % slower than")])
+def test_less_than_half_a_percent_is_as_fast(seconds, told):
+    found = compare.verdict({**NAIVE, "latent": block(0.97, 1.5, seconds)})
+    assert found == f"The latent policy is {told} naive exploration."
+
+
 def test_the_verdict_names_naive_exploration_and_the_fastest_policy():
     latent = block(0.97, 1.5, 36.0)
     # 36 / 40 = .9 and 36 / 30 = 1.2; `random` is faster, but wrong, and nobody alone counts.
