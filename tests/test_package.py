@@ -107,10 +107,10 @@ def test_examples_of_your_robot_run(tmp_path, monkeypatch, capsys):
     page, names = ROOT / "docs" / "robot.md", {}
     with imports_from_archives():
         run_example(page, 0, names)
-        assert capsys.readouterr().out == "False [0.5 0.5]\n"
+        assert capsys.readouterr().out == "False {'cylinder': 0.5, 'cube': 0.5}\n"
         run_example(page, 1, names)
     assert names["scan"].shape == (683,)
-    assert capsys.readouterr().out.startswith("(683,) True [")
+    assert capsys.readouterr().out == "(683,) True\n"
 
 
 def test_example_of_the_settings_runs():
