@@ -27,13 +27,13 @@ def multiplying(models: jaxsense.Models) -> jaxsense.Models:
 
 
 if __name__ == "__main__":
-    config, key = jaxsense.PRESETS["smoke"], jax.random.key(0)
-    models = multiplying(jaxsense.init(key, config))  # or those of `jaxsense.load("runs/...")`
+    config, trained = jaxsense.load_pretrained("default")  # or `jaxsense.load("runs/...")`
+    key, models = jax.random.key(0), multiplying(trained)
     mdp, step = jaxsense.make_mdp(config, models), jax.jit(dqn.step)
     state = dqn.reset(key, mdp, seen=jnp.zeros((mdp.num_pois, 2), bool))
     for look in range(3):
         state, outcome = step(jax.random.key(look), mdp, state, jnp.int32(0), jnp.int32(look % 2))
         print(f"sigma {state.belief.std[0]} after look {look + 1}, reward {outcome.reward:.2f}")
     scenario = mission.make_mission(config)
-    play = jax.jit(lambda k, m: mission.rollout(k, scenario, m, mission.reset(k, scenario, m), 50))
+    play = jax.jit(lambda k, m: mission.rollout(k, scenario, m, mission.reset(k, scenario, m), 150))
     print(f"looks in a mission:\n{play(key, models)[0].times_seen}")
