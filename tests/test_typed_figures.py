@@ -35,7 +35,7 @@ NOT_PROSE = [
     re.compile(r"`[^`]*`"),
     re.compile(r"\]\([^)]*\)"),
     re.compile(r"\$[^$]*\$", re.DOTALL),
-    re.compile(r"(?:Python|JAX|mujoco|is at|Apache)[ -]\d+\.\d+(?:(?:,| and| or) \d+\.\d+)*"),
+    re.compile(r"(?:Python|JAX|mujoco|is at|Apache|CC BY)[ -]\d+\.\d+(?:(?:,| and| or) \d+\.\d+)*"),
     re.compile(r"95 %"),
 ]
 FIGURE = re.compile(

@@ -178,7 +178,7 @@ def _layers(*modules: Any) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Weights and biases of the dense layers in networks of PyTorch."""
     of_all = [layer for module in modules for layer in module.modules()]
     dense = [layer for layer in of_all if isinstance(layer, torch.nn.Linear)]
-    # Copies: training goes on in place.
+    # Copies: training changes them in place.
     return tuple(
         (each.weight.detach().numpy().T.copy(), each.bias.detach().numpy().copy()) for each in dense
     )

@@ -66,7 +66,7 @@ def require_angles(name: str, angles: np.ndarray) -> None:
     """
     wrong = np.asarray(angles)[~(np.abs(angles) <= _TURN)]
     if wrong.size:
-        expected = "must be within 2 pi to either side (in radians?)"
+        expected = "must be from -2 pi to 2 pi (in radians?)"
         raise ValueError(f"{name} = {wrong[0]:g}: {expected}")
 
 

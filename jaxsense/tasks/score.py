@@ -197,7 +197,7 @@ def estimate(values: Float[np.ndarray, " seeds"]) -> Estimate:
 
 
 def mean_return(key: Key, task: Task, policy: Policy | Recurrent, episodes: int) -> float:
-    """Plays a task with starts and looks of one's own, for example to draw a learning curve.
+    """Plays a task with other starts and looks than a score, for example to draw a learning curve.
 
     Args:
       key: random key; none is that of a score.

@@ -29,8 +29,8 @@ def test_the_rays_of_a_sensor_read_what_was_recorded_along_them():
     ("angles", "ranges", "expected"),
     [
         ([0, 0.1], [1, 1, 1], r"readings have the shape \(3,\): must be one for each of 2 angles"),
-        ([0, np.nan], [1, 1], r"angles = nan: must be within 2 pi to either side \(in radians\?\)"),
-        ([-180, 180], [1, 1], "angles = -180: must be within 2 pi to either side"),
+        ([0, np.nan], [1, 1], r"angles = nan: must be from -2 pi to 2 pi \(in radians\?\)"),
+        ([-180, 180], [1, 1], "angles = -180: must be from -2 pi to 2 pi"),
     ],
 )
 def test_a_scan_along_no_directions_is_refused(angles, ranges, expected):
@@ -136,7 +136,7 @@ def test_the_widest_part_that_was_recorded_counts():
             degrees(*range(150, 211, 10)),
             r"recorded part of the field of view of lidar = 0.0 degrees: must",
         ),
-        (degrees(0, np.nan, 10), "angles of lidar = nan: must be within 2 pi to either side"),
+        (degrees(0, np.nan, 10), "angles of lidar = nan: must be from -2 pi to 2 pi"),
     ],
 )
 def test_scans_that_do_not_suffice_are_refused_with_what_would_fit(angles, reason):
