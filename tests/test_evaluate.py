@@ -121,7 +121,9 @@ def test_paths_are_printed_as_they_are(evaluated, tmp_path, capsys):
     film, metrics = capsys.readouterr().out.splitlines()
     assert film == f"The first mission of latent is in {path}/mission-latent-0.svg."
     assert f" {path}/evaluations/{NAME}.json, and with all others in {path}/report.html." in metrics
-    evaluate._print(rich.console.Console(width=80), blocks, 1)
+    evaluate._print(
+        rich.console.Console(width=80, force_terminal=True, color_system=None), blocks, 1
+    )
     printed = capsys.readouterr().out
     assert "The latent policy is" in printed
     assert max(map(len, printed.split("The latent")[0].splitlines())) <= 80
