@@ -172,7 +172,9 @@ def test_wrong_shapes_raise_errors_that_name_the_argument():
 @pytest.mark.parametrize("modality", [-1, 2, 3])
 def test_a_modality_that_is_not_there_is_named(modality):
     params, seen = init(jax.random.key(0), TWO), jnp.array([False, False])
-    with pytest.raises(ValueError, match=rf"modality = {modality}: must be a whole number"):
+    with pytest.raises(
+        ValueError, match=rf"modality = {modality}: must be 0 \(camera\) or 1 \(lidar\)"
+    ):
         update(in_place(TWO, params), OLD, seen, look(TWO, 0), modality=modality)
 
 
