@@ -53,8 +53,6 @@ def update(old, seen, features):
         ("std", lambda: dqn.information(jnp.float32(1))),
         ("belief.mean", lambda: dqn.observation(belief(2))),
         ("belief.std", lambda: dqn.observation(Belief(zeros(3, 2), zeros(3, 1)))),
-        ("bank", lambda: train_on(zeros(3, 8, 2), zeros(3, 8, 4))),
-        ("bank", lambda: train_on(zeros(3, 8, 2), zeros(2, 8, 2))),
         ("features of lidar", lambda: encode(zeros(2), zeros(3))),
         ("z", lambda: vae.decode(jmvae.init(KEY, MODEL), MODEL, zeros(3))),
         ("seen", lambda: update(belief(2), zeros(3), zeros(2))),
@@ -65,6 +63,16 @@ def update(old, seen, features):
 def test_argument_is_named(name, call):
     with pytest.raises(AssertionError, match=rf"(^|\W){name}\W"):
         jax.eval_shape(call)
+
+
+def test_bank_of_another_size_is_named():
+    with pytest.raises(ValueError, match=r"bank of lidar has the shape \(3, 8, 4\)"):
+        jax.eval_shape(lambda: train_on(zeros(3, 8, 2), zeros(3, 8, 4)))
+
+
+def test_bank_of_other_classes_is_named():
+    with pytest.raises(ValueError, match="bank of lidar has 2 classes"):
+        jax.eval_shape(lambda: train_on(zeros(3, 8, 2), zeros(2, 8, 2)))
 
 
 def test_missing_features_are_named():
