@@ -11,10 +11,11 @@ from pathlib import Path
 from smoke import without_times
 
 # Other processors and compilers add and multiply in another order, which learning amplifies: in the
-# 300 steps of the shared run another line of JAX changed a figure of the JMVAE by 1.4 %.
+# 300 steps of the shared run another line of JAX changed a figure of the JMVAE by 1.4 %, another
+# processor by 2.5 %.
 # What the map says after many looks amplifies that in turn. Returns may be near 0, and of the 12
 # PoIs in the missions of the shared run one more may be right, or be looked at once more.
-TOLERANCES = {"detectors": 1e-3, "jmvae": 2e-2, "belief": 5e-2}
+TOLERANCES = {"detectors": 1e-3, "jmvae": 4e-2, "belief": 5e-2}
 NEAR_RETURN, NEAR_MISSION = 2e-2, 0.1
 NOISE = "/ece", "/nll", "/readout_error"
 UNTRAINED = "naive", "random"
@@ -60,8 +61,11 @@ def different_across_compilers(first, second):
         )
         found |= different(*of_block, tolerance)
     for modality in first["dqn"]:
-        agents = (summary["dqn"][modality] for summary in (first, second))
-        of_policies = (some(agent, "optimal", "one_step/optimal", *UNTRAINED) for agent in agents)
+        agents = [summary["dqn"][modality] for summary in (first, second)]
+        # A map that is hardly trained may be read too badly for an optimum, or just well enough.
+        known = all(agent["optimal"] is not None for agent in agents)
+        names = (*UNTRAINED, "optimal", "one_step/optimal") if known else UNTRAINED
+        of_policies = (some(agent, *names) for agent in agents)
         found |= different(*of_policies, TOLERANCES["jmvae"], NEAR_RETURN)
     for policy in UNTRAINED:
         cases = (summary["mission"][policy] for summary in (first, second))

@@ -28,15 +28,15 @@ def test_other_figures_are_found():
 
 def test_what_other_compilers_must_not_change_is_compared():
     reference = json.loads(REFERENCE.read_text(encoding="utf-8"))
-    for block, name, factor in (("jmvae", "moment_matching_error", 1.03), ("detectors", "x", 2)):
+    for block, name, factor in (("jmvae", "moment_matching_error", 1.05), ("detectors", "x", 2)):
         other = copy.deepcopy(reference)
         other[block][name] = other[block].get(name, 1.0) * factor
         assert different_across_compilers(reference, other)
     other = copy.deepcopy(reference)
     other["belief"]["bayes_nll"][2] *= 1.1
-    other["dqn"]["lidar"]["naive"] *= 1.03
-    reference["dqn"]["lidar"]["optimal"] = 1.0  # which the shared run does not have
-    other["dqn"]["lidar"]["optimal"] = 1.05
+    other["dqn"]["lidar"]["naive"] *= 1.05
+    reference["dqn"]["lidar"]["optimal"] = 1.0
+    other["dqn"]["lidar"]["optimal"] = 1.07
     other["dqn"]["camera"]["return"] *= 2  # of a policy that was trained
     other["mission"]["latent"]["accuracy"] /= 2
     other["mission"]["naive"]["accuracy"] -= 2 / 12
