@@ -29,7 +29,7 @@ _FARTHEST_MOVE = 1.0  # m, about as far as a robot that looks again drives
 
 @pytree
 class Live:
-    """Looks at scenes of the simulation, each with its own MJX arena.
+    """Simulates every look, with one MJX arena for each environment.
 
     Attributes:
       world: the simulation.
@@ -70,7 +70,9 @@ class Live:
 
 @pytree
 class Bank:
-    """Looks that are drawn from stored features; a scene holds only the classes of the PoIs.
+    """Draws looks from stored features, without simulation.
+
+    A scene holds only the classes of the PoIs.
 
     Attributes:
       features: for each modality `[C, S, D_m]`, S looks at every class.
@@ -292,7 +294,7 @@ def by_class(
 
 
 def detections(key: Key, config: Config, models: Models, samples: int) -> Samples:
-    """Features of simulated looks at every class, for a `Bank`.
+    """Simulates looks at every class and returns their features, for a `Bank`.
 
     Args:
       key: random key.

@@ -132,7 +132,7 @@ class Models:
 
 
 def make_jmvae(config: Config) -> Jmvae:
-    """Shape of the JMVAE for the modalities and classes of a configuration."""
+    """Makes the shape of the JMVAE of a configuration: modalities and layer sizes."""
     sizes = tuple(len(config.labels(m)) for m in config.modalities)
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
@@ -172,7 +172,7 @@ def make_prior(config: Config) -> Belief:
 
 
 def make_bayes(config: Config) -> Bayes:
-    """Exact Bayes filter over the classes of a configuration."""
+    """Makes the exact Bayes filter over the classes of a configuration."""
     return Bayes(jnp.array([config.label_of_class(m) for m in config.modalities]))
 
 
@@ -205,7 +205,7 @@ def make_readout(config: Config, classes: Belief) -> Readout:
 
 
 def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InPlace:
-    """Fusion in place, see `vae.InPlace`.
+    """Makes the paper's fusion in place, see `vae.InPlace`.
 
     Args:
       config: all settings.
@@ -217,7 +217,7 @@ def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InP
 
 
 def init(key: Key, config: Config) -> Models:
-    """Models with random parameters, to try functions before training.
+    """Initialises untrained models, to try functions before training.
 
     Args:
       key: random key.

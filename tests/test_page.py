@@ -276,7 +276,7 @@ def test_columns_are_explained_when_they_are_asked_about(read, run):
     text = (run / "report.html").read_text()
     meanings = re.findall(r'<details class="meanings">(.*?)</details>', text, re.DOTALL)
     assert any("<dt>right</dt><dd>Share of PoIs" in each for each in meanings)
-    assert text.count("Share of PoIs whose likeliest class is right.") == 2  # and of all metrics
+    assert text.count("Share of PoIs whose most likely class is right.") == 2  # and of all metrics
 
 
 def test_the_name_of_an_animation_is_escaped(run, tmp_path):

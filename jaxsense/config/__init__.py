@@ -1,4 +1,4 @@
-"""Settings of a run: frozen dataclasses that check themselves when they are made, and presets.
+"""Settings of a run, as frozen dataclasses that check themselves, and presets.
 
 An invalid value raises `ConfigError`, a `ValueError` whose one line names the field, its value and
 what would be right. The attribute docstrings are the text of `--help`.

@@ -23,7 +23,7 @@ _SMALLEST, _LARGEST = 1e-30, 1e30  # a product of two still fits float32
 
 
 class ConfigError(ValueError):
-    """An invalid setting: `field = value: what would be right`."""
+    """Raised for an invalid setting; its message is `field = value: what would be right`."""
 
     def __init__(self, field: str, value: object, expected: str):
         super().__init__(f"{field} = {_shown(value)}: {expected}")
@@ -153,7 +153,7 @@ def check_fields(section: object, bits: int = 31) -> None:
 
 
 def require_32_bits() -> None:
-    """Checks that JAX computes in 32 bits.
+    """Checks that JAX's 64-bit mode is off.
 
     Raises:
       ConfigError: if it computes in 64 bits, which jaxsense does not support.

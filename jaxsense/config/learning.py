@@ -14,15 +14,15 @@ _MAX_WEIGHT = 1_000_000
 
 
 class DetectorConfig(Section, place="detector"):
-    """The scanline detectors f_x and f_w."""
+    """The detectors, which classify scanlines; f_x and f_w in the paper."""
 
     hidden: tuple[int, ...] = limited((64, 64), at_least=1, min_items=1)
     """Sizes of the hidden layers; not used if the JMVAE learns from scans."""
     num_scans: int = limited(98304, at_least=1)
     """Simulated scans to train on, per modality."""
     calibration: float = limited(0.0, at_least=0, at_most=0.5)
-    """Share of these scans that calibrates the detector instead, or the encoder if the JMVAE learns
-    from scans: the temperature of its probabilities maximises their likelihood."""
+    """Share of these scans that is set aside to calibrate the detector, or the encoder if the JMVAE
+    learns from scans: the temperature of its probabilities is fitted by maximum likelihood."""
     num_held_out: int = limited(8192, at_least=1)
     """Simulated scans for measuring the accuracy."""
     num_repeats: int = limited(0, at_least=0, at_most=1_000_000)
@@ -53,7 +53,7 @@ class JmvaeConfig(Section, place="jmvae"):
     """The joint multi-modal VAE."""
 
     learns_from: Literal["detections", "scans"] = "detections"
-    """What the JMVAE learns from. `scans` needs neither detectors nor labels: looks are grouped by
+    """Training data of the JMVAE. `scans` needs neither detectors nor labels: looks are grouped by
     PoI, and the encoders serve as detectors, see `jaxsense.vae.leave_one_out`. `jmvae.fusion` must
     then be `filter`."""
     latent_size: int = limited(2, at_least=1, at_most=256)
@@ -67,22 +67,22 @@ class JmvaeConfig(Section, place="jmvae"):
     beta: Traced[float] = limited(0.001, above=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to the prior."""
     initial_beta: Traced[float] = limited(0.7, above=0, at_most=_MAX_WEIGHT)
-    """Initial value of beta; far above beta, latent dimensions come into use one by one."""
+    """Initial value of beta; far above `beta`, latent dimensions come into use one by one."""
     annealing: Traced[float] = limited(0.5, at_least=0, at_most=1)
-    """Share of the training during which beta falls from initial_beta to beta."""
+    """Share of the training during which beta falls from `initial_beta` to `beta`."""
     reconstruction_weights: Traced[tuple[float, ...]] = limited(
         (10.0, 10.0), at_least=0, at_most=_MAX_WEIGHT, min_items=1
     )
     """Weight of each modality's reconstruction, in the order of `modalities`."""
     fusion: Literal["in_place", "filter"] = "in_place"
     """How a look updates a belief. `in_place`, as in the paper, replaces it. `filter` accumulates
-    looks, see the section filter."""
+    looks, see section `filter`."""
     restarts: int = limited(3, at_least=1, at_most=1000)
-    """Trainings from different random parameters. The run keeps the one with the lowest loss among
-    those whose beliefs give class probabilities back exactly, or among all if the JMVAE learns from
-    scans."""
+    """Number of trainings from different random parameters. The run keeps the one with the lowest
+    loss among those from whose beliefs class probabilities are read back exactly, or among all if
+    the JMVAE learns from scans."""
     looks: int = limited(4, at_least=2, at_most=100)
-    """Looks by each sensor at a PoI, if the JMVAE learns from scans."""
+    """Number of looks by each sensor at a PoI, if the JMVAE learns from scans."""
     samples_per_class: int = limited(10000, at_least=1)
     """Detections per class and modality in the training set."""
     steps: int = limited(3000, at_least=1)
@@ -138,7 +138,7 @@ class FilterConfig(Section, place="filter"):
     hidden: tuple[int, ...] = limited((32,), at_least=1, min_items=1)
     """Sizes of the hidden layers of each modality's network."""
     looks: int = limited(6, at_least=1, at_most=100)
-    """Looks in each training sequence."""
+    """Number of looks in each training sequence."""
     steps: int = limited(2000, at_least=1)
     """Gradient steps."""
     batch: int = limited(256, at_least=1)
@@ -155,7 +155,7 @@ class FilterConfig(Section, place="filter"):
 
 
 class MdpConfig(Section, place="mdp"):
-    """The map of beliefs as a Markov decision process."""
+    """The map MDP, a Markov decision process whose states are maps of beliefs."""
 
     unseen_variance: Traced[float] = limited(20.0, above=0, at_most=_MAX_WEIGHT)
     """Variance of each latent dimension of the prior, the belief before any look."""
@@ -163,17 +163,18 @@ class MdpConfig(Section, place="mdp"):
     """Reward of a look. `paper`: the gain of 1 / ||sigma||, or -1, see `min_increase`.
     `nats`: the information gained about the class, minus `look_cost`."""
     look_cost: Traced[float] = limited(0.05, at_least=0, at_most=_MAX_WEIGHT)
-    """Cost of a look with the reward `nats`."""
+    """Cost of a look, in nats; only with the reward `nats`."""
     min_increase: Traced[float] = limited(0.05, at_least=0)
-    """Gain of information, in inverse latent units, up to which a look's reward is -1."""
+    """Threshold of the reward `paper`: a look that gains no more information than this, in inverse
+    latent units, is rewarded with -1."""
     max_steps: Traced[int] = limited(20, at_least=1, at_most=10_000)
     """Maximum length of an episode, in actions."""
     partly_seen_starts: bool = False
-    """Exclude starts where every modality has seen every PoI, or none has seen any."""
+    """Whether to exclude starts where every modality has seen every PoI, or none has seen any."""
 
 
 class TravelConfig(Section, place="team.travel"):
-    """The model of travel: a robot turns to a PoI, drives straight until it is near, and looks."""
+    """The travel model: a robot turns to a PoI, drives straight until it is near, and looks."""
 
     speed: Traced[float] = limited(0.2, above=0)
     """Driving speed, in metres per second."""
@@ -186,14 +187,14 @@ class TravelConfig(Section, place="team.travel"):
 
 
 class ToursConfig(Section, place="team.tours"):
-    """Training of the order in which a team visits its PoIs, see `jaxsense.dqn.tours`."""
+    """Training of the network that orders a team's visits, see `jaxsense.dqn.tours`."""
 
     states: int = limited(65536, at_least=1)
-    """States in which choices are tried, rounded up to whole chunks."""
+    """Number of states in which choices are tried, rounded up to whole chunks."""
     tries: int = limited(4, at_least=2)
-    """Choices tried in each state."""
+    """Number of choices tried in each state."""
     walk: Traced[int] = limited(8, at_least=0, at_most=10_000)
-    """Maximum number of choices before the state in which alternatives are tried."""
+    """Maximum number of choices made before the state in which alternatives are tried."""
     steps: int = limited(3200, at_least=0)
     """Gradient steps. With 0, no order is learned, and an auction orders the looks that pay, as
     with `dqn.task` = `map`."""
@@ -244,27 +245,27 @@ class TeamConfig(Section, place="team"):
 
 
 class DqnConfig(Section, place="dqn"):
-    """The deep Q-network of each modality."""
+    """Deep Q-learning, with one network for each modality or for a team."""
 
     task: Literal["map", "team"] = "map"
-    """`map`: a single agent looks at `arena.num_pois` PoIs, and looks take no time, as in the
-    paper; each modality has a dense network. `team`: robots share the map, see the section team;
-    one network serves any number of PoIs and robots."""
+    """MDP to learn. `map`: a single agent looks at `arena.num_pois` PoIs, and looks take no time,
+    as in the paper; each modality has a dense network. `team`: robots share the map, see section
+    `team`; one network serves any number of PoIs and robots."""
     observe: Literal["live", "bank"] = "live"
-    """`live` casts a scan in the environment's own arena at every step; `bank` draws from stored
-    detections."""
+    """Source of looks. `live` casts a scan in the environment's own arena at every step; `bank`
+    draws stored detections, which is faster."""
     hidden: tuple[int, ...] = limited((24, 24), at_least=1, min_items=1)
     """Sizes of the hidden layers."""
     num_envs: int = limited(512, at_least=1)
-    """Environments that step in parallel."""
+    """Number of environments that step in parallel."""
     epochs: int = limited(800, at_least=1)
-    """Epochs, each of one step per environment and `updates` gradient steps."""
+    """Number of epochs, each of one step per environment and `updates` gradient steps."""
     updates: int = limited(64, at_least=1)
     """Gradient steps per epoch."""
     batch: int = limited(512, at_least=1)
     """Transitions per gradient step."""
     replay_capacity: int = limited(512000, at_least=1)
-    """Capacity of the replay, in transitions; a multiple of num_envs."""
+    """Capacity of the replay memory, in transitions; a multiple of `num_envs`."""
     discount: Traced[float] = limited(0.5, at_least=0, at_most=1)
     """Discount factor, gamma: per step, or per second with `dqn.task` = `team`."""
     learning_rate: Traced[float] = limited(1e-3, above=0, at_most=1)
@@ -280,7 +281,7 @@ class DqnConfig(Section, place="dqn"):
     target_period: Traced[int] = limited(50, at_least=1)
     """Epochs between updates of the target network."""
     num_starts: int = limited(8192, at_least=1)
-    """Start states, prepared once and divided among the environments; a multiple of num_envs."""
+    """Start states, prepared once and divided among the environments; a multiple of `num_envs`."""
     chunk: int = limited(100, at_least=1)
     """Epochs between reports of progress."""
 
@@ -320,7 +321,7 @@ class EvaluationConfig(Section, place="evaluation"):
     """Evaluation of the trained policies."""
 
     num_starts: int = limited(512, at_least=1)
-    """Start states of the episodes."""
+    """Number of start states of the episodes."""
     num_repeats: Traced[int] = limited(96, at_least=1)
     """Episodes per start state, to average over the noise of detections; an eighth as many for all
     policies but the learned and the optimal one."""

@@ -7,16 +7,16 @@ from jaxsense.config.section import Section, Traced
 MAX_EPISODES = 100_000
 """Maximum number of missions of one policy."""
 NODES_PER_POI = 10
-"""Waypoints of the roadmap around each PoI."""
+"""Number of waypoints of the roadmap around each PoI."""
 VIEW_SIDES = 16
-"""Directions of viewpoints around a PoI."""
+"""Number of directions from which a PoI has viewpoints."""
 
 
 class NavigationConfig(Section, place="navigation"):
     """Navigation of a robot: the paper's move_base, with the AMiRo's parameters."""
 
     horizon: Traced[float] = limited(2.0, at_least=1, at_most=60)
-    """Length of a trajectory, in seconds."""
+    """Length of the trajectories that a robot simulates to choose its speed, in seconds."""
     robot_radius: Traced[float] = limited(0.1, above=ROBOT_RADIUS)
     """Radius of a robot in planning, in metres; that of its body is 0.05."""
     inflation: Traced[float] = limited(0.1, at_least=0)
@@ -35,7 +35,7 @@ class NavigationConfig(Section, place="navigation"):
 
 
 class SearchConfig(Section, place="mission.localisation.search"):
-    """Search for a PoI in the scan of a robot that may be misplaced; off by default.
+    """Robots with localisation errors search their scans for the PoI; off by default.
 
     The gate judges all windows and distances that errors up to these could explain. A robot also
     keeps a distance of at least `viewpoint.min_distance` plus `position` from the PoI.
@@ -55,7 +55,7 @@ class SearchConfig(Section, place="mission.localisation.search"):
 
 
 class LocalisationConfig(Section, place="mission.localisation"):
-    """Errors of the poses that robots believe they have; 0 in all presets.
+    """Localisation errors, by which believed poses differ from true ones; 0 in all presets.
 
     All errors are normally distributed, and those of x and y are independent.
     """
@@ -74,7 +74,7 @@ class LocalisationConfig(Section, place="mission.localisation"):
     """Standard deviation of the error of the heading that one metre of driving adds, in degrees; it
     grows with the square root of the distance."""
     search: SearchConfig = SearchConfig()
-    """Search for a PoI in the scan of a robot that may be misplaced."""
+    """Search of scans for the PoI, for robots with localisation errors."""
 
 
 class CommunicationConfig(Section, place="mission.communication"):
@@ -100,7 +100,7 @@ class CommunicationConfig(Section, place="mission.communication"):
 
 
 class MissionConfig(Section, place="mission"):
-    """The closed loop of all robots in one arena."""
+    """Missions, in which all robots act in closed loop in one arena."""
 
     policies: tuple[str, ...] = limited(("latent", "naive", "random"), min_items=1)
     """Policies that play missions at the end of a run: any of `latent`, `greedy`, `bayes`,
@@ -113,12 +113,12 @@ class MissionConfig(Section, place="mission"):
     control_period: float = 0.1
     """Seconds between a robot's decisions, and between its scans."""
     auctions: Traced[bool] = True
-    """Whether robots divide the PoIs that their policy finds worth a look by an auction of travel
-    times, if the policy allows any order. Otherwise, they follow the values and the next three
-    rules."""
+    """Whether robots divide the PoIs that are worth a look among themselves by an auction, in which
+    they bid travel times, if their policy prescribes no order. Otherwise, they follow its values,
+    and `equal_values`, `avoids_targets` and `nearest_first` break ties."""
     equal_values: Traced[float] = limited(0.1, at_least=0)
-    """Actions whose values are this close to the best, in units of the reward, count as equally
-    good; see `nearest_first` and `avoids_targets`."""
+    """Tolerance, in units of the reward: actions whose values are this close to the best count as
+    equally good; see `avoids_targets` and `nearest_first`."""
     nearest_first: Traced[bool] = True
     """Whether a robot takes the nearest of equally good PoIs; otherwise the first."""
     redecides: Traced[bool] = True
@@ -128,10 +128,10 @@ class MissionConfig(Section, place="mission"):
     least_confidence: Traced[float] = limited(0.98, at_least=0, below=1)
     """Minimum probability of the most likely label for a scan to update the map."""
     attempts: Traced[int] = limited(3, at_least=1)
-    """Failed looks or goals after which a robot gives up a PoI. Before it finishes, it retries PoIs
-    where it was stuck, with the same number of attempts."""
+    """Number of failed looks or goals after which a robot gives up a PoI. Before it finishes, it
+    retries PoIs where it was stuck, with the same number of attempts."""
     localisation: LocalisationConfig = LocalisationConfig()
-    """Errors of the poses that robots believe they have."""
+    """Localisation errors."""
     communication: CommunicationConfig = CommunicationConfig()
     """Messages between robots about their looks."""
 

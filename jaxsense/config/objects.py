@@ -13,7 +13,7 @@ _MAX_NAME = 64  # letters; it becomes part of the names of files
 
 
 class Shape(Checked, place="shape"):
-    """An upright solid of the ray-caster, as high as all PoIs."""
+    """A shape of PoIs: an upright cylinder or box, `arena.poi_height` high."""
 
     primitive: Literal["cylinder", "box"]
     """The solid."""
@@ -28,7 +28,7 @@ class Shape(Checked, place="shape"):
 
 
 class Attribute(Checked, place="attribute"):
-    """A number of each PoI besides colour and shape, for example a temperature."""
+    """A numeric property of each PoI besides colour and shape, for example its temperature."""
 
     values: Mapping[str, float]
     """Number of each word that a class can have."""
@@ -52,7 +52,7 @@ COLOURS: Mapping[str, tuple[float, float, float]] = FrozenDict(
 """Built-in colours: albedo, linear RGB in [0, 1]."""
 
 SHAPES: Mapping[str, Shape] = FrozenDict({"cylinder": Shape("cylinder"), "cube": Shape("box")})
-"""Built-in shapes."""
+"""Built-in shapes of PoIs."""
 
 
 def require_words(names: Mapping[str, object], field: str) -> None:

@@ -193,7 +193,7 @@ _RECORDED = Config(
 )
 
 PresetName = Literal["default", "paper", "noisy", "many", "raw", "team", "recorded", "smoke"]
-"""The names of `PRESETS`."""
+"""Name of a preset, a key of `PRESETS`."""
 
 PRESETS: Mapping[str, Config] = FrozenDict(
     {
@@ -207,7 +207,7 @@ PRESETS: Mapping[str, Config] = FrozenDict(
         "smoke": _SMOKE,
     }
 )
-"""Settings to start a run from, by name.
+"""Ready-made settings of a run, by name.
 
 `default`: the best settings we know. `paper`: the paper's settings where it states them, otherwise
 settings chosen to reproduce its figures, see `docs/differences.md`. `noisy`: detections that are

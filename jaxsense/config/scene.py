@@ -32,17 +32,18 @@ class ArenaConfig(Section, place="arena"):
     num_pois: int = limited(3, at_least=1, at_most=64)
     """Number of points of interest."""
     poi_radius: float = limited(0.1, above=0)
-    """Radius of a cylinder and half the side of a cube, in metres; unit of custom shapes."""
+    """Radius of a cylinder and half the side of a cube, in metres; unit of the sides of custom
+    shapes."""
     poi_height: float = limited(0.2, above=LIDAR_HEIGHT, at_most=10)
     """Height of a PoI, in metres; more than 0.152, or the LiDAR looks over it."""
     poi_gap: float = limited(0.3, above=0)
-    """Smallest gap between two PoIs, in metres; a robot needs 0.1 to pass."""
+    """Minimum gap between two PoIs, in metres; a robot needs 0.1 to pass."""
     classes: tuple[str, ...] = limited(("green cylinder", "red cylinder", "red cube"), min_items=2)
     """Classes of PoIs, all equally likely: `"COLOUR SHAPE"` and a word for each of `attributes`."""
     colours: Mapping[str, tuple[float, float, float]] = limited(COLOURS, at_least=0, at_most=1)
     """Albedo of each colour, linear RGB in [0, 1]."""
     shapes: Mapping[str, Shape] = SHAPES
-    """Solid of each shape. Every PoI carries all of them, and rays are cast at each."""
+    """Geometry of each shape. Rays are tested against every shape at every PoI, used or not."""
     attributes: Mapping[str, Attribute] = FrozenDict()
     """Attributes besides colour and shape, for custom sensors."""
 
@@ -142,7 +143,7 @@ class ArenaConfig(Section, place="arena"):
 
 
 class LidarConfig(Section, place="lidar"):
-    """The Hokuyo URG-04LX on the AMiRo."""
+    """The AMiRo's LiDAR, a Hokuyo URG-04LX."""
 
     num_beams: int = limited(683, at_least=1, at_most=100_000)
     """Beams per scan."""
@@ -153,20 +154,20 @@ class LidarConfig(Section, place="lidar"):
     max_range: Traced[float] = limited(5.0, above=0, at_most=1000)
     """Longest measured distance, in metres; also the reading of a beam without a return."""
     range_noise: Traced[float] = limited(0.01, at_least=0)
-    """Standard deviation of a measured distance, in metres; see `range_noise_growth`."""
+    """Standard deviation of a measured distance, in metres; `range_noise_growth` adds to it."""
     range_noise_growth: float = limited(0.0, at_least=0, at_most=1)
     """Growth of that standard deviation with the distance, in metres per metre."""
     mixed_pixels: float = limited(0.0, at_least=0, at_most=1)
-    """Probability that a beam returns a distance between its surface and its neighbour's; at an
-    edge, no surface is there."""
+    """Probability that a beam returns a distance between that of its surface and that of its
+    neighbour's; at an edge, this is a point in empty space."""
     dropout: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam has no return."""
     window: int = limited(128, at_least=1)
-    """Beams around the PoI's bearing that the detector reads."""
+    """Number of beams around the PoI's bearing that the detector reads."""
     stride: int = limited(1, at_least=1)
     """Step between the beams that the detector reads, in beams."""
     window_range: Traced[float] = limited(1.5, above=0)
-    """Longest distance in the detector's input, in metres; it cuts off the background."""
+    """Distance at which the detector's input is clipped, in metres; removes the background."""
 
     def check(self) -> None:
         """Checks the order of distances, and the window; raises `ConfigError`."""
@@ -178,10 +179,10 @@ class LidarConfig(Section, place="lidar"):
 
 
 class CameraConfig(Section, place="camera"):
-    """One line of pixels of the camera on the AMiRo."""
+    """The AMiRo's camera, of which one line of pixels is used."""
 
     num_pixels: int = limited(640, at_least=1, at_most=100_000)
-    """Pixels of the scanline."""
+    """Number of pixels of the scanline."""
     field_of_view: float = limited(80.0, above=0, below=180)
     """Horizontal field of view, in degrees."""
     pixel_noise: Traced[float] = limited(0.007, at_least=0, at_most=1)
@@ -198,10 +199,10 @@ class CameraConfig(Section, place="camera"):
     """Distance over which exposure, colour cast, low light and shadow change, in metres: their
     correlation is a Gaussian function of the distance, with this standard deviation."""
     light_time: Traced[float] = limited(60.0, above=0)
-    """Time over which they change, in seconds; their correlation is a Gaussian function of it,
-    too."""
+    """Time over which exposure, colour cast, low light and shadow change, in seconds: their
+    correlation is a Gaussian function of time, too, with this standard deviation."""
     window: int = limited(80, at_least=1)
-    """Pixels around the PoI's bearing that the detector reads."""
+    """Number of pixels around the PoI's bearing that the detector reads."""
     stride: int = limited(4, at_least=1)
     """Step between the pixels that the detector reads, in pixels."""
 
@@ -222,7 +223,7 @@ class ViewpointConfig(Section, place="viewpoint"):
     bearing_error: Traced[float] = limited(1.0, at_least=0, at_most=10)
     """Largest error of the bearing on which the detector's window is centred, in degrees."""
     clearance: Traced[float] = limited(0.03, at_least=0)
-    """Free space around the robot at a viewpoint, in metres."""
+    """Minimum free space around a robot at a viewpoint, in metres."""
 
     def check(self) -> None:
         """Checks the order of distances; raises `ConfigError`."""
@@ -231,7 +232,7 @@ class ViewpointConfig(Section, place="viewpoint"):
 
 
 class SensorConfig(Checked, place="sensor"):
-    """A custom sensor, carried like a camera or a LiDAR."""
+    """A custom sensor, which a robot carries like the camera or the LiDAR."""
 
     make: str
     """Function that makes the `sim.Sensor` from a `Config`, as `package.module:function`: a name,

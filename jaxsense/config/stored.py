@@ -29,7 +29,7 @@ def from_plain(stored: object, base: Config | None = None) -> Config:
 
 
 def parse_json(text: str) -> object:
-    """Parses JSON.
+    """Parses JSON strictly: no deep nesting, no field twice.
 
     Raises:
       ValueError: if the text is not JSON, is nested too deeply, or names a field twice.
@@ -51,7 +51,7 @@ def _without_twins(fields: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def require_trust(config: Config) -> None:
-    """Checks that making the sensors would run no code that the settings name.
+    """Raises an error if settings name custom sensors, whose code would run.
 
     Raises:
       ConfigError: if there are custom sensors.

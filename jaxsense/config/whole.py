@@ -40,9 +40,9 @@ class Config(Section):
     modalities: tuple[str, ...] = limited(
         ("camera", "lidar"), min_items=1, max_items=_MAX_MODALITIES
     )
-    """The sensors that are trained."""
+    """Sensors to train: `camera`, `lidar` and names of `sensors`."""
     robots: tuple[str, ...] | None = limited(None, min_items=1, max_items=_MAX_ROBOTS)
-    """The robots of missions, each named by the modality of its sensor; several may share one. By
+    """The robots of missions, each given by the modality of its sensor, which several may share. By
     default, one robot for each of `modalities`."""
     sensors: Mapping[str, SensorConfig] = FrozenDict()
     """Custom sensors, by the name of their modality."""
@@ -257,7 +257,7 @@ class Config(Section):
 
 
 def names_of_robots(carried: Sequence[str]) -> tuple[str, ...]:
-    """Names of robots: the modality, numbered from 1 if several robots share it.
+    """Names robots by their modality, numbered from 1 if several share it.
 
     Args:
       carried: modality of each robot.

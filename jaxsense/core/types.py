@@ -30,7 +30,10 @@ Samples = tuple[Float[Array, "C _ _"], ...]
 
 @dataclass_transform(frozen_default=True, field_specifiers=(struct.field,))
 def pytree(cls: type[T]) -> type[T]:
-    """Makes a frozen dataclass that is a pytree; static fields may hold any hashable value."""
+    """Class decorator: makes a frozen dataclass that is a pytree.
+
+    Static fields may hold any hashable value.
+    """
     return struct.dataclass(cls)
 
 
@@ -65,7 +68,7 @@ class Reliability:
 
 
 class Fusion(Protocol):
-    """How looks update beliefs; a frozen pytree."""
+    """Protocol of a fusion, which updates beliefs with looks; a frozen pytree."""
 
     @property
     def accumulates(self) -> bool:
@@ -116,7 +119,7 @@ class Fusion(Protocol):
 
 @pytree
 class Transition:
-    """One step of the map MDP for a Q-network to learn from, or a batch as columns.
+    """One transition of an MDP, or a batch of them, from which a Q-network learns.
 
     Attributes:
       s_tm1: `[S, ...]` float32 observation before the action, see `Agent.observe`.

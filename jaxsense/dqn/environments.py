@@ -203,7 +203,7 @@ class Environment(Protocol, Generic[S]):
 
 @pytree
 class MapEnvironment:
-    """The map MDP of one agent.
+    """Environment for `train`: the map MDP of one agent.
 
     Attributes:
       agent: the learner.
@@ -270,7 +270,7 @@ class SmdpState:
 
 @pytree
 class TeamEnvironment:
-    """The team MDP, whose robots share one agent.
+    """Environment for `train`: the team MDP, whose robots share one agent.
 
     Attributes:
       agent: the learner.

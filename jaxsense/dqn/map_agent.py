@@ -189,7 +189,7 @@ class MapAgent:
 
 
 def observation(belief: Belief) -> Float[Array, " S"]:
-    """Mean and standard deviation of each PoI's belief, `[N * 2D]`, PoI by PoI.
+    """Concatenates mean and standard deviation of each PoI's belief, `[N * 2D]`, PoI by PoI.
 
     Raises:
       ValueError: if a standard deviation is not positive.

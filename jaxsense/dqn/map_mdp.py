@@ -21,7 +21,7 @@ from jaxsense.dqn.rewards import Reward
 
 
 class Looks(Protocol):
-    """How an MDP looks at a scene; a frozen pytree.
+    """Protocol of the source of an MDP's looks, for example `Bank` or `Live`; a frozen pytree.
 
     Attributes:
       num_modalities: M.
@@ -103,7 +103,7 @@ class MapMdp:
 
 @pytree
 class MapState:
-    """The map, and the scene that it describes.
+    """State of the map MDP: the map, and the scene that it describes.
 
     Attributes:
       belief: `[N, D]` the map.
@@ -122,7 +122,7 @@ class MapState:
 
 @pytree
 class Outcome:
-    """Outcome of an action.
+    """Outcome of an action: reward, duration, and whether the episode has ended.
 
     Attributes:
       reward: `[]` float32.

@@ -139,7 +139,7 @@ def _rows(sums, steps: int):
 
 
 def interpolate(table: Float[Array, " P"], probabilities: Float[Array, " C"]) -> Float[Array, ""]:
-    """Reads a table between the points of the lattice.
+    """Interpolates a table of values linearly between the points of the lattice.
 
     Args:
       table: `[P]` values at the points of `lattice`.
@@ -184,7 +184,7 @@ def value_iteration(
     max_points: int = MAX_POINTS,
     start: Float[Array, " C"] | None = None,
 ) -> LookValues:
-    """The values of one modality's looks.
+    """Computes the values of one modality's looks by dynamic programming.
 
     Instead of classes, all may be of a sensor's labels, if the reward depends on them alone.
 

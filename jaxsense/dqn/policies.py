@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 @pytree
 class Known:
-    """What a robot knows when it chooses.
+    """Input of a policy: what a robot knows when it chooses.
 
     Attributes:
       belief: `[N, D]` the map.
@@ -89,7 +89,7 @@ Values = Callable[[Key, Trained, Known], jax.Array]
 
 @dataclasses.dataclass(frozen=True)
 class Policy:
-    """A policy.
+    """A policy: a function that values looks, and how missions use the values.
 
     Attributes:
       values: see `Values`.
@@ -296,4 +296,4 @@ POLICIES: dict[str, Policy] = {
     "auction": Policy(_by_rule(rules.auction), _always),
     "rollout": Policy(_by_rule(rules.gain_rate), _always),
 }
-"""The policies of jaxsense, by name."""
+"""Built-in policies, by name."""

@@ -1,4 +1,4 @@
-"""A replay memory as pure functions: a ring of rounds, each with one transition per environment.
+"""Replay memory as pure functions: a ring buffer of rounds, with a transition per environment.
 
 Transitions are columns, drawn in blocks of neighbouring environments: copying a few pieces of
 memory is many times faster than picking single numbers.
@@ -14,7 +14,7 @@ from jaxsense.core.types import Transition, pytree
 
 @pytree
 class Replay:
-    """The memory.
+    """The replay memory.
 
     Attributes:
       columns: `[T, G, K, W]` float32, T rounds of G blocks of W environments.
@@ -26,7 +26,7 @@ class Replay:
 
 
 def init(state_size: int, rounds: int, blocks: int, width: int) -> Replay:
-    """An empty memory.
+    """Creates an empty memory.
 
     Args:
       state_size: numbers in a state.
@@ -39,7 +39,7 @@ def init(state_size: int, rounds: int, blocks: int, width: int) -> Replay:
 
 
 def add(replay: Replay, transitions: Transition) -> Replay:
-    """Adds a round in place of the oldest.
+    """Adds a round, which replaces the oldest once the memory is full.
 
     Args:
       replay: the memory.

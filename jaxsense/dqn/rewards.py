@@ -13,7 +13,7 @@ from jaxsense.core.types import Belief, pytree
 
 
 class Reward(Protocol):
-    """The reward of a look; a frozen pytree."""
+    """Protocol of the reward of a look; a frozen pytree."""
 
     @property
     def is_of_labels(self) -> bool:
@@ -66,7 +66,7 @@ class Paper:
 
 @pytree
 class Nats:
-    """The entropy that a look removes, minus the cost of the look.
+    """Reward in nats: the entropy that a look removes, minus the cost of the look.
 
     Attributes:
       look_cost: `[]` in nats.
@@ -101,7 +101,9 @@ def make(config: MdpConfig) -> Reward:
 
 
 def information(std: Float[Array, "... D"]) -> Float[Array, "..."]:
-    """Information of a belief, `I = 1 / ||std||_2` (Korthals et al. 2018, Sec. IV).
+    """Computes the information of a belief, `I = 1 / ||std||_2`.
+
+    Korthals et al. 2018, Sec. IV.
 
     Args:
       std: `[..., D]` positive standard deviations.

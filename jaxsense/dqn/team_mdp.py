@@ -52,7 +52,7 @@ class Team:
 
 @pytree
 class TeamState:
-    """The state before a choice.
+    """State of the team MDP before a robot's choice.
 
     Attributes:
       map: the map, and the scene that it describes.

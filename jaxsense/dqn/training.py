@@ -25,7 +25,7 @@ _EVALUATED = 10  # epochs
 
 @pytree
 class DqnState(Generic[S]):
-    """Training state between two chunks of epochs.
+    """State of a training between two chunks of epochs.
 
     Attributes:
       params: of the Q-network.
@@ -131,7 +131,7 @@ def starts(key: Key, environment: Environment[S], config: DqnConfig) -> S:
 def train(
     key: Key, environment: Environment[S], config: DqnConfig
 ) -> tuple[DqnState[S], EpochInfo]:
-    """Trains one agent; `vmap` over `key` for several seeds.
+    """Trains one agent by deep Q-learning; `vmap` over `key` for several seeds.
 
     Args:
       key: random key.

@@ -1,4 +1,4 @@
-"""The map MDP and the team MDP behind the interfaces of other libraries, one extra each.
+"""Environments for other libraries: the tasks, the map MDP and the team MDP.
 
 Import `jaxsense.interfaces.gymnax`, `.rejax`, `.gymnasium`, `.stable_baselines3`, `.jaxmarl` or
 `.pettingzoo` by name; only that library must be installed.

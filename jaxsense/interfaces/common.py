@@ -110,7 +110,7 @@ def environment_spaces(spaces: Any, played: Environment) -> tuple[Any, Any]:
 
 
 def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> Any:
-    """Random states, `[number]`, for episodes to start from.
+    """Draws random states, `[number]`, for episodes to start from.
 
     A start looks at everything it has seen, which costs several steps; a draw from a few thousand
     prepared ones costs nothing.

@@ -34,7 +34,7 @@ with extra("gymnasium"):
 
 
 class TaskEnv(Env):
-    """A task, step by step: `gymnasium.make("jaxsense/noisy-v0")`.
+    """A task as an environment: `gymnasium.make("jaxsense/noisy-v0")`.
 
     One policy chooses, for a team for the robot whose turn it is. Action n < N looks at PoI n;
     action N is NOP. `action_mask` in the infos, `[N + 1]` int8, is 1 for the actions that exist.
@@ -138,12 +138,12 @@ class TaskEnv(Env):
 
 
 class MapVectorEnv(VectorEnv):
-    """Many environments of one policy, stepped side by side by one compiled program.
+    """A vector environment, stepped by one compiled program.
 
-    Of a task, see `TaskEnv`, or of the map MDP of one agent, whose observations are the `[N * 2D]`
-    map, see `dqn.observation`. Action n < N looks at PoI n; action N is NOP and terminates the
-    episode. `action_mask` in the infos, `[E, N + 1]` int8, is 1 for the actions that exist. The
-    methods are Gymnasium's.
+    It plays a task, see `TaskEnv`, or the map MDP of one agent, whose observations are the
+    `[N * 2D]` map, see `dqn.observation`. Action n < N looks at PoI n; action N is NOP and
+    terminates the episode. `action_mask` in the infos, `[E, N + 1]` int8, is 1 for the actions that
+    exist. The methods are Gymnasium's.
     """
 
     def __init__(
@@ -278,7 +278,7 @@ def make_vec(
     starts: int | None = None,
     autoreset_mode: "AutoresetMode | str" = AutoresetMode.NEXT_STEP,
 ) -> MapVectorEnv:
-    """Many environments of a task: `gymnasium.make_vec("jaxsense/noisy-v0", num_envs=64)`.
+    """Makes a vector environment: `gymnasium.make_vec("jaxsense/noisy-v0", num_envs=64)`.
 
     Args:
       task: from `jaxsense.make`, or its name.

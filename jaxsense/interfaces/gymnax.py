@@ -23,7 +23,7 @@ with extra("gymnax"):
 
 @struct.dataclass
 class MapEnvState(environment.EnvState):
-    """The state of an environment.
+    """State of `MapEnv`.
 
     Attributes:
       time: `[]` int32 actions so far.
@@ -37,7 +37,7 @@ class MapEnvState(environment.EnvState):
 
 @struct.dataclass
 class MapEnvParams(environment.EnvParams):
-    """Parameters of an environment.
+    """Parameters of `MapEnv`: length of episodes, and prepared starts.
 
     Attributes:
       max_steps_in_episode: actions after which an episode is truncated.
@@ -50,7 +50,7 @@ class MapEnvParams(environment.EnvParams):
 
 
 class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
-    """A task, or the map MDP of one agent.
+    """A task, or the map MDP of one agent, as an environment of gymnax 1.x.
 
     One policy chooses, for a team for the robot whose turn it is. Observations of the map MDP are
     the `[N * 2D]` map, see `dqn.observation`. Action n < N looks at PoI n; action N is NOP.
@@ -178,7 +178,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
 
 
 def make_env(name: str, agent: str | None = None) -> MapEnv:
-    """The environment of a task, see `jaxsense.make`.
+    """Makes the environment of a task, see `jaxsense.make`.
 
     Args:
       name: of the task.

@@ -23,7 +23,7 @@ with extra("jaxmarl"), quietly():
 
 @struct.dataclass
 class TeamEnvState(multi_agent_env.State):
-    """The state of an environment.
+    """State of `TeamEnv`.
 
     Attributes:
       done: `[]` bool, the episode has ended.
@@ -35,7 +35,7 @@ class TeamEnvState(multi_agent_env.State):
 
 
 class TeamEnv(multi_agent_env.MultiAgentEnv):
-    """A task of a team, or the team MDP: each robot is an agent of its name.
+    """A task of a team, or the team MDP, as a `MultiAgentEnv`: each robot is an agent.
 
     Robots take turns, see `jaxsense.interfaces.team`. The methods are jaxmarl's.
     """
@@ -126,7 +126,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
 
 
 def make(name: str) -> TeamEnv:
-    """The environment of a task, see `jaxsense.make`.
+    """Makes the environment of a task, see `jaxsense.make`.
 
     Args:
       name: of the task.

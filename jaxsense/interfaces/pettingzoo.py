@@ -105,7 +105,7 @@ class _Team:
 
 
 class TeamAECEnv(_Team, AECEnv):
-    """A team whose robots take turns: each of them is an agent.
+    """A task of a team, or the team MDP, as an `AECEnv`: robots are agents that take turns.
 
     `agent_selection` is the robot that chooses; it earns the reward of its look before its next
     turn. The methods are PettingZoo's. `seconds` in the infos is the duration of the last action,
@@ -156,7 +156,7 @@ class TeamAECEnv(_Team, AECEnv):
 
 
 class TeamParallelEnv(_Team, ParallelEnv):
-    """A team for libraries that step all agents together: see `TeamAECEnv`.
+    """The same as `TeamAECEnv`, as a `ParallelEnv`: libraries step all agents together.
 
     In each step only the action of the robot whose turn it is counts. The methods are PettingZoo's.
     """
@@ -208,7 +208,7 @@ class TeamParallelEnv(_Team, ParallelEnv):
 
 
 def make(name: str) -> TeamAECEnv:
-    """The environment of a task, see `jaxsense.make`.
+    """Makes the `AECEnv` of a task, see `jaxsense.make`.
 
     Args:
       name: of the task.
@@ -220,7 +220,7 @@ def make(name: str) -> TeamAECEnv:
 
 
 def make_parallel(name: str) -> TeamParallelEnv:
-    """The environment of a task that steps all agents together, see `make`.
+    """Makes the `ParallelEnv` of a task, see `make`.
 
     Args:
       name: of the task.

@@ -34,7 +34,7 @@ _COUNT = struct.Struct("<I")
 
 @dataclasses.dataclass(frozen=True)
 class LaserScans:
-    """S scans of A beams by one laser scanner.
+    """Laser scans of a log: S scans of A beams by one scanner.
 
     Attributes:
       angles: `[A]` directions of the beams, in radians, from right to left.
@@ -46,7 +46,7 @@ class LaserScans:
 
 
 def read(path: Path | str) -> LaserScans:
-    """Reads all laser scans of a log.
+    """Reads all laser scans of an MRPT log.
 
     Args:
       path: a `.rawlog` or `.simplemap.gz`.
@@ -76,7 +76,7 @@ def read(path: Path | str) -> LaserScans:
 
 
 def read_logs(directory: Path = DIRECTORY) -> LaserScans:
-    """Reads the scans of all `LOGS`.
+    """Reads the scans of the MRPT logs that `LOGS` names, as one recording.
 
     Args:
       directory: where they are.

@@ -12,7 +12,7 @@ with extra("rejax"):
 
 
 class MapEnv(gymnax.MapEnv):
-    """The environment of gymnax 1.x, whose step returns five values as before gymnax 1.0.
+    """Environment for rejax: `gymnax.MapEnv`, but `step` returns five values, as rejax expects.
 
     rejax 0.1.3 treats a truncated episode as terminated when it learns.
     """

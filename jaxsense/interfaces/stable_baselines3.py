@@ -15,7 +15,7 @@ with extra("sb3"):
 
 
 class MapVecEnv(VecEnv):
-    """A vector environment of Gymnasium in the form that Stable-Baselines3 takes.
+    """Adapts a vector environment of Gymnasium to Stable-Baselines3.
 
     `MapVecEnv(MapVectorEnv(mdp, modality, num_envs, autoreset_mode="SameStep"))`. The methods are
     Stable-Baselines3's. The environments are one program: attributes and methods apply to all,

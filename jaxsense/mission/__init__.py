@@ -1,4 +1,4 @@
-"""Missions: all robots together in one MJX arena, in closed loop over one shared map.
+"""Missions: all robots act together in one MJX arena, in closed loop over a shared map.
 
 Each robot asks its policy which PoI to look at, drives to a viewpoint, turns to the PoI, scans it,
 updates the shared map with the detection and asks again, until the policy chooses NOP. Robots

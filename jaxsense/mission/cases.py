@@ -18,7 +18,7 @@ _TAKEN = ("all", "policies", "bytes_per_detection")  # by `evaluate` and by the 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A policy and faults to play missions with.
+    """A condition to play missions in: a policy, and faults of robots.
 
     Attributes:
       policy: index into `Mission.policies`.
@@ -60,12 +60,12 @@ def _require_names(policies: Iterable[str]) -> None:
 
 
 def is_fault(case: str) -> bool:
-    """Whether a case, given by its name, has a robot that is alone, stops or goes blind."""
+    """Tells from the name of a case whether a robot is alone, stops or goes blind in it."""
     return case.endswith(tuple(f"_{fault}" for fault in _FAULTS))
 
 
 def cases(config: Config, policies: Iterable[str] = POLICIES) -> dict[str, Case]:
-    """Cases of every policy, of each robot alone, and of each robot failing during the mission.
+    """Lists a case for every policy, for each robot alone, and for each robot that fails.
 
     Each policy is a case. In `ROBOT_alone` all other robots stand still from the start; in
     `ROBOT_stops` and `ROBOT_blind` the robot stops or its sensor goes blind after 6 s. Robots are

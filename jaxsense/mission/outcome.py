@@ -25,7 +25,7 @@ to even when it retried; `undetected`: it gave one up after looks that showed no
 
 
 def reason(state: MissionState) -> Int[Array, ""]:
-    """Reason of a mission's end, as an index into `REASONS`."""
+    """Returns why a mission ended, as an index into `REASONS`."""
     robots = state.robots
     working = robots.phase != FAILED
     ends = [
@@ -44,7 +44,7 @@ def reason(state: MissionState) -> Int[Array, ""]:
 
 
 def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, PyTree[Array]]:
-    """Measures the results of a mission.
+    """Computes the metrics of a finished mission.
 
     Args:
       mission: the mission.

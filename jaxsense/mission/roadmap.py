@@ -1,4 +1,4 @@
-"""Shortest paths around the PoIs of an arena to viewpoints.
+"""Shortest paths to viewpoints, around the PoIs of an arena.
 
 Robots do not know a PoI's shape before they have looked, so every PoI is a circle that holds all
 shapes. A roadmap has some nodes around each circle and the lengths of the free paths between them;
@@ -105,7 +105,7 @@ def build(config: Config, layout: Layout) -> Roadmap:
 def lengths(
     config: Config, layout: Layout, roadmap: Roadmap, position: Float[Array, "2"], poi: Index
 ) -> Float[Array, " V"]:
-    """Lengths of the shortest paths to the viewpoints of a PoI.
+    """Computes the lengths of the shortest paths to the viewpoints of a PoI.
 
     Ignores other robots: they will be elsewhere, or make room.
 
@@ -131,7 +131,7 @@ def lengths(
 def reachable(
     config: Config, layout: Layout, roadmap: Roadmap, position: Float[Array, "2"]
 ) -> Bool[Array, " N"]:
-    """Whether a path leads to any viewpoint of each PoI, see `lengths`.
+    """Marks the PoIs that have a reachable viewpoint, see `lengths`.
 
     Args:
       config: all settings.
@@ -160,7 +160,7 @@ def next_waypoint(
     poi: Index,
     view: Index,
 ) -> tuple[Float[Array, ""], Float[Array, "2"]]:
-    """Length and first waypoint of the shortest path to one viewpoint.
+    """Finds length and first waypoint of the shortest path to one viewpoint.
 
     Args:
       config: all settings.

@@ -27,7 +27,7 @@ backing off when stuck, ended by NOP, or failed."""
 
 @pytree
 class Faults:
-    """When robots fail, in seconds from the start; infinite for never.
+    """Times at which robots fail, in seconds from the start; infinite for never.
 
     Attributes:
       stops_at: `[R]` when the robot stops for good.
@@ -91,7 +91,7 @@ class Robots:
 
 @pytree
 class MissionState:
-    """One mission at one moment.
+    """State of one mission.
 
     Attributes:
       scene: PoIs, light and the robots' poses.
@@ -202,7 +202,7 @@ class Record:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mission:
-    """The parts that all missions of a configuration share. Static under `jit`.
+    """Arenas, settings and policies that missions share. Static under `jit`.
 
     Attributes:
       world: the simulation, with contacts or without.
@@ -248,7 +248,7 @@ def make_mission(
     contacts: bool = True,
     arenas: tuple[Arena, Arena] | None = None,
 ) -> Mission:
-    """Makes a mission.
+    """Makes the mission that `config` describes.
 
     Args:
       config: all settings; numbers that are declared `Traced` may be traced.
@@ -271,6 +271,6 @@ def make_mission(
 
 
 def no_faults(config: Config) -> Faults:
-    """Robots that never fail."""
+    """Makes the faults of robots that never fail."""
     never = jnp.full(len(config.carried), jnp.inf, jnp.float32)
     return Faults(never, never)

@@ -60,7 +60,7 @@ class Comparison:
 def compare_scans(
     run: Path | str, file: Path | str, picture: Path | str | None = None, trust: bool = False
 ) -> Comparison:
-    """Draws recorded windows, simulated ones and residuals, and states how far apart they are.
+    """Plots recorded windows next to simulated ones, and reports how far apart they are.
 
     Every recorded look is compared with simulated ones at the same bearing and distance, see
     `sim.similar.nearest`.

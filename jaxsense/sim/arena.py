@@ -30,7 +30,7 @@ _WALL_COLOUR = (0.6, 0.6, 0.6)
 
 @pytree
 class Layout:
-    """The PoIs of one arena, all of it data.
+    """Positions, shapes and colours of the PoIs in one arena; no field is static.
 
     Attributes:
       position: `[N, 2]` float32 centres of the PoIs, in metres from the arena's centre.
@@ -207,7 +207,7 @@ def make_layout(
 
 
 def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> Layout:
-    """Draws a layout of PoIs of given classes with gaps of `poi_gap` or more.
+    """Draws random positions of PoIs of given classes, at least `poi_gap` apart.
 
     The arena is divided into square cells, about twice as many as PoIs. Each PoI gets a cell of its
     own and a position that leaves half the gap free on every side.
@@ -237,7 +237,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
 
 @functools.partial(jax.jit, static_argnums=0)  # traced once for all callers
 def place(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
-    """Places PoIs and robots, which are at rest, and computes MJX's kinematics.
+    """Places PoIs and robots at rest, and computes MJX's kinematics.
 
     Args:
       arena: the arena.
@@ -297,7 +297,7 @@ def robot_poses(data: mjx.Data) -> Float[Array, "R 3"]:
 
 
 def drive(arena: Arena, data: mjx.Data, wheel_speeds: Float[Array, "R 2"]) -> mjx.Data:
-    """Makes one physics step of `TIMESTEP` seconds with commanded wheel speeds.
+    """Advances the physics by `TIMESTEP` seconds with commanded wheel speeds.
 
     Args:
       arena: the arena.

@@ -30,7 +30,7 @@ Origin = Float[Array | np.ndarray, "2"]
 
 @pytree
 class CrossSection:
-    """The scene cut at one height: O outlines, all circles followed by all rectangles.
+    """Horizontal cross-section of a scene: O outlines, first all circles, then all rectangles.
 
     Attributes:
       centre: `[O, 2]` in metres.
@@ -66,7 +66,7 @@ class Hit:
 def cross_section(
     arena: Arena, data: mjx.Data, height: Float[Array, ""] | float, robot: int
 ) -> CrossSection:
-    """Cuts the scene at a height above the floor.
+    """Computes the cross-section of a scene at a height above the floor.
 
     Args:
       arena: the arena.
@@ -114,7 +114,7 @@ def cast(
     origin: Origin,
     angle: Float[Array | np.ndarray, "..."],
 ) -> Hit:
-    """Casts rays from one position.
+    """Casts rays from one position and returns what each hits first.
 
     A ray that starts inside a geom hits it from inside, as in MuJoCo's `mj_ray`.
 
@@ -137,7 +137,7 @@ def cast(
 
 
 def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> Hit:
-    """Casts rays along unit vectors: twice as fast as `cast` if many calls share them.
+    """Casts rays along unit vectors; twice as fast as `cast` if many calls share them.
 
     Args:
       section: the scene.

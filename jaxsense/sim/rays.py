@@ -12,7 +12,7 @@ from jaxsense.core import checks
 
 @runtime_checkable
 class Rays(Protocol):
-    """Directions of B rays: a frozen value that can be hashed, static under `jit`."""
+    """Directions of B rays; frozen and hashable, static under `jit`."""
 
     @property
     def angles(self) -> Float[np.ndarray, "B"]:

@@ -1,4 +1,4 @@
-"""Recorded scans: other rays than the simulated sensor's, the noise of a LiDAR, PoIs cast in.
+"""Recorded scans: resampling, fitting the noise of a LiDAR, and inserting PoIs.
 
 `insert` and `random_view` can be traced; the other functions work on the host.
 """
@@ -30,7 +30,7 @@ def resample(
     angles: Float[np.ndarray, " A"],
     readings: Float[np.ndarray, "S A *channels"],
 ) -> Float[np.ndarray, "S B *channels"]:
-    """Turns scans along other rays into scans along the rays of a sensor.
+    """Resamples recorded scans to the rays of a simulated sensor.
 
     Between two recorded rays, readings are interpolated; distances only on one surface, otherwise
     the nearest ray counts. A distance of 0 is no return and becomes infinite. The last ray of a
@@ -105,7 +105,7 @@ def _longest(is_recorded: Bool[np.ndarray, " B"]) -> Int[np.ndarray, " _"]:
 def wall_residuals(
     angles: Float[np.ndarray, " A"], ranges: Float[np.ndarray, "S A"]
 ) -> tuple[Float[np.ndarray, "R K"], Float[np.ndarray, " R"]]:
-    """Differences of measured distances from straight lines through K neighbouring beams.
+    """Computes how far measured distances lie from straight lines through K neighbouring beams.
 
     Args:
       angles: directions of the beams, in radians, in order.
@@ -138,7 +138,7 @@ def wall_residuals(
 def fit_noise(
     config: LidarConfig, angles: Float[np.ndarray, " A"], ranges: Float[np.ndarray, "S A"]
 ) -> LidarConfig:
-    """Settings of a LiDAR whose noise is that of recorded scans, within its range.
+    """Fits the noise settings of a LiDAR to recorded scans.
 
     `range_noise` and `range_noise_growth` are a line through the medians, in bins of distance, of
     the standard deviations of pieces of walls: curved or rough ones are few enough not to matter.
@@ -197,7 +197,7 @@ def _edges(ranges: Float[np.ndarray, "S A"], max_range: float) -> tuple[float, f
 
 @pytree
 class Errors:
-    """Errors of a recorded LiDAR, to measure other surfaces with.
+    """Measured errors of a recorded LiDAR, for `insert` to apply to PoIs.
 
     Attributes:
       residuals: `[R, K]` of K neighbouring beams, in metres, see `wall_residuals`.
@@ -211,7 +211,7 @@ class Errors:
 def errors(
     config: Config, angles: Float[np.ndarray, " A"], ranges: Float[np.ndarray, "S A"]
 ) -> Errors:
-    """Errors of recorded scans at surfaces up to twice as far as PoIs.
+    """Measures the errors of recorded scans at surfaces up to twice as far as PoIs.
 
     Args:
       config: all settings.
@@ -229,7 +229,7 @@ def errors(
 
 @pytree
 class Inserted:
-    """A recorded scan with a PoI in it.
+    """A recorded scan with an inserted PoI.
 
     Attributes:
       ranges: `[A]` distances, in metres.
@@ -249,7 +249,7 @@ class Inserted:
 def random_view(
     key: Key, config: Config, angles: Float[Array | np.ndarray, " A"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Draws a bearing around which a whole window was recorded, and a distance.
+    """Draws a bearing around which a whole window was recorded, and a distance, for a PoI.
 
     Args:
       key: random key.
@@ -275,7 +275,7 @@ def insert(
     ranges: Float[Array, " A"],
     errors: Errors,
 ) -> Inserted:
-    """Puts a PoI of random shape, position and yaw into a recorded scan of a LiDAR.
+    """Inserts a PoI of random shape, position and yaw into a recorded scan of a LiDAR.
 
     Each beam measures what is nearer, the recorded surface or the PoI's. At the PoI it has
     recorded errors: those of pieces of walls, and mixed pixels at the edges.

@@ -186,7 +186,7 @@ class Camera(Sensor):
 
 
 def lidar(config: LidarConfig) -> Lidar:
-    """Makes the laser scanner; its settings may be traced."""
+    """Makes the built-in LiDAR; its settings may be traced."""
     return Lidar(
         config,
         name="lidar",
@@ -201,7 +201,7 @@ def lidar(config: LidarConfig) -> Lidar:
 
 
 def camera(config: CameraConfig) -> Camera:
-    """Makes the camera; its settings may be traced."""
+    """Makes the built-in camera; its settings may be traced."""
     return Camera(
         config,
         name="camera",
@@ -255,7 +255,7 @@ def _own(name: str, config: Config) -> Sensor:
 
 
 def surfaces(arena: Arena, layout: Layout) -> Surfaces:
-    """Looks up the surfaces of all geoms.
+    """Looks up colour and attributes of all geoms.
 
     Args:
       arena: the arena, for the surfaces of walls and robots.
@@ -285,7 +285,7 @@ def scan(
     seconds: Float[Array, ""] | float = 0.0,
     twin: Float[Array, "2"] | None = None,
 ) -> Float[Array, "B *channels"]:
-    """Scans along some rays of one robot's sensor.
+    """Simulates a scan by a robot's sensor, along all of its rays or some of them.
 
     Args:
       key: random key of the noise.

@@ -1,4 +1,4 @@
-"""Simulated looks like recorded ones, and how far recorded windows are from them."""
+"""Finds the simulated looks that are most similar to recorded ones, and their residuals."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ _MAX_SIDE = 100.0  # m
 
 @pytree
 class Similar:
-    """The simulated window that is nearest to a recorded one.
+    """The simulated window nearest to a recorded one, and residuals.
 
     Residuals are those of the rays at the PoI, NaN elsewhere, in the unit of the readings.
 
@@ -39,7 +39,7 @@ class Similar:
 
 
 def root_mean_square(residuals: Float[Array, "*S F"]) -> Float[Array, "*S"]:
-    """Root mean square of the residuals of each window, over those that are numbers.
+    """Computes the root mean square of the residuals of each window, without NaN.
 
     Args:
       residuals: `[..., F]` see `Similar`.
@@ -48,7 +48,7 @@ def root_mean_square(residuals: Float[Array, "*S F"]) -> Float[Array, "*S"]:
 
 
 def make_world(config: Config, distance: float) -> World:
-    """Makes the simulation, with walls behind a PoI in the middle of the arena.
+    """Makes a simulation for `simulate`, with walls beyond a PoI in the middle of the arena.
 
     Args:
       config: all settings.

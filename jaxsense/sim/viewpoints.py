@@ -110,7 +110,7 @@ def _bearings(
 def bearing(
     pose: Float[Array | np.ndarray, "3"], position: Float[Array | np.ndarray, "2"]
 ) -> Float[Array, ""]:
-    """Bearing of a position in a robot's frame.
+    """Computes the bearing of a position in a robot's frame.
 
     Args:
       pose: x [m], y [m] and yaw [rad] of the robot.

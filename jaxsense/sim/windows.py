@@ -1,4 +1,4 @@
-"""Windows: the part of a scan around a PoI, which the detector reads."""
+"""Windows: the part of a scan around a PoI that the detector reads."""
 
 import chex
 import jax
@@ -13,7 +13,7 @@ from jaxsense.sim.sensors import Sensor
 def window_of(
     sensor: Sensor, values: Shaped[np.ndarray, "*axes B"], bearing: Float[Array, ""]
 ) -> Shaped[Array, "*axes window"]:
-    """Selects from the values of all rays those of the rays that the detector reads.
+    """Selects the values of the window's rays from those of all rays.
 
     Args:
       sensor: the sensor.
@@ -47,7 +47,7 @@ def cut_out(
     readings: Float[Array | np.ndarray, "B *channels"],
     bearing: Float[Array | np.ndarray, ""] | float,
 ) -> Float[Array, "F"]:
-    """Cuts the detector's input out of a whole scan, recorded or simulated.
+    """Cuts the detector's input, a window, out of a whole scan, recorded or simulated.
 
     Args:
       sensor: the sensor.
@@ -79,7 +79,7 @@ def cut_out(
 def around(
     sensor: Sensor, readings: Float[Array | np.ndarray, "B *channels"], bearing: Float[Array, ""]
 ) -> Float[Array, "window *channels"]:
-    """Selects the readings of the rays that the detector reads, without any check.
+    """Selects the readings of the window's rays, without checks.
 
     Args:
       sensor: the sensor.
@@ -92,7 +92,7 @@ def around(
 
 
 def is_in_view(sensor: Sensor, bearing: Float[Array, ""]) -> Bool[Array, ""]:
-    """Tells whether a bearing is between the outermost rays.
+    """Tells whether a bearing is within the sensor's field of view.
 
     Args:
       sensor: the sensor.
@@ -102,7 +102,7 @@ def is_in_view(sensor: Sensor, bearing: Float[Array, ""]) -> Bool[Array, ""]:
 
 
 def as_window(sensor: Sensor, readings: Float[Array, "window *channels"]) -> Float[Array, "F"]:
-    """Turns the readings of a window into the detector's input.
+    """Converts the readings of a window into the detector's input.
 
     Args:
       sensor: the sensor.

@@ -20,7 +20,7 @@ from jaxsense.sim.light import Light, random_light
 
 @struct.dataclass
 class World:
-    """The parts that all scenes of a simulation share.
+    """A simulation: its arena, sensors and viewpoints, which all scenes share.
 
     Attributes:
       arena: the compiled arena; static.
@@ -42,7 +42,7 @@ class World:
 
 @pytree
 class Scene:
-    """One arena at one moment; determines the MJX state.
+    """State of one arena: PoIs, light and robot poses, which determine the MJX state.
 
     Attributes:
       layout: the PoIs.
@@ -115,7 +115,7 @@ def random_scene(
 def look(
     key: Key, world: World, scene: Scene, robot: int, poi: Int[Array, ""]
 ) -> tuple[Float[Array, "F"], Scene]:
-    """Places a robot at a random viewpoint of a PoI and scans.
+    """Places a robot at a random viewpoint of a PoI, and scans the PoI.
 
     Casts only the rays that the detector reads; their readings are those of a whole scan.
 

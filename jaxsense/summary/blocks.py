@@ -26,16 +26,20 @@ class StageTiming(TypedDict):
 class Timing(TypedDict):
     """`timing`."""
 
-    total_s: Annotated[float, Metric("total time [s]", "The whole command; its stages overlap.", 1)]
+    total_s: Annotated[
+        float, Metric("total time [s]", "Duration of the whole command; stages overlap.", 1)
+    ]
     stages: dict[str, StageTiming]
 
 
 class Detector(TypedDict):
     """`detectors.MODALITY`."""
 
-    accuracy: Annotated[float, Metric("accuracy", "Share of right labels in held-out scenes.", 4)]
+    accuracy: Annotated[
+        float, Metric("accuracy", "Share of looks at held-out scenes with the right label.", 4)
+    ]
     ece: Annotated[
-        float, Metric("calibration error", "Mean gap between confidence and accuracy.", 4)
+        float, Metric("calibration error", "Mean gap between confidence and accuracy (ECE).", 4)
     ]
     nll: Annotated[float, Metric("NLL", "Mean -log p of the right label, in nats.", 4)]
 
@@ -45,14 +49,17 @@ class Fusion(TypedDict):
 
     accuracy: Annotated[
         float | None,
-        Metric("fusion: right", "Share of beliefs whose likeliest class is the true one.", 4),
+        Metric("fusion: right", "Share of fused beliefs whose most likely class is right.", 4),
     ]
     mean_error: Annotated[
-        float | None, Metric("fusion: error", "Distance from the joint belief in sigma.")
+        float | None,
+        Metric("fusion: error", "Distance of the mean from the joint belief, in sigmas."),
     ]
     std_error: Annotated[
         float | None,
-        Metric("fusion: error of sigma", "Mean absolute log-ratio to the joint sigma."),
+        Metric(
+            "fusion: error of sigma", "Mean absolute log-ratio to the sigma of the joint belief."
+        ),
     ]
 
 
@@ -60,10 +67,10 @@ class Grouped(TypedDict):
     """`jmvae.grouped`: joint posteriors of a JMVAE that learns from scans, at held-out PoIs."""
 
     pair: Annotated[
-        float, Metric("right, one look each", "Share nearest to the true class, by cluster.", 4)
+        float, Metric("right, one look each", "Share of PoIs nearest to the right cluster.", 4)
     ]
     all_looks: Annotated[
-        float, Metric("right, all looks", "The same after `jmvae.looks` by each sensor.", 4)
+        float, Metric("right, all looks", "The same after `jmvae.looks` looks by each sensor.", 4)
     ]
 
 
@@ -73,35 +80,39 @@ class Jmvae(TypedDict):
     active_units: Annotated[
         int,
         Metric(
-            "dimensions in use", "Latent dimensions that vary between classes; one in the paper."
+            "dimensions in use",
+            "Number of latent dimensions that vary between classes; one in the paper.",
         ),
     ]
     sigma_norm: Annotated[
-        PerClass, Metric("sigma norm", "Mean of each class, `joint` and by sensor.")
+        PerClass,
+        Metric(
+            "sigma norm", "Mean for each class, with all sensors (`joint`) and with each alone."
+        ),
     ]
     unambiguous: Annotated[
         dict[str, list[bool]],
         Metric(
             "unambiguous",
-            "Whether over 90% of its looks leave a class plausible and no other (Table I).",
+            "Whether over 90% of looks leave this class, and no other, plausible (Table I).",
         ),
     ]
     consistent: Annotated[
         PerClass,
         Metric(
             "consistent",
-            "Share of looks that leave exactly the classes that the sensor cannot tell apart.",
+            "Share of looks that leave exactly the classes that the sensor cannot distinguish.",
         ),
     ]
     moment_matching_error: Annotated[
         float,
-        Metric("error of moments", "Distance from the best Gaussian over the possible classes."),
+        Metric("error of moments", "Distance from the best Gaussian over the classes left open."),
     ]
     readout_error: Annotated[
         float,
         Metric(
             "error of the readout",
-            "Nats lost in writing and reading exact probabilities.",
+            "Nats lost when a belief stores exact probabilities and they are read back.",
             digits=4,
         ),
     ]
@@ -112,13 +123,16 @@ class Jmvae(TypedDict):
 class Beliefs(TypedDict):
     """`belief`: the map after random looks at one PoI, compared with exact Bayes on them."""
 
-    looks: Annotated[list[int], Metric("looks", "1 to 6.")]
+    looks: Annotated[list[int], Metric("looks", "Number of looks at the PoI, 1 to 6.")]
     nll: Annotated[list[float], Metric("NLL of the map", "Mean -log p of the true class.")]
-    bayes_nll: Annotated[list[float], Metric("NLL of exact Bayes")]
+    bayes_nll: Annotated[list[float], Metric("NLL of exact Bayes", "The same with exact Bayes.")]
     accuracy: Annotated[
-        list[float], Metric("accuracy of the map", "Share of right likeliest classes.")
+        list[float],
+        Metric("accuracy of the map", "Share of histories with the right most likely class."),
     ]
-    bayes_accuracy: Annotated[list[float], Metric("accuracy of exact Bayes")]
+    bayes_accuracy: Annotated[
+        list[float], Metric("accuracy of exact Bayes", "The same with exact Bayes.")
+    ]
     doubt_correlation: Annotated[
         float,
         Metric("sigma and uncertainty", "Correlation of the sigma norm with the exact entropy."),
@@ -129,18 +143,20 @@ Returns = TypedDict(
     "Returns",
     {
         "return": Annotated[
-            float, Metric("Q-network", "Reward of an episode without exploration.")
+            float, Metric("Q-network", "Reward of an episode, without exploration.")
         ],
-        "optimal": Annotated[float | None, Metric("optimal", "The optimal policy; see concepts.")],
+        "optimal": Annotated[
+            float | None, Metric("optimal", "The optimal policy; null if it is unknown.")
+        ],
         "greedy": Annotated[
             float, Metric("greedy", "Takes the look with the highest expected gain.")
         ],
         "naive": Annotated[
-            float, Metric("naive", "Looks at each PoI once, whatever the map holds.")
+            float, Metric("naive", "Looks once at each PoI, whatever the map holds.")
         ],
-        "random": Annotated[float, Metric("random")],
+        "random": Annotated[float, Metric("random", "Takes any action.")],
         "fraction_of_optimal": Annotated[
-            float | None, Metric("of optimal", "Q-network over optimal.")
+            float | None, Metric("of optimal", "Reward as a share of the optimal one.")
         ],
     },
 )
@@ -150,7 +166,7 @@ Returns = TypedDict(
 class OneStep(TypedDict):
     """`dqn.MODALITY.one_step`: the reward of the first step, as in the authors' code."""
 
-    policy: Annotated[float, Metric("one step: Q-network")]
+    policy: Annotated[float, Metric("one step: Q-network", "Reward of the first step.")]
     optimal: Annotated[float | None, Metric("one step: optimal")]
     random: Annotated[float, Metric("one step: random")]
 
@@ -160,21 +176,24 @@ class Agent(Returns):
 
     one_step: OneStep
     optimal_states: Annotated[
-        int | None, Metric("optimal in", "States with a reward within 0.01 of optimal.", 1)
+        int | None,
+        Metric("optimal in", "Number of states with a reward within 0.01 of optimal.", 1),
     ]
     num_states: Annotated[
-        int, Metric("states", "Combinations of classes and looks, or a sample of them.", 0)
+        int, Metric("states", "Number of combinations of classes and looks, or of a sample.", 0)
     ]
     optimal_permutations: Annotated[int | None, Metric("optimal permutations", digits=1)]
     num_permutations: Annotated[
-        int, Metric("permutations", "States in which all classes differ.", 0)
+        int, Metric("permutations", "Number of states in which all classes differ.", 0)
     ]
     other_numbers: NotRequired[
         Annotated[
             dict[str, Returns], Metric("other numbers", "Rewards with `evaluation.num_pois` PoIs.")
         ]
     ]
-    env_steps: Annotated[int, Metric("steps of training", "In all environments together.", 0)]
+    env_steps: Annotated[
+        int, Metric("steps of training", "Environment steps, over all environments.", 0)
+    ]
     env_steps_per_s: Annotated[
         float, Metric("steps per second", "Environment steps per second of training.", 0)
     ]
@@ -183,16 +202,20 @@ class Agent(Returns):
 class Differences(TypedDict):
     """`mission.POLICY.intervals`: from the latent policy, arena by arena, with 95% intervals."""
 
-    accuracy: Annotated[Interval, Metric("right, difference", "From `latent`, with 95% interval.")]
-    observations_per_poi: Annotated[Interval, Metric("looks, difference", "From `latent`.", 2)]
-    time_s: Annotated[Interval, Metric("mean time, difference [s]", "From `latent`.", 1)]
+    accuracy: Annotated[
+        Interval, Metric("right, difference", "Difference from `latent`, with 95% interval.")
+    ]
+    observations_per_poi: Annotated[
+        Interval, Metric("looks, difference", "Difference from `latent` in looks per PoI.", 2)
+    ]
+    time_s: Annotated[Interval, Metric("mean time, difference [s]", "Difference from `latent`.", 1)]
 
 
 class OfNaive(TypedDict):
     """`mission.POLICY.of_naive`: ratios to naive exploration, see `compare.of_naive`."""
 
     observations_per_poi: Annotated[
-        float, Metric("looks, of naive", "Ratio to naive exploration of the same accuracy.", 2)
+        float, Metric("looks, of naive", "Ratio to naive exploration with the same accuracy.", 2)
     ]
     time_s: Annotated[float, Metric("time, of naive", digits=2)]
     mean_time_s: Annotated[float, Metric("mean time, of naive", digits=2)]
@@ -204,39 +227,44 @@ class Calibration(TypedDict):
     confidence: Annotated[
         float | None,
         Metric(
-            "confidence", "Mean probability of the likeliest class; if calibrated, the share right."
+            "confidence",
+            "Mean probability of the most likely class; equals the share right if calibrated.",
         ),
     ]
-    accuracy: Annotated[
-        float | None, Metric("right, of detected", "Share of PoIs that were detected.")
-    ]
+    accuracy: Annotated[float | None, Metric("right, of detected", "Share of the detected PoIs.")]
     nll: Annotated[float | None, Metric("NLL of the maps", "Mean -log p of the true class.")]
 
 
 class Case(TypedDict):
     """`mission.POLICY`: missions of one policy, or with a robot that fails."""
 
-    accuracy: Annotated[float, Metric("right", "Share of PoIs whose likeliest class is right.")]
-    observations_per_poi: Annotated[float, Metric("looks per PoI", digits=2)]
+    accuracy: Annotated[float, Metric("right", "Share of PoIs whose most likely class is right.")]
+    observations_per_poi: Annotated[float, Metric("looks per PoI", "Mean number of looks.", 2)]
     time_s: Annotated[float, Metric("time [s]", "Median time until all robots are done.", 1)]
     mean_time_s: Annotated[
-        float, Metric("mean time [s]", "Long missions lift it above the median.", 1)
+        float,
+        Metric("mean time [s]", "Mean time until all robots are done.", 1),
     ]
-    collisions: Annotated[int, Metric("collisions", "Control periods with contact.", 0)]
+    collisions: Annotated[int, Metric("collisions", "Number of control periods with contact.", 0)]
     goals_reached_fraction: Annotated[
-        float | None, Metric("goals reached", "Share of chosen viewpoints.")
+        float | None, Metric("goals reached", "Share of the chosen viewpoints.")
     ]
     information: Annotated[float, Metric("information", "Sum of 1 / sigma norm over the map.", 2)]
     calibration: Calibration
-    episodes: Annotated[int, Metric("missions", digits=0)]
+    episodes: Annotated[int, Metric("missions", "Number of missions.", 0)]
     ended: Annotated[dict[str, int], Metric("ends", "Number of missions by how they ended.")]
-    told: NotRequired[Annotated[float, Metric("right labels", "A robot alone: share of PoIs.")]]
-    ambiguous_reported: NotRequired[
+    told: NotRequired[
         Annotated[
-            float | None, Metric("reported as ambiguous", "Of the PoIs that it cannot tell apart.")
+            float, Metric("right labels", "Share of PoIs with the right label; of a robot alone.")
         ]
     ]
-    seed: NotRequired[Annotated[int, Metric("seed", "Of the arenas of an evaluation.")]]
+    ambiguous_reported: NotRequired[
+        Annotated[
+            float | None,
+            Metric("reported as ambiguous", "Share of the PoIs that it cannot tell apart."),
+        ]
+    ]
+    seed: NotRequired[Annotated[int, Metric("seed", "Seed of the arenas of an evaluation.")]]
     intervals: NotRequired[Differences]
     of_naive: NotRequired[OfNaive]
 
@@ -244,7 +272,7 @@ class Case(TypedDict):
 class Traffic(TypedDict):
     """`mission.bytes_per_detection`."""
 
-    latent: Annotated[float, Metric("bytes in the map", "Size of a belief.", 0)]
+    latent: Annotated[float, Metric("bytes in the map", "Size of one belief.", 0)]
     features: Annotated[
         float, Metric("bytes of features", "Mean size of a detection's features.", 0)
     ]
@@ -274,21 +302,21 @@ class Results(Learned):
 class Evaluation(TypedDict):
     """Missions of `evaluate` in the same arenas: `RUN/evaluations/NAME.json`."""
 
-    num_pois: Annotated[int, Metric("PoIs", "Points of interest of an evaluation.", 0)]
-    side: Annotated[float, Metric("side [m]", "Of its arena.", 2)]
-    robots: Annotated[list[str], Metric("robots", "The sensor of each.")]
+    num_pois: Annotated[int, Metric("PoIs", "Number of points of interest.", 0)]
+    side: Annotated[float, Metric("side [m]", "Side of the arena.", 2)]
+    robots: Annotated[list[str], Metric("robots", "Modality of each robot.")]
     mission: Missions
 
 
 class Header(TypedDict):
     """The keys of a summary about the run itself."""
 
-    preset: Annotated[str, Metric("preset", "Origin of the settings.")]
-    seed: Annotated[int, Metric("seed", "Of all randomness; of several, the first.")]
-    versions: Annotated[dict[str, str], Metric("versions", "Of Python and of libraries.")]
-    devices: Annotated[list[str], Metric("devices", "The kind of each accelerator, or `cpu`.")]
+    preset: Annotated[str, Metric("preset", "Preset that the settings started from.")]
+    seed: Annotated[int, Metric("seed", "Source of all randomness; the first of several seeds.")]
+    versions: Annotated[dict[str, str], Metric("versions", "Versions of Python and of libraries.")]
+    devices: Annotated[list[str], Metric("devices", "Kind of each accelerator, or `cpu`.")]
     seeds: NotRequired[
-        Annotated[dict[str, Results], Metric("seeds", "The results of each of several.")]
+        Annotated[dict[str, Results], Metric("seeds", "Results of each of several seeds.")]
     ]
     failed: NotRequired[Annotated[dict[str, str], Metric("failed", "Seeds that failed, and why.")]]
 

@@ -1,4 +1,4 @@
-"""Trained models, frozen tasks and scores that travel with the package."""
+"""Frozen tasks, their scores, and trained models that ship with the package."""
 
 from jaxsense.tasks.environment import Environment as Environment
 from jaxsense.tasks.environment import TimeStep as TimeStep

@@ -44,7 +44,7 @@ class Scaling:
 
 @pytree
 class TimeStep:
-    """What a step of a task returns besides the next state.
+    """Output of a step: observation, reward, and whether the episode has ended.
 
     Attributes:
       observation: `[S]` float32 after the action.
@@ -60,7 +60,7 @@ class TimeStep:
 
 
 class Environment(Protocol):
-    """An MDP of one policy; a pytree.
+    """An environment in which one policy makes all choices; a pytree.
 
     Attributes:
       mdp: the MDP.

@@ -13,7 +13,7 @@ from jaxsense.tasks.task import Task
 
 
 def greedy(task: Task, agent: Agent, params: Params) -> Policy:
-    """The policy of a Q-network, for `score`: always the action of the highest value.
+    """Makes a policy for `score` that takes the action with the highest Q-value.
 
     Args:
       task: the task that the network has learned in.

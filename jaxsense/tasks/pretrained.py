@@ -13,7 +13,7 @@ from jaxsense.tasks import archive
 DATA = Path(__file__).parent / "data"
 """Where the files are."""
 PRETRAINED = ("default", "noisy", "many", "raw", "team")
-"""Presets whose trained models `load_pretrained` reads."""
+"""Presets with trained models, for `load_pretrained`."""
 
 # The others follow from the settings.
 _PARTS = "detectors", "jmvae", "fusion", "novelty", "look_values", "q_networks", "tours"
@@ -21,7 +21,7 @@ _PARTS = "detectors", "jmvae", "fusion", "novelty", "look_values", "q_networks",
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """What made trained models.
+    """Origin of trained models: command, seed, commit and versions.
 
     Attributes:
       command: that trained them.
@@ -39,7 +39,7 @@ class Origin:
 
 
 def load_pretrained(preset: str) -> tuple[Config, Models]:
-    """Settings and trained models of a preset, as `jaxsense.load` reads those of a run.
+    """Loads the settings and the trained models of a preset, which ship with the package.
 
     Args:
       preset: one of `PRETRAINED`.
@@ -59,7 +59,7 @@ def load_pretrained(preset: str) -> tuple[Config, Models]:
 
 
 def origin(preset: str) -> Origin:
-    """What made the models of `load_pretrained`.
+    """Returns the origin of the models of `load_pretrained`.
 
     Args:
       preset: one of `PRETRAINED`.

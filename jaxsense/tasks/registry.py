@@ -35,12 +35,12 @@ _TEAM = "team"
 
 
 def registered() -> tuple[str, ...]:
-    """Names of all tasks, for `make`."""
+    """Lists the names of all tasks that `make` accepts."""
     return tuple(TASKS)
 
 
 def about(name: str) -> str:
-    """What is special in a task, in a few words.
+    """Describes a task in a few words.
 
     Args:
       name: one of `registered()`.
@@ -49,7 +49,7 @@ def about(name: str) -> str:
 
 
 def agents(name: str) -> tuple[str, ...]:
-    """The agents of a task, for `make`.
+    """Lists the agents of a task that `make` accepts.
 
     Args:
       name: one of `registered()`.
@@ -61,7 +61,7 @@ def agents(name: str) -> tuple[str, ...]:
 
 
 def make(name: str, agent: str | None = None) -> Task:
-    """Makes a frozen task.
+    """Makes a frozen task by its name, for example `noisy-v0`.
 
     `map-v0` is the paper's map MDP, whose looks are almost certain. In `noisy-v0` they are not, and
     beliefs accumulate. `many-v0` has eight PoIs of sixteen classes. In `team-v0`, a camera and a

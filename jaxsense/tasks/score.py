@@ -34,7 +34,7 @@ from `on_host`."""
 
 @dataclasses.dataclass(frozen=True)
 class Recurrent:
-    """A policy that remembers.
+    """A policy with memory, for `score`.
 
     Attributes:
       act: `(key, memory, observation [S]) -> ([] action, memory)`.
@@ -47,7 +47,7 @@ class Recurrent:
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """A mean over seeds with its interval.
+    """An interquartile mean over seeds, with its 95 % interval.
 
     Attributes:
       value: interquartile mean over seeds (Agarwal et al. 2021, Deep RL at the edge of the
@@ -66,7 +66,7 @@ class Estimate:
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """What a policy reaches in a task.
+    """Result of `score`: returns of a policy, and of known policies to compare it with.
 
     Attributes:
       task: name of the task.
@@ -119,7 +119,7 @@ def score(
     agent: str | None = None,
     episodes: int = EPISODES,
 ) -> Score:
-    """Plays a task with a policy, and with policies whose scores are known.
+    """Evaluates a policy in a task, next to the optimum and other known policies.
 
     Args:
       task: from `make`, or its name.
@@ -157,7 +157,7 @@ def score(
 
 
 def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
-    """A policy that JAX cannot trace, for example of another library.
+    """Wraps a policy that JAX cannot trace, for example one in NumPy or PyTorch.
 
     Args:
       act: `[B, S]` float32 observations to `[B]` integer actions.
@@ -178,7 +178,7 @@ def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
 
 
 def estimate(values: Float[np.ndarray, " seeds"]) -> Estimate:
-    """Interquartile mean of some seeds, with the interval of a bootstrap.
+    """Computes the interquartile mean over seeds, with a bootstrap interval.
 
     Args:
       values: `[seeds]`.
@@ -197,7 +197,9 @@ def estimate(values: Float[np.ndarray, " seeds"]) -> Estimate:
 
 
 def mean_return(key: Key, task: Task, policy: Policy | Recurrent, episodes: int) -> float:
-    """Plays a task with other starts and looks than a score, for example to draw a learning curve.
+    """Computes the mean return of a policy, for example for a learning curve.
+
+    Starts and looks differ from those of a score.
 
     Args:
       key: random key; none is that of a score.

@@ -26,9 +26,9 @@ from jaxsense.tasks.environment import Environment, Scaling, TimeStep
 M = TypeVar("M")
 
 SEEDS = 10
-"""Seeds of a score."""
+"""Number of seeds of a score."""
 EPISODES = 1024
-"""Episodes with each seed."""
+"""Number of episodes of a score with each seed."""
 
 _FIRST_SEED = 2**31  # far from those that anybody trains with
 
@@ -37,7 +37,7 @@ Act = Callable[[Key, M, jax.Array], tuple[jax.Array, M]]
 
 
 class Task(Environment, Protocol):
-    """A frozen task; a pytree.
+    """A frozen task: an environment with fixed networks and looks; a pytree.
 
     Attributes:
       name: with its version.

@@ -110,7 +110,7 @@ class Stage:
 
 @pytree
 class Learned:
-    """The outputs of a training.
+    """Result of `learn`: the outputs of all stages, and their losses.
 
     Attributes:
       outputs: of every stage, by its name.

@@ -62,7 +62,7 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
 def learn(
     key: Key, config: Config, arena: Arena | None = None, *, until: str | None = None
 ) -> Learned:
-    """Trains everything, as one pure function.
+    """Runs the whole training as one pure function.
 
     Args:
       key: the only source of randomness.

@@ -48,7 +48,7 @@ def bayes_update(
     label_of_class: _Labels,
     weight: Float[Array, ""] | float = 1.0,
 ) -> Float[Array, " C"]:
-    """Updates the exact posterior over the classes by one look.
+    """Updates the exact posterior over the classes with one look.
 
     Args:
       log_weights: `[C]` logarithms of the classes' probabilities before the look.

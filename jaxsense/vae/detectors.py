@@ -23,7 +23,7 @@ _MIN_PROBABILITY = 1e-9  # whose logarithm counts
 
 
 class Detector(Protocol):
-    """A detector of one sensor: from a window to features; a frozen pytree."""
+    """Protocol of a sensor's detector, which maps windows to features; a frozen pytree."""
 
     @property
     def gate(self) -> Gate:
@@ -95,7 +95,7 @@ def init(
 
 @pytree
 class Detection:
-    """What a look says.
+    """Result of a look: whether the PoI is there, and its features.
 
     Attributes:
       is_there: `[]` whether the window shows its PoI.
@@ -117,7 +117,7 @@ def logits(detector: Classifier, window: Float[Array, " F"]) -> Float[Array, " D
 
 
 def detect(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
-    """Features of a look that shows its PoI; `answer` also tells whether it does.
+    """Computes the features of a look that shows its PoI; `answer` also checks that it does.
 
     Args:
       detector: of the sensor.
@@ -130,7 +130,7 @@ def detect(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m
 
 
 def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array, ""]) -> Detection:
-    """What a look says, which may be that there is nothing.
+    """Evaluates a look: whether the window shows its PoI, and the features.
 
     Args:
       detector: of the sensor.
@@ -240,7 +240,7 @@ def retrain(
     labels: Int[Array, " S"],
     config: DetectorConfig = RETRAINING,
 ) -> Classifier:
-    """Continues the training of a detector with other windows, for example 200 recorded ones.
+    """Fine-tunes a detector on other windows, for example 200 recorded ones.
 
     Few windows may replace what many have taught. So the parameters move from the old ones towards
     the new ones (as in Wortsman et al. 2022) as far as that helps with windows kept from training.

@@ -34,7 +34,7 @@ Drawn = tuple[jax.Array, jax.Array, tuple[jax.Array, ...]]
 
 @pytree
 class Filter:
-    """Fusion by a filter.
+    """Fusion by a learned Bayes filter, which accumulates looks in the belief.
 
     Attributes:
       networks: by modality, parameters of the network that maps features to K coefficients of the

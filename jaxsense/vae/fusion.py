@@ -207,7 +207,7 @@ def train_decoders(
 
 
 def prior(model: Jmvae, variance: float) -> Belief:
-    """Belief before any look, with mean 0.
+    """Makes the belief before any look, with mean 0.
 
     Args:
       model: shape of the JMVAE.

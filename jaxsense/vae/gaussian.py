@@ -11,7 +11,7 @@ _Columns = Float[Array, "D ..."]
 
 
 def kl_divergence(mean_p: _Row, log_var_p: _Row, mean_q: _Row, log_var_q: _Row) -> Float[Array, ""]:
-    """Kullback-Leibler divergence `KL(p || q)` of two diagonal Gaussians.
+    """Computes the Kullback-Leibler divergence `KL(p || q)` of two diagonal Gaussians.
 
     Args:
       mean_p: `[D]`.
@@ -82,7 +82,7 @@ def product(
 def moment_match(
     mean: Float[Array, "K D"], std: Float[Array, "K D"]
 ) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
-    """Mean and standard deviation of an equal mixture of diagonal Gaussians.
+    """Computes mean and standard deviation of an equal mixture of diagonal Gaussians.
 
     The Gaussian with these moments minimises `E KL(component || q)` over diagonal Gaussians q, the
     training goal of a JMVAE's uni-modal encoders.

@@ -27,7 +27,7 @@ Drawn = tuple[jax.Array, tuple[jax.Array, ...]]
 
 @dataclasses.dataclass(frozen=True)
 class Jmvae:
-    """Shape of a JMVAE; hashable, static under `jit`.
+    """Shape of a JMVAE: modalities and layer sizes, no parameters; static under `jit`.
 
     Attributes:
       modalities: names, in the order of the features.
@@ -76,7 +76,7 @@ class Jmvae:
 
 
 def init(key: Key, model: Jmvae, *, last_scale: float = 1.0) -> Params:
-    """Random parameters, `{"encoders": {NAME: ...}, "decoders": {NAME: ...}}`.
+    """Initialises parameters, `{"encoders": {NAME: ...}, "decoders": {NAME: ...}}`.
 
     Args:
       key: random key.
@@ -108,7 +108,7 @@ def init(key: Key, model: Jmvae, *, last_scale: float = 1.0) -> Params:
 def encode(
     params: Params, model: Jmvae, features: Features
 ) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
-    """Mean and log-variance of the posterior `q(z | present features)`.
+    """Encodes features into mean and log-variance of the posterior `q(z | present features)`.
 
     Of a subset without an encoder it is the product of the posteriors of its modalities, in which
     their prior N(0, I) counts once.
@@ -160,7 +160,7 @@ def _check_features(model: Jmvae, features: Features) -> None:
 
 
 def decode(params: Params, model: Jmvae, z: Float[Array, " D"]) -> tuple[Float[Array, "_"], ...]:
-    """Mean of `p(features | z)` for every modality.
+    """Decodes a latent into the mean of `p(features | z)` for every modality.
 
     Args:
       params: from `init` or `train`.
@@ -183,7 +183,7 @@ def _decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]
 
 
 def posterior(params: Params, model: Jmvae, features: Features) -> Belief:
-    """Posterior `q(z | present features)` as a belief, see `encode`.
+    """Encodes features into a belief, the posterior `q(z | present features)`; see `encode`.
 
     Args:
       params: from `init` or `train`.
@@ -204,8 +204,9 @@ def loss(
     beta: float | jax.Array,
     reconstruction_weights: tuple[float, ...],
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """JMVAE-kl objective of one example (Suzuki et al. 2017, Sec. 3.3), to minimise.
+    """Loss of one example, the negative JMVAE-kl objective.
 
+    Suzuki et al. 2017, Sec. 3.3:
     `-E[sum_m w_m log p(x_m|z)] + beta KL(q(z|all) || N(0, I)) + alpha sum_s KL(q(z|all) || q(z|s))`
     where z is one reparameterised draw from `q(z|all)`, p a Gaussian of unit variance without its
     constant, and s every proper subset of the modalities that has an encoder. A weight w_m is the

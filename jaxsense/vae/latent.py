@@ -15,7 +15,9 @@ PLAUSIBLE_DISTANCE = 2.0
 
 
 def sigma_norm(std: Float[Array, "*S D"]) -> Float[Array, "*S"]:
-    """Norm `||sigma||_2` of `[..., D]` standard deviations, the colour in the paper's Fig. 4.
+    """Norm `||sigma||_2` of `[..., D]` standard deviations.
+
+    The colour in the paper's Fig. 4.
 
     Raises:
       ValueError: if a standard deviation is not positive.
@@ -36,7 +38,7 @@ def active_units(mean: Float[Array, "S D"]) -> Int[Array, ""]:
 
 
 def plausible_classes(belief: Belief, class_means: Float[Array, "C D"]) -> Bool[Array, " C"]:
-    """Classes that are plausible given a belief.
+    """Marks the classes that are plausible given a belief.
 
     Args:
       belief: `[D]`.
@@ -55,7 +57,7 @@ def plausible_classes(belief: Belief, class_means: Float[Array, "C D"]) -> Bool[
 
 
 def nearest_class(belief: Belief, class_means: Float[Array, "C D"]) -> Int[Array, ""]:
-    """Class whose mean is nearest to the mean of a belief, int32.
+    """Returns the class whose mean is nearest to the mean of a belief, int32.
 
     Args:
       belief: `[D]`.

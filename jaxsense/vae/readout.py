@@ -33,7 +33,7 @@ _THRESHOLD = 0.05  # of the largest singular value; smaller differences of momen
 
 
 def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
-    """Gaussian with the moments of a mixture of the classes.
+    """Computes the belief with the moments of a mixture of the classes.
 
     Args:
       classes: `[C, D]` joint posterior of each class.
