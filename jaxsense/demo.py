@@ -1,4 +1,4 @@
-"""`jaxsense demo`: plays a mission of trained robots and opens a page with its films."""
+"""`jaxsense demo`: plays a mission of trained robots and opens a page with its animations."""
 
 import contextlib
 import dataclasses
@@ -109,7 +109,7 @@ def _page(
     played: dict[str, Played],
     table: tables.Table,
 ) -> str:
-    """The page, with the films in it."""
+    """The page, with the animations in it."""
     lasts = max(
         animation.duration_of(scenario.config, each.recording.end) for each in played.values()
     )
@@ -140,14 +140,14 @@ def _page(
 
 
 def _sentence(policy: str, robots: int) -> str:
-    """What the films show."""
+    """What the animations show."""
     naive = f"under naive exploration each of the {robots} robots looks at every PoI (point of "
     naive += "interest) once"
     if policy == _REFERENCE:
         return f"{naive[0].upper()}{naive[1:]}, and what it sees goes into the shared map."
     chooses = {"latent": "a learned policy asks the shared map which look is worth most"}
     how = chooses.get(policy, f"the policy {policy} chooses which look comes next")
-    return f"In the first film {how}, and ends when none pays; {naive}."
+    return f"In the first animation {how}, and ends when none pays; {naive}."
 
 
 def _has_display() -> bool:

@@ -232,14 +232,14 @@ def test_of_a_film_the_page_holds_a_data_uri_and_nothing_else(tmp_path):
     assert figure.count(f'src="data:image/svg+xml;base64,{data}"') == 4
     tags = set(re.findall("<(\\w+)", figure))
     assert tags == {"section", "h2", "figure", "input", "label", "div", "img", "figcaption"}
-    others = text.replace(figure, "").replace('<a href="#film">Film</a>', "")
+    others = text.replace(figure, "").replace('<a href="#film">Animation</a>', "")
     assert others.split() == without.split()
 
 
 def test_a_film_can_be_stopped_without_a_script(run):
     text = (run / "report.html").read_text()
     (name,) = re.findall(r'<input type="checkbox" class="stop" id="([\w-]+)">', text)
-    assert f'<label for="{name}">Stop the film</label>' in text
+    assert f'<label for="{name}">Stop the animation</label>' in text
     assert ".stop:checked~.film .plays{display:none}" in text
     plays, stopped = (
         base64.b64decode(re.findall(rf'class="{kind}" src="data:[^,]*,([^"]*)"', text)[0])
@@ -257,8 +257,8 @@ def test_films_of_one_arena_stand_side_by_side(run, tmp_path):
     text = page.render(tmp_path, CONFIG, SUMMARY)
     pair, alone = re.findall(r'<div class="film( pair)?">(.*?)</figure>', text, re.DOTALL)
     assert (pair[0], alone[0]) == (" pair", "")
-    assert re.findall(r"Film ([\w-]+):", pair[1]) == ["mission", "mission-naive"]
-    assert re.findall(r"Film ([\w-]+):", alone[1]) == ["mission-naive-7"]
+    assert re.findall(r"Animation ([\w-]+):", pair[1]) == ["mission", "mission-naive"]
+    assert re.findall(r"Animation ([\w-]+):", alone[1]) == ["mission-naive-7"]
 
 
 def test_plots_of_an_earlier_version_are_shown(tmp_path):
