@@ -189,6 +189,7 @@ def test_a_recording_that_does_not_fit_is_named_in_one_line(
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_there", [True, False])
 def test_recorded_scans_neither_invents_nor_replaces_a_recording(
     recorded_scans, tmp_path, is_there, capsys
@@ -282,6 +283,7 @@ class Latest(InPlace):
         return Belief(jnp.full_like(belief.mean, modality + 5.5), belief.std)
 
 
+@pytest.mark.slow
 def test_recorded_scans_uses_the_fusion_of_the_run(recorded_scans, tmp_path, monkeypatch, capsys):
     recorded_scans(tmp_path / "recorded.npz", "--simulate")
     load = export.load

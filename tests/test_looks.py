@@ -268,6 +268,7 @@ def features(windows_of, look_live):
     return modality, np.asarray(bank(detector, new)), jax.tree.map(np.asarray, look_live(modality))
 
 
+@pytest.mark.slow
 def test_surveys_look_at_pois_of_the_classes_that_they_tell(windows_of):
     modality, _, windows, _ = windows_of
     sensor = (CONFIG.camera, CONFIG.lidar)[modality]
@@ -289,6 +290,7 @@ def test_looks_are_all_different(windows_of):
     assert len(np.unique(windows.reshape(1500, -1), axis=0)) == 1500
 
 
+@pytest.mark.slow
 def test_a_short_training_tells_most_looks_apart(features):
     modality, bank, (classes, live) = features
     labels = np.array(CONFIG.label_of_class(CONFIG.modalities[modality]))

@@ -36,6 +36,7 @@ def test_first_example_of_the_readme_runs(capsys):
     assert -0.1 <= float(names["seen"].reward) < 1.0
 
 
+@pytest.mark.slow
 def test_example_of_the_first_steps_runs(capsys):
     belief = run_example(ROOT / "docs" / "getting-started.md")["belief"]
     assert capsys.readouterr().out == "(64, 2) (64, 2)\n"
@@ -53,6 +54,7 @@ def test_example_of_several_settings_runs(capsys):
 SINGLE = ROOT / "docs" / "functions.md"
 
 
+@pytest.mark.slow
 def test_examples_of_single_functions_run(capsys):
     rays, fusion, values, paths, memory = (run_example(SINGLE, i) for i in range(5))
     np.testing.assert_allclose(rays["hit"].distance, [1.5, np.inf, 2.5], rtol=1e-6)
@@ -67,6 +69,7 @@ def test_examples_of_single_functions_run(capsys):
     assert memory["batch"].s_t.shape == (3, 128)
 
 
+@pytest.mark.slow
 def test_example_of_the_jmvae_on_own_data_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     page, names = ROOT / "docs" / "jmvae.md", {}
@@ -87,6 +90,7 @@ def test_example_of_another_fusion_runs(capsys):
     assert np.isclose(probabilities.sum(), 1)
 
 
+@pytest.mark.slow
 def test_examples_of_the_tasks_run(capsys):
     page = ROOT / "docs" / "tasks.md"
     assert np.isfinite(run_example(page, 0)["seen"].reward)

@@ -230,6 +230,7 @@ def test_recorded_windows_are_compared_with_simulated_ones(run, write, few):
     assert not found.picture.exists()
 
 
+@pytest.mark.slow
 def test_another_scanner_is_farther_from_simulated_windows(run, write, few, tmp_path):
     content = simulated()
     number = len(content["places"])

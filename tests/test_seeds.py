@@ -35,6 +35,7 @@ def seeds(tmp_path_factory, cache):
     return path
 
 
+@pytest.mark.slow
 def test_a_seed_of_several_is_the_run_of_that_seed(seeds, smoke_run):
     assert without_times(seeds / "seed-5") == without_times(smoke_run)
     models = [jaxsense.load(path)[1] for path in (seeds / "seed-5", smoke_run)]
@@ -46,6 +47,7 @@ def test_a_seed_of_several_is_the_run_of_that_seed(seeds, smoke_run):
     assert names == {path.name for path in smoke_run.iterdir()}
 
 
+@pytest.mark.slow
 def test_curves_are_those_of_all_seeds(seeds):
     config = read_settings(seeds / "config.json").config
     runs = [seeds / "seed-4", seeds / "seed-5"]
@@ -58,6 +60,7 @@ def test_curves_are_those_of_all_seeds(seeds):
         np.testing.assert_array_equal(curves["lidar"][name][1], of_5[name])
 
 
+@pytest.mark.slow
 def test_the_summary_of_several_seeds_is_over_all_of_them(seeds, capsys):
     summary = json.loads((seeds / "summary.json").read_text(encoding="utf-8"))
     each = [without_times(seeds / f"seed-{s}") for s in (4, 5)]
@@ -79,6 +82,7 @@ def test_the_summary_of_several_seeds_is_over_all_of_them(seeds, capsys):
     assert "is finished" in error_line(["--resume", str(seeds)], capsys)
 
 
+@pytest.mark.slow
 def test_seeds_that_are_all_finished_are_only_summed_up(seeds, tmp_path, monkeypatch):
     path = tmp_path / "seeds"
     shutil.copytree(seeds, path)
@@ -88,6 +92,7 @@ def test_seeds_that_are_all_finished_are_only_summed_up(seeds, tmp_path, monkeyp
     assert (path / "summary.json").read_text() == (seeds / "summary.json").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["altered", "missing", "all missing"])
 def test_seeds_are_summed_up_without_a_damaged_curve(seeds, tmp_path, capsys, damage):
     path = tmp_path / "seeds"
@@ -109,6 +114,7 @@ def test_seeds_are_summed_up_without_a_damaged_curve(seeds, tmp_path, capsys, da
     assert (path / "reward.svg").exists()
 
 
+@pytest.mark.slow
 def test_a_seed_that_fails_leaves_the_others(seeds, cache, tmp_path, monkeypatch, capsys):
     path = tmp_path / "seeds"
     shutil.copytree(seeds, path)

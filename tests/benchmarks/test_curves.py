@@ -52,6 +52,7 @@ def test_a_table_has_a_row_for_each_policy():
     assert labels == ["latent", "naive"]
 
 
+@pytest.mark.slow
 def test_the_oracle_takes_the_shortest_tour_of_what_its_sensor_has_to_tell():
     config = PRESETS["smoke"]
     models = init(jax.random.key(0), config)

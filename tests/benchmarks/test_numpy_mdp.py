@@ -19,6 +19,7 @@ def task():
     return untrained_task(DqnConfig(observe="bank"), samples=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("modality", [0, 1])
 def test_every_step_equals_ours(task, modality):
     mdp = task.mdp

@@ -55,6 +55,7 @@ def loss_of(model, params, looks, beta=1.0, has_begun=1.0):
     return loss_function(model)(KEY, params, looks, jnp.float32(beta), jnp.float32(has_begun))
 
 
+@pytest.mark.slow
 def test_the_variant_ours_has_the_loss_of_the_library():
     model, params = OURS_MODEL, random_params(OURS_MODEL)
     shape = Shape(("camera", "lidar"), SIZES, 2, OURS.jmvae.hidden)
@@ -103,6 +104,7 @@ def test_the_paper_has_the_objective_of_a_jmvae():
     np.testing.assert_allclose(found, objective(params, looks), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_all_that_is_known_of_a_look_is_in_its_row():
     looks = simulate(KEY, 288)
     assert {len(x) for x in (*looks.windows, *looks.frames, looks.classes)} == {36}

@@ -50,6 +50,7 @@ def train(found, name, seeds=(20, 21)):
     return recorder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["map-v0", "team-v0"])
 def test_our_dqn_trains_in_every_kind_of_task(name):
     small = dqn.Dqn(num_envs=32, updates=1, batch=32, replay=1024)
@@ -194,6 +195,7 @@ class Nop:
             report(steps, {seed: Partial(nop)})
 
 
+@pytest.mark.slow
 def test_a_row_of_a_job_holds_all_seeds():
     job = jobs.Job("map-v0", "camera", Nop(), (20, 21, 22), 64)
     row, points = jobs.do(job, {"commit": "0", "date": "2026-11-26"})

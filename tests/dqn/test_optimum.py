@@ -130,7 +130,7 @@ def known_of_start(classes, bits):
     return tuple(known)
 
 
-@pytest.mark.parametrize("num_pois", [2, 3])
+@pytest.mark.parametrize("num_pois", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_no_policy_expects_more_than_the_optimal_one(num_pois):
     states = [
         (classes, seen)

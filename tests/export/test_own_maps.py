@@ -95,6 +95,7 @@ def test_maps_are_merged_as_missions_merge_them(models, archive, player):
     np.testing.assert_array_equal(merged["std"][4], models.fusion.prior.std)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("player", PLAYERS)
 def test_the_example_plays_robots_with_maps_of_their_own(archive, player):
     example = runpy.run_path(str(EXAMPLE))

@@ -123,6 +123,7 @@ def test_what_cannot_be_in_gymnasium_is_told(gymnasium):
         gymnasium.make("jaxsense/map-v0", agent="sonar")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["map-v0", "team-v0"])
 def test_a_vector_of_gymnasium_is_one_program(gymnasium, name):
     from jaxsense.interfaces.gymnasium import MapVectorEnv
@@ -189,6 +190,7 @@ def scaled(task, state, robot):
     return task.observe(state.replace(agent=jnp.int32(robot)))
 
 
+@pytest.mark.slow
 def test_jaxmarl_scales_for_every_robot():
     jaxmarl = pytest.importorskip("jaxsense.interfaces.jaxmarl", reason="needs jaxsense[jaxmarl]")
     task, env = make("team-v0"), jaxmarl.make("team-v0")

@@ -90,6 +90,7 @@ def assert_same(ours, theirs):
             jax.tree.map(np.testing.assert_array_equal, ours[4][name], value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_ends_are_followed_by_starts_as_in_gymnasiums_own(mode):
     mdp, start = small.noiseless()

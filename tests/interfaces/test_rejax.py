@@ -12,6 +12,7 @@ from jaxsense.interfaces import gymnax
 from jaxsense.interfaces.rejax import MapEnv
 
 
+@pytest.mark.slow
 def test_a_step_is_that_of_gymnax_with_five_values():
     ours, theirs = MapEnv(small.small_mdp(), 0), gymnax.MapEnv(small.small_mdp(), 0)
     params = ours.default_params.replace(max_steps_in_episode=2)

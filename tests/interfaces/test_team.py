@@ -31,6 +31,7 @@ def at_the_limit(number):
     return state, act
 
 
+@pytest.mark.slow
 def test_a_robot_that_chose_nop_at_the_limit_is_done_and_not_cut():
     state, act = at_the_limit(1)
     _, outcome = act(state, jnp.full(3, NOP))
@@ -62,6 +63,7 @@ def test_actions_that_do_not_exist_are_refused(actions):
         team.step(jax.random.key(1), small.team(), state, jnp.asarray(actions))
 
 
+@pytest.mark.slow
 def test_classes_and_scans_of_detections_are_drawn_from_keys_of_their_own(monkeypatch):
     """With one key for both, the order of the classes and the first scene would be related."""
     keys, balanced, survey = {}, looks.balanced_classes, looks.surveys

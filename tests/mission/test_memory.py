@@ -250,6 +250,7 @@ def scan(own_team, own_models):
     return of_one
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delay", "hears"), [(0.0, True), (5.0, False)])
 def test_a_scan_is_remembered_and_told(
     scan, own_team, own_models, own_arena, set_robot, delay, hears

@@ -91,6 +91,7 @@ def test_a_batch_moves_like_its_members(move, pushing):
         np.testing.assert_allclose(clearance[i], expected[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_touched_the_empty_arena_gives_the_same_motion(move, pushing):
     # The second robot could touch the PoI, but does not.
     start = pushing(0.05, 0.022, 0.002)

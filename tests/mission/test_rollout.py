@@ -255,6 +255,7 @@ def driven(team, played, as_numpy):
     return as_numpy((recorded, before, *after))
 
 
+@pytest.mark.slow
 def test_a_physics_step_from_recorded_states_is_that_of_c_mujoco(team, driven):
     arena = team.world.arena
     recorded, before, qpos, qvel, speeds = driven

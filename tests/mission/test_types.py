@@ -21,6 +21,7 @@ def test_a_mission_begins_without_weak_types(preset):
     assert not weak(state)
 
 
+@pytest.mark.slow
 def test_episodes_begin_without_weak_types():
     key = jax.random.key(0)
     for preset, reset in (("smoke", map_mdp.reset), ("team", team_mdp.reset)):

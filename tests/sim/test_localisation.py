@@ -83,6 +83,7 @@ def test_training_looks_have_the_bearing_and_distance_of_a_misplaced_robot(simul
     assert np.mean(distance) == pytest.approx(0.5, abs=0.001)
 
 
+@pytest.mark.slow
 def test_surveys_expect_pois_where_misplaced_robots_do(simulation):
     classes, keys = jnp.array([0, 1, 2]), jax.random.split(jax.random.key(0), 64)
 

@@ -27,6 +27,7 @@ def hit(origin, angle, section):
 INPUTS = 0, 1, 2
 
 
+@pytest.mark.slow
 def test_slopes_are_those_of_finite_differences(by):
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
@@ -140,6 +141,7 @@ def test_slopes_are_finite_for_every_ray(slopes):
     np.testing.assert_array_equal(values[len(cases) :], [[np.inf, 0.0, 0.0]] * len(misses))
 
 
+@pytest.mark.slow
 def test_slopes_reach_through_the_arena(arena, place, known_layout):
     """Readings of the LiDAR in where its robot and the PoIs are, through the kinematics of MJX."""
     lidar = sensors.lidar(LidarConfig(range_noise=0.0))

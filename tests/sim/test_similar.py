@@ -28,6 +28,7 @@ def test_walls_are_behind_the_poi(world):
         similar.make_world(replace(SMOKE, arena=replace(SMOKE.arena, side=101.0)), 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bearing", "distance"), [(0.0, 2.0), (-1.2, 0.5)])
 def test_a_simulated_look_shows_a_lone_poi_where_it_is_expected(world, bearing, distance):
     look = jax.jit(
@@ -44,6 +45,7 @@ def test_a_simulated_look_shows_a_lone_poi_where_it_is_expected(world, bearing, 
     assert 0.3 < np.abs(middle).max() * 240 / 682 < 1.4  # degrees
 
 
+@pytest.mark.slow
 def test_a_window_is_as_far_from_simulated_ones_as_it_is_off(world):
     bearing, distance = jnp.float32(0.2), jnp.float32(0.8)
     sensor = world.sensors[1]

@@ -52,6 +52,7 @@ def test_where_no_place_is_free_at_that_distance_the_robot_stays(moved):
     np.testing.assert_array_equal(poses[:, :2], np.broadcast_to(PLACE, (64, 2)))
 
 
+@pytest.mark.slow
 def test_looks_from_one_place_are_alike_but_for_their_noise():
     simulation = world.make_world(CONFIG)
 

@@ -169,6 +169,7 @@ def test_surveys_equal_single_ones(simulation, monkeypatch):
         chex.assert_trees_all_close(jax.tree.map(lambda x: x[i], together), alone, atol=1e-5)  # noqa: B023
 
 
+@pytest.mark.slow
 def test_looks_at_a_scene_share_what_changes_its_light(simulation):
     camera = CameraConfig(pixel_noise=0.0, exposure_error=0.5)
     changing = world.make_world(Config(camera=camera), arena=simulation.arena)
@@ -222,6 +223,7 @@ def test_the_world_of_other_settings_keeps_the_arena():
         world.make_world(other, arena=made.arena)
 
 
+@pytest.mark.slow
 def test_a_world_is_an_input_of_a_program(simulation):
     key = jax.random.key(0)
     survey = jax.jit(world.survey)

@@ -16,6 +16,7 @@ from jaxsense.tasks.score import _play_compiled
 make = functools.cache(jaxsense.make)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["map-v0", "team-v0"])
 def test_a_network_reads_from_an_observation_what_it_learns_from(name):
     task = make(name)
@@ -39,6 +40,7 @@ def test_a_network_reads_from_an_observation_what_it_learns_from(name):
         assert set(np.unique(features[:, -3])) == {0.0, 1.0}
 
 
+@pytest.mark.slow
 def test_robots_of_a_team_learn_in_the_teams_of_the_task():
     task = make("team-v0")
     state = jax.jit(task.learning(task.models.agent).reset)(jax.random.key(0)).now
@@ -69,6 +71,7 @@ def above(bound, key, observation):
     return jnp.where(observation[0] > bound, 0, 3)
 
 
+@pytest.mark.slow
 def test_policies_of_one_kind_are_compiled_once():
     task = make("map-v0")
     programs = _play_compiled._cache_size()
@@ -86,6 +89,7 @@ def test_policies_of_one_kind_are_compiled_once():
     assert len(set(alone)) == 3
 
 
+@pytest.mark.slow
 def test_policies_that_are_no_pytrees_of_numbers_are_played():
     """As a module of another library, whose activation function is a leaf."""
     policy = Partial(lambda choose, nop, key, seen: choose(nop), lambda x: x, jnp.int32(3))

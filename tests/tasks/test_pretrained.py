@@ -24,7 +24,7 @@ def test_models_have_the_settings_of_their_preset(preset):
 
 @pytest.mark.parametrize(
     "preset",
-    [p if p == "noisy" else pytest.param(p, marks=pytest.mark.slow) for p in tasks.PRETRAINED],
+    [p if p == "default" else pytest.param(p, marks=pytest.mark.slow) for p in tasks.PRETRAINED],
 )
 def test_models_tell_classes_apart(preset):
     """Looks by all sensors at a PoI of each class, from the detectors to the map."""

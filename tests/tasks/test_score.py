@@ -55,6 +55,7 @@ def test_a_policy_on_the_host_plays_the_same_episodes():
     assert one.mean_return.value > 0
 
 
+@pytest.mark.slow
 def test_a_policy_that_remembers_looks_at_each_poi_once():
     def act(key, memory, observation):
         return memory, memory + 1
@@ -67,6 +68,7 @@ def test_a_policy_that_remembers_looks_at_each_poi_once():
     assert (found.returns > found.references["random"]).all()
 
 
+@pytest.mark.slow
 def test_policies_of_several_trainings_play_a_seed_each(of_uniform):
     found = jaxsense.score(NAME, [uniform, nop])
     np.testing.assert_allclose(found.returns, [of_uniform.returns[0], 0.0], rtol=1e-6)

@@ -26,7 +26,7 @@ def detections_of(bank, held_out: Any = (), starts: Any = ()) -> Detections:
     return Detections(bank, held_out, starts, nothing)
 
 
-@pytest.mark.parametrize("reward", ["nats", "paper"])
+@pytest.mark.parametrize("reward", ["nats", pytest.param("paper", marks=pytest.mark.slow)])
 def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(reward):
     mdp = MdpConfig(reward=reward, look_cost=0.125, min_increase=0.01)
     fusion = dataclasses.replace(TINY.jmvae, fusion="filter", latent_size=1)

@@ -244,6 +244,7 @@ def play(modality, models, bank):
 PAYS = constant(1.0, 1.0)
 
 
+@pytest.mark.slow
 def test_policies_are_played_from_every_state_and_from_random_starts():
     # Where a look replaces the one before, the values of looks do not matter.
     models = models_with(jnp.array([0.0, 0.0, 0.0, 1.0]), (PAYS, PAYS))

@@ -37,6 +37,7 @@ def given_to_detectors(windows, labels):
     return {"surveys": Surveys(survey, nothing), "examples": (examples, examples)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "trained_on"), [(0.0, 10), (0.1, 9), (0.25, 7), (0.5, 5)])
 def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, monkeypatch):
     config = dataclasses.replace(TINY.detector, calibration=share)
@@ -94,6 +95,7 @@ def test_without_calibration_a_detector_is_what_was_trained():
     assert np.isfinite(found.gate.threshold)
 
 
+@pytest.mark.slow
 def test_the_loss_of_a_restart_is_the_mean_of_its_last_chunk(monkeypatch):
     # 41 steps are 14 chunks of 3, the last of which has 2. The loss of a step is its number.
     monkeypatch.setattr(jmvae.Fitting, "loss", lambda self, params, drawn, step: step + 1.0)
@@ -139,6 +141,7 @@ def best_of(losses, classes):
     return int(kept(np.float32(losses), stacked))
 
 
+@pytest.mark.slow
 def test_the_exact_restart_with_the_lowest_loss_is_kept():
     nan, inf = jnp.nan, jnp.inf
     for losses, expected in {(1, 0.5, 0.9): 1, (1, nan, 0.9): 2, (nan, inf): 0, (nan,): 0}.items():

@@ -103,6 +103,7 @@ def test_learn_and_a_run_come_to_the_same(trained):
             close(values, found.curves[name][metric])
 
 
+@pytest.mark.slow
 def test_learn_stops_after_the_stage_that_is_named():
     names = [stage.name for stage in training.stages.stages(TINY)]
     shapes = jax.eval_shape(lambda: learn(KEY, TINY, until="best_jmvae"))

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxsense.vae import clusters
 
@@ -10,6 +11,7 @@ KEY = jax.random.key(0)
 PLACES = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0], [3.0, 3.0], [9.0, 9.0]])
 
 
+@pytest.mark.slow
 def test_centres_are_found_wherever_the_starts_fall():
     of_point = np.repeat(np.arange(5), [400, 30, 400, 400, 5])
     noise = 0.1 * np.random.default_rng(0).normal(size=(len(of_point), 2))

@@ -130,6 +130,7 @@ def test_the_posterior_takes_any_number_of_looks_in_any_order():
     np.testing.assert_allclose(turned.mean, fewer.mean, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_fit_lowers_the_loss():
     config = JmvaeConfig(
         learns_from="scans", fusion="filter", hidden=(4,), steps=300, batch=16, alpha=0.1,

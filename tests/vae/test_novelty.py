@@ -78,6 +78,7 @@ def _looks(key, number, share, apart):
     return found, jnp.broadcast_to(positions, (number, 4, 2)), classes
 
 
+@pytest.mark.slow
 def test_it_learns_that_repeated_looks_say_nothing_and_distant_ones_everything():
     same_key, far_key = jax.random.split(jax.random.key(0))
     near, far = _looks(same_key, 5000, 1.0, 0.0), _looks(far_key, 5000, 0.0, 3.0)
@@ -97,6 +98,7 @@ def test_it_learns_the_share_that_looks_have_in_common():
     assert worth == pytest.approx(1.6, abs=0.3)
 
 
+@pytest.mark.slow
 def test_maps_are_no_surer_than_right_of_looks_from_several_places():
     """Likelihoods gain more from three scenes in ten, than they lose by errors in the others."""
     shared_key, own_key = jax.random.split(jax.random.key(2))
