@@ -1,5 +1,6 @@
 """Stable-Baselines3's DQN on the map MDP in NumPy."""
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +17,7 @@ from stable_baselines3.common.callbacks import (  # pyright: ignore[reportMissin
 from benchmarks.maps import MODALITY, Task
 from benchmarks.measure import Options, Side
 from benchmarks.peers.numpy_mdp import NumpyMdp
+from benchmarks.tasks.sb3 import Sb3Dqn, layers
 
 
 class MapEnv(gymnasium.Env):
@@ -40,21 +42,25 @@ class MapEnv(gymnasium.Env):
         return self._mdp.observation(self._state), reward, terminated, truncated, {}
 
 
-def make(task: Task, **settings: Any) -> DQN:
-    """The algorithm with our network, learning rate and discount."""
+def make(task: Task, learner: Sb3Dqn, **others: Any) -> DQN:
+    """The algorithm with our network, batch, learning rate and discount, on one thread.
+
+    Args:
+      task: what to learn.
+      learner: all other settings, of which one gradient step at a time is made.
+      **others: those that a learner does not have, by the algorithm's names.
+    """
+    torch.set_num_threads(1)  # faster than two for networks of this size
     dqn = task.config.dqn
-    return DQN(
-        "MlpPolicy",
-        MapEnv(task),
+    same = dataclasses.replace(
+        learner,
+        discount=dqn.discount,
+        updates=1,
+        batch=dqn.batch,
         learning_rate=dqn.learning_rate,
-        gamma=dqn.discount,
-        batch_size=dqn.batch,
-        exploration_final_eps=dqn.epsilon_min,
-        policy_kwargs={"net_arch": list(dqn.hidden), "activation_fn": torch.nn.ReLU},
-        device="cpu",
-        seed=0,
-        **settings,
     )
+    env, hidden = MapEnv(task), dqn.hidden
+    return same.make(env, 0, hidden, exploration_final_eps=dqn.epsilon_min, **others)
 
 
 def throughputs(task: Task, options: Options) -> list[Side]:
@@ -62,8 +68,8 @@ def throughputs(task: Task, options: Options) -> list[Side]:
     steps = 20 if options.quick else 1000
 
     def side(train_freq: int) -> Side:
-        torch.set_num_threads(1)  # faster than two for networks of this size
-        model = make(task, train_freq=train_freq, learning_starts=1, buffer_size=131072)
+        learner = Sb3Dqn(replay=131072, exploration=0.1, target_period=10000)
+        model = make(task, learner, train_freq=train_freq, learning_starts=1)
 
         def run() -> None:
             model.learn(steps, reset_num_timesteps=False)
@@ -75,16 +81,8 @@ def throughputs(task: Task, options: Options) -> list[Side]:
 
 def as_our_params(model: DQN) -> optax.Params:
     """Its Q-network as one of ours."""
-    linear = [m for m in model.q_net.q_net if isinstance(m, torch.nn.Linear)]
-    return {
-        "params": {
-            f"Dense_{i}": {
-                "kernel": layer.weight.detach().numpy().T.copy(),
-                "bias": layer.bias.detach().numpy().copy(),
-            }
-            for i, layer in enumerate(linear)
-        }
-    }
+    of_layers = enumerate(layers(model.q_net.q_net))
+    return {"params": {f"Dense_{i}": {"kernel": w, "bias": b} for i, (w, b) in of_layers}}
 
 
 def time_to(task: Task, passes: Callable[[optax.Params], bool], limit: float) -> tuple[float, bool]:
@@ -112,14 +110,7 @@ def time_to(task: Task, passes: Callable[[optax.Params], bool], limit: float) ->
             return is_stopped and spent < limit
 
     begin = time.perf_counter()
-    torch.set_num_threads(1)
-    model = make(
-        task,
-        train_freq=4,
-        learning_starts=500,
-        buffer_size=65536,
-        target_update_interval=500,
-        exploration_fraction=0.02,
-    )
+    learner = Sb3Dqn(replay=65536, exploration=0.02, target_period=500)
+    model = make(task, learner, train_freq=4, learning_starts=500)
     model.learn(most, callback=Examination())
     return spent, is_stopped

@@ -43,23 +43,30 @@ class RejaxDqn:
     exploration: float = 0.5
     target_period: int = 2560
 
-    def train(self, task: Task, seeds: Sequence[int], steps: int, report: Report) -> None:
-        """Trains all seeds in one program, see `Learner.train`."""
-        algorithm = _make(
-            DQN,
-            task,
+    def make(self, steps: int, **others: Any) -> Any:
+        """The algorithm.
+
+        Args:
+          steps: environment steps of a training.
+          **others: the environment, its parameters, and other settings, by rejax's names.
+        """
+        return DQN.create(  # pyright: ignore[reportAttributeAccessIssue]
             num_envs=self.num_envs,
             num_epochs=self.updates,
             batch_size=self.batch,
             buffer_size=self.replay,
-            fill_buffer=1024,
             total_timesteps=steps,
             learning_rate=self.learning_rate,
             gamma=self.discount,
             exploration_fraction=self.exploration,
             target_update_freq=self.target_period,
             polyak=0.0,
+            **{"fill_buffer": 1024, **others},
         )
+
+    def train(self, task: Task, seeds: Sequence[int], steps: int, report: Report) -> None:
+        """Trains all seeds in one program, see `Learner.train`."""
+        algorithm = self.make(steps, **_environment(task))
 
         def act(params: Any, key: jax.Array, observation: jax.Array) -> jax.Array:
             del key
@@ -94,9 +101,8 @@ class RejaxPpo:
 
     def train(self, task: Task, seeds: Sequence[int], steps: int, report: Report) -> None:
         """Trains all seeds in one program, see `Learner.train`."""
-        algorithm = _make(
-            PPO,
-            task,
+        algorithm = PPO.create(  # pyright: ignore[reportAttributeAccessIssue]
+            **_environment(task),
             num_envs=self.num_envs,
             num_steps=self.num_steps,
             num_epochs=self.epochs,
@@ -113,10 +119,15 @@ class RejaxPpo:
         _train(algorithm, seeds, steps, unit, lambda state: state.actor_ts, act, report)
 
 
-def _make(kind: Any, task: Task, **settings: Any) -> Any:
-    """An algorithm of rejax in a task."""
+def iterate(algorithm: Any, state: Any, number: int) -> Any:
+    """Some iterations of an algorithm; to be jitted."""
+    return jax.lax.fori_loop(0, number, lambda _, s: algorithm.train_iteration(s), state)
+
+
+def _environment(task: Task) -> dict[str, Any]:
+    """What an algorithm learns in, by rejax's names."""
     env = MapEnv(task)
-    return kind.create(env=env, env_params=env.prepared_params(_STARTS, NUM_STARTS), **settings)
+    return {"env": env, "env_params": env.prepared_params(_STARTS, NUM_STARTS)}
 
 
 def _train(
@@ -134,13 +145,12 @@ def _train(
     """
     number = part(steps, unit)
 
-    def advance(algorithm: Any, state: Any) -> Any:
-        iterate = lambda _, state: algorithm.train_iteration(state)  # noqa: E731
-        return jax.lax.fori_loop(0, number, iterate, state)
-
     keys = jax.vmap(jax.random.key)(jnp.array(seeds))
     states = jax.jit(jax.vmap(algorithm.init_state))(keys)
-    of_all = jax.jit(jax.vmap(advance, (None, 0)), donate_argnums=1)
+    of_all = jax.jit(
+        jax.vmap(lambda algorithm, state: iterate(algorithm, state, number), (None, 0)),
+        donate_argnums=1,
+    )
     compiled = of_all.lower(algorithm, states).compile(devices.compiler_options(runs_long=True))
     for i in range(POINTS + 1):
         found = of_seeds(seeds, learned(states).params)

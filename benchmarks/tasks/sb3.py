@@ -51,31 +51,38 @@ class Sb3Dqn:
     exploration: float = 0.5
     target_period: int = 2560
 
+    def make(self, envs: Any, seed: int, hidden: Sequence[int] = _HIDDEN, **others: Any) -> DQN:
+        """The algorithm.
+
+        Args:
+          envs: where it learns, one environment or several.
+          seed: of the training.
+          hidden: sizes of the hidden layers.
+          **others: other settings, by its own names.
+        """
+        return DQN(
+            "MlpPolicy",
+            envs,
+            gradient_steps=self.updates,
+            batch_size=self.batch,
+            buffer_size=self.replay,
+            learning_rate=self.learning_rate,
+            gamma=self.discount,
+            exploration_fraction=self.exploration,
+            target_update_interval=self.target_period,
+            policy_kwargs={"net_arch": list(hidden), "activation_fn": torch.nn.ReLU},
+            device="cpu",
+            seed=seed,
+            **{"learning_starts": 1024, "train_freq": 1, **others},
+        )
+
     def train(self, task: Task, seeds: Sequence[int], steps: int, report: Report) -> None:
         """Trains one seed after another, see `Learner.train`."""
 
-        def make(envs: Any, seed: int) -> Any:
-            return DQN(
-                "MlpPolicy",
-                envs,
-                learning_starts=1024,
-                train_freq=1,
-                gradient_steps=self.updates,
-                batch_size=self.batch,
-                buffer_size=self.replay,
-                learning_rate=self.learning_rate,
-                gamma=self.discount,
-                exploration_fraction=self.exploration,
-                target_update_interval=self.target_period,
-                policy_kwargs={"net_arch": list(_HIDDEN), "activation_fn": torch.nn.ReLU},
-                device="cpu",
-                seed=seed,
-            )
-
         def policy(model: Any) -> "Dense":
-            return Dense(_layers(model.q_net.q_net), jax.nn.relu, best)
+            return Dense(layers(model.q_net.q_net), jax.nn.relu, best)
 
-        _train(task, self.num_envs, make, policy, seeds, steps, report)
+        _train(task, self.num_envs, self.make, policy, seeds, steps, report)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +129,7 @@ class Sb3Ppo:
 
         def policy(model: Any) -> "Dense":
             last = model.policy.mlp_extractor.policy_net, model.policy.action_net
-            return Dense(_layers(*last), jnp.tanh, jax.random.categorical)
+            return Dense(layers(*last), jnp.tanh, jax.random.categorical)
 
         _train(task, self.num_envs, make, policy, seeds, steps, report)
 
@@ -174,8 +181,8 @@ class _Points(BaseCallback):
         return True
 
 
-def _layers(*modules: Any) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Weights and biases of the dense layers in networks of PyTorch."""
+def layers(*modules: Any) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Weights `[in, out]` and biases `[out]` of the dense layers in networks of PyTorch."""
     of_all = [layer for module in modules for layer in module.modules()]
     dense = [layer for layer in of_all if isinstance(layer, torch.nn.Linear)]
     # Copies: training changes them in place.

@@ -101,8 +101,8 @@ def test_networks_of_stable_baselines3_choose_as_they_do_in_jax():
             linear.bias.normal_()
             linear.weight.mul_(20)
     ours = {
-        on_policy: sb3.Dense(sb3._layers(*network), jnp.tanh, sb3.best),
-        off_policy: sb3.Dense(sb3._layers(off_policy.q_net.q_net), jax.nn.relu, sb3.best),
+        on_policy: sb3.Dense(sb3.layers(*network), jnp.tanh, sb3.best),
+        off_policy: sb3.Dense(sb3.layers(off_policy.q_net.q_net), jax.nn.relu, sb3.best),
     }
     for model, policy in ours.items():
         chosen = jax.vmap(lambda x: policy(None, x))(seen)  # noqa: B023
