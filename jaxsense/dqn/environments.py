@@ -297,7 +297,7 @@ class TeamEnvironment:
 
     def action_mask(self, state: SmdpState) -> Bool[Array, " A"]:
         """Mask `[A]` of the PoIs that are present, and NOP."""
-        return jnp.append(state.now.team.present, True)
+        return team_mdp.action_mask(state.now)
 
     def observe(self, state: SmdpState) -> Float[Array, " S"]:
         """Observation `[F * N]` of the robot that chooses."""

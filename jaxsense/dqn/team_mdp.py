@@ -16,7 +16,7 @@ import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import TeamConfig, TravelConfig
 from jaxsense.core import checks
@@ -90,6 +90,21 @@ class TeamMdp:
     map: MapMdp
     places: Places
     modalities: Names = struct.field(pytree_node=False)
+
+    @property
+    def num_features(self) -> int:
+        """Numbers that a robot knows of each PoI, F, see `observation`."""
+        return num_features(self.map.fusion.prior.mean.size, self.map.num_modalities)
+
+    def observe(self, state: TeamState, robot: Int[Array, ""]) -> Float[Array, "F N"]:
+        """What a robot knows, see `observation`.
+
+        Args:
+          state: the current state.
+          robot: `[]` int32.
+        """
+        belief, travel, number = state.map.belief, self.config.travel, self.map.num_modalities
+        return observation(travel, belief, state.team, robot, number)
 
     def time_price(self, team: Team, seconds: Float[Array, ""]) -> Float[Array, ""]:
         """What all robots that work pay together for some time.
@@ -232,6 +247,27 @@ def observation(
         relative.T,
     ]
     return jnp.where(team.present[None], jnp.concatenate(rows, axis=0), 0.0)
+
+
+def action_mask(state: TeamState) -> Bool[Array, " A"]:
+    """Mask `[N + 1]` of the PoIs that are present, and NOP.
+
+    Args:
+      state: the current state.
+    """
+    return jnp.append(state.team.present, True)
+
+
+def existing(state: TeamState, action: Int[Array, ""]) -> Int[Array, ""]:
+    """The action, or NOP in place of a PoI that is not present.
+
+    Args:
+      state: the current state.
+      action: `[]` int32; returned as it is if there is no such action.
+    """
+    nop = len(state.team.present)
+    is_absent = jnp.any(~state.team.present & (jnp.arange(nop) == action))
+    return jnp.where(is_absent, nop, action)
 
 
 def alone(num_pois: int, modality: Index) -> Team:

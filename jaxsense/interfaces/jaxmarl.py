@@ -53,9 +53,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         self.robots = team.robots_of(mdp, config)
         super().__init__(len(self.robots.names))
         self.agents = list(self.robots.names)
-        observation, action = self.robots.spaces(spaces)
-        self.observation_spaces = dict.fromkeys(self.agents, observation)
-        self.action_spaces = dict.fromkeys(self.agents, action)
+        self.observation_spaces, self.action_spaces = self.robots.spaces(spaces)
 
     # jaxmarl makes the environment static, here as in its `step`, and with it the MDP.
     @functools.partial(jax.jit, static_argnums=0)
@@ -95,17 +93,17 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         ended = jnp.all(dones)
         state = TeamEnvState(done=ended, step=after.map.steps, team=after)  # pyright: ignore
         infos = {"seconds": jnp.full(self.num_agents, outcome.seconds)}
-        of_each = {**self._named(dones), "__all__": ended}
-        return self.get_obs(state), state, self._named(outcome.rewards), of_each, infos
+        of_each = {**self.robots.named(dones), "__all__": ended}
+        return self.get_obs(state), state, self.robots.named(outcome.rewards), of_each, infos
 
     def get_obs(self, state: TeamEnvState) -> dict[str, jax.Array]:  # pyright: ignore
         """Observation of each robot, `[S]`, see `team_mdp.observation`."""
-        return self._named(self.robots.observations(state.team))
+        return self.robots.named(self.robots.observations(state.team))
 
     @functools.partial(jax.jit, static_argnums=0)
     def get_avail_actions(self, state: TeamEnvState) -> dict[str, jax.Array]:
         """Actions that each robot has, `[N + 1]` bool: only NOP if it is not its turn."""
-        return self._named(team.available(state.team))
+        return self.robots.named(team.available(state.team))
 
     @property
     def name(self) -> str:
@@ -119,10 +117,6 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         for agent, modality in zip(self.agents, self.robots.modality, strict=True):
             classes.setdefault(modality, []).append(agent)
         return classes
-
-    def _named(self, of_robots: jax.Array) -> dict[str, jax.Array]:
-        """`[R, ...]` by the names of the robots."""
-        return dict(zip(self.agents, of_robots, strict=True))
 
 
 def make(name: str) -> TeamEnv:

@@ -41,9 +41,7 @@ class _Team:
         self.render_mode = None
         self.possible_agents = list(self._robots.names)
         self.agents: list[str] = []
-        observation, action = self._robots.spaces(spaces)
-        self.observation_spaces = dict.fromkeys(self.possible_agents, observation)
-        self.action_spaces = dict.fromkeys(self.possible_agents, action)
+        self.observation_spaces, self.action_spaces = self._robots.spaces(spaces)
         self._state: TeamState | None = None
         self._key: Key | None = None
 
@@ -94,7 +92,7 @@ class _Team:
 
     def _named(self, of_robots: jax.Array, kind: Any = np.array) -> dict[str, Any]:
         """`[R, ...]` by the names of the robots that work."""
-        of_each = dict(zip(self.possible_agents, np.asarray(of_robots), strict=True))
+        of_each = self._robots.named(np.asarray(of_robots))
         return {agent: kind(of_each[agent]) for agent in self.agents}
 
     def _infos(self, seconds: float, available: jax.Array) -> Infos:

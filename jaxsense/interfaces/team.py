@@ -6,7 +6,8 @@ choose, time passes until the next look. The robot that has looked earns the rew
 chooses next.
 """
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, TypeVar
 
 import chex
 import jax
@@ -23,6 +24,8 @@ from jaxsense.interfaces import common
 from jaxsense.tasks import make
 from jaxsense.tasks.environment import Scaling
 from jaxsense.tasks.task import TeamTask
+
+T = TypeVar("T")
 
 
 @struct.dataclass
@@ -74,16 +77,27 @@ class Robots:
     names: tuple[str, ...] = struct.field(pytree_node=False)
     modality: tuple[str, ...] = struct.field(pytree_node=False)
 
-    def spaces(self, spaces: Any) -> tuple[Any, Any]:
-        """Spaces of what a robot knows, `[S]`, and of its actions, see `common.spaces_of`.
+    def spaces(self, spaces: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Spaces of what each robot knows, `[S]`, and of its actions, see `common.spaces_of`.
 
         Args:
           spaces: another library's module, with `Box` and `Discrete`.
+
+        Returns:
+          Both by the names of the robots.
         """
-        of_map = self.mdp.map
-        features = team_mdp.num_features(of_map.fusion.prior.mean.size, of_map.num_modalities)
-        size, num_actions = features * of_map.num_pois, of_map.num_pois + 1
-        return common.spaces_of(spaces, size, num_actions, self.scaling.bound)
+        num_pois = self.mdp.map.num_pois
+        size, bound = self.mdp.num_features * num_pois, self.scaling.bound
+        observation, action = common.spaces_of(spaces, size, num_pois + 1, bound)
+        return dict.fromkeys(self.names, observation), dict.fromkeys(self.names, action)
+
+    def named(self, of_robots: Iterable[T]) -> dict[str, T]:
+        """What each robot has, by its name.
+
+        Args:
+          of_robots: `[R, ...]`.
+        """
+        return dict(zip(self.names, of_robots, strict=True))
 
     def start(self, key: Key) -> TeamState:
         """Starts an episode of all robots.
@@ -102,11 +116,9 @@ class Robots:
         Returns:
           `[R, S]`.
         """
-        belief, number = state.map.belief, self.mdp.map.num_modalities
-        travel = self.mdp.config.travel
 
         def observation(robot: jax.Array) -> jax.Array:
-            return self.scaling(team_mdp.observation(travel, belief, state.team, robot, number).T)
+            return self.scaling(self.mdp.observe(state, robot).T)
 
         return jax.vmap(observation)(jnp.arange(len(self.names)))
 
@@ -160,8 +172,7 @@ def available(state: TeamState) -> Bool[Array, "R A"]:
     """
     robots = jnp.arange(len(state.team.works))
     chooses = state.team.works & (robots == state.agent)
-    pois = chooses[:, None] & state.team.present[None]
-    return jnp.concatenate([pois, jnp.ones((len(robots), 1), bool)], axis=1)
+    return (chooses[:, None] & team_mdp.action_mask(state)[None]).at[:, -1].set(True)
 
 
 def step(
@@ -187,9 +198,8 @@ def step(
     num_robots, num_pois = len(state.team.works), mdp.map.num_pois
     chex.assert_shape(actions, (num_robots,), custom_message="actions")
     checks.require_index("actions", actions, num_pois + 1)
-    action = actions[state.agent]
-    is_absent = jnp.any(~state.team.present & (jnp.arange(num_pois) == action))
-    after, outcome = team_mdp.step(key, mdp, state, jnp.where(is_absent, num_pois, action))
+    action = team_mdp.existing(state, actions[state.agent])
+    after, outcome = team_mdp.step(key, mdp, state, action)
     works, seconds = after.team.works, jnp.asarray(outcome.seconds)
     price = mdp.config.second_cost * seconds
     earned = jnp.where(jnp.arange(num_robots) == after.agent, outcome.reward, 0.0)

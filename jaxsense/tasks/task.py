@@ -275,9 +275,7 @@ class TeamTask:
     @property
     def observation_size(self) -> int:
         """What a robot knows of each PoI, see `team_mdp.observation`."""
-        latent_size = self.mdp.map.fusion.prior.mean.size
-        number = team_mdp.num_features(latent_size, self.mdp.map.num_modalities)
-        return number * self.mdp.map.num_pois
+        return self.mdp.num_features * self.mdp.map.num_pois
 
     @property
     def bound(self) -> float:
@@ -301,9 +299,7 @@ class TeamTask:
 
     def features(self, state: TeamState) -> Float[Array, "N F"]:
         """`[N, F]` what the robot knows whose turn it is, not yet scaled."""
-        belief, team, agent = state.map.belief, state.team, state.agent
-        number = self.mdp.map.num_modalities
-        return team_mdp.observation(self.mdp.config.travel, belief, team, agent, number).T
+        return self.mdp.observe(state, state.agent).T
 
     def learning(self, agent: Agent) -> environments.Environment[Any]:
         """The team MDP with the robots of the task, see `Task.learning`."""
@@ -326,7 +322,7 @@ class TeamTask:
 
     def action_mask(self, state: TeamState) -> Bool[Array, " A"]:
         """`[A]` bool: the PoIs that are present, and NOP."""
-        return jnp.append(state.team.present, True)
+        return team_mdp.action_mask(state)
 
     def step(
         self, key: Key, state: TeamState, action: Int[Array, ""]
@@ -336,8 +332,7 @@ class TeamTask:
         A PoI that is not present counts as NOP. The reward is that of the look, if there was one,
         less the price of the time of all robots.
         """
-        action = self._existing(state, action)
-        after, outcome = team_mdp.step(key, self.mdp, state, action)
+        after, outcome = team_mdp.step(key, self.mdp, state, team_mdp.existing(state, action))
         price = self.mdp.time_price(after.team, jnp.asarray(outcome.seconds))
         seen, reward = self.observe(after), outcome.reward - price
         return after, TimeStep(seen, reward, outcome.terminated, outcome.truncated)
@@ -348,7 +343,7 @@ class TeamTask:
         def choose(key: Key, state: TeamState, known: Known, memory: M) -> tuple[jax.Array, M]:
             del known
             action, memory = act(key, memory, self.observe(state))
-            return self._existing(state, action), memory
+            return team_mdp.existing(state, action), memory
 
         return self._play(key, choose, memory)
 
@@ -369,12 +364,6 @@ class TeamTask:
         start_key, play_key = jax.random.split(key)
         start = team_mdp.reset(start_key, self.mdp, self.robots)
         return episodes.run_team(play_key, self.mdp, choose, memory, start)[0]
-
-    def _existing(self, state: TeamState, action: jax.Array) -> jax.Array:
-        """The action, or NOP in place of a PoI that is not present."""
-        num_pois = self.mdp.map.num_pois
-        is_absent = jnp.any(~state.team.present & (jnp.arange(num_pois) == action))
-        return jnp.where(is_absent, num_pois, action)
 
 
 def key_of_seed(seed: int) -> Key:
