@@ -10,8 +10,6 @@ import jax.numpy as jnp
 from benchmarks.tasks.learner import NUM_STARTS, POINTS, Report, of_seeds, part
 from jaxsense.config import DqnConfig
 from jaxsense.dqn import training
-from jaxsense.dqn.environments import Agent
-from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.run import devices
 from jaxsense.tasks import Task, greedy
 
@@ -46,7 +44,9 @@ class Dqn:
 
     def train(self, task: Task, seeds: Sequence[int], steps: int, report: Report) -> None:
         """Trains all seeds in one program, see `Learner.train`."""
-        agent = self._agent(task)
+        agent = task.models.agent.with_discount(
+            step=self.discount, second=self.discount_of_a_second
+        )
         chunk = part(steps, self.num_envs)
         epochs = POINTS * chunk
         settings = DqnConfig(
@@ -85,13 +85,6 @@ class Dqn:
             if i < POINTS:
                 states = compiled(keys[:, i], task, prepared, states)
                 jax.block_until_ready(states)
-
-    def _agent(self, task: Task) -> Agent:
-        """The agent of the task's preset, with our discount."""
-        agent = task.models.agent
-        if isinstance(agent, TeamAgent):
-            return dataclasses.replace(agent, discount=self.discount_of_a_second)
-        return dataclasses.replace(agent, discount=self.discount)  # pyright: ignore
 
 
 LEARNERS = (Dqn(),)

@@ -44,6 +44,15 @@ class Agent(Protocol):
         """Whether the Q-network is for this number of PoIs."""
         ...
 
+    def with_discount(self, *, step: float, second: float) -> "Agent":
+        """The agent with another discount factor, of which it takes that of its unit of time.
+
+        Args:
+          step: factor of a step, for an agent whose actions take no time.
+          second: factor of a second.
+        """
+        ...
+
     def mdp(
         self, of_number: Callable[[int], MapMdp], places: Places, names: Names
     ) -> MapMdp | TeamMdp:

@@ -56,6 +56,16 @@ class MapAgent:
         """Whether the Q-network is for this number of PoIs."""
         return num_pois == self.num_pois
 
+    def with_discount(self, *, step: float, second: float) -> "MapAgent":
+        """The agent with another discount factor of a step, see `Agent.with_discount`.
+
+        Args:
+          step: the factor.
+          second: not used.
+        """
+        del second
+        return dataclasses.replace(self, discount=step)
+
     def mdp(self, of_number: Callable[[int], MapMdp], places: Places, names: Names) -> MapMdp:
         """The map MDP.
 

@@ -70,6 +70,16 @@ class TeamAgent:
         del num_pois
         return True
 
+    def with_discount(self, *, step: float, second: float) -> "TeamAgent":
+        """The agent with another discount factor of a second, see `Agent.with_discount`.
+
+        Args:
+          step: not used.
+          second: the factor.
+        """
+        del step
+        return dataclasses.replace(self, discount=second)
+
     def mdp(self, of_number: Callable[[int], MapMdp], places: Places, names: Names) -> TeamMdp:
         """The team MDP.
 

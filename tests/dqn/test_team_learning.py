@@ -223,3 +223,9 @@ def test_a_look_that_tells_nothing_earns_what_the_settings_say(preset, reward):
     agent = make_agent(PRESETS[preset])
     assert isinstance(agent, TeamAgent)
     np.testing.assert_allclose(agent.useless, reward, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("preset", "discount"), [("noisy", 0.5), ("team", 0.99)])
+def test_an_agent_discounts_its_own_unit_of_time(preset, discount):
+    agent = make_agent(PRESETS[preset]).with_discount(step=0.5, second=0.99)
+    assert agent.discount == discount
