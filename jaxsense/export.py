@@ -34,7 +34,6 @@ from jaxsense.sim.sensors import Sensor
 from jaxsense.tasks import load_pretrained
 
 PROGRAM = "jaxsense.export"
-_PRETRAINED = "pretrained:"
 _PLAYERS = (Path(onboard.__file__).with_name(f"robot_{name}.py") for name in ("numpy", "onnx"))
 FILES = (*_PLAYERS, Path(resampling.__file__))
 """Files for a robot, which each archive holds: they need neither JAX nor jaxsense."""
@@ -159,8 +158,8 @@ def load(run: Path, trust: bool = False) -> tuple[Config, Models, Path]:
     Raises:
       ConfigError: if there is no such run, or no such models.
     """
-    if (given := str(run)).startswith(_PRETRAINED):
-        preset = given.removeprefix(_PRETRAINED)
+    if (given := str(run)).startswith(cli.PRETRAINED):
+        preset = given.removeprefix(cli.PRETRAINED)
         return *load_pretrained(preset), Path(f"{preset}.zip")
     run = cli.find_run(run)
     return *rundir.load(run, trust), run / "exported.zip"

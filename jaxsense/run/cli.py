@@ -18,6 +18,8 @@ from jaxsense.run.kept import Kept
 T = TypeVar("T")
 
 CACHE = Path("~/.cache/jaxsense")
+PRETRAINED = "pretrained:"
+"""Before the preset of models that come with jaxsense, in place of a run."""
 # Exit statuses, as in shells.
 INTERRUPTED = 130
 _CLOSED = 141
@@ -142,8 +144,12 @@ def find_run(path: Path) -> Path:
     """Returns the directory of a run, where `latest` is the newest finished one in `runs/`.
 
     Raises:
-      ConfigError: if there is no finished run.
+      ConfigError: if there is no finished run, or if the models that come with jaxsense are named.
     """
+    if (given := str(path)).startswith(PRETRAINED) and not path.exists():
+        demo = f"{options.command('jaxsense.demo')} --preset {given.removeprefix(PRETRAINED)}"
+        reason = f"must be the directory of a finished run; play pretrained models with {demo}"
+        raise ConfigError("run", given, reason)
     if path != Path("latest") or path.exists():
         return path
     configs = Path("runs").glob("*/config.json")

@@ -243,6 +243,12 @@ OTHERS = [
         "missing argument RUN: the directory of a finished run, e.g. runs/20261123-190025-default",
     ),
     (evaluate, ["latest"], "run = 'latest': there is no finished run in runs/"),
+    (
+        evaluate,
+        ["pretrained:noisy"],
+        "run = 'pretrained:noisy': must be the directory of a finished run; play pretrained models "
+        "with python -m jaxsense.demo --preset noisy",
+    ),
     (evaluate, [""], "run = '': must be a path"),
     (evaluate, ["none"], "none is not a run directory: it has no config.json"),
     (evaluate, ["file"], "file is not a run directory: it has no config.json"),
