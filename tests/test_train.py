@@ -1,5 +1,6 @@
 """The command `train`, run as a user runs it: in-process, with the smoke preset."""
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -98,6 +99,18 @@ def test_summary_keeps_its_contract(smoke_run):
     assert summary["mission"]["bytes_per_detection"]["latent"] == 16
     assert summary["mission"]["bytes_per_detection"]["features"] == 8
     assert 1920 <= summary["mission"]["bytes_per_detection"]["raw"] <= 2732
+
+
+def test_a_run_of_smoke_ends_by_saying_what_it_is_good_for(smoke_run, monkeypatch, capsys):
+    run = SimpleNamespace(path=smoke_run, settings=Settings("smoke", 5, PRESETS["smoke"]))
+    monkeypatch.setattr(train, "_open", lambda arguments: contextlib.nullcontext(run))
+    monkeypatch.setattr(train, "_train", lambda *inputs: None)  # it is trained
+    train.main(["--preset", "smoke", "--seed", "5"])
+    *told, where, following = capsys.readouterr().out.splitlines()
+    only = "Preset smoke only checks that everything runs: its policies are not meant to be good."
+    assert only in told
+    assert where == f"Results are in {smoke_run}. Start with {smoke_run / 'report.html'}."
+    assert following == f"Next: python -m jaxsense.evaluate {smoke_run} --animate"
 
 
 def test_the_time_of_a_run_adds_up(smoke_run):

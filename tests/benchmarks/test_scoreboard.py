@@ -4,6 +4,8 @@ import dataclasses
 import functools
 import importlib
 import json
+import os
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -70,18 +72,31 @@ def peer(module, package):
     return pytest.importorskip(f"benchmarks.tasks.{module}", reason=reason)
 
 
+def draws(recorder, name):
+    """Whether the policies that are scored draw their actions, from one observation."""
+    _, state = make(name).reset(jax.random.key(0))
+    seen, keys = make(name).observe(state), jax.random.split(jax.random.key(1), 64)
+    return [
+        len(set(jax.vmap(policy, (0, None))(keys, seen).tolist())) > 1
+        for policy in recorder.policies.values()
+    ]
+
+
 @pytest.mark.parametrize("number", [0, 1])
-def test_learners_of_rejax_train(number, monkeypatch):
+def test_learners_of_rejax_train_and_ppo_draws_its_actions(number, monkeypatch):
     rejax = peer("rejax", "rejax")
     monkeypatch.setattr(rejax, "NUM_STARTS", 32)
-    train(dataclasses.replace(rejax.LEARNERS[number], num_envs=16), "map-v0")
+    recorder = train(dataclasses.replace(rejax.LEARNERS[number], num_envs=16), "map-v0")
+    assert draws(recorder, "map-v0") == [number == 1] * 2
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_learners_of_stable_baselines3_train(number, monkeypatch):
+def test_learners_of_stable_baselines3_train_and_ppo_draws_its_actions(number, monkeypatch):
     sb3 = peer("sb3", "stable_baselines3")
     monkeypatch.setattr(sb3, "NUM_STARTS", 32)
-    train(dataclasses.replace(sb3.LEARNERS[number], num_envs=16), "map-v0", seeds=(20,))
+    learner = dataclasses.replace(sb3.LEARNERS[number], num_envs=16)
+    recorder = train(learner, "map-v0", seeds=(20,))
+    assert draws(recorder, "map-v0") == [number == 1]
 
 
 def test_networks_of_stable_baselines3_choose_as_they_do_in_jax():
@@ -205,6 +220,34 @@ def test_a_row_of_a_job_holds_all_seeds():
     assert row.wall_seconds > row.seconds > 0
     assert len(points) == 6
     json.dumps(dataclasses.asdict(row), allow_nan=False)
+
+
+def test_jobs_travel_to_other_processes():
+    for each in learners.load():
+        sent = jobs.do, jobs.Job("map-v0", "camera", each, (20,), 64)
+        assert pickle.loads(pickle.dumps(sent)) == sent
+
+
+@dataclasses.dataclass(frozen=True)
+class Elsewhere(Nop):
+    """Learns nothing, in a process other than this one."""
+
+    process: int
+
+    def train(self, task, seeds, steps, report):
+        assert os.getpid() != self.process
+        assert not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) == 1
+        assert jax.config.jax_default_matmul_precision == "highest"
+        super().train(task, seeds, steps, report)
+
+
+@pytest.mark.slow  # a new process imports everything
+def test_a_job_is_done_in_a_process_of_its_own(tmp_path):
+    job = jobs.Job("map-v0", "camera", Elsewhere(os.getpid()), (20,), 64)
+    jobs.run([job], 1, tmp_path, "python -m benchmarks.tasks nop")
+    (row,) = board.read(tmp_path / jobs.SCORES)
+    assert row.settings == {"process": os.getpid()}
+    assert [p.steps for p in record.read(tmp_path / jobs.CURVES)] == [0, 64]
 
 
 def test_results_of_other_learners_stay(tmp_path, monkeypatch):
