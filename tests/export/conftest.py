@@ -8,12 +8,12 @@ from jaxsense.models import init
 from jaxsense.run.rundir import RunDirectory, Settings
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def models():
     return with_classes(init(jax.random.key(0), CONFIG), CONFIG)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(models, tmp_path_factory):
     """The directory of a run that trained nothing."""
     path = tmp_path_factory.mktemp("runs") / "run"
@@ -22,7 +22,7 @@ def run(models, tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def file(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("exported") / "exported.zip"
     export.main([str(run), "--out", str(path)])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
 from jaxsense.core.types import Belief
@@ -32,6 +33,21 @@ class Only:
 sys.meta_path.insert(0, Only())
 example = runpy.run_path({str(EXAMPLE)!r})
 """
+RUN_ALL = """
+import importlib
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+contents, programs = importlib.import_module(sys.argv[2]).load(sys.argv[1])
+inputs, found = np.load(sys.argv[3]), {}
+for name, about in contents["programs"].items():
+    given = {key: inputs[f"{name}/{key}"] for key in about["inputs"] if f"{name}/{key}" in inputs}
+    if not given:
+        continue
+    rows = [programs[name](**{key: x[row] for key, x in given.items()})
+            for row in range(len(next(iter(given.values()))))]
+    found |= {f"{name}/{key}": np.stack([row[key] for row in rows]) for key in rows[0]}
+np.savez(sys.argv[4], **found)
+"""
 ABSENT = {
     "robot_numpy": "jaxsense,jax,jaxlib,onnx,onnxruntime",
     "robot_onnx": "jaxsense,jax,jaxlib,onnx",
@@ -42,6 +58,15 @@ def run_alone(code, player, *arguments):
     """Runs code where nothing is there but what a player needs."""
     command = [sys.executable, "-I", "-c", ALONE + code, ABSENT[player], *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def played(path, player, inputs, folder):
+    """What a player's programs give for `{NAME/KEY: array}`, alone."""
+    given, found = folder / "in.npz", folder / f"{player}.npz"
+    np.savez(given, **inputs)
+    done = run_alone(RUN_ALL, player, path, player, given, found)
+    assert done.returncode == 0, done.stderr
+    return dict(np.load(found))
 
 
 def with_classes(models, config):

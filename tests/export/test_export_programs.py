@@ -1,61 +1,28 @@
 """Exported programs, against jaxsense, in processes that can import neither jaxsense nor JAX."""
 
-import dataclasses
-import inspect
 import io
 import json
-import runpy
 import zipfile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from exporting import ABSENT, CONFIG, EXAMPLE, run_alone, with_classes
-from smoke import save_models
+from exporting import ABSENT, CONFIG, played
 
 from benchmarks import exported
 from jaxsense import export
-from jaxsense.config import PRESETS, LocalisationConfig, SearchConfig
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
 from jaxsense.dqn import observation, team_mdp
-from jaxsense.dqn.team_mdp import Team
-from jaxsense.interfaces import robot_numpy, robot_onnx
 from jaxsense.interfaces.onboard import functions
-from jaxsense.models import init, make_jmvae, make_readout
-from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.models import make_jmvae
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
-from jaxsense.sim import windows as windowing
 from jaxsense.vae import detectors, jmvae, latent
 
 BATCH = 12
 SIZES = {"pois": 3, "robots": 2, "looks": 4}
-RUN_ALL = """
-import importlib
-import numpy as np
-sys.path.insert(0, sys.argv[1])
-contents, programs = importlib.import_module(sys.argv[2]).load(sys.argv[1])
-inputs, found = np.load(sys.argv[3]), {}
-for name, about in contents["programs"].items():
-    given = {key: inputs[f"{name}/{key}"] for key in about["inputs"] if f"{name}/{key}" in inputs}
-    if not given:
-        continue
-    rows = [programs[name](**{key: x[row] for key, x in given.items()})
-            for row in range(len(next(iter(given.values()))))]
-    found |= {f"{name}/{key}": np.stack([row[key] for row in rows]) for key in rows[0]}
-np.savez(sys.argv[4], **found)
-"""
-
-
-def played(path, player, inputs, folder):
-    """What a player's programs give for `{NAME/KEY: array}`, alone."""
-    given, found = folder / "in.npz", folder / f"{player}.npz"
-    np.savez(given, **inputs)
-    done = run_alone(RUN_ALL, player, path, player, given, found)
-    assert done.returncode == 0, done.stderr
-    return dict(np.load(found))
 
 
 @pytest.fixture(scope="module")
@@ -168,73 +135,6 @@ def test_decisions_are_those_of_the_policy_and_the_rules(models, results):
         assert len(set(outputs["decide/action"].tolist())) > 1
 
 
-@pytest.mark.parametrize("player", [*ABSENT])
-def test_an_exported_detector_answers_what_is_not_there(file, tmp_path, player):
-    given, expected = {}, {}
-    for sensor in sensors.make(CONFIG):
-        name = f"detect_{sensor.name}"
-        scan = np.full(functions(CONFIG)[name].inputs["readings"].shape, 0.5, np.float32)
-        ahead = len(scan) // 2
-        at = {"bearing": 0.0, "distance": 1.0}
-        cases = [
-            (scan, at, True),
-            (np.where(scan > 0, np.nan, scan), at, False),
-            (scan.copy(), at, False),
-            (-scan, at, False),
-            # A beam without a return; no pixel is infinitely bright.
-            (np.where(scan > 0, np.inf, scan), at, sensor.measures_distance),
-            (np.zeros_like(scan), at, True),
-            *((scan, {**at, "bearing": b}, False) for b in (np.radians(121.0), -np.pi, np.nan)),
-            *((scan, {**at, "distance": d}, False) for d in (0.0, -1.0, np.inf, np.nan)),
-        ]
-        cases[2][0][ahead : ahead + 4] = np.nan  # the camera reads every fourth pixel
-        given[f"{name}/readings"] = np.stack([readings for readings, _, _ in cases])
-        given |= {f"{name}/{key}": np.float32([x[key] for _, x, _ in cases]) for key in at}
-        expected[name] = np.array([is_there for _, _, is_there in cases])
-    found = played(file, player, given, tmp_path)
-    for name, is_there in expected.items():
-        np.testing.assert_array_equal(found[f"{name}/is_there"], is_there)
-        features = found[f"{name}/features"]
-        assert np.isfinite(features).all()
-        np.testing.assert_allclose(features[~is_there], 0.5)
-
-
-def test_encoders_of_scans_give_what_jaxsense_gives(tmp_path):
-    networks = dataclasses.replace(PRESETS["raw"].jmvae, hidden=(8, 8))
-    config = dataclasses.replace(CONFIG, jmvae=networks)
-    learned = init(jax.random.key(0), config)
-    means = jnp.array([[0.5, 0.5], [-0.5, 0.5], [0.5, -0.5]])
-    classes = Belief(means, jnp.full((3, 2), 0.9))
-    readout = make_readout(config, classes)
-    encoders = tuple(dataclasses.replace(x, readout=readout) for x in learned.detectors)
-    learned = dataclasses.replace(learned, detectors=encoders)
-    with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as created:
-        save_models(created, learned)
-    path = tmp_path / "exported.zip"
-    export.main([str(tmp_path / "run"), "--out", str(path)])
-    rng, given, expected = np.random.default_rng(0), {}, {}
-    for sensor, encoder in zip(sensors.make(config), encoders, strict=True):
-        name = f"detect_{sensor.name}"
-        shape = functions(config)[name].inputs["readings"].shape
-        scans = rng.uniform(0.3, 0.9, (BATCH, *shape)).astype(np.float32)
-        bearings = rng.uniform(-0.3, 0.3, BATCH).astype(np.float32)
-        given |= {
-            f"{name}/readings": scans,
-            f"{name}/bearing": bearings,
-            f"{name}/distance": np.full(BATCH, 0.6, np.float32),
-        }
-
-        def features(scan, bearing):
-            return encoder.features(windowing.cut_out(sensor, scan, bearing))  # noqa: B023
-
-        expected[name] = np.asarray(jax.jit(jax.vmap(features))(scans, bearings))
-        assert np.ptp(expected[name], axis=0).max() > 1e-3
-    for player in ABSENT:
-        found = played(path, player, given, tmp_path)
-        for name, each in expected.items():
-            np.testing.assert_allclose(found[f"{name}/features"], each, atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("name", "given"), [("camera", [0]), ("lidar", [1]), ("camera+lidar", [0, 1])]
 )
@@ -261,76 +161,6 @@ def test_the_map_is_read_as_jaxsense_reads_it(models, results):
         return fusion.class_probabilities(belief), fusion.most_likely_class(belief), plausible
 
     check(results, "classify", classify, "probabilities", "most_likely", "plausible")
-
-
-@pytest.fixture(scope="module")
-def team(tmp_path_factory):
-    """Settings, models and archive of a team with tours."""
-    dqn = dataclasses.replace(PRESETS["team"].dqn, hidden=(8,))
-    config = dataclasses.replace(CONFIG, dqn=dqn, robots=("camera", "lidar", "lidar"))
-    trained = with_classes(init(jax.random.key(0), config), config)
-    path = tmp_path_factory.mktemp("team") / "team.zip"
-    path.write_bytes(export.archive(config, trained))
-    return config, trained, path
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
-def test_a_team_may_have_any_number_of_points_and_robots(team, player):
-    _, trained, path = team
-    assert trained.agent.orders
-    contents, programs = player.load(path)
-    about = contents["programs"]["decide"]
-    assert about["outputs"]["values"]["shape"] == ["pois + 1"]
-    for num_pois, num_robots, num_looks in ((5, 3, 2), (2, 1, 1), (9, 4, 32)):
-        rng = np.random.default_rng(num_pois)
-        belief = Belief(*rng.uniform(0.1, 1, (2, num_pois, 2)).astype(np.float32))
-        of_team = Team(
-            positions=rng.normal(size=(num_pois, 2)).astype(np.float32),
-            present=np.arange(num_pois) < 4,
-            poses=rng.normal(size=(num_robots, 3)).astype(np.float32),
-            modality=np.ones(num_robots, np.int32),
-            works=np.ones(num_robots, bool),
-            target=np.full(num_robots, num_pois, np.int32),
-        )
-        robot = np.int32(num_robots - 1)
-        looked_from = np.full((num_pois, 2, num_looks, 2), np.inf, np.float32)
-        given = {**vars(belief), **vars(of_team), "robot": robot, "looked_from": looked_from}
-        found = programs["decide"](**given)
-        expected = trained.agent.decide(
-            trained.q_networks[1],
-            trained.tours,
-            trained.fusion.classes,
-            belief,
-            jax.tree.map(jnp.asarray, of_team),
-            robot,
-        )
-        np.testing.assert_allclose(found["values"], expected, rtol=1e-4)
-        # Values count travel time: the best is taken.
-        assert found["action"] == np.argmax(expected)
-
-
-@pytest.mark.slow
-def test_a_value_that_is_not_a_number_is_answered_by_minus_one(team):
-    _, _, path = team
-    for player in (robot_numpy, robot_onnx):
-        contents, programs = player.load(path)
-        given = {
-            name: np.ones([{"pois": 2}.get(n, n if isinstance(n, int) else 1) for n in x["shape"]])
-            for name, x in contents["programs"]["decide"]["inputs"].items()
-        }
-        given["robot"] = 0
-        assert programs["decide"](**given)["action"] >= 0
-        given["mean"][1, 0] = np.nan
-        assert programs["decide"](**given)["action"] == -1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
-def test_the_example_plays_a_team(team, player):
-    lines = runpy.run_path(str(EXAMPLE))["explore"](*player.load(team[2]), [0, 1, 2, 0])
-    assert [line.split(" is a ")[0] for line in lines[-4:]] == [f"PoI {n}" for n in range(4)]
-    assert any("looks at PoI" in line for line in lines)
 
 
 @pytest.mark.slow
@@ -374,82 +204,3 @@ def test_contents_describe_what_is_there(results, file):
     assert (limits["min_distance"], limits["max_distance"]) == (0.3, 1.2)
     assert limits["max_bearing"] == pytest.approx(np.radians(20), abs=1e-6)
     assert contents["versions"] == {"jaxsense": __version__}
-
-
-@pytest.mark.parametrize("player", [robot_numpy, pytest.param(robot_onnx, marks=pytest.mark.slow)])
-def test_an_exported_robot_searches_as_missions_do(models, player, tmp_path):
-    errors = SearchConfig(position=0.06, heading=3.0)
-    localisation = LocalisationConfig(search=errors)
-    config = dataclasses.replace(
-        CONFIG, mission=dataclasses.replace(CONFIG.mission, localisation=localisation)
-    )
-    # Untrained detectors have no scale, and are never unsure.
-    unsure = tuple(
-        dataclasses.replace(
-            each,
-            scale=jnp.float32(1.0),
-            gate=dataclasses.replace(each.gate, scale=jnp.float32(1.0)),
-        )
-        for each in models.detectors
-    )
-    models = dataclasses.replace(models, detectors=unsure)
-    path = tmp_path / "searching.zip"
-    path.write_bytes(export.archive(config, models))
-    _, programs = player.load(path)
-    rng = np.random.default_rng(0)
-    for m, sensor in enumerate(sensors.make(config)):
-
-        @jax.jit
-        def detect(*given):
-            return [models.detect(m, sensor, *given, *search) for search in ((errors,), ())]  # noqa: B023
-
-        channels = () if sensor.channels == 1 else (sensor.channels,)
-        for bearing, distance in ((0.1, 0.7), (-0.2, 0.4), (3.0, 0.5)):
-            scan = rng.uniform(0.1, 1.0, (len(sensor.angles), *channels)).astype(np.float32)
-            given = scan, np.float32(bearing), np.float32(distance)
-            searched, plain = detect(*given)
-            about = dict(zip(("readings", "bearing", "distance"), given, strict=True))
-            found = programs[f"detect_{sensor.name}"](**about)
-            assert found["is_there"] == searched.is_there == (bearing < 1)
-            np.testing.assert_allclose(found["features"], searched.features, atol=1e-5)
-            assert bearing > 1 or np.abs(searched.features - plain.features).max() > 1e-4
-
-
-@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
-def test_inputs_of_other_names_or_shapes_are_refused(file, player):
-    _, programs = player.load(file)
-    look = {"bearing": 0.0, "distance": 0.9}
-    rays = len(sensors.make(CONFIG)[1].angles)
-    other_scan = rf"detect_lidar: readings has the shape \({rays + 37},\): must be \({rays},\) .*; "
-    with pytest.raises(ValueError, match=f"{other_scan}resample other scans first"):
-        programs["detect_lidar"](readings=np.ones(rays + 37), **look)
-    with pytest.raises(ValueError, match=r"bearing has the shape \(1,\): must be \(\) \(of the "):
-        programs["detect_lidar"](readings=np.ones(rays), bearing=[0.0], distance=0.9)
-    needs = "^detect_lidar needs readings, bearing, distance"
-    with pytest.raises(TypeError, match=f"{needs}; scan is none of them; readings is missing$"):
-        programs["detect_lidar"](scan=np.ones(rays), **look)
-    with pytest.raises(TypeError, match=f"{needs}; more is none of them$"):
-        programs["detect_lidar"](readings=np.ones(rays), more=1, **look)
-    with pytest.raises(TypeError, match=f"{needs}, by name$"):
-        programs["detect_lidar"](np.ones(rays), 0.0, 0.9)
-
-
-@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
-def test_axes_of_one_name_have_one_size(player):
-    inputs = {
-        "poses": {"shape": ["robots", 3], "dtype": "float32", "about": "of the robots"},
-        "works": {"shape": ["robots"], "dtype": "bool", "about": "which are at work"},
-    }
-    for number in (1, 4):
-        given = {"poses": np.zeros((number, 3)), "works": np.ones(number)}
-        found = player.checked("decide", inputs, (), given)
-        assert found["works"].dtype == bool
-    with pytest.raises(ValueError, match=r"poses has the shape \(4,\): must be \(robots, 3\)"):
-        player.checked("decide", inputs, (), {"poses": np.zeros(4), "works": np.ones(4)})
-    with pytest.raises(ValueError, match=r"works has the shape \(3,\): must be \(4,\) \(which are"):
-        player.checked("decide", inputs, (), {"poses": np.zeros((4, 3)), "works": np.ones(3)})
-
-
-def test_both_players_check_alike():
-    # Each file is copied to robots alone.
-    assert inspect.getsource(robot_numpy.checked) == inspect.getsource(robot_onnx.checked)
