@@ -1,72 +1,15 @@
-"""Spaces, starts and the map MDP of one agent, shared by the interfaces."""
+"""Spaces and starts, shared by the interfaces."""
 
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jaxsense.core import checks
-from jaxsense.core.types import Key, pytree
-from jaxsense.dqn import map_mdp
-from jaxsense.dqn.map_agent import observation
-from jaxsense.dqn.map_mdp import MapMdp, MapState
-from jaxsense.tasks.environment import Environment, TimeStep
-
-
-@pytree
-class OneAgent:
-    """The map MDP of one agent, whose observations are not scaled; see `Environment`.
-
-    Attributes:
-      mdp: the MDP.
-      modality: index of the agent's own sensor.
-    """
-
-    mdp: MapMdp
-    modality: int = struct.field(pytree_node=False)
-
-    @property
-    def num_actions(self) -> int:
-        """A look at each PoI, and NOP."""
-        return self.mdp.num_pois + 1
-
-    @property
-    def observation_size(self) -> int:
-        """Mean and standard deviation of each PoI's belief."""
-        return 2 * self.mdp.num_pois * self.mdp.fusion.prior.mean.size
-
-    @property
-    def bound(self) -> float:
-        """None: infinity."""
-        return float("inf")
-
-    @property
-    def max_steps(self) -> int:
-        """Actions in an episode, at most."""
-        return self.mdp.config.max_steps
-
-    def reset(self, key: Key) -> tuple[Float[Array, " S"], MapState]:
-        """Starts an episode, see `Environment.reset`."""
-        state = map_mdp.reset(key, self.mdp)
-        return self.observe(state), state
-
-    def observe(self, state: MapState) -> Float[Array, " S"]:
-        """The map, `[N * 2D]`, see `dqn.observation`."""
-        return observation(state.belief)
-
-    def action_mask(self, state: MapState) -> Bool[Array, " A"]:
-        """`[A]` bool: all actions exist."""
-        del state
-        return jnp.ones(self.num_actions, bool)
-
-    def step(self, key: Key, state: MapState, action: Int[Array, ""]) -> tuple[MapState, TimeStep]:
-        """Takes an action, see `Environment.step`."""
-        after, outcome = map_mdp.step(key, self.mdp, state, action, self.modality)
-        seen = self.observe(after)
-        return after, TimeStep(seen, outcome.reward, outcome.terminated, outcome.truncated)
+from jaxsense.core.types import Key
+from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.tasks.environment import Environment, OneAgent
 
 
 def environment(mdp: MapMdp | Environment, modality: int | None) -> Environment:

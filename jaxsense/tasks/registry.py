@@ -195,7 +195,7 @@ def _made(
     if agent not in config.modalities:
         raise ConfigError("agent", agent, f"must be one of {', '.join(config.modalities)}")
     modality = config.modalities.index(agent)
-    return MapTask(mdp, parts, scaling, returns(agent), modality, name, agent)
+    return MapTask(mdp, modality, parts, scaling, returns(agent), name, agent)
 
 
 def _scaling(key: Key, task: Task) -> Scaling:

@@ -13,15 +13,15 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Belief, Key, pytree
-from jaxsense.dqn import environments, episodes, map_agent, map_mdp, policies, team_mdp
+from jaxsense.dqn import environments, episodes, map_agent, policies, team_mdp
 from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.episodes import Start
-from jaxsense.dqn.map_mdp import MapMdp, MapState
+from jaxsense.dqn.map_mdp import MapState
 from jaxsense.dqn.policies import Known
 from jaxsense.dqn.reference import reference
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.models import Models
-from jaxsense.tasks.environment import Environment, Scaling, TimeStep
+from jaxsense.tasks.environment import Environment, OneAgent, Scaling, TimeStep
 
 M = TypeVar("M")
 
@@ -128,46 +128,27 @@ class Task(Environment, Protocol):
 
 
 @pytree
-class MapTask:
+class MapTask(OneAgent):
     """A task in the map MDP: one agent looks at PoIs until it has seen enough.
 
     Attributes:
-      mdp: the MDP.
       models: frozen networks, of which only those that the references read are there.
       scaling: of observations.
       returns: `[R, seeds]` see `Task`.
-      modality: index of the agent's sensor.
       name: with its version.
       agent: name of the agent's sensor.
     """
 
-    mdp: MapMdp
     models: Models
     scaling: Scaling
     returns: jax.Array
-    modality: int = struct.field(pytree_node=False)
     name: str = struct.field(pytree_node=False)
     agent: str = struct.field(pytree_node=False)
-
-    @property
-    def num_actions(self) -> int:
-        """A look at each PoI, and NOP."""
-        return self.mdp.num_pois + 1
-
-    @property
-    def observation_size(self) -> int:
-        """Mean and standard deviation of each PoI's belief."""
-        return 2 * self.mdp.num_pois * self.mdp.fusion.prior.mean.size
 
     @property
     def bound(self) -> float:
         """Observations are clipped there."""
         return self.scaling.bound
-
-    @property
-    def max_steps(self) -> int:
-        """Actions in an episode, at most."""
-        return self.mdp.config.max_steps
 
     @property
     def references(self) -> tuple[str, ...]:
@@ -191,25 +172,9 @@ class MapTask:
         """The map, see `Task.inputs`."""
         return self.scaling.inverse(observation).reshape(-1)
 
-    def reset(self, key: Key) -> tuple[Float[Array, " S"], MapState]:
-        """Starts an episode, see `Task.reset`."""
-        state = map_mdp.reset(key, self.mdp)
-        return self.observe(state), state
-
     def observe(self, state: MapState) -> Float[Array, " S"]:
-        """What the agent sees: the map."""
+        """What the agent sees: the map, scaled."""
         return self.scaling(self.features(state))
-
-    def action_mask(self, state: MapState) -> Bool[Array, " A"]:
-        """`[A]` bool: all actions exist."""
-        del state
-        return jnp.ones(self.num_actions, bool)
-
-    def step(self, key: Key, state: MapState, action: Int[Array, ""]) -> tuple[MapState, TimeStep]:
-        """Takes an action, see `Task.step`."""
-        after, outcome = map_mdp.step(key, self.mdp, state, action, self.modality)
-        seen = self.observe(after)
-        return after, TimeStep(seen, outcome.reward, outcome.terminated, outcome.truncated)
 
     def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
         """Plays an episode, see `Task.play`; the k-th look at a PoI shows the same to all."""
