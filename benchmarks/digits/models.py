@@ -15,8 +15,6 @@ from jaxsense.config import JmvaeConfig
 from jaxsense.core.networks import Params
 from jaxsense.vae import Jmvae
 
-_LAST_SCALE = 0.1  # PyTorch's initial weights are also smaller than ours
-
 Subset = tuple[int, ...]
 """Indices of the views that are seen."""
 
@@ -115,9 +113,12 @@ class Ours:
 
     Attributes:
       max_subset: see `Jmvae`.
+      last_scale: see `vae.init`; PyTorch's initial weights are also smaller than ours.
+        `benchmarks.digits.scale` compares some.
     """
 
     max_subset: int | None
+    last_scale: float = 0.1
 
     def runs(self, digits: Digits, budget: Budget, seeds: range) -> Iterator[Run]:
         """Trains once for each seed, see `Kind`; all by one program."""
@@ -136,7 +137,7 @@ class Ours:
 
         def train(key: jax.Array, bank: tuple[jax.Array, ...]) -> Params:
             init_key, train_key = jax.random.split(key)
-            params = vae.init(init_key, model, last_scale=_LAST_SCALE)
+            params = vae.init(init_key, model, last_scale=self.last_scale)
             return vae.train(train_key, params, model, bank, config)[0]
 
         bank = tuple(jax.device_put(x[:, None]) for x in digits.train)
