@@ -1,5 +1,6 @@
 """The comparison of JMVAEs on digits: its data, its measures, its table, and all of it tiny."""
 
+import dataclasses
 import json
 import math
 
@@ -8,7 +9,7 @@ import pytest
 from scipy import stats
 
 from benchmarks import measure as machine
-from benchmarks.digits import __main__, data, measures, models, table
+from benchmarks.digits import __main__, data, measures, models, scale, table
 from benchmarks.digits.models import Budget
 
 BUDGET = Budget(latent_size=4, hidden=(8,), steps=100, batch=64, learning_rate=1e-2)
@@ -173,6 +174,14 @@ def test_the_page_says_how_fast_and_how_good():
     of_each = {name: runs[0].keys() for name, runs in stored["models"].items()}
     assert len(set(map(tuple, of_each.values()))) == 1
     assert {*models.OURS, "MultiVae JMVAE"} <= of_each.keys()
+
+
+@pytest.mark.slow  # compiles a training for each scale
+def test_scales_are_compared_over_seeds(digits):
+    budget = dataclasses.replace(BUDGET, steps=20)
+    small, large = (scale.likelihoods(digits, x, budget) for x in (0.1, 5.0))
+    assert len(small) == len(set(small)) == 3
+    assert min(small) > max(large)
 
 
 @pytest.mark.slow  # imports PyTorch
