@@ -10,19 +10,21 @@ interpolated linearly; intervals are a bootstrap over the arenas, the same for a
 
 import dataclasses
 import itertools
-import json
+import math
+import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, cast
+from typing import Annotated, Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.measure import save
+from benchmarks import studies
+from benchmarks.measure import joined, reserve, save
 from jaxsense import Config, Key, Models, detections, mission
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
@@ -30,8 +32,7 @@ from jaxsense.dqn import policies
 from jaxsense.dqn.policies import Known, Policy, Trained
 from jaxsense.mission import Mission, MissionState
 from jaxsense.models import make_agent
-from jaxsense.run import cli, rundir
-from jaxsense.run.version import commit, versions
+from jaxsense.run import cli, devices
 from jaxsense.show.colours import policy_colour, policy_marker
 from jaxsense.sim.world import Scene, make_world
 from jaxsense.training import agents
@@ -57,7 +58,7 @@ class Arguments:
     """Play every policy with several costs of a look, and compare them at the same accuracy."""
 
     run: Annotated[Path, Name("RUN")]
-    """The directory of a finished run, or `latest`."""
+    """The directory of a finished run, `latest`, or `pretrained:PRESET`."""
     episodes: int = 256
     """Missions of each policy with each cost."""
     seed: int = 0
@@ -65,7 +66,7 @@ class Arguments:
     costs: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)
     """Costs of a look, which only rewards in nats read."""
     json: Path | None = None
-    """File to write the curves to."""
+    """File to write; must be new."""
     plot: Path | None = None
     """Picture to write, for example `curves.png`."""
 
@@ -177,6 +178,7 @@ class Curves:
         config: Config,
         episodes: int,
         own: Mapping[str, Policy] = MappingProxyType({}),
+        only: Collection[str] | None = None,
     ):
         """Missions of E arenas, with a program that is compiled once.
 
@@ -185,17 +187,24 @@ class Curves:
           config: all settings.
           episodes: E.
           own: more policies than those of the settings, by name.
+          only: names of the policies that play, which makes compiling faster; all by default.
         """
-        self.scenario = mission.make_mission(config, own)
-        self._keys = jax.random.split(key, episodes)
-        self._begin = jax.jit(jax.vmap(self._start, in_axes=(0, None, None, None)))
-        self._go_on = jax.jit(self._play_on)
+        made = mission.make_mission(config, own)
+        chosen = {name: x for name, x in made.policies.items() if only is None or name in only}
+        self.scenario = dataclasses.replace(made, policies=chosen)
+        threads = os.cpu_count() if jax.default_backend() == "cpu" else 1
+        self._keys = jnp.split(jax.random.split(key, episodes), math.gcd(episodes, threads or 1))
+        options = devices.compiler_options()  # compiling takes longer than playing
+        start = jax.vmap(self._start, in_axes=(0, None, None, None))
+        self._begin = jax.jit(start, compiler_options=options)
+        self._go_on = jax.jit(self._play_on, compiler_options=options)
         self._measure = jax.jit(jax.vmap(self._result, in_axes=(None, None, 0)))
 
     def _with(self, config: Config) -> Mission:
         """The same mission with other numbers, which may be traced."""
         arenas = self.scenario.world.arena, self.scenario.free_arena
-        return mission.make_mission(config, self.scenario.policies, arenas=arenas)
+        made = mission.make_mission(config, arenas=arenas)
+        return dataclasses.replace(made, policies=self.scenario.policies)
 
     def _start(self, key: Key, config: Config, models: Models, policy: jax.Array) -> MissionState:
         """A mission in which the policies `oracle` read the true classes."""
@@ -211,8 +220,8 @@ class Curves:
     def _play_on(
         self, keys: Key, config: Config, models: Models, states: MissionState
     ) -> MissionState:
-        each, scenario = len(self._keys), self._with(config)
-        return mission.rollout_batch(keys, scenario, models, states, _CHUNK, each)[0]
+        scenario = self._with(config)
+        return mission.rollout_batch(keys, scenario, models, states, _CHUNK, len(keys))[0]
 
     def _result(self, config: Config, models: Models, state: MissionState) -> dict[str, jax.Array]:
         found = mission.measure(self._with(config), models, state)
@@ -235,13 +244,23 @@ class Curves:
         """
         config = self.scenario.config if config is None else config
         number = jnp.int32(self.scenario.policy(policy))
-        states = self._begin(self._keys, config, models, number)
-        for chunk in itertools.count(1):
-            keys = jax.vmap(lambda key: jax.random.fold_in(key, chunk))(self._keys)  # noqa: B023
-            states = self._go_on(keys, config, models, states)
-            if np.all(states.done):
-                return jax.tree.map(np.asarray, self._measure(config, models, states))
-        raise AssertionError
+        states = [self._begin(keys, config, models, number) for keys in self._keys]
+
+        def advance(part: int, chunk: int) -> None:
+            keys = jax.vmap(lambda key: jax.random.fold_in(key, chunk))(self._keys[part])
+            states[part] = self._go_on(keys, config, models, states[part])
+
+        def finish(part: int) -> None:
+            for chunk in itertools.count(2):
+                if np.all(states[part].done):
+                    return
+                advance(part, chunk)
+
+        # One after the other, so that the program is compiled once.
+        for part in range(len(states)):
+            advance(part, 1)
+        devices.side_by_side(finish, len(states))
+        return joined([self._measure(config, models, each) for each in states])
 
 
 def play_all(curves: Curves, costs: tuple[float, ...], priced: Models, free: Models) -> Iterator:
@@ -371,6 +390,15 @@ def as_table(blocks: list[dict]) -> str:
     return "\n".join(rows)
 
 
+def table(results: Mapping[str, Any]) -> str:
+    """What every policy needs for each accuracy, in Markdown, and how that came.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    return studies.with_origin(as_table(results["policies"]), results)
+
+
 def draw(blocks: list[dict]) -> Figure:
     """Looks and time of every policy against its share of wrong PoIs.
 
@@ -407,22 +435,19 @@ def draw(blocks: list[dict]) -> Figure:
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    config, models = rundir.load(cli.find_run(arguments.run))
+    config, models = studies.load(PROGRAM, arguments.run)
+    if arguments.json is not None:
+        reserve(PROGRAM, "json", arguments.json)
     train_key, play_key = jax.random.split(jax.random.key(arguments.seed))
     priced = of_costs(train_key, config, models, jnp.array(arguments.costs))
     own = {f"naive_{k}": Policy(policies.naive(k), is_unordered=True) for k in (4, NAIVE)}
     if config.arena.num_pois <= _MOST_POIS:
         own |= {f"oracle_{share}": oracle(share) for share in ORACLE}
     curves = Curves(play_key, config, arguments.episodes, own)
-    blocks = []
-    for name, varies, points in play_all(curves, arguments.costs, priced, models):
-        blocks.append(as_block(name, varies, points))
-        print(as_table(blocks[-1:]).splitlines()[-1], flush=True)
-    print(as_table(blocks))
-    if arguments.json is not None:
-        whole = {"commit": commit(), "versions": versions(), "episodes": arguments.episodes}
-        text = json.dumps({**whole, "seed": arguments.seed, "policies": blocks}, indent=1)
-        arguments.json.write_text(text + "\n", encoding="utf-8")
+    blocks = [as_block(*curve) for curve in play_all(curves, arguments.costs, priced, models)]
+    results = {**studies.origin(PROGRAM, arguments), "policies": blocks}
+    studies.write(arguments.json, results)
+    print(table(results))
     if arguments.plot is not None:
         save(PROGRAM, "plot", arguments.plot, draw(blocks))
 

@@ -1,27 +1,29 @@
 """How far exported programs are from ours, and how long they take: `python -m benchmarks.exported`.
 
-Plays missions of a run, and asks the programs of its archive, with NumPy and, if it is installed,
+Plays missions of runs, and asks the programs of their archives, with NumPy and, if it is installed,
 with onnxruntime on one core, what ours say in the same states.
 """
 
 import contextlib
 import dataclasses
+import functools
 import io
+import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import rich.console
-import rich.table
 
+from benchmarks import studies
+from benchmarks.measure import reserve
 from jaxsense import export, mission
 from jaxsense.config import Config
-from jaxsense.config.checks import check_fields
+from jaxsense.config.checks import check_fields, limited
 from jaxsense.config.options import Name
 from jaxsense.interfaces import robot_numpy
 from jaxsense.interfaces.onboard import Function, functions
@@ -42,6 +44,9 @@ with contextlib.suppress(ModuleNotFoundError):
     from jaxsense.interfaces import robot_onnx
 
     LOADERS["onnxruntime"] = robot_onnx.load
+SHOWN = ("decide", "detect_camera", "write_lidar", "classify")
+"""Programs in the tables of the pages."""
+_THREADS = "OPENBLAS_NUM_THREADS"  # of NumPy
 _MISSIONS = 16
 _TIMED = 200
 _CLOSED = 1e5  # above any value of an action that is open
@@ -53,14 +58,19 @@ Arrays = dict[str, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Compare what an exported run says with the run itself, in states of missions."""
+    """Compare what exported runs say with the runs themselves, in states of missions."""
 
-    run: Annotated[Path, Name("RUN")]
-    """The directory of a finished run, or `pretrained:PRESET`."""
-    states: int = 1000
-    """How many states of missions."""
+    runs: Annotated[tuple[Path, ...], Name("RUNS")] = limited(
+        tuple(Path(f"pretrained:{name}") for name in ("default", "noisy", "many")),
+        min_items=1,
+    )
+    """Directories of finished runs, `latest`, or `pretrained:PRESET`."""
+    states: int = limited(1000, at_least=1)
+    """How many states of missions of each run."""
     trust: bool = False
-    """Run the code of custom sensors that the run's `config.json` names."""
+    """Run the code of custom sensors that a run's `config.json` names."""
+    json: Path | None = None
+    """File to write; must be new."""
 
     def __post_init__(self):
         check_fields(self)
@@ -100,11 +110,13 @@ def choices(config: Config, models: Models, number: int, seed: int = 0) -> list[
       number: how many.
       seed: of the arenas.
     """
-    scenario = mission.make_mission(config)
+    made = mission.make_mission(config)
+    # Only the policy that plays, which makes compiling faster.
+    scenario = dataclasses.replace(made, policies={"latent": made.policies["latent"]})
     keys = jax.random.split(jax.random.key(seed), _MISSIONS)
     begin = jax.jit(jax.vmap(lambda key: mission.reset(key, scenario, models)))
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=devices.compiler_options())
     def advance(keys: jax.Array, states: MissionState) -> MissionState:
         return mission.rollout_batch(keys, scenario, models, states, 1, every=_MISSIONS)[0]
 
@@ -330,18 +342,89 @@ def relative_error(theirs: np.ndarray, ours: np.ndarray) -> float:
     return float(np.abs(theirs[is_value] - ours[is_value]).max(initial=0.0) / scale)
 
 
+def measure(arguments: Arguments) -> dict[str, Any]:
+    """The content of the JSON file.
+
+    Args:
+      arguments: of the program.
+    """
+    packages = [name for name in LOADERS if name == "onnxruntime"]
+    results = studies.origin(PROGRAM, arguments, ("onnx", *packages))
+    if (threads := os.environ.get(_THREADS)) is not None:
+        results["command"] = f"{_THREADS}={threads} {results['command']}"
+    results["programs"] = {}
+    for run in arguments.runs:
+        config, models = studies.load(PROGRAM, run, arguments.trust)
+        found = choices(config, models, arguments.states)
+        compared = compare(config, models, export.archive(config, models), found)
+        results["programs"][str(run)] = {
+            player: {name: dataclasses.asdict(each) for name, each in programs.items()}
+            for player, programs in compared.items()
+        }
+    return results
+
+
+def table(results: Mapping[str, Any], programs: Collection[str] | None = None) -> str:
+    """Answers, errors and latencies of all runs, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+      programs: names of the programs to show; all by default.
+    """
+    rows, players = [], [*LOADERS]
+    for run, found in results["programs"].items():
+        players = [*found]
+        for name, first in found[players[0]].items():
+            if programs is None or name in programs:
+                each = [found[player][name] for player in players]
+                different = max(x["different"] for x in each)
+                rows.append(
+                    [
+                        f"`{studies.name_of(run)}`",
+                        f"`{name}`",
+                        f"{different} of {first['states']:,}",
+                        f"{max(x['error'] for x in each):.1e}",
+                        *(_microseconds(x) for x in each),
+                    ]
+                )
+    heads = ["run", "program", "other answers", "error", *players]
+    return studies.with_origin(studies.as_table(heads, rows), results)
+
+
+def latencies(results: Mapping[str, Any], runs: Sequence[str], programs: Sequence[str]) -> str:
+    """Latencies with NumPy, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+      runs: columns.
+      programs: rows.
+    """
+    rows = [
+        [
+            f"`{name}`",
+            *(_microseconds(results["programs"][run]["NumPy"][name]) for run in runs),
+        ]
+        for name in programs
+    ]
+    heads = ["program", *(f"`{studies.name_of(run)}`" for run in runs)]
+    return studies.with_origin(studies.as_table(heads, rows), results)
+
+
+def _microseconds(compared: Mapping[str, Any]) -> str:
+    """A latency with two digits."""
+    rounded = float(f"{1e6 * compared['seconds']:.2g}")
+    return f"{rounded:,.0f} µs"
+
+
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     devices.start(None)
-    config, models, _ = export.load(arguments.run, arguments.trust)
-    found = choices(config, models, arguments.states)
-    table = rich.table.Table("program", "by", "states", "other answers", "error", "microseconds")
-    for player, programs in compare(config, models, export.archive(config, models), found).items():
-        for name, each in programs.items():
-            figures = each.states, each.different, f"{each.error:.1e}", f"{each.seconds * 1e6:.0f}"
-            table.add_row(name, player, *map(str, figures))
-    rich.console.Console().print(table)
+    if arguments.json is not None:
+        reserve(PROGRAM, "json", arguments.json)
+    results = measure(arguments)
+    studies.write(arguments.json, results)
+    print(table(results))
     if "onnxruntime" not in LOADERS:
         print("NumPy alone: onnxruntime is not installed; pip install onnxruntime")
 

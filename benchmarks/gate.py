@@ -1,42 +1,79 @@
-"""`python -m benchmarks.gate RUN`: how often looks at nothing are answered with a class."""
+"""`python -m benchmarks.gate RUNS`: how often looks at nothing are answered with a class."""
 
-import argparse
 import dataclasses
+import functools
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
-import rich.console
-import rich.table
 
 import jaxsense
-from jaxsense.config import ConfigError, SearchConfig
+from benchmarks import studies
+from benchmarks.measure import reserve
+from jaxsense.config import SearchConfig
+from jaxsense.config.checks import check_fields, limited
+from jaxsense.config.options import Name
+from jaxsense.run import cli, devices
 from jaxsense.sim import absence, amiro, search, viewpoints
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import world as worlds
 from jaxsense.sim.absence import View
 from jaxsense.sim.world import Scene, World
 
-SITUATIONS = ("PoI", "empty", "wall", "behind robot", "behind wall", "robot", "off", "failed")
-"""`PoI`: a look at one. `empty`: its place is empty. `wall`: 0.5 to 5 m away, at any expected
-distance. `behind robot`, `behind wall`: all of the PoI is covered. `robot`: one in its place.
-`off`: the bearing is wrong by 30 to 180 degrees. `failed`: the sensor has failed."""
+PROGRAM = "benchmarks.gate"
+SITUATIONS = {
+    "PoI": "a PoI",
+    "empty": "the PoI's empty position",
+    "wall": "a wall, 0.5 to 5 m away",
+    "behind robot": "a robot that covers the PoI",
+    "behind wall": "a wall that covers the PoI",
+    "robot": "a robot in the PoI's position",
+    "off": "the PoI, 30 to 180 degrees off the bearing",
+    "failed": "anything, with a failed sensor",
+}
+"""What a sensor looks at, and how a table calls it. The expected distance of `empty` and `wall` is
+any."""
 _WALLS = (0.5, 5.0)  # m
 _MIN_SIDE = 11.0  # m, of an arena with room for such walls
 _AT_ONCE = 500
 _SEED = 29
 
 
-def view_of(key: jax.Array, world: World, scene: Scene, robot: int, name: str) -> View:
-    """A look of a robot at the first PoI.
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Count looks at PoIs and at nothing that are answered with a class."""
 
-    Args:
-      key: random key.
-      world: the simulation.
-      scene: a random scene.
-      robot: index of the robot and of its modality; static.
-      name: one of `SITUATIONS`; static.
-    """
+    runs: Annotated[tuple[Path, ...], Name("RUNS")] = limited(
+        (Path("pretrained:default"), Path("pretrained:noisy")), min_items=1
+    )
+    """Directories of finished runs, `latest`, or `pretrained:PRESET`."""
+    looks: int = limited(10_000, at_least=1)
+    """In each situation."""
+    search_position: float = 0.0
+    """Largest error of the position to search for, in metres."""
+    search_heading: float = 0.0
+    """Largest error of the heading to search for, in degrees. With a search, looks without one are
+    counted, too."""
+    trust: bool = False
+    """Run the code of custom sensors that a run's `config.json` names."""
+    json: Path | None = None
+    """File to write; must be new."""
+
+    def __post_init__(self):
+        check_fields(self, bits=64)
+        self.search  # noqa: B018
+
+    @property
+    def search(self) -> SearchConfig:
+        """The search."""
+        return SearchConfig(position=self.search_position, heading=self.search_heading)
+
+
+def _view_of(world: World, robot: int, name: str, key: jax.Array, scene: Scene) -> View:
+    """A look of a robot at the first PoI of a random scene, in one of `SITUATIONS`."""
     config, poi, limits = world.arena.config, jnp.int32(0), world.viewpoint
     key, viewpoint_key = jax.random.split(key)
     draw = jax.random.uniform(key, (6,))
@@ -89,7 +126,7 @@ def view_of(key: jax.Array, world: World, scene: Scene, robot: int, name: str) -
 
 
 def simulate(
-    key: jax.Array, world: World, robot: int, name: str
+    key: jax.Array, world: World, robot: int, situation: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Readings of one look, and the believed bearing and the expected distance of its PoI.
 
@@ -97,21 +134,22 @@ def simulate(
       key: random key.
       world: the simulation.
       robot: index of the robot and of its modality; static.
-      name: one of `SITUATIONS`; static.
+      situation: `[]` index in `SITUATIONS`.
     """
     class_key, scene_key, view_key, noise_key = jax.random.split(key, 4)
     arena = world.arena.config
     classes = jax.random.randint(class_key, (arena.num_pois,), 0, len(arena.classes))
     scene = worlds.random_scene(scene_key, world, classes)
-    view = view_of(view_key, world, scene, robot, name)
+    views = [functools.partial(_view_of, world, robot, name) for name in SITUATIONS]
+    view = jax.lax.switch(situation, views, view_key, scene)
     layout = dataclasses.replace(scene.layout, position=view.positions)
     scene = dataclasses.replace(scene, layout=layout, poses=view.poses)
     data = arenas.place(world.arena, layout, view.poses)
     readings = worlds.scan_around(
         noise_key, world, scene, data, robot, view.bearing, robot, twin=view.twin
     )
-    if name == "failed":
-        readings = jnp.full_like(readings, world.sensors[robot].blind)
+    has_failed = situation == [*SITUATIONS].index("failed")
+    readings = jnp.where(has_failed, world.sensors[robot].blind, readings)
     return readings, view.bearing, view.distance
 
 
@@ -137,44 +175,92 @@ def answered(
     found: dict[str, dict[str, float]] = {}
     for robot, modality in enumerate(config.modalities):
 
-        def share(key: jax.Array, name: str, robot: int = robot) -> float:
-            @jax.jit
-            def answers(keys: jax.Array, models: jaxsense.Models) -> jax.Array:
-                def one(key: jax.Array) -> jax.Array:
-                    readings, bearing, distance = simulate(key, world, robot, name)
-                    return models.detect_in_window(
-                        robot, made.sensors[robot], readings, bearing, distance, errors
-                    ).is_there
+        @functools.partial(jax.jit, compiler_options=devices.compiler_options())
+        def share(keys: jax.Array, models: jaxsense.Models, situation: jax.Array) -> jax.Array:
+            def one(key: jax.Array) -> jax.Array:
+                readings, bearing, distance = simulate(key, world, robot, situation)  # noqa: B023
+                return models.detect_in_window(
+                    robot,  # noqa: B023
+                    made.sensors[robot],  # noqa: B023
+                    readings,
+                    bearing,
+                    distance,
+                    errors,
+                ).is_there
 
-                return jax.lax.map(one, keys, batch_size=_AT_ONCE)
+            return jnp.mean(jax.lax.map(one, keys, batch_size=_AT_ONCE))
 
-            return float(jnp.mean(answers(jax.random.split(key, number), models)))
-
-        key = jax.random.fold_in(jax.random.key(_SEED), robot)
-        found[modality] = {name: share(key, name) for name in SITUATIONS}
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), robot), number)
+        found[modality] = {
+            name: float(share(keys, models, jnp.int32(i))) for i, name in enumerate(SITUATIONS)
+        }
     return found
 
 
+def measure_all(arguments: Arguments) -> dict[str, Any]:
+    """The content of the JSON file: shares by run, modality and situation.
+
+    Args:
+      arguments: of the program.
+    """
+    results = studies.origin(PROGRAM, arguments)
+    searches = {"answered": SearchConfig(), "answered in a search": arguments.search}
+    for name, errors in searches.items():
+        results[name] = {
+            str(run): answered(
+                *studies.load(PROGRAM, run, arguments.trust), arguments.looks, errors
+            )
+            for run in arguments.runs
+            if errors.applies or name == "answered"
+        }
+    return results
+
+
+def table(results: Mapping[str, Any]) -> str:
+    """The shares without a search, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    return _table(results, lambda *place: f"{_share(results['answered'], *place):.4f}")
+
+
+def of_search(results: Mapping[str, Any]) -> str:
+    """The shares without a search and with one, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+
+    def cell(*place: str) -> str:
+        both = results["answered"], results["answered in a search"]
+        return ", ".join(f"{_share(each, *place):.4f}" for each in both)
+
+    return _table(results, cell)
+
+
+def _share(answered: Mapping[str, Any], run: str, modality: str, situation: str) -> float:
+    return answered[run][modality][situation]
+
+
+def _table(results: Mapping[str, Any], cell: Callable[[str, str, str], str]) -> str:
+    columns = [(run, name) for run, found in results["answered"].items() for name in found]
+    heads = [f"{name} of `{studies.name_of(run)}`" for run, name in columns]
+    rows = [
+        [about, *(cell(*column, situation) for column in columns)]
+        for situation, about in SITUATIONS.items()
+    ]
+    return studies.with_origin(studies.as_table(["looks at", *heads], rows), results)
+
+
 def main(argv: list[str] | None = None) -> None:
-    """Runs the program."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path, help="directory of a finished run")
-    parser.add_argument("--looks", type=int, default=10_000, help="in each situation")
-    parser.add_argument(
-        "--search", type=float, nargs=2, default=(0.0, 0.0), metavar=("M", "DEGREES")
-    )
-    parser.add_argument("--trust", action="store_true", help="import the run's own sensors")
-    arguments = parser.parse_args(argv)
-    try:
-        errors = SearchConfig(*arguments.search)
-    except ConfigError as error:
-        parser.error(str(error))
-    config, models = jaxsense.load(arguments.run, arguments.trust)
-    found = answered(config, models, arguments.looks, errors)
-    table = rich.table.Table("answered with a class", *found, title=f"{arguments.looks} looks each")
-    for name in SITUATIONS:
-        table.add_row(name, *(f"{of_modality[name]:.4f}" for of_modality in found.values()))
-    rich.console.Console().print(table)
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    if arguments.json is not None:
+        reserve(PROGRAM, "json", arguments.json)
+    results = measure_all(arguments)
+    studies.write(arguments.json, results)
+    print((of_search if arguments.search.applies else table)(results))
 
 
 if __name__ == "__main__":

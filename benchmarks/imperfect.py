@@ -4,22 +4,24 @@ Plays the same arenas with errors of pose and heading, constant or growing while
 and, where looks add up, with maps by each robot between which messages are lost and late. All rows
 are compared, arena by arena, with robots that know their poses and share one map. Errors and
 messages of one arena are drawn alike for all sizes, so that a curve is smooth. `break` is the size
-at which the accuracy has fallen by .01.
+at which the accuracy has fallen by .01. If misplaced robots are to search, they play both without a
+search and with one.
 """
 
 import dataclasses
-import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import studies
 from benchmarks.curves import Curves, Need
-from benchmarks.where import compare
+from benchmarks.measure import reserve
+from benchmarks.where import as_cell, compare
 from jaxsense import Config, Models, mission
 from jaxsense.config import CommunicationConfig, ConfigError, LocalisationConfig, SearchConfig
 from jaxsense.config.checks import check_fields, require
@@ -27,13 +29,24 @@ from jaxsense.config.options import Name
 from jaxsense.config.section import Section
 from jaxsense.mission import MissionState
 from jaxsense.mission.maps import map_of
-from jaxsense.run import cli, rundir
-from jaxsense.run.version import commit, versions
+from jaxsense.run import cli
 
 PROGRAM = "benchmarks.imperfect"
 FALL = 0.01
 """Loss of accuracy that counts as broken."""
-_KEYS = ("accuracy", "own", "nll", "looks", "time", "collisions")
+NO_SEARCH, SEARCH, MESSAGES = "no search", "with a search", "messages"
+"""Names of the curves."""
+_KEYS = {"accuracy": 3, "own": 3, "nll": 3, "looks": 2, "time": 1, "collisions": 3}
+"""What is measured, with its decimals in tables."""
+_HEADS = {
+    "accuracy": "accuracy",
+    "own": "accuracy of the robots' own maps",
+    "nll": "NLL",
+    "looks": "looks per PoI",
+    "time": "mean time [s]",
+}
+_OF_SIZES = ("accuracy", "looks", "time")
+_OF_MESSAGES = ("accuracy", "own", "nll", "looks", "time")
 _DRAWS = 1000  # of the bootstrap
 _DELAY_OF_LOSSES, _LOSS_OF_DELAYS = 2.0, 0.5  # s and share, of the sweeps of both together
 
@@ -43,7 +56,7 @@ class Arguments:
     """Play missions with errors of localisation and with messages that are lost or late."""
 
     run: Annotated[Path, Name("RUN")]
-    """The directory of a finished run, or `latest`."""
+    """The directory of a finished run, `latest`, or `pretrained:PRESET`."""
     episodes: int = 256
     """Missions of each row."""
     seed: int = 0
@@ -74,7 +87,7 @@ class Arguments:
     search_heading: float = 0.0
     """Largest error of the heading that misplaced robots search for, in degrees."""
     json: Path | None = None
-    """File to write the figures to."""
+    """File to write; must be new."""
 
     def __post_init__(self):
         check_fields(self, bits=64)
@@ -126,13 +139,14 @@ class Imperfect(Curves):
         }
 
 
-def poses(arguments: Arguments) -> list[Sweep]:
+def poses(arguments: Arguments, search: SearchConfig) -> list[Sweep]:
     """Constant errors of position, of heading and of both, then those that driving adds.
 
     Args:
       arguments: of the program.
+      search: of misplaced robots.
     """
-    at, to, search = arguments.positions, arguments.headings, arguments.search
+    at, to = arguments.positions, arguments.headings
     moves, turns = arguments.position_drifts, arguments.heading_drifts
     of = lambda **errors: {"localisation": LocalisationConfig(search=search, **errors)}  # noqa: E731
     both, drifts = zip(at, to, strict=True), zip(moves, turns, strict=True)
@@ -249,19 +263,114 @@ def play(
         for size, sections in zip(sweep.sizes, sweep.changes, strict=True):
             config = changed(curves.scenario.config, sections)
             found = curves.play(models, policy, config)
-            rows.append({"size": size, **compare(found, usual, _KEYS)})
+            rows.append({"size": size, **compare(found, usual, tuple(_KEYS))})
             lost.append(usual["accuracy"] - found["accuracy"])
-            print(_row(sweep.name, rows[-1], usual), flush=True)
         point = break_point(sweep.sizes, np.stack(lost))
-        print(f"| {sweep.name} | break | {_text(point)} |" + " |" * len(_KEYS[1:]), flush=True)
+        print(sweep.name, _text(point), file=sys.stderr)
         yield {"sweep": sweep.name, "rows": rows, "break": point}
 
 
-def _row(name: str, row: dict, usual: dict[str, np.ndarray]) -> str:
-    """A line of the table."""
-    cells = [f"{row[k][0]:.4f} {row[k][1]:+.4f} ± {row[k][2]:.4f}" for k in _KEYS]
-    ratio = row["time"][0] / usual["time"].mean()
-    return f"| {name} | {row['size']:g} | {' | '.join(cells)} ({ratio:.3f}) |"
+def measure(arguments: Arguments, config: Config, models: Models) -> dict[str, Any]:
+    """The figures of the JSON file: without errors, and of each curve by sweep.
+
+    Args:
+      arguments: of the program.
+      config: settings of the missions, without errors.
+      models: of a finished run.
+    """
+    key, policy = jax.random.key(arguments.seed), arguments.policy
+    share = Imperfect(key, config, arguments.episodes, only=(policy,))
+    usual = share.play(models, policy)
+    searches = {NO_SEARCH: SearchConfig()}
+    if arguments.search.applies:
+        searches[SEARCH] = arguments.search
+    found = {
+        name: [*play(share, models, policy, poses(arguments, search), usual)]
+        for name, search in searches.items()
+    }
+    if models.fusion.accumulates:
+        own_maps = {"communication": CommunicationConfig(own_maps=True)}
+        each = Imperfect(key, changed(config, own_maps), arguments.episodes, only=(policy,))
+        found[MESSAGES] = [*play(each, models, policy, messages(arguments), usual)]
+    return {
+        "usual": {name: float(usual[name].mean()) for name in _KEYS},
+        "curves": {name: sweeps for name, sweeps in found.items() if sweeps},
+    }
+
+
+def breaks(results: Mapping[str, Any]) -> str:
+    """Sizes of each error at which the accuracy has fallen by `FALL`, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    curves = _by_sweep(results, (NO_SEARCH, SEARCH))
+    rows = [
+        [sweep, *(_text(found[sweep]["break"]) for found in curves.values())]
+        for sweep in next(iter(curves.values()))
+    ]
+    return studies.with_origin(studies.as_table(["error", *curves], rows), results)
+
+
+def of_sizes(results: Mapping[str, Any], sweeps: Sequence[str]) -> str:
+    """Figures without a search and with one at all sizes of some errors, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+      sweeps: names of the errors.
+    """
+    curves = _by_sweep(results, (NO_SEARCH, SEARCH))
+    heads = [f"{_HEADS[key]}, {name}" for name in curves for key in _OF_SIZES]
+    none = [f"{results['usual'][key]:.{_KEYS[key]}f}" for key in _OF_SIZES]
+    rows = [["none", *none * len(curves)]]
+    for sweep in sweeps:
+        for i, row in enumerate(next(iter(curves.values()))[sweep]["rows"]):
+            each = [found[sweep]["rows"][i] for found in curves.values()]
+            cells = [as_cell(row[key], _KEYS[key]) for row in each for key in _OF_SIZES]
+            rows.append([f"{sweep}: {row['size']:g}", *cells])
+    return studies.with_origin(studies.as_table(["error", *heads], rows), results)
+
+
+def of_messages(results: Mapping[str, Any]) -> str:
+    """Figures at the largest loss and delay of each kind, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    usual = results["usual"]
+    none = [f"{usual[key]:.{_KEYS[key]}f}" for key in _OF_MESSAGES]
+    rows = [["one shared map", *none, ""]]
+    for found in results["curves"][MESSAGES]:
+        row = found["rows"][-1]
+        cells = [as_cell(row[key], _KEYS[key]) for key in _OF_MESSAGES]
+        ratio = row["time"][0] / usual["time"]
+        rows.append([f"{found['sweep']}: {row['size']:g}", *cells, f"{ratio:.3f}"])
+    heads = ["messages", *(_HEADS[key] for key in _OF_MESSAGES), "ratio of mean times"]
+    return studies.with_origin(studies.as_table(heads, rows), results)
+
+
+def _by_sweep(
+    results: Mapping[str, Any], names: Iterable[str]
+) -> dict[str, dict[str, Mapping[str, Any]]]:
+    """Those of some curves that were measured, their sweeps by name."""
+    return {
+        name: {each["sweep"]: each for each in results["curves"][name]}
+        for name in names
+        if name in results["curves"]
+    }
+
+
+def tables(results: Mapping[str, Any]) -> Iterator[str]:
+    """All tables of a JSON file.
+
+    Args:
+      results: its content.
+    """
+    for found in _by_sweep(results, (NO_SEARCH,)).values():
+        yield breaks(results)
+        yield of_sizes(results, [*found])
+    if MESSAGES in results["curves"]:
+        yield of_messages(results)
 
 
 def _text(point: Need | None) -> str:
@@ -274,29 +383,19 @@ def _text(point: Need | None) -> str:
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    trained, models = rundir.load(cli.find_run(arguments.run))
+    trained, models = studies.load(PROGRAM, arguments.run)
+    exact = {"localisation": LocalisationConfig(), "communication": CommunicationConfig()}
     try:
         config = elsewhere(arguments, trained, models)
         changed(config, {"localisation": LocalisationConfig(search=arguments.search)})
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
-    exact = {"localisation": LocalisationConfig(), "communication": CommunicationConfig()}
-    config = changed(config, exact)
-    key = jax.random.key(arguments.seed)
-    share = Imperfect(key, config, arguments.episodes)
-    usual = share.play(models, arguments.policy)
-    print(f"| what | size | {' | '.join(_KEYS)} |\n{'| --- ' * (2 + len(_KEYS))}|")
-    print(_row("-", {"size": 0.0, **compare(usual, usual, _KEYS)}, usual), flush=True)
-    found = [*play(share, models, arguments.policy, poses(arguments), usual)]
-    if models.fusion.accumulates:
-        own_maps = {"communication": CommunicationConfig(own_maps=True)}
-        each = Imperfect(key, changed(config, own_maps), arguments.episodes)
-        found += play(each, models, arguments.policy, messages(arguments), usual)
     if arguments.json is not None:
-        whole = {"commit": commit(), "versions": versions(), "episodes": arguments.episodes}
-        whole |= {"seed": arguments.seed, "policy": arguments.policy, "sweeps": found}
-        whole |= {"usual": {name: float(usual[name].mean()) for name in _KEYS}}
-        arguments.json.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+        reserve(PROGRAM, "json", arguments.json)
+    origin = studies.origin(PROGRAM, arguments)
+    results = {**origin, **measure(arguments, changed(config, exact), models)}
+    studies.write(arguments.json, results)
+    print(*tables(results), sep="\n\n")
 
 
 if __name__ == "__main__":

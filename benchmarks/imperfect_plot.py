@@ -1,20 +1,21 @@
 """`python -m benchmarks.imperfect_plot FILES --plot PICTURE`: curves of imperfect robots.
 
-FILES are what `python -m benchmarks.imperfect RUN --json` has written: a curve for each, with the
-name of the file.
+FILES are what `python -m benchmarks.imperfect RUN --json` has written: a curve for each run,
+without a search and with one.
 """
 
 import dataclasses
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks import studies
 from benchmarks.measure import save
 from jaxsense.config.checks import check_fields, limited, require
 from jaxsense.config.options import Name
@@ -42,16 +43,29 @@ class Arguments:
     )
     """What to draw, a row for each."""
     sweeps: tuple[str, ...] | None = None
-    """What gets worse, a column for each; by default all that every file has."""
+    """What gets worse, a column for each; by default all that every curve has. Curves that lack one
+    of those named are left out."""
     plot: Path = Path("imperfect.png")
     """Picture to write; must be new."""
 
     def __post_init__(self):
         check_fields(self)
-        names = [path.stem for path in self.files]
-        is_once = 0 < len(names) == len(set(names))
-        require(is_once, self, "files", "must name one file or more, each of another name")
+        is_once = 0 < len(self.files) == len(set(self.files))
+        require(is_once, self, "files", "must name one file or more, each once")
         require(not self.plot.exists(), self, "plot", "must be a new file")
+
+
+def curves_of(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The curves of a file by name, as `draw` takes them.
+
+    Args:
+      results: the content of the file.
+    """
+    name = studies.name_of(results["options"]["run"])
+    return {
+        f"{name}, {curve}": {"usual": results["usual"], "sweeps": sweeps}
+        for curve, sweeps in results["curves"].items()
+    }
 
 
 def draw(
@@ -62,25 +76,27 @@ def draw(
     Bands are 95% intervals of the differences from robots without errors, which are dotted.
 
     Args:
-      found: by the name of the curve, what `benchmarks.imperfect` has written.
+      found: figures of each curve, from `curves_of`.
       figures: names of what is drawn.
-      sweeps: names of what gets worse; by default all that every file has.
+      sweeps: names of what gets worse, see `Arguments`.
 
     Raises:
-      ValueError: if a file lacks a sweep, or there is none.
+      ValueError: if no curve has all sweeps, or no sweep is in all curves.
     """
-    of_files = [{s["sweep"]: s["rows"] for s in each["sweeps"]} for each in found.values()]
-    common = [name for name in of_files[0] if all(name in each for each in of_files)]
-    sweeps = common if sweeps is None else sweeps
-    if not sweeps or not set(sweeps) <= set(common):
-        raise ValueError(f"sweeps = {[*sweeps]}: must be among {common}, which every file has")
+    of_curves = {name: {s["sweep"]: s["rows"] for s in found[name]["sweeps"]} for name in found}
+    known = [*dict.fromkeys(sweep for rows in of_curves.values() for sweep in rows)]
+    if sweeps is None:
+        sweeps = [name for name in known if all(name in rows for rows in of_curves.values())]
+    found = {name: each for name, each in found.items() if {*sweeps} <= of_curves[name].keys()}
+    if not (found and sweeps):
+        raise ValueError(f"sweeps = {[*sweeps]}: must be some of {known} that a curve has")
     figure = Figure(figsize=(3 * len(sweeps), 2.4 * len(figures)), layout="constrained")
     axes = figure.subplots(len(figures), len(sweeps), sharex="col", sharey="row", squeeze=False)
     for i, (name, each) in enumerate(found.items()):
         style = {"color": f"C{i}", "marker": MARKERS[i % len(MARKERS)], "label": name}
         for column, sweep in zip(axes.T, sweeps, strict=True):
             for axis, figure_name in zip(column, figures, strict=True):
-                _draw_curve(axis, of_files[i][sweep], each["usual"], figure_name, style)
+                _draw_curve(axis, of_curves[name][sweep], each["usual"], figure_name, style)
     for row, figure_name in zip(axes, figures, strict=True):
         row[0].set_ylabel(_LABELS[figure_name])
         for axis in row:
@@ -107,7 +123,11 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
-        found = {p.stem: json.loads(p.read_text(encoding="utf-8")) for p in arguments.files}
+        found = {
+            name: curve
+            for file in arguments.files
+            for name, curve in curves_of(json.loads(file.read_text(encoding="utf-8"))).items()
+        }
         figure = draw(found, arguments.figures, arguments.sweeps)
     except (OSError, ValueError, KeyError, TypeError) as error:
         cli.fail(PROGRAM, f"files: {error}")

@@ -13,22 +13,23 @@ them exact evidence; m gives a single look the detector's accuracy.
 
 import dataclasses
 import functools
-import json
 import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from benchmarks import studies
+from benchmarks.measure import reserve
+from jaxsense import Config, Models, detections
 from jaxsense.config import ConfigError
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
-from jaxsense.run import cli, rundir
-from jaxsense.run.version import commit, versions
-from jaxsense.summary import read
-from jaxsense.summary.metrics import mean
+from jaxsense.run import cli
 from jaxsense.vae.novelty import LEAST_NEW
 
 PROGRAM = "benchmarks.place"
@@ -38,6 +39,8 @@ RULES = {f"share {share:g}": share for share in (LEAST_NEW, 0.25, 0.1)}
 _PRICES = np.geomspace(20.0, 2e4, 60)  # s for an error
 _MOST = 8  # looks from one place whose weights differ
 _CHANGE = 1e-6  # s, of values between the last two rounds
+_SAMPLES = 4000  # looks at each class, for the accuracy of single looks
+_SEED = 37
 _LOG_ODDS = np.linspace(-15.0, 15.0, 301)
 
 
@@ -46,11 +49,11 @@ class Arguments:
     """Compare the best choice of where to look again with rules."""
 
     run: Annotated[Path, Name("RUN")]
-    """The directory of a finished run, or `latest`."""
+    """The directory of a finished run, `latest`, or `pretrained:PRESET`."""
     drives: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0)
     """Seconds of driving to a place where a look is new."""
     json: Path | None = None
-    """File to write the figures to."""
+    """File to write; must be new."""
 
     def __post_init__(self):
         check_fields(self, bits=64)
@@ -158,36 +161,81 @@ def seconds_at(sensor: Sensor, least_new: float | None = None) -> list[float]:
     return [float(np.interp(e, wrong[order], time[order])) for e in ERRORS]
 
 
-def main(argv: list[str] | None = None) -> None:
-    """The program."""
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    directory = cli.find_run(arguments.run)
-    config, models = rundir.load(directory)
-    detectors = read(directory)["detectors"]
-    rows = []
-    print(f"| sensor, drive | wrong | best | {' | '.join(RULES)} |\n{'| --- ' * (3 + len(RULES))}|")
+def accuracies(config: Config, models: Models) -> dict[str, float]:
+    """Share of simulated looks of which the most likely label is right, by modality.
+
+    Args:
+      config: settings of the run.
+      models: its trained models.
+    """
+    found = detections(jax.random.key(_SEED), config, models, _SAMPLES)
+    return {
+        name: float(np.mean(features.argmax(-1) == np.array(config.label_of_class(name))[:, None]))
+        for name, features in zip(config.modalities, found, strict=True)
+    }
+
+
+def compared(
+    config: Config, models: Models, accuracy: Mapping[str, float], drives: tuple[float, ...]
+) -> Iterator[dict[str, Any]]:
+    """Seconds by sensor and drive, of the best robot and of each rule, for each of `ERRORS`.
+
+    Args:
+      config: settings of the run.
+      models: its trained models.
+      accuracy: from `accuracies`.
+      drives: seconds to where a look is new.
+    """
     for m, name in enumerate(config.modalities):
-        if len(config.labels(name)) > 2:
-            raise ConfigError(
-                "run", arguments.run, f"must tell two labels apart by {name}, not more"
-            )
-        for drive in arguments.drives:
+        for drive in drives:
             sensor = Sensor(
-                accuracy=mean(detectors[name]["accuracy"]),
+                accuracy=accuracy[name],
                 strength=float(models.novelty.strength[m]),
                 look=float(config.team.travel.look_seconds),
                 drive=drive,
             )
-            least = seconds_at(sensor)
             by_rule = {rule: seconds_at(sensor, share) for rule, share in RULES.items()}
-            rows.append({"sensor": name, "drive": drive, "best": least, **by_rule})
-            for i, error in enumerate(ERRORS):
-                cells = [f"{seconds[i] / least[i] - 1:+.1%}" for seconds in by_rule.values()]
-                row = [f"{name}, {drive:g} s", f"{error:.1%}", f"{least[i]:.2f} s", *cells]
-                print(f"| {' | '.join(row)} |", flush=True)
+            yield {"sensor": name, "drive": drive, "best": seconds_at(sensor), **by_rule}
+
+
+def table(results: Mapping[str, Any], error: float = 0.01) -> str:
+    """What the best choice needs and what the rules need beyond it, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+      error: share of errors, one of `ERRORS`.
+    """
+    i = results["errors"].index(error)
+
+    def cells(row: Mapping[str, Any]) -> list[str]:
+        least = row["best"][i]
+        rules = [f"{row[rule][i] / least - 1:+.1%}" for rule in RULES]
+        return [f"{row['sensor']}, {row['drive']:g} s", f"{least:.2f} s", *rules]
+
+    heads = ["sensor, drive", f"best with {error:.1%} wrong", *RULES]
+    rows = [cells(row) for row in results["rows"]]
+    return studies.with_origin(studies.as_table(heads, rows), results)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    config, models = studies.load(PROGRAM, arguments.run)
+    for name in config.modalities:
+        if len(config.labels(name)) > 2:
+            expected = f"must tell two labels apart by {name}, not more"
+            cli.fail(PROGRAM, str(ConfigError("run", arguments.run, expected)))
     if arguments.json is not None:
-        whole = {"commit": commit(), "versions": versions(), "rows": rows}
-        arguments.json.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+        reserve(PROGRAM, "json", arguments.json)
+    accuracy = accuracies(config, models)
+    results = {
+        **studies.origin(PROGRAM, arguments),
+        "accuracy": accuracy,
+        "errors": ERRORS,
+        "rows": [*compared(config, models, accuracy, arguments.drives)],
+    }
+    studies.write(arguments.json, results)
+    print(*(table(results, error) for error in ERRORS), sep="\n\n")
 
 
 if __name__ == "__main__":

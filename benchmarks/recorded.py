@@ -1,26 +1,48 @@
 """`python -m benchmarks.recorded RUN`: looks through the real laser scans of mrpt-common."""
 
-import argparse
 import dataclasses
+import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import rich.console
-import rich.table
 
 import jaxsense
+from benchmarks import studies
+from benchmarks.measure import reserve
+from jaxsense.config.checks import check_fields
+from jaxsense.config.options import Name
 from jaxsense.interfaces import rawlog
+from jaxsense.run import cli
 from jaxsense.sim import recorded, sensors, windows
 from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Classifier, Detector
 
+PROGRAM = "benchmarks.recorded"
+NOISE = ("range_noise", "range_noise_growth", "mixed_pixels", "dropout")
+"""Settings of the LiDAR that are fitted to the scans."""
 _VIEWS = 10  # of each scan
 _LABELLED = 200  # windows to retrain with
 _RETRAINED = 5  # times, each with other windows
 _SEED = 31
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Count looks through real laser scans that are answered, and that are right."""
+
+    run: Annotated[Path, Name("RUN")]
+    """The directory of a finished run, `latest`, or `pretrained:PRESET`."""
+    logs: Path = rawlog.DIRECTORY
+    """Directory of the logs."""
+    json: Path | None = None
+    """File to write; must be new."""
+
+    def __post_init__(self):
+        check_fields(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,20 +202,42 @@ def figures(
     return found
 
 
+def table(results: Mapping[str, Any]) -> str:
+    """The shares, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    rows = [[name, f"{share:.4f}"] for name, share in results["shares"].items()]
+    return studies.with_origin(studies.as_table(["looks", "share"], rows), results)
+
+
+def of_noise(results: Mapping[str, Any]) -> str:
+    """The fitted noise of the scanner, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    rows = [[f"`lidar.{name}`", f"{value:.2g}"] for name, value in results["noise"].items()]
+    return studies.with_origin(studies.as_table(["setting", "fitted"], rows), results)
+
+
 def main(argv: list[str] | None = None) -> None:
-    """Runs the program."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path, help="directory of a finished run")
-    parser.add_argument("--logs", type=Path, default=rawlog.DIRECTORY, help="of the logs")
-    arguments = parser.parse_args(argv)
-    config, models = jaxsense.load(arguments.run)
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    config, models = studies.load(PROGRAM, arguments.run)
     scans = rawlog.read_logs(arguments.logs)
-    table = rich.table.Table("", "share", title=f"{len(scans.ranges)} real scans")
-    for name, share in figures(config, models, scans).items():
-        table.add_row(name, f"{share:.4f}")
-    console = rich.console.Console()
-    console.print(table)
-    console.print(recorded.fit_noise(config.lidar, scans.angles, scans.ranges))
+    if arguments.json is not None:
+        reserve(PROGRAM, "json", arguments.json)
+    fitted = recorded.fit_noise(config.lidar, scans.angles, scans.ranges)
+    results = {
+        **studies.origin(PROGRAM, arguments),
+        "scans": len(scans.ranges),
+        "shares": figures(config, models, scans),
+        "noise": {name: getattr(fitted, name) for name in NOISE},
+    }
+    studies.write(arguments.json, results)
+    print(table(results), of_noise(results), sep="\n\n")
 
 
 if __name__ == "__main__":

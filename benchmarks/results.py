@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks import curves, exported, gate, imperfect, place, recorded, where
 from benchmarks.digits import table as digits
 from benchmarks.fusions import table as fusions
 from benchmarks.seeds import tables
@@ -20,7 +21,7 @@ _HERE = Path(__file__).parent
 RESULTS = _HERE / "results"
 PAGES = (
     _HERE.parent / "README.md",
-    *(_HERE.parent / "docs" / f"{name}.md" for name in ("figures", "jmvae", "fusion", "tasks")),
+    *sorted((_HERE.parent / "docs").glob("*.md")),
     _HERE / "RESULTS.md",
 )
 _BLOCK = re.compile(
@@ -89,7 +90,13 @@ def number(value: float) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
-TABLES: Mapping[str, Mapping[str | None, Callable[[Any], str]]] = {
+_Tables = Mapping[str | None, Callable[[Any], str]]
+_IMPERFECT: _Tables = {
+    "breaks": imperfect.breaks,
+    "constant": partial(imperfect.of_sizes, sweeps=["both [m]"]),
+    "drifts": partial(imperfect.of_sizes, sweeps=["both drifts [m]"]),
+}
+TABLES: Mapping[str, _Tables] = {
     **{name: {None: table} for name in ("cpu.json", "h100.json", "h100x2.json")},
     "digits.json": {None: digits.of_results},
     "fusions.json": {None: fusions.of_results},
@@ -104,6 +111,22 @@ TABLES: Mapping[str, Mapping[str | None, Callable[[Any], str]]] = {
         "many": partial(tables.missions, preset="many", num_pois=8),
     },
     "tasks.json": {None: board.tables},
+    "gate.json": {None: gate.table, "search": gate.of_search},
+    "where.json": {None: where.table, "accuracy": where.of_accuracies},
+    "place.json": {None: place.table},
+    "curves.json": {None: curves.table},
+    **{name: _IMPERFECT for name in ("imperfect_default.json", "imperfect_noisy.json")},
+    "imperfect_trained.json": {None: partial(imperfect.of_sizes, sweeps=["both [m]"])},
+    "imperfect_messages.json": {None: imperfect.of_messages},
+    "exported.json": {
+        None: partial(exported.table, programs=exported.SHOWN),
+        "numpy": partial(
+            exported.latencies,
+            runs=("pretrained:default", "pretrained:noisy"),
+            programs=exported.SHOWN,
+        ),
+    },
+    "recorded.json": {None: recorded.table, "noise": recorded.of_noise},
 }
 """What makes each table of a file, by their names."""
 

@@ -10,11 +10,10 @@ mostly drive need for the same accuracy.
 """
 
 import dataclasses
-import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +21,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import stats
 
+from benchmarks import studies
 from benchmarks.curves import Curves, as_block, as_table, of_costs, stacked
+from benchmarks.measure import reserve
 from jaxsense import Config, Key, Models, pytree
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
-from jaxsense.run import cli, rundir
-from jaxsense.run.version import commit, versions
+from jaxsense.run import cli
 from jaxsense.vae.novelty import LEAST_NEW, Novelty
 
 PROGRAM = "benchmarks.where"
@@ -35,7 +35,8 @@ SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9)
 CURVES = (0.1, 0.25, LEAST_NEW)
 """Shares that are compared at the same accuracy. With 0 some robots would look on from one place
 for ever, since the values of looks take each look for a new one."""
-_KEYS = ("accuracy", "confidence", "looks", "time")
+_KEYS = {"accuracy": 3, "confidence": 3, "looks": 2, "time": 1}
+"""What is compared, with its decimals in the table."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Arguments:
     """Play missions in which robots look from other places."""
 
     run: Annotated[Path, Name("RUN")]
-    """The directory of a finished run, or `latest`."""
+    """The directory of a finished run, `latest`, or `pretrained:PRESET`."""
     episodes: int = 256
     """Missions of each policy with each rule."""
     seed: int = 0
@@ -55,7 +56,7 @@ class Arguments:
     costs: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)
     """Costs of a look with which robots are compared at the same accuracy."""
     json: Path | None = None
-    """File to write the figures to."""
+    """File to write; must be new."""
 
     def __post_init__(self):
         check_fields(self, bits=64)
@@ -110,7 +111,7 @@ def within(config: Config, farthest: float) -> Config:
 def compare(
     found: dict[str, np.ndarray],
     usual: dict[str, np.ndarray],
-    keys: tuple[str, ...] = _KEYS,
+    keys: Sequence[str] = tuple(_KEYS),
 ) -> dict[str, list[float]]:
     """Means, and differences from the usual rule in the same arenas with their 95% half-widths.
 
@@ -145,7 +146,7 @@ def by_rule(
     """
     rules = [(f"share {share:g}", own, share) for share in SHARES]
     for farthest in arguments.ranges:
-        nearer = Curves(key, within(config, farthest), arguments.episodes)
+        nearer = Curves(key, within(config, farthest), arguments.episodes, only=arguments.policies)
         rules.append((f"range {farthest:g} m", nearer, LEAST_NEW))
     for policy in arguments.policies:
         usual = own.play(with_share(models, LEAST_NEW), policy)
@@ -175,26 +176,61 @@ def by_cost(
             yield as_block(name, {"look_cost": arguments.costs}, points)
 
 
+def table(results: Mapping[str, Any]) -> str:
+    """What each rule of where to look from changes, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    heads = ["policy", "rule", "right", "confidence", "looks per PoI", "mean time [s]"]
+    rows = [
+        [
+            f"`{row['policy']}`",
+            row["rule"],
+            *(as_cell(row[key], digits) for key, digits in _KEYS.items()),
+        ]
+        for row in results["rows"]
+    ]
+    return studies.with_origin(studies.as_table(heads, rows), results)
+
+
+def of_accuracies(results: Mapping[str, Any]) -> str:
+    """What robots need for the same accuracy, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    return studies.with_origin(as_table(results["curves"]), results)
+
+
+def as_cell(compared: Sequence[float], digits: int) -> str:
+    """A mean, its difference and the half-width of that, unless nothing differs.
+
+    Args:
+      compared: a value of `compare`.
+      digits: decimals.
+    """
+    mean, less, width = compared
+    text = f"{mean:.{digits}f}"
+    return f"{text}, {less:+.{digits}f} ± {width:.{digits}f}" if less or width else text
+
+
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    config, models = rundir.load(cli.find_run(arguments.run))
+    config, models = studies.load(PROGRAM, arguments.run)
+    if arguments.json is not None:
+        reserve(PROGRAM, "json", arguments.json)
     play_key = jax.random.key(arguments.seed)
     train_key = jax.random.fold_in(play_key, 1)
-    own = Curves(play_key, config, arguments.episodes)
-    rows, curves = [], []
-    for row in by_rule(play_key, config, models, own, arguments):
-        rows.append(row)
-        cells = [f"{row[k][0]:.3f} {row[k][1]:+.3f} ± {row[k][2]:.3f}" for k in _KEYS]
-        print(f"| `{row['policy']}` | {row['rule']} | {' | '.join(cells)} |", flush=True)
-    for block in by_cost(train_key, config, models, own, arguments):
-        curves.append(block)
-        print(as_table([block]).splitlines()[-1], flush=True)
-    print(as_table(curves))
-    if arguments.json is not None:
-        whole = {"commit": commit(), "versions": versions(), "episodes": arguments.episodes}
-        whole |= {"seed": arguments.seed, "rows": rows, "curves": curves}
-        arguments.json.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+    own = Curves(play_key, config, arguments.episodes, only=arguments.policies)
+    results = {
+        **studies.origin(PROGRAM, arguments),
+        "rows": [*by_rule(play_key, config, models, own, arguments)],
+        "curves": [*by_cost(train_key, config, models, own, arguments)],
+    }
+    studies.write(arguments.json, results)
+    print(table(results), of_accuracies(results), sep="\n\n")
 
 
 if __name__ == "__main__":

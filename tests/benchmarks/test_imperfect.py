@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import imperfect
 from jaxsense import PRESETS
-from jaxsense.config import ConfigError
+from jaxsense.config import ConfigError, SearchConfig
 
 ARGUMENTS = imperfect.Arguments(run=Path("latest"))
 MODELS: Any = SimpleNamespace(agent=SimpleNamespace(plays=lambda number: number in (3, 16)))
@@ -58,7 +58,7 @@ def test_sweeps_change_one_thing_or_two():
         "both drifts [m]": (0.0, 0.0, 0.02, 2.0),
     }
     found = {}
-    for sweep in imperfect.poses(ARGUMENTS):
+    for sweep in imperfect.poses(ARGUMENTS, SearchConfig()):
         errors = imperfect.changed(PRESETS["noisy"], sweep.changes[2]).mission.localisation
         constant = errors.position_error, errors.heading_error
         found[sweep.name] = (*constant, errors.position_drift, errors.heading_drift)
@@ -81,7 +81,7 @@ def test_sweeps_change_one_thing_or_two():
 
 def test_misplaced_robots_may_search():
     given = imperfect.Arguments(run=Path("latest"), search_position=0.09, search_heading=6.0)
-    for sweep in imperfect.poses(given):
+    for sweep in imperfect.poses(given, given.search):
         for changes in sweep.changes:
             searched = imperfect.changed(PRESETS["noisy"], changes).mission.localisation.search
             assert (searched.position, searched.heading) == (0.09, 6.0)
@@ -102,3 +102,52 @@ def test_other_arenas_and_robots():
         imperfect.Arguments(run=Path("latest"), headings=(1.0,))
     with pytest.raises(ConfigError, match=r"heading_drifts .*: must be as many as position_drifts"):
         imperfect.Arguments(run=Path("latest"), heading_drifts=(1.0,))
+
+
+ORIGIN = {
+    "command": "python -m benchmarks.imperfect pretrained:noisy", "device": "cpu", "cores": 2,
+    "commit": "0123456789abcdef", "date": "2026-11-26", "versions": {"jax": "0.10.2"},
+}  # fmt: skip
+USUAL = {"accuracy": 0.99, "own": 0.99, "nll": 0.05, "looks": 2.5, "time": 40.0}
+
+
+def sweep(name, *sizes, accuracy=0.98, point=None):
+    """Rows whose figures differ from those without errors by the same at all sizes."""
+    figures = {key: [mean, 0.5, 0.25] for key, mean in {**USUAL, "accuracy": accuracy}.items()}
+    return {"sweep": name, "rows": [{"size": x, **figures} for x in sizes], "break": point}
+
+
+POINT = {"mean": 0.005, "low": 0.004, "high": None}
+RESULTS = {
+    **ORIGIN,
+    "usual": USUAL,
+    "curves": {
+        "no search": [sweep("both [m]", 0.01, 0.02, point=POINT)],
+        "with a search": [sweep("both [m]", 0.01, 0.02, accuracy=0.985)],
+        "messages": [sweep("loss", 0.1, 0.9)],
+    },
+}
+
+
+def test_break_points_stand_next_to_those_with_a_search():
+    head, _, row, _, about = imperfect.breaks(RESULTS).splitlines()
+    assert head == "| error | no search | with a search |"
+    assert row == "| both [m] | 0.005 (0.004 to ?) | - |"
+    assert about.startswith("`python -m benchmarks.imperfect pretrained:noisy`: cpu with 2 cores;")
+
+
+def test_sizes_are_compared_with_no_error():
+    _, _, none, _, second, *_ = imperfect.of_sizes(RESULTS, ["both [m]"]).splitlines()
+    assert none == "| none | 0.990 | 2.50 | 40.0 | 0.990 | 2.50 | 40.0 |"
+    assert second.startswith("| both [m]: 0.02 | 0.980, +0.500 ± 0.250 | 2.50, +0.50 ± 0.25 |")
+    assert "| 0.985, +0.500 ± 0.250 |" in second
+    alone = {**RESULTS, "curves": {"no search": RESULTS["curves"]["no search"]}}
+    assert "with a search" not in imperfect.of_sizes(alone, ["both [m]"])
+
+
+def test_messages_are_shown_at_their_worst():
+    _, _, shared, worst, *_ = imperfect.of_messages(RESULTS).splitlines()
+    assert shared == "| one shared map | 0.990 | 0.990 | 0.050 | 2.50 | 40.0 |  |"
+    assert worst.startswith("| loss: 0.9 | 0.980, +0.500 ± 0.250 |")
+    assert worst.endswith("| 1.000 |")
+    assert len([*imperfect.tables(RESULTS)]) == 3

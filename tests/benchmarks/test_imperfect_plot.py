@@ -47,7 +47,8 @@ def test_sweeps_and_figures_are_chosen():
 @pytest.fixture
 def files(tmp_path):
     for name, sweeps in (("one", [POSES, LOSSES]), ("other", [POSES]), ("third", [LOSSES])):
-        text = json.dumps({"usual": USUAL, "sweeps": sweeps})
+        of_run = {"options": {"run": f"pretrained:{name}"}, "usual": USUAL}
+        text = json.dumps({**of_run, "curves": {"no search": sweeps}})
         (tmp_path / f"{name}.json").write_text(text, encoding="utf-8")
     (tmp_path / "bad.json").write_text("{}", encoding="utf-8")
     return tmp_path
@@ -55,11 +56,16 @@ def files(tmp_path):
 
 def test_files_are_compared_where_both_say_something(files):
     paths = [files / "one.json", files / "other.json"]
-    found = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths}
+    found = {}
+    for path in paths:
+        found |= imperfect_plot.curves_of(json.loads(path.read_text(encoding="utf-8")))
     figure = imperfect_plot.draw(found, ALL_FIGURES)
     assert len(figure.axes) == 3
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["one", "other"]
+    assert names == ["one, no search", "other, no search"]
+    # The other file has no losses.
+    figure = imperfect_plot.draw(found, ALL_FIGURES, ("loss",))
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one, no search"]
     imperfect_plot.main([*map(str, paths), "--plot", str(files / "p.png")])
     assert (files / "p.png").read_bytes().startswith(b"\x89PNG")
 
@@ -69,9 +75,13 @@ def test_files_are_compared_where_both_say_something(files):
     [
         (["one"], "one.json", r"plot = PosixPath\('.*one.json'\): must be a new file"),
         (["one"], "nowhere/p.png", "plot = '.*p.png': cannot be written: No such file"),
-        (["bad"], "p.png", "files: 'sweeps'"),
-        (["one", "one"], "p.png", "must name one file or more, each of another name"),
-        (["other", "third"], "p.png", r"sweeps = \[\]: must be among \[\], which every file has"),
+        (["bad"], "p.png", "files: 'options'"),
+        (["one", "one"], "p.png", "must name one file or more, each once"),
+        (
+            ["other", "third"],
+            "p.png",
+            r"sweeps = \[\]: must be some of \['position \[m\]', 'l",
+        ),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_in_one_line(files, names, plot, reason, capsys):

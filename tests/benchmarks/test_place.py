@@ -67,3 +67,14 @@ def test_a_rule_stays_while_its_share_is_new_and_then_drives():
 
 def _rules(sensor, price):
     return [(share, place.best(sensor, price, share)) for share in (1.0, 0.3, 0.25, 0.2, 0.0)]
+
+
+def test_the_table_shows_what_rules_need_beyond_the_best_choice():
+    origin = {
+        "command": "python -m benchmarks.place RUN", "device": "cpu", "cores": 2,
+        "commit": "0123456789abcdef", "date": "2026-11-26", "versions": {"jax": "0.10.2"},
+    }  # fmt: skip
+    rules = dict(zip(place.RULES, ([3, 2.2, 4], [3, 2.0, 4], [3, 3.0, 4]), strict=True))
+    row = {"sensor": "camera", "drive": 0.5, "best": [1.0, 2.0, 4.0], **rules}
+    found = place.table({**origin, "errors": place.ERRORS, "rows": [row]}, 0.01)
+    assert "| camera, 0.5 s | 2.00 s | +10.0% | +0.0% | +50.0% |" in found

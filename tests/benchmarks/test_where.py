@@ -60,3 +60,16 @@ def test_differences_are_paired_by_arena():
     for mean, less, width in where.compare(found, usual).values():
         assert mean == pytest.approx(noise.mean() + 1)
         assert (less, width) == pytest.approx((1.0, 0.0), abs=1e-9)
+
+
+def test_a_rule_is_compared_with_the_usual_one():
+    assert where.as_cell([0.9876, 0.0, 0.0], 3) == "0.988"
+    assert where.as_cell([40.0, -1.26, 0.5], 1) == "40.0, -1.3 ± 0.5"
+    origin = {
+        "command": "python -m benchmarks.where RUN", "device": "cpu", "cores": 2,
+        "commit": "0123456789abcdef", "date": "2026-11-26", "versions": {"jax": "0.10.2"},
+    }  # fmt: skip
+    figures = {"accuracy": [0.99, 0, 0], "confidence": [0.98, 0, 0], "looks": [2.5, 0, 0]}
+    row = {"policy": "latent", "rule": "share 0.5", **figures, "time": [40.0, 0, 0]}
+    *_, found, _, _ = where.table({**origin, "rows": [row]}).splitlines()
+    assert found == "| `latent` | share 0.5 | 0.990 | 0.980 | 2.50 | 40.0 |"

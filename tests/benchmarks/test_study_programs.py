@@ -1,0 +1,75 @@
+"""Programs of studies from the command line to JSON and table, with made-up figures."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks import curves, gate, imperfect, place, recorded, results, where
+from benchmarks.curves import Curves
+
+FIGURES = ("accuracy", "confidence", "looks", "time", "own", "nll", "collisions")
+
+
+@pytest.fixture
+def _played(monkeypatch):
+    """Missions and trainings that take no time."""
+
+    def play(self, models, policy, config=None):
+        del models, config
+        self.scenario.policy(policy)
+        return {name: np.linspace(0.5, 1.0, 4) for name in FIGURES}
+
+    def of_costs(key, config, models, costs):
+        del key, config
+        return jax.tree.map(lambda x: np.stack([x] * len(costs)), models)
+
+    monkeypatch.setattr(Curves, "play", play)
+    for module in (curves, where):
+        monkeypatch.setattr(module, "of_costs", of_costs)
+    shares = {name: dict.fromkeys(gate.SITUATIONS, 0.5) for name in ("camera", "lidar")}
+    monkeypatch.setattr(gate, "answered", lambda *_: shares)
+    monkeypatch.setattr(place, "accuracies", lambda *_: {"camera": 0.9, "lidar": 0.8})
+    monkeypatch.setattr(place, "seconds_at", lambda *_: [1.0, 2.0, 3.0])
+    monkeypatch.setattr(recorded, "figures", lambda *_: {"PoI: answered": 0.5})
+
+
+@pytest.mark.usefixtures("_played")
+@pytest.mark.parametrize(
+    ("program", "file", "options"),
+    [
+        (gate, "gate", ["--looks", "3", "--search-position", ".09"]),
+        (where, "where", ["pretrained:noisy", "--episodes", "4", "--policies", "latent"]),
+        (place, "place", ["pretrained:noisy"]),
+        (curves, "curves", ["pretrained:noisy", "--episodes", "4"]),
+        (imperfect, "imperfect_default", ["pretrained:default", "--search-position", ".09"]),
+        (imperfect, "imperfect_messages", ["pretrained:noisy", "--positions", "--headings"]),
+    ],
+)
+def test_a_program_prints_the_tables_of_its_file(program, file, options, tmp_path, capsys):
+    path = tmp_path / f"{file}.json"
+    program.main([*options, "--json", str(path)])
+    content = json.loads(path.read_text(encoding="utf-8"))
+    printed = capsys.readouterr().out
+    for name, table in results.TABLES[path.name].items():
+        made = table(content)
+        # A search prints its own table, and robots print all errors in one.
+        if (file, name) not in {("gate", None), *((file, x) for x in ("constant", "drifts"))}:
+            assert made in printed
+        assert content["command"] in made
+    with pytest.raises(SystemExit):
+        program.main([*options, "--json", str(path)])
+    assert "already exists" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("_played")
+@pytest.mark.skipif(not recorded.rawlog.DIRECTORY.exists(), reason="mrpt-common is not installed")
+def test_real_scans_go_into_a_file(tmp_path, capsys):
+    path = tmp_path / "recorded.json"
+    recorded.main(["pretrained:default", "--json", str(path)])
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert content["scans"] == 704
+    assert content["noise"]["range_noise"] == pytest.approx(0.0048, abs=1e-4)
+    printed = capsys.readouterr().out
+    assert all(table(content) in printed for table in results.TABLES[path.name].values())
