@@ -109,6 +109,8 @@ TABLES: Mapping[str, _Tables] = {
         "noisy": partial(tables.missions, preset="noisy", num_pois=3),
         "maps": partial(tables.of_presets, rows=tables.OF_MAPS, presets=("noisy", "many")),
         "many": partial(tables.missions, preset="many", num_pois=8),
+        "team": partial(tables.missions, preset="team", num_pois=16),
+        "failures": partial(tables.failures, preset="default", num_pois=3),
     },
     "tasks.json": {None: board.tables},
     "gate.json": {None: gate.table, "search": gate.of_search},

@@ -18,7 +18,7 @@ TYPED = {
     "docs/concepts.md": 28,
     "docs/differences.md": 63,
     "docs/extending.md": 12,
-    "docs/figures.md": 251,
+    "docs/figures.md": 75,
     "docs/getting-started.md": 24,
     "docs/imperfect.md": 7,
     "docs/interfaces.md": 1,

@@ -51,6 +51,11 @@ _SIGMAS = [
     )
     for name, paper in (("unambiguous", "from 1.05"), ("ambiguous", "to 1.25"))
 ]
+_CONSISTENT = Row(
+    "least share of looks that leave the right classes open (`consistent`)",
+    lambda figures: min(x for each in figures["consistent"].values() for x in each),
+    "{:.3f}",
+)
 _NEAREST = Row("fused beliefs nearest to the right class", _key("fusion_accuracy"), "{:.4f}")
 _STATES = [
     Row("start states within 0.01 of the optimal return, of 1,728", _key("optimal_states"), "{:,}"),
@@ -64,6 +69,7 @@ _FRACTION = Row(
 OF_README = [_TABLE_ONE, *_SIGMAS, _NEAREST, _FRACTION, *_STATES]
 OF_FIGURES = [
     _TABLE_ONE,
+    _CONSISTENT,
     *_SIGMAS,
     Row(
         "latent dimensions in use, of 2",
@@ -158,11 +164,7 @@ OF_RAW = [
     ),
     Row("... of four looks by each", _grouped("all_looks"), "{:.4f}"),
     _TABLE_ONE,
-    Row(
-        "least share of looks that leave the right classes open (`consistent`)",
-        lambda figures: min(x for each in figures["consistent"].values() for x in each),
-        "{:.3f}",
-    ),
+    _CONSISTENT,
     Row("latent dimensions in use, of 2", _key("active_units"), "{}"),
     Row("accuracy of single looks, camera, LiDAR", _key("detectors"), "{:.4f}"),
     Row(
@@ -301,6 +303,36 @@ def missions(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
     command = f"python -m jaxsense.evaluate RUN` of `python -m jaxsense.train --preset {preset}"
     used = [(seed, found[preset][seed]) for seed in runs]
     return "\n".join([*lines, "", _about(used, command)])
+
+
+_OF_CASES = (
+    ("right", "accuracy", "{:.3f}"),
+    ("looks per PoI", "observations_per_poi", "{:.2f}"),
+    ("time, median", "time_s", "{:.1f} s"),
+    ("time, mean", "mean_time_s", "{:.1f} s"),
+    ("collisions", "collisions", "{}"),
+)
+
+
+def failures(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
+    """Missions in which robots fail, next to those in which none does.
+
+    Args:
+      found: from `gather`.
+      preset: its name.
+      num_pois: of the evaluations.
+    """
+    lines = [_line("robots", *(head for head, _, _ in _OF_CASES))]
+    lines.append(_line(*["---"] * (1 + len(_OF_CASES))))
+    runs = _evaluated(found, preset, num_pois)
+    cases = dict.fromkeys(case for run in runs.values() for case in run if case not in _POLICIES)
+    for case, label in {"latent": "all work", **{x: x.replace("_", " ") for x in cases}}.items():
+        shown = [run[case] for run in runs.values() if case in run]
+        lines.append(
+            _line(label, *(_range(form, [x[key] for x in shown]) for _, key, form in _OF_CASES))
+        )
+    command = f"python -m jaxsense.evaluate RUN` of `python -m jaxsense.train --preset {preset}"
+    return "\n".join([*lines, "", _about([(x, found[preset][x]) for x in runs], command)])
 
 
 def _interval(of: Mapping[str, float]) -> str:

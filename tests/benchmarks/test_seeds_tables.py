@@ -104,6 +104,15 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     assert "--preset many" in shown.splitlines()[-1]
 
 
+def test_robots_that_fail_stand_below_those_that_work(runs):
+    cases = {"latent": CASE, "auction": CASE, "camera_alone": {**CASE, "accuracy": 0.7}}
+    run = runs("default", 100, a={**EVALUATION, "num_pois": 3, "mission": cases})
+    table = tables.failures(gather([run]), "default", 3)
+    assert cells(table, "all work") == ["0.998", "1.68", "13.8 s", "14.5 s", "0"]
+    assert cells(table, "camera alone")[0] == "0.700"
+    assert "auction" not in table
+
+
 def test_missions_of_trainings_stand_side_by_side(runs):
     table = tables.of_missions(gather([runs("default", 100)]), "default")
     assert cells(table, "time, mean") == ["14.5 s"]
