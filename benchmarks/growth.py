@@ -1,13 +1,13 @@
-"""Fails if a run needs much more than in the last baseline: in pairs, on this machine.
+"""`python -m benchmarks.growth`: fails if a run needs much more than in the last baseline.
 
-Trains the preset `smoke` with this tree and with that of `.ci/baseline.json`, in turn and each with
-an empty cache. Whoever lets a figure grow on purpose renews the baseline and says why.
+Trains the preset `smoke` with this tree and with that of `.ci/baseline.json`, in turn, on this
+machine and each with an empty cache. Whoever lets a figure grow on purpose renews the baseline and
+says why.
 """
 
 import argparse
 import dataclasses
 import json
-import os
 import pickle
 import re
 import subprocess
@@ -17,10 +17,10 @@ from pathlib import Path
 
 from jax import export
 
+from benchmarks import pipeline
 from jaxsense.run import files
 
-_ROOT = Path(__file__).parents[1]
-_BASELINE = _ROOT / ".ci" / "baseline.json"
+_BASELINE = pipeline.ROOT / ".ci" / "baseline.json"
 _MOST = 1.1  # times the baseline
 _OPERATION = re.compile(r"^\s*(%[\w:#, %]+ = |return)", re.MULTILINE)
 
@@ -52,16 +52,12 @@ class Needs:
 
 def train(tree: Path, place: Path) -> Needs:
     """Trains once in a tree of the source."""
-    command = [sys.executable, "-m", "jaxsense.train", "--preset", "smoke", "--quiet"]
-    command += ["--cache", str(place / "cache"), "--out", str(place / "run")]
-    environment = {**os.environ, "PYTHONPATH": str(tree)}
-    process = subprocess.Popen(command, cwd=place, env=environment, stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        sys.exit(f"the training in {tree} has failed")
+    words = ["jaxsense.train", "--preset", "smoke", "--quiet"]
+    words += ["--cache", str(place / "cache"), "--out", str(place / "run")]
+    needs = pipeline.run(tree, words, place)
     programs = (place / "cache" / "traced").glob("*.stablehlo")
     operations = {path.name.rpartition("-")[0]: _operations(path) for path in programs}
-    return Needs(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, operations)
+    return Needs(needs.cpu_s, 1024 * needs.memory_gib, operations)
 
 
 def _operations(path: Path) -> int:
@@ -98,7 +94,7 @@ def main() -> None:
     pairs = parser.parse_args().pairs
     baseline = json.loads(_BASELINE.read_text(encoding="utf-8"))
     commit = baseline["commit"]
-    has_commit = ["git", "-C", str(_ROOT), "cat-file", "-e", f"{commit}^{{commit}}"]
+    has_commit = ["git", "-C", str(pipeline.ROOT), "cat-file", "-e", f"{commit}^{{commit}}"]
     if subprocess.run(has_commit, capture_output=True, check=False).returncode:
         print(f"this checkout does not hold {commit}, the baseline: nothing is compared")
         return
@@ -106,21 +102,18 @@ def main() -> None:
         place = Path(folder)
         old = place / "baseline"
         old.mkdir()
-        archive = subprocess.run(
-            ["git", "-C", str(_ROOT), "archive", commit], capture_output=True, check=True
-        )
-        subprocess.run(["tar", "x", "-C", str(old)], input=archive.stdout, check=True)
-        runs: dict[Path, list[Needs]] = {old: [], _ROOT: []}
+        pipeline.unpack(commit, old)
+        runs: dict[Path, list[Needs]] = {old: [], pipeline.ROOT: []}
         for i in range(pairs):
             for j, (tree, needs) in enumerate(runs.items()):
                 (place / f"{i}-{j}").mkdir()
                 needs.append(train(tree, place / f"{i}-{j}"))
     print(f"{'':40} {commit[:10]:>10} {'now':>10}")
-    grown = compare(least(runs[old]), least(runs[_ROOT]))
+    grown = compare(least(runs[old]), least(runs[pipeline.ROOT]))
     if grown:
         sys.exit(
             f"{', '.join(grown)}: more than {_MOST} times that of {commit[:10]}; renew "
-            f"{_BASELINE.relative_to(_ROOT)} and say why, or find the cause"
+            f"{_BASELINE.relative_to(pipeline.ROOT)} and say why, or find the cause"
         )
 
 

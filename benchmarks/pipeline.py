@@ -1,0 +1,219 @@
+"""`python -m benchmarks.pipeline COMMIT`: whole commands, now and in an earlier tree."""
+
+import dataclasses
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from benchmarks import measure, studies
+from jaxsense.config.checks import check_fields, limited
+from jaxsense.config.options import Name
+from jaxsense.run import cli
+
+PROGRAM = "benchmarks.pipeline"
+ROOT = Path(__file__).parents[1]
+_MISSIONS = ["--policy", "naive", "--arena.num-pois", "16", "--arena.side", "6"]
+_GIB = 2**20  # kB
+
+
+@dataclasses.dataclass(frozen=True)
+class Needs:
+    """What a command needs.
+
+    Attributes:
+      seconds: from its start to its end.
+      cpu_s: seconds of all cores.
+      memory_gib: at the peak.
+    """
+
+    seconds: float
+    cpu_s: float
+    memory_gib: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """A command to measure.
+
+    Attributes:
+      name: in tables.
+      words: behind `python -m`; `{run}` is the directory of a training by the same tree.
+      cold: whether its compilation cache is empty; else it has run once before.
+      trains: options of the training, if one is needed first; it is not measured.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    cold: bool = False
+    trains: tuple[str, ...] | None = None
+
+
+TRAIN = ("jaxsense.train", "--seed", "1", "--quiet")
+COMMANDS: Mapping[str, Command] = {
+    "cold": Command("`train`, cold", TRAIN, cold=True),
+    "warm": Command("`train`, warm", TRAIN),
+    "team": Command("`train --preset team`, cold", (*TRAIN, "--preset", "team"), cold=True),
+    "missions": Command(
+        f"`evaluate RUN {' '.join(_MISSIONS)} --episodes 384`, a run of `smoke`, warm",
+        ("jaxsense.evaluate", "{run}", *_MISSIONS, "--episodes", "384"),
+        trains=("--preset", "smoke"),
+    ),
+}
+"""What is measured, by the names of the option `commands`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Measure whole commands by this tree and by an earlier one, in turn."""
+
+    commit: Annotated[str, Name("COMMIT")]
+    """The earlier tree."""
+    commands: tuple[str, ...] = tuple(COMMANDS)
+    """Which ones."""
+    pairs: int = limited(1, at_least=1)
+    """How often each tree is measured; the medians count."""
+    json: Path | None = None
+    """File to write; must be new."""
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+def unpack(commit: str, folder: Path) -> None:
+    """Writes the tree of a commit of this repository.
+
+    Args:
+      commit: its hash.
+      folder: where to.
+
+    Raises:
+      subprocess.CalledProcessError: if this checkout does not hold it.
+    """
+    git = ["git", "-C", str(ROOT), "archive", commit]
+    archive = subprocess.run(git, capture_output=True, check=True)
+    subprocess.run(["tar", "x", "-C", str(folder)], input=archive.stdout, check=True)
+
+
+def run(tree: Path, words: Sequence[str], place: Path) -> Needs:
+    """Runs a module of a tree of the source, or ends the program if it fails.
+
+    Args:
+      tree: the source.
+      words: behind `python -m`.
+      place: working directory.
+    """
+    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    begin = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-m", *words], cwd=place, env=environment, stdout=subprocess.DEVNULL
+    )
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        sys.exit(f"python -m {' '.join(words)}, in {tree}, has failed")
+    seconds = time.perf_counter() - begin
+    return Needs(seconds, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / _GIB)
+
+
+def measured(tree: Path, command: Command, place: Path) -> Needs:
+    """Runs a command once, after what it needs.
+
+    Args:
+      tree: the source.
+      command: the command.
+      place: an empty directory.
+    """
+    cache = ("--cache", str(place / "cache"))
+    if command.trains is not None:
+        run(tree, (*TRAIN, *command.trains, *cache, "--out", str(place / "run")), place)
+
+    def words(number: int) -> tuple[str, ...]:
+        given = tuple(str(place / "run") if word == "{run}" else word for word in command.words)
+        # An evaluation writes into the directory of its run, under a name that says what it played.
+        own = (
+            ("--seed", str(number))
+            if command.trains is not None
+            else ("--out", str(place / f"{number}"))
+        )
+        return (*given, *cache, *own)
+
+    if not command.cold:
+        run(tree, words(1), place)
+    return run(tree, words(2), place)
+
+
+def pairs(arguments: Arguments, before: Path, place: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yields each command's name, and what both trees need for it.
+
+    Args:
+      arguments: of the program.
+      before: the earlier tree.
+      place: an empty directory.
+    """
+    for name in arguments.commands:
+        found: dict[str, list[dict[str, float]]] = {"before": [], "now": []}
+        for i in range(arguments.pairs):
+            for side, tree in (("before", before), ("now", ROOT)):
+                own = place / f"{name}-{i}-{side}"
+                own.mkdir()
+                found[side].append(dataclasses.asdict(measured(tree, COMMANDS[name], own)))
+                print(f"{name}, {side}: {found[side][-1]}", file=sys.stderr)
+        yield name, found
+
+
+def table(results: Mapping[str, Any]) -> str:
+    """What both trees need, and its ratio, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    commit = results["options"]["commit"][:10]
+    heads = ["command"]
+    for what in ("seconds", "CPU seconds", "peak memory [GiB]"):
+        heads += [f"{what}: {commit}", "now", "ratio"]
+    rows = []
+    for name, found in results["commands"].items():
+        cells = [COMMANDS[name].name]
+        for key, form in (("seconds", "{:.1f}"), ("cpu_s", "{:.0f}"), ("memory_gib", "{:.2f}")):
+            before, now = (
+                statistics.median(each[key] for each in found[side]) for side in ("before", "now")
+            )
+            cells += [form.format(before), form.format(now), f"{now / before:.2f}"]
+        rows.append(cells)
+    return studies.with_origin(studies.as_table(heads, rows), results)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    for name in arguments.commands:
+        if name not in COMMANDS:
+            cli.fail(PROGRAM, f"commands = {name!r}: must be one of {', '.join(COMMANDS)}")
+    if arguments.json is not None:
+        measure.reserve(PROGRAM, "json", arguments.json)
+    results = {
+        **measure.origin(studies.command(PROGRAM, arguments)),
+        "options": {"commit": arguments.commit, "pairs": arguments.pairs},
+        "commands": {},
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        before, place = Path(folder) / "before", Path(folder) / "runs"
+        before.mkdir()
+        place.mkdir()
+        try:
+            unpack(arguments.commit, before)
+        except subprocess.CalledProcessError as error:
+            cli.fail(PROGRAM, f"commit = {arguments.commit!r}: {error.stderr.decode().strip()}")
+        for name, found in pairs(arguments, before, place):
+            results["commands"][name] = found
+            studies.write(arguments.json, results)
+    print(table(results))
+
+
+if __name__ == "__main__":
+    main()
