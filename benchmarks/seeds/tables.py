@@ -244,7 +244,7 @@ _OF_MISSIONS = (
     ("looks per PoI", "observations_per_poi", "{:.2f}"),
     ("time, median", "time_s", "{:.1f} s"),
     ("time, mean", "mean_time_s", "{:.1f} s"),
-    ("confidence less accuracy", "overconfidence", "{:.3f}"),
+    ("confidence minus accuracy", "overconfidence", "{:.3f}"),
     ("NLL of the maps", "nll", "{:.3f}"),
 )
 
@@ -259,25 +259,27 @@ EVALUATED = {
 
 
 def worth(found: Mapping[str, Any], names: Mapping[tuple[str, int], str]) -> str:
-    """Time of every policy as a multiple of the learned one's, and its wrong PoIs.
+    """What every policy reaches: time, as a multiple of the learned one's; looks; and wrong PoIs.
 
     Args:
       found: from `gather`.
       names: of the columns, by preset and number of PoIs of their evaluations.
     """
-    heads = [f"{name}: {what}" for name in names.values() for what in ("time", "wrong")]
-    lines = [_line("policy", *heads), _line(*["---"] * (1 + len(heads)))]
     played = {of: _evaluated(found, *of) for of in names}
+    heads = [f"{names[of]}, {_seeds(sorted(map(int, runs)))}" for of, runs in played.items()]
+    lines = [_line("policy", *heads), _line(*["---"] * (1 + len(heads)))]
     for policy, what in _POLICIES.items():
         cells = []
         for of_seeds in played.values():
             runs = [run for run in of_seeds.values() if policy in run]
             ratios = [run[policy]["mean_time_s"] / run["latent"]["mean_time_s"] for run in runs]
+            looks = [run[policy]["observations_per_poi"] for run in runs]
             wrong = [100 * (1 - run[policy]["accuracy"]) for run in runs]
-            cells += (
-                [_range("{:.2f}", ratios), _range("{:.1f}", wrong) + " %"] if runs else ["", ""]
+            shown = ("{:.2f}", ratios), ("{:.1f}", looks), ("{:.1f}", wrong)
+            cells.append(
+                "; ".join(_range(*each) for each in shown) + " %" if runs else "not played"
             )
-        if any(cells):
+        if any(cell != "not played" for cell in cells):
             lines.append(_line(f"`{policy}`, {what}", *cells))
     command = "python -m jaxsense.evaluate RUN"
     used = [(seed, found[preset][seed]) for (preset, _), runs in played.items() for seed in runs]

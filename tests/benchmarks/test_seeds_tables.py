@@ -86,15 +86,10 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     team = runs("team", 100, a=evaluation(16, latent=4.0), b=evaluation(16, latent=4.0, naive=6.0))
     found = gather([first, second, team])
     table = tables.worth(found, {("many", 8): "`many`", ("team", 16): "`team`"})
-    assert cells(table, "policy") == [
-        "`many`: time",
-        "`many`: wrong",
-        "`team`: time",
-        "`team`: wrong",
-    ]
-    assert cells(table, "`latent`")[::2] == ["1.00", "1.00"]
-    assert cells(table, "`auction`") == ["0.95 to 1.10", "0.2 %", "", ""]
-    assert cells(table, "`naive`") == ["0.80", "0.2 %", "1.50", "0.2 %"]
+    assert cells(table, "policy") == ["`many`, seeds 100 to 101", "`team`, seed 100"]
+    assert cells(table, "`latent`") == ["1.00; 1.7; 0.2 %", "1.00; 1.7; 0.2 %"]
+    assert cells(table, "`auction`") == ["0.95 to 1.10; 1.7; 0.2 %", "not played"]
+    assert cells(table, "`naive`") == ["0.80; 1.7; 0.2 %", "1.50; 1.7; 0.2 %"]
     assert "`random`" not in table
     shown = tables.missions(found, "many", 8)
     assert cells(shown, "`latent`") == [
