@@ -1,0 +1,145 @@
+"""`python -m benchmarks.remeasure [NAMES]`: measures results again, and writes the pages anew.
+
+Every file of `benchmarks/results` holds the command that made it. This runs them one after another,
+which takes hours for all of them, and replaces each file whose command succeeds. Then it draws the
+pictures of these files and writes their tables, see `benchmarks.results`.
+"""
+
+import dataclasses
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from benchmarks import results
+from jaxsense.config.options import Name
+from jaxsense.run import cli
+
+PROGRAM = "benchmarks.remeasure"
+FIGURES = Path(__file__).parents[1] / "docs" / "figures"
+_OTHERWISE: Mapping[str, str] = {
+    "seeds": 'train and evaluate as "The commands of the README" in docs/figures.md say, and '
+    "gather the runs with python -m benchmarks.seeds",
+    "tasks": "python -m benchmarks.tasks writes it",
+}
+"""Files that no single command with `--json` makes, and what makes them."""
+_SWEEPS = {
+    "imperfect.png": ("position [m]", "heading [deg]", "both [m]"),
+    "imperfect_drift.png": ("position drift [m]", "heading drift [deg]", "both drifts [m]"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Measure stored results again, and write the pages anew."""
+
+    names: Annotated[tuple[str, ...], Name("NAMES")] = ()
+    """Files of `benchmarks/results` without their ending; by default all that one command makes on
+    this kind of device."""
+
+
+def command_of(content: Any) -> str | None:
+    """The command that made the content of a file, if there is a single one.
+
+    Args:
+      content: of the JSON file.
+    """
+    if isinstance(content, dict):
+        return content.get("command")
+    rows = " ".join(row["row"] for row in content)
+    peers = " --peers" if any(row["theirs"] is not None for row in content) else ""
+    return f"python -m benchmarks {rows}{peers}"
+
+
+def device_of(content: Any) -> str:
+    """The kind of device that a file was measured on.
+
+    Args:
+      content: of the JSON file.
+    """
+    device = content["device"] if isinstance(content, dict) else content[0]["device"]
+    return "cpu" if device.endswith("cpu") else device
+
+
+def measure(name: str, command: str) -> bool:
+    """Runs a command and, if it succeeds, replaces the file; tells whether it did.
+
+    Args:
+      name: of the file, without its ending.
+      command: that makes it.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        new = Path(folder) / f"{name}.json"
+        words = [sys.executable, *shlex.split(command)[1:], "--json", str(new)]
+        if name == "curves":
+            words += ["--plot", str(Path(folder) / "noisy_curves.png")]
+        print(f"{name}: {command}", flush=True)
+        if subprocess.run(words, check=False).returncode:
+            return False
+        shutil.move(new, results.RESULTS / new.name)
+        for picture in Path(folder).glob("*.png"):
+            shutil.move(picture, FIGURES / picture.name)
+    return True
+
+
+def draw(name: str) -> None:
+    """Draws the pictures that are made from a file.
+
+    Args:
+      name: of the file, without its ending.
+    """
+    file = results.RESULTS / f"{name}.json"
+    plot = [sys.executable, "-m", "benchmarks.imperfect_plot"]
+    if name == "imperfect_messages":
+        _replace([*plot, str(file), "--figures", "accuracy", "own", "nll", "time"], f"{name}.png")
+    elif name in ("imperfect_default", "imperfect_noisy"):
+        files = [str(results.RESULTS / f"imperfect_{run}.json") for run in ("default", "noisy")]
+        for picture, sweeps in _SWEEPS.items():
+            _replace([*plot, *files, "--sweeps", *sweeps], picture)
+
+
+def _replace(words: list[str], picture: str) -> None:
+    """Draws a picture of the pages anew; the programs write new files only."""
+    with tempfile.TemporaryDirectory() as folder:
+        new = Path(folder) / picture
+        subprocess.run([*words, "--plot", str(new)], check=True)
+        shutil.move(new, FIGURES / picture)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    stored = {
+        path.stem: json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted(results.RESULTS.glob("*.json"))
+    }
+    for name in arguments.names:
+        if name not in stored:
+            cli.fail(PROGRAM, f"names = {name!r}: must be one of {', '.join(stored)}")
+        if name in _OTHERWISE:
+            cli.fail(PROGRAM, f"names = {name!r}: {_OTHERWISE[name]}")
+    names = arguments.names or [
+        name
+        for name, content in stored.items()
+        if name not in _OTHERWISE and device_of(content) == "cpu"
+    ]
+    failed = []
+    for name in names:
+        command = command_of(stored[name])
+        assert command is not None
+        if measure(name, command):
+            draw(name)
+        else:
+            failed.append(name)
+    results.main()
+    if failed:
+        sys.exit(f"not measured: {', '.join(failed)}; their files are as they were")
+
+
+if __name__ == "__main__":
+    main()
