@@ -428,7 +428,8 @@ def draw(blocks: list[dict]) -> Figure:
         axis.set(xlabel=label, yscale="log", xlim=(0, None))
         axis.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("wrong PoIs [%]")
-    axes[0].legend(fontsize="small")
+    handles = axes[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper center", ncols=len(handles[1]), frameon=False)
     return figure
 
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from jaxsense.run import cli, devices, version
 from jaxsense.run.devices import Workers
-from jaxsense.show.drawing import png
+from jaxsense.show.drawing import png, svg
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
 
@@ -305,10 +305,10 @@ def save(program: str, option: str, path: Path, figure: Figure) -> None:
     Args:
       program: module that runs.
       option: that names the file.
-      path: of the file; a PNG, whatever its name.
+      path: of the file: an SVG if its name ends in `.svg`, else a PNG.
       figure: the picture.
     """
-    content = png(figure)
+    content = (svg if path.suffix == ".svg" else png)(figure)
     try:
         with path.open("xb") as file:
             file.write(content)

@@ -77,12 +77,12 @@ def measure(name: str, command: str) -> bool:
         new = Path(folder) / f"{name}.json"
         words = [sys.executable, *shlex.split(command)[1:], "--json", str(new)]
         if name == "curves":
-            words += ["--plot", str(Path(folder) / "noisy_curves.png")]
+            words += ["--plot", str(Path(folder) / "noisy_curves.svg")]
         print(f"{name}: {command}", flush=True)
         if subprocess.run(words, check=False).returncode:
             return False
         shutil.move(new, results.RESULTS / new.name)
-        for picture in Path(folder).glob("*.png"):
+        for picture in Path(folder).glob("*.svg"):
             shutil.move(picture, FIGURES / picture.name)
     return True
 

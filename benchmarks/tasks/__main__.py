@@ -14,7 +14,7 @@ from benchmarks.tasks.jobs import Job
 from jaxsense.config.checks import check_fields, limited, require
 from jaxsense.config.options import Name
 from jaxsense.run import cli
-from jaxsense.show.drawing import png
+from jaxsense.show.drawing import svg
 
 PROGRAM = "benchmarks.tasks"
 STEPS = {
@@ -77,7 +77,7 @@ def main(argv: list[str] | None = None) -> None:
         jobs.run(arguments.jobs_to_do, arguments.jobs, arguments.out or results.RESULTS, command)
     if arguments.out is None:
         results.main()
-        plot.PICTURE.write_bytes(png(plot.draw(record.read(results.RESULTS / jobs.CURVES))))
+        plot.PICTURE.write_bytes(svg(plot.draw(record.read(results.RESULTS / jobs.CURVES))))
 
 
 if __name__ == "__main__":

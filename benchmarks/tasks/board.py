@@ -11,7 +11,7 @@ import numpy as np
 import jaxsense
 from jaxsense.tasks import Score, Task, estimate
 
-_PICTURE = "![Learning curves of all learners in all tasks](figures/tasks_curves.png)"
+_PICTURE = "![Learning curves of all learners in all tasks](figures/tasks_curves.svg)"
 _LAST = "naive", "random"
 
 

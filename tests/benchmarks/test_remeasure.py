@@ -62,7 +62,7 @@ def test_pictures_are_drawn_of_what_was_measured(ran):
         store(name, {"command": f"python -m benchmarks.{name}", "device": "cpu"})
     remeasure.main([])
     assert sorted(x.name for x in remeasure.FIGURES.iterdir()) == [
-        "imperfect.png", "imperfect_drift.png", "imperfect_messages.png", "noisy_curves.png",
+        "imperfect.png", "imperfect_drift.png", "imperfect_messages.png", "noisy_curves.svg",
     ]  # fmt: skip
 
 

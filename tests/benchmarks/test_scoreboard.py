@@ -183,7 +183,7 @@ def test_a_table_shows_what_policies_reach():
 
 def test_the_picture_has_a_curve_of_each_learner():
     points = [
-        Point(task, "camera", name, seed, steps, 1.0, 1.0, 0.9)
+        Point(task, "camera", name, seed, steps, 1.0, 1.0, 0.9 if name == "mine" else 0.25)
         for task in ("map-v0", "noisy-v0")
         for name in ("mine", "yours")
         for seed in range(3)
@@ -195,6 +195,7 @@ def test_the_picture_has_a_curve_of_each_learner():
     assert (line.get_label(), other.get_label()) == ("mine", "yours")
     np.testing.assert_allclose(line.get_ydata(), 0.9)
     assert list(line.get_xdata()) == [0, 64, 128]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["yours: 0.25"]
 
 
 @dataclasses.dataclass(frozen=True)
