@@ -9,10 +9,13 @@ from scipy import stats
 from benchmarks.measure import describe
 
 _DIGITS = {"log-likelihood": 1, "seconds": 1, "seconds compiling": 1}
+_NOISY = "seconds"  # of a machine that others may use: medians, and ratios of the same seed
 
 
 def of_results(results: Mapping[str, Any]) -> str:
     """Means over the trainings, with the half-widths of their 95% intervals, and how they came.
+
+    Seconds are medians, and from the lowest to the highest training.
 
     Args:
       results: the content of the JSON file.
@@ -21,9 +24,22 @@ def of_results(results: Mapping[str, Any]) -> str:
     lines = [f"| | {' | '.join(models)} |", f"| ---{' | ---' * len(models)} |"]
     for figure in next(iter(models.values()))[0]:
         of_each = [[run[figure] for run in runs] for runs in models.values()]
-        cells = [_cell(values, _DIGITS.get(figure, 3)) for values in of_each]
+        cell = _median if figure == _NOISY else _cell
+        cells = [cell(values, _DIGITS.get(figure, 3)) for values in of_each]
         lines.append(f"| {figure} | {' | '.join(cells)} |")
+        if figure == _NOISY:
+            ours = of_each[0]
+            ratios = [[x / y for x, y in zip(each, ours, strict=True)] for each in of_each]
+            cells = [_median(values, 1) for values in ratios]
+            lines.append(
+                f"| ... over those of {next(iter(models))}, same seed | {' | '.join(cells)} |"
+            )
     return "\n".join([*lines, "", describe(results)])
+
+
+def _median(values: Sequence[float], digits: int) -> str:
+    low, middle, high = (f"{f(values):.{digits}f}" for f in (min, statistics.median, max))
+    return middle if low == high else f"{middle} ({low} to {high})"
 
 
 def _cell(values: Sequence[float], digits: int) -> str:

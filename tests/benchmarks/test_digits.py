@@ -155,13 +155,20 @@ def test_figures_of_ours_at_tiny_size(digits, found):
 
 
 def test_the_table_shows_means_and_intervals():
-    runs = {"ours": [{"coherence": 0.3, "seconds": 2.0}, {"coherence": 0.5, "seconds": 2.0}]}
+    runs = {
+        "ours": [{"coherence": 0.3, "seconds": 2.0}, {"coherence": 0.5, "seconds": 2.0}],
+        "theirs": [{"coherence": 0.3, "seconds": 8.0}, {"coherence": 0.3, "seconds": 12.0}],
+    }
     origin = machine.origin("python -m x", ("scipy",))
     lines = table.of_results({**origin, "models": runs}).splitlines()
     # Standard error .1, and t = 12.706 for 1 degree of freedom.
-    assert lines[:4] == [
-        "| | ours |", "| --- | --- |", "| coherence | 0.400 ± 1.271 |", "| seconds | 2.0 |",
-    ]  # fmt: skip
+    assert lines[:5] == [
+        "| | ours | theirs |",
+        "| --- | --- | --- |",
+        "| coherence | 0.400 ± 1.271 | 0.300 |",
+        "| seconds | 2.0 | 10.0 (8.0 to 12.0) |",
+        "| ... over those of ours, same seed | 1.0 | 5.0 (4.0 to 6.0) |",
+    ]
     assert lines[-1].startswith("`python -m x`: cpu with ")
     assert "scipy" in lines[-1]
 
