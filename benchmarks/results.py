@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import curves, exported, gate, imperfect, pipeline, place, recorded, where
+from benchmarks import curves, exported, gate, imperfect, place, recorded, where
 from benchmarks.digits import table as digits
 from benchmarks.fusions import table as fusions
 from benchmarks.seeds import tables
@@ -100,7 +100,6 @@ TABLES: Mapping[str, _Tables] = {
     **{name: {None: table} for name in ("cpu.json", "h100.json", "h100x2.json")},
     "digits.json": {None: digits.of_results},
     "fusions.json": {None: fusions.of_results},
-    "pipeline.json": {None: pipeline.table},
     "seeds.json": {
         "readme": partial(tables.of_presets, rows=tables.OF_README, presets=("paper", "default")),
         "worth": partial(tables.worth, names=tables.EVALUATED),

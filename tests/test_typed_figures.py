@@ -19,7 +19,7 @@ TYPED = {
     "docs/differences.md": 63,
     "docs/extending.md": 12,
     "docs/figures.md": 75,
-    "docs/getting-started.md": 24,
+    "docs/getting-started.md": 21,
     "docs/imperfect.md": 7,
     "docs/interfaces.md": 1,
     "docs/raw.md": 892,
