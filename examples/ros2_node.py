@@ -36,7 +36,8 @@ VIEW_SIDES = 16  # directions around a PoI that are tried
 CLEARANCE = 0.3  # m, from a viewpoint to other PoIs and robots, and to where a look has failed
 AT_GOAL = 0.3  # m, from a viewpoint within which the robot looks
 MAX_AGE = 0.3  # s, of a scan
-STILL = np.array([0.01, 0.01, 0.01])  # m, m and rad between two scans: the robot stands still
+STILL = np.array([0.1, 0.1, 0.1])  # m/s, m/s and rad/s, up to which the robot stands still
+STILL_FOR = 0.1  # s, within which a robot that stands still moves by no more than that
 SILENCE = 5.0  # s, after which a robot that tells nothing counts as failed
 PATIENCE = 60.0  # s, after which a robot that has not looked gives its viewpoint up
 NEW = 0.5  # share of a look that must be new
@@ -129,6 +130,21 @@ def wrapped(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
+def index(name: str, value: Any, number: int) -> int:
+    """A value of a report that must be an integer from 0, less than `number`."""
+    if type(value) is not int or not 0 <= value < number:
+        raise ValueError(f"{name} = {value!r}: must be an integer from 0 to {number - 1}")
+    return value
+
+
+def finite(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """A value of a report that must hold finite numbers."""
+    found = np.asarray(value, np.float32)
+    if found.shape != shape or not np.isfinite(found).all():
+        raise ValueError(f"{name} = {value!r}: must be finite numbers of shape {shape}")
+    return found
+
+
 @dataclasses.dataclass(frozen=True)
 class Scan:
     """What a sensor has read.
@@ -210,7 +226,8 @@ class Robot:
             "target": np.full(number, pois, np.int32),
         }
         self.known = empty(contents, pois)
-        self._has_news, self._last_pose = True, np.full(3, np.inf)
+        self._has_news = True
+        self._last_pose, self._last_stamp = np.full(3, np.inf), -np.inf
         self._heard_at = np.full(number, -np.inf)
         self._failed_at: list[list[np.ndarray]] = [[] for _ in range(pois)]
 
@@ -259,8 +276,10 @@ class Robot:
         Returns:
           The look by which it has updated the map, for `report`; None if there was none.
         """
-        is_still = (np.abs(scan.pose - self._last_pose) <= STILL).all()
-        self._last_pose = np.array(scan.pose)
+        elapsed, moved = scan.stamp - self._last_stamp, np.abs(scan.pose - self._last_pose)
+        self._last_pose, self._last_stamp = np.array(scan.pose), scan.stamp
+        # Over a long time, a mean speed says little about that of now.
+        is_still = elapsed > 0 and (moved <= STILL * min(elapsed, STILL_FOR)).all()
         if self.goal is None or not is_still or now - scan.stamp > MAX_AGE:
             return None
         sensor, limits = compose(scan.pose, self.mounting), self.contents["viewpoint"]
@@ -311,15 +330,32 @@ class Robot:
         Args:
           now: time, in seconds.
           report: see `report`.
+
+        Raises:
+          ValueError: if it is no report of a robot in the team; it then changes nothing.
         """
-        told = json.loads(report)
-        if (robot := told["robot"]) == self.robot:
-            return
+        pois = len(self.team["positions"])
+        try:
+            told = json.loads(report)
+            robot = index("robot", told["robot"], len(self._heard_at))
+            if robot == self.robot:
+                return
+            state = {
+                "poses": finite("pose", told["pose"], (3,)),
+                "target": index("target", told["target"], pois + 1),
+                "works": bool(told["works"]),
+            }
+            if (look := told["look"]) is not None:
+                index("poi", look["poi"], pois)
+                finite("place", look["place"], (2,))
+                finite("weight", look["weight"], ())
+                finite("features", look["features"], (len(look["features"]),))
+                self._write(robot, look)
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"no report of a robot in the team: {error!r}") from error
         self._heard_at[robot] = now
-        for mine, theirs in (("poses", "pose"), ("target", "target"), ("works", "works")):
-            self.team[mine][robot] = told[theirs]
-        if told["look"] is not None:
-            self._write(robot, told["look"])
+        for name, value in state.items():
+            self.team[name][robot] = value
 
     def _heading(self) -> int:
         """The target, as `decide` reads it."""
@@ -378,6 +414,14 @@ def load(archive: Path, robot: int, positions: np.ndarray) -> Robot:
     contents, programs = importlib.import_module("robot_numpy").load(archive)
     resample = importlib.import_module("resampling").resample
     return Robot(contents, programs, resample, robot, positions)
+
+
+def hear(node: Any, robot: Robot, now: float, report: str) -> None:
+    """Lets a robot hear a message; warns once, with the reason, of those that are no reports."""
+    try:
+        robot.hear(now, report)
+    except ValueError as error:
+        node.get_logger().warning(f"ignored a message on `team`: {error}", once=True)
 
 
 def connect(node: Any, robot: Robot) -> Any:
@@ -440,7 +484,7 @@ def connect(node: Any, robot: Robot) -> Any:
             write_pose(goal.pose, robot.goal)
             goals.publish(goal)
 
-    node.create_subscription(String, "team", lambda told: robot.hear(now(), told.data), 100)
+    node.create_subscription(String, "team", lambda told: hear(node, robot, now(), told.data), 100)
     if robot.name == "camera":
         node.create_subscription(CameraInfo, "camera_info", infos.append, qos_profile_sensor_data)
         node.create_subscription(Image, "image", on_image, qos_profile_sensor_data)

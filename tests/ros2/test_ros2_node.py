@@ -1,9 +1,14 @@
 """The robot of the node for ROS 2, and its program, without ROS."""
 
+import copy
 import dataclasses
+import json
 import math
 import re
+import sys
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import jax
 import jax.numpy as jnp
@@ -75,9 +80,10 @@ def arrive(robot, pose=(0.0, 0.0, 0.0)):
 def see(ros2, robot, pose, angles=OWN, readings=None, age=0.0):
     """The look of a robot that arrives at a pose, and stands still in the second scan."""
     readings = np.full(len(angles), 1.0) if readings is None else np.asarray(readings)
-    scans = [ros2.Scan(9.0 - age, np.asarray(pose, float), angles, readings)] * 2
-    robot.see(0.0, dataclasses.replace(scans[0], pose=scans[0].pose + 1))
-    first, second = [robot.see(9.0, scan) for scan in scans]
+    scan = ros2.Scan(9.0 - age, np.asarray(pose, float), angles, readings)
+    before = [dataclasses.replace(scan, stamp=scan.stamp - ago) for ago in (0.2, 0.1)]
+    robot.see(9.0, dataclasses.replace(before[0], pose=scan.pose + 1))
+    first, second = [robot.see(9.0, each) for each in (before[1], scan)]
     assert first is None
     return second
 
@@ -151,10 +157,37 @@ def test_a_robot_looks_only_from_its_viewpoint_when_it_stands_still(ros2, robot,
     assert see(ros2, robot, goal - [0.4, 0, 0]) is None  # too far from the viewpoint
     assert see(ros2, robot, goal + np.array([0, 0, 0.4])) is None  # not facing the PoI
     assert see(ros2, robot, goal, age=0.31) is None  # too old
-    moved = [ros2.Scan(9.0, goal + np.array([0, 0, turn]), OWN, np.ones(9)) for turn in (0, 0.02)]
-    assert [robot.see(9.0, scan) for scan in moved[::-1]] == [None, None]
+    moved = [
+        ros2.Scan(9.1 - turn, goal + np.array([0, 0, turn]), OWN, np.ones(9)) for turn in (0.02, 0)
+    ]
+    assert [robot.see(9.1, scan) for scan in moved] == [None, None]
     assert stub.asked == []
     assert see(ros2, robot, goal, age=0.29) is not None
+
+
+@pytest.mark.parametrize(
+    ("speed", "period", "looks"),
+    [
+        (0.3, 1 / 40, False),
+        (0.3, 1 / 10, False),
+        (0.05, 1 / 40, True),
+        (0.05, 1, False),
+        (0, 1, True),
+    ],
+)
+def test_whether_a_robot_stands_still_does_not_depend_on_the_rate_of_scans(
+    ros2, robot, speed, period, looks
+):
+    goal = arrive(robot)
+    away = goal - np.array([speed * period, 0, 0])
+    assert robot.see(9.0, ros2.Scan(9.0, away, OWN, np.ones(9))) is None
+    scan = ros2.Scan(9.0 + period, goal, OWN, np.ones(9))
+    assert (robot.see(9.0 + period, scan) is not None) == looks
+
+
+def test_the_same_scan_twice_does_not_tell_that_a_robot_stands_still(ros2, robot):
+    scan = ros2.Scan(9.0, arrive(robot), OWN, np.ones(9))
+    assert [robot.see(9.0, scan) for _ in range(2)] == [None, None]
 
 
 def test_a_look_updates_the_map_and_the_next_choice_is_new(ros2, robot, stub):
@@ -226,6 +259,53 @@ def test_robots_tell_each_other_their_looks(ros2, robot, stub):
     other.choose(6.1, np.zeros(3))
     assert other.team["works"].tolist() == [True, False]
     assert robot.team["works"].tolist() == [False, True]
+
+
+LOOK = {"poi": 2, "features": [0.75, 0.25], "weight": 1.0, "place": [-1.1, 0.0]}
+REPORT = {"robot": 0, "pose": [1, 1, 0], "target": 1, "works": True, "look": LOOK}
+MALFORMED = {
+    "": "JSONDecodeError",
+    "[" * 100_000: "RecursionError",
+    "[]": "TypeError",
+    "{}": "KeyError('robot')",
+    json.dumps({**REPORT, "robot": 2}): "robot = 2: must be an integer from 0 to 1",
+    json.dumps({**REPORT, "robot": -1}): "robot = -1: must be an integer from 0 to 1",
+    json.dumps({**REPORT, "pose": [1, 1]}): "pose = [1, 1]: must be finite numbers of shape (3,)",
+    json.dumps({**REPORT, "pose": [1, 1, math.nan]}): "pose = [1, 1, nan]: must be finite",
+    json.dumps({**REPORT, "target": 4}): "target = 4: must be an integer from 0 to 3",
+    json.dumps({**REPORT, "look": {**LOOK, "poi": -1}}): "poi = -1: must be an integer from 0 to 2",
+    json.dumps({**REPORT, "look": {**LOOK, "place": [0]}}): "place = [0]: must be finite numbers",
+    json.dumps({**REPORT, "look": {**LOOK, "weight": None}}): "weight = None: must be finite",
+    json.dumps(
+        {**REPORT, "look": {**LOOK, "features": [math.inf, 0]}}
+    ): "features = [inf, 0]: must",
+}
+
+
+@pytest.mark.parametrize("report", MALFORMED, ids=MALFORMED.values())
+def test_a_message_that_is_no_report_changes_nothing(robot, report):
+    before = copy.deepcopy((robot.team, robot.known, robot._heard_at))
+    with pytest.raises(ValueError, match=re.escape(MALFORMED[report])):
+        robot.hear(1.0, report)
+    jax.tree.map(np.testing.assert_array_equal, (robot.team, robot.known, robot._heard_at), before)
+
+
+def test_a_message_that_is_no_report_does_not_end_the_node(ros2, robot, monkeypatch):
+    for name in ("geometry_msgs", "rclpy", "sensor_msgs", "std_msgs", "tf2_ros"):
+        for part in ("", ".duration", ".msg", ".qos", ".time"):
+            monkeypatch.setitem(sys.modules, name + part, MagicMock())
+    node = MagicMock()
+    node.get_clock().now().nanoseconds = 10**9
+    ros2.connect(node, robot)
+    given = (call.args for call in node.create_subscription.call_args_list)
+    (hear,) = (callback for _, topic, callback, _ in given if topic == "team")
+    hear(SimpleNamespace(data="nonsense"))
+    (warned,) = node.get_logger().warning.call_args_list
+    assert "ignored a message on `team`: no report of a robot" in warned.args[0]
+    assert warned.kwargs == {"once": True}
+    hear(SimpleNamespace(data=json.dumps(REPORT)))
+    assert robot.known["seen"][2, 0]
+    assert robot._heard_at[0] == pytest.approx(1)
 
 
 def test_a_robot_ends_by_nop(robot, stub):
@@ -331,8 +411,10 @@ def test_a_team_of_nodes_finds_out_what_stands_where(ros2, tmp_path):
             angles = world.sensors[i].angles
             if robot.name == "lidar":  # from left to right, as some drivers have it
                 readings, angles = readings[::-1], angles[::-1]
-            scan = ros2.Scan(number, poses[i].copy(), angles, readings)
-            looks = [robot.see(number, scan) for _ in range(2)]
+            looks = [
+                robot.see(stamp, ros2.Scan(stamp, poses[i].copy(), angles, readings))
+                for stamp in (number, number + 0.1)
+            ]
             for other in team:
                 other.hear(number, robot.report(looks[1]))
             number += 1
