@@ -247,6 +247,10 @@ class MapVectorEnv(VectorEnv):
             observations = self._restarted(self._ended)
         return observations, rewards, terminations, truncations, {**self._infos(), **final}
 
+    def action_masks(self) -> np.ndarray:
+        """`[E, N + 1]` bool, the actions that exist, see `TaskEnv.action_masks`."""
+        return self._mask.astype(bool)
+
     def _check_step(self, actions: np.ndarray) -> None:
         """Raises what `step` raises."""
         if self._states is None:

@@ -158,8 +158,8 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
 
     @property
     def name(self) -> str:
-        """Name of the environment."""
-        return "jaxsense-Map"
+        """Name of the task; of a map MDP `jaxsense-Map`."""
+        return getattr(self.played, "name", "jaxsense-Map")
 
     @property
     def num_actions(self) -> int:

@@ -19,7 +19,7 @@ class MapVecEnv(VecEnv):
 
     `MapVecEnv(MapVectorEnv(mdp, modality, num_envs, autoreset_mode="SameStep"))`. The methods are
     Stable-Baselines3's. The environments are one program: attributes and methods apply to all,
-    whatever the indices.
+    whatever the indices; only `action_masks`, for sb3-contrib, has a row for each.
     """
 
     def __init__(self, env: VectorEnv):
@@ -54,6 +54,8 @@ class MapVecEnv(VecEnv):
         of_each: list[dict[str, Any]] = [
             {"TimeLimit.truncated": bool(truncated)} for truncated in cuts
         ]
+        for info, mask in zip(of_each, infos.get("action_mask", ()), strict=False):
+            info["action_mask"] = mask
         for i in np.flatnonzero(dones):
             of_each[i]["terminal_observation"] = infos["final_obs"][i]
         return observations, rewards.astype(np.float32), dones, of_each
@@ -82,7 +84,7 @@ class MapVecEnv(VecEnv):
         setattr(self.env, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **more: Any) -> list:
-        """Calls the shared method and returns its result once for each index.
+        """Calls the shared method and returns its result, or its row, once for each index.
 
         Args:
           method_name: its name.
@@ -91,7 +93,8 @@ class MapVecEnv(VecEnv):
           **more: its arguments by name.
         """
         result = getattr(self.env, method_name)(*args, **more)
-        return [result for _ in self._get_indices(indices)]
+        has_rows = method_name == "action_masks"
+        return [result[i] if has_rows else result for i in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Returns False for each index: no environment has its own wrapper.

@@ -11,6 +11,7 @@ pytest.importorskip("gymnax", reason="needs the extra jaxsense[gymnax]")
 from gymnax.wrappers import purerl
 from gymnax.wrappers.gym import GymnaxToGymWrapper
 
+from jaxsense import make
 from jaxsense.dqn import map_mdp, observation
 from jaxsense.interfaces.gymnax import MapEnv
 from jaxsense.looks import make_mdp
@@ -108,6 +109,11 @@ def test_wrappers_of_gymnax_take_it(env):
     obs, _ = single.reset(seed=0)
     assert single.observation_space.contains(np.asarray(obs))
     assert single.step(single.action_space.n - 1)[2]
+
+
+def test_its_name_is_that_of_the_task(env):
+    assert MapEnv(make("many-v0")).name == "many-v0"
+    assert env.name == "jaxsense-Map"
 
 
 def test_live_observations_trace():

@@ -12,6 +12,7 @@ import torch
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
+from jaxsense import make
 from jaxsense.interfaces import prepared_starts
 from jaxsense.interfaces.gymnasium import MapVectorEnv
 from jaxsense.interfaces.stable_baselines3 import MapVecEnv
@@ -63,6 +64,7 @@ def test_ends_are_told_as_stable_baselines3_has_them(env):
     assert (rewards.dtype, list(dones)) == (np.float32, [True, False, False, False])
     np.testing.assert_array_equal(infos[0]["terminal_observation"], first[0])
     assert (observations[0] != first[0]).any()
+    np.testing.assert_array_equal(infos[1].pop("action_mask"), [1, 1, 1, 1])
     assert infos[1] == {"TimeLimit.truncated": False}
     for _ in range(small.CONFIG.mdp.max_steps - 1):
         _, _, dones, infos = env.step(np.zeros(4, int))
@@ -80,6 +82,23 @@ def test_attributes_are_those_of_the_whole():
     assert not any(env.env_is_wrapped(VecMonitor))
     assert env.env_method("close") == [None, None]
     assert env.get_attr("closed", [0]) == [True]
+
+
+def test_masks_are_those_of_each_environment():
+    """As `sb3_contrib.common.maskable.utils.get_action_masks` asks for them."""
+    env = VecMonitor(
+        MapVecEnv(MapVectorEnv(make("team-v0"), num_envs=8, autoreset_mode="SameStep"))
+    )
+    env.seed(0)
+    env.reset()
+    masks = np.stack(env.env_method("action_masks"))
+    assert (masks.shape, masks.dtype) == ((8, 9), bool)
+    assert masks[:, -1].all()
+    assert len(np.unique(masks, axis=0)) > 1  # the numbers of PoIs differ
+    np.testing.assert_array_equal(env.env_method("action_masks", indices=[2, 5]), masks[[2, 5]])
+    _, _, _, infos = env.step(np.full(8, 8))
+    told = np.stack([info["action_mask"] for info in infos])
+    np.testing.assert_array_equal(told, env.env_method("action_masks"))
 
 
 def test_only_episodes_that_start_again_in_the_same_step_are_taken():
