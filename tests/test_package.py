@@ -100,7 +100,16 @@ def test_examples_of_the_tasks_run(capsys):
     on_host = run_example(page, 2)["found"]
     assert capsys.readouterr().out.endswith("(10,)\n")
     assert 0 < on_host.fraction_of_optimal.low <= on_host.fraction_of_optimal.value <= 1
-    assert run_example(page, 4)["models"].tours
+    run_example(page, 3)
+    assert "noisy-v0, camera: return" in capsys.readouterr().out
+    run_example(page, 4)
+    printed = capsys.readouterr().out
+    learned, random = (
+        float(re.search(rf"{name}:?(?: return)? (-?[\d.]+)", printed)[1])
+        for name in ("map-v0, camera", "random")
+    )
+    assert learned > random
+    assert run_example(page, 5)["models"].tours
     assert "--preset team --seed 0" in capsys.readouterr().out
 
 
