@@ -1,10 +1,10 @@
-"""Another policy, in the map MDP and in missions: `python examples/new_policy.py`."""
+"""A custom policy, in the map MDP and in missions: `python examples/new_policy.py`."""
 
 import jax
 import jax.numpy as jnp
 
 import jaxsense
-from jaxsense import dqn, mission
+from jaxsense import dqn
 from jaxsense.dqn import episodes, policies
 
 
@@ -16,9 +16,8 @@ def widest(key: jax.Array, models: policies.Trained, known: dqn.Known) -> jax.Ar
 
 
 if __name__ == "__main__":
-    config, key = jaxsense.PRESETS["smoke"], jax.random.key(0)
-    models = jaxsense.init(key, config)  # or those of `jaxsense.load("runs/...")`
-    mdp = jaxsense.make_mdp(config, models)
+    config, models = jaxsense.load_pretrained("noisy")  # or those of `jaxsense.load("runs/...")`
+    key, mdp = jax.random.key(0), jaxsense.make_mdp(config, models)
 
     def act(key: jax.Array, known: dqn.Known) -> jax.Array:
         """The action in the map MDP."""
@@ -27,7 +26,4 @@ if __name__ == "__main__":
     start = episodes.reset(key, mdp, models.bayes)
     total, first = jax.jit(lambda: episodes.run_episode(key, mdp, models.bayes, act, start, 0))()
     print(f"map MDP: total reward {total:.2f}, of the first look {first:.2f}")
-    scenario = mission.make_mission(config, policies={"widest": widest})
-    state = mission.reset(key, scenario, models, scenario.policy("widest"))
-    state, _ = jax.jit(mission.rollout, static_argnums=(1, 4))(key, scenario, models, state, 50)
-    print(f"mission: the robots head for PoIs {state.robots.target}")
+    print(jaxsense.score_missions(config, models, {"widest": widest}, episodes=64))

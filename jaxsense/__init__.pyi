@@ -25,6 +25,8 @@ from .models import make_bayes as make_bayes
 from .models import make_in_place as make_in_place
 from .models import make_jmvae as make_jmvae
 from .run.rundir import load as load
+from .run.score import MissionScore as MissionScore
+from .run.score import score_missions as score_missions
 from .run.version import __version__ as __version__
 from .show.scans import compare_scans as compare_scans
 from .tasks import load_pretrained as load_pretrained

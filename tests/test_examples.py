@@ -350,8 +350,8 @@ def test_the_optimum_of_a_product_of_experts_is_that_of_looks_which_add_up(examp
 def test_new_policy(capsys):
     told = printed("new_policy", capsys)
     assert re.search(r"map MDP: total reward -?\d+\.\d\d, of the first look -?\d+\.\d\d", told)
-    # Untrained detectors say nothing: both look at PoIs that nobody knows yet.
-    assert re.search(r"mission: the robots head for PoIs \[[0-3] [0-3]\]", told)
+    rows = re.findall(r"^  (\w+) +[01]\.\d{3} +\d+\.\d\d +\d+\.\d ", told, re.MULTILINE)
+    assert rows == ["widest", "latent", "auction", "naive", "random"]
 
 
 def test_the_widest_belief_is_looked_at_twice_at_most(example):

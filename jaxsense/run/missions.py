@@ -114,6 +114,7 @@ class Player:
         batch: int,
         workers: Workers = ALONE,
         runs_long: bool = False,
+        models: Models | None = None,
     ):
         """Starts to compile the programs.
 
@@ -123,6 +124,8 @@ class Player:
           batch: number of missions side by side, rounded up to a multiple of the workers.
           workers: share the missions. Each thread plays its own, without waiting for the others.
           runs_long: see `devices.compiler_options`.
+          models: with the shapes of those to play with, for example with a custom fusion; by
+            default those of the settings.
         """
         self.mission, self._monitor, self._workers = mission, compiler.monitor, workers
         config, self._share = mission.config, -(-batch // workers.number)
@@ -183,14 +186,14 @@ class Player:
         faults = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((number, *x.shape), x.dtype), no_faults(config)
         )
-        models = jax.eval_shape(lambda: init(jax.random.key(0), config))
+        shapes = jax.eval_shape(lambda: models or init(jax.random.key(0), config))
         whole = (0, 1, 2)
         self._begin = Program(compiler, "mission", "begin")
         slots = self._begin.compile(
             begin,
             key,
             config,
-            models,
+            shapes,
             numbers,
             numbers,
             faults,
@@ -204,7 +207,7 @@ class Player:
             go_on,
             key,
             config,
-            models,
+            shapes,
             slots,
             slots,
             numbers,

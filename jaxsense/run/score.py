@@ -1,0 +1,164 @@
+"""Scores of policies in missions, compared with built-in policies in the same arenas."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+
+from jaxsense.config import Config, ConfigError
+from jaxsense.config.mission import MAX_EPISODES
+from jaxsense.core import checks
+from jaxsense.core.types import Key
+from jaxsense.dqn.policies import POLICIES, Known, Policy, Trained, Values
+from jaxsense.mission import cases, make_mission
+from jaxsense.models import Models
+from jaxsense.run import batches, devices, missions
+from jaxsense.run.compilation import Compiler
+from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.monitor import Monitor
+from jaxsense.summary import Case, make
+from jaxsense.summary.blocks import MISSIONS
+from jaxsense.summary.compare import REFERENCE, Measured, differences
+
+AGAINST = (REFERENCE, "auction", "naive", "random")
+"""Policies that `score_missions` compares with, unless told otherwise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MissionScore:
+    """Result of `score_missions`; `print` shows a table.
+
+    Attributes:
+      policies: by name, the policies in the order of the table. `accuracy` is the share of PoIs
+        whose most likely class is right, `observations_per_poi` the mean number of looks,
+        `mean_time_s` the mean time until all robots are done, and `time_s` its median, in seconds.
+        `intervals` holds the mean differences of accuracy, looks and time from the reference,
+        arena by arena, each with a 95 % interval: `mean`, `low` and `high`. The reference has none.
+      reference: name of the policy from which differences are taken.
+      episodes: number of missions of each policy.
+    """
+
+    policies: dict[str, Case]
+    reference: str
+    episodes: int
+
+    def __str__(self):
+        metrics = [MISSIONS[key] for key in ("accuracy", "observations_per_poi", "mean_time_s")]
+        difference = MISSIONS["intervals.time_s"]
+        against = f"difference from {self.reference} [s]"
+        rows = [["", *(metric.label for metric in metrics), against]]
+        for name, case in self.policies.items():
+            rows.append([name, *(metric.text(case) for metric in (*metrics, difference))])
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = [f"missions of each policy, in the same arenas: {self.episodes:,}"]
+        for name, *values in rows:
+            cells = [value.rjust(w) for value, w in zip(values, widths[1:], strict=True)]
+            lines.append("  ".join([name.ljust(widths[0]), *cells]))
+        return "\n  ".join(lines)
+
+
+def score_missions(
+    config: Config,
+    models: Models,
+    policies: Mapping[str, Values | Policy],
+    *,
+    against: Sequence[str] = AGAINST,
+    episodes: int = 256,
+    seed: int = 0,
+) -> MissionScore:
+    """Evaluates policies in missions, next to built-in policies in the same arenas.
+
+    The arenas are those of `python -m jaxsense.evaluate` with the same seed. Compiling the missions
+    takes most of the time of a few hundred; one call for several policies compiles once.
+
+    Args:
+      config: settings of the arena, the robots and their sensors.
+      models: trained for them, for example both from `load_pretrained`.
+      policies: custom policies by name, each a pure function `(key, models, known) -> [N + 1]`
+        float values of looks at the N PoIs and of NOP, or a `dqn.Policy`.
+      against: names of policies to compare with, from `dqn.POLICIES` or `policies`. Differences are
+        taken from the first.
+      episodes: missions of each policy.
+      seed: of the arenas and of all noise, from 0 to 2^32 - 1.
+
+    Returns:
+      The score.
+
+    Raises:
+      ConfigError: if an argument is wrong, a policy is unknown or has a name that is taken, or the
+        models are for another number of PoIs.
+      ValueError: if a policy returns values of another shape or dtype.
+      RuntimeError: if the values of a policy, the models or the beliefs are not finite.
+    """
+    _require(config, models, policies, against, episodes, seed)
+    own = {
+        name: each if name in POLICIES else _checked(name, each) for name, each in policies.items()
+    }
+    # As the programs compute on an accelerator.
+    with jax.default_matmul_precision("highest"), Compiler(Monitor()) as compiler:
+        scenario = make_mission(config, own)
+        known = cases(config, scenario.policies)
+        played = {name: known[name] for name in dict.fromkeys((*policies, *against))}
+        number, workers = episodes * len(played), _workers()
+        batch = batches.batch_of(config, number, workers)
+        runs_long = batches.runs_long(config, number)
+        player = missions.Player(scenario, compiler, batch, workers, runs_long, models)
+        found = player.play(jax.random.key(seed), models, played, episodes)
+    return _score(config, found.metrics, against[0])
+
+
+def _score(config: Config, found: Mapping[str, Measured], reference: str) -> MissionScore:
+    """The score of measured missions."""
+    blocks = {name: make.case(config, name, each) for name, each in found.items()}
+    for name, block in blocks.items():
+        if name != reference:
+            block["intervals"] = differences(found[name], found[reference])
+    return MissionScore(blocks, reference, blocks[reference]["episodes"])
+
+
+def _workers() -> Workers:
+    """All threads of a CPU, or one accelerator."""
+    return Workers(threads=devices.NUM_THREADS) if jax.default_backend() == "cpu" else ALONE
+
+
+def _require(
+    config: Config,
+    models: Models,
+    policies: Mapping[str, Values | Policy],
+    against: Sequence[str],
+    episodes: int,
+    seed: int,
+) -> None:
+    """Checks the arguments of `score_missions`, before anything is compiled."""
+    checks.require_number("episodes", episodes)
+    if episodes > MAX_EPISODES:
+        raise ConfigError("episodes", episodes, f"must be from 1 to {MAX_EPISODES:,}")
+    if not 0 <= seed < 2**32:
+        raise ConfigError("seed", seed, "must be from 0 to 2^32 - 1")
+    for name, each in policies.items():
+        if not callable(each) and not isinstance(each, Policy):
+            raise ConfigError("policies", name, "must be a function or a dqn.Policy")
+    names = (*POLICIES, *policies)
+    if isinstance(against, str) or not against or not set(against) <= set(names):
+        reason = f"must be one or more of {', '.join(dict.fromkeys(names))}"
+        raise ConfigError("against", against, reason)
+    checks.require_one_each("models.detectors", models.detectors, config.modalities)
+    if not models.agent.plays(config.arena.num_pois):
+        reason = "must be the number of PoIs that the models were trained with"
+        raise ConfigError("arena.num_pois", config.arena.num_pois, reason)
+
+
+def _checked(name: str, policy: Values | Policy) -> Policy:
+    """The policy, which names itself if its values have another shape or dtype."""
+    wrapped = policy if isinstance(policy, Policy) else Policy(policy)
+
+    def values(key: Key, models: Trained, known: Known) -> jax.Array:
+        found = jnp.asarray(wrapped.values(key, models, known))
+        number = len(known.looks) + 1
+        if found.shape != (number,) or not jnp.issubdtype(found.dtype, jnp.floating):
+            expected = f"must return floats of shape [{number}], one for each PoI and NOP's last"
+            raise ValueError(f"policies = {name!r}: {expected}; not {found.dtype}{[*found.shape]}")
+        return found
+
+    return dataclasses.replace(wrapped, values=values)
