@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import curves, exported, gate, imperfect, place, recorded, where
+from benchmarks import curves, gate, imperfect, place, recorded, where
 from benchmarks.digits import table as digits
 from benchmarks.fusions import table as fusions
 from benchmarks.seeds import tables
@@ -120,14 +120,6 @@ TABLES: Mapping[str, _Tables] = {
     **{name: _IMPERFECT for name in ("imperfect_default.json", "imperfect_noisy.json")},
     "imperfect_trained.json": {None: partial(imperfect.of_sizes, sweeps=["both [m]"])},
     "imperfect_messages.json": {None: imperfect.of_messages},
-    "exported.json": {
-        None: partial(exported.table, programs=exported.SHOWN),
-        "numpy": partial(
-            exported.latencies,
-            runs=("pretrained:default", "pretrained:noisy"),
-            programs=exported.SHOWN,
-        ),
-    },
     "recorded.json": {None: recorded.table, "noise": recorded.of_noise},
 }
 """What makes each table of a file, by their names."""

@@ -21,7 +21,7 @@ TYPED = {
     "docs/figures.md": 75,
     "docs/getting-started.md": 21,
     "docs/imperfect.md": 7,
-    "docs/interfaces.md": 1,
+    "docs/interfaces.md": 51,
     "docs/raw.md": 892,
     "docs/recorded.md": 2,
     "docs/tasks.md": 4,
