@@ -426,6 +426,7 @@ def draw(blocks: list[dict]) -> Figure:
                 label=name,
             )
         axis.set(xlabel=label, yscale="log", xlim=(0, None))
+        axis.yaxis.set(major_formatter="{x:g}", minor_formatter="{x:g}")
         axis.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("wrong PoIs [%]")
     handles = axes[0].get_legend_handles_labels()
