@@ -245,7 +245,7 @@ def _share(answered: Mapping[str, Any], run: str, modality: str, situation: str)
 
 def _table(results: Mapping[str, Any], cell: Callable[[str, str, str], str]) -> str:
     columns = [(run, name) for run, found in results["answered"].items() for name in found]
-    heads = [f"{name} of `{studies.name_of(run)}`" for run, name in columns]
+    heads = [f"{studies.in_words(name)} of `{studies.name_of(run)}`" for run, name in columns]
     rows = [
         [about, *(cell(*column, situation) for column in columns)]
         for situation, about in SITUATIONS.items()

@@ -210,7 +210,7 @@ def table(results: Mapping[str, Any], error: float = 0.01) -> str:
     def cells(row: Mapping[str, Any]) -> list[str]:
         least = row["best"][i]
         rules = [f"{row[rule][i] / least - 1:+.1%}" for rule in RULES]
-        return [f"{row['sensor']}, {row['drive']:g} s", f"{least:.2f} s", *rules]
+        return [f"{studies.in_words(row['sensor'])}, {row['drive']:g} s", f"{least:.2f} s", *rules]
 
     heads = ["sensor, drive", f"best with {error:.1%} wrong", *RULES]
     rows = [cells(row) for row in results["rows"]]

@@ -97,6 +97,15 @@ def write(file: Path | None, results: Mapping[str, Any]) -> None:
         file.write_text(json.dumps(results, indent=1, default=str) + "\n", encoding="utf-8")
 
 
+def in_words(modality: str) -> str:
+    """A modality as pages call it.
+
+    Args:
+      modality: its name in the settings.
+    """
+    return modality.replace("lidar", "LiDAR").replace("_", " ")
+
+
 def as_table(heads: list[str], rows: list[list[str]]) -> str:
     """A Markdown table.
 

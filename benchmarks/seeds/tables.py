@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from benchmarks.seeds.runs import Figures
+from benchmarks.studies import in_words
 
 Value = Callable[[Figures], Any]
 """Reads a number of a run, or one for each agent or policy; None if the run has none."""
@@ -328,7 +329,7 @@ def failures(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
     lines.append(_line(*["---"] * (1 + len(_OF_CASES))))
     runs = _evaluated(found, preset, num_pois)
     cases = dict.fromkeys(case for run in runs.values() for case in run if case not in _POLICIES)
-    for case, label in {"latent": "all work", **{x: x.replace("_", " ") for x in cases}}.items():
+    for case, label in {"latent": "all work", **{x: in_words(x) for x in cases}}.items():
         shown = [run[case] for run in runs.values() if case in run]
         lines.append(
             _line(label, *(_range(form, [x[key] for x in shown]) for _, key, form in _OF_CASES))

@@ -67,10 +67,10 @@ def test_the_comparison_needs_numpy_alone(monkeypatch, capsys):
     names = runpy.run_path(exported.__file__)
     assert [*names["LOADERS"]] == ["NumPy"]
     main, stub = names["main"], SimpleNamespace(load=lambda *_: [None] * 3, archive=lambda *_: b"")
-    stubs = {"export": stub, "choices": lambda *_: [], "compare": lambda *_: {}}
+    stubs = {"export": stub, "choices": lambda *_: [], "compare": lambda *_: {"NumPy": {}}}
     for name, each in {**stubs, "devices": SimpleNamespace(start=lambda *_: None)}.items():
         monkeypatch.setitem(main.__globals__, name, each)
-    main(["RUN"])
+    main(["pretrained:default"])
     assert "NumPy alone: onnxruntime is not installed" in capsys.readouterr().out
 
 
