@@ -308,13 +308,7 @@ def missions(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
     return "\n".join([*lines, "", _about(used, command)])
 
 
-_OF_CASES = (
-    ("right", "accuracy", "{:.3f}"),
-    ("looks per PoI", "observations_per_poi", "{:.2f}"),
-    ("time, median", "time_s", "{:.1f} s"),
-    ("time, mean", "mean_time_s", "{:.1f} s"),
-    ("collisions", "collisions", "{}"),
-)
+_OF_CASES = (("right", "accuracy", "{:.3f}"), *_OF_SUMMARY[1:])
 
 
 def failures(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
