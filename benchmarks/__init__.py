@@ -10,6 +10,8 @@ from benchmarks.missions import (
     missions_devices,
     missions_many,
     missions_many_devices,
+    missions_many_under_way,
+    missions_under_way,
     resets_many,
 )
 from benchmarks.physics import (
@@ -42,8 +44,10 @@ ROWS: dict[str, Callable[[Options], Row]] = {
     "rays_warp": rays_warp,
     "rays_warp_bvh": rays_warp_bvh,
     "missions": missions,
+    "missions_under_way": missions_under_way,
     "missions_devices": missions_devices,
     "missions_many": missions_many,
+    "missions_many_under_way": missions_many_under_way,
     "missions_many_devices": missions_many_devices,
     "resets_many": resets_many,
     "jmvae": jmvae,

@@ -26,6 +26,7 @@ _UNIT = "control-steps/s"
 # For each accelerator.
 _MISSIONS, _MISSIONS_OF_MANY = 16384, 8192
 _PERIODS_BEFORE = 40  # 4 s of missions that last 14 s
+_PERIODS = 20  # to measure
 
 
 def missions(options: Options) -> Row:
@@ -36,6 +37,16 @@ def missions(options: Options) -> Row:
 def missions_many(options: Options) -> Row:
     """The same with 16 PoIs in an arena of 6 m."""
     return _play("missions_many", options, of_many_pois(), _MISSIONS_OF_MANY)
+
+
+def missions_under_way(options: Options) -> Row:
+    """Control steps of missions of `missions` that are all under way, without begin and end."""
+    return _go_on("missions_under_way", options, untrained("default"), _MISSIONS)
+
+
+def missions_many_under_way(options: Options) -> Row:
+    """The same with 16 PoIs in an arena of 6 m."""
+    return _go_on("missions_many_under_way", options, of_many_pois(), _MISSIONS_OF_MANY)
 
 
 def missions_devices(options: Options) -> Row:
@@ -77,6 +88,26 @@ def _play(
         )
         peer = "one device" if against_one else None
         return measure.compare(name, _UNIT, [ours], theirs, options, peer=peer)
+
+
+def _go_on(name: str, options: Options, config: Config, accelerator: int) -> Row:
+    """Some control periods of missions after their first seconds."""
+    (batch,) = measure.batches(options, quick=4, cpu=(384,), accelerator=(accelerator,))
+    missions = playing(config, "naive", batch, _PERIODS)
+
+    def go_on(keys: jax.Array, states: MissionState) -> MissionState:
+        return missions.go_on(keys, missions.models, states)
+
+    side = measure.compiled(
+        go_on,
+        missions.keys,
+        missions.states,
+        work=batch * _PERIODS,
+        batch=batch,
+        workers=devices.start(None),
+        wide_vectors=True,
+    )
+    return measure.compare(name, _UNIT, [side], [], options)
 
 
 def resets_many(options: Options) -> Row:
