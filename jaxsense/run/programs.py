@@ -6,7 +6,7 @@ compiled programs already run. Shapes come from tracing: a stage's outputs are l
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import suppress
 
@@ -173,18 +173,7 @@ def compile_programs(
     return programs
 
 
-_BEFORE_ALL = 2  # stages that all others wait for
-
-
-def _before_missions(stages: Sequence[Stage]) -> int:
-    """How many stages to trace before the missions, which come last but take longest to compile.
-
-    Next to an accelerator, cores are free to compile, and everything waits for tracing: what the
-    Q-networks learn from is traced first, so that it is computed while they compile.
-    """
-    if _on_cpu():
-        return _BEFORE_ALL
-    return next(i for i, stage in enumerate(stages) if stage.name.startswith("dqn"))
+_BEFORE_MISSIONS = 2  # stages that all others wait for
 
 
 def _on_cpu() -> bool:
@@ -195,12 +184,16 @@ def _on_cpu() -> bool:
 def _trace(programs: Programs, compiler: Compiler) -> None:
     """Traces all programs; an error reaches whoever waits for one."""
     try:
-        before = _before_missions(programs.stages)
-        for stage in programs.stages[:before]:
+        for stage in programs.stages[:_BEFORE_MISSIONS]:
             _trace_stage(programs, stage)
-        _trace_missions(programs, compiler)
-        for stage in programs.stages[before:]:
+        # Missions come last, but take a CPU longest to compile. With an accelerator, cores are
+        # free to compile, and everything waits for tracing.
+        if _on_cpu():
+            _trace_missions(programs, compiler)
+        for stage in programs.stages[_BEFORE_MISSIONS:]:
             _trace_stage(programs, stage)
+        if not _on_cpu():
+            _trace_missions(programs, compiler)
     except BaseException as error:
         programs.fail(error)
 
