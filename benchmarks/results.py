@@ -97,7 +97,7 @@ _IMPERFECT: _Tables = {
     "drifts": partial(imperfect.of_sizes, sweeps=["both drifts [m]"]),
 }
 TABLES: Mapping[str, _Tables] = {
-    **{name: {None: table} for name in ("cpu.json", "h100.json", "h100x2.json")},
+    **{name: {None: table} for name in ("cpu.json", "h100.json", "h200.json", "h100x2.json")},
     "digits.json": {None: digits.of_results},
     "fusions.json": {None: fusions.of_results},
     "seeds.json": {
