@@ -60,9 +60,10 @@ COMMANDS: Mapping[str, Command] = {
     "warm": Command("`train`, warm", TRAIN),
     "team": Command("`train --preset team`, cold", (*TRAIN, "--preset", "team"), cold=True),
     "missions": Command(
-        f"`evaluate RUN {' '.join(_MISSIONS)} --episodes 384`, a run of `smoke`, warm",
+        f"`evaluate RUN {' '.join(_MISSIONS)} --episodes 384`, a team of `smoke`, warm",
         ("jaxsense.evaluate", "{run}", *_MISSIONS, "--episodes", "384"),
-        trains=("--preset", "smoke"),
+        # The policies of others play among as many PoIs as they were trained with.
+        trains=("--preset", "smoke", "--dqn.task", "team"),
     ),
 }
 """What is measured, by the names of the option `commands`."""

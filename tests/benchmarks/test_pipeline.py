@@ -3,10 +3,12 @@
 import json
 from pathlib import Path
 
+import jax
 import pytest
 
 from benchmarks import pipeline
 from benchmarks.pipeline import Command, Needs
+from jaxsense import init, train
 
 
 @pytest.fixture
@@ -41,6 +43,13 @@ def test_an_evaluation_is_of_a_run_by_the_same_tree(ran, tmp_path):
     assert [words[:3] for words in evaluations] == 2 * [["tree", "evaluate", str(tmp_path / "run")]]
     # Of the same seed, the second would have nothing left to write.
     assert [words[-2:] for words in evaluations] == [["--seed", "1"], ["--seed", "2"]]
+
+
+def test_the_policies_of_the_run_play_among_as_many_pois_as_the_evaluation_has():
+    trains = pipeline.COMMANDS["missions"].trains
+    config = train.parse([*trains]).config
+    learned = jax.eval_shape(lambda: init(jax.random.key(0), config))
+    assert learned.agent.plays(16)
 
 
 def test_the_table_holds_medians_and_their_ratios(ran, tmp_path, monkeypatch, capsys):
