@@ -47,6 +47,7 @@ def test_an_evaluation_is_of_a_run_by_the_same_tree(ran, tmp_path):
 
 def test_the_policies_of_the_run_play_among_as_many_pois_as_the_evaluation_has():
     trains = pipeline.COMMANDS["missions"].trains
+    assert trains is not None
     config = train.parse([*trains]).config
     learned = jax.eval_shape(lambda: init(jax.random.key(0), config))
     assert learned.agent.plays(16)
