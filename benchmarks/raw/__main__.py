@@ -13,14 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.measure import reserve
+from benchmarks import measure, studies
 from benchmarks.raw.looks import Looks, simulate
 from benchmarks.raw.training import PARTS, compiled, split
-from benchmarks.raw.variants import TABLES, Variant
+from benchmarks.raw.variants import DRAWN, TABLES, Variant
 from jaxsense import Key
 from jaxsense.config.checks import check_fields, limited, require
 from jaxsense.run import cli
-from jaxsense.run.version import commit, versions
 
 PROGRAM = "benchmarks.raw"
 _COMPILED_AT_ONCE = 4
@@ -95,19 +94,22 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     if arguments.json is not None:
-        reserve(PROGRAM, "json", arguments.json)
+        measure.reserve(PROGRAM, "json", arguments.json)
     # The trainings consume the keys of the seeds.
     simulate_key = jax.random.fold_in(jax.random.key(arguments.first_seed), 1)
     looks = simulate(simulate_key, arguments.scans)
     keys = jnp.stack([jax.random.key(seed) for seed in arguments.range])
     tables = chosen(arguments)
-    whole = {"commit": commit(), "versions": versions(), "seeds": [*arguments.range]}
-    whole |= {"device": jax.devices()[0].device_kind, "steps": arguments.steps}
-    whole |= {"scans": arguments.scans}
+    whole = {
+        **measure.origin(studies.command(PROGRAM, arguments)),
+        "seeds": [*arguments.range],
+        "steps": arguments.steps,
+        "scans": arguments.scans,
+    }
     rows = []
     found = trained([variant for _, variant in tables], looks, keys)
     for (table, _), (variant, figures, seconds) in zip(tables, found, strict=True):
-        rows.append({"table": table, "name": variant.name, **_as_json(figures)})
+        rows.append({"table": table, "name": variant.name, **_as_json(variant, figures)})
         right = np.asarray(figures["pair"])
         print(
             f"{table}: {variant.name}: a pair right {right.mean():.3f} "
@@ -120,10 +122,12 @@ def main(argv: list[str] | None = None) -> None:
             arguments.json.write_text(text + "\n", encoding="utf-8")
 
 
-def _as_json(figures: dict) -> dict:
-    """Lists over the seeds; posteriors of the first seed alone."""
+def _as_json(variant: Variant, figures: dict) -> dict:
+    """Lists over the seeds; posteriors of the first seed alone, of variants that are drawn."""
     posteriors = figures.pop("posteriors")
     lists = {name: np.round(x.astype(float), 5).tolist() for name, x in figures.items()}
+    if variant.name not in DRAWN:
+        return lists
     first = {name: np.round(x[0].astype(float), 3).tolist() for name, x in posteriors.items()}
     return {**lists, "posteriors": first}
 

@@ -6,6 +6,7 @@ FILES are what `python -m benchmarks.raw --json` has written, one or more tables
 import dataclasses
 import json
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,6 +27,7 @@ from benchmarks.raw.variants import (
     TABLES,
     Variant,
 )
+from benchmarks.studies import as_table, with_origin
 from jaxsense import PRESETS
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
@@ -64,16 +66,15 @@ class Arguments:
             require(path is None or not path.exists(), self, field, "must be a new file")
 
 
-def read(files: tuple[Path, ...]) -> tuple[Found, list[int]]:
+def gather(*wholes: Mapping[str, Any]) -> tuple[Found, list[int]]:
     """Figures of all variants, and the seeds.
 
     Args:
-      files: from `python -m benchmarks.raw --json`.
+      *wholes: contents of files from `python -m benchmarks.raw --json`.
 
     Raises:
       ValueError: if the files are of different seeds, steps or scans, or a table lacks variants.
     """
-    wholes = [json.loads(path.read_text(encoding="utf-8")) for path in files]
     for field in ("seeds", "steps", "scans"):
         if any(whole[field] != wholes[0][field] for whole in wholes):
             raise ValueError(f"{field} = {[w[field] for w in wholes]}: must be the same in all")
@@ -100,11 +101,6 @@ def _share(values: Any) -> str:
     return f"{found['mean']:.3f} ± {width} ({np.min(values):.3f} to {np.max(values):.3f})"
 
 
-def _table(heads: list[str], rows: list[list[str]]) -> str:
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def of_ablation(found: Found) -> str:
     """The table of the ablation.
 
@@ -120,7 +116,7 @@ def of_ablation(found: Found) -> str:
         others = [_spread(of["units"], 1), _spread(of["by_class"], 2), _spread(of["by_view"], 2)]
         return [variant.name, *shares, *others]
 
-    return _table(heads, [row(variant) for variant in ABLATION])
+    return as_table(heads, [row(variant) for variant in ABLATION])
 
 
 def of_ratio(found: Found) -> str:
@@ -133,7 +129,7 @@ def of_ratio(found: Found) -> str:
         [f"{c}:{w}", *(_share(found["ratio", f"{name}, {c}:{w}"]["pair"]) for name in OF_RATIO)]
         for c, w in RATIOS
     ]
-    return _table(["camera : LiDAR", *OF_RATIO], rows)
+    return as_table(["camera : LiDAR", *OF_RATIO], rows)
 
 
 def of_depth(found: Found) -> str:
@@ -155,7 +151,7 @@ def of_depth(found: Found) -> str:
         others = ("least_weights", "dead_at_start", "dead")
         return [*cells, *(_spread(of[figure], 2) for figure in others)]
 
-    return _table(heads, [row(name, depth) for name in OF_DEPTH for depth in DEPTHS])
+    return as_table(heads, [row(name, depth) for name in OF_DEPTH for depth in DEPTHS])
 
 
 def _gradient(of: Figures, network: int) -> np.ndarray:
@@ -180,7 +176,18 @@ def of_seeds(found: Found, seeds: list[int]) -> str:
 
     both = [found["ablation", variant.name] for variant in (PAPER, OURS)]
     rows = [[str(s), *cells(both[0], i), *cells(both[1], i)] for i, s in enumerate(seeds)]
-    return _table(["seed", *heads], rows)
+    return as_table(["seed", *heads], rows)
+
+
+def written(content: Mapping[str, Any], make: Callable[[Found], str]) -> str:
+    """The table of a file, and how it came.
+
+    Args:
+      content: of the file.
+      make: the table.
+    """
+    found, _ = gather(content)
+    return with_origin(make(found), content)
 
 
 def draw(found: Found) -> Figure:
@@ -286,7 +293,9 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
-        found, seeds = read(arguments.files)
+        found, seeds = gather(
+            *(json.loads(path.read_text(encoding="utf-8")) for path in arguments.files)
+        )
     except (OSError, ValueError, KeyError) as error:
         cli.fail(PROGRAM, f"files: {error}")
     tables = {table for table, _ in found}

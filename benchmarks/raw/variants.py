@@ -156,6 +156,9 @@ ABLATION = (
 """From the paper's way to ours: either with one thing changed, or with a few that may need each
 other."""
 
+DRAWN = (PAPER.name, OURS.name)
+"""Variants of the ablation whose posteriors are kept, to be drawn."""
+
 OF_RATIO = {
     "paper, standardised": _STANDARDISED,
     "ours, sum of squares": OURS.but("", **_SUMMED),

@@ -361,3 +361,8 @@ def test_the_program_writes_what_the_report_reads(tmp_path, monkeypatch, capsys)
     __main__.main([*options, "--json", str(path)])
     report.main([str(path), "--posteriors", str(tmp_path / "p.png")])
     assert "| paper | 0." in capsys.readouterr().out
+    # What pages say of a table.
+    content = json.loads(path.read_text())
+    written = report.written(content, report.of_ablation)
+    command = "python -m benchmarks.raw --tables ablation --seeds 2 --steps 20 --scans 600"
+    assert f"`{command}`: {content['device']}" in written
