@@ -65,19 +65,19 @@ def init(key: jax.Array, network: nn.Module, inputs: int) -> Params:
 
 
 def apply(
-    network: nn.Module, params: Params, x: Float[Array | np.ndarray, "F ..."]
+    network: nn.Module, params: Params, *x: Float[Array | np.ndarray, "F ..."]
 ) -> Float[Array, "A ..."]:
     """Applies a network.
 
     Args:
       network: for example an `MLP`.
       params: its parameters.
-      x: `[F]`, or `[F, B]`.
+      *x: its inputs, `[F]` or `[F, B]` each.
 
     Returns:
       `[A]`, or `[A, B]`.
     """
-    return jnp.asarray(network.apply(params, x))
+    return jnp.asarray(network.apply(params, *x))
 
 
 def statistics(

@@ -30,43 +30,96 @@ class PoolingNetwork(nn.Module):
     features: int
 
     @nn.compact
-    def __call__(self, x: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
-        """`[F * N]` to `[N + 1]` values, NOP's last; or `[F * N, B]` to `[N + 1, B]`."""
+    def __call__(
+        self, x: Float[Array, "S ..."], others: Float[Array, "S ..."] | None = None
+    ) -> Float[Array, "A ..."]:
+        """`[F * N]` to `[N + 1]` values, NOP's last; or `[F * N, B]` to `[N + 1, B]`.
+
+        Args:
+          x: what is known of each PoI.
+          others: what each PoI's value takes the other PoIs to be; as in `x` by default. Presence
+            and positions are those of `x`.
+        """
         batch = x.shape[1:]
         chex.assert_is_divisible(x.shape[0], self.features)
-        x = x.reshape(self.features, x.shape[0] // self.features, *batch)
-        present, place = x[-3][None], x[-2:]
-        known = x[:-2]
-        flat = known.reshape(known.shape[0], -1)
-        for i, size in enumerate(self.hidden):
-            flat = nn.relu(Dense(size, nn.initializers.he_normal(), name=f"PoI_{i}")(flat))
-        each = flat.reshape(-1, *known.shape[1:]) * present
-        number = jnp.maximum(jnp.sum(present, axis=1), 1.0)
-        pool = jnp.concatenate([jnp.sum(each, axis=1) / number, jnp.max(each, axis=1)])
-        around = self._messages(flat, present, place)
+        shape = self.features, x.shape[0] // self.features, *batch
+        x = x.reshape(shape)
+        present, place, known = x[-3][None], x[-2:], x[:-2]
+        layers = [
+            Dense(size, nn.initializers.he_normal(), name=f"PoI_{i}")
+            for i, size in enumerate(self.hidden)
+        ]
+        message = Dense(_MESSAGES, nn.initializers.lecun_normal(), name="Message")
+
+        def embed(known: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """What each PoI adds to the pool, and its message."""
+            flat = known.reshape(known.shape[0], -1)
+            for layer in layers:
+                flat = nn.relu(layer(flat))
+            each, sent = (x.reshape(-1, *known.shape[1:]) for x in (flat, nn.relu(message(flat))))
+            return each * present, sent * present
+
+        each, sent = embed(known)
+        number = jnp.maximum(jnp.sum(present, axis=1, keepdims=True), 1.0)
+        if others is None:
+            mean = jnp.sum(each, axis=1, keepdims=True) / number
+            pool = [mean, jnp.max(each, axis=1, keepdims=True)]
+            around = _heard(sent, sent, present, place)
+        else:
+            rest, told = embed(others.reshape(shape)[:-2])
+            mean = (each + jnp.sum(rest, axis=1, keepdims=True) - rest) / number
+            pool = [mean, jnp.maximum(each, _max_of_others(rest))]
+            around = _heard(sent, told, present, place)
+        pool = jnp.concatenate(pool)
         own = jnp.concatenate([known, each, around])
         size = self.hidden[-1]
         last = nn.initializers.lecun_normal()
-        context = Dense(size, nn.initializers.he_normal(), name="Context")(pool)
+        context = Dense(size, nn.initializers.he_normal(), name="Context")(
+            pool.reshape(pool.shape[0], -1)
+        ).reshape(size, *pool.shape[1:])
         of_poi = Dense(size, nn.initializers.he_normal(), name="Own")(own.reshape(own.shape[0], -1))
-        of_poi = nn.relu(of_poi.reshape(size, *known.shape[1:]) + context[:, None])
+        of_poi = nn.relu(of_poi.reshape(size, *known.shape[1:]) + context)
         value = Dense(1, last, name="Value")(of_poi.reshape(size, -1))
         value = value.reshape(*known.shape[1:])
         # Nothing follows NOP.
         nop = jnp.zeros((1, *batch))
         return jnp.concatenate([jnp.where(present[0] > 0, value, _NOTHING), nop])
 
-    def _messages(self, flat: jax.Array, present: jax.Array, place: jax.Array) -> jax.Array:
-        """Sums the messages of all PoIs, weighted by travel time."""
-        sent = Dense(_MESSAGES, nn.initializers.lecun_normal(), name="Message")(flat)
-        sent = nn.relu(sent).reshape(_MESSAGES, *present.shape[1:]) * present
-        seconds = _seconds_between(place)
-        near, far = (jnp.exp(-seconds / reach) for reach in _REACHES)
-        of_near = jnp.sum(near[None] * sent[:, None], axis=2)
-        # A mean, so that many distant PoIs do not count like a near one.
-        of_far = jnp.sum(far[None] * sent[:, None], axis=2)
-        of_far /= 1.0 + jnp.sum(far * present, axis=1)[None]
-        return jnp.concatenate([of_near, of_far])
+
+def _max_of_others(x: jax.Array) -> jax.Array:
+    """`[F, N, ...]` maximum over all PoIs but this one, of `[F, N, ...]` that are not negative."""
+    most = jnp.max(x, axis=1, keepdims=True)
+    is_most = x == most
+    second = jnp.max(jnp.where(is_most, 0.0, x), axis=1, keepdims=True)
+    is_alone = jnp.sum(is_most, axis=1, keepdims=True) == 1
+    return jnp.where(is_most & is_alone, second, most)
+
+
+def _heard(own: jax.Array, others: jax.Array, present: jax.Array, place: jax.Array) -> jax.Array:
+    """Sums the messages of all PoIs, weighted by travel time.
+
+    Args:
+      own: `[M, N, ...]` what each PoI tells itself.
+      others: `[M, N, ...]` what each PoI tells the others.
+      present: `[1, N, ...]` whether it exists.
+      place: see `_seconds_between`.
+
+    Returns:
+      `[2M, N, ...]`.
+    """
+    seconds = _seconds_between(place)
+    near, far = (jnp.exp(-seconds / reach) for reach in _REACHES)
+
+    def heard(weights: jax.Array) -> jax.Array:
+        total = jnp.sum(weights[None] * others[:, None], axis=2)
+        if own is others:
+            return total
+        of_itself = jnp.moveaxis(jnp.diagonal(weights), -1, 0)
+        return total + of_itself[None] * (own - others)
+
+    # A mean, so that many distant PoIs do not count like a near one.
+    of_far = heard(far) / (1.0 + jnp.sum(far * present, axis=1)[None])
+    return jnp.concatenate([heard(near), of_far])
 
 
 def _seconds_between(place: jax.Array) -> jax.Array:

@@ -119,14 +119,21 @@ class TeamAgent:
         travel, number = self.config.travel, self.num_modalities
         return team_mdp.observation(travel, belief, team, robot, number).reshape(-1)
 
-    def q(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+    def q(
+        self,
+        params: Params,
+        observed: Float[Array, "S ..."],
+        others: Float[Array, "S ..."] | None = None,
+    ) -> Float[Array, "A ..."]:
         """Values once the robot has arrived, see `Agent.q`.
 
         Args:
           params: of the Q-network.
           observed: `[F * N]`, or `[F * N, B]`.
+          others: what each PoI's value takes the other PoIs to be; as observed by default.
         """
-        return networks.apply(self.network, params, observed)
+        inputs = (observed,) if others is None else (observed, others)
+        return networks.apply(self.network, params, *inputs)
 
     def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
         """Discounts values on arrival to the time of departure.
@@ -222,15 +229,9 @@ class TeamAgent:
         apart = jnp.sum((belief.mean[:, None] - classes.mean[None]) ** 2, axis=-1)
         nearest = jnp.argmin(apart, axis=-1)
         known = Belief(jnp.asarray(classes.mean)[nearest], jnp.asarray(classes.std)[nearest])
-        pois = jnp.arange(belief.mean.shape[0])
-
-        def observe(poi: Int[Array, ""]) -> jax.Array:
-            is_other = (pois != poi)[:, None]
-            only = jax.tree.map(lambda x, y: jnp.where(is_other, x, y), known, belief)
-            return self.observe(only, team, robot)
-
-        of_look = jnp.diagonal(self.q(params, jax.vmap(observe, out_axes=-1)(pois))[:-1])
-        of_known = self.q(params, self.observe(known, team, robot))[:-1]
+        seen, seen_known = (self.observe(x, team, robot) for x in (belief, known))
+        of_look = self.q(params, seen, seen_known)[:-1]
+        of_known = self.q(params, seen_known)[:-1]
         # Where there is no PoI both are far below any reward.
         return jnp.where(team.present, of_look - of_known + self.useless, of_look)
 

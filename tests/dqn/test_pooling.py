@@ -57,6 +57,27 @@ def test_a_poi_counts_for_the_values_of_the_others():
         assert np.all(changed[:3] != apply(x)[:3])
 
 
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_each_poi_among_others_that_are_taken_to_be_different(number):
+    x, others = seen(number), seen(number, seed=2)
+    others = others.at[-3:].set(x[-3:])
+    if number == 5:
+        x, others = (given.at[-3, 3].set(0.0) for given in (x, others))
+    found = networks.apply(NETWORK, PARAMS, x.reshape(-1), others.reshape(-1))
+    for poi in range(number):
+        one = apply(others.at[:, poi].set(x[:, poi]))
+        np.testing.assert_allclose(found[poi], one[poi], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        networks.apply(NETWORK, PARAMS, x.reshape(-1), x.reshape(-1)), apply(x), atol=1e-5
+    )
+
+
+def test_the_maximum_of_the_others():
+    x = jnp.array([[1.0, 3.0, 2.0], [4.0, 0.0, 4.0], [0.0, 0.0, 0.0]])
+    expected = [[3.0, 2.0, 3.0], [4.0, 4.0, 4.0], [0.0, 0.0, 0.0]]
+    np.testing.assert_array_equal(pooling._max_of_others(x), expected)
+
+
 def test_a_batch_equals_single_ones():
     batch = jnp.stack([seen(3, seed) for seed in range(4)], axis=-1)
     batch = batch.at[-3, 1, 2].set(0.0)

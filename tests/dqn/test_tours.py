@@ -177,6 +177,19 @@ def sigmas(observed, features):
     return observed.reshape(features, 3, *observed.shape[1:])[2]
 
 
+def replace_q(monkeypatch, q):
+    """Replaces the Q-network of three PoIs by a function of what a robot knows."""
+
+    def of_all(self, params, observed, others=None):
+        if others is None:
+            return q(self, params, observed)
+        x, rest = (given.reshape(self.network.features, 3) for given in (observed, others))
+        mixed = [rest.at[:, i].set(x[:, i]).reshape(-1) for i in range(3)]
+        return jnp.stack([*(q(self, params, x)[i] for i, x in enumerate(mixed)), 0.0])
+
+    monkeypatch.setattr(TeamAgent, "q", of_all)
+
+
 def decided(monkeypatch, after, cost):
     """Values in a mission, where the networks say what follows looks, and 20, 30 and 10 s."""
 
@@ -187,7 +200,7 @@ def decided(monkeypatch, after, cost):
         values = jnp.where(sigma > 0.3, of_each - self.useless - 0.7, -0.7)
         return jnp.concatenate([values, jnp.zeros_like(values[:1])])
 
-    monkeypatch.setattr(TeamAgent, "q", q)
+    replace_q(monkeypatch, q)
     monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
     agent = replace(AGENT, config=TeamConfig(travel=TRAVEL, second_cost=cost))
     return jax.jit(lambda: agent.decide({}, ({},), classes=CLASSES, **AT_ORIGIN))()
@@ -201,7 +214,7 @@ def test_what_is_left_to_learn_elsewhere_makes_no_look_worth_its_way(monkeypatch
         elsewhere = 0.5 * (jnp.sum(sigma, axis=0, keepdims=True) - sigma)
         return jnp.concatenate([sigma - 0.5 + elsewhere, jnp.zeros_like(sigma[:1])])
 
-    monkeypatch.setattr(TeamAgent, "q", q)
+    replace_q(monkeypatch, q)
     agent = replace(AGENT, discount=1.0)
     belief = Belief(jnp.zeros((3, 2)), jnp.array([[0.1, 1.0], [1.5, 1.0], [0.1, 1.0]]))
     given = {**AT_ORIGIN, "belief": belief}
@@ -217,7 +230,7 @@ def test_what_a_look_is_worth_does_not_depend_on_who_else_is_near(monkeypatch):
         values = sigmas(observed, features) * (1 + jnp.sum(surroundings, axis=0))
         return jnp.concatenate([values, jnp.zeros_like(values[:1])])
 
-    monkeypatch.setattr(TeamAgent, "q", q)
+    replace_q(monkeypatch, q)
     team = AT_ORIGIN["team"]
     poses, heads = np.array([[0, 0, 0], [*PLACES[0], 0]], np.float32), np.array([3, 0])
     near = replace(team, poses=poses, target=heads)
@@ -239,7 +252,7 @@ def of_sigmas(monkeypatch, after):
         values = jnp.where(sigma > 0.3, of_each, 0.0)
         return jnp.concatenate([values, jnp.zeros_like(values[:1])])
 
-    monkeypatch.setattr(TeamAgent, "q", q)
+    replace_q(monkeypatch, q)
 
 
 def test_without_tours_the_values_are_those_of_setting_out(monkeypatch):
