@@ -28,6 +28,7 @@ _OTHERWISE: Mapping[str, str] = {
     "tasks": "python -m benchmarks.tasks writes it",
 }
 """Files that no single command with `--json` makes, and what makes them."""
+_OF_RAW = ("raw_ablation", "raw_ratio", "raw_depth")
 _SWEEPS = {
     "imperfect.png": ("position [m]", "heading [deg]", "both [m]"),
     "imperfect_drift.png": ("position drift [m]", "heading drift [deg]", "both drifts [m]"),
@@ -101,13 +102,18 @@ def draw(name: str) -> None:
         files = [str(results.RESULTS / f"imperfect_{run}.json") for run in ("default", "noisy")]
         for picture, sweeps in _SWEEPS.items():
             _replace([*plot, *files, "--sweeps", *sweeps], picture)
+    elif name in _OF_RAW:
+        report = [sys.executable, "-m", "benchmarks.raw.report"]
+        report += [str(results.RESULTS / f"{each}.json") for each in _OF_RAW]
+        _replace(report, "raw_ablation.png")
+        _replace(report, "raw_posteriors.png", "--posteriors")
 
 
-def _replace(words: list[str], picture: str) -> None:
+def _replace(words: list[str], picture: str, option: str = "--plot") -> None:
     """Draws a picture of the pages anew; the programs write new files only."""
     with tempfile.TemporaryDirectory() as folder:
         new = Path(folder) / picture
-        subprocess.run([*words, "--plot", str(new)], check=True)
+        subprocess.run([*words, option, str(new)], check=True)
         shutil.move(new, FIGURES / picture)
 
 

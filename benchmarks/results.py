@@ -14,6 +14,7 @@ from typing import Any
 from benchmarks import curves, gate, imperfect, place, recorded, where
 from benchmarks.digits import table as digits
 from benchmarks.fusions import table as fusions
+from benchmarks.raw import report as raw
 from benchmarks.seeds import tables
 from benchmarks.tasks import board
 
@@ -120,6 +121,12 @@ TABLES: Mapping[str, _Tables] = {
     **{name: _IMPERFECT for name in ("imperfect_default.json", "imperfect_noisy.json")},
     "imperfect_trained.json": {None: partial(imperfect.of_sizes, sweeps=["both [m]"])},
     "imperfect_messages.json": {None: imperfect.of_messages},
+    "raw_ablation.json": {
+        None: partial(raw.written, make=raw.of_ablation),
+        "seeds": lambda content: raw.of_seeds(*raw.gather(content)),
+    },
+    "raw_ratio.json": {None: partial(raw.written, make=raw.of_ratio)},
+    "raw_depth.json": {None: partial(raw.written, make=raw.of_depth)},
     "recorded.json": {None: recorded.table, "noise": recorded.of_noise},
 }
 """What makes each table of a file, by their names."""

@@ -22,7 +22,6 @@ TYPED = {
     "docs/getting-started.md": 21,
     "docs/imperfect.md": 5,
     "docs/interfaces.md": 51,
-    "docs/raw.md": 892,
     "docs/recorded.md": 2,
     "docs/tasks.md": 4,
 }
