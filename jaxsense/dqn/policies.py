@@ -5,6 +5,7 @@ which is taken; the last is NOP's. A custom policy is one more entry of a table.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Protocol, TypeVar
 
@@ -158,8 +159,29 @@ def expected_gains(
     Returns:
       `[M, N]`.
     """
-    on_map = jax.vmap(fusion.class_probabilities)(belief)
-    return jnp.stack([jax.vmap(values.of_next)(on_map, is_seen) for values in look_values])
+    of_poi = jax.vmap(functools.partial(expected_gain, fusion, look_values), out_axes=1)
+    return of_poi(belief, is_seen)
+
+
+def expected_gain(
+    fusion: Fusion,
+    look_values: tuple[LookValues, ...],
+    belief: Belief,
+    is_seen: Bool[Array, ""],
+) -> Float[Array, " M"]:
+    """Expected reward of each modality's next look at one PoI, given the map.
+
+    Args:
+      fusion: reads the map.
+      look_values: of each modality.
+      belief: `[D]` of the PoI.
+      is_seen: `[]` bool.
+
+    Returns:
+      `[M]`.
+    """
+    on_map = fusion.class_probabilities(belief)
+    return jnp.stack([values.of_next(on_map, is_seen) for values in look_values])
 
 
 def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:

@@ -9,24 +9,55 @@ Monte-Carlo search; Bertsekas, Tsitsiklis and Wu 1997, J. Heuristics 3, 245-262)
 """
 
 import dataclasses
-from collections.abc import Callable
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import ToursConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Key, pytree
+from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.dqn import team_mdp
 from jaxsense.dqn.losses import pseudo_huber
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import TIME_SCALE, TeamMdp, TeamState
 
-Policy = Callable[[TeamState], jax.Array]
-"""Values of actions, `[N + 1]`, NOP's last; robots take the action of the highest."""
+
+class Policy(Protocol):
+    """What all robots follow in trials.
+
+    Reading the map takes longest, and each look changes one PoI: so a trial keeps what was read.
+    """
+
+    def read(self, belief: Belief, is_seen: Bool[Array, ""]) -> Float[Array, " G"]:
+        """`[G]` what the policy reads of one PoI.
+
+        Args:
+          belief: `[D]` of the PoI.
+          is_seen: `[]` whether anybody has looked at it.
+        """
+        ...
+
+    def values(self, read: Float[Array, "N G"], state: TeamState) -> Float[Array, " A"]:
+        """Values of actions, `[N + 1]`, NOP's last; robots take the action of the highest.
+
+        Args:
+          read: `[N, G]` of all PoIs.
+          state: the current state.
+        """
+        ...
+
+
+@pytree
+class _Now:
+    """A state, and `[N, G]` what the policy has read of its map."""
+
+    state: TeamState
+    read: jax.Array
+
 
 _NEAR = 5.0  # s; each further one makes a trial e times as rare
 _ERROR = 3.0  # s, above which an error counts linearly
@@ -71,15 +102,18 @@ def try_choices(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, num
 def _trial(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig) -> Trials:
     """The trials from one state, `[F * N]` and `[N]`."""
     start_key, walk_key, tried_key, play_key = jax.random.split(key, 4)
-    state = _some_way_on(walk_key, mdp, policy, config, team_mdp.reset(start_key, mdp))
-    values, num_pois = policy(state), mdp.map.num_pois
+    first = team_mdp.reset(start_key, mdp)
+    read = jax.vmap(policy.read)(first.map.belief, jnp.any(first.map.seen, axis=-1))
+    now = _some_way_on(walk_key, mdp, policy, config, _Now(first, read))
+    state, num_pois = now.state, mdp.map.num_pois
+    values = policy.values(now.read, state)
     is_open = values[:-1] > values[-1]
     travel = mdp.config.travel
     pose = state.team.poses[state.agent]
     times = team_mdp.travel_seconds(travel, pose, state.team.positions)
     rank = jnp.where(is_open, jax.random.gumbel(tried_key, (num_pois,)) - times / _NEAR, -jnp.inf)
     tried = jax.lax.top_k(rank, min(config.tries, num_pois))[1]
-    seconds = jax.vmap(lambda poi: _seconds_to_end(play_key, mdp, policy, state, poi))(tried)
+    seconds = jax.vmap(lambda poi: _seconds_to_end(play_key, mdp, policy, now, poi))(tried)
     is_choice = jnp.sum(is_open) > 1
     observation = team_mdp.observation(
         travel, state.map.belief, state.team, state.agent, mdp.map.num_modalities
@@ -91,48 +125,59 @@ def _trial(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig) -> Trial
     )
 
 
-def _some_way_on(
-    key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, state: TeamState
-) -> TeamState:
+def _some_way_on(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, now: _Now) -> _Now:
     """Follows the policy for up to `config.walk` random choices."""
     number_key, step_key = jax.random.split(key)
     number = jax.random.randint(number_key, (), 0, config.walk + 1)
 
-    def advance(i: jax.Array, state: TeamState) -> TeamState:
-        after, outcome = _step(jax.random.fold_in(step_key, i), mdp, policy, state)
-        return _where(outcome.terminated, state, after)
+    def advance(i: jax.Array, now: _Now) -> _Now:
+        after, terminated = _follow(jax.random.fold_in(step_key, i), mdp, policy, now)
+        return jax.tree.map(lambda x, y: jnp.where(terminated, x, y), now, after)
 
-    return jax.lax.fori_loop(0, number, advance, state)
+    return jax.lax.fori_loop(0, number, advance, now)
 
 
-def _seconds_to_end(
-    key: Key, mdp: TeamMdp, policy: Policy, state: TeamState, poi: jax.Array
-) -> jax.Array:
+def _seconds_to_end(key: Key, mdp: TeamMdp, policy: Policy, now: _Now, poi: jax.Array) -> jax.Array:
     """`[]` mean seconds until a working robot is done if one sets out for a PoI."""
     begin_key, step_key = jax.random.split(key)
-    after, _ = team_mdp.step(begin_key, mdp, state, poi)
-    ends = jnp.full(state.team.works.shape, state.seconds)
+    state = now.state
+    after, _ = _step(begin_key, mdp, policy, now, poi)
 
-    def goes_on(carry: tuple[TeamState, jax.Array, jax.Array]) -> jax.Array:
-        return jnp.any(carry[0].team.works) & (carry[2] < mdp.config.max_steps)
+    def ends_of(now: TeamState, ends: jax.Array) -> jax.Array:
+        return jnp.where(now.team.works, now.seconds, ends)
 
-    def advance(carry: tuple[TeamState, jax.Array, jax.Array]):
+    def goes_on(carry: tuple[_Now, jax.Array, jax.Array]) -> jax.Array:
+        return jnp.any(carry[0].state.team.works) & (carry[2] < mdp.config.max_steps)
+
+    def advance(carry: tuple[_Now, jax.Array, jax.Array]):
         now, ends, i = carry
-        now, _ = _step(jax.random.fold_in(step_key, i), mdp, policy, now)
-        return now, jnp.where(now.team.works, now.seconds, ends), i + 1
+        now, _ = _follow(jax.random.fold_in(step_key, i), mdp, policy, now)
+        return now, ends_of(now.state, ends), i + 1
 
-    first = after, jnp.where(after.team.works, after.seconds, ends), jnp.int32(0)
+    ends = jnp.full(state.team.works.shape, state.seconds)
+    first = after, ends_of(after.state, ends), jnp.int32(0)
     _, ends, _ = jax.lax.while_loop(goes_on, advance, first)
     took = jnp.where(state.team.works, ends - state.seconds, 0.0)
     return jnp.sum(took) / jnp.maximum(jnp.sum(state.team.works), 1)
 
 
-def _step(key: Key, mdp: TeamMdp, policy: Policy, state: TeamState):
-    return team_mdp.step(key, mdp, state, jnp.argmax(policy(state)).astype(jnp.int32))
+def _follow(key: Key, mdp: TeamMdp, policy: Policy, now: _Now) -> tuple[_Now, jax.Array]:
+    """What follows the policy's choice, and `[]` bool, whether all robots are done."""
+    action = jnp.argmax(policy.values(now.read, now.state)).astype(jnp.int32)
+    return _step(key, mdp, policy, now, action)
 
 
-def _where(condition: jax.Array, ours: TeamState, theirs: TeamState) -> TeamState:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), ours, theirs)
+def _step(
+    key: Key, mdp: TeamMdp, policy: Policy, now: _Now, action: jax.Array
+) -> tuple[_Now, jax.Array]:
+    """What follows a choice, and `[]` bool, whether all robots are done."""
+    before = now.state
+    after, outcome = team_mdp.step(key, mdp, before, action)
+    # If a robot has looked, it is the one that chooses next. NOP is beyond the last row.
+    poi = before.team.target.at[before.agent].set(action)[after.agent]
+    belief = jax.tree.map(lambda x: x.at[poi].get(mode="clip"), after.map.belief)
+    found = policy.read(belief, jnp.any(after.map.seen.at[poi].get(mode="clip")))
+    return _Now(after, now.read.at[poi].set(found, mode="drop")), outcome.terminated
 
 
 def no_trials(num_features: int, num_pois: int, number: int) -> Trials:

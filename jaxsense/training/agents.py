@@ -8,19 +8,19 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import Config
+from jaxsense.config import Config, TeamConfig
 from jaxsense.core import supervised
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
-from jaxsense.core.types import Belief, Fusion, Key
+from jaxsense.core.types import Belief, Fusion, Key, pytree
 from jaxsense.dqn import map_mdp, optimum, rewards, rules, team_mdp, tours
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.environments import Environment
 from jaxsense.dqn.map_mdp import Looks, MapMdp, MapState
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.policies import expected_gains
+from jaxsense.dqn.policies import expected_gain
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.dqn.tours import Trials
@@ -224,7 +224,7 @@ def _tour_stage(config: Config, network: PoolingNetwork) -> Stage:
         settings = config.team.tours
         try_key, draw_key = jax.random.split(key)
         mdp = cast("TeamMdp", mdp_of(config, fusion, Bank(detections.bank)))
-        followed = _auction(config, fusion, look_values)
+        followed = _Auction(config.team, fusion, look_values)
         found = tours.try_choices(try_key, mdp, followed, settings, number)
         trials = tours.write(trials, found, fit.step // size * number)
         problem = tours.Fitting(settings, trials, network, config.jmvae.latent_size)
@@ -239,14 +239,20 @@ def _tour_stage(config: Config, network: PoolingNetwork) -> Stage:
     return Stage("tours", begin, inputs, advance, finish, steps=settings.steps, chunks=chunks)
 
 
-def _auction(config: Config, fusion: Fusion, look_values: tuple[LookValues, ...]) -> tours.Policy:
+@pytree
+class _Auction:
     """The policy that robots follow in trials: an auction of gains minus the price of travel."""
 
-    def policy(state: TeamState) -> Float[Array, " A"]:
-        is_seen = jnp.any(state.map.seen, axis=-1)
-        gains = expected_gains(fusion, look_values, state.map.belief, is_seen)
-        times = team_mdp.travel_times(config.team.travel, state.team)
-        worth = gains[state.team.modality] - config.team.second_cost * times
-        return rules.auction(worth, times, state.team, state.agent)
+    config: TeamConfig
+    fusion: Fusion
+    look_values: tuple[LookValues, ...]
 
-    return policy
+    def read(self, belief: Belief, is_seen: Bool[Array, ""]) -> Float[Array, " M"]:
+        """`[M]` expected reward of each modality's next look."""
+        return expected_gain(self.fusion, self.look_values, belief, is_seen)
+
+    def values(self, read: Float[Array, "N M"], state: TeamState) -> Float[Array, " A"]:
+        """`[N + 1]` values of actions."""
+        times = team_mdp.travel_times(self.config.travel, state.team)
+        worth = read.T[state.team.modality] - self.config.second_cost * times
+        return rules.auction(worth, times, state.team, state.agent)

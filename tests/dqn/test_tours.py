@@ -12,7 +12,7 @@ from toys import SENSORS, Fixed, classes_mdp
 
 from jaxsense.config import TeamConfig, ToursConfig, TravelConfig
 from jaxsense.core import networks, supervised
-from jaxsense.core.types import Belief
+from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import team_mdp, tours
 from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.dqn.team_mdp import Team, TeamMdp
@@ -55,16 +55,28 @@ def trials_of(present=2, max_steps=300, walk=0, bonus=0.0):
     return _trials(present, max_steps, walk, bonus)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _trials(present, max_steps, walk, bonus):
+@pytree
+class InOrder:
+    """All look once at each PoI, in the order of their numbers; it reads what has been seen."""
 
-    def in_order(state):
+    bonus: jax.Array
+
+    def read(self, belief, is_seen):
+        return jnp.append(belief.mean, is_seen)
+
+    def values(self, read, state):
+        # What has been read is what is on the map now.
+        belief, is_seen = state.map.belief, jnp.any(state.map.seen, axis=-1)
+        is_right = jnp.array_equal(read, jax.vmap(self.read)(belief, is_seen))
         own = state.map.seen[:, state.team.modality[state.agent]]
         of_pois = jnp.where(own | ~state.team.present, -1.0, 3.0 - jnp.arange(3))
-        return jnp.append(of_pois + bonus, 0.0)
+        return jnp.append(of_pois + self.bonus, 0.0) + jnp.where(is_right, 0.0, jnp.nan)
 
+
+@functools.partial(jax.jit, static_argnums=0)
+def _trials(present, max_steps, walk, bonus):
     config, mdp = ToursConfig(tries=2, walk=walk), make_mdp(present, max_steps)
-    return tours.try_choices(jax.random.key(0), mdp, in_order, config, 64)
+    return tours.try_choices(jax.random.key(0), mdp, InOrder(bonus), config, 64)
 
 
 def fitting(trials, **config):
