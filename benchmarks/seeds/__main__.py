@@ -4,7 +4,7 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from benchmarks.seeds.runs import gather
 from jaxsense.config.checks import check_fields
@@ -17,12 +17,15 @@ FILE = Path(__file__).parents[1] / "results" / "seeds.json"
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Gathers figures of runs that differ in their seeds."""
+    """Gathers figures of runs that differ in their seeds.
+
+    They replace those of the same presets and seeds in the file; all others stay.
+    """
 
     runs: Annotated[tuple[Path, ...], Name("RUN")]
     """Directories of finished runs of presets."""
     out: Path = FILE
-    """JSON file to write."""
+    """JSON file to write, or to write into."""
 
     def __post_init__(self):
         check_fields(self)
@@ -31,7 +34,12 @@ class Arguments:
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    found = gather(arguments.runs)
+    found: dict[str, dict[str, Any]] = {}
+    if arguments.out.exists():
+        found = json.loads(arguments.out.read_text(encoding="utf-8"))
+    for preset, of_seeds in gather(arguments.runs).items():
+        found[preset] = dict(sorted((found.get(preset, {}) | of_seeds).items()))
+    found = dict(sorted(found.items()))
     arguments.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 

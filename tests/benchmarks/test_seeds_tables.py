@@ -126,6 +126,20 @@ def test_the_program_writes_what_it_gathers(runs, tmp_path):
     assert json.loads(out.read_text()) == json.loads(json.dumps(gather([run])))
 
 
+def test_the_program_replaces_runs_and_keeps_others(runs, tmp_path):
+    out = tmp_path / "seeds.json"
+    old = {"many": {"100": "old"}, "paper": {"100": "old", "101": "old"}}
+    out.write_text(json.dumps(old))
+    program.main([str(runs("paper", 101)), str(runs("default", 100)), "--out", str(out)])
+    found = json.loads(out.read_text())
+    assert [*found] == ["default", "many", "paper"]
+    assert found["many"] == old["many"]
+    assert found["paper"]["100"] == "old"
+    assert (
+        found["paper"]["101"]["commit"] == found["default"]["100"]["commit"] == "0123456789abcdef"
+    )
+
+
 def test_a_zero_has_no_sign():
     assert tables._range("{:.3f}", [-0.0001, 0.002]) == "0.000 to 0.002"
     assert tables._range("{:.1f} s", [-0.01]) == "0.0 s"
