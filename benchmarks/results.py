@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import curves, gate, imperfect, place, recorded, where
+from benchmarks import curves, gate, imperfect, pipeline, place, recorded, where
 from benchmarks.digits import table as digits
 from benchmarks.fusions import table as fusions
 from benchmarks.raw import report as raw
@@ -116,6 +116,7 @@ TABLES: Mapping[str, _Tables] = {
     "tasks.json": {None: board.tables},
     "gate.json": {None: gate.table, "search": gate.of_search},
     "where.json": {None: where.table, "accuracy": where.of_accuracies},
+    "pipeline.json": {None: pipeline.table},
     "place.json": {None: place.table},
     "curves.json": {None: curves.table},
     **{name: _IMPERFECT for name in ("imperfect_default.json", "imperfect_noisy.json")},

@@ -15,7 +15,7 @@ from jaxsense.tasks import pretrained
 
 PRETRAINED = "pretrained:"
 """What precedes the preset of models that travel with the package, in place of a run."""
-_RUNS = ("run", "runs")  # words without an option
+_POSITIONAL = ("run", "runs", "commit")  # words without an option
 _FILES = ("json", "plot")  # do not change results
 
 
@@ -52,10 +52,10 @@ def command(program: str, arguments: Any) -> str:
     """
     words = ["python", "-m", program]
     for field in dataclasses.fields(arguments):
-        value, is_run = getattr(arguments, field.name), field.name in _RUNS
-        if field.name in _FILES or (value == field.default and not is_run):
+        value, is_word = getattr(arguments, field.name), field.name in _POSITIONAL
+        if field.name in _FILES or (value == field.default and not is_word):
             continue
-        words += [] if is_run else [f"--{field.name.replace('_', '-')}"]
+        words += [] if is_word else [f"--{field.name.replace('_', '-')}"]
         if value is not True:
             words += map(str, value if isinstance(value, tuple) else (value,))
     return shlex.join(words)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import exported, gate, imperfect, recorded, results, studies
+from benchmarks import exported, gate, imperfect, pipeline, recorded, results, studies
 from benchmarks.results import PAGES, TABLES
 from jaxsense.config import options
 
@@ -22,6 +22,7 @@ ORIGIN = {
         (imperfect, "pretrained:noisy --episodes 8 --positions --headings --losses 0.5 0.9"),
         (exported, "runs/a --states 5 --trust"),
         (recorded, "latest"),
+        (pipeline, "ce31224 --commands cold warm"),
     ],
 )
 def test_the_command_measures_the_same_again(program, line):
