@@ -50,7 +50,10 @@ def stated(cell):
 
 
 TABLES = [
-    (PRESET_OF[page], *row) for page in PRESET_OF for row in rows(page) if row[1] and "*" not in row[0]
+    (preset, names, cell)
+    for page, preset in PRESET_OF.items()
+    for names, cell in rows(page)
+    if cell and "*" not in names
 ]
 
 
