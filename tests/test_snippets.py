@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import random
@@ -84,7 +85,9 @@ def test_looks_fill_the_map(monkeypatch, capsys):
     models = init(jax.random.key(0), config)
     monkeypatch.setattr(jaxsense, "load", lambda run: (config, models))
     camera, lidar = sim.sensors.make(config)
-    of_lidar = models.detect(1, lidar, np.ones(len(lidar.rays.angles), np.float32), 0.0, 1.0)
+    of_lidar = models.detect(
+        1, lidar, np.ones(len(lidar.rays.angles), np.float32), jnp.float32(0.0), jnp.float32(1.0)
+    )
     scan = np.ones((len(camera.rays.angles), 3), np.float32)
     found = {"jaxsense": jaxsense, "sim": sim, "np": np, "of_lidar": of_lidar}
     exec(LOOKS, found | {"scan": scan, "bearing": 0.0, "distance": 1.0})
