@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +28,7 @@ _OTHERWISE: Mapping[str, str] = {
     "tasks": "python -m benchmarks.tasks writes it",
 }
 """Files that no single command with `--json` makes, and what makes them."""
+_OF_IMPERFECT = ("imperfect_default", "imperfect_noisy")
 _OF_RAW = ("raw_ablation", "raw_ratio", "raw_depth")
 _SWEEPS = {
     "imperfect.png": ("position [m]", "heading [deg]", "both [m]"),
@@ -88,25 +89,27 @@ def measure(name: str, command: str) -> bool:
     return True
 
 
-def draw(name: str) -> None:
-    """Draws the pictures that are made from a file.
+def draw(names: Collection[str]) -> None:
+    """Draws the pictures that are made from files.
 
     Args:
-      name: of the file, without its ending.
+      names: of the files, without their endings.
     """
-    file = results.RESULTS / f"{name}.json"
     plot = [sys.executable, "-m", "benchmarks.imperfect_plot"]
-    if name == "imperfect_messages":
-        _replace([*plot, str(file), "--figures", "accuracy", "own", "nll", "time"], f"{name}.png")
-    elif name in ("imperfect_default", "imperfect_noisy"):
-        files = [str(results.RESULTS / f"imperfect_{run}.json") for run in ("default", "noisy")]
+    if "imperfect_messages" in names:
+        figures = ["--figures", "accuracy", "own", "nll", "time"]
+        _replace([*plot, *_files("imperfect_messages"), *figures], "imperfect_messages.png")
+    if not {*_OF_IMPERFECT}.isdisjoint(names):
         for picture, sweeps in _SWEEPS.items():
-            _replace([*plot, *files, "--sweeps", *sweeps], picture)
-    elif name in _OF_RAW:
-        report = [sys.executable, "-m", "benchmarks.raw.report"]
-        report += [str(results.RESULTS / f"{each}.json") for each in _OF_RAW]
+            _replace([*plot, *_files(*_OF_IMPERFECT), "--sweeps", *sweeps], picture)
+    if not {*_OF_RAW}.isdisjoint(names):
+        report = [sys.executable, "-m", "benchmarks.raw.report", *_files(*_OF_RAW)]
         _replace(report, "raw_ablation.png")
         _replace(report, "raw_posteriors.png", "--posteriors")
+
+
+def _files(*names: str) -> list[str]:
+    return [str(results.RESULTS / f"{name}.json") for name in names]
 
 
 def _replace(words: list[str], picture: str, option: str = "--plot") -> None:
@@ -138,10 +141,9 @@ def main(argv: list[str] | None = None) -> None:
     for name in names:
         command = command_of(stored[name])
         assert command is not None
-        if measure(name, command):
-            draw(name)
-        else:
+        if not measure(name, command):
             failed.append(name)
+    draw({*names} - {*failed})
     results.main()
     if failed:
         sys.exit(f"not measured: {', '.join(failed)}; their files are as they were")

@@ -90,8 +90,18 @@ def test_looks_fill_the_map(monkeypatch, capsys):
     )
     scan = np.ones((len(camera.rays.angles), 3), np.float32)
     found = {"jaxsense": jaxsense, "sim": sim, "np": np, "of_lidar": of_lidar}
-    exec(LOOKS, found | {"scan": scan, "bearing": 0.0, "distance": 1.0})
-    assert capsys.readouterr().out.strip() in config.arena.classes
+    found |= {"scan": scan, "bearing": 0.0, "distance": 1.0}
+    exec(LOOKS, found)
+    of_camera, fusion = found["detection"], models.fusion
+    first = fusion.update(fusion.prior, np.zeros(2, bool), of_camera.features, 0)
+    both = fusion.update(first, np.array([True, False]), of_lidar.features, 1)
+    for expected, belief in zip(
+        jax.tree.leaves(both), jax.tree.leaves(found["belief"]), strict=True
+    ):
+        np.testing.assert_allclose(belief, expected, rtol=1e-6)
+    assert not np.allclose(both.mean, first.mean)
+    likely = config.arena.classes[int(fusion.most_likely_class(both))]
+    assert capsys.readouterr().out.strip() == likely
 
 
 def arguments_of(function, snippet, names):

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from test_page_settings import PRESET_OF
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -45,8 +46,9 @@ FIGURE = re.compile(
 )
 
 
-def figures(page: str) -> list[str]:
-    page = SETTINGS.sub(lambda table: SECOND.sub(r"\1 |", table[0]), page)
+def figures(page: str, has_settings: bool = False) -> list[str]:
+    if has_settings:
+        page = SETTINGS.sub(lambda table: SECOND.sub(r"\1 |", table[0]), page)
     for pattern in NOT_PROSE:
         page = pattern.sub(" ", page)
     return FIGURE.findall(page)
@@ -54,15 +56,17 @@ def figures(page: str) -> list[str]:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_figures_are_not_typed(page):
-    found = figures((ROOT / page).read_text(encoding="utf-8"))
+    found = figures((ROOT / page).read_text(encoding="utf-8"), Path(page).stem in PRESET_OF)
     assert len(found) <= TYPED.get(page, 0), found
 
 
 def test_what_counts_as_a_figure():
     assert figures("takes 3.5 s, 12 %, 1,024 of 0.98 GiB") == ["3.5 s", "12 %", "0.98 GiB"]
     assert figures("Python 3.11, 3.12 and 3.13; `--x 0.5`; $0.1$; a [link](0.4)") == []
-    assert figures("| setting | value | about |\n| --- | --- |\n| `a` | 0.5 | 2.5 |\n") == ["2.5"]
-    assert figures("| row | value |\n| --- | --- |\n| `a` | 0.5 |\n") == ["0.5"]
+    settings = "| setting | value | about |\n| --- | --- |\n| `a` | 0.5 | 2.5 |\n"
+    assert figures(settings, has_settings=True) == ["2.5"]
+    assert figures(settings) == ["0.5", "2.5"]
+    assert figures("| row | value |\n| --- | --- |\n| `a` | 0.5 |\n", True) == ["0.5"]
     assert figures(
         "<!-- a.json b -->\n| 0.5 |\n<!-- end -->\n| 0.25 |\n```\n0.1\n```\n    0.2"
     ) == ["0.25"]

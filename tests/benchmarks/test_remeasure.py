@@ -18,8 +18,8 @@ def ran(tmp_path, monkeypatch):
         words.append(given[1:])
         if "--json" in given:
             Path(given[given.index("--json") + 1]).write_text('{"command": "new"}')
-        if "--plot" in given:
-            Path(given[given.index("--plot") + 1]).write_text("picture")
+        for option in {"--plot", "--posteriors"} & {*given}:
+            Path(given[given.index(option) + 1]).write_text("picture")
         return SimpleNamespace(returncode=int("benchmarks.bad" in given))
 
     (tmp_path / "results").mkdir()
@@ -58,12 +58,15 @@ def test_a_file_whose_command_fails_stays(ran):
 
 
 def test_pictures_are_drawn_of_what_was_measured(ran):
-    for name in ("curves", "imperfect_noisy", "imperfect_messages"):
+    for name in ("curves", "imperfect_noisy", "imperfect_messages", "raw_ratio", "raw_depth"):
         store(name, {"command": f"python -m benchmarks.{name}", "device": "cpu"})
     remeasure.main([])
     assert sorted(x.name for x in remeasure.FIGURES.iterdir()) == [
         "imperfect.png", "imperfect_drift.png", "imperfect_messages.png", "noisy_curves.svg",
+        "raw_ablation.png", "raw_posteriors.png",
     ]  # fmt: skip
+    # One picture of several files is drawn once.
+    assert sum("benchmarks.raw.report" in words for words in ran) == 2
 
 
 @pytest.mark.parametrize(
