@@ -66,3 +66,15 @@ def test_wide_vectors_are_for_a_cpu_alone(monkeypatch):
         assert "xla_cpu_prefer_vector_width" not in devices.compiler_options(wide_vectors=True)
     finally:
         jax.config.update("jax_disable_most_optimizations", True)
+
+
+def test_passes_over_loops_run_only_in_programs_that_run_long_on_a_cpu(monkeypatch):
+    monkeypatch.setattr(devices, "_is_known", lambda name, value: True)
+    jax.config.update("jax_disable_most_optimizations", False)
+    try:
+        assert "code-motion" in devices.compiler_options()["xla_disable_hlo_passes"]
+        assert "xla_disable_hlo_passes" not in devices.compiler_options(runs_long=True)
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        assert "xla_disable_hlo_passes" not in devices.compiler_options()
+    finally:
+        jax.config.update("jax_disable_most_optimizations", True)

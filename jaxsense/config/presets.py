@@ -215,5 +215,5 @@ often uncertain, and beliefs that accumulate looks. `many`: sixteen classes of f
 shapes, with the sensors of `noisy` and a team. `raw`: `default`, but the JMVAE learns from scans
 themselves, without detectors or labels. `team`: one policy for any number of PoIs and robots that
 takes travel time into account. `recorded`: `default` with the noise of a real laser scanner.
-`smoke`: the whole pipeline in about half a minute, for tests.
+`smoke`: the whole pipeline with very little training, for tests.
 """
