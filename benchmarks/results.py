@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import curves, gate, imperfect, pipeline, place, recorded, where
+from benchmarks import curves, exported, gate, imperfect, pipeline, place, recorded, where
 from benchmarks.digits import table as digits
 from benchmarks.fusions import table as fusions
 from benchmarks.raw import report as raw
@@ -128,6 +128,14 @@ TABLES: Mapping[str, _Tables] = {
     },
     "raw_ratio.json": {None: partial(raw.written, make=raw.of_ratio)},
     "raw_depth.json": {None: partial(raw.written, make=raw.of_depth)},
+    "exported.json": {
+        None: partial(exported.table, programs=exported.SHOWN),
+        "numpy": partial(
+            exported.latencies,
+            runs=("pretrained:default", "pretrained:noisy"),
+            programs=("detect_camera", "write_lidar", "decide", "classify"),
+        ),
+    },
     "recorded.json": {None: recorded.table, "noise": recorded.of_noise},
 }
 """What makes each table of a file, by their names."""
