@@ -10,13 +10,17 @@ from pathlib import Path
 
 from smoke import without_times
 
-# Other processors and compilers add and multiply in another order, which learning amplifies: in the
-# 300 steps of the shared run another line of JAX changed a figure of the JMVAE by 1.4 %, another
-# processor by 2.5 %.
+# Other processors and compilers add and multiply in another order. In the 300 steps of the shared
+# run that changes the JMVAE for good, and by a step, as when a rounding error turns on a ReLU:
+# sixteen runs whose sensors' noise differed by a few millionths, and others on two lines of JAX,
+# came to a handful of JMVAEs. Their fusion had mean errors of .0485 to .0516 and standard
+# deviations of .0034 to .0038, from detectors that agree to 1e-5, and random looks returned .316 to
+# .377 of an optimum of 2.37. Another processor changed a figure of the JMVAE by 2.5 %.
 # What the map says after many looks amplifies that in turn. Returns may be near 0, and of the 12
 # PoIs in the missions of the shared run one more may be right, or be looked at once more.
 TOLERANCES = {"detectors": 1e-3, "jmvae": 4e-2, "belief": 5e-2}
-NEAR_RETURN, NEAR_MISSION = 2e-2, 0.1
+NEAR_ERRORS = {"jmvae": 5e-3}  # of means and standard deviations on the map
+NEAR_RETURN, NEAR_RANDOM_RETURN, NEAR_MISSION = 2e-2, 0.1, 0.1
 NOISE = "/ece", "/nll", "/readout_error"
 UNTRAINED = "naive", "random"
 
@@ -59,14 +63,15 @@ def different_across_compilers(first, second):
             {n: x for n, x in numbers(summary[block]).items() if not n.endswith(NOISE)}
             for summary in (first, second)
         )
-        found |= different(*of_block, tolerance)
+        found |= different(*of_block, tolerance, NEAR_ERRORS.get(block, 0.0))
     for modality in first["dqn"]:
         agents = [summary["dqn"][modality] for summary in (first, second)]
         # A map that is hardly trained may be read too badly for an optimum, or just well enough.
         known = all(agent["optimal"] is not None for agent in agents)
-        names = (*UNTRAINED, "optimal", "one_step/optimal") if known else UNTRAINED
-        of_policies = (some(agent, *names) for agent in agents)
-        found |= different(*of_policies, TOLERANCES["jmvae"], NEAR_RETURN)
+        names = ("naive", "optimal", "one_step/optimal") if known else ("naive",)
+        for chosen, near in ((names, NEAR_RETURN), (("random",), NEAR_RANDOM_RETURN)):
+            of_policies = (some(agent, *chosen) for agent in agents)
+            found |= different(*of_policies, TOLERANCES["jmvae"], near)
     for policy in UNTRAINED:
         cases = (summary["mission"][policy] for summary in (first, second))
         names = "accuracy", "observations_per_poi", "information", "collisions"

@@ -35,10 +35,19 @@ def test_what_other_compilers_must_not_change_is_compared():
     other = copy.deepcopy(reference)
     other["belief"]["bayes_nll"][2] *= 1.1
     other["dqn"]["lidar"]["naive"] *= 1.05
+    other["dqn"]["lidar"]["random"] += 0.15
+    other["jmvae"]["fusion"]["mean_error"] += 0.006
     reference["dqn"]["lidar"]["optimal"] = 1.0
     other["dqn"]["lidar"]["optimal"] = 1.07
     other["dqn"]["camera"]["return"] *= 2  # of a policy that was trained
     other["mission"]["latent"]["accuracy"] /= 2
     other["mission"]["naive"]["accuracy"] -= 2 / 12
     found = different_across_compilers(reference, other)
-    assert set(found) == {"/bayes_nll/2", "naive", "optimal", "accuracy"}
+    assert set(found) == {
+        "/fusion/mean_error",
+        "/bayes_nll/2",
+        "naive",
+        "random",
+        "optimal",
+        "accuracy",
+    }
