@@ -116,7 +116,7 @@ TABLES: Mapping[str, _Tables] = {
     "tasks.json": {None: board.tables},
     "gate.json": {None: gate.table, "search": gate.of_search},
     "where.json": {None: where.table, "accuracy": where.of_accuracies},
-    "pipeline.json": {None: pipeline.table},
+    **{name: {None: pipeline.table} for name in ("pipeline.json", "pipeline_newest.json")},
     "place.json": {None: place.table},
     "curves.json": {None: curves.table},
     **{name: _IMPERFECT for name in ("imperfect_default.json", "imperfect_noisy.json")},

@@ -22,7 +22,7 @@ TYPED = {
     "docs/figures.md": 71,
     "docs/getting-started.md": 10,
     "docs/imperfect.md": 3,
-    "docs/interfaces.md": 51,
+    "docs/interfaces.md": 1,
     "docs/recorded.md": 2,
     "docs/tasks.md": 4,
 }
