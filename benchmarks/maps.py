@@ -15,6 +15,7 @@ from jaxsense.dqn import episodes, policies
 from jaxsense.dqn.episodes import Start
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.policies import Known
+from jaxsense.dqn.reference import reference
 
 MODALITY = 0
 """The agent looks with the camera."""
@@ -85,29 +86,30 @@ class Examiner:
         reset = jax.jit(jax.vmap(lambda key: episodes.reset(key, mdp, exact)))
         starts = reset(jax.random.split(reset_key, num_starts))
         play_keys = jax.random.split(play_key, num_starts)
-        optimal = policies.POLICIES["optimal"].values
+        optimal = reference(jax.random.key(0), mdp, MODALITY, task.models, exact.labels)
 
         def mean_return(
-            values: Callable[[jax.Array, Known], jax.Array], starts: Start
+            values: Callable[[Known, jax.Array], jax.Array], starts: Start
         ) -> jax.Array:
-            def act(key: jax.Array, known: Known) -> jax.Array:
-                return policies.best(values(key, known))
-
             def play(key: jax.Array, start: Start) -> jax.Array:
+                def act(key: jax.Array, known: Known) -> jax.Array:
+                    del key
+                    return policies.best(values(known, start.state.classes))
+
                 return episodes.run_episode(key, mdp, exact, act, start, MODALITY)[0]
 
             return jnp.mean(jax.vmap(play)(play_keys, starts))
 
         def learned_return(params: optax.Params, starts: Start) -> jax.Array:
-            def values(key: jax.Array, known: Known) -> jax.Array:
-                del key
+            def values(known: Known, classes: jax.Array) -> jax.Array:
+                del classes
                 observed = agent.observe(known.belief, known.team, known.robot)
                 return agent.values(params, observed)
 
             return mean_return(values, starts)
 
         def optimal_return(starts: Start) -> jax.Array:
-            return mean_return(lambda key, known: optimal(key, task.models, known), starts)
+            return mean_return(optimal, starts)
 
         self.target = SHARE * float(jax.jit(optimal_return)(starts))
         self._starts = starts

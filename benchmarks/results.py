@@ -97,6 +97,7 @@ _IMPERFECT: _Tables = {
     "constant": partial(imperfect.of_sizes, sweeps=["both [m]"]),
     "drifts": partial(imperfect.of_sizes, sweeps=["both drifts [m]"]),
 }
+_PIPELINE = "pipeline.json", "pipeline_newest.json", "pipeline_missions.json"
 TABLES: Mapping[str, _Tables] = {
     **{name: {None: table} for name in ("cpu.json", "h100.json", "h200.json", "h100x2.json")},
     "digits.json": {None: digits.of_results},
@@ -116,7 +117,7 @@ TABLES: Mapping[str, _Tables] = {
     "tasks.json": {None: board.tables},
     "gate.json": {None: gate.table, "search": gate.of_search},
     "where.json": {None: where.table, "accuracy": where.of_accuracies},
-    **{name: {None: pipeline.table} for name in ("pipeline.json", "pipeline_newest.json")},
+    **{name: {None: pipeline.table} for name in _PIPELINE},
     "place.json": {None: place.table},
     "curves.json": {None: curves.table},
     **{name: _IMPERFECT for name in ("imperfect_default.json", "imperfect_noisy.json")},

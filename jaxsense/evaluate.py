@@ -228,8 +228,8 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
         # In one order, so that a team plays in the same arenas however it is named.
         robots = tuple(sorted(given, key=[*config.modalities, *given].index))
     # No mission starts with a map that is partly seen, which limits the number of PoIs.
-    mdp = dataclasses.replace(config.mdp, partly_seen_starts=False)
-    mdp = config.mdp if arena == config.arena else mdp
+    has_other = arena != config.arena
+    mdp = dataclasses.replace(config.mdp, partly_seen_starts=False) if has_other else config.mdp
     return dataclasses.replace(config, arena=arena, robots=robots, mdp=mdp)
 
 

@@ -276,7 +276,7 @@ def by_class(
 
     Args:
       values: `[S, N, ...]`, of which looks are taken again where a class has fewer than `number`.
-      classes: `[S, N]` int32.
+      classes: `[S, N]` int32, among which each class must occur.
       num_classes: C; static.
       number: looks to keep at each class; static.
 

@@ -53,7 +53,8 @@ class Models:
       novelty: how much of a look is new evidence.
       look_values: for each modality, the values of looks by dynamic programming.
       agent: how the Q-networks are used.
-      q_networks: for each modality, parameters of the Q-network; the same for all in a team.
+      q_networks: for each modality, parameters of the Q-network; once trained, the same for all in
+        a team.
       tours: parameters of each network that orders looks, see `dqn.tours`.
     """
 
@@ -223,14 +224,13 @@ def init(key: Key, config: Config) -> Models:
       key: random key.
       config: all settings.
     """
-    detector_key, jmvae_key, dqn_key = jax.random.split(key, 3)
+    detector_key, jmvae_key, dqn_key, filter_key, tours_key = jax.random.split(key, 5)
     model, agent = make_jmvae(config), make_agent(config)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
     shape = len(config.arena.classes), model.latent_size
     classes = Belief(jnp.zeros(shape), jnp.ones(shape))
     learners = {"detections": _classifiers, "scans": _encoders}
     untrained, params = learners[config.jmvae.learns_from](detector_key, jmvae_key, config, classes)
-    filter_key = jax.random.fold_in(jmvae_key, 1)
     fusions: dict[str, Callable[[], Fusion]] = {
         "in_place": lambda: make_in_place(config, params, classes),
         "filter": lambda: filter.init(
@@ -246,7 +246,7 @@ def init(key: Key, config: Config) -> Models:
         look_values=tuple(_no_values(config, m) for m in config.modalities),
         agent=agent,
         q_networks=tuple(agent.init(k) for k in dqn_keys),
-        tours=agent.init_tours(jax.random.fold_in(dqn_key, 1)),
+        tours=agent.init_tours(tours_key),
     )
 
 

@@ -55,6 +55,15 @@ class Thermal(sim.Sensor):
         return hits.distance
 
 
+def test_a_sensor_above_the_body_makes_its_robot_as_tall(own_sensors):
+    names = ("lidar", "thermal", "thermal")
+    for height, expected in ((0.09, (True, False, False)), (0.12, (True, True, True))):
+        own_sensors.thermal = lambda config, height=height: thermal(config, height=height)
+        assert sim.sensors.on_top(OWN, names) == expected
+    world = sim.world.make_world(OWN, ("thermal",))
+    assert world.arena.mj_model.geom("robot0_lidar").pos[2] > 0.09
+
+
 def thermal(config, **changed):
     return Thermal(**{"height": 0.1, "rays": sim.Fan(32, 60.0), "window": 8, **changed})
 

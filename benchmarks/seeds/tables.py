@@ -234,7 +234,7 @@ _POLICIES = {
     "optimal": "dynamic programming",
     "auction": "rule: an auction of PoIs",
     "nearest": "rule: the nearest PoI worth a look",
-    "rollout": "rule: the best simulated order",
+    "rollout": "rule: the highest gain per second",
     "naive": "one look by each robot",
     "naive_2": "two looks by each robot",
     "naive_3": "three looks by each robot",

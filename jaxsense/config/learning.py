@@ -67,9 +67,9 @@ class JmvaeConfig(Section, place="jmvae"):
     beta: Traced[float] = limited(0.001, above=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to the prior."""
     initial_beta: Traced[float] = limited(0.7, above=0, at_most=_MAX_WEIGHT)
-    """Initial value of beta; far above `beta`, latent dimensions come into use one by one."""
+    """Initial value of beta. If far above `beta`, latent dimensions come into use one by one."""
     annealing: Traced[float] = limited(0.5, at_least=0, at_most=1)
-    """Share of the training during which beta falls from `initial_beta` to `beta`."""
+    """Share of the training during which beta changes from `initial_beta` to `beta`."""
     reconstruction_weights: Traced[tuple[float, ...]] = limited(
         (10.0, 10.0), at_least=0, at_most=_MAX_WEIGHT, min_items=1
     )

@@ -29,7 +29,7 @@ class OptionError(ValueError):
 class Name(str):
     """Annotates a field that is not the option `--FIELD` on the command line.
 
-    `Name("--config")` is another option, `Name("RUN")` a word without an option, and `Name("--")` a
+    `Name("--config")` is another option, `Name("RUN")` a positional argument, and `Name("--")` a
     section whose options have no prefix.
     """
 
@@ -84,7 +84,7 @@ def command(program: str) -> str:
     Args:
       program: its module, for example "jaxsense.train".
     """
-    # Where the console script is, no `python` may find the package.
+    # If the console script is in use, `python` on the path may not find the package.
     if Path(sys.argv[0]).name == "jaxsense":
         return program.replace(".", " ", 1)
     return f"python -m {program}"
@@ -118,7 +118,7 @@ def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Option:
-    """An option of a command line, or a word without one, or a section of options.
+    """A command-line option, a positional argument, or a section of options.
 
     Attributes:
       path: fields and keys that lead to its value.
@@ -227,7 +227,7 @@ def _of_type(kind: object, word: str) -> object:
 
 
 def _plain(text: str) -> str:
-    """A docstring without the marks of code."""
+    """A docstring without backticks."""
     return text.replace("`", "")
 
 
@@ -236,7 +236,7 @@ def docs(section: type) -> dict[str, str]:
     """Docstrings of the fields of a dataclass, each as one line.
 
     Args:
-      section: the dataclass; its source must be there.
+      section: the dataclass; its source must be available.
     """
     found: dict[str, str] = {}
     (node,) = ast.parse(textwrap.dedent(inspect.getsource(section))).body

@@ -120,6 +120,15 @@ class Config(Section):
         leaves_some = self.detector.num_training(parts) > 0
         expected = f"leaves none of {scans} scans to train on; lower it"
         require(leaves_some, self.detector, "calibration", expected)
+        num_classes = len(self.arena.classes)
+        of_class = -(-self.detector.num_held_out // num_classes)
+        for section, field, number in (
+            (self.detector, "num_held_out", of_class),
+            (self.jmvae, "samples_per_class", self.jmvae.samples_per_class),
+        ):
+            groups = -(-number * num_classes // in_group)
+            expected = f"leaves some of {num_classes} classes without a look; raise it"
+            require(groups * self.arena.num_pois >= num_classes, section, field, expected)
         adds_up = self.jmvae.fusion == "filter" or not self.mission.communication.own_maps
         expected = "must be off unless jmvae.fusion is 'filter', by which looks add up"
         require(adds_up, self.mission.communication, "own_maps", expected)

@@ -7,7 +7,7 @@ which is taken; the last is NOP's. A custom policy is one more entry of a table.
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,6 @@ from jaxsense.dqn import rules
 from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team_mdp import Team
-
-T = TypeVar("T")
 
 
 @pytree
@@ -193,10 +191,13 @@ def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
       known: what the robot knows.
     """
     del key
-    q_network = jax.tree.map(lambda x: x[known.modality], _stacked(models.q_networks))
-    classes = models.fusion.classes
     return models.agent.decide(
-        q_network, models.tours, classes, known.belief, known.team, known.robot
+        _own_network(models, known),
+        models.tours,
+        models.fusion.classes,
+        known.belief,
+        known.team,
+        known.robot,
     )
 
 
@@ -209,8 +210,7 @@ def latent_worth(key: Key, models: Trained, known: Known) -> Float[Array, " N"]:
       known: what the robot knows.
     """
     del key
-    q_network = jax.tree.map(lambda x: x[known.modality], _stacked(models.q_networks))
-    classes = models.fusion.classes
+    q_network, classes = _own_network(models, known), models.fusion.classes
     return models.agent.worth(q_network, classes, known.belief, known.team, known.robot)
 
 
@@ -295,9 +295,9 @@ def _gains(models: Trained, known: Known) -> jax.Array:
     return of_modality[known.team.modality]
 
 
-def _stacked(of_modalities: tuple[T, ...]) -> T:
-    """One tree with the leaves of all, `[M, ...]`."""
-    return jax.tree.map(lambda *x: jnp.stack(x), *of_modalities)
+def _own_network(models: Trained, known: Known) -> Params:
+    """Parameters of the Q-network of the robot's own sensor."""
+    return jax.tree.map(lambda *x: jnp.stack(x)[known.modality], *models.q_networks)
 
 
 def _always(agent: Agent) -> bool:

@@ -57,7 +57,7 @@ class TeamState:
     Attributes:
       map: the map, and the scene that it describes.
       team: robots and PoIs at this moment.
-      asks: `[R]` bool, robots that have yet to choose at this moment; at first all.
+      asks: `[R]` bool, robots that have yet to choose at this moment; at first all that work.
       agent: `[]` int32, the robot that chooses.
       looked: `[R]` seconds that each robot has been looking.
       seconds: `[]` since the start.

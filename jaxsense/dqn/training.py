@@ -56,8 +56,8 @@ class EpochInfo:
       loss: `[]` mean over the gradient steps.
       episode_return: `[]` mean total reward of the exploring policy's episodes that ended.
       episodes: `[]` int32 episodes that ended.
-      evaluation_return: `[]` mean total reward of the learned policy after the epoch; NaN except in
-        every tenth epoch.
+      evaluation_return: `[]` mean total reward of the learned policy after the epoch; NaN except
+        after the last epoch of a chunk, see `train_chunk`.
       epsilon: `[]` chance of a random action.
       is_finite: `[]` bool, whether values, rewards, loss and new parameters are finite.
     """

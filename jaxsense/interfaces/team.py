@@ -28,7 +28,7 @@ from jaxsense.tasks.task import TeamTask
 T = TypeVar("T")
 
 
-@struct.dataclass
+@pytree
 class TeamOutcome:
     """Outcome of a choice for each robot.
 

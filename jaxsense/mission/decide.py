@@ -155,7 +155,7 @@ def set_out(
         view=jnp.where(sets_out_now, view, own.view),
         to_view=jnp.where(sets_out_now, to_view, own.to_view),
         decided_on=jnp.where(decides, map_of(mission, state, robot).version, own.decided_on),
-        excluded=found.excluded,
+        excluded=jnp.where(decides, found.excluded, own.excluded),
         attempts=attempts,
         backs_off_until=jnp.where(backs_off, time + RECOVERY_TIME, own.backs_off_until),
         unreachable=jnp.where(gives_up, given_up.at[poi].set(True), given_up),

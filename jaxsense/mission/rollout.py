@@ -190,7 +190,7 @@ def _drift(keys: Key, mission: Mission, before: MissionState, after: MissionStat
 
 
 def _repeat_messages(key: Key, mission: Mission, state: MissionState) -> MissionState:
-    """Lets all robots that work tell their looks again, once in a while."""
+    """Lets all robots that have not failed tell their looks again, once in a while."""
     settings = mission.config.mission
     if state.memory is None:
         return state

@@ -13,6 +13,7 @@ from jaxsense.dqn.policies import Policy, Values, table
 from jaxsense.mission.memory import Memory
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.sim import arena as arenas_of
+from jaxsense.sim import sensors
 from jaxsense.sim import world as worlds
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import Scene, World
@@ -260,11 +261,11 @@ def make_mission(
     Raises:
       ValueError: if `arenas` were compiled from other settings than `config.arena`.
     """
-    carries_lidar = tuple(name == "lidar" for name in config.carried)
     arena, free = (None, None) if arenas is None else arenas
     return Mission(
         world=worlds.make_world(config, config.carried, arena=arena, contacts=contacts),
-        free_arena=free or arenas_of.build(config.arena, carries_lidar, obstacles=False),
+        free_arena=free
+        or arenas_of.build(config.arena, sensors.on_top(config, config.carried), obstacles=False),
         config=config,
         policies=table(policies),
     )

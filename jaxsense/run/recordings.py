@@ -67,7 +67,8 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
         with np.load(file, allow_pickle=False) as content:
             found = dict(content)
     except (zipfile.BadZipFile, zlib.error, TypeError, EOFError, ValueError):
-        raise ValueError(f"{file} is not a whole file of NumPy's format .npz") from None
+        expected = "is not a whole file of NumPy's format .npz, or holds objects, not numbers"
+        raise ValueError(f"{file} {expected}") from None
     made = sensors.make(config)
     parts = [f"{sensor.name}_{part}" for sensor in made for part in ("poses", "scans")]
     known = {"places", *parts, *(f"{sensor.name}_angles" for sensor in made)}

@@ -86,9 +86,10 @@ def score_missions(
       The score.
 
     Raises:
-      ConfigError: if an argument is wrong, a policy is unknown or has a name that is taken, or the
-        models are for another number of PoIs.
-      ValueError: if a policy returns values of another shape or dtype.
+      ConfigError: if a policy is unknown or has a name that is taken, or the models are for another
+        number of PoIs.
+      ValueError: if another argument is wrong, or a policy returns values of another shape or
+        dtype.
       RuntimeError: if the values of a policy, the models or the beliefs are not finite.
     """
     _require(config, models, policies, against, episodes, seed)

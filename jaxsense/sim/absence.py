@@ -121,5 +121,4 @@ def _wrong_bearing(
 
 def _half_width(sensor: Sensor) -> float:
     """Half the width, at the sensor's height, of a robot that carries the same sensor."""
-    top = amiro.GROUND_CLEARANCE + amiro.BODY_HEIGHT
-    return amiro.BODY_RADIUS if sensor.height <= top else amiro.LIDAR_HALF_WIDTH
+    return amiro.LIDAR_HALF_WIDTH if sensor.is_on_top else amiro.BODY_RADIUS

@@ -21,6 +21,7 @@ CASTER_OFFSET = 0.036  # m, fore and aft
 CAMERA_HEIGHT = 0.042  # m, above the floor
 LIDAR_HALF_WIDTH = 0.025  # m, the URG-04LX is 50 mm x 50 mm x 70 mm
 LIDAR_TOP = 0.164  # m
+BODY_TOP = GROUND_CLEARANCE + BODY_HEIGHT  # m, above the floor
 
 MAX_SPEED = 0.2  # m/s
 MAX_TURN_RATE = 1.0  # rad/s
@@ -52,7 +53,7 @@ def body(name: str, has_lidar: bool, reach: float) -> str:
 
     Args:
       name: prefix of the names of its parts.
-      has_lidar: whether a laser scanner is mounted on top; the camera is inside the body.
+      has_lidar: whether a sensor is mounted on top, in the case of a laser scanner.
       reach: maximum distance of the robot's centre from the origin along x and y, in metres.
 
     Returns:
@@ -60,7 +61,7 @@ def body(name: str, has_lidar: bool, reach: float) -> str:
       boxes and other robots, it collides exactly where the robot's disc would.
     """
     middle = GROUND_CLEARANCE + BODY_HEIGHT / 2
-    tower = (LIDAR_TOP - GROUND_CLEARANCE - BODY_HEIGHT) / 2
+    tower = (LIDAR_TOP - BODY_TOP) / 2
     lidar = (
         f'<geom name="{name}_lidar" type="box" pos="0 0 {LIDAR_TOP - tower}" mass="0" '
         f'size="{LIDAR_HALF_WIDTH} {LIDAR_HALF_WIDTH} {tower}" rgba=".15 .15 .15 1"/>'

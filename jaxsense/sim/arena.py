@@ -101,7 +101,7 @@ def build(
 
     Args:
       config: sizes and number of PoIs.
-      lidar_robots: for each robot, whether it carries a laser scanner.
+      lidar_robots: for each robot, whether it carries a laser scanner, or another sensor on top.
       contacts: whether robots collide with PoIs, with each other and with the walls.
       obstacles: whether there are PoIs and walls.
 

@@ -53,11 +53,12 @@ class Fan:
     @property
     def angles(self) -> Float[np.ndarray, "B"]:
         """See `Rays.angles`."""
-        return np.linspace(-self._half, self._half, self.num_rays, dtype=np.float32)
+        first = -self._half if self.num_rays > 1 else 0.0  # one ray points ahead
+        return np.linspace(first, self._half, self.num_rays, dtype=np.float32)
 
     def centre(self, bearing: Float[Array, ""]) -> Float[Array, ""]:
         """See `Rays.centre`."""
-        return (bearing + self._half) / (2 * self._half / max(self.num_rays - 1, 1))
+        return (bearing - self.angles[0]) / (2 * self._half / max(self.num_rays - 1, 1))
 
 
 @dataclasses.dataclass(frozen=True)

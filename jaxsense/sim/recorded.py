@@ -17,7 +17,6 @@ from jaxsense.core.types import Key, pytree
 from jaxsense.sim import raycast, resampling
 from jaxsense.sim.sensors import Sensor
 
-_SURFACE = 0.1  # m; neighbouring beams that differ by more hit two surfaces
 _BEAMS = 15  # of a piece of wall
 _MIN_FACING = 0.5  # cosine of the angle at which a beam meets a wall
 _MIN_PIECES = 20  # in a bin of distances
@@ -30,11 +29,7 @@ def resample(
     angles: Float[np.ndarray, " A"],
     readings: Float[np.ndarray, "S A *channels"],
 ) -> Float[np.ndarray, "S B *channels"]:
-    """Resamples recorded scans to the rays of a simulated sensor.
-
-    Between two recorded rays, readings are interpolated; distances only on one surface, otherwise
-    the nearest ray counts. A distance of 0 is no return and becomes infinite. The last ray of a
-    full circle has the first as its neighbour.
+    """Resamples recorded scans to the rays of a simulated sensor, see `resampling.resample`.
 
     Args:
       sensor: the sensor.
@@ -74,11 +69,6 @@ def resample(
     return np.moveaxis(found, 0, 1)
 
 
-def _with_returns(ranges: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
-    """Distances in metres, infinite instead of 0 where a beam has no return."""
-    return np.where(ranges == 0, np.inf, ranges)
-
-
 def _require_dense(sensor: Sensor, angles: Float[np.ndarray, " A"]) -> int:
     """How many of the sensor's rays a window spans.
 
@@ -109,12 +99,18 @@ def wall_residuals(
 
     Args:
       angles: directions of the beams, in radians, in order.
-      ranges: `[S, A]` distances in metres, infinite without a return.
+      ranges: `[S, A]` distances in metres, infinite or 0 without a return.
 
     Returns:
       `[R, K]` residuals along the beams, in metres, of all pieces of scans that no surface of
       another depth interrupts and that face the scanner; and `[R]` their mean distances, in metres.
+
+    Raises:
+      ValueError: if there are fewer than K beams.
     """
+    if len(angles) < _BEAMS:
+        raise ValueError(f"angles are {len(angles)}: must be at least {_BEAMS}, of a piece of wall")
+    ranges = resampling.with_returns(ranges)
     residuals, distances = [], []
     for first in range(0, len(angles) - _BEAMS + 1, _BEAMS):
         piece = slice(first, first + _BEAMS)
@@ -129,7 +125,7 @@ def wall_residuals(
         with np.errstate(divide="ignore"):
             residual = found - to_wall / facing
         is_wall = np.abs(facing).min(axis=1) > _MIN_FACING
-        is_wall &= np.abs(residual).max(axis=1) < _SURFACE
+        is_wall &= np.abs(residual).max(axis=1) < resampling.SURFACE
         residuals.append(residual[is_wall])
         distances.append(found[is_wall].mean(axis=1))
     return np.concatenate(residuals), np.concatenate(distances)
@@ -154,7 +150,7 @@ def fit_noise(
     Raises:
       ValueError: if the scans show too few straight walls or edges.
     """
-    ranges = _with_returns(ranges)
+    ranges = resampling.with_returns(ranges)
     residuals, distances = wall_residuals(angles, ranges)
     free = _BEAMS - 2  # a line has two parameters
     unbiased = np.sqrt(scipy.special.chdtri(free, 0.5) / free)
@@ -163,7 +159,10 @@ def fit_noise(
     number = np.bincount(bins)
     kept = np.flatnonzero(number >= _MIN_PIECES)
     if len(kept) < 2:
-        raise ValueError(f"scans show {len(distances)} pieces of walls: too few to fit the noise")
+        bins = f"{_MIN_PIECES} or more at {len(kept)} distances, by half a metre"
+        raise ValueError(
+            f"scans show {len(distances)} pieces of walls, {bins}: must be at 2 or more"
+        )
     within = distances < config.max_range
     middles = [np.median(distances[within][bins == i]) for i in kept]
     medians = [np.median(spread[within][bins == i]) for i in kept]
@@ -178,11 +177,13 @@ def _edges(ranges: Float[np.ndarray, "S A"], max_range: float) -> tuple[float, f
     """Share of edges with a mixed pixel, and of beams on one surface that drop out."""
     first, before, middle, after, last = (ranges[:, i : ranges.shape[1] - 4 + i] for i in range(5))
     with np.errstate(divide="ignore", invalid="ignore"):
-        is_smooth = (np.abs(first - before) < _SURFACE) & (np.abs(after - last) < _SURFACE)
+        is_smooth = (np.abs(first - before) < resampling.SURFACE) & (
+            np.abs(after - last) < resampling.SURFACE
+        )
         near, far = np.minimum(before, after), np.maximum(before, after)
         is_edge = is_smooth & (far - near > _EDGE) & (far < max_range) & np.isfinite(middle)
         is_mixed = is_edge & (middle > near + _MARGIN) & (middle < far - _MARGIN)
-        is_surface = is_smooth & (far - near < _SURFACE) & (far < max_range)
+        is_surface = is_smooth & (far - near < resampling.SURFACE) & (far < max_range)
         # A mixed pixel lies anywhere between both surfaces; those near one are not seen.
         visible = 1 - 2 * _MARGIN / (far - near)
     if not is_edge.any():

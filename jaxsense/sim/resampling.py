@@ -8,7 +8,8 @@ import numpy as np
 _TURN = 2 * np.pi + 1e-3  # rad; drivers round the last angle
 MAX_STEPS = 3.0
 """A gap between two rays of more than this many median steps was not recorded."""
-_SURFACE = 0.1  # m; neighbouring beams that differ by more hit two surfaces
+SURFACE = 0.1
+"""Metres; neighbouring beams that differ by more hit two surfaces."""
 
 
 def resample(
@@ -40,18 +41,23 @@ def resample(
     right, left, share, is_between = _neighbours(targets, angles)
     readings = np.asarray(readings, np.float32)
     if measures_distance:
-        readings = np.where(readings == 0, np.inf, readings)
+        readings = with_returns(readings)
     first, second = readings[right], readings[left]
     # One number for each ray, next to readings of any shape.
     of_rays = (-1, *[1] * (readings.ndim - 1))
     share, is_between = share.reshape(of_rays), is_between.reshape(of_rays)
     with np.errstate(invalid="ignore"):  # a beam without a return is infinitely long
         between = first + share * (second - first)
-        is_same = np.abs(second - first) < _SURFACE if measures_distance else True
+        is_same = np.abs(second - first) < SURFACE if measures_distance else True
     nearest = np.where(share < 0.5, first, second)
     found = np.where(is_between & is_same, between, nearest).astype(np.float32)
     found[~covered(targets, angles)] = np.nan
     return found
+
+
+def with_returns(ranges: np.ndarray) -> np.ndarray:
+    """Distances in metres, infinite instead of 0 where a beam has no return."""
+    return np.where(ranges == 0, np.inf, ranges)
 
 
 def require_angles(name: str, angles: np.ndarray) -> None:

@@ -112,6 +112,11 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
         return self.rays.angles
 
     @property
+    def is_on_top(self) -> bool:
+        """Whether it is mounted on top of the robot's body, as the LiDAR is."""
+        return self.height > amiro.BODY_TOP
+
+    @property
     def field_of_view(self) -> float:
         """Angle between the outermost rays, in degrees."""
         return float(np.degrees(np.ptp(self.angles)))
@@ -229,6 +234,17 @@ def make(config: Config) -> tuple[Sensor, ...]:
         _own(name, config) if name in config.sensors else known[name]()
         for name in config.modalities
     )
+
+
+def on_top(config: Config, carried: tuple[str, ...]) -> tuple[bool, ...]:
+    """Which robots have a sensor on top of their bodies.
+
+    Args:
+      config: all settings.
+      carried: modality of each robot.
+    """
+    is_on_top = {sensor.name: sensor.is_on_top for sensor in make(config)}
+    return tuple(is_on_top[name] for name in carried)
 
 
 def _own(name: str, config: Config) -> Sensor:

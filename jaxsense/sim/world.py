@@ -18,7 +18,7 @@ from jaxsense.sim.absence import View
 from jaxsense.sim.light import Light, random_light
 
 
-@struct.dataclass
+@pytree
 class World:
     """A simulation: its arena, sensors and viewpoints, which all scenes share.
 
@@ -77,8 +77,8 @@ def make_world(
       ConfigError: if a custom sensor is wrong, see `sensors.make`.
     """
     if arena is None:
-        carries_lidar = tuple(name == "lidar" for name in robots or config.modalities)
-        arena = arenas.build(config.arena, carries_lidar, contacts=contacts)
+        on_top = sensors.on_top(config, robots or config.modalities)
+        arena = arenas.build(config.arena, on_top, contacts=contacts)
     elif arena.config != config.arena:
         raise ValueError("arena: must be compiled from config.arena; its settings differ")
     errors = config.mission.localisation

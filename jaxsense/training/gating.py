@@ -58,8 +58,8 @@ def nothing(
 ) -> gates.Looks:
     """Looks that show no PoI, in random order: empty ones, and others that are spoilt by hand.
 
-    A window of a PoI shows none if most of its rays are lost, if all of its readings are equal, or
-    if the PoI is expected at another distance.
+    A window of a PoI shows none if most of its readings are lost, if all are equal, or if the PoI
+    is expected at another distance.
 
     Args:
       key: random key.

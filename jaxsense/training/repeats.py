@@ -53,7 +53,7 @@ def novelty_stage(
     scenes: Callable[..., Repeated] = random_scenes,
     inputs: Mapping[str, str] | None = None,
 ) -> Stage:
-    """Makes the stage that learns how much of a look is new; all of it if there are no pairs.
+    """Makes the stage that learns how much of a look is new; all of it if there are no such scenes.
 
     Args:
       arena: of the simulation.

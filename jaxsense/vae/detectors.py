@@ -257,6 +257,7 @@ def retrain(
 
     Raises:
       TypeError: if the detector is an encoder of scans, which learns without labels.
+      ValueError: if `config.calibration` leaves no window to train with, or none to judge by.
     """
     if not isinstance(detector, Classifier):
         kind = type(detector).__name__
@@ -264,6 +265,9 @@ def retrain(
     windows, labels = jnp.asarray(windows), jnp.asarray(labels)
     chex.assert_equal_shape_prefix([windows, labels], 1)
     number = config.num_training(len(labels))
+    if not 0 < number < len(labels):
+        expected = f"must leave some of {len(labels)} windows to train with, and some to judge by"
+        raise ValueError(f"config.calibration = {config.calibration}: {expected}")
     problem = Fitting(config, detector, windows[:number], labels[:number])
     fit, _ = supervised.fit(key, supervised.start(detector.params, config), problem, config.steps)
     kept = jnp.arange(number, len(labels))

@@ -9,7 +9,6 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Float
 
 from jaxsense.config.learning import PROFILE
@@ -19,6 +18,7 @@ from jaxsense.core.types import pytree
 _HALF_WIDTH = 1.5  # this and what follows in extents of a PoI, the radius of a circle around it
 _TO_MIDDLE = 0.35  # from the front of a PoI on, half of a small one's depth
 _NEAR = 1.15  # depth within which a beam is on the PoI
+_BESIDE = 1.15  # half-widths within which it is
 _DEPTHS = -1.4, 2.1  # beyond which depth tells nothing of the PoI
 _AHEAD = 0.1  # rad, half the width of a PoI's front
 _NOTHING = 0.05  # beams, as many as which a place without any counts as having hit nothing
@@ -66,7 +66,7 @@ class Profile:
         middle = jnp.min(jnp.where(is_ahead, triples, jnp.inf)) + _TO_MIDDLE * self.extent
         half_width = _HALF_WIDTH * self.extent
         is_near = jnp.abs(window - middle) < _NEAR * self.extent
-        is_near &= jnp.abs(window * self.across) < 1.15 * half_width
+        is_near &= jnp.abs(window * self.across) < _BESIDE * half_width
         sine = jnp.sum(jnp.where(is_near, self.across, 0.0)) / jnp.maximum(jnp.sum(is_near), 1)
         cosine = jnp.sqrt(1 - sine**2)
         across = window * (self.across * cosine - self.along * sine)
@@ -130,7 +130,7 @@ def make(
     return Chromaticity() if channels == 3 else Plain()
 
 
-@struct.dataclass
+@pytree
 class Scaling:
     """Numbers in a frame, standardised by those of a training.
 

@@ -129,9 +129,10 @@ def losses(
 
     For each PoI with looks `x_mk`, `sum_mk -w_m / F_m log p(x_mk | z_mk)` up to a constant, with
     `z_mk` drawn from `q(z | all looks but x_mk)` and p a Gaussian of the variance at which the
-    looks of the batch by this sensor are likeliest; plus `beta` times the divergences of these
-    posteriors, and of that of all looks, from the prior; plus `alpha` times the divergences of the
-    posterior of all looks from those of single looks and of sets of one by each sensor.
+    looks of the batch by this sensor are likeliest; plus `beta` times the divergences from the
+    prior of the posterior of all looks and, as a mean over looks for each sensor, of these
+    posteriors; plus `alpha` times the divergences of the posterior of all looks from those of
+    single looks and of sets of one by each sensor.
 
     Args:
       noise: `[M, D, B, K]` standard normal draws.

@@ -258,6 +258,7 @@ SCANS = {"jmvae.learns_from": "scans", "jmvae.fusion": "filter", "jmvae.looks": 
 FROM_SCANS = SCANS | {"jmvae.looks": 4}
 POSTS = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "post": Shape("box", (0.5, 0.5))}
 SIXTEEN = tuple(f"{colour} {shape}" for colour in COLOURS for shape in POSTS)
+OF_SIXTEEN = {"jmvae.latent_size": 4, "arena.shapes": POSTS, "arena.classes": SIXTEEN}
 EIGHT = tuple(
     f"{colour} {shape} {heat}"
     for colour in ("red", "green")
@@ -283,6 +284,11 @@ CHANGES = [
     (
         FROM_SCANS | {"lidar.window_range": 1.1},
         "lidar.window_range = 1.1: must be at least viewpoint.max_distance = 1.2 m to learn from",
+    ),
+    # Groups of looks at the same PoIs: 16 scenes of three, of which two groups show six PoIs.
+    (
+        FROM_SCANS | OF_SIXTEEN | {"detector.num_held_out": 16},
+        "detector.num_held_out = 16: leaves some of 16 classes without a look; raise it",
     ),
     ({"modalities": 5}, "modalities = 5: must be a list of texts"),
     ({"modalities": ("lidar", "lidar")}, "must name no modality twice"),

@@ -322,9 +322,14 @@ def test_a_target_of_equal_value_is_kept(chosen, set_robot):
 
 @pytest.mark.parametrize("phase", [BACKING, ENDED])
 def test_a_robot_that_backs_off_or_has_ended_does_not_decide(chosen, set_robot, phase):
-    state = chosen([1.0] * 3 + [0.0], change=lambda s: set_robot(s, 0, phase=phase, target=2))
+    def change(state):
+        everywhere = jnp.ones_like(state.robots.excluded[0])
+        return set_robot(state, 0, phase=phase, target=2, excluded=everywhere)
+
+    state = chosen([1.0] * 3 + [0.0], change=change)
     assert state.robots.phase[0] == phase
     assert state.robots.target[0] == 2
+    assert state.robots.excluded[0].all()
 
 
 def test_a_robot_that_sees_the_poi_looks_from_where_it_stands(chosen):

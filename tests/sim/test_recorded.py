@@ -191,6 +191,22 @@ def test_noise_is_fitted_to_scans(measured):
     assert recorded.fit_noise(LidarConfig(), ANGLES, np.where(np.isinf(ranges), 0, ranges)) == found
 
 
+def test_beams_without_a_return_are_no_wall():
+    wall = 2 / np.cos(ANGLES[90:271])
+    wall[30:60] = np.inf
+    expected = recorded.wall_residuals(ANGLES[90:271], wall[None])
+    assert len(expected[0]) == 10  # of 12 pieces
+    with_zeros = np.where(np.isinf(wall), 0, wall)
+    found = recorded.wall_residuals(ANGLES[90:271], with_zeros[None])
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_scan_narrower_than_a_piece_of_wall_is_refused():
+    with pytest.raises(ValueError, match="angles are 14: must be at least 15"):
+        recorded.wall_residuals(ANGLES[:14], np.ones((1, 14)))
+
+
 def test_noise_is_fitted_without_bias():
     # Two walls, 2 and 3 m ahead, and one edge between them, at which 30 % of the beams are mixed.
     rng = np.random.default_rng(0)
@@ -222,8 +238,13 @@ def test_residuals_are_those_of_straight_walls():
 
 
 def test_too_few_scans_to_fit_the_noise_to_are_named():
-    with pytest.raises(ValueError, match="too few to fit the noise"):
+    expected = "scans show 0 pieces of walls, 20 or more at 0 distances, by half a metre: must be"
+    with pytest.raises(ValueError, match=expected):
         recorded.fit_noise(LidarConfig(), ANGLES, np.full((3, 361), np.inf, np.float32))
+    # A round room has all of its walls at one distance.
+    expected = "pieces of walls, 20 or more at 1 distances"
+    with pytest.raises(ValueError, match=expected):
+        recorded.fit_noise(LidarConfig(), ANGLES, np.full((3, 361), 2.2, np.float32))
 
 
 def exact(mixed_pixels=0.0):

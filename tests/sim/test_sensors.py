@@ -285,6 +285,12 @@ def test_a_traced_robot_sees_what_a_static_one_does(arena, place, noiseless, kno
             np.testing.assert_allclose(traced(robot), expected, atol=1e-6)
 
 
+def test_a_single_ray_points_ahead():
+    ray = sim.Fan(1, 90.0)
+    np.testing.assert_array_equal(ray.angles, [0.0])
+    assert ray.centre(jnp.float32(0.0)) == 0.0
+
+
 def test_make_follows_the_order_of_the_modalities():
     config = dataclasses.replace(Config(), modalities=("lidar", "camera"))
     assert [s.name for s in sensors.make(config)] == ["lidar", "camera"]

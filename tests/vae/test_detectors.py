@@ -208,9 +208,18 @@ def test_retraining_moves_no_farther_than_serves_windows_kept_from_it(trained):
     assert accuracy(same, windows, labels) >= accuracy(detector, windows, labels) - 0.01
 
 
+@pytest.mark.parametrize(("calibration", "number"), [(0.0, 10), (0.5, 1)])
+def test_windows_to_train_with_and_to_judge_by_are_needed(trained, calibration, number):
+    config = replace(detectors.RETRAINING, calibration=calibration)
+    detector = trained[1]
+    windows = jnp.zeros((number, len(detector.offset)))
+    with pytest.raises(ValueError, match=f"config.calibration = {calibration}: must leave some of"):
+        detectors.retrain(jax.random.key(0), detector, windows, jnp.zeros(number, int), config)
+
+
 def test_windows_and_labels_to_retrain_with_may_be_those_of_numpy(trained):
     windows, labels = synthetic_windows(jax.random.key(5), 40)
-    config = replace(CONFIG, steps=2)
+    config = replace(CONFIG, steps=2, calibration=0.25)
     of_numpy, of_jax = (
         detectors.retrain(jax.random.key(7), trained[1], *data, config)
         for data in ((np.array(windows), np.array(labels)), (windows, labels))
