@@ -16,6 +16,8 @@ os.environ["XLA_FLAGS"] = " ".join(
         "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters",
         # The parts of a program are linked for longer than two cores save.
         "--xla_cpu_parallel_codegen_split_count=1",
+        # They have all other passes run again after each level of nested loops.
+        "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-constant-sinking",
     )
 )
 # What one worker, or a process that a test starts, has compiled serves all others.
