@@ -4,8 +4,7 @@ A single figure of a policy depends on when it stops, so each plays missions wit
 look: the values of looks are computed and the Q-networks trained for each of them, with the
 detectors and the fusion of the run. Naive exploration plays with one to five looks. The oracle
 knows the classes: it looks at what its own sensor has to tell the map until that has the true class
-with some probability, along the shortest tour. Between two points of a curve, looks and time are
-interpolated linearly; intervals are a bootstrap over the arenas, the same for all policies.
+with some probability, along the shortest tour. `benchmarks.same_accuracy` compares the curves.
 """
 
 import dataclasses
@@ -16,15 +15,15 @@ import sys
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, cast
+from typing import Annotated, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
-from benchmarks import studies
+from benchmarks import same_accuracy, studies
 from benchmarks.measure import joined, reserve, save
+from benchmarks.same_accuracy import Points, as_block, stacked
 from jaxsense import Config, Key, Models, detections, mission
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
@@ -33,24 +32,18 @@ from jaxsense.dqn.policies import Known, Policy, Trained
 from jaxsense.mission import Mission, MissionState
 from jaxsense.models import make_agent
 from jaxsense.run import cli, devices
-from jaxsense.show.colours import policy_colour, policy_marker
 from jaxsense.sim.world import Scene, make_world
 from jaxsense.training import agents
 from jaxsense.training.perception import Detections, Starts
 from jaxsense.training.stage import Stage, compose
 
 PROGRAM = "benchmarks.curves"
-ACCURACIES = (0.95, 0.98, 0.99)
 ORACLE = (0.8, 0.95, 0.99)
 NAIVE = 5
 _BY_COST = ("latent", "greedy", "bayes", "optimal", "nearest", "auction", "rollout")
 _SAMPLES = 4000  # detections of each class by each sensor
 _CHUNK = 25  # control periods
-_DRAWS = 1000  # of the bootstrap
 _MOST_POIS = 6  # whose orders the oracle tries; it does not play with more
-
-Points = dict[str, np.ndarray]
-"""`accuracy`, `confidence`, `looks`, `time` of K points of a curve in E arenas, `[K, E]` each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -287,153 +280,6 @@ def _of(curves: Curves, models: Models, names: list[str]) -> Points:
     return stacked([curves.play(models, name) for name in names])
 
 
-def stacked(points: list[dict[str, np.ndarray]]) -> Points:
-    """A curve from its points.
-
-    Args:
-      points: figures of `Curves.play`, of K points.
-    """
-    return {key: np.stack([point[key] for point in points]) for key in points[0]}
-
-
-Need = dict[str, float | None]
-"""`mean` with `low` and `high`, of which the last is None if the policy may never get there."""
-
-
-def at_accuracy(points: Points, accuracy: float, key: str) -> Need | None:
-    """What a policy needs for an accuracy, with a 95% interval; None if it never gets there.
-
-    Args:
-      points: of its curve.
-      accuracy: to reach, on average over the arenas.
-      key: `looks` or `time`.
-    """
-    middle = _needed(points["accuracy"].mean(axis=1), points[key].mean(axis=1), accuracy)
-    if not np.isfinite(middle):
-        return None
-    arenas = points["accuracy"].shape[1]
-    draws = np.random.default_rng(0).integers(arenas, size=(_DRAWS, arenas))
-    again = [
-        _needed(
-            points["accuracy"][:, rows].mean(axis=1), points[key][:, rows].mean(axis=1), accuracy
-        )
-        for rows in draws
-    ]
-    ends = np.quantile(again, (0.025, 0.975), method="inverted_cdf")
-    low, high = (float(end) if np.isfinite(end) else None for end in ends)
-    return {"mean": float(middle), "low": low, "high": high}
-
-
-def _needed(accuracies: np.ndarray, needs: np.ndarray, accuracy: float) -> float:
-    """Least need for an accuracy along a line through points; infinite if none is as accurate."""
-    best = np.inf
-    for i, j in itertools.combinations_with_replacement(range(len(needs)), 2):
-        low, high = sorted((i, j), key=lambda k: accuracies[k])
-        if accuracies[high] < accuracy:
-            continue
-        if accuracies[low] >= accuracy:
-            best = min(best, needs[low])
-            continue
-        share = (accuracy - accuracies[low]) / (accuracies[high] - accuracies[low])
-        best = min(best, needs[low] + share * (needs[high] - needs[low]))
-    return float(best)
-
-
-def as_block(name: str, varies: dict[str, tuple], points: Points) -> dict:
-    """A curve for JSON.
-
-    Args:
-      name: of the policy.
-      varies: what varies along the curve.
-      points: of the curve.
-    """
-    means = {
-        key: [round(float(x), 4) for x in values.mean(axis=1)] for key, values in points.items()
-    }
-    needs = {
-        str(accuracy): {key: at_accuracy(points, accuracy, key) for key in ("looks", "time")}
-        for accuracy in ACCURACIES
-    }
-    return {
-        "policy": name,
-        **{key: list(values) for key, values in varies.items()},
-        **means,
-        "at": needs,
-    }
-
-
-def as_table(blocks: list[dict]) -> str:
-    """What every policy needs for each accuracy, as a Markdown table.
-
-    Args:
-      blocks: of `as_block`.
-    """
-
-    def text(need: Need | None, digits: int) -> str:
-        if need is None:
-            return "-"
-        mean, low, high = (
-            "?" if need[key] is None else f"{need[key]:.{digits}f}"
-            for key in ("mean", "low", "high")
-        )
-        return f"{mean} ({low} to {high})"
-
-    heads = [f"{key} at {a:g}" for key in ("looks", "time [s]") for a in ACCURACIES]
-    rows = [f"| policy | {' | '.join(heads)} |", "| --- |" + " --- |" * len(heads)]
-    for block in blocks:
-        cells = [
-            text(block["at"][str(a)][key], digits)
-            for key, digits in (("looks", 2), ("time", 1))
-            for a in ACCURACIES
-        ]
-        rows.append(f"| `{block['policy']}` | {' | '.join(cells)} |")
-    return "\n".join(rows)
-
-
-def table(results: Mapping[str, Any]) -> str:
-    """What every policy needs for each accuracy, in Markdown, and how that came.
-
-    Args:
-      results: the content of the JSON file.
-    """
-    return studies.with_origin(as_table(results["policies"]), results)
-
-
-def draw(blocks: list[dict]) -> Figure:
-    """Looks and time of every policy against its share of wrong PoIs.
-
-    Args:
-      blocks: of `as_block`.
-    """
-    figure = Figure(figsize=(11, 4.5), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, key, label in zip(
-        axes, ("looks", "time"), ("looks per PoI", "mean time of a mission [s]"), strict=True
-    ):
-        for block in blocks:
-            name = block["policy"]
-            if name == "random":
-                continue
-            order = np.argsort(block[key])
-            wrong = 100 * (1 - np.array(block["accuracy"]))[order]
-            axis.plot(
-                np.array(block[key])[order],
-                np.maximum(wrong, 0.05),
-                color="k" if name == "oracle" else policy_colour(name),
-                marker=policy_marker(name),
-                linewidth=2.5 if name == "latent" else 1.2,
-                linestyle=":" if name == "oracle" else "-",
-                label=name,
-            )
-        axis.set(xlabel=label, yscale="log", xlim=(0, None))
-        axis.yaxis.set(major_formatter="{x:g}", minor_formatter="{x:g}")
-        axis.grid(alpha=0.3, which="both")
-    axes[0].set_ylabel("wrong PoIs [%]")
-    handles = axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside upper center", ncols=len(handles[1]), frameon=False)
-    return figure
-
-
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
@@ -449,9 +295,9 @@ def main(argv: list[str] | None = None) -> None:
     blocks = [as_block(*curve) for curve in play_all(curves, arguments.costs, priced, models)]
     results = {**studies.origin(PROGRAM, arguments), "policies": blocks}
     studies.write(arguments.json, results)
-    print(table(results))
+    print(same_accuracy.table(results))
     if arguments.plot is not None:
-        save(PROGRAM, "plot", arguments.plot, draw(blocks))
+        save(PROGRAM, "plot", arguments.plot, same_accuracy.draw(blocks))
 
 
 if __name__ == "__main__":

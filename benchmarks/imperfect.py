@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import studies
-from benchmarks.curves import Curves, Need
+from benchmarks.curves import Curves
 from benchmarks.measure import reserve
+from benchmarks.same_accuracy import Need
 from benchmarks.where import as_cell, compare
 from jaxsense import Config, Models, mission
 from jaxsense.config import CommunicationConfig, ConfigError, LocalisationConfig, SearchConfig

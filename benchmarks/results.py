@@ -11,7 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import curves, exported, gate, imperfect, pipeline, place, recorded, where
+from benchmarks import (
+    exported,
+    gate,
+    imperfect,
+    pipeline,
+    place,
+    recorded,
+    same_accuracy,
+    where,
+)
 from benchmarks.digits import table as digits
 from benchmarks.fusions import table as fusions
 from benchmarks.raw import report as raw
@@ -119,7 +128,7 @@ TABLES: Mapping[str, _Tables] = {
     "where.json": {None: where.table, "accuracy": where.of_accuracies},
     **{name: {None: pipeline.table} for name in _PIPELINE},
     "place.json": {None: place.table},
-    "curves.json": {None: curves.table},
+    "curves.json": {None: same_accuracy.table},
     **{name: _IMPERFECT for name in ("imperfect_default.json", "imperfect_noisy.json")},
     "imperfect_trained.json": {None: partial(imperfect.of_sizes, sweeps=["both [m]"])},
     "imperfect_messages.json": {None: imperfect.of_messages},

@@ -22,8 +22,9 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from benchmarks import studies
-from benchmarks.curves import Curves, as_block, as_table, of_costs, stacked
+from benchmarks.curves import Curves, of_costs
 from benchmarks.measure import reserve
+from benchmarks.same_accuracy import as_block, as_table, stacked
 from jaxsense import Config, Key, Models, pytree
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import curves
+from benchmarks import curves, same_accuracy
 from jaxsense import PRESETS, init
 from jaxsense.dqn import team_mdp
 from jaxsense.dqn.policies import Known
@@ -22,18 +22,18 @@ def points(accuracies, looks):
 
 def test_needs_are_interpolated_between_points():
     # Half way between .94 and .96.
-    found = curves.at_accuracy(points([0.94, 0.96], [2.0, 3.0]), 0.95, "looks")
+    found = same_accuracy.at_accuracy(points([0.94, 0.96], [2.0, 3.0]), 0.95, "looks")
     assert found == pytest.approx({"mean": 2.5, "low": 2.5, "high": 2.5})
     # A point of more looks and less accuracy is of no use; nor is one that needs more for less.
-    found = curves.at_accuracy(points([0.97, 0.94, 0.99], [3.0, 5.0, 4.0]), 0.96, "time")
+    found = same_accuracy.at_accuracy(points([0.97, 0.94, 0.99], [3.0, 5.0, 4.0]), 0.96, "time")
     assert found["mean"] == pytest.approx(30.0)
-    assert curves.at_accuracy(points([0.9, 0.94], [1.0, 2.0]), 0.95, "looks") is None
+    assert same_accuracy.at_accuracy(points([0.9, 0.94], [1.0, 2.0]), 0.95, "looks") is None
 
 
 def test_intervals_are_of_arenas():
     found = points([0.96], [2.0])
     found["looks"] = np.linspace(1.0, 3.0, 10)[None]
-    need = curves.at_accuracy(found, 0.95, "looks")
+    need = same_accuracy.at_accuracy(found, 0.95, "looks")
     assert need["mean"] == pytest.approx(2.0)
     # Two standard errors of ten numbers of deviation .64: .40, of which a bootstrap has .38.
     assert need["low"] == pytest.approx(1.62, abs=0.06)
@@ -42,13 +42,13 @@ def test_intervals_are_of_arenas():
 
 def test_a_table_has_a_row_for_each_policy():
     blocks = [
-        curves.as_block("latent", {"look_cost": (0.1,)}, points([0.96], [2.0])),
-        curves.as_block("naive", {"looks": (1,)}, points([0.9], [1.0])),
+        same_accuracy.as_block("latent", {"look_cost": (0.1,)}, points([0.96], [2.0])),
+        same_accuracy.as_block("naive", {"looks": (1,)}, points([0.9], [1.0])),
     ]
-    *_, first, second = curves.as_table(blocks).splitlines()
+    *_, first, second = same_accuracy.as_table(blocks).splitlines()
     assert first.startswith("| `latent` | 2.00 (2.00 to 2.00) | - | - | 20.0 (20.0 to 20.0) |")
     assert second == "| `naive` | - | - | - | - | - | - |"
-    labels = curves.draw(blocks).axes[0].get_legend_handles_labels()[1]
+    labels = same_accuracy.draw(blocks).axes[0].get_legend_handles_labels()[1]
     assert labels == ["latent", "naive"]
 
 
