@@ -146,7 +146,7 @@ def verdict(played: dict[str, Case]) -> str | None:
       played: cases in the same arenas.
 
     Returns:
-      A sentence about median times; None unless both policies were played.
+      A sentence about mean times; None unless both policies were played.
     """
     if not {REFERENCE, "naive"} <= set(played):
         return None
@@ -169,5 +169,5 @@ def verdict(played: dict[str, Case]) -> str | None:
     }
     if faster:
         best = min(faster, key=lambda name: faster[name])
-        text += f" (and {against(best)}`{best}`)"
+        text += f" (and {against(best)}{best})"
     return f"{text}."

@@ -119,7 +119,7 @@ def test_the_verdict_names_naive_exploration_and_the_fastest_policy():
     faster = "The latent policy is 10 % faster than naive exploration"
     assert compare.verdict({**NAIVE, "latent": latent, **wrong}) == f"{faster}."
     found = compare.verdict({**NAIVE, "latent": latent, **others, **wrong})
-    assert found == f"{faster} (and 20 % slower than `auction`)."
+    assert found == f"{faster} (and 20 % slower than auction)."
     assert compare.verdict(NAIVE) is None
     quick = {**NAIVE, "naive_3": block(0.99, 6.0, 20.0), "latent": latent}
     assert compare.verdict(quick) == f"{faster}."
