@@ -199,7 +199,7 @@ def test_the_demo_writes_one_page_with_both_films(played, capsys):
     # Both halves of each film, as they play and stopped.
     assert text.count("data:image/svg+xml;base64,") == 2 * 2 * 2
     assert '<div class="film pair">' in text
-    assert "python -m jaxsense.demo --preset default --seed 1" in text
+    assert "python -m jaxsense.demo --preset default --seed 3" in text
     assert 'load_pretrained("default")' in text
     assert "one mission of many" in text
     assert "under <i>What learning is worth</i>" in text

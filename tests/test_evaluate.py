@@ -125,8 +125,8 @@ def test_paths_are_printed_as_they_are(evaluated, tmp_path, capsys):
         rich.console.Console(width=80, force_terminal=True, color_system=None), blocks, 1
     )
     printed = capsys.readouterr().out
-    assert "The latent policy is" in printed
-    assert max(map(len, printed.split("The latent")[0].splitlines())) <= 80
+    assert "By median times, the latent policy is" in printed
+    assert max(map(len, printed.split("By median times")[0].splitlines())) <= 80
 
 
 def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):

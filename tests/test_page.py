@@ -96,7 +96,7 @@ def rows_of(text):
 
 def test_figures_stand_in_tables(read):
     columns, *rows = [row for row in read.rows if len(row) > 1]
-    assert columns == ["", "right", "looks per PoI", "time [s]", "collisions", "unfinished"]
+    assert columns == ["", "right", "looks per PoI", "median time [s]", "collisions", "unfinished"]
     assert rows[0] == ["latent", "0.998", "1.68", "13.8", "0", "1 time limit"]
     rows = [tuple(row) for row in rows]
     assert ("camera", "0.9995", "0.0100", "0.0200") in rows
@@ -132,7 +132,7 @@ def test_main_results_stand_beside_what_they_are_compared_with(tmp_path):
     assert "<td><b>1.68</b></td>" in text
     assert "<td><b>13.8</b></td>" in text
     assert "<b>9.0</b>" not in text
-    assert "The latent policy is 8 % faster than naive exploration." in text
+    assert "By median times, the latent policy is 8 % faster than naive exploration." in text
 
 
 def test_what_took_longest_stands_below_the_chart(tmp_path):

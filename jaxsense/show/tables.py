@@ -136,12 +136,26 @@ def failures(block: Missions) -> Table:
     return _missions(failing, "The latent policy, with a robot that is alone, stops or goes blind")
 
 
+_AGAINST = {"against naive": "Difference of the median time from that of naive exploration."}
+_UNFINISHED = {
+    "unfinished": (
+        "Number of missions that ended otherwise than by the choice of all robots. `time limit`: "
+        "after `mission.time_limit`; `unreachable`: a robot gave up a PoI that it could not get "
+        "to; `undetected`: it gave one up after looks that showed nothing; `exhausted`: it left "
+        "one at which looks paid, but none from anywhere would have been new; `robot failed`: the "
+        "others finished; `no robot left`: all failed."
+    ),
+    "in bold": "The best value of the policies that label as many PoIs right as the best one.",
+}
+
+
 def _missions(played: Mapping[str, Case], caption: str) -> Table:
     keys = "accuracy", "observations_per_poi", "time_s", "collisions"
     table = _table(caption, played, [MISSIONS[key] for key in keys])
     values = [[mean(case[key]) for key in keys[:3]] for case in played.values()]
     most = max((accuracy for accuracy, *_ in values), default=0.0)
-    able = [row for row in values if row[0] >= most - AS_ACCURATE and len(values) > 1]
+    able = [row for row in values if row[0] >= most - AS_ACCURATE]
+    able = able if len(able) > 1 else []  # nothing to compare with
     best = {(r, c) for r, row in enumerate(values) for c in range(1, 3) if row in able
             and row[c] == min(each[c] for each in able)}  # fmt: skip
     best |= {(r, 0) for r, row in enumerate(values) if able and row[0] == most}
@@ -153,7 +167,8 @@ def _missions(played: Mapping[str, Case], caption: str) -> Table:
         rows.append((name, [*texts[:3], *against, *texts[3:], unfinished]))
     against = ["against naive"] if "naive" in played else []
     columns = [*table.columns[:3], *against, *table.columns[3:], "unfinished"]
-    return Table(caption, columns, rows, table.meanings, frozenset(best))
+    meanings = {**table.meanings, **(_AGAINST if against else {}), **_UNFINISHED}
+    return Table(caption, columns, rows, meanings, frozenset(best))
 
 
 def all_of_missions(block: Missions) -> Table:

@@ -203,7 +203,7 @@ class Differences(TypedDict):
     """`mission.POLICY.intervals`: from the latent policy, arena by arena, with 95% intervals."""
 
     accuracy: Annotated[
-        Interval, Metric("right, difference", "Difference from `latent`, with 95% interval.")
+        Interval, Metric("right, difference", "Difference from `latent`, with 95 % interval.")
     ]
     observations_per_poi: Annotated[
         Interval, Metric("looks, difference", "Difference from `latent` in looks per PoI.", 2)
@@ -240,7 +240,7 @@ class Case(TypedDict):
 
     accuracy: Annotated[float, Metric("right", "Share of PoIs whose most likely class is right.")]
     observations_per_poi: Annotated[float, Metric("looks per PoI", "Mean number of looks.", 2)]
-    time_s: Annotated[float, Metric("time [s]", "Median time until all robots are done.", 1)]
+    time_s: Annotated[float, Metric("median time [s]", "Median time until all robots are done.", 1)]
     mean_time_s: Annotated[
         float,
         Metric("mean time [s]", "Mean time until all robots are done.", 1),

@@ -146,7 +146,7 @@ def verdict(played: dict[str, Case]) -> str | None:
       played: cases in the same arenas.
 
     Returns:
-      A sentence about mean times; None unless both policies were played.
+      A sentence about median times; None unless both policies were played.
     """
     if not {REFERENCE, "naive"} <= set(played):
         return None
@@ -158,7 +158,9 @@ def verdict(played: dict[str, Case]) -> str | None:
             return "as fast as "
         return f"{abs(percent):.0f} % {'faster' if percent < 0 else 'slower'} than "
 
-    text = f"The latent policy is {against('naive')}naive exploration"
+    text = f"By median times, the latent policy is {against('naive')}naive exploration"
+    if mean(own["accuracy"]) <= mean(played["naive"]["accuracy"]) - AS_ACCURATE:
+        text += ", but labels fewer PoIs right"
     faster = {
         name: mean(case["time_s"])
         for name, case in played.items()
