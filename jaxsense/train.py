@@ -383,8 +383,8 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
         print_table(console, table)
     if verdict := compare.verdict(summary.cases(found["mission"])):
         say(verdict)
-    if settings.preset == "smoke":
-        say("Preset smoke only checks that everything runs: its policies are not meant to be good.")
+    if caution := compare.caution(settings.preset):
+        say(caution)
     if unsound := compare.unsound(found["belief"]):
         say(unsound)
 

@@ -109,6 +109,7 @@ def test_a_run_of_smoke_ends_by_saying_what_it_is_good_for(smoke_run, monkeypatc
     *told, where, following = capsys.readouterr().out.splitlines()
     only = "Preset smoke only checks that everything runs: its policies are not meant to be good."
     assert only in told
+    assert only in (smoke_run / "report.html").read_text()
     assert where == f"Results are in {smoke_run}. Start with {smoke_run / 'report.html'}."
     assert following == f"Next: python -m jaxsense.evaluate {smoke_run} --animate"
 

@@ -49,6 +49,7 @@ def render(
         argument=lambda path: shlex.quote(str(path)),
         trust=" --trust" if config.sensors else "",
         summary=summary,
+        caution=compare.caution(summary["preset"]),
         unsound=compare.unsound(summary["belief"]),
         cards=tables.cards(summary),
         missions=[here, *elsewhere],

@@ -24,6 +24,11 @@ _CONFIDENCE = 0.95
 _NAIVE = ("naive", "naive_2", "naive_3")
 _MOST_TIMES, _MOST_NATS = 1.2, 0.01  # NLL of a sound map, of that of exact Bayes
 _AS_FAST = 0.005  # share of a time that does not matter
+_CAUTIONS = {
+    "smoke": (
+        "Preset smoke only checks that everything runs: its policies are not meant to be good."
+    )
+}
 
 
 def bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,6 +142,11 @@ def unsound(block: Beliefs) -> str | None:
         f"{bayes:.2f}. Try jmvae.fusion = filter, a larger jmvae.latent_size, or more "
         "jmvae.restarts."
     )
+
+
+def caution(preset: str) -> str | None:
+    """What to keep in mind about all results of a preset; None for most."""
+    return _CAUTIONS.get(preset)
 
 
 def verdict(played: dict[str, Case]) -> str | None:
