@@ -138,8 +138,7 @@ _TEAM = Config(
         epsilon_min=0.05,
         target_period=5,
     ),
-    # Three times as many take a quarter of a training and change no figure.
-    evaluation=EvaluationConfig(num_pois=(3, 8, 20), num_repeats=32),
+    evaluation=EvaluationConfig(num_pois=(3, 8, 20)),
     mission=MissionConfig(
         policies=("latent", "nearest", "auction", "rollout", "naive", "random"), time_limit=300.0
     ),
