@@ -38,8 +38,9 @@ class Arguments:
     policy: str = "latent"
     """Policy to compare with naive exploration: `latent` (the learned policy), `greedy`, `bayes`,
     `optimal`, `naive_2`, `naive_3`, `random`, `nearest`, `auction` or `rollout`."""
-    seed: int = 2  # in whose arena the learned policy skips looks, as in most
-    """Seed of the arena and of all noise, from 0 to 2^32 - 1."""
+    seed: int = 2
+    """Seed of the arena and of all noise, from 0 to 2^32 - 1. Looks can be skipped in the arenas of
+    2 and 3, not in those of 0 and 1."""
     out: Path | None = None
     """Directory for the page, new or empty; by default `runs/DATE-TIME-demo-PRESET`."""
     browser: bool = True

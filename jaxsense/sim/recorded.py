@@ -150,7 +150,6 @@ def fit_noise(
     Raises:
       ValueError: if the scans show too few straight walls or edges.
     """
-    ranges = resampling.with_returns(ranges)
     residuals, distances = wall_residuals(angles, ranges)
     free = _BEAMS - 2  # a line has two parameters
     unbiased = np.sqrt(scipy.special.chdtri(free, 0.5) / free)
@@ -167,7 +166,7 @@ def fit_noise(
     middles = [np.median(distances[within][bins == i]) for i in kept]
     medians = [np.median(spread[within][bins == i]) for i in kept]
     growth, noise = np.polyfit(middles, medians, 1, w=np.sqrt(number[kept]))
-    mixed, dropout = _edges(ranges, config.max_range)
+    mixed, dropout = _edges(resampling.with_returns(ranges), config.max_range)
     found = {"range_noise": noise, "range_noise_growth": growth, "mixed_pixels": mixed}
     rounded = {name: round(max(float(x), 0.0), 5) for name, x in found.items()}
     return dataclasses.replace(config, **rounded, dropout=round(dropout, 5))
