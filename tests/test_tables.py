@@ -27,3 +27,11 @@ def test_every_agent_must_have_the_papers_task():
     assert tables.paper(SUMMARY) is not None
     other = {"camera": camera, "lidar": {**camera, "num_permutations": 200}}
     assert tables.paper({**SUMMARY, "dqn": other}) is None
+
+
+def test_where_one_alone_is_as_accurate_as_the_best_only_its_accuracy_is_marked():
+    worse = {**CASE, "accuracy": CASE["accuracy"] - 0.1}
+    table = tables.missions(played(latent=CASE, naive=worse), "")
+    assert table.best == {(0, 0)}
+    assert {"against naive", "unfinished", "in bold"} <= set(table.meanings)
+    assert "against naive" not in tables.missions(played(latent=CASE), "").meanings

@@ -155,10 +155,10 @@ def _missions(played: Mapping[str, Case], caption: str) -> Table:
     values = [[mean(case[key]) for key in keys[:3]] for case in played.values()]
     most = max((accuracy for accuracy, *_ in values), default=0.0)
     able = [row for row in values if row[0] >= most - AS_ACCURATE]
-    able = able if len(able) > 1 else []  # nothing to compare with
+    # A value alone is not the best of any.
     best = {(r, c) for r, row in enumerate(values) for c in range(1, 3) if row in able
-            and row[c] == min(each[c] for each in able)}  # fmt: skip
-    best |= {(r, 0) for r, row in enumerate(values) if able and row[0] == most}
+            and len(able) > 1 and row[c] == min(each[c] for each in able)}  # fmt: skip
+    best |= {(r, 0) for r, row in enumerate(values) if len(values) > 1 and row[0] == most}
     rows = []
     for (name, texts), case in zip(table.rows, played.values(), strict=True):
         ends = {reason: mean(n) for reason, n in case["ended"].items() if reason != "finished"}

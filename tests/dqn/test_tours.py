@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from toys import SENSORS, Fixed, classes_mdp
 
-from jaxsense.config import TeamConfig, ToursConfig, TravelConfig
+from jaxsense.config import PRESETS, TeamConfig, ToursConfig, TravelConfig
 from jaxsense.core import networks, supervised
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import team_mdp, tours
 from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.dqn.team_mdp import Team, TeamMdp
 from jaxsense.dqn.tours import Trials
+from jaxsense.models import init
 
 TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
 # In a row, 1.9 and 3.9 m from two robots at the origin; the third is not present.
@@ -282,3 +283,11 @@ def test_without_tours_a_look_no_better_than_one_at_a_known_poi_comes_last(monke
     values = jax.jit(lambda: AGENT.decide({}, (), classes=CLASSES, **AT_ORIGIN))()
     assert values[0] > values[3] == 0 > values[1]
     assert jnp.isnan(values[2])
+
+
+def test_no_two_networks_start_alike():
+    config = PRESETS["team"]
+    models = init(jax.random.key(0), config)
+    firsts = [jax.tree.leaves(x)[-1] for x in (*models.q_networks, *models.tours)]
+    for i, one in enumerate(firsts):
+        assert all(not np.array_equal(one, other) for other in firsts[i + 1 :])
