@@ -65,6 +65,11 @@ COMMANDS: Mapping[str, Command] = {
         # The policies of others play among as many PoIs as they were trained with.
         trains=("--preset", "smoke", "--dqn.task", "team"),
     ),
+    "noisy": Command(
+        "`evaluate RUN --episodes 1024` of `noisy`, warm",
+        ("jaxsense.evaluate", "{run}", "--episodes", "1024"),
+        trains=("--preset", "noisy"),
+    ),
 }
 """What is measured, by the names of the option `commands`."""
 
@@ -75,8 +80,8 @@ class Arguments:
 
     commit: Annotated[str, Name("COMMIT")]
     """The earlier tree."""
-    commands: tuple[str, ...] = tuple(COMMANDS)
-    """Which ones."""
+    commands: tuple[str, ...] = ("cold", "warm", "team", "missions")
+    """Which ones. `noisy`, besides, is for accelerators."""
     pairs: int = limited(1, at_least=1)
     """How often each tree is measured; the medians count."""
     json: Path | None = None

@@ -68,7 +68,7 @@ def test_the_table_holds_medians_and_their_ratios(ran, tmp_path, monkeypatch, ca
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["HEAD", "--commands", "warmer"], "must be one of cold, warm, team, missions"),
+        (["HEAD", "--commands", "warmer"], "must be one of cold, warm, team, missions, noisy"),
         (["0000000"], "commit = '0000000': fatal: "),
     ],
 )
