@@ -164,6 +164,17 @@ def test_pois_that_are_certain_are_listed_at_their_class():
     found = [t for t in moving.iter(f"{SVG}text") if "film-label" in t.get("class")]
     labels = {t.text: t for t in found}
     assert set(labels) == {"green cylinder", "red cylinder", "2", "red cube"}
+    # Each also below the beliefs, where it covers the ring of what nobody has seen, and no belief.
+    parents = {child: parent for parent in moving.iter() for child in parent}
+    siblings = list(parents[labels["red cube"]])
+    (ring,) = (e for e in moving.iter(f"{SVG}ellipse") if e.get("fill") == "none")
+    first, last = (siblings.index(each) for each in (beliefs(moving)[0], beliefs(moving)[-1]))
+    for text, above in labels.items():
+        (below,) = (t for t in found if t.text == text and t is not above)
+        assert "film-on-floor" in below.get("class")
+        assert siblings.index(ring) < siblings.index(below) < first
+        assert last < siblings.index(above)
+        assert below.get("y") == above.get("y")
     is_told = frames(labels["2"], "opacity")
     np.testing.assert_array_equal(np.flatnonzero(is_told), np.arange(41, 60))
     # The name of the class stands between its place and the numbers.
@@ -177,6 +188,22 @@ def test_pois_that_are_certain_are_listed_at_their_class():
         texts = [t for t in moving.iter(f"{SVG}text") if t.text == never]
         (in_map,) = (t for t in texts if t.get("class") == "film-number film-on-light")
         assert not frames(in_map, "opacity").any()
+
+
+def test_the_legend_names_every_sign_of_the_map(picture):
+    for name in ("film-moving", "film-still"):
+        notes = [t for t in part(picture, name).iter(f"{SVG}text") if t.get("class") == "film-note"]
+        assert sum((t.text or "").startswith("Dotted circle:") for t in notes) == 1
+        height = float(picture.get("viewBox").split()[3])
+        assert max(float(t.get("y")) for t in notes) < height - 8
+
+
+def test_the_legend_fits_below_a_single_robot():
+    config = dataclasses.replace(CONFIG, robots=("camera",))
+    picture = ElementTree.fromstring(draw(config))
+    notes = [t for t in picture.iter(f"{SVG}text") if t.get("class") == "film-note"]
+    height = float(picture.get("viewBox").split()[3])
+    assert max(float(t.get("y")) for t in notes) < height - 8
 
 
 def test_films_that_last_equally_long_stay_together():

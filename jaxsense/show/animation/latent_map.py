@@ -56,6 +56,7 @@ class MapView:
         is_seen = np.any(record.seen, axis=-1)
         is_certain = is_seen & (self._probabilities.max(axis=-1) >= _CERTAIN)
         self._draw_unknown(parent, timeline, is_seen)
+        self._draw_labels(parent, timeline, colours, is_certain, "film-on-floor")
         numbers = add(parent, "g")
         for n in range(arena.num_pois):
             colour = colours[int(self._end.classes[n])]
@@ -72,7 +73,7 @@ class MapView:
             is_open = is_seen[:, n] & ~is_certain[:, n]
             text = add(number, "text", str(n + 1), class_="film-number film-on-light", fill=colour)
             timeline.animate(text, "opacity", is_open, jumps=True)
-        self._draw_labels(parent, timeline, colours, is_certain)
+        self._draw_labels(parent, timeline, colours, is_certain, "film-on-light")
 
     def _draw_unknown(self, parent: Element, timeline: Timeline, is_seen: np.ndarray) -> None:
         """One ring for all PoIs that nobody has seen, `[F, N]`, and their numbers."""
@@ -86,12 +87,21 @@ class MapView:
         timeline.animate(ring, "opacity", ~is_seen.all(axis=1), jumps=True)
         numbers = [_listed(~seen) for seen in is_seen]
         texts = [f"unknown: {each}" if each else "" for each in numbers]
-        strip(parent, timeline, texts, x=8, y=18, class_="film-unknown film-start film-on-light")
+        style = "film-unknown film-start film-on-floor"
+        strip(parent, timeline, texts, x=8, y=18, class_=style)
 
     def _draw_labels(
-        self, parent: Element, timeline: Timeline, colours: list[str], is_certain: np.ndarray
+        self,
+        parent: Element,
+        timeline: Timeline,
+        colours: list[str],
+        is_certain: np.ndarray,
+        around: str,
     ) -> None:
-        """The classes and, beyond their names, the PoIs that are certain to be of them."""
+        """The classes and, beyond their names, the PoIs that are certain to be of them.
+
+        Drawn below the ellipses they cover the ring, drawn above these they can be read.
+        """
         likeliest = self._probabilities.argmax(axis=-1)
         for c, (label, colour) in enumerate(zip(self._config.arena.classes, colours, strict=True)):
             x, y = self._place(self._means[c])
@@ -100,7 +110,7 @@ class MapView:
             numbers = [_listed(of_class) for of_class in is_certain & (likeliest == c)]
             half = min(_LETTER * max(map(len, [label, *numbers])), SIZE / 2)
             style = {"x": np.clip(x, half, SIZE - half), "fill": colour}
-            style["class_"] = "film-label film-on-light"
+            style["class_"] = f"film-label {around}"
             add(parent, "text", label, y=y, **style)
             strip(parent, timeline, numbers, y=y + side * _NEXT_LINE, **style)
 
