@@ -6,6 +6,7 @@ import re
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
+import jax
 import numpy as np
 import pytest
 from recordings import CONFIG, FIELDS_OF_VIEW, FUSION, recording
@@ -188,6 +189,55 @@ def test_pois_that_are_certain_are_listed_at_their_class():
         texts = [t for t in moving.iter(f"{SVG}text") if t.text == never]
         (in_map,) = (t for t in texts if t.get("class") == "film-number film-on-light")
         assert not frames(in_map, "opacity").any()
+
+
+@pytest.fixture
+def crowd():
+    """Twelve PoIs in a wide arena, all like the second one, which is seen in period 40."""
+    arena = dataclasses.replace(CONFIG.arena, num_pois=12, side=6.0)
+    played = recording()
+    records, layout = played.records, played.end.scene.layout
+    belief = jax.tree.map(lambda x: np.repeat(x[:, 1:2], 12, axis=1), records.belief)
+    seen = np.repeat(records.seen[:, 1:2], 12, axis=1)
+    layout.position = np.stack([np.tile([-2.0, -0.7, 0.7, 2.0], 3), np.repeat([-2, 0, 2], 4)], -1)
+    layout.yaw, layout.shape = np.zeros(12), np.zeros(12, int)
+    end = SimpleNamespace(**{**vars(played.end), "classes": np.ones(12, int)})
+    records = dataclasses.replace(records, belief=belief, seen=seen)
+    config = dataclasses.replace(CONFIG, arena=arena)
+    return ElementTree.fromstring(draw(config, type(played)(end, records)))
+
+
+def test_many_numbers_at_a_class_stand_in_lines(crowd):
+    labels = [
+        t
+        for t in part(crowd, "film-still").iter(f"{SVG}text")
+        if t.get("class") == "film-label film-on-light"
+    ]
+    shown = {t.text: float(t.get("y")) for t in labels if t.get("opacity") != "0"}
+    lines = ["1, 2, 3, 4, 5", "6, 7, 8, 9, 10", "11, 12"]
+    assert set(shown) == {*CONFIG.arena.classes, *lines}
+    steps = np.diff([shown[text] for text in ("red cylinder", *lines)])
+    assert np.all(np.abs(steps) >= 14)
+    assert len(set(np.sign(steps))) == 1
+    assert all(10 < y < 340 for y in shown.values())
+
+
+def test_bars_cover_no_number_of_a_small_poi(crowd):
+    arena = part(crowd, "film-still")
+    upwards = r"translate\((\S+) (\S+)\) scale\(1 -1\)"
+    bars = [re.match(upwards, g.get("transform", "")) for g in arena.iter(f"{SVG}g")]
+    left, bottom = np.array([[float(x) for x in bar.groups()] for bar in bars if bar]).T
+    groups = [
+        g for g in arena.iter(f"{SVG}g") if any(t.text == "12" for t in g.findall(f"{SVG}text"))
+    ]
+    x, y = map(float, re.findall(r"[\d.]+", groups[0].get("transform")))
+    (number,) = groups[0].findall(f"{SVG}text")
+    middle = x + float(number.get("x"))
+    is_level = (bottom > y - 6) & (bottom - 24 < y + 6)  # with the digits, 12 px high
+    apart = np.maximum(
+        left - (middle + 9), (middle - 9) - (left + 18)
+    )  # 9 px for each of two digits
+    assert apart[is_level].min() >= 0
 
 
 def test_the_legend_names_every_sign_of_the_map(picture):

@@ -1,5 +1,6 @@
 """The right half of the picture: the shared map."""
 
+import itertools
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxsense.show.animation.svg import SIZE, Timeline, add, smooth, strip
 from jaxsense.show.colours import as_hex, class_colour, in_plane, plane
 
 _CERTAIN = 0.9  # probability of a class from which on a PoI stands at its name
-_MOST_ABREAST = 4  # numbers
+_MOST_ABREAST, _MOST_LISTED = 4, 5  # numbers, of PoIs at one place and in a line of a list
 _LETTER, _NEXT_LINE = 3.9, 16.0  # px, of a label: half a letter, and from line to line
 
 
@@ -107,12 +108,15 @@ class MapView:
             x, y = self._place(self._means[c])
             side = -1 if self._means[c, 1] >= 0 else 1
             y += side * (self._scale * self._stds[c, 1] + 12) + 5
-            numbers = [_listed(of_class) for of_class in is_certain & (likeliest == c)]
-            half = min(_LETTER * max(map(len, [label, *numbers])), SIZE / 2)
+            lists = [_lines(of_class) for of_class in is_certain & (likeliest == c)]
+            longest = max(map(len, [label, *itertools.chain(*lists)]))
+            half = min(_LETTER * longest, SIZE / 2)
             style = {"x": np.clip(x, half, SIZE - half), "fill": colour}
             style["class_"] = f"film-label {around}"
             add(parent, "text", label, y=y, **style)
-            strip(parent, timeline, numbers, y=y + side * _NEXT_LINE, **style)
+            of_line = itertools.zip_longest(*lists, fillvalue="")
+            for i, numbers in enumerate(of_line):
+                strip(parent, timeline, [*numbers], y=y + side * _NEXT_LINE * (i + 1), **style)
 
     def _radii(self, std: ArrayLike) -> np.ndarray:
         """`[..., D]` standard deviations in px; before the first look they exceed the view."""
@@ -126,6 +130,13 @@ class MapView:
 def _listed(chosen: np.ndarray) -> str:
     """The numbers of the chosen `[N]` PoIs."""
     return ", ".join(str(n + 1) for n in np.flatnonzero(chosen))
+
+
+def _lines(chosen: np.ndarray) -> list[str]:
+    """The numbers of the chosen `[N]` PoIs, in lines that leave room for other classes."""
+    numbers = [str(n + 1) for n in np.flatnonzero(chosen)]
+    starts = range(0, len(numbers), _MOST_LISTED)
+    return [", ".join(numbers[i : i + _MOST_LISTED]) for i in starts]
 
 
 def _beside(n: int, num_pois: int) -> np.ndarray:
