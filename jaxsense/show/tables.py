@@ -36,8 +36,8 @@ _PAPER = {
 _RULES = ("nearest", "auction", "rollout")  # written by hand, and learned by none
 _NO_BOUND = (
     "The optimal policy decides by the expected rewards of looks, not by what the map made of "
-    "them: on a poor map, or from few starts, another policy can get more. With over 1 % and two "
-    "standard errors more, no policy would be called optimal here."
+    "them: on a poor map, or from few starts, another policy can get more. With a lead of over 1 % "
+    "and two standard errors, the table would name no optimal policy."
 )
 _YES_OR_NO = {0.0: "no", 1.0: "yes"}
 
@@ -136,7 +136,9 @@ def unambiguous(results: Results, classes: tuple[str, ...]) -> Table:
         if is_paper:
             here += f" / {_YES_OR_NO[name == 'joint' or (classes[c], name) in _PAPER_CERTAIN]}"
         norm, consistent = (mean(block[key][name][c]) for key in ("sigma_norm", "consistent"))
-        return f"{here} ({consistent:.1%}, {norm:.2f})".replace(" ", "\u00a0")
+        return " ".join(
+            part.replace(" ", "\u00a0") for part in (here, f"({consistent:.1%}, {norm:.2f})")
+        )
 
     caption = "Is a class certain?" + is_paper * " Here / in the paper's Table I"
     rows = [(label, [cell(c, name) for name in columns]) for c, label in enumerate(classes)]
