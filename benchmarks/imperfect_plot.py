@@ -45,7 +45,7 @@ class Arguments:
     sweeps: tuple[str, ...] | None = None
     """What gets worse, a column for each; by default all that every curve has. Curves that lack one
     of those named are left out."""
-    plot: Path = Path("imperfect.png")
+    plot: Path = Path("imperfect.svg")
     """Picture to write; must be new."""
 
     def __post_init__(self):

@@ -31,8 +31,8 @@ _OTHERWISE: Mapping[str, str] = {
 _OF_IMPERFECT = ("imperfect_default", "imperfect_noisy")
 _OF_RAW = ("raw_ablation", "raw_ratio", "raw_depth")
 _SWEEPS = {
-    "imperfect.png": ("position [m]", "heading [deg]", "both [m]"),
-    "imperfect_drift.png": ("position drift [m]", "heading drift [deg]", "both drifts [m]"),
+    "imperfect.svg": ("position [m]", "heading [deg]", "both [m]"),
+    "imperfect_drift.svg": ("position drift [m]", "heading drift [deg]", "both drifts [m]"),
 }
 
 
@@ -98,14 +98,14 @@ def draw(names: Collection[str]) -> None:
     plot = [sys.executable, "-m", "benchmarks.imperfect_plot"]
     if "imperfect_messages" in names:
         figures = ["--figures", "accuracy", "own", "nll", "time"]
-        _replace([*plot, *_files("imperfect_messages"), *figures], "imperfect_messages.png")
+        _replace([*plot, *_files("imperfect_messages"), *figures], "imperfect_messages.svg")
     if not {*_OF_IMPERFECT}.isdisjoint(names):
         for picture, sweeps in _SWEEPS.items():
             _replace([*plot, *_files(*_OF_IMPERFECT), "--sweeps", *sweeps], picture)
     if not {*_OF_RAW}.isdisjoint(names):
         report = [sys.executable, "-m", "benchmarks.raw.report", *_files(*_OF_RAW)]
-        _replace(report, "raw_ablation.png")
-        _replace(report, "raw_posteriors.png", "--posteriors")
+        _replace(report, "raw_ablation.svg")
+        _replace(report, "raw_posteriors.svg", "--posteriors")
 
 
 def _files(*names: str) -> list[str]:

@@ -116,7 +116,7 @@ def _page(
     )
 
     def film(name: str) -> html.Film:
-        recording, title = played[name].recording, f"{name} policy".replace("_", " ")
+        recording, title = played[name].recording, f"{name} policy"
         drawn = animation.draw(
             scenario.config,
             recording.records,

@@ -159,7 +159,7 @@ def _write(
     run, written, place = arguments.run, [], _place(config)
     if arguments.animate:
         name = next(iter(summary.cases(missions)))
-        title = f"{name} policy, seed {arguments.seed}".replace("_", " ")
+        title = f"{name} policy, seed {arguments.seed}"
         suffix = ""
         if config != trained:
             suffix = f"-{place}"
@@ -257,11 +257,7 @@ def _print(console: rich.console.Console, missions: summary.Missions, episodes: 
             print_table(console, table)
     if verdict := compare.verdict(summary.cases(missions)):
         say(verdict)
-    size = summary.traffic(missions)
-    say(
-        f"A detection takes {size['latent']:.0f} bytes in the map, {size['features']:.0f} as the "
-        f"detector's features and {size['raw']:.0f} as a raw scan."
-    )
+    say(compare.detection_sizes(missions))
 
 
 if __name__ == "__main__":

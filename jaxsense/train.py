@@ -383,10 +383,8 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
         print_table(console, table)
     if verdict := compare.verdict(summary.cases(found["mission"])):
         say(verdict)
-    if caution := compare.caution(settings.preset):
-        say(caution)
-    if unsound := compare.unsound(found["belief"]):
-        say(unsound)
+    for remark in compare.remarks(settings.preset, found["belief"]):
+        say(remark)
 
 
 if __name__ == "__main__":

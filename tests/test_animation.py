@@ -6,6 +6,7 @@ import re
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
+import jax
 import numpy as np
 import pytest
 from recordings import CONFIG, FIELDS_OF_VIEW, FUSION, recording
@@ -164,6 +165,17 @@ def test_pois_that_are_certain_are_listed_at_their_class():
     found = [t for t in moving.iter(f"{SVG}text") if "film-label" in t.get("class")]
     labels = {t.text: t for t in found}
     assert set(labels) == {"green cylinder", "red cylinder", "2", "red cube"}
+    # Each also below the beliefs, where it covers the ring of what nobody has seen, and no belief.
+    parents = {child: parent for parent in moving.iter() for child in parent}
+    siblings = list(parents[labels["red cube"]])
+    (ring,) = (e for e in moving.iter(f"{SVG}ellipse") if e.get("fill") == "none")
+    first, last = (siblings.index(each) for each in (beliefs(moving)[0], beliefs(moving)[-1]))
+    for text, above in labels.items():
+        (below,) = (t for t in found if t.text == text and t is not above)
+        assert "film-on-floor" in below.get("class")
+        assert siblings.index(ring) < siblings.index(below) < first
+        assert last < siblings.index(above)
+        assert below.get("y") == above.get("y")
     is_told = frames(labels["2"], "opacity")
     np.testing.assert_array_equal(np.flatnonzero(is_told), np.arange(41, 60))
     # The name of the class stands between its place and the numbers.
@@ -177,6 +189,71 @@ def test_pois_that_are_certain_are_listed_at_their_class():
         texts = [t for t in moving.iter(f"{SVG}text") if t.text == never]
         (in_map,) = (t for t in texts if t.get("class") == "film-number film-on-light")
         assert not frames(in_map, "opacity").any()
+
+
+@pytest.fixture
+def crowd():
+    """Twelve PoIs in a wide arena, all like the second one, which is seen in period 40."""
+    arena = dataclasses.replace(CONFIG.arena, num_pois=12, side=6.0)
+    played = recording()
+    records, layout = played.records, played.end.scene.layout
+    belief = jax.tree.map(lambda x: np.repeat(x[:, 1:2], 12, axis=1), records.belief)
+    seen = np.repeat(records.seen[:, 1:2], 12, axis=1)
+    layout.position = np.stack([np.tile([-2.0, -0.7, 0.7, 2.0], 3), np.repeat([-2, 0, 2], 4)], -1)
+    layout.yaw, layout.shape = np.zeros(12), np.zeros(12, int)
+    end = SimpleNamespace(**{**vars(played.end), "classes": np.ones(12, int)})
+    records = dataclasses.replace(records, belief=belief, seen=seen)
+    config = dataclasses.replace(CONFIG, arena=arena)
+    return ElementTree.fromstring(draw(config, type(played)(end, records)))
+
+
+def test_many_numbers_at_a_class_stand_in_lines(crowd):
+    labels = [
+        t
+        for t in part(crowd, "film-still").iter(f"{SVG}text")
+        if t.get("class") == "film-label film-on-light"
+    ]
+    shown = {t.text: float(t.get("y")) for t in labels if t.get("opacity") != "0"}
+    lines = ["1, 2, 3, 4, 5", "6, 7, 8, 9, 10", "11, 12"]
+    assert set(shown) == {*CONFIG.arena.classes, *lines}
+    steps = np.diff([shown[text] for text in ("red cylinder", *lines)])
+    assert np.all(np.abs(steps) >= 14)
+    assert len(set(np.sign(steps))) == 1
+    assert all(10 < y < 340 for y in shown.values())
+
+
+def test_bars_cover_no_number_of_a_small_poi(crowd):
+    arena = part(crowd, "film-still")
+    upwards = r"translate\((\S+) (\S+)\) scale\(1 -1\)"
+    bars = [re.match(upwards, g.get("transform", "")) for g in arena.iter(f"{SVG}g")]
+    left, bottom = np.array([[float(x) for x in bar.groups()] for bar in bars if bar]).T
+    groups = [
+        g for g in arena.iter(f"{SVG}g") if any(t.text == "12" for t in g.findall(f"{SVG}text"))
+    ]
+    x, y = map(float, re.findall(r"[\d.]+", groups[0].get("transform")))
+    (number,) = groups[0].findall(f"{SVG}text")
+    middle = x + float(number.get("x"))
+    is_level = (bottom > y - 6) & (bottom - 24 < y + 6)  # with the digits, 12 px high
+    apart = np.maximum(
+        left - (middle + 9), (middle - 9) - (left + 18)
+    )  # 9 px for each of two digits
+    assert apart[is_level].min() >= 0
+
+
+def test_the_legend_names_every_sign_of_the_map(picture):
+    for name in ("film-moving", "film-still"):
+        notes = [t for t in part(picture, name).iter(f"{SVG}text") if t.get("class") == "film-note"]
+        assert sum((t.text or "").startswith("Dotted circle:") for t in notes) == 1
+        height = float(picture.get("viewBox").split()[3])
+        assert max(float(t.get("y")) for t in notes) < height - 8
+
+
+def test_the_legend_fits_below_a_single_robot():
+    config = dataclasses.replace(CONFIG, robots=("camera",))
+    picture = ElementTree.fromstring(draw(config))
+    notes = [t for t in picture.iter(f"{SVG}text") if t.get("class") == "film-note"]
+    height = float(picture.get("viewBox").split()[3])
+    assert max(float(t.get("y")) for t in notes) < height - 8
 
 
 def test_films_that_last_equally_long_stay_together():

@@ -58,3 +58,11 @@ def test_a_table_is_not_cut_without_a_terminal():
     narrow = io.StringIO()
     print_table(rich.console.Console(file=narrow, width=80, force_terminal=True), table)
     assert not any(name in narrow.getvalue() for name in table.columns)
+
+
+def test_the_note_of_a_table_stands_below_it():
+    text = io.StringIO()
+    console = rich.console.Console(file=text, width=80)
+    print_table(console, Table("caption", ["column"], [("row", ["1"])], note="why [x] " + "y" * 90))
+    *_, last = text.getvalue().rstrip().splitlines()
+    assert last == "why [x] " + "y" * 90

@@ -15,12 +15,12 @@ import jax
 import pytest
 from matplotlib.figure import Figure
 from recordings import CONFIG, FIELDS_OF_VIEW, FUSION, recording
-from summaries import CASE, EVALUATION, SUMMARY
+from summaries import BYTES, CASE, EVALUATION, SUMMARY
 
 import jaxsense
 from jaxsense import mission, summary
 from jaxsense.show import animation, drawing, page
-from jaxsense.summary import statistics
+from jaxsense.summary import compare, statistics
 from jaxsense.summary.profile import Span
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -231,7 +231,7 @@ def test_of_a_film_the_page_holds_a_data_uri_and_nothing_else(tmp_path):
     # Two halves, which would look the same if it moved.
     assert figure.count(f'src="data:image/svg+xml;base64,{data}"') == 4
     tags = set(re.findall("<(\\w+)", figure))
-    assert tags == {"section", "h2", "figure", "input", "label", "div", "img", "figcaption"}
+    assert tags == {"section", "h2", "figure", "input", "label", "div", "img", "figcaption", "span"}
     others = text.replace(figure, "").replace('<a href="#film">Animation</a>', "")
     assert others.split() == without.split()
 
@@ -352,7 +352,40 @@ def test_evaluations_have_tables_of_their_own(tmp_path):
     # A seed is no count, and stands above the table of all metrics.
     assert '<th scope="col">seed</th>' not in text
     rows = [row for row in Reader(text).rows if row and row[0] == "latent"]
-    assert [row[1] for row in rows] == ["0.998", "0.998", "0.750", "0.750"]  # and all metrics
+    # Of each: the main figures, the maps at the end, and looks and time.
+    assert [row[1] for row in rows] == ["0.998", "0.998", "1.68", "0.750", "0.750", "1.68"]
+
+
+def test_each_set_of_missions_has_the_sizes_of_its_own_detections(tmp_path):
+    # A scan's mean size depends on which sensors looked how often.
+    other = {**EVALUATION["mission"], "bytes_per_detection": {**BYTES, "raw": 1500.0}}
+    evaluations = {"there": {**EVALUATION, "mission": other}}
+    text = page.render(write_run(tmp_path), CONFIG, SUMMARY, evaluations)
+    own, there = (compare.detection_sizes(block) for block in (SUMMARY["mission"], other))
+    assert "2,326 as a raw scan" in own
+    assert "1,500 as a raw scan" in there
+    text = html.unescape(text)
+    sections = text.index(own), text.index(there)
+    assert sections[0] < text.index("Evaluation: 16 PoIs") < sections[1]
+
+
+def test_a_preset_that_is_not_meant_to_be_good_gets_no_advice(tmp_path):
+    worse = {**SUMMARY, "belief": {**SUMMARY["belief"], "nll": [2.0, 4.0]}}
+    run, advice = write_run(tmp_path), "Try jmvae.fusion"
+    assert advice not in page.render(run, CONFIG, worse)
+    assert "Preset smoke only checks" in page.render(run, CONFIG, worse)
+    assert advice in page.render(run, CONFIG, {**worse, "preset": "default"})
+
+
+def test_where_motion_is_unwelcome_the_page_does_not_speak_of_playing(run):
+    text = (run / "report.html").read_text()
+    (moves,) = re.findall('<span class="moves">(.*?)</span>', text, re.DOTALL)
+    (stands,) = re.findall('<span\\s+class="stands">(.*?)</span>', text, re.DOTALL)
+    assert "reload the page" in moves
+    assert "reduced motion" in stands
+    hidden = "@media (prefers-reduced-motion:reduce){.stop,.stop+label,.moves{display:none}"
+    assert hidden + ".stands{display:inline}}" in text
+    assert "\n.stands{display:none}\n" in text
 
 
 def test_a_page_of_several_seeds_links_to_theirs(tmp_path):
@@ -363,4 +396,4 @@ def test_a_page_of_several_seeds_links_to_theirs(tmp_path):
     assert "smoke preset, 2 seeds" in text
     assert '<a href="seed-4/report.html">4</a>' in text
     assert "5 (jmvae)" in text
-    assert "<td>0.998 (0.998 to 0.998)</td>" in text
+    assert "<td>0.998 (0.998\u00a0to\u00a00.998)</td>" in text

@@ -290,7 +290,7 @@ def test_policies_stand_in_rows_by_their_time():
     }
     by_looks, by_time = mission_plots.policies(block, 3).axes
     names = [label.get_text() for label in by_looks.get_yticklabels()]
-    assert names == ["naive 3", "latent", "random"]  # upwards
+    assert names == ["naive_3", "latent", "random"]  # upwards
     wrong = [text.get_text() for text in by_time.texts]
     # Of 3 PoIs in 128 missions; .05^(1 / 384) = .9922, below which no wrong one would be luck.
     assert wrong == [

@@ -18,7 +18,7 @@ def test_stages_stand_in_the_order_in_which_they_run():
     assert [label.get_text() for label in axes.get_yticklabels()] == [
         "command",
         "dqn",
-        "best jmvae",
+        "best_jmvae",
     ]
     assert axes.get_xlim()[0] == 1
     assert axes.yaxis_inverted()

@@ -148,12 +148,12 @@ def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     played = SimpleNamespace(recording=recording(50), missions={}, naive=None)
     found = report.of_missions(config, learned, played)  # pyright: ignore
     assert [*found] == ["mission.svg"]
-    assert drawn == [("naive 2 policy", pytest.approx(5.0))]
+    assert drawn == [("naive_2 policy", pytest.approx(5.0))]
     # With the film of naive exploration, both last as long as the longer one.
     played = SimpleNamespace(recording=recording(50), missions={}, naive=recording(80))
     found = report.of_missions(config, learned, played)  # pyright: ignore
     assert [*found] == ["mission.svg", "mission-naive.svg"]
-    assert drawn[1:] == [("naive 2 policy", pytest.approx(8.0)), ("naive policy", drawn[1][1])]
+    assert drawn[1:] == [("naive_2 policy", pytest.approx(8.0)), ("naive policy", drawn[1][1])]
 
 
 def test_a_finished_run_is_loaded_with_its_settings(smoke_run):

@@ -9,42 +9,49 @@ from matplotlib.figure import Figure
 
 from benchmarks.tasks.record import Point
 from jaxsense.show.colours import MARKERS
+from jaxsense.show.drawing import name_ends
 from jaxsense.tasks import estimate
 
 PICTURE = Path(__file__).parents[2] / "docs" / "figures" / "tasks_curves.svg"
 
+_ABREAST = 2  # plots
 _LOWEST = 0.5  # share of the optimum, below which curves only begin
 
 
 def draw(points: Iterable[Point]) -> Figure:
     """Return over that of the optimum or the best rule, by environment steps: a plot for each task.
 
-    Lines are interquartile means over seeds, bands their 95 % intervals. What ends below the plot
-    is written at its lower edge.
+    Lines are interquartile means over seeds, bands their 95 % intervals. Their names stand at their
+    ends, of those that end below the plot with their last value.
 
     Args:
       points: of all curves.
     """
     of_task = _grouped(points, lambda point: (point.task, point.agent))
     learners = {name: i for i, name in enumerate(dict.fromkeys(p.learner for p in points))}
-    figure = Figure(figsize=(2.6 * len(of_task), 2.6), layout="constrained")
-    axes = figure.subplots(1, len(of_task), sharey=True, squeeze=False)[0]
-    for axis, ((task, agent), found) in zip(axes, of_task.items(), strict=True):
-        below = []
+    rows = -(-len(of_task) // _ABREAST)
+    figure = Figure(figsize=(4.6 * min(len(of_task), _ABREAST), 2.9 * rows), layout="constrained")
+    axes = figure.subplots(rows, min(len(of_task), _ABREAST), sharey=True, squeeze=False)
+    for axis in axes.flat[len(of_task) :]:
+        axis.set_axis_off()
+    named = []
+    for axis, ((task, agent), found) in zip(axes.flat, of_task.items(), strict=False):
+        ends = []
         for name, curve in _grouped(found, lambda point: point.learner).items():
             last = _draw_curve(axis, name, learners[name], curve)
-            if last < _LOWEST:
-                below.append((f"{name}: {last:.2f}", f"C{learners[name]}"))
-        for i, (text, colour) in enumerate(below):
-            place = {"xytext": (4, 4 + 11 * i), "textcoords": "offset points"}
-            axis.annotate(text, (0, 0), xycoords="axes fraction", color=colour, fontsize=8, **place)
+            text = name if last >= _LOWEST else f"{name}: {last:.2f}"
+            ends.append((text, last, f"C{learners[name]}"))
         axis.axhline(1.0, color="0.5", linestyle=":")
-        axis.set(title=f"{task}, {agent}", xlabel="environment steps", ylim=(_LOWEST, 1.05))
-        axis.ticklabel_format(axis="x", style="sci", scilimits=(0, 3))
+        axis.set(title=f"{task}, {agent}", ylim=(_LOWEST, 1.05))
+        axis.xaxis.set_major_formatter(lambda steps, _: f"{steps / 1000:g}")
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("return over the best known")
-    handles = axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside upper center", ncols=len(learners), frameon=False)
+        named.append((axis, ends))
+    for axis in axes[-1]:
+        axis.set_xlabel("environment steps / 1000")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("share of the best known")
+    for axis, ends in named:
+        name_ends(axis, ends)
     return figure
 
 

@@ -28,7 +28,7 @@ _SAVING = "saving", "#7d8a12"
 ACTIVITIES: dict[Kind, tuple[str, str]] = {
     "import": _OWN, "start": _OWN, "summarise": _OWN, "trace": _TRACING, "lower": _TRACING,
     "compile": ("compiling", "#c8443c"), "load": ("loading", "#8250c8"),
-    "wait_program": ("waiting for a program", "0.85"), "run": ("running", "#1558b0"),
+    "wait_program": ("waiting for a program", "0.7"), "run": ("running", "#1558b0"),
     "save": _SAVING, "draw": ("drawing", "#0891a8"),
 }  # fmt: skip
 """Name and colour of what a run does; the others are not drawn."""

@@ -41,7 +41,7 @@ def policies(block: Missions, num_pois: int) -> Figure:
         ax.set(xlabel=MISSIONS[key].label, ylim=(-0.7, len(names) - 0.3))
         ax.set_xlim(0, 1.05 * ax.dataLim.x1)
         ax.grid(axis="x", alpha=0.3)
-    axes[0].set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
+    axes[0].set_yticks(range(len(names)), names)
     for label, name in zip(axes[0].get_yticklabels(), names, strict=True):
         if name == "latent":
             label.set(color=policy_colour(name), weight="bold")
@@ -150,7 +150,7 @@ def _draw_times(ax: Axes, places: list[Evaluation], key: str, reference: str | N
         colour, is_own = policy_colour(name), name == "latent"
         style = {"color": colour, "linewidth": 2.5 if is_own else 1.2, "zorder": 3 if is_own else 2}
         ax.plot([*map(number, played)], times, policy_marker(name) + line, label=name, **style)
-        ends.append((name.replace("_", " "), times[-1], colour))
+        ends.append((name, times[-1], colour))
     label = "PoIs" if key == "num_pois" else "robots"
     ticks = sorted(set(numbers))
     texts = [str(n) for n in ticks]

@@ -10,7 +10,7 @@ from pathlib import Path
 from jaxsense.config import PRESETS, Config, as_plain, parse_json
 from jaxsense.show import html, tables
 from jaxsense.show.mission_plots import counted
-from jaxsense.summary import Evaluation, Missions, Summary, cases, compare, profile, traffic
+from jaxsense.summary import Evaluation, Missions, Summary, cases, compare, profile
 from jaxsense.summary.metrics import mean
 from jaxsense.summary.profile import Span
 from jaxsense.summary.read import EVALUATIONS
@@ -49,12 +49,9 @@ def render(
         argument=lambda path: shlex.quote(str(path)),
         trust=" --trust" if config.sensors else "",
         summary=summary,
-        caution=compare.caution(summary["preset"]),
-        unsound=compare.unsound(summary["belief"]),
+        remarks=compare.remarks(summary["preset"], summary["belief"]),
         cards=tables.cards(summary),
         missions=[here, *elsewhere],
-        bytes=traffic(summary["mission"]),
-        mean=mean,
         learned=[
             tables.detectors(summary),
             tables.agents(summary),
@@ -101,6 +98,7 @@ def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:
         "verdict": compare.verdict(played),
         "tables": [table for table in found if table.rows],
         "details": tables.all_of_missions(missions),
+        "sizes": compare.detection_sizes(missions),
         "plot": _data(plot),
     }
 

@@ -37,9 +37,7 @@ def of_missions(config: Config, learned: Learned, played: Played) -> Pictures:
     lasts = max(animation.duration_of(config, each.end) for each in films.values())
     fusion, fields = learned.models.fusion, learned.fields_of_view
     drawn = [
-        animation.draw(
-            config, film.records, film.end, fusion, fields, title.replace("_", " "), lasts
-        )
+        animation.draw(config, film.records, film.end, fusion, fields, title, lasts)
         for title, film in films.items()
     ]
     names = (f"{name}.svg" for name in page.OWN_FILMS)

@@ -2,10 +2,20 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping
+from typing import cast
 
 from jaxsense.mission import is_fault
 from jaxsense.summary import Case, Metric, Missions, Results, Timing, cases
-from jaxsense.summary.blocks import AGENTS, BELIEF, DETECTORS, JMVAE, MISSIONS, STAGES, policies
+from jaxsense.summary.blocks import (
+    AGENTS,
+    BELIEF,
+    DETECTORS,
+    JMVAE,
+    MISSIONS,
+    STAGES,
+    Agent,
+    policies,
+)
 from jaxsense.summary.compare import AS_ACCURATE
 from jaxsense.summary.metrics import Number, mean, text
 
@@ -24,6 +34,11 @@ _PAPER = {
     "env_steps": "2,000 epochs",
 }
 _RULES = ("nearest", "auction", "rollout")  # written by hand, and learned by none
+_NO_BOUND = (
+    "The optimal policy decides by the expected rewards of looks, not by what the map made of "
+    "them: on a poor map, or from few starts, another policy can get more. With a lead of over 1 % "
+    "and two standard errors, the table would name no optimal policy."
+)
 _YES_OR_NO = {0.0: "no", 1.0: "yes"}
 
 
@@ -37,6 +52,7 @@ class Table:
       rows: the name of each, and a text for each column.
       meanings: explanations, by names of columns.
       best: rows and columns of values to highlight.
+      note: a text below it; empty if there is nothing to add.
     """
 
     caption: str
@@ -44,16 +60,18 @@ class Table:
     rows: list[tuple[str, list[str]]]
     meanings: dict[str, str] = dataclasses.field(default_factory=dict)
     best: frozenset[tuple[int, int]] = frozenset()
+    note: str = ""
 
 
 def _table(
     caption: str, blocks: Mapping[str, Mapping[str, object]], metrics: Iterable[Metric]
 ) -> Table:
-    """A row for each block and a column for each metric that one of them has."""
+    """A row for each block that has one of the metrics, a column for each that one of them has."""
     shown = [m for m in metrics if any(m.value(block) is not None for block in blocks.values())]
     rows = [
-        (name.replace("_", " "), [metric.text(block) for metric in shown])
+        (name, [metric.text(block) for metric in shown])
         for name, block in blocks.items()
+        if any(metric.value(block) is not None for metric in shown)
     ]
     meanings = {metric.label: metric.meaning for metric in shown if metric.meaning}
     return Table(caption, [metric.label for metric in shown], rows, meanings)
@@ -68,7 +86,26 @@ def agents(results: Results) -> Table:
     """The Q-networks compared with other policies on the map."""
     keys = "return", "optimal", "greedy", "naive", "random", "fraction_of_optimal", "optimal_states"
     metrics = [AGENTS[key] for key in (*keys, "num_states")]
-    return _table("Policies of a robot alone on the map: mean reward", results["dqn"], metrics)
+    caption = "Policies of a robot alone on the map: mean reward"
+    table = _table(caption, results["dqn"], metrics)
+    above = [
+        text for name, agent in results["dqn"].items() if (text := _above_optimal(name, agent))
+    ]
+    return dataclasses.replace(table, note=" ".join([*above, _NO_BOUND]) if above else "")
+
+
+def _above_optimal(name: str, agent: Agent) -> str:
+    """Names the policies whose mean reward is shown above the optimal one; empty without any."""
+    if agent["optimal"] is None:
+        return ""
+
+    def shown(key: str) -> float:
+        return round(mean(cast(Number, AGENTS[key].value(agent))), AGENTS[key].digits)
+
+    rivals = "return", "greedy", "naive", "random"
+    above = [AGENTS[key].label for key in rivals if shown(key) > shown("optimal")]
+    verb = "get" if len(above) > 1 else "gets"
+    return f"For {name}, {' and '.join(above)} {verb} more than optimal." if above else ""
 
 
 def latent_space(results: Results) -> Table:
@@ -99,7 +136,9 @@ def unambiguous(results: Results, classes: tuple[str, ...]) -> Table:
         if is_paper:
             here += f" / {_YES_OR_NO[name == 'joint' or (classes[c], name) in _PAPER_CERTAIN]}"
         norm, consistent = (mean(block[key][name][c]) for key in ("sigma_norm", "consistent"))
-        return f"{here} ({consistent:.1%}, {norm:.2f})".replace(" ", "\u00a0")
+        return " ".join(
+            part.replace(" ", "\u00a0") for part in (here, f"({consistent:.1%}, {norm:.2f})")
+        )
 
     caption = "Is a class certain?" + is_paper * " Here / in the paper's Table I"
     rows = [(label, [cell(c, name) for name in columns]) for c, label in enumerate(classes)]
@@ -162,7 +201,9 @@ def _missions(played: Mapping[str, Case], caption: str) -> Table:
     rows = []
     for (name, texts), case in zip(table.rows, played.values(), strict=True):
         ends = {reason: mean(n) for reason, n in case["ended"].items() if reason != "finished"}
-        unfinished = ", ".join(f"{n:g} {reason}" for reason, n in ends.items()) or "0"
+        unfinished = ", ".join(
+            f"{n:g} {reason}".replace(" ", "\u00a0") for reason, n in ends.items()
+        )
         against = [_percent(case["time_s"], played["naive"]["time_s"])] if "naive" in played else []
         rows.append((name, [*texts[:3], *against, *texts[3:], unfinished]))
     against = ["against naive"] if "naive" in played else []
@@ -171,10 +212,27 @@ def _missions(played: Mapping[str, Case], caption: str) -> Table:
     return Table(caption, columns, rows, meanings, frozenset(best))
 
 
-def all_of_missions(block: Missions) -> Table:
-    """Every metric of every case of a block `mission`; their seed stands above."""
-    metrics = [metric for key, metric in MISSIONS.items() if key != "seed"]
-    return _table("All metrics of these missions", cases(block), metrics)
+ALL_OF_MISSIONS = {
+    "Maps at the end": ("accuracy", "calibration.accuracy", "calibration.confidence",
+                        "calibration.nll", "information"),
+    "Looks and time": ("observations_per_poi", "time_s", "mean_time_s", "goals_reached_fraction",
+                       "collisions", "episodes"),
+    "Difference from the latent policy in the same arenas, with 95 % intervals": (
+        "intervals.accuracy", "intervals.observations_per_poi", "intervals.time_s"),
+    "Ratio to naive exploration of the same accuracy": (
+        "of_naive.observations_per_poi", "of_naive.time_s", "of_naive.mean_time_s"),
+    "A robot alone": ("told", "ambiguous_reported"),
+}  # fmt: skip
+"""The metrics of all tables of `all_of_missions`, by their captions."""
+
+
+def all_of_missions(block: Missions) -> list[Table]:
+    """Every metric of every case of a block `mission`, except its seed and how missions ended."""
+    found = [
+        _table(caption, cases(block), [MISSIONS[key] for key in keys])
+        for caption, keys in ALL_OF_MISSIONS.items()
+    ]
+    return [table for table in found if table.rows]
 
 
 def _percent(value: Number, reference: Number) -> str:

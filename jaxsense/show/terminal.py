@@ -154,3 +154,5 @@ def print_table(console: rich.console.Console, table: Table) -> None:
     if not console.is_terminal:
         console = rich.console.Console(file=console.file, width=_ENDLESS, quiet=console.quiet)
     console.print(drawn)
+    if table.note:
+        console.print(rich.text.Text(table.note))

@@ -39,7 +39,7 @@ def timeline(spans: Sequence[Span]) -> Figure:
                 ]
                 ax.broken_barh(bars, (y - above * _HEIGHT, _HEIGHT), facecolors=colour)
         ax.broken_barh([], (0, 0), facecolors=colour, label=name)
-    ax.set_yticks(range(len(rows)), [row.replace("_", " ") for row in rows])
+    ax.set_yticks(range(len(rows)), rows)
     ax.set(xlabel="seconds since the command was started", ylim=(len(rows) - 0.4, -0.6))
     ax.set_xlim(left=min((span.start_s for span in shown), default=0.0))
     ax.grid(axis="x", alpha=0.3)

@@ -215,10 +215,15 @@ class OfNaive(TypedDict):
     """`mission.POLICY.of_naive`: ratios to naive exploration, see `compare.of_naive`."""
 
     observations_per_poi: Annotated[
-        float, Metric("looks, of naive", "Ratio to naive exploration with the same accuracy.", 2)
+        float,
+        Metric("looks, relative to naive", "Ratio to naive exploration with the same accuracy.", 2),
     ]
-    time_s: Annotated[float, Metric("time, of naive", digits=2)]
-    mean_time_s: Annotated[float, Metric("mean time, of naive", digits=2)]
+    time_s: Annotated[
+        float, Metric("median time, relative to naive", "The same, of the median times.", 2)
+    ]
+    mean_time_s: Annotated[
+        float, Metric("mean time, relative to naive", "The same, of the mean times.", 2)
+    ]
 
 
 class Calibration(TypedDict):

@@ -8,7 +8,15 @@ import scipy.special
 from jaxtyping import PyTree
 
 from jaxsense.mission import is_fault
-from jaxsense.summary.blocks import Beliefs, Case, Differences, Missions, OfNaive, cases
+from jaxsense.summary.blocks import (
+    Beliefs,
+    Case,
+    Differences,
+    Missions,
+    OfNaive,
+    cases,
+    traffic,
+)
 from jaxsense.summary.metrics import Interval, mean
 
 REFERENCE = "latent"
@@ -144,9 +152,35 @@ def unsound(block: Beliefs) -> str | None:
     )
 
 
-def caution(preset: str) -> str | None:
-    """What to keep in mind about all results of a preset; None for most."""
-    return _CAUTIONS.get(preset)
+def remarks(preset: str, block: Beliefs) -> list[str]:
+    """What to keep in mind about all results of a run.
+
+    Args:
+      preset: its name.
+      block: `belief` of its summary.
+
+    Returns:
+      Sentences. Where results are not meant to be good, none says how to improve them.
+    """
+    found = _CAUTIONS.get(preset) or unsound(block)
+    return [found] if found else []
+
+
+def detection_sizes(block: Missions) -> str:
+    """Says how many bytes a detection takes, on average over those of some missions.
+
+    Args:
+      block: `mission` of a summary or of an evaluation.
+    """
+    size = traffic(block)
+    latent, features, raw = (
+        f"{mean(number):,.0f}" for number in (size["latent"], size["features"], size["raw"])
+    )
+    return (
+        f"A detection takes {latent} bytes in the map. In these missions it takes, on "
+        f"average over the sensors that made it, {features} bytes as the detector's "
+        f"features and {raw} as a raw scan."
+    )
 
 
 def verdict(played: dict[str, Case]) -> str | None:

@@ -51,7 +51,7 @@ def mean(value: Number) -> float:
 
 
 def text(value: object, digits: int = 3) -> str:
-    """A number, with its interval if it has one; a hyphen for None.
+    """A number, with its interval, which no line breaks, if it has one; a hyphen for None.
 
     Args:
       value: a number, a `Number` of several seeds, or None.
@@ -59,7 +59,7 @@ def text(value: object, digits: int = 3) -> str:
     """
     if isinstance(value, Mapping):
         middle, low, high = (text(value.get(name), digits) for name in ("mean", "low", "high"))
-        return middle if low == "-" else f"{middle} ({low} to {high})"
+        return middle if low == "-" else f"{middle} ({low}\u00a0to\u00a0{high})"
     if isinstance(value, float):
         return f"{round(value, digits) + 0.0:,.{digits}f}"  # no "-0.00"
     return f"{value:,}" if isinstance(value, int) else "-"

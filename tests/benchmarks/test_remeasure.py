@@ -62,8 +62,8 @@ def test_pictures_are_drawn_of_what_was_measured(ran):
         store(name, {"command": f"python -m benchmarks.{name}", "device": "cpu"})
     remeasure.main([])
     assert sorted(x.name for x in remeasure.FIGURES.iterdir()) == [
-        "imperfect.png", "imperfect_drift.png", "imperfect_messages.png", "noisy_curves.svg",
-        "raw_ablation.png", "raw_posteriors.png",
+        "imperfect.svg", "imperfect_drift.svg", "imperfect_messages.svg", "noisy_curves.svg",
+        "raw_ablation.svg", "raw_posteriors.svg",
     ]  # fmt: skip
     # One picture of several files is drawn once.
     assert sum("benchmarks.raw.report" in words for words in ran) == 2

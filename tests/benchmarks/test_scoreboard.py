@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import importlib
+import itertools
 import json
 import os
 import pickle
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.tree_util import Partial
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import jaxsense
 from benchmarks.tasks import __main__ as program
@@ -195,7 +197,30 @@ def test_the_picture_has_a_curve_of_each_learner():
     assert (line.get_label(), other.get_label()) == ("mine", "yours")
     np.testing.assert_allclose(line.get_ydata(), 0.9)
     assert list(line.get_xdata()) == [0, 64, 128]
-    assert [text.get_text() for text in figure.axes[0].texts] == ["yours: 0.25"]
+    # Names at the ends of curves, upwards, of those below the plot with their last value.
+    assert [text.get_text() for text in figure.axes[0].texts] == ["yours: 0.25", "mine"]
+
+
+def test_names_of_curves_that_end_together_do_not_overlap():
+    points = [
+        Point(task, "camera", name, 0, steps, 1.0, 1.0, 0.9)
+        for task in ("map-v0", "noisy-v0", "many-v0")
+        for name in ("mine", "yours", "theirs")
+        for steps in (0, 64)
+    ]
+    figure = plot.draw(points)
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw(renderer)
+    *with_curves, empty = figure.axes
+    assert not empty.axison
+    for axis in with_curves:
+        boxes = [text.get_window_extent(renderer) for text in axis.texts]
+        assert all(low.y1 < high.y0 for low, high in itertools.pairwise(boxes))
+        assert min(box.x0 for box in boxes) > axis.get_window_extent(renderer).x1
+    of_left, of_right = (axis.texts[0] for axis in with_curves[:2])
+    right = of_left.get_window_extent(renderer).x1
+    assert right < with_curves[1].get_window_extent(renderer).x0
+    assert of_right.get_window_extent(renderer).x1 < figure.bbox.x1
 
 
 @dataclasses.dataclass(frozen=True)

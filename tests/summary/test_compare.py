@@ -150,3 +150,13 @@ def test_the_largest_loss_of_information_is_told():
     # .7 - .5 = .2 after one look, and .5 - .1 = .4 after two, where the NLL itself is lower.
     told = compare.unsound({"looks": [1, 2], "nll": [0.7, 0.5], "bayes_nll": [0.5, 0.1]})
     assert "NLL after 2 looks is 0.50, that of exact Bayes 0.10." in told
+
+
+def test_no_remark_advises_where_results_are_not_meant_to_be_good():
+    worse = {"looks": [1], "nll": [2.0], "bayes_nll": [0.5]}
+    (of_default,) = compare.remarks("default", worse)
+    assert of_default == compare.unsound(worse)
+    (of_smoke,) = compare.remarks("smoke", worse)
+    assert "only checks that everything runs" in of_smoke
+    assert "Try" not in of_smoke
+    assert compare.remarks("default", {**worse, "nll": [0.5]}) == []

@@ -14,6 +14,7 @@ from jaxsense.show.colours import as_hex, class_colour, modality_colour
 
 _FLASH = 6  # frames that a look is shown for
 _READABLE = 9.0  # px, radius of a PoI that its number fits into
+_NUMBER, _DIGIT = 12.0, 5.0  # px, from a small PoI to the middle of its number, and half a digit
 _GAP = 4.0  # px, between a PoI and its bars
 _BARS, _BAR, _TALL = 26.0, 6.0, 24.0  # px: most of all bars abreast, most of one, and height
 
@@ -41,7 +42,8 @@ class ArenaView:
         self._scale = SIZE / config.arena.side
         radius = self._scale * config.arena.poi_radius
         # With its number, if that stands to the right of it.
-        reach = np.array([radius, radius, radius + 16 if self._is_small else radius, radius])
+        number = _NUMBER + _DIGIT * len(str(config.arena.num_pois)) if self._is_small else 0.0
+        reach = np.array([radius, radius, radius + number, radius])
         size = np.array([_width(len(config.arena.classes)) * len(config.arena.classes), _TALL])
         self._bars_at = _corners(self._place(end.scene.layout.position), reach, size)
 
@@ -107,7 +109,7 @@ class ArenaView:
             box = add(group, "rect", x=-u, y=-v, width=2 * u, height=2 * v, rx=1, fill=colour)
             box.set("transform", turn)
         if self._is_small:
-            beside = {"x": radius + 12, "fill": colour, "class_": "film-number film-on-light"}
+            beside = {"x": radius + _NUMBER, "fill": colour, "class_": "film-number film-on-light"}
         else:
             beside = {"x": 0, "fill": "#fff", "class_": "film-number"}
         add(group, "text", str(n + 1), y=5, **beside)

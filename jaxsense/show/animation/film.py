@@ -23,6 +23,11 @@ _TINY = 1e-3  # s, less than a control period
 _TOP, _LINE = 38, 26
 _ICON = 14  # px, length of a field of view next to the name of a robot
 _PHASES = ("choosing", "driving to", "looking at", "backing off from", "done", "failed")
+_NOTES = (
+    "Ellipse: 1-sigma belief in a numbered PoI.",
+    "PoIs that are certain stand at their class.",
+    "Dotted circle: PoIs that nobody has seen.",
+)
 _STYLE = """
 .film{--paper:#fff;--ink:#1d2129;--soft:#59616e;--floor:#f2f4f7;color-scheme:light dark}
 .film text{font-family:system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
@@ -31,9 +36,11 @@ _STYLE = """
 .film-line{fill:var(--ink);font-size:17px}.film-end{text-anchor:end}
 .film-number{font-size:15px;font-weight:700;text-anchor:middle}
 .film-label{font-size:14px;font-weight:600;text-anchor:middle}
+.film-label.film-on-light{stroke-width:5px}
 .film-note{fill:var(--soft);font-size:14px}
 .film-unknown{fill:#59616e;font-size:12px;text-anchor:middle}.film-start{text-anchor:start}
 .film-on-light{stroke:var(--floor);stroke-width:3px;paint-order:stroke;stroke-linejoin:round}
+.film-on-floor{stroke:var(--floor);stroke-width:9px;paint-order:stroke;stroke-linejoin:round}
 .film-still{display:none}
 @media (prefers-color-scheme:dark){
 .film{--paper:#16181d;--ink:#e6e8ec;--soft:#a3abb8;--floor:#dfe2e8}}
@@ -75,7 +82,7 @@ def draw(
         ArenaView(config, end, fields_of_view, probabilities),
         MapView(config, end, fusion, probabilities),
     )
-    height = _TOP + SIZE + _LINE * (len(config.carried) + 1) + 16
+    height = _TOP + SIZE + _LINE * max(len(config.carried) + 1, len(_NOTES)) + 16
     root = Element("svg", {"xmlns": "http://www.w3.org/2000/svg", "class": "film", "role": "img"})
     root.set("viewBox", f"0 0 {WIDTH} {height}")
     root.set("aria-labelledby", "title")
@@ -145,11 +152,7 @@ def _draw(
     note = "Bars: class probabilities; dots: who saw it."
     add(half, "text", note, y=below + _LINE * len(config.carried), class_="film-note")
     half = _half(parent, 1, "the shared map", timeline, record, latent)
-    notes = (
-        "Ellipse: 1-sigma belief in a numbered PoI.",
-        "PoIs that are certain stand at their class.",
-    )
-    for line, note in enumerate(notes):
+    for line, note in enumerate(_NOTES):
         add(half, "text", note, y=below + _LINE * line, class_="film-note")
 
 

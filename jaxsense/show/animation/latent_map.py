@@ -1,5 +1,6 @@
 """The right half of the picture: the shared map."""
 
+import itertools
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxsense.show.animation.svg import SIZE, Timeline, add, smooth, strip
 from jaxsense.show.colours import as_hex, class_colour, in_plane, plane
 
 _CERTAIN = 0.9  # probability of a class from which on a PoI stands at its name
-_MOST_ABREAST = 4  # numbers
+_MOST_ABREAST, _MOST_LISTED = 4, 5  # numbers, of PoIs at one place and in a line of a list
 _LETTER, _NEXT_LINE = 3.9, 16.0  # px, of a label: half a letter, and from line to line
 
 
@@ -56,6 +57,7 @@ class MapView:
         is_seen = np.any(record.seen, axis=-1)
         is_certain = is_seen & (self._probabilities.max(axis=-1) >= _CERTAIN)
         self._draw_unknown(parent, timeline, is_seen)
+        self._draw_labels(parent, timeline, colours, is_certain, "film-on-floor")
         numbers = add(parent, "g")
         for n in range(arena.num_pois):
             colour = colours[int(self._end.classes[n])]
@@ -72,7 +74,7 @@ class MapView:
             is_open = is_seen[:, n] & ~is_certain[:, n]
             text = add(number, "text", str(n + 1), class_="film-number film-on-light", fill=colour)
             timeline.animate(text, "opacity", is_open, jumps=True)
-        self._draw_labels(parent, timeline, colours, is_certain)
+        self._draw_labels(parent, timeline, colours, is_certain, "film-on-light")
 
     def _draw_unknown(self, parent: Element, timeline: Timeline, is_seen: np.ndarray) -> None:
         """One ring for all PoIs that nobody has seen, `[F, N]`, and their numbers."""
@@ -86,23 +88,35 @@ class MapView:
         timeline.animate(ring, "opacity", ~is_seen.all(axis=1), jumps=True)
         numbers = [_listed(~seen) for seen in is_seen]
         texts = [f"unknown: {each}" if each else "" for each in numbers]
-        strip(parent, timeline, texts, x=8, y=18, class_="film-unknown film-start film-on-light")
+        style = "film-unknown film-start film-on-floor"
+        strip(parent, timeline, texts, x=8, y=18, class_=style)
 
     def _draw_labels(
-        self, parent: Element, timeline: Timeline, colours: list[str], is_certain: np.ndarray
+        self,
+        parent: Element,
+        timeline: Timeline,
+        colours: list[str],
+        is_certain: np.ndarray,
+        around: str,
     ) -> None:
-        """The classes and, beyond their names, the PoIs that are certain to be of them."""
+        """The classes and, beyond their names, the PoIs that are certain to be of them.
+
+        Drawn below the ellipses they cover the ring, drawn above these they can be read.
+        """
         likeliest = self._probabilities.argmax(axis=-1)
         for c, (label, colour) in enumerate(zip(self._config.arena.classes, colours, strict=True)):
             x, y = self._place(self._means[c])
             side = -1 if self._means[c, 1] >= 0 else 1
             y += side * (self._scale * self._stds[c, 1] + 12) + 5
-            numbers = [_listed(of_class) for of_class in is_certain & (likeliest == c)]
-            half = min(_LETTER * max(map(len, [label, *numbers])), SIZE / 2)
+            lists = [_lines(of_class) for of_class in is_certain & (likeliest == c)]
+            longest = max(map(len, [label, *itertools.chain(*lists)]))
+            half = min(_LETTER * longest, SIZE / 2)
             style = {"x": np.clip(x, half, SIZE - half), "fill": colour}
-            style["class_"] = "film-label film-on-light"
+            style["class_"] = f"film-label {around}"
             add(parent, "text", label, y=y, **style)
-            strip(parent, timeline, numbers, y=y + side * _NEXT_LINE, **style)
+            of_line = itertools.zip_longest(*lists, fillvalue="")
+            for i, numbers in enumerate(of_line):
+                strip(parent, timeline, [*numbers], y=y + side * _NEXT_LINE * (i + 1), **style)
 
     def _radii(self, std: ArrayLike) -> np.ndarray:
         """`[..., D]` standard deviations in px; before the first look they exceed the view."""
@@ -116,6 +130,13 @@ class MapView:
 def _listed(chosen: np.ndarray) -> str:
     """The numbers of the chosen `[N]` PoIs."""
     return ", ".join(str(n + 1) for n in np.flatnonzero(chosen))
+
+
+def _lines(chosen: np.ndarray) -> list[str]:
+    """The numbers of the chosen `[N]` PoIs, in lines that leave room for other classes."""
+    numbers = [str(n + 1) for n in np.flatnonzero(chosen)]
+    starts = range(0, len(numbers), _MOST_LISTED)
+    return [", ".join(numbers[i : i + _MOST_LISTED]) for i in starts]
 
 
 def _beside(n: int, num_pois: int) -> np.ndarray:
