@@ -39,7 +39,7 @@ class ArenaConfig(Section, place="arena"):
     poi_gap: float = limited(0.3, above=0)
     """Minimum gap between two PoIs, in metres; a robot needs 0.1 to pass."""
     classes: tuple[str, ...] = limited(("green cylinder", "red cylinder", "red cube"), min_items=2)
-    """Classes of PoIs, all equally likely: `"COLOUR SHAPE"` and a word for each of `attributes`."""
+    """Classes of PoIs, all equally likely: `"COLOUR SHAPE"`, and a word per custom attribute."""
     colours: Mapping[str, tuple[float, float, float]] = limited(COLOURS, at_least=0, at_most=1)
     """Albedo of each colour, linear RGB in [0, 1]."""
     shapes: Mapping[str, Shape] = SHAPES
