@@ -100,7 +100,7 @@ def as_task(task: Task | str, agent: str | None = None) -> Task:
     if isinstance(task, str):
         return make(task, agent)
     if agent is not None:
-        raise ConfigError("agent", agent, "goes with a name; make(name, agent) has one already")
+        raise ConfigError("agent", agent, "must be None with a task; pass it to make(name, agent)")
     return task
 
 
