@@ -63,7 +63,7 @@ class ArenaConfig(Section, place="arena"):
         self._check_classes()
         most = math.floor(self.side / self.poi_pitch) ** 2
         expected = (
-            f"must be at most {most}: so many PoIs of radius {self.poi_radius} m with gaps of "
+            f"must be at most {most}: no more PoIs of radius {self.poi_radius} m with gaps of "
             f"{self.poi_gap} m fit into an arena of side {self.side} m"
             if most
             else "no PoI fits; lower arena.poi_gap or arena.poi_radius, or raise arena.side"
