@@ -24,7 +24,7 @@ TASKS = {
     "map-v0": "the paper's map of three PoIs, whose looks are almost certain",
     "many-v0": "eight PoIs of sixteen classes; each sensor distinguishes four labels",
     "noisy-v0": "uncertain looks, which beliefs accumulate",
-    "team-v0": "two robots, with a camera and a LiDAR, drive among three to eight PoIs; time has a cost",
+    "team-v0": "robots with a camera and a LiDAR drive among three to eight PoIs; time has a cost",
 }
 """The frozen tasks, and what is special in each."""
 
