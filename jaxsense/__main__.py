@@ -7,8 +7,8 @@ from typing import NoReturn
 from jaxsense.run.version import __version__
 
 COMMANDS = {
-    "demo": ("jaxsense.demo", "plays a mission of trained robots and opens a page with its film"),
-    "tasks": ("jaxsense.task_list", "lists the frozen tasks and what known policies reach in them"),
+    "demo": ("jaxsense.demo", "plays a mission with trained robots and opens a page that shows it"),
+    "tasks": ("jaxsense.task_list", "lists the frozen tasks and the returns of known policies"),
     "train": ("jaxsense.train", "trains the whole pipeline, from scanlines to policies"),
     "evaluate": ("jaxsense.evaluate", "plays missions with the policies of a finished run"),
     "export": ("jaxsense.export", "writes trained models as one file for robots without JAX"),

@@ -1,4 +1,4 @@
-"""`jaxsense demo`: plays a mission of trained robots and opens a page with its animations."""
+"""`jaxsense demo`: plays a mission with trained robots and opens a page with its animations."""
 
 import contextlib
 import dataclasses
@@ -39,8 +39,8 @@ class Arguments:
     """Policy to compare with naive exploration: `latent` (the learned policy), `greedy`, `bayes`,
     `optimal`, `naive_2`, `naive_3`, `random`, `nearest`, `auction` or `rollout`."""
     seed: int = 2
-    """Seed of the arena and of all noise, from 0 to 2^32 - 1. Looks can be skipped in the arenas of
-    2 and 3, not in those of 0 and 1."""
+    """Seed of the arena and of all noise, from 0 to 2^32 - 1. In the arenas of seeds 2 and 3,
+    robots can skip looks; in those of 0 and 1, they cannot."""
     out: Path | None = None
     """Directory for the page, new or empty; by default `runs/DATE-TIME-demo-PRESET`."""
     browser: bool = True

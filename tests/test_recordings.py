@@ -245,7 +245,7 @@ def test_another_scanner_is_farther_from_simulated_windows(run, write, few, tmp_
     assert found.of_sensors["lidar"].looks == number - 3
     assert 0.13 < found.of_sensors["lidar"].recorded < 0.22
     content["lidar_poses"][:-3, 2] += np.pi
-    with pytest.raises(ValueError, match="lidar_scans: no window around a place was recorded"):
+    with pytest.raises(ValueError, match="lidar_scans: no window around a PoI was recorded"):
         jaxsense.compare_scans(run, write(**content), tmp_path / "another.png")
     assert not list(tmp_path.glob("another*"))
 

@@ -26,8 +26,8 @@ class DetectorConfig(Section, place="detector"):
     num_held_out: int = limited(8192, at_least=1)
     """Simulated scans for measuring the accuracy."""
     num_repeats: int = limited(0, at_least=0, at_most=1_000_000)
-    """Scenes in which each sensor looks at a PoI several times, to learn how much of a look near
-    earlier ones is new, see `vae.novelty`. With 0, every look counts in full."""
+    """Scenes in which each sensor looks at a PoI several times, to learn how much of a look is new
+    after others nearby, see `vae.novelty`. With 0, every look counts in full."""
     steps: int = limited(4000, at_least=1)
     """Gradient steps."""
     batch: int = limited(512, at_least=1)
@@ -75,12 +75,12 @@ class JmvaeConfig(Section, place="jmvae"):
     )
     """Weight of each modality's reconstruction, in the order of `modalities`."""
     fusion: Literal["in_place", "filter"] = "in_place"
-    """How a look updates a belief. `in_place`, as in the paper, replaces it. `filter` accumulates
-    looks, see section `filter`."""
+    """How a look updates a belief. `in_place`, as in the paper, keeps the last look of each sensor.
+    `filter` accumulates looks, see section `filter`."""
     restarts: int = limited(3, at_least=1, at_most=1000)
     """Number of trainings from different random parameters. The run keeps the one with the lowest
-    loss among those from whose beliefs class probabilities are read back exactly, or among all if
-    the JMVAE learns from scans."""
+    loss among those whose beliefs give class probabilities back exactly, or among all if the JMVAE
+    learns from scans."""
     looks: int = limited(4, at_least=2, at_most=100)
     """Number of looks by each sensor at a PoI, if the JMVAE learns from scans."""
     samples_per_class: int = limited(10000, at_least=1)

@@ -39,7 +39,7 @@ class ArenaConfig(Section, place="arena"):
     poi_gap: float = limited(0.3, above=0)
     """Minimum gap between two PoIs, in metres; a robot needs 0.1 to pass."""
     classes: tuple[str, ...] = limited(("green cylinder", "red cylinder", "red cube"), min_items=2)
-    """Classes of PoIs, all equally likely: `"COLOUR SHAPE"` and a word for each of `attributes`."""
+    """Classes of PoIs, all equally likely: `"COLOUR SHAPE"`, and a word per custom attribute."""
     colours: Mapping[str, tuple[float, float, float]] = limited(COLOURS, at_least=0, at_most=1)
     """Albedo of each colour, linear RGB in [0, 1]."""
     shapes: Mapping[str, Shape] = SHAPES
@@ -63,7 +63,7 @@ class ArenaConfig(Section, place="arena"):
         self._check_classes()
         most = math.floor(self.side / self.poi_pitch) ** 2
         expected = (
-            f"must be at most {most}: so many PoIs of radius {self.poi_radius} m with gaps of "
+            f"must be at most {most}: no more PoIs of radius {self.poi_radius} m with gaps of "
             f"{self.poi_gap} m fit into an arena of side {self.side} m"
             if most
             else "no PoI fits; lower arena.poi_gap or arena.poi_radius, or raise arena.side"

@@ -40,10 +40,10 @@ class Config(Section):
     modalities: tuple[str, ...] = limited(
         ("camera", "lidar"), min_items=1, max_items=_MAX_MODALITIES
     )
-    """Sensors to train: `camera`, `lidar` and names of `sensors`."""
+    """Sensors to train: `camera`, `lidar` and the names of custom `sensors`."""
     robots: tuple[str, ...] | None = limited(None, min_items=1, max_items=_MAX_ROBOTS)
-    """The robots of missions, each given by the modality of its sensor, which several may share. By
-    default, one robot for each of `modalities`."""
+    """Sensors of the robots in missions, one per robot, for example `camera camera lidar`; by
+    default, one robot for each modality."""
     sensors: Mapping[str, SensorConfig] = FrozenDict()
     """Custom sensors, by the name of their modality."""
     arena: ArenaConfig = ArenaConfig()
@@ -130,7 +130,7 @@ class Config(Section):
             expected = f"leaves some of {num_classes} classes without a look; raise it"
             require(groups * self.arena.num_pois >= num_classes, section, field, expected)
         adds_up = self.jmvae.fusion == "filter" or not self.mission.communication.own_maps
-        expected = "must be off unless jmvae.fusion is 'filter', by which looks add up"
+        expected = "must be off unless jmvae.fusion is 'filter', which accumulates looks"
         require(adds_up, self.mission.communication, "own_maps", expected)
 
     def _least_latent_size(self) -> int:

@@ -156,7 +156,7 @@ def interpolate(table: Float[Array, " P"], probabilities: Float[Array, " C"]) ->
     steps = steps_of_lattice(len(probabilities), len(table))
     number = _num_points(steps, len(probabilities))
     if len(table) != number:
-        reason = f"must be {number} or another number of points of a lattice"
+        reason = f"must be {number} or another size of a grid"
         raise ValueError(f"length of table = {len(table)}: {reason}")
     rows, shares = _corners(probabilities, steps)
     return jnp.sum(shares * table[rows])

@@ -26,7 +26,7 @@ def environment(mdp: MapMdp | Environment, modality: int | None) -> Environment:
         checks.require_index("modality", modality, mdp.num_modalities)
         return OneAgent(mdp, modality)  # pyright: ignore[reportArgumentType]
     if modality is not None:
-        raise ValueError(f"modality = {modality}: goes with a MapMdp; a task has its agent")
+        raise ValueError(f"modality = {modality}: must be None with a task, which has its agent")
     return mdp
 
 

@@ -61,7 +61,7 @@ def read(path: Path | str) -> LaserScans:
         while content.startswith(b"\x1f\x8b"):
             content = gzip.decompress(content)
     except (EOFError, zlib.error) as error:
-        raise ValueError(f"{path} is not a whole file of gzip: {error}") from None
+        raise ValueError(f"{path} is not a complete gzip file: {error}") from None
     try:
         scans = [_scan(content, found) for found in _SCAN.finditer(content)]
     except (struct.error, ValueError) as error:
@@ -97,7 +97,7 @@ def _scan(content: bytes, found: re.Match[bytes]) -> tuple[float, np.ndarray]:
     aperture, from_right, _ = _HEAD.unpack_from(content, found.end())
     pose = _POSE.match(content, found.end() + _HEAD.size)
     if pose is None or pose[1][0] not in _POSE_SIZES:
-        raise ValueError("a laser scan is damaged, or the pose of its scanner of another version")
+        raise ValueError("a laser scan is damaged, or the pose of its scanner has another version")
     start = pose.end() + _POSE_SIZES[pose[1][0]] + 1  # the end's flag
     (number,) = _COUNT.unpack_from(content, start)
     start += _COUNT.size

@@ -136,7 +136,7 @@ def robots_of(mdp: TeamMdp | TeamTask, config: Config | None) -> Robots:
     """
     if isinstance(mdp, TeamTask):
         if config is not None:
-            raise ValueError("config: goes with a TeamMdp; a task has its robots")
+            raise ValueError("config: must be None with a task, which has its robots")
         modality = tuple(mdp.mdp.modalities[m] for m in mdp.robots.tolist())
         return Robots(mdp.mdp, mdp.robots, mdp.scaling, names_of_robots(modality), modality)
     if config is None or mdp.modalities != config.modalities:

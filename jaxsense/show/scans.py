@@ -111,7 +111,7 @@ def _compare(config: Config, modality: int, looks: RecordedLooks) -> tuple[Apart
         windows.is_in_view(sensor, jnp.asarray(bearings))
     )
     if not is_whole.any():
-        raise ValueError(f"{name}_scans: no window around a place was recorded as a whole")
+        raise ValueError(f"{name}_scans: no window around a PoI was recorded completely")
     cut, bearings, distances = cut[is_whole], bearings[is_whole], distances[is_whole]
 
     @jax.jit

@@ -109,7 +109,7 @@ def wall_residuals(
       ValueError: if there are fewer than K beams.
     """
     if len(angles) < _BEAMS:
-        raise ValueError(f"angles are {len(angles)}: must be at least {_BEAMS}, of a piece of wall")
+        raise ValueError(f"number of angles = {len(angles)}: must be at least {_BEAMS}")
     ranges = resampling.with_returns(ranges)
     residuals, distances = [], []
     for first in range(0, len(angles) - _BEAMS + 1, _BEAMS):
@@ -158,9 +158,9 @@ def fit_noise(
     number = np.bincount(bins)
     kept = np.flatnonzero(number >= _MIN_PIECES)
     if len(kept) < 2:
-        bins = f"{_MIN_PIECES} or more at {len(kept)} distances, by half a metre"
         raise ValueError(
-            f"scans show {len(distances)} pieces of walls, {bins}: must be at 2 or more"
+            f"scans show {len(distances)} pieces of walls, {_MIN_PIECES} or more of them in "
+            f"{len(kept)} bins of half a metre: must be in 2 or more bins"
         )
     within = distances < config.max_range
     middles = [np.median(distances[within][bins == i]) for i in kept]
@@ -186,7 +186,7 @@ def _edges(ranges: Float[np.ndarray, "S A"], max_range: float) -> tuple[float, f
         # A mixed pixel lies anywhere between both surfaces; those near one are not seen.
         visible = 1 - 2 * _MARGIN / (far - near)
     if not is_edge.any():
-        raise ValueError("scans show no edges: too few to fit the noise")
+        raise ValueError("scans show no edges: must show some to fit the noise")
     mixed = np.sum(1 / visible[is_mixed])
     # A clean edge is met twice, before and after its jump; one whose mixed pixel is not seen looks
     # the same.

@@ -236,7 +236,10 @@ class Calibration(TypedDict):
             "Mean probability of the most likely class; equals the share right if calibrated.",
         ),
     ]
-    accuracy: Annotated[float | None, Metric("right, of detected", "Share of the detected PoIs.")]
+    accuracy: Annotated[
+        float | None,
+        Metric("right, of detected", "Share of detected PoIs whose most likely class is right."),
+    ]
     nll: Annotated[float | None, Metric("NLL of the maps", "Mean -log p of the true class.")]
 
 
@@ -252,21 +255,23 @@ class Case(TypedDict):
     ]
     collisions: Annotated[int, Metric("collisions", "Number of control periods with contact.", 0)]
     goals_reached_fraction: Annotated[
-        float | None, Metric("goals reached", "Share of the chosen viewpoints.")
+        float | None, Metric("goals reached", "Share of goals that robots reached.")
     ]
     information: Annotated[float, Metric("information", "Sum of 1 / sigma norm over the map.", 2)]
     calibration: Calibration
     episodes: Annotated[int, Metric("missions", "Number of missions.", 0)]
-    ended: Annotated[dict[str, int], Metric("ends", "Number of missions by how they ended.")]
+    ended: Annotated[dict[str, int], Metric("ends", "Number of missions with each kind of end.")]
     told: NotRequired[
         Annotated[
-            float, Metric("right labels", "Share of PoIs with the right label; of a robot alone.")
+            float, Metric("right labels", "For a robot alone: share of PoIs with the right label.")
         ]
     ]
     ambiguous_reported: NotRequired[
         Annotated[
             float | None,
-            Metric("reported as ambiguous", "Share of the PoIs that it cannot tell apart."),
+            Metric(
+                "reported as ambiguous", "For a robot alone: share of PoIs it cannot tell apart."
+            ),
         ]
     ]
     seed: NotRequired[Annotated[int, Metric("seed", "Seed of the arenas of an evaluation.")]]

@@ -22,9 +22,9 @@ from jaxsense.training.mdp import models_of
 
 TASKS = {
     "map-v0": "the paper's map of three PoIs, whose looks are almost certain",
-    "many-v0": "eight PoIs of sixteen classes, of which a sensor tells four labels apart",
-    "noisy-v0": "looks are uncertain and beliefs accumulate them",
-    "team-v0": "a camera and a LiDAR drive among three to eight PoIs, and time has a price",
+    "many-v0": "eight PoIs of sixteen classes; each sensor distinguishes four labels",
+    "noisy-v0": "uncertain looks, which beliefs accumulate",
+    "team-v0": "robots with a camera and a LiDAR drive among three to eight PoIs; time has a cost",
 }
 """The frozen tasks, and what is special in each."""
 
@@ -64,8 +64,8 @@ def make(name: str, agent: str | None = None) -> Task:
     """Makes a frozen task by its name, for example `noisy-v0`.
 
     `map-v0` is the paper's map MDP, whose looks are almost certain. In `noisy-v0` they are not, and
-    beliefs accumulate. `many-v0` has eight PoIs of sixteen classes. In `team-v0`, a camera and a
-    LiDAR drive among three to eight PoIs, and time has a price.
+    beliefs accumulate them. `many-v0` has eight PoIs of sixteen classes. In `team-v0`, two robots,
+    with a camera and a LiDAR, drive among three to eight PoIs, and time has a cost.
 
     Args:
       name: one of `registered()`.
@@ -100,7 +100,7 @@ def as_task(task: Task | str, agent: str | None = None) -> Task:
     if isinstance(task, str):
         return make(task, agent)
     if agent is not None:
-        raise ConfigError("agent", agent, "goes with a name; make(name, agent) has one already")
+        raise ConfigError("agent", agent, "must be None with a task; pass it to make(name, agent)")
     return task
 
 

@@ -207,7 +207,7 @@ class MapTask(OneAgent):
 
 @pytree
 class TeamTask:
-    """A task in the team MDP: robots choose in turn, drive and look, and time has a price.
+    """A task in the team MDP: robots choose in turn, drive and look, and time has a cost.
 
     One policy chooses for all robots; each observation is what the robot knows whose turn it is.
 

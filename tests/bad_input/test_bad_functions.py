@@ -297,7 +297,7 @@ FUNCTIONS = {
     ),
     "interpolate": (
         lambda w: dqn.interpolate(jnp.zeros(7), jnp.full(3, 1 / 3)),
-        "length of table = 7: must be 6 or another number of points of a lattice",
+        "length of table = 7: must be 6 or another size of a grid",
     ),
     "fuse seen": (
         lambda w: vae.fuse(w.params, w.model, w.belief, jnp.zeros(3, bool), (w.x, None)),

@@ -332,7 +332,7 @@ CHANGES = [
     ({"arena.colours": {"red": "red"}}, "lists of 3 numbers, each 0 or of"),
     (
         {"arena.num_pois": 26},
-        "arena.num_pois = 26: must be at most 25: so many PoIs of radius 0.1 m with gaps of 0.3 m "
+        "arena.num_pois = 26: must be at most 25: no more PoIs of radius 0.1 m with gaps of 0.3 m "
         "fit into an arena of side 3.0 m",
     ),
     (

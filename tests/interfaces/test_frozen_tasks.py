@@ -150,7 +150,7 @@ def test_a_vector_of_gymnasium_is_one_program(gymnasium, name):
 
 def test_a_task_has_its_sensor():
     gymnax = pytest.importorskip("jaxsense.interfaces.gymnax", reason="needs jaxsense[gymnax]")
-    with pytest.raises(ValueError, match="modality = 0: goes with a MapMdp"):
+    with pytest.raises(ValueError, match="modality = 0: must be None with a task"):
         gymnax.MapEnv(make("map-v0"), 0)
 
 
@@ -238,7 +238,7 @@ def test_turns_of_pettingzoo_have_masks_and_seeds():
             observations, _, _, _, infos = together.step({agent: action})
             seen.append(observation)
     np.testing.assert_array_equal(seen[:6], seen[6:])
-    with pytest.raises(ValueError, match="config: goes with a TeamMdp"):
+    with pytest.raises(ValueError, match="config: must be None with a task"):
         pettingzoo.TeamAECEnv(make("team-v0"), jaxsense.PRESETS["team"])
 
 

@@ -86,5 +86,5 @@ def test_logs_of_debian_hold_704_scans():
 def test_a_log_that_is_not_whole_is_named(log, damage):
     path = log(scan(np.ones(300), np.ones(300)))
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(ValueError, match=f"{path} is not a whole file of gzip: "):
+    with pytest.raises(ValueError, match=f"{path} is not a complete gzip file: "):
         rawlog.read(path)

@@ -114,7 +114,7 @@ def test_wrong_policies_and_names_are_refused(arguments, message):
 
 
 def test_an_agent_goes_with_a_name():
-    with pytest.raises(ConfigError, match="agent = 'lidar': goes with a name"):
+    with pytest.raises(ConfigError, match="agent = 'lidar': must be None with a task"):
         jaxsense.score(jaxsense.make(NAME), nop, agent="lidar")
     assert EPISODES > 1
 
