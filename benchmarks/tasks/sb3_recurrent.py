@@ -1,6 +1,8 @@
 """The recurrent PPO of sb3-contrib."""
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -8,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from sb3_contrib import RecurrentPPO  # pyright: ignore[reportMissingImports]
 
+from benchmarks.tasks.learner import Report
 from benchmarks.tasks.sb3 import Sb3Ppo, actor
 from jaxsense.core.types import Key, pytree
-from jaxsense.tasks import Recurrent
+from jaxsense.tasks import Recurrent, Task
 from jaxsense.tasks.score import Policy
 
 Memory = tuple[jax.Array, jax.Array]
@@ -23,11 +26,13 @@ class RecurrentPpo(Sb3Ppo):
 
     Attributes:
       lstm: units of each LSTM.
+      share_of_steps: of the environment steps of other learners, since each takes longer.
     """
 
     name = "SB3 RecurrentPPO"
     packages = (*Sb3Ppo.packages, "sb3-contrib")
     lstm: int = 64
+    share_of_steps: float = 0.5
 
     def make(self, envs: Any, seed: int) -> RecurrentPPO:
         """The algorithm, see `Sb3Ppo.make`."""
@@ -38,13 +43,17 @@ class RecurrentPpo(Sb3Ppo):
         """What an algorithm from `make` has learned, see `Sb3Ppo.policy`."""
         return recurrent(model.policy.lstm_actor, actor(model))
 
+    def train(self, task: Task, seeds: Sequence[int], steps: int, report: Report) -> None:
+        """Takes a share of the steps, see `Sb3Ppo.train`."""
+        super().train(task, seeds, math.ceil(self.share_of_steps * steps), report)
+
 
 @pytree
 class Lstm:
     """A policy that reads the hidden state of an LSTM, which JAX compiles.
 
     Attributes:
-      input_weights: `[S, 4H]` of the input gate, the forget gate, the candidate and the output gate.
+      input_weights: `[S, 4H]` of input gate, forget gate, candidate and output gate.
       hidden_weights: `[H, 4H]` of the same.
       bias: `[4H]` of the same.
       choose: the policy, whose observation is the hidden state `[H]`.

@@ -137,6 +137,15 @@ def test_the_recurrent_ppo_trains_and_draws_its_actions(monkeypatch):
     assert draws(recorder, "map-v0") == [True]
 
 
+def test_the_recurrent_ppo_takes_a_share_of_the_steps(monkeypatch):
+    sb3, contrib = peer("sb3", "stable_baselines3"), peer("sb3_recurrent", "sb3_contrib")
+    asked = []
+    monkeypatch.setattr(sb3, "_train", lambda *arguments: asked.append(arguments[-2]))
+    for steps in (65536, 1):
+        contrib.RecurrentPpo(share_of_steps=0.25).train(make("map-v0"), (20,), steps, None)
+    assert asked == [16384, 1]
+
+
 def test_a_recurrent_network_chooses_and_remembers_as_it_does_in_jax():
     sb3, contrib = peer("sb3", "stable_baselines3"), peer("sb3_recurrent", "sb3_contrib")
     gymnasium, torch = map(importlib.import_module, ("gymnasium", "torch"))
