@@ -313,6 +313,13 @@ def test_results_of_other_learners_stay(tmp_path, monkeypatch):
     assert [p.learner for p in record.read(tmp_path / jobs.CURVES)] == ["mine", "nop", "nop"]
 
 
+def test_the_command_of_a_row_can_be_copied(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(jobs, "run", lambda *arguments: asked.append(arguments[-1]))
+    program.main(["our DQN", "--seeds", "1", "--out", str(tmp_path)])
+    assert asked == [f"python -m benchmarks.tasks 'our DQN' --seeds 1 --out {tmp_path}"]
+
+
 def test_learners_have_names_of_their_own_and_settings():
     names = [each.name for each in learners.load()]
     assert len(set(names)) == len(names)
