@@ -6,6 +6,7 @@ EXPECTED = (
     # Too large for the extra `test`, or from a nightly build.
     "rejax",
     "stable_baselines3",
+    "sb3_contrib",
     "multivae",
     # Not a package of Python.
     "none of chromium",

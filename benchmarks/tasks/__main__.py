@@ -4,6 +4,7 @@ Results go to `benchmarks/results`, the tables and the picture made of them to `
 """
 
 import dataclasses
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -73,7 +74,7 @@ def main(argv: list[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     arguments = cli.parse(PROGRAM, Arguments, argv)
     if not arguments.page:
-        command = " ".join(["python -m benchmarks.tasks", *argv])
+        command = shlex.join(["python", "-m", PROGRAM, *argv])
         jobs.run(arguments.jobs_to_do, arguments.jobs, arguments.out or results.RESULTS, command)
     if arguments.out is None:
         results.main()

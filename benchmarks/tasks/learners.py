@@ -6,7 +6,7 @@ import sys
 
 from benchmarks.tasks.learner import Learner
 
-MODULES = "dqn", "sb3", "rejax"
+MODULES = "dqn", "sb3", "sb3_recurrent", "rejax"
 """Modules of this package, each with a tuple `LEARNERS`, in the order of the tables."""
 
 

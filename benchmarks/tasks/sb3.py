@@ -19,7 +19,8 @@ from jaxsense.core.types import pytree
 from jaxsense.interfaces import prepared_starts
 from jaxsense.interfaces.gymnasium import MapVectorEnv
 from jaxsense.interfaces.stable_baselines3 import MapVecEnv
-from jaxsense.tasks import Task
+from jaxsense.tasks import Recurrent, Task
+from jaxsense.tasks.score import Policy
 
 _STARTS = jax.random.key(2**30)
 _HIDDEN = (64, 64)
@@ -109,35 +110,61 @@ class Sb3Ppo:
     learning_rate: float = 1e-3
     entropy: float = 0.01
 
+    def make(self, envs: Any, seed: int) -> Any:
+        """The algorithm.
+
+        Args:
+          envs: where it learns.
+          seed: of the training.
+        """
+        return PPO("MlpPolicy", envs, **self.options(seed))
+
+    def options(self, seed: int, **network: Any) -> dict[str, Any]:
+        """Settings by PPO's names.
+
+        Args:
+          seed: of the training.
+          **network: arguments of its policy besides the hidden layers.
+        """
+        return {
+            "n_steps": self.num_steps,
+            "n_epochs": self.epochs,
+            "batch_size": self.batch,
+            "learning_rate": self.learning_rate,
+            "gamma": self.discount,
+            "ent_coef": self.entropy,
+            "policy_kwargs": {"net_arch": list(_HIDDEN), **network},
+            "device": "cpu",
+            "seed": seed,
+        }
+
+    def policy(self, model: Any) -> Policy | Recurrent:
+        """What an algorithm from `make` has learned.
+
+        Args:
+          model: the algorithm.
+        """
+        return actor(model)
+
     def train(self, task: Task, seeds: Sequence[int], steps: int, report: Report) -> None:
         """Trains one seed after another, see `Learner.train`."""
-
-        def make(envs: Any, seed: int) -> Any:
-            return PPO(
-                "MlpPolicy",
-                envs,
-                n_steps=self.num_steps,
-                n_epochs=self.epochs,
-                batch_size=self.batch,
-                learning_rate=self.learning_rate,
-                gamma=self.discount,
-                ent_coef=self.entropy,
-                policy_kwargs={"net_arch": list(_HIDDEN)},
-                device="cpu",
-                seed=seed,
-            )
-
-        def policy(model: Any) -> "Dense":
-            last = model.policy.mlp_extractor.policy_net, model.policy.action_net
-            return Dense(layers(*last), jnp.tanh, jax.random.categorical)
-
-        _train(task, self.num_envs, make, policy, seeds, steps, report)
+        _train(task, self.num_envs, self.make, self.policy, seeds, steps, report)
 
 
 def best(key: jax.Array, values: jax.Array) -> jax.Array:
     """`[]` action of the highest value, with any key."""
     del key
     return jnp.argmax(values)
+
+
+def actor(model: Any) -> "Dense":
+    """The dense network from whose outputs PPO draws its actions.
+
+    Args:
+      model: the algorithm.
+    """
+    last = model.policy.mlp_extractor.policy_net, model.policy.action_net
+    return Dense(layers(*last), jnp.tanh, jax.random.categorical)
 
 
 @pytree
@@ -195,7 +222,7 @@ def _train(
     task: Task,
     num_envs: int,
     make: Callable[[Any, int], Any],
-    policy: Callable[[Any], Dense],
+    policy: Callable[[Any], Policy | Recurrent],
     seeds: Sequence[int],
     steps: int,
     report: Report,

@@ -128,6 +128,54 @@ def test_networks_of_stable_baselines3_choose_as_they_do_in_jax():
         assert len(set(theirs.tolist())) > 1
 
 
+def test_the_recurrent_ppo_trains_and_draws_its_actions(monkeypatch):
+    sb3, contrib = peer("sb3", "stable_baselines3"), peer("sb3_recurrent", "sb3_contrib")
+    monkeypatch.setattr(sb3, "NUM_STARTS", 32)
+    learner = dataclasses.replace(contrib.LEARNERS[0], num_envs=16, lstm=8)
+    recorder = train(learner, "map-v0", seeds=(20,))
+    policy = recorder.policies[20]
+    assert [each.shape for each in policy.memory] == [(8,), (8,)]
+    recorder.policies[20] = lambda key, seen: policy.act(key, policy.memory, seen)[0]
+    assert draws(recorder, "map-v0") == [True]
+
+
+def test_the_recurrent_ppo_takes_a_share_of_the_steps(monkeypatch):
+    sb3, contrib = peer("sb3", "stable_baselines3"), peer("sb3_recurrent", "sb3_contrib")
+    asked = []
+    monkeypatch.setattr(sb3, "_train", lambda *arguments: asked.append(arguments[-2]))
+    for steps in (65536, 1):
+        contrib.RecurrentPpo(share_of_steps=0.25).train(make("map-v0"), (20,), steps, None)
+    assert asked == [16384, 1]
+
+
+def test_a_recurrent_network_chooses_and_remembers_as_it_does_in_jax():
+    sb3, contrib = peer("sb3", "stable_baselines3"), peer("sb3_recurrent", "sb3_contrib")
+    gymnasium, torch = map(importlib.import_module, ("gymnasium", "torch"))
+
+    class Env(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-10, 10, (6,))
+        action_space = gymnasium.spaces.Discrete(5)
+
+    model = contrib.RecurrentPpo(lstm=7).make(Env(), seed=0)
+    lstm = model.policy.lstm_actor
+    dense = model.policy.mlp_extractor.policy_net, model.policy.action_net
+    with torch.no_grad():
+        for each in (each for module in (lstm, *dense) for each in module.parameters()):
+            each.normal_()
+    policy = contrib.recurrent(lstm, sb3.Dense(sb3.layers(*dense), jnp.tanh, sb3.best))
+    memory = jax.tree.map(lambda x: jnp.tile(x, (64, 1)), policy.memory)
+    state, start, found = None, np.ones(64, bool), []
+    for seen in np.random.default_rng(0).normal(size=(5, 64, 6)).astype(np.float32):
+        chosen, memory = jax.vmap(lambda m, x: policy.act(None, m, x))(memory, seen)
+        theirs, state = model.predict(seen, state, start, deterministic=True)
+        start = np.zeros(64, bool)
+        np.testing.assert_array_equal(chosen, theirs)
+        for mine, other in zip(memory, state, strict=True):
+            np.testing.assert_allclose(mine, other[0], atol=1e-5)
+        found.append(theirs)
+    assert len(set(np.ravel(found).tolist())) > 1
+
+
 def nop(key, observation):
     return jnp.int32(3)
 
@@ -288,6 +336,13 @@ def test_results_of_other_learners_stay(tmp_path, monkeypatch):
     assert rows["mine"] == ROW
     assert rows["nop"].about["command"] == "python -m benchmarks.tasks nop"
     assert [p.learner for p in record.read(tmp_path / jobs.CURVES)] == ["mine", "nop", "nop"]
+
+
+def test_the_command_of_a_row_can_be_copied(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(jobs, "run", lambda *arguments: asked.append(arguments[-1]))
+    program.main(["our DQN", "--seeds", "1", "--out", str(tmp_path)])
+    assert asked == [f"python -m benchmarks.tasks 'our DQN' --seeds 1 --out {tmp_path}"]
 
 
 def test_learners_have_names_of_their_own_and_settings():
