@@ -106,7 +106,9 @@ _IMPERFECT: _Tables = {
     "constant": partial(imperfect.of_sizes, sweeps=["both [m]"]),
     "drifts": partial(imperfect.of_sizes, sweeps=["both drifts [m]"]),
 }
-_PIPELINE = "pipeline.json", "pipeline_newest.json", "pipeline_missions.json"
+_PIPELINE = [
+    f"pipeline{of}.json" for of in ("", "_newest", "_missions", "_accelerator", "_evaluation")
+]
 TABLES: Mapping[str, _Tables] = {
     **{name: {None: table} for name in ("cpu.json", "h100.json", "h200.json", "h100x2.json")},
     "digits.json": {None: digits.of_results},
@@ -117,11 +119,21 @@ TABLES: Mapping[str, _Tables] = {
         "paper": partial(tables.of_presets, rows=tables.OF_FIGURES, presets=("paper", "default")),
         "default": partial(tables.of_missions, preset="default"),
         "raw": partial(tables.of_presets, rows=tables.OF_RAW, presets=("raw", "default")),
-        "noisy": partial(tables.missions, preset="noisy", num_pois=3),
+        **{
+            f"raw_{preset}": partial(
+                tables.of_presets,
+                rows=tables.OF_RAW_AND_LABELLED,
+                presets=(f"raw_{preset}", preset),
+                heads=("from scans", "with detectors"),
+            )
+            for preset in ("noisy", "many")
+        },
+        "noisy": partial(tables.missions, preset="noisy", num_pois=3, robots=2),
         "maps": partial(tables.of_presets, rows=tables.OF_MAPS, presets=("noisy", "many")),
-        "many": partial(tables.missions, preset="many", num_pois=8),
-        "team": partial(tables.missions, preset="team", num_pois=16),
-        "failures": partial(tables.failures, preset="default", num_pois=3),
+        "many": partial(tables.missions, preset="many", num_pois=8, robots=4),
+        "team": partial(tables.missions, preset="team", num_pois=16, robots=2),
+        "sizes": partial(tables.worth, names=tables.SIZES),
+        "failures": partial(tables.failures, preset="default", num_pois=3, robots=2),
     },
     "tasks.json": {None: board.tables},
     "gate.json": {None: gate.table, "search": gate.of_search},

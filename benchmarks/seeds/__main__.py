@@ -19,11 +19,13 @@ FILE = Path(__file__).parents[1] / "results" / "seeds.json"
 class Arguments:
     """Gathers figures of runs that differ in their seeds.
 
-    They replace those of the same presets and seeds in the file; all others stay.
+    They replace those of the same groups and seeds in the file; all others stay.
     """
 
     runs: Annotated[tuple[Path, ...], Name("RUN")]
     """Directories of finished runs of presets."""
+    group: str | None = None
+    """Name for runs with other settings than their presets, or for their evaluations alone."""
     out: Path = FILE
     """JSON file to write, or to write into."""
 
@@ -37,8 +39,8 @@ def main(argv: list[str] | None = None) -> None:
     found: dict[str, dict[str, Any]] = {}
     if arguments.out.exists():
         found = json.loads(arguments.out.read_text(encoding="utf-8"))
-    for preset, of_seeds in gather(arguments.runs).items():
-        found[preset] = dict(sorted((found.get(preset, {}) | of_seeds).items()))
+    for group, of_seeds in gather(arguments.runs, arguments.group).items():
+        found[group] = dict(sorted((found.get(group, {}) | of_seeds).items()))
     found = dict(sorted(found.items()))
     arguments.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 

@@ -19,32 +19,36 @@ _PAPER = {
 """Table I: which classes each encoder tells apart."""
 
 
-def gather(runs: Iterable[Path]) -> dict[str, Any]:
-    """Figures of runs, by preset and seed, and how they were made.
+def gather(runs: Iterable[Path], group: str | None = None) -> dict[str, Any]:
+    """Figures of runs, by group and seed, and how they were made.
 
     Args:
       runs: their directories.
+      group: of all; by default each is in the group of its preset.
 
     Raises:
-      ConfigError: if two runs have the same preset and seed, or one is not finished.
+      ConfigError: if two runs have the same group and seed, or one is not finished.
     """
     found: dict[str, Any] = {}
     for run in runs:
         written, own = json.loads((run / "config.json").read_text()), summary.read(run)
-        of_preset = found.setdefault(written["preset"], {})
-        if str(written["seed"]) in of_preset:
-            raise ConfigError("runs", str(run), "is a second run of its preset and seed")
-        of_preset[str(written["seed"])] = {
+        of_group = found.setdefault(group or written["preset"], {})
+        if str(written["seed"]) in of_group:
+            raise ConfigError("runs", str(run), "is a second run of its group and seed")
+        of_group[str(written["seed"])] = {
             "commit": written["commit"],
             "versions": own["versions"],
             "devices": own["devices"],
             "figures": of_summary(own),
             "evaluations": {
-                name: {"num_pois": each["num_pois"], "mission": _of_missions(each["mission"])}
+                name: {
+                    **{key: each[key] for key in ("num_pois", "robots")},
+                    "mission": _of_missions(each["mission"]),
+                }
                 for name, each in summary.read_evaluations(run).items()
             },
         }
-    return {preset: dict(sorted(found[preset].items())) for preset in sorted(found)}
+    return {name: dict(sorted(found[name].items())) for name in sorted(found)}
 
 
 def of_summary(own: Mapping[str, Any]) -> Figures:

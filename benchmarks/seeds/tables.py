@@ -4,7 +4,7 @@ import dataclasses
 import re
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 from benchmarks.seeds.runs import Figures
 from benchmarks.studies import in_words
@@ -100,15 +100,21 @@ OF_FIGURES = [
 ]
 
 
-def of_presets(found: Mapping[str, Any], rows: Iterable[Row], presets: tuple[str, ...]) -> str:
+def of_presets(
+    found: Mapping[str, Any],
+    rows: Iterable[Row],
+    presets: tuple[str, ...],
+    heads: tuple[str, ...] = (),
+) -> str:
     """A table of presets next to the paper, each cell from the minimum to the maximum of its seeds.
 
     Args:
       found: from `gather`.
       rows: of the table.
-      presets: its columns.
+      presets: or other groups of runs, its columns.
+      heads: of the columns, if they are not named after presets.
     """
-    names = [f"`{preset}` preset" for preset in presets]
+    names = heads or [f"`{preset}` preset" for preset in presets]
     rows = list(rows)
     paper = ["paper"] if any(row.paper for row in rows) else []
     lines = [_line("", *paper, *names), _line(*["---"] * (1 + len(paper) + len(presets)))]
@@ -181,6 +187,43 @@ OF_RAW = [
     ),
     Row("time, median, latent, naive", _of_policy("time_s", "latent", "naive"), "{:.1f} s"),
 ]
+_CHOOSING, _COUNTING = ("latent", "greedy"), ("naive", "naive_2", "naive_3")
+OF_RAW_AND_LABELLED = [
+    Row("accuracy of single looks, camera, LiDAR", _key("detectors"), "{:.3f}"),
+    Row("right at held-out PoIs, one look by each sensor", _grouped("pair"), "{:.3f}"),
+    Row("... four looks by each", _grouped("all_looks"), "{:.3f}"),
+    Row(
+        "NLL of the map less that of exact Bayes, after six random looks",
+        lambda figures: figures["nll_over_bayes"][-1],
+        "{:.3f}",
+    ),
+    _CONSISTENT,
+    Row(
+        "accuracy of the finished map, latent, greedy",
+        _of_policy("accuracy", *_CHOOSING),
+        "{:.3f}",
+    ),
+    Row(
+        "... naive, naive_2, naive_3",
+        _of_policy("accuracy", *_COUNTING),
+        "{:.3f}",
+    ),
+    Row(
+        "looks per PoI, latent, greedy",
+        _of_policy("observations_per_poi", *_CHOOSING),
+        "{:.2f}",
+    ),
+    Row(
+        "... naive, naive_2, naive_3",
+        _of_policy("observations_per_poi", *_COUNTING),
+        "{:.2f}",
+    ),
+    Row(
+        "confidence minus accuracy, latent",
+        _of_policy("overconfidence", "latent"),
+        "{:.3f}",
+    ),
+]
 OF_MAPS = [
     Row("accuracy of single looks, camera, LiDAR", _key("detectors"), "{:.3f}"),
     Row(
@@ -250,21 +293,30 @@ _OF_MISSIONS = (
 )
 
 
-EVALUATED = {
-    ("default", 3): "`default`",
-    ("noisy", 3): "`noisy`",
-    ("many", 8): "`many`",
-    ("team", 16): "`team`, 16 PoIs",
+Played: TypeAlias = tuple[str, int, int]
+"""A preset or another group of runs, and numbers of PoIs and robots of their evaluations."""
+EVALUATED: Mapping[Played, str] = {
+    ("default", 3, 2): "`default`",
+    ("noisy", 3, 2): "`noisy`",
+    ("many", 8, 4): "`many`",
+    ("team", 16, 2): "`team`, 16 PoIs",
 }
-"""Columns of README's table, by preset and number of PoIs."""
+"""Columns of README's table."""
+SIZES: Mapping[Played, str] = {
+    ("team_sizes", 3, 2): "3 PoIs",
+    ("team_sizes", 8, 2): "8 PoIs",
+    ("team_sizes", 16, 4): "16 PoIs, four robots",
+    ("team_sizes", 16, 6): "16 PoIs, six robots",
+}
+"""Columns of the table of teams that differ in size."""
 
 
-def worth(found: Mapping[str, Any], names: Mapping[tuple[str, int], str]) -> str:
+def worth(found: Mapping[str, Any], names: Mapping[Played, str]) -> str:
     """What every policy reaches: time, as a multiple of the learned one's; looks; and wrong PoIs.
 
     Args:
       found: from `gather`.
-      names: of the columns, by preset and number of PoIs of their evaluations.
+      names: of the columns.
     """
     played = {of: _evaluated(found, *of) for of in names}
     heads = [f"{names[of]}, {_seeds(sorted(map(int, runs)))}" for of, runs in played.items()]
@@ -283,21 +335,23 @@ def worth(found: Mapping[str, Any], names: Mapping[tuple[str, int], str]) -> str
         if any(cell != "not played" for cell in cells):
             lines.append(_line(f"`{policy}`, {what}", *cells))
     command = "python -m jaxsense.evaluate RUN"
-    used = [(seed, found[preset][seed]) for (preset, _), runs in played.items() for seed in runs]
-    return "\n".join([*lines, "", _about(used, command)])
+    used = dict.fromkeys((group, seed) for (group, *_), runs in played.items() for seed in runs)
+    origin = _about([(seed, found[group][seed]) for group, seed in used], command)
+    return "\n".join([*lines, "", origin])
 
 
-def missions(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
+def missions(found: Mapping[str, Any], preset: str, num_pois: int, robots: int) -> str:
     """What every policy of a preset's evaluations reaches, over seeds.
 
     Args:
       found: from `gather`.
       preset: its name.
       num_pois: of the evaluations.
+      robots: their number.
     """
     heads = [*(head for head, _, _ in _OF_MISSIONS), "seconds longer than `latent`, by seed"]
     lines = [_line("policy", *heads), _line(*["---"] * (1 + len(heads)))]
-    runs = _evaluated(found, preset, num_pois)
+    runs = _evaluated(found, preset, num_pois, robots)
     for policy in _POLICIES:
         if shown := [run[policy] for run in runs.values() if policy in run]:
             cells = [_range(form, [x[key] for x in shown]) for _, key, form in _OF_MISSIONS]
@@ -311,17 +365,18 @@ def missions(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
 _OF_CASES = (("right", "accuracy", "{:.3f}"), *_OF_SUMMARY[1:])
 
 
-def failures(found: Mapping[str, Any], preset: str, num_pois: int) -> str:
+def failures(found: Mapping[str, Any], preset: str, num_pois: int, robots: int) -> str:
     """Missions in which robots fail, next to those in which none does.
 
     Args:
       found: from `gather`.
       preset: its name.
       num_pois: of the evaluations.
+      robots: their number.
     """
     lines = [_line("robots", *(head for head, _, _ in _OF_CASES))]
     lines.append(_line(*["---"] * (1 + len(_OF_CASES))))
-    runs = _evaluated(found, preset, num_pois)
+    runs = _evaluated(found, preset, num_pois, robots)
     cases = dict.fromkeys(case for run in runs.values() for case in run if case not in _POLICIES)
     for case, label in {"latent": "all work", **{x: in_words(x) for x in cases}}.items():
         shown = [run[case] for run in runs.values() if case in run]
@@ -337,11 +392,17 @@ def _interval(of: Mapping[str, float]) -> str:
     return f"{mean} ({low} to {high})"
 
 
-def _evaluated(found: Mapping[str, Any], preset: str, num_pois: int) -> dict[str, dict[str, Any]]:
-    """Policies and their missions by the seeds that were evaluated with so many PoIs."""
+def _evaluated(
+    found: Mapping[str, Any], group: str, num_pois: int, robots: int
+) -> dict[str, dict[str, Any]]:
+    """Policies and their missions by the seeds that were evaluated with so many PoIs and robots."""
     of_seeds = {
-        seed: [x["mission"] for x in run["evaluations"].values() if x["num_pois"] == num_pois]
-        for seed, run in found[preset].items()
+        seed: [
+            x["mission"]
+            for x in run["evaluations"].values()
+            if (x["num_pois"], len(x["robots"])) == (num_pois, robots)
+        ]
+        for seed, run in found[group].items()
     }
     return {seed: dict(ChainMap(*of_seed)) for seed, of_seed in of_seeds.items() if of_seed}
 

@@ -57,6 +57,13 @@ def test_cells_go_from_the_minimum_to_the_maximum_of_the_seeds(runs):
     )
 
 
+def test_columns_may_have_other_names_than_presets(runs):
+    found = gather([runs("paper", 100)], "wider") | gather([runs("paper", 101)])
+    heads = ("wider", "as it is")
+    table = tables.of_presets(found, tables.OF_FIGURES[:2], ("wider", "paper"), heads)
+    assert table.splitlines()[0] == "|  | paper | wider | as it is |"
+
+
 def test_what_a_run_does_not_have_stays_empty(runs):
     scans = {**OF_SCANS, "belief": {**OF_SCANS["belief"], "nll": [0.5, 0.25]}}
     scans["mission"] = {**scans["mission"], "naive": CASE}
@@ -85,13 +92,13 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     # Another number of PoIs is another column; this one comes in two files.
     team = runs("team", 100, a=evaluation(16, latent=4.0), b=evaluation(16, latent=4.0, naive=6.0))
     found = gather([first, second, team])
-    table = tables.worth(found, {("many", 8): "`many`", ("team", 16): "`team`"})
+    table = tables.worth(found, {("many", 8, 3): "`many`", ("team", 16, 3): "`team`"})
     assert cells(table, "policy") == ["`many`, seeds 100 to 101", "`team`, seed 100"]
     assert cells(table, "`latent`") == ["1.00; 1.7; 0.2 %", "1.00; 1.7; 0.2 %"]
     assert cells(table, "`auction`") == ["0.95 to 1.10; 1.7; 0.2 %", "not played"]
     assert cells(table, "`naive`") == ["0.80; 1.7; 0.2 %", "1.50; 1.7; 0.2 %"]
     assert "`random`" not in table
-    shown = tables.missions(found, "many", 8)
+    shown = tables.missions(found, "many", 8, 3)
     assert cells(shown, "`latent`") == [
         "0.998", "1.68", "13.8 s", "10.0 to 20.0 s", "-0.001", "0.013", "",
     ]  # fmt: skip
@@ -99,10 +106,25 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     assert "--preset many" in shown.splitlines()[-1]
 
 
+def test_teams_of_other_sizes_are_other_columns(runs):
+    def evaluation(robots, accuracy):
+        mission = {"latent": {**CASE, "accuracy": accuracy}}
+        return {**EVALUATION, "num_pois": 8, "robots": robots, "mission": mission}
+
+    two, three = ["camera", "lidar"], ["camera", "camera", "lidar"]
+    run = runs("team", 100, a=evaluation(two, 0.9), b=evaluation(three, 0.8))
+    found = gather([run], "sizes")
+    names = {("sizes", 8, 3): "three", ("sizes", 8, 2): "two"}
+    assert cells(tables.worth(found, names), "`latent`") == [
+        "1.00; 1.7; 20.0 %",
+        "1.00; 1.7; 10.0 %",
+    ]
+
+
 def test_robots_that_fail_stand_below_those_that_work(runs):
     cases = {"latent": CASE, "auction": CASE, "camera_alone": {**CASE, "accuracy": 0.7}}
     run = runs("default", 100, a={**EVALUATION, "num_pois": 3, "mission": cases})
-    table = tables.failures(gather([run]), "default", 3)
+    table = tables.failures(gather([run]), "default", 3, 3)
     assert cells(table, "all work") == ["0.998", "1.68", "13.8 s", "14.5 s", "0"]
     assert cells(table, "camera alone")[0] == "0.700"
     assert "auction" not in table
@@ -116,7 +138,7 @@ def test_missions_of_trainings_stand_side_by_side(runs):
 
 def test_two_runs_of_a_seed_are_refused(runs, tmp_path):
     run = runs("paper", 100)
-    with pytest.raises(ConfigError, match="is a second run of its preset and seed"):
+    with pytest.raises(ConfigError, match="is a second run of its group and seed"):
         gather([run, run])
 
 
@@ -124,6 +146,16 @@ def test_the_program_writes_what_it_gathers(runs, tmp_path):
     run, out = runs("paper", 100), tmp_path / "seeds.json"
     program.main([str(run), "--out", str(out)])
     assert json.loads(out.read_text()) == json.loads(json.dumps(gather([run])))
+
+
+def test_runs_with_other_settings_are_a_group_of_their_own(runs, tmp_path):
+    out = tmp_path / "seeds.json"
+    program.main([str(runs("paper", 100)), "--out", str(out)])
+    program.main([str(runs("paper", 101)), "--group", "wider", "--out", str(out)])
+    found = json.loads(out.read_text())
+    assert {name: [*of_seeds] for name, of_seeds in found.items()} == {
+        "paper": ["100"], "wider": ["101"],
+    }  # fmt: skip
 
 
 def test_the_program_replaces_runs_and_keeps_others(runs, tmp_path):
