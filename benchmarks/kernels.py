@@ -9,15 +9,14 @@ import dataclasses
 import re
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
-import rich.console
-import rich.table
 
-from benchmarks import measure
+from benchmarks import measure, studies
 from benchmarks.missions import Playing, of_many_pois, playing, untrained
 from jaxsense.config.checks import check_fields, limited
 from jaxsense.run import cli, devices
@@ -30,18 +29,28 @@ _OTHER = "other"
 Parts: TypeAlias = dict[str, "Part"]
 
 
+CASES: Mapping[str, tuple[str, int]] = {
+    "few": ("default", 384),
+    "many": ("default", 16384),
+    "pois": ("16 PoIs", 8192),
+}
+"""Settings and number of missions, by the names of the option `cases`."""
+_CONFIGS = {"default": partial(untrained, "default"), "16 PoIs": of_many_pois}
+
+
 @dataclasses.dataclass(frozen=True)
 class Arguments:
     """Count the kernels of a control step, part by part, and their microseconds."""
 
-    many_pois: bool = False
-    """16 PoIs in an arena of 6 m; by default the settings of `default`."""
-    batch: int = limited(384, at_least=1)
-    """Number of missions side by side."""
+    cases: tuple[str, ...] = tuple(CASES)
+    """Which missions: `few` (384) and `many` (16,384) with the settings of `default`, or 8,192 with
+    16 PoIs (`pois`)."""
     policy: str = "naive"
     """What chooses looks."""
     steps: int = limited(20, at_least=1)
     """Number of control steps to profile, in the middle of missions."""
+    json: Path | None = None
+    """File to write; must be new."""
 
     def __post_init__(self):
         check_fields(self)
@@ -63,27 +72,57 @@ class Part:
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    for name in arguments.cases:
+        if name not in CASES:
+            cli.fail(PROGRAM, f"cases = {name!r}: must be one of {', '.join(CASES)}")
+    if arguments.json is not None:
+        measure.reserve(PROGRAM, "json", arguments.json)
     jax.config.update("jax_default_matmul_precision", "highest")
-    config = of_many_pois() if arguments.many_pois else untrained("default")
-    missions = playing(config, arguments.policy, arguments.batch, arguments.steps)
-    program = missions.compiled(devices.compiler_options())
-    wall, parts = profile(program, missions)
-    table = rich.table.Table("part", "kernels in a step", "us in a step")
-    for name, part in sorted(parts.items(), key=lambda item: -item[1].seconds):
-        table.add_row(
-            name,
-            f"{part.kernels / arguments.steps:,.1f}",
-            f"{1e6 * part.seconds / arguments.steps:,.1f}",
-        )
-    console = rich.console.Console()
-    console.print(table)
-    number = sum(part.kernels for part in parts.values()) / arguments.steps
-    busy = sum(part.seconds for part in parts.values()) / arguments.steps
-    console.print(
-        f"{arguments.batch} missions of {config.arena.num_pois} PoIs, policy {arguments.policy}, "
-        f"{jax.devices()[0].device_kind}: {1e3 * wall / arguments.steps:.3f} ms in a step, "
-        f"{number:,.0f} kernels, {1e3 * busy:.3f} ms of them"
-    )
+    results: dict[str, Any] = {
+        **measure.origin(studies.command(PROGRAM, arguments)),
+        "steps": arguments.steps,
+        "cases": {},
+    }
+    for name in arguments.cases:
+        settings, batch = CASES[name]
+        missions = playing(_CONFIGS[settings](), arguments.policy, batch, arguments.steps)
+        wall, parts = profile(missions.compiled(devices.compiler_options()), missions)
+        results["cases"][name] = {
+            "wall_s": wall,
+            "parts": {part: dataclasses.asdict(of) for part, of in parts.items()},
+        }
+        studies.write(arguments.json, results)
+    print(table(results))
+
+
+def table(results: Mapping[str, Any]) -> str:
+    """Kernels and milliseconds of a control step, part by part, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    steps, cases = results["steps"], results["cases"]
+    heads = ["kernels in a step; ms"]
+    for name in cases:
+        settings, batch = CASES[name]
+        heads.append(f"{batch:,} missions, {'3 PoIs' if settings == 'default' else settings}")
+
+    def cell(number: int, seconds: float) -> str:
+        return f"{number / steps:,.0f}; {1e3 * seconds / steps:.2f}"
+
+    def of_all(case: Mapping[str, Any], key: str) -> Any:
+        return sum(part[key] for part in case["parts"].values())
+
+    rows = [["all", *(cell(of_all(x, "kernels"), of_all(x, "seconds")) for x in cases.values())]]
+    longest = collections.Counter[str]()
+    for case in cases.values():
+        longest.update({name: part["seconds"] for name, part in case["parts"].items()})
+    for name, _ in longest.most_common():
+        parts = [case["parts"].get(name, {"kernels": 0, "seconds": 0.0}) for case in cases.values()]
+        rows.append([f"`{name}`", *(cell(part["kernels"], part["seconds"]) for part in parts)])
+    walls = (f"{1e3 * case['wall_s'] / steps:.2f}" for case in cases.values())
+    rows.append(["from begin to end of a step, ms", *walls])
+    return studies.with_origin(studies.as_table(heads, rows), results)
 
 
 def profile(program: jax.stages.Compiled, missions: Playing) -> tuple[float, Parts]:

@@ -36,3 +36,31 @@ def test_kernels_are_counted_by_the_innermost_part():
         "ask": Part(1, pytest.approx(0.5e-6)),
         "other": Part(2, pytest.approx(0.5e-6)),
     }
+
+
+def test_the_table_adds_up_the_parts_of_a_step():
+    steer, move = ({"kernels": n, "seconds": s} for n, s in ((40, 0.02), (20, 0.04)))
+    results = {
+        **{"command": "python -m x", "commit": "0" * 40, "date": "2026-01-01", "cores": 2},
+        **{"device": "cpu", "versions": {"jax": "0.10.2"}, "steps": 20},
+        "cases": {
+            "few": {"wall_s": 0.08, "parts": {"steer": steer, "move": move}},
+            "pois": {"wall_s": 0.1, "parts": {"steer": steer}},
+        },
+    }
+    lines = kernels.table(results).splitlines()
+    assert lines[0] == "| kernels in a step; ms | 384 missions, 3 PoIs | 8,192 missions, 16 PoIs |"
+    assert lines[2:6] == [
+        "| all | 3; 3.00 | 2; 1.00 |",
+        # The longest parts first.
+        "| `steer` | 2; 1.00 | 2; 1.00 |",
+        "| `move` | 1; 2.00 | 0; 0.00 |",
+        "| from begin to end of a step, ms | 4.00 | 5.00 |",
+    ]
+
+
+def test_unknown_cases_are_refused(capsys):
+    with pytest.raises(SystemExit) as stop:
+        kernels.main(["--cases", "few", "fewer"])
+    assert stop.value.code == 2
+    assert "cases = 'fewer': must be one of few, many, pois" in capsys.readouterr().err
