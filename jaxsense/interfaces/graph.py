@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -15,8 +15,8 @@ OPSET, IR_VERSION = 18, 9
 Array = tuple[str, tuple[int | str, ...]]
 """Dtype and shape of an array; an axis with a name has any size."""
 
-Attributes = dict[str, Any]
-"""Of an operator: numbers, lists of them, or a `Graph`."""
+Attribute: TypeAlias = "int | str | list[int] | Graph"
+"""Of an operator: a number, a name, axes, or a graph within."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Node:
     operator: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    attributes: Attributes
+    attributes: dict[str, Attribute]
 
 
 @dataclasses.dataclass
@@ -128,7 +128,7 @@ class Builder:
         """The name of a list of int64, as operators take axes and shapes."""
         return self.constant(np.array(values, np.int64))
 
-    def op(self, operator: str, *inputs: str, **attributes: Any) -> str:
+    def op(self, operator: str, *inputs: str, **attributes: Attribute) -> str:
         """Applies an operator with one output, and returns its name."""
         key = operator, inputs, repr(sorted(attributes.items()))
         scope: Builder | None = self
@@ -139,7 +139,9 @@ class Builder:
         (self._known[key],) = self.ops(operator, 1, *inputs, **attributes)
         return self._known[key]
 
-    def ops(self, operator: str, number: int, *inputs: str, **attributes: Any) -> tuple[str, ...]:
+    def ops(
+        self, operator: str, number: int, *inputs: str, **attributes: Attribute
+    ) -> tuple[str, ...]:
         """Applies an operator with some number of outputs, and returns their names."""
         outputs = tuple(self.constants.name() for _ in range(number))
         self.graph.nodes.append(Node(operator, inputs, outputs, attributes))
