@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from benchmarks import studies
 from benchmarks.measure import reserve
@@ -139,7 +140,7 @@ def choices(config: Config, models: Models, number: int, seed: int = 0) -> list[
     return found[:number]
 
 
-def _rows(seen: tuple[np.ndarray, Any]) -> Iterator[Choice]:
+def _rows(seen: tuple[np.ndarray, dict[str, PyTree]]) -> Iterator[Choice]:
     is_due, choice = seen
     for row in np.flatnonzero(is_due):
         yield Choice(**jax.tree.map(lambda x: x[row], choice))  # noqa: B023
@@ -147,11 +148,11 @@ def _rows(seen: tuple[np.ndarray, Any]) -> Iterator[Choice]:
 
 def _observer(
     scenario: Mission, models: Models, robot: int
-) -> Callable[[jax.Array, MissionState], tuple[jax.Array, dict[str, Any]]]:
+) -> Callable[[jax.Array, MissionState], tuple[jax.Array, dict[str, PyTree]]]:
     config, index, policy = scenario.config, jnp.int32(robot), scenario.policies["latent"]
     sensor = scenario.world.sensors[config.modality_of_robot[robot]]
 
-    def observe(key: jax.Array, state: MissionState) -> tuple[jax.Array, dict[str, Any]]:
+    def observe(key: jax.Array, state: MissionState) -> tuple[jax.Array, dict[str, PyTree]]:
         robots, scene = state.robots, state.scene
         given_up = robots.unreachable | robots.undetected | robots.exhausted
         phase, position = robots.phase, scene.layout.position
@@ -342,7 +343,7 @@ def relative_error(theirs: np.ndarray, ours: np.ndarray) -> float:
     return float(np.abs(theirs[is_value] - ours[is_value]).max(initial=0.0) / scale)
 
 
-def measure(arguments: Arguments) -> dict[str, Any]:
+def measure(arguments: Arguments) -> dict[str, object]:
     """The content of the JSON file.
 
     Args:

@@ -271,7 +271,7 @@ def play(
         yield {"sweep": sweep.name, "rows": rows, "break": point}
 
 
-def measure(arguments: Arguments, config: Config, models: Models) -> dict[str, Any]:
+def measure(arguments: Arguments, config: Config, models: Models) -> dict[str, object]:
     """The figures of the JSON file: without errors, and of each curve by sweep.
 
     Args:

@@ -1,11 +1,11 @@
 """Adapts the map MDP and the team MDP to one interface for Q-learning, and defines agents'."""
 
 from collections.abc import Callable
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Index, Key, Transition, pytree
@@ -65,7 +65,7 @@ class Agent(Protocol):
         """
         ...
 
-    def environment(self, mdp: Any, modality: Index) -> "Environment[Any]":
+    def environment(self, mdp: PyTree, modality: Index) -> "Environment[PyTree]":
         """What the agent learns in.
 
         Args:

@@ -64,7 +64,7 @@ class Graph:
             wanted.update(node.inputs, *(graph.read() for graph in _within(node)))
         return dataclasses.replace(self, nodes=kept[::-1])
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The graph for `json.dumps`."""
         nodes = [
             [

@@ -1,7 +1,6 @@
 """Pictures of states of tasks, while somebody plays them."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -15,7 +14,7 @@ from jaxsense.core.types import Belief
 from jaxsense.dqn.map_mdp import MapMdp, MapState
 from jaxsense.dqn.team_mdp import Team, TeamState
 from jaxsense.show.colours import in_plane, modality_colour, plane
-from jaxsense.tasks import Environment
+from jaxsense.tasks import Task
 
 _SIZE = 4.0  # inches, of each part
 _DPI = 100
@@ -25,7 +24,7 @@ _AROUND = 0.75  # of how far classes lie apart
 _TEN = 10
 
 
-def frame(task: Environment, state: MapState | TeamState, actions: Sequence[int]) -> np.ndarray:
+def frame(task: Task, state: MapState | TeamState, actions: Sequence[int]) -> np.ndarray:
     """What is known in a state, and the truth.
 
     Beliefs are 2-sigma ellipses in the two latent dimensions that show classes, which are numbered,
@@ -71,7 +70,7 @@ def _read(mdp: MapMdp, belief: Belief) -> tuple[jax.Array, jax.Array]:
     return probabilities, mdp.fusion.classes.mean
 
 
-def _title(task: Any, state: MapState | TeamState, number: int) -> str:
+def _title(task: Task, state: MapState | TeamState, number: int) -> str:
     """Name, step and, of a team, time."""
     parts = [f"{task.name}, {task.agent}", f"step {number} of {task.max_steps}"]
     if isinstance(state, TeamState):
