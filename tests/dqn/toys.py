@@ -6,13 +6,16 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxsense.config import MdpConfig
+from jaxsense.config import MdpConfig, TravelConfig
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import policies, rewards, team_mdp
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.policies import Known
 
 SENSORS = ("camera", "lidar")
+TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
+# From the origin 1.0, 2.0 and 3.0 m to drive: 5, 10 and 15 s.
+PLACES = jnp.array([[1.9, 0.0], [0.0, 2.9], [-3.9, 0.0]])
 
 
 @pytree
