@@ -172,7 +172,7 @@ class Translator(Operators):
         )
         is_second = self.cast(index, bool)
         number = len(equation.outvars)
-        return self.build.ops("If", number, is_second, then_branch=yes, else_branch=no)
+        return self.build.control("If", number, is_second, then_branch=yes, else_branch=no)
 
     def _within(
         self, inputs: dict[str, Array], body: Callable[["Translator"], Sequence[str]]
@@ -198,7 +198,7 @@ class Translator(Operators):
         inputs = {self.build.constants.name(): kind for kind in kinds}
         step, _, *within = inputs
         graph = self._within(inputs, lambda inner: body(inner, step, within))
-        return self.build.ops("Loop", len(equation.outvars), most, goes_on, *carry, body=graph)
+        return self.build.control("Loop", len(equation.outvars), most, goes_on, *carry, body=graph)
 
     def _scan(self, equation: core.JaxprEqn, *given: str) -> Sequence[str]:
         params = equation.params

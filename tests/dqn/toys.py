@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from jaxsense.config import MdpConfig, TravelConfig
@@ -143,3 +144,16 @@ def paying_once_mdp(num_pois=2, max_steps=20):
     """
     fusion = Once(Belief(jnp.zeros(2), jnp.array([3.0, 4.0])), 1)
     return make_mdp(Certain(1), fusion, num_pois, max_steps=max_steps, partly_seen_starts=False)
+
+
+# Every state of two PoIs of `paying_once_mdp`. A first look gains .8 and a second costs 1; with
+# gamma = .5, for look 0, look 1 and NOP:
+ONCE_SEEN = jnp.array([[[0], [0]], [[1], [0]], [[0], [1]], [[1], [1]]], bool)
+ONCE_Q = np.array(
+    [
+        [1.2, 1.2, 0.0],  # .8 + .5 x .8
+        [-0.6, 0.8, 0.0],  # -1 + .5 x .8; .8 + .5 x 0
+        [0.8, -0.6, 0.0],
+        [-1.0, -1.0, 0.0],  # -1 + .5 x 0
+    ]
+)
