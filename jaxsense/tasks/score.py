@@ -27,7 +27,7 @@ _UNTRACEABLE = (
 _RESAMPLES = 2000
 _LEVEL = 0.95
 
-Policy = Callable[[Key, jax.Array], ArrayLike]
+Policy = Callable[[Key, jax.Array], jax.Array]
 """`(key, observation [S]) -> []` action, an integer; a pure function that JAX can trace, or one
 from `on_host`."""
 
@@ -261,6 +261,6 @@ _play_compiled = jax.jit(_play, static_argnums=4)
 
 def _forget(
     policy: Policy, key: Key, memory: tuple[()], observation: jax.Array
-) -> tuple[ArrayLike, tuple[()]]:
+) -> tuple[jax.Array, tuple[()]]:
     """A policy without memory."""
     return policy(key, observation), memory
