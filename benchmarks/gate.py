@@ -197,7 +197,7 @@ def answered(
     return found
 
 
-def measure_all(arguments: Arguments) -> dict[str, Any]:
+def measure_all(arguments: Arguments) -> dict[str, object]:
     """The content of the JSON file: shares by run, modality and situation.
 
     Args:

@@ -10,9 +10,9 @@ search and with one.
 
 import dataclasses
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +20,10 @@ import numpy as np
 
 from benchmarks import studies
 from benchmarks.curves import Curves
+from benchmarks.imperfect_tables import KEYS, MESSAGES, NO_SEARCH, SEARCH, point_in_words, tables
 from benchmarks.measure import reserve
 from benchmarks.same_accuracy import Need
-from benchmarks.where import as_cell, compare
+from benchmarks.where import compare
 from jaxsense import Config, Models, mission
 from jaxsense.config import CommunicationConfig, ConfigError, LocalisationConfig, SearchConfig
 from jaxsense.config.checks import check_fields, require
@@ -35,19 +36,6 @@ from jaxsense.run import cli
 PROGRAM = "benchmarks.imperfect"
 FALL = 0.01
 """Loss of accuracy that counts as broken."""
-NO_SEARCH, SEARCH, MESSAGES = "no search", "with a search", "messages"
-"""Names of the curves."""
-_KEYS = {"accuracy": 3, "own": 3, "nll": 3, "looks": 2, "time": 1, "collisions": 3}
-"""What is measured, with its decimals in tables."""
-_HEADS = {
-    "accuracy": "accuracy",
-    "own": "accuracy of the robots' own maps",
-    "nll": "NLL",
-    "looks": "looks per PoI",
-    "time": "mean time [s]",
-}
-_OF_SIZES = ("accuracy", "looks", "time")
-_OF_MESSAGES = ("accuracy", "own", "nll", "looks", "time")
 _DRAWS = 1000  # of the bootstrap
 _DELAY_OF_LOSSES, _LOSS_OF_DELAYS = 2.0, 0.5  # s and share, of the sweeps of both together
 
@@ -264,14 +252,14 @@ def play(
         for size, sections in zip(sweep.sizes, sweep.changes, strict=True):
             config = changed(curves.scenario.config, sections)
             found = curves.play(models, policy, config)
-            rows.append({"size": size, **compare(found, usual, tuple(_KEYS))})
+            rows.append({"size": size, **compare(found, usual, tuple(KEYS))})
             lost.append(usual["accuracy"] - found["accuracy"])
         point = break_point(sweep.sizes, np.stack(lost))
-        print(sweep.name, _text(point), file=sys.stderr)
+        print(sweep.name, point_in_words(point), file=sys.stderr)
         yield {"sweep": sweep.name, "rows": rows, "break": point}
 
 
-def measure(arguments: Arguments, config: Config, models: Models) -> dict[str, Any]:
+def measure(arguments: Arguments, config: Config, models: Models) -> dict[str, object]:
     """The figures of the JSON file: without errors, and of each curve by sweep.
 
     Args:
@@ -294,91 +282,9 @@ def measure(arguments: Arguments, config: Config, models: Models) -> dict[str, A
         each = Imperfect(key, changed(config, own_maps), arguments.episodes, only=(policy,))
         found[MESSAGES] = [*play(each, models, policy, messages(arguments), usual)]
     return {
-        "usual": {name: float(usual[name].mean()) for name in _KEYS},
+        "usual": {name: float(usual[name].mean()) for name in KEYS},
         "curves": {name: sweeps for name, sweeps in found.items() if sweeps},
     }
-
-
-def breaks(results: Mapping[str, Any]) -> str:
-    """Sizes of each error at which the accuracy has fallen by `FALL`, in Markdown.
-
-    Args:
-      results: the content of the JSON file.
-    """
-    curves = _by_sweep(results, (NO_SEARCH, SEARCH))
-    rows = [
-        [sweep, *(_text(found[sweep]["break"]) for found in curves.values())]
-        for sweep in next(iter(curves.values()))
-    ]
-    return studies.with_origin(studies.as_table(["error", *curves], rows), results)
-
-
-def of_sizes(results: Mapping[str, Any], sweeps: Sequence[str]) -> str:
-    """Figures without a search and with one at all sizes of some errors, in Markdown.
-
-    Args:
-      results: the content of the JSON file.
-      sweeps: names of the errors.
-    """
-    curves = _by_sweep(results, (NO_SEARCH, SEARCH))
-    heads = [f"{_HEADS[key]}, {name}" for name in curves for key in _OF_SIZES]
-    none = [f"{results['usual'][key]:.{_KEYS[key]}f}" for key in _OF_SIZES]
-    rows = [["none", *none * len(curves)]]
-    for sweep in sweeps:
-        for i, row in enumerate(next(iter(curves.values()))[sweep]["rows"]):
-            each = [found[sweep]["rows"][i] for found in curves.values()]
-            cells = [as_cell(row[key], _KEYS[key]) for row in each for key in _OF_SIZES]
-            rows.append([f"{sweep}: {row['size']:g}", *cells])
-    return studies.with_origin(studies.as_table(["error", *heads], rows), results)
-
-
-def of_messages(results: Mapping[str, Any]) -> str:
-    """Figures at the largest loss and delay of each kind, in Markdown.
-
-    Args:
-      results: the content of the JSON file.
-    """
-    usual = results["usual"]
-    none = [f"{usual[key]:.{_KEYS[key]}f}" for key in _OF_MESSAGES]
-    rows = [["one shared map", *none, ""]]
-    for found in results["curves"][MESSAGES]:
-        row = found["rows"][-1]
-        cells = [as_cell(row[key], _KEYS[key]) for key in _OF_MESSAGES]
-        ratio = row["time"][0] / usual["time"]
-        rows.append([f"{found['sweep']}: {row['size']:g}", *cells, f"{ratio:.3f}"])
-    heads = ["messages", *(_HEADS[key] for key in _OF_MESSAGES), "ratio of mean times"]
-    return studies.with_origin(studies.as_table(heads, rows), results)
-
-
-def _by_sweep(
-    results: Mapping[str, Any], names: Iterable[str]
-) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """Those of some curves that were measured, their sweeps by name."""
-    return {
-        name: {each["sweep"]: each for each in results["curves"][name]}
-        for name in names
-        if name in results["curves"]
-    }
-
-
-def tables(results: Mapping[str, Any]) -> Iterator[str]:
-    """All tables of a JSON file.
-
-    Args:
-      results: its content.
-    """
-    for found in _by_sweep(results, (NO_SEARCH,)).values():
-        yield breaks(results)
-        yield of_sizes(results, [*found])
-    if MESSAGES in results["curves"]:
-        yield of_messages(results)
-
-
-def _text(point: Need | None) -> str:
-    if point is None:
-        return "-"
-    mean, low, high = ("?" if x is None else f"{x:.3g}" for x in point.values())
-    return f"{mean} ({low} to {high})"
 
 
 def main(argv: list[str] | None = None) -> None:

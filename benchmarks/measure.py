@@ -54,7 +54,7 @@ class Side:
       num_devices: how many JAX devices it uses.
     """
 
-    run: Callable[[], Any]
+    run: Callable[[], PyTree]
     work: float
     batch: int
     compile_s: float = 0.0
@@ -93,7 +93,7 @@ class Row:
     is_bound: bool = False
     also: dict[str, float] = dataclasses.field(default_factory=dict)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The public keys, and when, where and how it was measured.
 
         The name of a peer that was stopped says so.
@@ -149,7 +149,7 @@ def make_row(
     )
 
 
-def provenance(command: str) -> dict[str, Any]:
+def provenance(command: str) -> dict[str, object]:
     """Commit, day, number of cores and the command itself."""
     return {
         "commit": version.commit(),
@@ -165,7 +165,7 @@ def versions(packages: tuple[str, ...] = ()) -> dict[str, str]:
     return {"python": platform.python_version(), **found}
 
 
-def origin(command: str, packages: tuple[str, ...] = ()) -> dict[str, Any]:
+def origin(command: str, packages: tuple[str, ...] = ()) -> dict[str, object]:
     """How, where and when results were measured, for a JSON file.
 
     Args:
@@ -196,8 +196,8 @@ def describe(results: Mapping[str, Any]) -> str:
 
 
 def compiled(
-    function: Callable[..., Any],
-    *args: Any,
+    function: Callable[..., PyTree],
+    *args: PyTree,
     work: float,
     batch: int,
     workers: Workers = devices.ALONE,
@@ -218,7 +218,7 @@ def compiled(
     program = jax.jit(function).lower(*parts[0]).compile(options)
     compile_s = time.perf_counter() - begin
 
-    def run() -> list[Any]:
+    def run() -> list[PyTree]:
         work_on = lambda i: jax.block_until_ready(program(*parts[i]))  # noqa: E731
         return devices.side_by_side(work_on, threads)
 
@@ -275,7 +275,7 @@ def joined(parts: list[PyTree]) -> PyTree:
     return jax.tree.map(lambda *x: np.concatenate([np.asarray(each) for each in x]), *parts)
 
 
-def seconds(run: Callable[[], Any]) -> float:
+def seconds(run: Callable[[], object]) -> float:
     """How long a call takes."""
     begin = time.perf_counter()
     run()

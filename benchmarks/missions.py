@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -166,7 +165,7 @@ class Playing:
     steps: int
 
     @property
-    def args(self) -> tuple[Any, ...]:
+    def args(self) -> tuple[jax.Array, Models, MissionState]:
         """Arguments of the program."""
         return self.keys, self.models, self.states
 
@@ -174,7 +173,7 @@ class Playing:
         """Runs `steps` control periods of all missions."""
         return rollout_batch(keys, self.scenario, models, states, self.steps, len(keys))[0]
 
-    def compiled(self, options: dict[str, Any]) -> jax.stages.Compiled:
+    def compiled(self, options: devices.Options) -> jax.stages.Compiled:
         """The program of `go_on`."""
         return jax.jit(self.go_on).lower(*self.args).compile(options)
 

@@ -4,12 +4,13 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import PyTree
 from mujoco import mjx
 
 from benchmarks import measure, peers
@@ -103,7 +104,7 @@ class Peer:
         return measure.compare(row, _UNIT, ours, theirs, options, **names)
 
 
-def _native(simulate: Callable[..., Callable[[], Any]], options: Options) -> Sides | None:
+def _native(simulate: Callable[..., Callable[[], PyTree]], options: Options) -> Sides | None:
     return functools.partial(_native_sides, simulate) if options.peers else None
 
 
@@ -283,10 +284,10 @@ def _drive_side(arena: Arena, drives: Drives, workers: Workers, keeps_data: bool
         is_empty = not np.any(arena.poi_of_geom >= 0)
         still = arena.data if is_empty else arenas.put(arena, drives.layout, drives.poses)
 
-        def kept(data: mjx.Data) -> Any:
+        def kept(data: mjx.Data) -> PyTree:
             return data if keeps_data else (data.qpos, data.qvel, data.qacc_warmstart)
 
-        def step(state: Any, wheel_speeds: jax.Array) -> tuple[Any, None]:
+        def step(state: PyTree, wheel_speeds: jax.Array) -> tuple[PyTree, None]:
             names = ("qpos", "qvel", "qacc_warmstart")
             data = state if keeps_data else still.replace(**dict(zip(names, state, strict=True)))
             return kept(arenas.drive(arena, data, wheel_speeds)), None
@@ -322,7 +323,7 @@ def _move_side(scenario: Mission, states: MissionState) -> Side:
 
 
 def _native_sides(
-    simulate: Callable[..., Callable[[], Any]], arena: Arena, drives: Drives
+    simulate: Callable[..., Callable[[], PyTree]], arena: Arena, drives: Drives
 ) -> list[Side]:
     """C MuJoCo on the same drives, with a thread for each core and twice as many."""
     put = jax.jit(jax.vmap(lambda layout, poses: arenas.put(arena, layout, poses)))

@@ -153,7 +153,9 @@ def measured(tree: Path, command: Command, place: Path) -> Needs:
     return run(tree, words(2), place)
 
 
-def pairs(arguments: Arguments, before: Path, place: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def pairs(
+    arguments: Arguments, before: Path, place: Path
+) -> Iterator[tuple[str, Mapping[str, object]]]:
     """Yields each command's name, and what both trees need for it.
 
     Args:

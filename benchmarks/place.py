@@ -177,7 +177,7 @@ def accuracies(config: Config, models: Models) -> dict[str, float]:
 
 def compared(
     config: Config, models: Models, accuracy: Mapping[str, float], drives: tuple[float, ...]
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[dict[str, object]]:
     """Seconds by sensor and drive, of the best robot and of each rule, for each of `ERRORS`.
 
     Args:

@@ -4,12 +4,12 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import PyTree
 from mujoco import mjx
 
 from benchmarks import measure, peers
@@ -170,7 +170,7 @@ def _native_sides(world: World, placed: mjx.Data) -> list[Side]:
     ]
 
 
-def _warp_side(cast: Callable[..., Callable[[], Any]], world: World, placed: mjx.Data) -> Side:
+def _warp_side(cast: Callable[..., Callable[[], PyTree]], world: World, placed: mjx.Data) -> Side:
     """Warp in the same scenes, with the rays of all robots in one call."""
     robots = range(len(world.sensors))
     origins, directions = [], []

@@ -14,7 +14,7 @@ from typing import Any
 from benchmarks import (
     exported,
     gate,
-    imperfect,
+    imperfect_tables,
     pipeline,
     place,
     recorded,
@@ -102,9 +102,9 @@ def number(value: float) -> str:
 
 _Tables = Mapping[str | None, Callable[[Any], str]]
 _IMPERFECT: _Tables = {
-    "breaks": imperfect.breaks,
-    "constant": partial(imperfect.of_sizes, sweeps=["both [m]"]),
-    "drifts": partial(imperfect.of_sizes, sweeps=["both drifts [m]"]),
+    "breaks": imperfect_tables.breaks,
+    "constant": partial(imperfect_tables.of_sizes, sweeps=["both [m]"]),
+    "drifts": partial(imperfect_tables.of_sizes, sweeps=["both drifts [m]"]),
 }
 _PIPELINE = [
     f"pipeline{of}.json" for of in ("", "_newest", "_missions", "_accelerator", "_evaluation")
@@ -142,8 +142,8 @@ TABLES: Mapping[str, _Tables] = {
     "place.json": {None: place.table},
     "curves.json": {None: same_accuracy.table},
     **{name: _IMPERFECT for name in ("imperfect_default.json", "imperfect_noisy.json")},
-    "imperfect_trained.json": {None: partial(imperfect.of_sizes, sweeps=["both [m]"])},
-    "imperfect_messages.json": {None: imperfect.of_messages},
+    "imperfect_trained.json": {None: partial(imperfect_tables.of_sizes, sweeps=["both [m]"])},
+    "imperfect_messages.json": {None: imperfect_tables.of_messages},
     "raw_ablation.json": {
         None: partial(raw.written, make=raw.of_ablation),
         "seeds": lambda content: raw.of_seeds(*raw.gather(content)),

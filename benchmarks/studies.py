@@ -61,7 +61,7 @@ def command(program: str, arguments: Any) -> str:
     return shlex.join(words)
 
 
-def origin(program: str, arguments: Any, packages: tuple[str, ...] = ()) -> dict[str, Any]:
+def origin(program: str, arguments: Any, packages: tuple[str, ...] = ()) -> dict[str, object]:
     """How, where and when results were measured, with all options and the models' own origin.
 
     Args:
@@ -78,7 +78,7 @@ def origin(program: str, arguments: Any, packages: tuple[str, ...] = ()) -> dict
     }
 
 
-def _made(run: Path) -> dict[str, Any]:
+def _made(run: Path) -> dict[str, object]:
     """What made the models of a run."""
     if (name := str(run)).startswith(PRETRAINED):
         return dataclasses.asdict(pretrained.origin(name.removeprefix(PRETRAINED)))
@@ -86,7 +86,7 @@ def _made(run: Path) -> dict[str, Any]:
     return {name: found.get(name) for name in ("preset", "seed", "commit", "versions")}
 
 
-def write(file: Path | None, results: Mapping[str, Any]) -> None:
+def write(file: Path | None, results: Mapping[str, object]) -> None:
     """Writes results to the file that `measure.reserve` has made, if one was asked for.
 
     Args:

@@ -55,7 +55,7 @@ class Models:
       agent: how the Q-networks are used.
       q_networks: for each modality, parameters of the Q-network; once trained, the same for all in
         a team.
-      tours: parameters of each network that orders looks, see `dqn.tours`.
+      tours: parameters of the network that orders looks, if any does, see `dqn.tours`.
     """
 
     detectors: tuple[Detector, ...]

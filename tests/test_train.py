@@ -373,11 +373,3 @@ def test_presets_are_configurations():
     assert PRESETS["paper"].dqn.observe == "bank"
     assert (PRESETS["paper"].jmvae.alpha, PRESETS["paper"].jmvae.beta) == (1.0, 0.1)
     assert (PRESETS["paper"].dqn.epochs, PRESETS["paper"].dqn.num_envs) == (2000, 512)
-
-
-def test_tensorboard_without_its_package_leaves_no_directory(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    path = tmp_path / "run"
-    line = error_line([*SMOKE, "--tensorboard", "--out", str(path)], capsys)
-    assert "tensorboard = True: needs tensorboardX: pip install" in line
-    assert not path.exists()

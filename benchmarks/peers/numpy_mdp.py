@@ -1,11 +1,12 @@
 """The map MDP with stored detections in NumPy, one environment at a time."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
 from jaxsense import Config, make_jmvae
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Samples
 
 
 @dataclasses.dataclass
@@ -30,7 +31,7 @@ class NumpyMap:
 class NumpyMdp:
     """`dqn.map_mdp` on a bank of detections, with the same rewards and the same maps."""
 
-    def __init__(self, config: Config, params: Any, bank: Any, modality: int):
+    def __init__(self, config: Config, params: Params, bank: Samples, modality: int):
         """Takes a JMVAE's parameters, a bank `[C, S, D_m]` per modality, and the own sensor."""
         self.config = config
         self.modality = modality
@@ -119,7 +120,7 @@ class NumpyMdp:
         state.seen[poi, modality] = True
 
 
-def _layers(params: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+def _layers(params: Params) -> list[tuple[np.ndarray, np.ndarray]]:
     """Kernels and biases of an MLP, from the first layer to the last."""
     layers = params["params"]
     names = sorted(layers, key=lambda name: int(name.split("_")[1]))

@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, SupportsInt
 
 import gymnasium  # pyright: ignore[reportMissingImports]
 import numpy as np
@@ -36,7 +36,7 @@ class MapEnv(gymnasium.Env):
         self._state = self._mdp.reset(self.np_random)
         return self._mdp.observation(self._state), {}
 
-    def step(self, action: Any):
+    def step(self, action: SupportsInt):
         """One action."""
         reward, terminated, truncated = self._mdp.step(self.np_random, self._state, int(action))
         return self._mdp.observation(self._state), reward, terminated, truncated, {}

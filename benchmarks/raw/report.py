@@ -6,7 +6,7 @@ FILES are what `python -m benchmarks.raw --json` has written, one or more tables
 import dataclasses
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -87,13 +87,13 @@ def gather(*wholes: Mapping[str, Any]) -> tuple[Found, list[int]]:
     return found, wholes[0]["seeds"]
 
 
-def _spread(values: Any, digits: int) -> str:
+def _spread(values: Sequence[float] | np.ndarray, digits: int) -> str:
     """The mean over the seeds with their range, unless all are alike."""
     mean, low, high = (f"{x:.{digits}f}" for x in (np.mean(values), np.min(values), np.max(values)))
     return mean if low == high else f"{mean} ({low} to {high})"
 
 
-def _share(values: Any) -> str:
+def _share(values: Sequence[float] | np.ndarray) -> str:
     """The mean over the seeds with the half-width of its 95% interval, and the range."""
     found = interval(np.asarray(values, float))
     low, high = found["low"], found["high"]

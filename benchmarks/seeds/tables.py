@@ -143,13 +143,13 @@ def _cell(row: Row, runs: list[Figures]) -> str:
     return joint.join(_range(row.form, list(of_agent)) for of_agent in zip(*values, strict=True))
 
 
-def _written(form: str, value: Any) -> str:
+def _written(form: str, value: float) -> str:
     """The number in words, without the sign of a zero."""
     text = form.format(value)
     return text if re.search("[1-9]", text) else text.removeprefix("-")
 
 
-def _range(form: str, values: list[Any]) -> str:
+def _range(form: str, values: list[float]) -> str:
     low, high = _written(form, min(values)), _written(form, max(values))
     unit = " s" if form.endswith(" s") else ""
     return low if low == high else f"{low.removesuffix(unit)} to {high}"

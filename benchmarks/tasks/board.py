@@ -42,7 +42,7 @@ class Row:
     steps: int | None = None
     seconds: float | None = None
     wall_seconds: float | None = None
-    settings: dict[str, Any] = dataclasses.field(default_factory=dict)
+    settings: dict[str, object] = dataclasses.field(default_factory=dict)
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @property

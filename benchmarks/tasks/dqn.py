@@ -2,14 +2,16 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from benchmarks.tasks.learner import NUM_STARTS, POINTS, Report, of_seeds, part
 from jaxsense.config import DqnConfig
+from jaxsense.core.types import Key
 from jaxsense.dqn import training
+from jaxsense.dqn.training import DqnState
 from jaxsense.run import devices
 from jaxsense.tasks import Task, greedy
 
@@ -62,14 +64,16 @@ class Dqn:
             num_starts=NUM_STARTS,
         )
 
-        def begin(key: jax.Array, task: Task) -> Any:
+        def begin(key: jax.Array, task: Task) -> tuple[Key, PyTree, DqnState[PyTree]]:
             init_key, start_key, chunk_key = jax.random.split(key, 3)
             learning = task.learning(agent)
             prepared = training.starts(start_key, learning, settings)
             state = training.init(init_key, learning, settings, prepared)
             return jax.random.split(chunk_key, POINTS), prepared, state
 
-        def advance(key: jax.Array, task: Task, prepared: Any, state: Any) -> Any:
+        def advance(
+            key: jax.Array, task: Task, prepared: PyTree, state: DqnState[PyTree]
+        ) -> DqnState[PyTree]:
             learning = task.learning(agent)
             return training.train_chunk(key, learning, settings, state, prepared)[0]
 

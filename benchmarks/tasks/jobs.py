@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing.queues import Queue
 from pathlib import Path
-from typing import Any
 
 import jax
 import rich.console
@@ -47,7 +46,7 @@ class Job:
     steps: int
 
 
-def do(job: Job, provenance: dict[str, Any]) -> tuple[Row, list[Point]]:
+def do(job: Job, provenance: dict[str, object]) -> tuple[Row, list[Point]]:
     """Trains, and gives the row and the curves.
 
     Args:

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
+from jaxtyping import PyTree
 from rejax import DQN, PPO  # pyright: ignore[reportMissingImports]
 
 from benchmarks.tasks.learner import NUM_STARTS, POINTS, Report, of_seeds, part
@@ -68,7 +69,7 @@ class RejaxDqn:
         """Trains all seeds in one program, see `Learner.train`."""
         algorithm = self.make(steps, **_environment(task))
 
-        def act(params: Any, key: jax.Array, observation: jax.Array) -> jax.Array:
+        def act(params: PyTree, key: jax.Array, observation: jax.Array) -> jax.Array:
             del key
             return jnp.argmax(algorithm.agent.apply(params, observation[None])[0])
 
@@ -112,19 +113,19 @@ class RejaxPpo:
             ent_coef=self.entropy,
         )
 
-        def act(params: Any, key: jax.Array, observation: jax.Array) -> jax.Array:
+        def act(params: PyTree, key: jax.Array, observation: jax.Array) -> jax.Array:
             return algorithm.actor.apply(params, observation[None], key, method="act")[0]
 
         unit = self.num_envs * self.num_steps
         _train(algorithm, seeds, steps, unit, lambda state: state.actor_ts, act, report)
 
 
-def iterate(algorithm: Any, state: Any, number: int) -> Any:
+def iterate(algorithm: Any, state: PyTree, number: int) -> PyTree:
     """Some iterations of an algorithm; to be jitted."""
     return jax.lax.fori_loop(0, number, lambda _, s: algorithm.train_iteration(s), state)
 
 
-def _environment(task: Task) -> dict[str, Any]:
+def _environment(task: Task) -> dict[str, object]:
     """What an algorithm learns in, by rejax's names."""
     env = MapEnv(task)
     return {"env": env, "env_params": env.prepared_params(_STARTS, NUM_STARTS)}
@@ -135,8 +136,8 @@ def _train(
     seeds: Sequence[int],
     steps: int,
     unit: int,
-    learned: Callable[[Any], Any],
-    act: Callable[[Any, jax.Array, jax.Array], jax.Array],
+    learned: Callable[[PyTree], PyTree],
+    act: Callable[[PyTree, jax.Array, jax.Array], jax.Array],
     report: Report,
 ) -> None:
     """Trains an algorithm that takes `unit` steps at a time.

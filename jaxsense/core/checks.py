@@ -4,11 +4,11 @@ Traced values are unknown: their checks pass and cost nothing.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import ArrayLike
 
 
 def require(
@@ -144,7 +144,9 @@ def require_one_each(name: str, values: Sequence[object], modalities: Sequence[s
         )
 
 
-def require_bank(bank: Sequence[Any], modalities: Sequence[str], sizes: Sequence[int]) -> None:
+def require_bank(
+    bank: Sequence[ArrayLike], modalities: Sequence[str], sizes: Sequence[int]
+) -> None:
     """Checks that each modality has finite features of looks at the same classes, one or more.
 
     Args:

@@ -1,15 +1,14 @@
 """Multi-layer perceptrons: dense layers with ReLU between them."""
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-Params = Any
+Params = PyTree
 """A pytree of network parameters."""
 
 

@@ -2,13 +2,13 @@
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol, TypeVar, dataclass_transform
+from typing import Protocol, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
 T = TypeVar("T")
 
@@ -21,7 +21,7 @@ Index = int | jax.Array
 Features = tuple[Float[Array, "_"] | None, ...]
 """`[D_m]` features of each modality, or None where it has not looked."""
 
-Scene = Any
+Scene = PyTree
 """A pytree that describes what looks see; MDPs only carry it."""
 
 Samples = tuple[Float[Array, "C _ _"], ...]

@@ -1,11 +1,11 @@
 """Adapts the map MDP and the team MDP to one interface for Q-learning, and defines agents'."""
 
 from collections.abc import Callable
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Index, Key, Transition, pytree
@@ -32,8 +32,8 @@ class Agent(Protocol):
         ...
 
     @property
-    def tour_networks(self) -> tuple[PoolingNetwork, ...]:
-        """The networks that order looks; none if looks take no time."""
+    def tour_networks(self) -> tuple[PoolingNetwork] | tuple[()]:
+        """The network that orders looks; none if looks take no time."""
         ...
 
     def learner(self, modality: str) -> str:
@@ -65,7 +65,7 @@ class Agent(Protocol):
         """
         ...
 
-    def environment(self, mdp: Any, modality: Index) -> "Environment[Any]":
+    def environment(self, mdp: PyTree, modality: Index) -> "Environment[PyTree]":
         """What the agent learns in.
 
         Args:
@@ -79,7 +79,7 @@ class Agent(Protocol):
         ...
 
     def init_tours(self, key: Key) -> tuple[Params, ...]:
-        """Random parameters of each of `tour_networks`."""
+        """Random parameters of `tour_networks`."""
         ...
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
@@ -129,7 +129,7 @@ class Agent(Protocol):
 
         Args:
           params: of the robot's Q-network.
-          tour_params: of each of `tour_networks`, or none.
+          tour_params: of `tour_networks`, or none.
           classes: `[C, D]` joint posterior of each class.
           belief: `[N, D]` the map.
           team: robots and PoIs at this moment; PoIs that are not present are never chosen.

@@ -3,12 +3,12 @@
 import itertools
 import random
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.core.types import Index, Key, call, pytree
 from jaxsense.dqn import map_mdp, team_mdp
@@ -247,7 +247,7 @@ class _TeamCarry:
 
     state: TeamState
     looks: jax.Array
-    memory: Any
+    memory: PyTree
     done: jax.Array
     total: jax.Array
 
@@ -271,7 +271,7 @@ class _Carry:
     looks: jax.Array
     own_looks: jax.Array
     log_likelihood: jax.Array
-    memory: Any
+    memory: PyTree
     done: jax.Array
     total: jax.Array
     first: jax.Array

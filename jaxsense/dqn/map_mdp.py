@@ -119,6 +119,11 @@ class MapState:
     scene: Scene
     steps: jax.Array
 
+    @property
+    def map(self) -> "MapState":
+        """The state itself; of a `TeamState`, that of the map."""
+        return self
+
 
 @pytree
 class Outcome:

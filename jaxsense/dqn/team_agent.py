@@ -56,9 +56,9 @@ class TeamAgent:
         return PoolingNetwork(self.hidden, features)
 
     @property
-    def tour_networks(self) -> tuple[PoolingNetwork, ...]:
+    def tour_networks(self) -> tuple[PoolingNetwork] | tuple[()]:
         """The network that orders looks, if any does."""
-        return (self.network,) * self.orders
+        return (self.network,) if self.orders else ()
 
     def learner(self, modality: str) -> str:
         """The name of what learns for robots of a modality: all robots share one network."""
@@ -105,8 +105,8 @@ class TeamAgent:
         return networks.init(key, self.network, self.network.features * self.config.num_pois[1])
 
     def init_tours(self, key: Key) -> tuple[Params, ...]:
-        """Random parameters of each of `tour_networks`."""
-        return (self.init(key),) * self.orders
+        """Random parameters of `tour_networks`."""
+        return tuple(self.init(key) for _ in self.tour_networks)
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
         """What a robot knows of each PoI, see `team_mdp.observation`.

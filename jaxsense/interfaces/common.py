@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxsense.core import checks
 from jaxsense.core.types import Key
@@ -52,7 +52,7 @@ def environment_spaces(spaces: Any, played: Environment) -> tuple[Any, Any]:
     return spaces_of(spaces, played.observation_size, played.num_actions, played.bound)
 
 
-def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> Any:
+def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> PyTree:
     """Draws random states, `[number]`, for episodes to start from.
 
     A start looks at everything it has seen, which costs several steps; a draw from a few thousand
@@ -73,7 +73,7 @@ def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> Any:
     return jax.jit(lambda key, played: reset(jax.random.split(key, number), played))(key, played)
 
 
-def start(key: Key, played: Environment, starts: Any) -> tuple[Float[Array, " S"], Any]:
+def start(key: Key, played: Environment, starts: PyTree) -> tuple[Float[Array, " S"], PyTree]:
     """Starts an episode.
 
     Args:

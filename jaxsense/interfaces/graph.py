@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,18 +15,36 @@ OPSET, IR_VERSION = 18, 9
 Array = tuple[str, tuple[int | str, ...]]
 """Dtype and shape of an array; an axis with a name has any size."""
 
-Attributes = dict[str, Any]
-"""Of an operator: numbers, lists of them, or a `Graph`."""
+Attribute = int | str | list[int]
+"""Of an operator: a number, a name, or axes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Node:
-    """An operator with names of its inputs and outputs; an input that is left out is ""."""
+    """An operator with names of its inputs and outputs; an input that is left out is "".
+
+    A loop or a branch also has graphs.
+    """
 
     operator: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    attributes: Attributes
+    attributes: Mapping[str, Attribute]
+    graphs: Mapping[str, "Graph"]
+
+    def read(self) -> set[str]:
+        """All names that the operator and those in its graphs read."""
+        return set(self.inputs).union(*(graph.read() for graph in self.graphs.values()))
+
+    def pruned(self) -> "Node":
+        """The operator with pruned graphs."""
+        graphs = {name: graph.pruned() for name, graph in self.graphs.items()}
+        return dataclasses.replace(self, graphs=graphs)
+
+    def as_json(self) -> tuple[object, ...]:
+        """The operator for `json.dumps`."""
+        graphs = {name: graph.as_json() for name, graph in self.graphs.items()}
+        return self.operator, self.inputs, self.outputs, {**self.attributes, **graphs}
 
 
 @dataclasses.dataclass
@@ -45,44 +63,21 @@ class Graph:
 
     def read(self) -> set[str]:
         """All names that operators of the graph, and of those within it, read."""
-        found = set(self.outputs)
-        for node in self.nodes:
-            found.update(node.inputs, *(graph.read() for graph in _within(node)))
-        return found
+        return set(self.outputs).union(*(node.read() for node in self.nodes))
 
     def pruned(self) -> "Graph":
         """The graph without operators whose outputs nobody reads."""
         wanted, kept = set(self.outputs), []
         for node in reversed(self.nodes):
-            if wanted.isdisjoint(node.outputs):
-                continue
-            attributes = {
-                name: value.pruned() if isinstance(value, Graph) else value
-                for name, value in node.attributes.items()
-            }
-            kept.append(node := dataclasses.replace(node, attributes=attributes))
-            wanted.update(node.inputs, *(graph.read() for graph in _within(node)))
+            if not wanted.isdisjoint(node.outputs):
+                kept.append(node.pruned())
+                wanted |= kept[-1].read()
         return dataclasses.replace(self, nodes=kept[::-1])
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """The graph for `json.dumps`."""
-        nodes = [
-            [
-                node.operator,
-                node.inputs,
-                node.outputs,
-                {
-                    name: value.as_json() if isinstance(value, Graph) else value
-                    for name, value in node.attributes.items()
-                },
-            ]
-            for node in self.nodes
-        ]
+        nodes = [node.as_json() for node in self.nodes]
         return {"inputs": [*self.inputs], "outputs": self.outputs, "nodes": nodes}
-
-
-def _within(node: Node) -> Iterator[Graph]:
-    return (value for value in node.attributes.values() if isinstance(value, Graph))
 
 
 class Constants:
@@ -128,7 +123,7 @@ class Builder:
         """The name of a list of int64, as operators take axes and shapes."""
         return self.constant(np.array(values, np.int64))
 
-    def op(self, operator: str, *inputs: str, **attributes: Any) -> str:
+    def op(self, operator: str, *inputs: str, **attributes: Attribute) -> str:
         """Applies an operator with one output, and returns its name."""
         key = operator, inputs, repr(sorted(attributes.items()))
         scope: Builder | None = self
@@ -139,10 +134,26 @@ class Builder:
         (self._known[key],) = self.ops(operator, 1, *inputs, **attributes)
         return self._known[key]
 
-    def ops(self, operator: str, number: int, *inputs: str, **attributes: Any) -> tuple[str, ...]:
+    def ops(
+        self, operator: str, number: int, *inputs: str, **attributes: Attribute
+    ) -> tuple[str, ...]:
         """Applies an operator with some number of outputs, and returns their names."""
+        return self._add(operator, number, inputs, attributes, {})
+
+    def control(self, operator: str, number: int, *inputs: str, **graphs: Graph) -> tuple[str, ...]:
+        """Applies a loop or a branch, and returns the names of its outputs."""
+        return self._add(operator, number, inputs, {}, graphs)
+
+    def _add(
+        self,
+        operator: str,
+        number: int,
+        inputs: tuple[str, ...],
+        attributes: dict[str, Attribute],
+        graphs: dict[str, Graph],
+    ) -> tuple[str, ...]:
         outputs = tuple(self.constants.name() for _ in range(number))
-        self.graph.nodes.append(Node(operator, inputs, outputs, attributes))
+        self.graph.nodes.append(Node(operator, inputs, outputs, attributes, graphs))
         return outputs
 
 
@@ -174,17 +185,16 @@ def as_onnx(
         return helper.make_tensor_value_info(name, kind, shape)
 
     def node(each: Node) -> onnx.NodeProto:
-        attributes: dict[str, Any] = {
+        graphs = {
             key: helper.make_graph(
-                [node(x) for x in value.nodes],
+                [node(x) for x in within.nodes],
                 key,
-                [described(x, *each) for x, each in value.inputs.items()],
-                [helper.make_empty_tensor_value_info(x) for x in value.outputs],
+                [described(x, *each) for x, each in within.inputs.items()],
+                [helper.make_empty_tensor_value_info(x) for x in within.outputs],
             )
-            if isinstance(value, Graph)
-            else value
-            for key, value in each.attributes.items()
+            for key, within in each.graphs.items()
         }
+        attributes: dict[str, Any] = {**each.attributes, **graphs}
         if each.operator == "Cast":
             attributes["to"] = helper.np_dtype_to_tensor_dtype(np.dtype(attributes["to"]))
         return helper.make_node(each.operator, each.inputs, each.outputs, **attributes)

@@ -3,11 +3,13 @@
 The import registers every task as `jaxsense/NAME`, for `gymnasium.make` and `make_vec`.
 """
 
-from typing import Any
+from typing import Any, SupportsInt
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from jaxsense.core import checks
 from jaxsense.core.types import Key
@@ -61,7 +63,7 @@ class TaskEnv(Env):
         self.task = as_task(task, agent)
         self.observation_space, self.action_space = common.environment_spaces(spaces, self.task)
         self._key: Key | None = None
-        self._state: Any = None
+        self._state: PyTree = None
         self._mask = np.ones(self.task.num_actions, np.int8)
         self._actions: list[int] = []
         self._has_ended = False
@@ -86,7 +88,7 @@ class TaskEnv(Env):
         self._actions, self._has_ended = [], False
         return np.array(observation), self._info(mask)
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: SupportsInt) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Takes an action.
 
         Args:
@@ -132,7 +134,7 @@ class TaskEnv(Env):
             raise error.ResetNeeded("render before reset")
         return frame(self.task, self._state, self._actions)
 
-    def _info(self, mask: jax.Array) -> dict[str, Any]:
+    def _info(self, mask: jax.Array) -> dict[str, np.ndarray]:
         self._mask = np.asarray(mask, np.int8)
         return {"action_mask": self._mask.copy()}
 
@@ -151,7 +153,7 @@ class MapVectorEnv(VectorEnv):
         mdp: MapMdp | Environment,
         modality: int | None = None,
         num_envs: int = 1,
-        starts: Any = None,
+        starts: PyTree = None,
         # Quoted: where the site is built without Gymnasium, a stand-in has no `|`.
         autoreset_mode: "AutoresetMode | str" = AutoresetMode.NEXT_STEP,
     ):
@@ -176,7 +178,7 @@ class MapVectorEnv(VectorEnv):
         self.single_observation_space, self.single_action_space = single
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._states: Any = None
+        self._states: PyTree = None
         self._mask = np.ones((num_envs, played.num_actions), np.int8)
         self._ended = np.zeros(num_envs, bool)
         self._key = jax.random.key(0)
@@ -209,7 +211,7 @@ class MapVectorEnv(VectorEnv):
         return self._restarted(mask), self._infos()
 
     def step(
-        self, actions: Any
+        self, actions: ArrayLike
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Takes one action in each environment.
 
@@ -270,7 +272,7 @@ class MapVectorEnv(VectorEnv):
         self._mask = np.array(found, np.int8)
         return np.array(observations)
 
-    def _infos(self) -> dict[str, Any]:
+    def _infos(self) -> dict[str, np.ndarray]:
         """The actions that exist, and that all environments tell them."""
         return {"action_mask": self._mask.copy(), "_action_mask": np.ones(self.num_envs, bool)}
 
@@ -301,7 +303,7 @@ def make_vec(
     return MapVectorEnv(found, None, num_envs, prepared, autoreset_mode)
 
 
-def _key(env: Any) -> Key:
+def _key(env: "Env | VectorEnv") -> Key:
     """A key from the random numbers of an environment."""
     return jax.random.key(int(env.np_random.integers(2**32)))
 
@@ -316,7 +318,7 @@ def _final(observations: np.ndarray, mask: np.ndarray, ended: np.ndarray) -> dic
 
 
 @jax.jit
-def _begin(key: Key, played: Environment) -> tuple[Key, jax.Array, Any, jax.Array]:
+def _begin(key: Key, played: Environment) -> tuple[Key, jax.Array, PyTree, jax.Array]:
     """Next key, `[S]` observation, state and `[A]` actions that exist."""
     next_key, key = jax.random.split(key)
     observation, state = played.reset(key)
@@ -325,8 +327,8 @@ def _begin(key: Key, played: Environment) -> tuple[Key, jax.Array, Any, jax.Arra
 
 @jax.jit
 def _advance(
-    key: Key, played: Environment, state: Any, action: jax.Array
-) -> tuple[Key, Any, TimeStep, jax.Array]:
+    key: Key, played: Environment, state: PyTree, action: jax.Array
+) -> tuple[Key, PyTree, TimeStep, jax.Array]:
     """Next key, state, what the agent sees of it, and `[A]` actions that exist."""
     next_key, key = jax.random.split(key)
     after, found = played.step(key, state, action)
@@ -335,8 +337,8 @@ def _advance(
 
 @jax.jit
 def _step(
-    key: Key, played: Environment, states: Any, actions: jax.Array
-) -> tuple[Key, Any, TimeStep, jax.Array]:
+    key: Key, played: Environment, states: PyTree, actions: jax.Array
+) -> tuple[Key, PyTree, TimeStep, jax.Array]:
     """Next key, `[E]` states, `[E]` time steps and `[E, A]` actions that exist."""
     next_key, key = jax.random.split(key)
     step = jax.vmap(played.step)
@@ -346,8 +348,8 @@ def _step(
 
 @jax.jit
 def _start(
-    key: Key, played: Environment, starts: Any, states: Any, mask: jax.Array
-) -> tuple[Key, jax.Array, Any, jax.Array]:
+    key: Key, played: Environment, starts: PyTree, states: PyTree, mask: jax.Array
+) -> tuple[Key, jax.Array, PyTree, jax.Array]:
     """Next key, observations, states and actions that exist.
 
     Starts are new where `mask` is True, or all of them if there are no states yet.

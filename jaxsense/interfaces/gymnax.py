@@ -4,11 +4,12 @@ The import registers every task by its name, for `gymnax.make("noisy-v0", agent=
 """
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from jaxsense.core.types import Key
 from jaxsense.dqn.map_mdp import MapMdp
@@ -31,7 +32,7 @@ class MapEnvState(environment.EnvState):
       terminated: `[]` bool, the last action was NOP.
     """
 
-    map: Any
+    map: PyTree
     terminated: jax.Array
 
 
@@ -46,7 +47,7 @@ class MapEnvParams(environment.EnvParams):
     """
 
     max_steps_in_episode: int = 20
-    starts: Any = None
+    starts: PyTree = None
 
 
 class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
@@ -96,8 +97,8 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         return seen, MapEnvState(time=jnp.int32(0), map=start, terminated=jnp.bool_(False))  # pyright: ignore
 
     def step_env(
-        self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams
-    ) -> tuple[jax.Array, MapEnvState, jax.Array, jax.Array, dict[Any, Any]]:
+        self, key: Key, state: MapEnvState, action: ArrayLike, params: MapEnvParams
+    ) -> tuple[jax.Array, MapEnvState, jax.Array, jax.Array, dict[str, jax.Array]]:
         """Takes one action, without a reset.
 
         Args:
@@ -125,7 +126,9 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         """
         return self.played.action_mask(state.map)
 
-    def observe(self, key: Key, state: MapEnvState, action: Any, params: MapEnvParams) -> jax.Array:
+    def observe(
+        self, key: Key, state: MapEnvState, action: ArrayLike | None, params: MapEnvParams
+    ) -> jax.Array:
         """What the policy sees of a state.
 
         Args:

@@ -4,7 +4,6 @@
 """
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -70,7 +69,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         TeamEnvState,
         dict[str, jax.Array],
         dict[str, jax.Array],
-        dict[str, Any],
+        dict[str, jax.Array],
     ]:
         """Takes one step, without a reset.
 

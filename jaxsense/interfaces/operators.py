@@ -3,10 +3,13 @@
 import ast
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
+from jax.core import Atom, ShapedArray
+from jax.extend.core import JaxprEqn
+from jax.typing import DTypeLike
 
 from jaxsense.interfaces.graph import Array, Builder
 
@@ -43,10 +46,15 @@ SAME = {
 """Primitives that are one operator."""
 
 
-def described(aval: Any) -> Array:
+def aval(variable: Atom) -> ShapedArray:
+    """What JAX knows of an input or output of an equation: all are arrays."""
+    return cast(ShapedArray, variable.aval)
+
+
+def described(traced: ShapedArray | jax.ShapeDtypeStruct) -> Array:
     """Dtype and shape of what JAX has traced."""
-    shape = tuple(n if isinstance(n, int) else str(n) for n in aval.shape)
-    return aval.dtype.name, shape
+    shape = tuple(n if isinstance(n, int) else str(n) for n in traced.shape)
+    return traced.dtype.name, shape
 
 
 class Operators:
@@ -94,65 +102,65 @@ class Operators:
             "Concat", *(self.build.op("Unsqueeze", self.size(n), axis) for n in sizes), axis=0
         )
 
-    def _dim_as_value(self, equation: Any) -> str:
-        return self.cast(self.size(equation.params["dim"]), equation.outvars[0].aval.dtype)
+    def _dim_as_value(self, equation: JaxprEqn) -> str:
+        return self.cast(self.size(equation.params["dim"]), aval(equation.outvars[0]).dtype)
 
     # Numbers.
 
-    def cast(self, x: str, dtype: Any) -> str:
+    def cast(self, x: str, dtype: DTypeLike) -> str:
         """An array with another dtype."""
         return self.build.op("Cast", x, to=np.dtype(dtype).name)
 
-    def _convert_element_type(self, equation: Any, x: str) -> str:
-        before, after = equation.invars[0].aval.dtype, equation.params["new_dtype"]
+    def _convert_element_type(self, equation: JaxprEqn, x: str) -> str:
+        before, after = aval(equation.invars[0]).dtype, equation.params["new_dtype"]
         return x if before == after else self.cast(x, after)
 
-    def _ne(self, equation: Any, x: str, y: str) -> str:
+    def _ne(self, equation: JaxprEqn, x: str, y: str) -> str:
         return self.build.op("Not", self.build.op("Equal", x, y))
 
-    def _is_finite(self, equation: Any, x: str) -> str:
+    def _is_finite(self, equation: JaxprEqn, x: str) -> str:
         odd = self.build.op("Or", self.build.op("IsNaN", x), self.build.op("IsInf", x))
         return self.build.op("Not", odd)
 
-    def _and(self, equation: Any, x: str, y: str) -> str:
+    def _and(self, equation: JaxprEqn, x: str, y: str) -> str:
         return self._of_bools("And", equation, x, y)
 
-    def _or(self, equation: Any, x: str, y: str) -> str:
+    def _or(self, equation: JaxprEqn, x: str, y: str) -> str:
         return self._of_bools("Or", equation, x, y)
 
-    def _not(self, equation: Any, x: str) -> str:
+    def _not(self, equation: JaxprEqn, x: str) -> str:
         return self._of_bools("Not", equation, x)
 
-    def _of_bools(self, operator: str, equation: Any, *given: str) -> str:
-        if equation.invars[0].aval.dtype != bool:
+    def _of_bools(self, operator: str, equation: JaxprEqn, *given: str) -> str:
+        if aval(equation.invars[0]).dtype != bool:
             raise NotImplementedError(f"{operator} of bits has no ONNX translation")
         return self.build.op(operator, *given)
 
-    def _rem(self, equation: Any, x: str, y: str) -> str:
+    def _rem(self, equation: JaxprEqn, x: str, y: str) -> str:
         return self.build.op("Mod", x, y, fmod=1)
 
-    def _clamp(self, equation: Any, least: str, x: str, most: str) -> str:
+    def _clamp(self, equation: JaxprEqn, least: str, x: str, most: str) -> str:
         return self.build.op("Min", self.build.op("Max", x, least), most)
 
-    def _round(self, equation: Any, x: str) -> str:
+    def _round(self, equation: JaxprEqn, x: str) -> str:
         if equation.params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
             raise NotImplementedError("rounding away from zero has no ONNX translation")
         return self.build.op("Round", x)
 
-    def _square(self, equation: Any, x: str) -> str:
+    def _square(self, equation: JaxprEqn, x: str) -> str:
         return self.build.op("Mul", x, x)
 
-    def _rsqrt(self, equation: Any, x: str) -> str:
+    def _rsqrt(self, equation: JaxprEqn, x: str) -> str:
         return self.build.op("Reciprocal", self.build.op("Sqrt", x))
 
-    def _integer_pow(self, equation: Any, x: str) -> str:
+    def _integer_pow(self, equation: JaxprEqn, x: str) -> str:
         power = equation.params["y"]
         product = functools.reduce(
             lambda y, _: self.build.op("Mul", y, x), range(abs(power) - 1), x
         )
         return product if power > 0 else self.build.op("Reciprocal", product)
 
-    def _atan2(self, equation: Any, y: str, x: str) -> str:
+    def _atan2(self, equation: JaxprEqn, y: str, x: str) -> str:
         """By the arc tangent of `y / x`, which is one of two half planes."""
         op = self.build.op
         zero, pi = (self.build.constant(np.float32(n)) for n in (0, np.pi))
@@ -163,10 +171,10 @@ class Operators:
         behind = op("Where", op("Less", x, zero), op("Add", angle, half), angle)
         return op("Where", op("Equal", x, zero), steep, behind)
 
-    def _select_n(self, equation: Any, which: str, *cases: str) -> str:
-        if len(cases) != 2 or equation.invars[0].aval.dtype != bool:
+    def _select_n(self, equation: JaxprEqn, which: str, *cases: str) -> str:
+        if len(cases) != 2 or aval(equation.invars[0]).dtype != bool:
             raise NotImplementedError("a choice among more than two has no ONNX translation")
-        if equation.invars[1].aval.dtype != bool:
+        if aval(equation.invars[1]).dtype != bool:
             return self.build.op("Where", which, cases[1], cases[0])
         # Runtimes choose no bool.
         op = self.build.op
@@ -174,7 +182,7 @@ class Operators:
 
     # Shapes.
 
-    def _iota(self, equation: Any) -> str:
+    def _iota(self, equation: JaxprEqn) -> str:
         shape, axis = equation.params["shape"], equation.params["dimension"]
         numbers = self.cast(self.range(shape[axis]), equation.params["dtype"])
         return self.broadcast(numbers, shape[axis : axis + 1], shape, (axis,))
@@ -184,8 +192,8 @@ class Operators:
         first, step = self.build.constant(np.int64(0)), self.build.constant(np.int64(1))
         return self.build.op("Range", first, self.size(size), step)
 
-    def _broadcast_in_dim(self, equation: Any, x: str, *_: str) -> str:
-        before, shape = equation.invars[0].aval.shape, equation.params["shape"]
+    def _broadcast_in_dim(self, equation: JaxprEqn, x: str, *_: str) -> str:
+        before, shape = aval(equation.invars[0]).shape, equation.params["shape"]
         return self.broadcast(x, before, shape, equation.params["broadcast_dimensions"])
 
     def broadcast(
@@ -198,17 +206,17 @@ class Operators:
         widened = [before[axes.index(a)] if a in axes else 1 for a in range(len(shape))]
         return x if widened == list(shape) else self.build.op("Expand", x, self.shape(shape))
 
-    def _reshape(self, equation: Any, x: str, *_: str) -> str:
+    def _reshape(self, equation: JaxprEqn, x: str, *_: str) -> str:
         return self.build.op("Reshape", x, self.shape(equation.params["new_sizes"]))
 
-    def _squeeze(self, equation: Any, x: str) -> str:
+    def _squeeze(self, equation: JaxprEqn, x: str) -> str:
         return self.without(x, equation.params["dimensions"])
 
     def without(self, x: str, axes: Sequence[int]) -> str:
         """An array less axes of size 1."""
         return self.build.op("Squeeze", x, self.build.integers(*axes)) if len(axes) else x
 
-    def _transpose(self, equation: Any, x: str) -> str:
+    def _transpose(self, equation: JaxprEqn, x: str) -> str:
         return self.permuted(x, equation.params["permutation"])
 
     def permuted(self, x: str, axes: Sequence[int]) -> str:
@@ -216,27 +224,27 @@ class Operators:
         axes = [int(axis) for axis in axes]
         return x if axes == sorted(axes) else self.build.op("Transpose", x, perm=axes)
 
-    def _concatenate(self, equation: Any, *parts: str) -> str:
+    def _concatenate(self, equation: JaxprEqn, *parts: str) -> str:
         return self.build.op("Concat", *parts, axis=int(equation.params["dimension"]))
 
-    def _stack(self, equation: Any, *parts: str) -> str:
+    def _stack(self, equation: JaxprEqn, *parts: str) -> str:
         axis = int(equation.params["axis"])
         parts = tuple(self.build.op("Unsqueeze", x, self.build.integers(axis)) for x in parts)
         return self.build.op("Concat", *parts, axis=axis)
 
-    def _split(self, equation: Any, x: str) -> Sequence[str]:
+    def _split(self, equation: JaxprEqn, x: str) -> Sequence[str]:
         sizes, axis = equation.params["sizes"], int(equation.params["axis"])
         return self.build.ops("Split", len(sizes), x, self.build.integers(*sizes), axis=axis)
 
-    def _slice(self, equation: Any, x: str) -> str:
+    def _slice(self, equation: JaxprEqn, x: str) -> str:
         params = equation.params
         starts, ends = self.shape(params["start_indices"]), self.shape(params["limit_indices"])
         steps = params["strides"] or [1] * len(params["start_indices"])
         axes = self.build.integers(*range(len(steps)))
         return self.build.op("Slice", x, starts, ends, axes, self.build.integers(*steps))
 
-    def _dynamic_slice(self, equation: Any, x: str, *starts: str) -> str:
-        sizes, shape = equation.params["slice_sizes"], equation.invars[0].aval.shape
+    def _dynamic_slice(self, equation: JaxprEqn, x: str, *starts: str) -> str:
+        sizes, shape = equation.params["slice_sizes"], aval(equation.invars[0]).shape
         return self.window(x, shape, dict(enumerate(starts)), sizes)
 
     def window(
@@ -262,43 +270,43 @@ class Operators:
 
     # Reductions.
 
-    def reduced(self, operator: str, equation: Any, x: str) -> str:
+    def reduced(self, operator: str, equation: JaxprEqn, x: str) -> str:
         """An array reduced along the axes of an equation."""
         axes = self.build.integers(*equation.params["axes"])
         return self.build.op(operator, x, axes, keepdims=0) if len(equation.params["axes"]) else x
 
-    def _reduce_sum(self, equation: Any, x: str) -> str:
+    def _reduce_sum(self, equation: JaxprEqn, x: str) -> str:
         return self.reduced("ReduceSum", equation, x)
 
-    def _reduce_max(self, equation: Any, x: str) -> str:
+    def _reduce_max(self, equation: JaxprEqn, x: str) -> str:
         return self.reduced("ReduceMax", equation, x)
 
-    def _reduce_min(self, equation: Any, x: str) -> str:
+    def _reduce_min(self, equation: JaxprEqn, x: str) -> str:
         return self.reduced("ReduceMin", equation, x)
 
-    def _reduce_and(self, equation: Any, x: str) -> str:
+    def _reduce_and(self, equation: JaxprEqn, x: str) -> str:
         return self.cast(self.reduced("ReduceMin", equation, self.cast(x, np.int32)), bool)
 
-    def _reduce_or(self, equation: Any, x: str) -> str:
+    def _reduce_or(self, equation: JaxprEqn, x: str) -> str:
         return self.cast(self.reduced("ReduceMax", equation, self.cast(x, np.int32)), bool)
 
-    def _argmax(self, equation: Any, x: str) -> str:
+    def _argmax(self, equation: JaxprEqn, x: str) -> str:
         return self.best("ArgMax", equation, x)
 
-    def _argmin(self, equation: Any, x: str) -> str:
+    def _argmin(self, equation: JaxprEqn, x: str) -> str:
         return self.best("ArgMin", equation, x)
 
-    def best(self, operator: str, equation: Any, x: str) -> str:
+    def best(self, operator: str, equation: JaxprEqn, x: str) -> str:
         """Index of the first maximum or minimum along an axis."""
         (axis,) = equation.params["axes"]
         found = self.build.op(operator, x, axis=int(axis), keepdims=0)
         return self.cast(found, equation.params["index_dtype"])
 
-    def _dot_general(self, equation: Any, x: str, y: str) -> str:
+    def _dot_general(self, equation: JaxprEqn, x: str, y: str) -> str:
         (of_x, of_y), (batch_x, batch_y) = equation.params["dimension_numbers"]
         letters = iter("abcdefghijklmnopqrstuvwxyz")
-        left = [next(letters) for _ in equation.invars[0].aval.shape]
-        right = [next(letters) for _ in equation.invars[1].aval.shape]
+        left = [next(letters) for _ in aval(equation.invars[0]).shape]
+        right = [next(letters) for _ in aval(equation.invars[1]).shape]
         for i, j in zip([*of_x, *batch_x], [*of_y, *batch_y], strict=True):
             right[j] = left[i]
         both = [left[i] for i in batch_x]

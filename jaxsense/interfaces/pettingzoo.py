@@ -3,7 +3,7 @@
 `make("team-v0")` and `make_parallel("team-v0")` make a task.
 """
 
-from typing import Any
+from typing import Any, SupportsInt
 
 import jax
 import numpy as np
@@ -20,7 +20,7 @@ with extra("pettingzoo"):
     from gymnasium import error, spaces  # pyright: ignore[reportMissingImports]
     from pettingzoo import AECEnv, ParallelEnv  # pyright: ignore[reportMissingImports]
 
-Infos = dict[str, dict[str, Any]]
+Infos = dict[str, dict[str, float | np.ndarray]]
 
 
 class _Team:
@@ -45,11 +45,11 @@ class _Team:
         self._state: TeamState | None = None
         self._key: Key | None = None
 
-    def observation_space(self, agent: str) -> Any:
+    def observation_space(self, agent: str) -> spaces.Space:
         """Space of a robot's observations, `[S]`."""
         return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> Any:
+    def action_space(self, agent: str) -> spaces.Space:
         """Space of a robot's actions: each PoI, and NOP."""
         return self.action_spaces[agent]
 
@@ -84,7 +84,7 @@ class _Team:
             raise error.ResetNeeded("step before reset, or after the end of an episode")
         return self.possible_agents[int(self._state.agent)]
 
-    def _checked(self, agent: str, name: str, action: Any) -> int:
+    def _checked(self, agent: str, name: str, action: SupportsInt) -> int:
         """An integer of any library; raises `ValueError` if it is no action of the robot."""
         if not self.action_space(agent).contains(np.asarray(action)):
             raise ValueError(f"{name} = {action!r}: must be in {self.action_space(agent)}")
@@ -175,7 +175,7 @@ class TeamParallelEnv(_Team, ParallelEnv):
         return self._begin(seed)
 
     def step(
-        self, actions: dict[str, Any]
+        self, actions: dict[str, SupportsInt]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
         """Takes one step.
 

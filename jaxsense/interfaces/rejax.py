@@ -1,8 +1,7 @@
 """Tasks and the map MDP as rejax 0.1.3 trains them: `pip install -e '.[rejax]'`."""
 
-from typing import Any
-
 import jax
+from jax.typing import ArrayLike
 
 from jaxsense.core.types import Key
 from jaxsense.interfaces.extras import extra
@@ -21,9 +20,9 @@ class MapEnv(gymnax.MapEnv):
         self,
         key: Key,
         state: gymnax.MapEnvState,
-        action: Any,
+        action: ArrayLike,
         params: gymnax.MapEnvParams | None = None,
-    ) -> tuple[jax.Array, gymnax.MapEnvState, jax.Array, jax.Array, dict[Any, Any]]:
+    ) -> tuple[jax.Array, gymnax.MapEnvState, jax.Array, jax.Array, dict[str, jax.Array]]:
         """Takes one action, and restarts an episode that has ended.
 
         Args:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 Arrays = dict[str, np.ndarray]
 Program = Callable[..., Arrays]
@@ -43,7 +44,10 @@ def load(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, Program
 
 
 def checked(
-    program: str, inputs: Mapping[str, Any], unnamed: tuple[Any, ...], given: Mapping[str, Any]
+    program: str,
+    inputs: Mapping[str, Any],
+    unnamed: tuple[object, ...],
+    given: Mapping[str, ArrayLike],
 ) -> Arrays:
     """The inputs of a program as arrays of its types.
 
@@ -91,7 +95,7 @@ def _program(
         else:
             steps.append(_step(node))
 
-    def program(*unnamed: Any, **given: Any) -> Arrays:
+    def program(*unnamed: object, **given: ArrayLike) -> Arrays:
         values = {**known, **checked(name, about["inputs"], unnamed, given)}
         # As on other runtimes, infinity and NaN are no errors.
         with np.errstate(all="ignore"):
@@ -169,7 +173,13 @@ def _divide(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return x / y
 
 
-def _slice(x: np.ndarray, starts: Any, ends: Any, axes: Any, steps: Any = None) -> np.ndarray:
+def _slice(
+    x: np.ndarray,
+    starts: np.ndarray,
+    ends: np.ndarray,
+    axes: np.ndarray,
+    steps: np.ndarray | None = None,
+) -> np.ndarray:
     parts = [slice(None)] * x.ndim
     each = [1] * len(axes) if steps is None else steps
     for axis, start, end, step in zip(axes, starts, ends, each, strict=True):

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import onnxruntime
+from numpy.typing import ArrayLike
 
 Arrays = dict[str, np.ndarray]
 Program = Callable[..., Arrays]
@@ -40,7 +41,10 @@ def load(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, Program
 
 
 def checked(
-    program: str, inputs: Mapping[str, Any], unnamed: tuple[Any, ...], given: Mapping[str, Any]
+    program: str,
+    inputs: Mapping[str, Any],
+    unnamed: tuple[object, ...],
+    given: Mapping[str, ArrayLike],
 ) -> Arrays:
     """The inputs of a program as arrays of its types.
 
@@ -82,7 +86,7 @@ def _program(name: str, model: bytes, about: Mapping[str, Any]) -> Program:
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     outputs = [*about["outputs"]]
 
-    def program(*unnamed: Any, **given: Any) -> Arrays:
+    def program(*unnamed: object, **given: ArrayLike) -> Arrays:
         found = session.run(outputs, checked(name, about["inputs"], unnamed, given))
         return {output: np.asarray(x) for output, x in zip(outputs, found, strict=True)}
 

@@ -32,7 +32,7 @@ class MapVecEnv(VecEnv):
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(f"autoreset_mode = {mode}: must be AutoresetMode.SAME_STEP")
         self.env = env
-        self._actions: Any = None
+        self._actions: np.ndarray | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> np.ndarray:

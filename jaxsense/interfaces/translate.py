@@ -6,17 +6,19 @@ needs no line here, unless it uses a primitive that has no translation yet.
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import export
+from jax.core import Atom, ShapedArray
 from jax.extend import core
 from jax.lax import GatherScatterMode
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from jaxsense.interfaces.graph import Array, Builder, Constants, Graph
-from jaxsense.interfaces.operators import SAME, Operators, described
+from jaxsense.interfaces.operators import SAME, Operators, Size, aval, described
 
 _INLINED = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 
@@ -24,7 +26,9 @@ _INLINED = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 class Translator(Operators):
     """Translates the equations of a function, also those that take indices, and loops."""
 
-    def run(self, jaxpr: core.Jaxpr, consts: Sequence[Any], inputs: Sequence[str]) -> list[str]:
+    def run(
+        self, jaxpr: core.Jaxpr, consts: Sequence[ArrayLike | str], inputs: Sequence[str]
+    ) -> list[str]:
         """Translates all equations, and returns the names of the outputs.
 
         Args:
@@ -35,14 +39,14 @@ class Translator(Operators):
         Raises:
           NotImplementedError: if a primitive has no translation.
         """
-        names: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
+        names: dict[core.Var, ArrayLike | str] = dict(zip(jaxpr.constvars, consts, strict=True))
         names |= dict(zip(jaxpr.invars, inputs, strict=True))
 
-        def read(variable: Any) -> str:
+        def read(variable: Atom) -> str:
             value = variable.val if isinstance(variable, core.Literal) else names[variable]
             if isinstance(value, str):
                 return value
-            return self.build.constant(np.asarray(value, described(variable.aval)[0]))
+            return self.build.constant(np.asarray(value, described(aval(variable))[0]))
 
         for equation in jaxpr.eqns:
             # An input that nobody reads, such as a random key, may have no name.
@@ -51,10 +55,10 @@ class Translator(Operators):
             names |= dict(zip(equation.outvars, outputs, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    def _equation(self, equation: Any, given: list[str]) -> Sequence[str]:
+    def _equation(self, equation: core.JaxprEqn, given: list[str]) -> Sequence[str]:
         kind, params = equation.primitive.name, equation.params
         if kind in _INLINED:
-            closed = params.get("jaxpr") or params.get("call_jaxpr")
+            closed = params.get("jaxpr") or params["call_jaxpr"]
             return self._closed(closed, given)
         if kind in SAME:
             return [self.build.op(SAME[kind], *given)]
@@ -69,9 +73,9 @@ class Translator(Operators):
 
     # Indices.
 
-    def _gather(self, equation: Any, x: str, indices: str) -> str:
+    def _gather(self, equation: core.JaxprEqn, x: str, indices: str) -> str:
         numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
-        shape, rank = equation.invars[0].aval.shape, len(equation.invars[1].aval.shape)
+        shape, rank = aval(equation.invars[0]).shape, len(aval(equation.invars[1]).shape)
         mapped = [int(axis) for axis in numbers.start_index_map]
         dropped = [int(axis) for axis in numbers.collapsed_slice_dims]
         if equation.params["mode"] == GatherScatterMode.FILL_OR_DROP:
@@ -88,7 +92,7 @@ class Translator(Operators):
         rest = [axis for axis in range(len(shape)) if axis not in moved + batched]
         leading = [*together, *(axis for axis in range(rank - 1) if axis not in together)]
         indices = self.permuted(indices, [*leading, rank - 1])
-        of_batch = [equation.invars[1].aval.shape[axis] for axis in leading]
+        of_batch = [aval(equation.invars[1]).shape[axis] for axis in leading]
         grid = self.shape([*of_batch, *(sizes[axis] for axis in wide)])
         parts = []
         for axis in moved:
@@ -123,18 +127,20 @@ class Translator(Operators):
         """One number of each index."""
         return self.build.op("Gather", indices, self.build.constant(np.int64(i)), axis=axis)
 
-    def _scatter(self, equation: Any, x: str, indices: str, updates: str) -> str:
+    def _scatter(self, equation: core.JaxprEqn, x: str, indices: str, updates: str) -> str:
         return self._scattered(equation, x, indices, lambda old: updates)
 
-    def _scatter_add(self, equation: Any, x: str, indices: str, updates: str) -> str:
+    def _scatter_add(self, equation: core.JaxprEqn, x: str, indices: str, updates: str) -> str:
         return self._scattered(equation, x, indices, lambda old: self.build.op("Add", old, updates))
 
-    def _scattered(self, equation: Any, x: str, indices: str, new: Callable[[str], str]) -> str:
+    def _scattered(
+        self, equation: core.JaxprEqn, x: str, indices: str, new: Callable[[str], str]
+    ) -> str:
         """Changes one row, along one axis, unless the row does not exist."""
-        numbers, shape = equation.params["dimension_numbers"], equation.invars[0].aval.shape
+        numbers, shape = equation.params["dimension_numbers"], aval(equation.invars[0]).shape
         mapped = [int(axis) for axis in numbers.scatter_dims_to_operand_dims]
         is_one = len(mapped) == 1 and [*map(int, numbers.inserted_window_dims)] == mapped
-        if not is_one or len(equation.invars[1].aval.shape) != 1 or numbers.operand_batching_dims:
+        if not is_one or len(aval(equation.invars[1]).shape) != 1 or numbers.operand_batching_dims:
             raise NotImplementedError("scatter of several rows has no ONNX translation")
         op, (axis,) = self.build.op, mapped
         row = self.cast(self.component(indices, 0, 0), np.int64)
@@ -144,17 +150,17 @@ class Translator(Operators):
         if after:
             is_row = op("Unsqueeze", is_row, self.build.integers(*after))
         value = op("Unsqueeze", new(old), self.build.integers(axis))
-        if equation.invars[0].aval.dtype == bool:
+        if aval(equation.invars[0]).dtype == bool:
             return op("Or", op("And", is_row, value), op("And", op("Not", is_row), x))
         return op("Where", is_row, value, x)
 
     # Loops and branches.
 
-    def _platform_index(self, equation: Any) -> str:
+    def _platform_index(self, equation: core.JaxprEqn) -> str:
         platforms = equation.params["platforms"]
         return self.build.constant(np.int32(platforms.index(None)))
 
-    def _cond(self, equation: Any, index: str, *given: str) -> Sequence[str]:
+    def _cond(self, equation: core.JaxprEqn, index: str, *given: str) -> Sequence[str]:
         branches, arrays = equation.params["branches"], self.build.constants.arrays
         if index in arrays:
             return self._closed(branches[int(arrays[index])], given)
@@ -166,7 +172,7 @@ class Translator(Operators):
         )
         is_second = self.cast(index, bool)
         number = len(equation.outvars)
-        return self.build.ops("If", number, is_second, then_branch=yes, else_branch=no)
+        return self.build.control("If", number, is_second, then_branch=yes, else_branch=no)
 
     def _within(
         self, inputs: dict[str, Array], body: Callable[["Translator"], Sequence[str]]
@@ -180,11 +186,11 @@ class Translator(Operators):
 
     def _loop(
         self,
-        equation: Any,
+        equation: core.JaxprEqn,
         most: str,
         goes_on: str,
         carry: Sequence[str],
-        avals: Sequence[Any],
+        avals: Sequence[ShapedArray],
         body: Callable[["Translator", str, list[str]], Sequence[str]],
     ) -> Sequence[str]:
         """ONNX's loop; `body(inner, step, carry)` gives whether it continues, carry and rows."""
@@ -192,16 +198,16 @@ class Translator(Operators):
         inputs = {self.build.constants.name(): kind for kind in kinds}
         step, _, *within = inputs
         graph = self._within(inputs, lambda inner: body(inner, step, within))
-        return self.build.ops("Loop", len(equation.outvars), most, goes_on, *carry, body=graph)
+        return self.build.control("Loop", len(equation.outvars), most, goes_on, *carry, body=graph)
 
-    def _scan(self, equation: Any, *given: str) -> Sequence[str]:
+    def _scan(self, equation: core.JaxprEqn, *given: str) -> Sequence[str]:
         params = equation.params
         if params["reverse"]:
             raise NotImplementedError("a scan from the end has no ONNX translation")
         inner, before, after = params["jaxpr"], equation.invars, equation.outvars
         # What moves along has one axis more outside; versions of JAX name the numbers otherwise.
-        rows = sum(v.aval.ndim > x.ndim for v, x in zip(before, inner.in_avals, strict=True))
-        number = sum(v.aval.ndim == x.ndim for v, x in zip(after, inner.out_avals, strict=True))
+        rows = sum(aval(v).ndim > x.ndim for v, x in zip(before, inner.in_avals, strict=True))
+        number = sum(aval(v).ndim == x.ndim for v, x in zip(after, inner.out_avals, strict=True))
         last = len(before) - rows
         first = last - number
         consts, carry, moving = given[:first], given[first:last], given[last:]
@@ -211,10 +217,10 @@ class Translator(Operators):
             of_step = [inner.build.op("Gather", row, step, axis=0) for row in moving]
             return [true, *inner._closed(params["jaxpr"], [*consts, *carry, *of_step])]
 
-        avals = [v.aval for v in before[first:last]]
+        avals = [aval(v) for v in before[first:last]]
         return self._loop(equation, self.size(params["length"]), true, carry, avals, body)
 
-    def _while(self, equation: Any, *given: str) -> Sequence[str]:
+    def _while(self, equation: core.JaxprEqn, *given: str) -> Sequence[str]:
         params = equation.params
         first, last = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
         of_cond, of_body, carry = given[:first], given[first:last], given[last:]
@@ -224,7 +230,7 @@ class Translator(Operators):
             after = inner._closed(params["body_jaxpr"], [*of_body, *carry])
             return [*inner._closed(params["cond_jaxpr"], [*of_cond, *after]), *after]
 
-        avals = [v.aval for v in equation.invars[last:]]
+        avals = [aval(v) for v in equation.invars[last:]]
         return self._loop(equation, "", goes_on, carry, avals, body)
 
 
@@ -243,7 +249,7 @@ class Program:
 
 def program(
     apply: Callable[..., dict[str, jax.Array]],
-    models: Any,
+    models: PyTree,
     inputs: Mapping[str, Array],
     constants: Constants,
 ) -> Program:
@@ -260,11 +266,9 @@ def program(
     """
     named = sorted({n for _, shape in inputs.values() for n in shape if isinstance(n, str)})
     axes = export.symbolic_shape(", ".join(named), constraints=[f"{n} >= 1" for n in named])
-    of_name: dict[Any, Any] = dict(zip(named, axes, strict=True))
+    of_name: dict[int | str, Size] = dict(zip(named, axes, strict=True))
     given = [
-        jax.ShapeDtypeStruct(
-            tuple(of_name.get(n, n) if isinstance(n, str) else n for n in shape), dtype
-        )
+        jax.ShapeDtypeStruct(tuple(of_name.get(n, n) for n in shape), dtype)
         for dtype, shape in inputs.values()
     ]
     models = jax.tree.map(_array, models)
@@ -283,7 +287,7 @@ def program(
     return Program(build.graph.pruned(), outputs)
 
 
-def arrays_of(models: Any) -> dict[str, np.ndarray]:
+def arrays_of(models: PyTree) -> dict[str, np.ndarray]:
     """All arrays of a pytree, by their place in it, for example `"novelty/strength"`.
 
     Args:
@@ -293,10 +297,10 @@ def arrays_of(models: Any) -> dict[str, np.ndarray]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): x for path, x in leaves}
 
 
-def _array(x: Any) -> np.ndarray:
+def _array(x: ArrayLike) -> np.ndarray:
     x = np.asarray(x)
     return x.astype(np.float32) if x.dtype == np.float64 else x
 
 
-def _is_array(variable: Any) -> bool:
-    return not jnp.issubdtype(variable.aval.dtype, jax.dtypes.extended)
+def _is_array(variable: Atom) -> bool:
+    return not jnp.issubdtype(aval(variable).dtype, jax.dtypes.extended)

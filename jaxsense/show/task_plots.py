@@ -1,7 +1,6 @@
 """Pictures of states of tasks, while somebody plays them."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -15,7 +14,7 @@ from jaxsense.core.types import Belief
 from jaxsense.dqn.map_mdp import MapMdp, MapState
 from jaxsense.dqn.team_mdp import Team, TeamState
 from jaxsense.show.colours import in_plane, modality_colour, plane
-from jaxsense.tasks import Environment
+from jaxsense.tasks import Task
 
 _SIZE = 4.0  # inches, of each part
 _DPI = 100
@@ -25,7 +24,7 @@ _AROUND = 0.75  # of how far classes lie apart
 _TEN = 10
 
 
-def frame(task: Environment, state: MapState | TeamState, actions: Sequence[int]) -> np.ndarray:
+def frame(task: Task, state: MapState | TeamState, actions: Sequence[int]) -> np.ndarray:
     """What is known in a state, and the truth.
 
     Beliefs are 2-sigma ellipses in the two latent dimensions that show classes, which are numbered,
@@ -42,24 +41,24 @@ def frame(task: Environment, state: MapState | TeamState, actions: Sequence[int]
       `[H, W, 3]` uint8 sRGB.
     """
     mdp: MapMdp = task.mdp.map
-    is_team = isinstance(state, TeamState)
-    map_state = state.map if is_team else state
-    found = _read(mdp, map_state.belief)
-    shown, probabilities, classes = jax.tree.map(np.asarray, (map_state.belief, *found))
+    teams = [state] if isinstance(state, TeamState) else []
+    found = _read(mdp, state.map.belief)
+    shown, probabilities, classes = jax.tree.map(np.asarray, (state.map.belief, *found))
     colours = _class_colours(mdp.num_classes)
-    present = np.asarray(state.team.present) if is_team else np.ones(mdp.num_pois, bool)
-    number = 3 if is_team else 2
+    present = np.asarray(task.action_mask(state))[:-1]
+    number = 2 + len(teams)
     figure = Figure(figsize=(_SIZE * number, _SIZE), dpi=_DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots(1, number)
-    figure.suptitle(_title(task, state, len(actions)))
+    title = f"{task.name}, {task.agent}", f"step {len(actions)} of {task.max_steps}"
+    figure.suptitle(", ".join([*title, *(f"{float(each.seconds):.1f} s" for each in teams)]))
     nearest = colours[np.argmax(probabilities, axis=1)]
     _draw_beliefs(axes[0], shown, classes, colours, nearest, present)
-    _draw_probabilities(axes[1], probabilities, map_state, actions, colours, present)
-    if is_team:
-        truth = colours[np.asarray(map_state.classes)]
-        team = jax.tree.map(np.asarray, state.team)
-        _draw_places(axes[2], team, int(state.agent), nearest, truth)
+    _draw_probabilities(axes[1], probabilities, state.map, actions, colours, present)
+    for each in teams:
+        truth = colours[np.asarray(each.map.classes)]
+        team = jax.tree.map(np.asarray, each.team)
+        _draw_places(axes[2], team, int(each.agent), nearest, truth)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
@@ -69,14 +68,6 @@ def _read(mdp: MapMdp, belief: Belief) -> tuple[jax.Array, jax.Array]:
     """`[N, C]` class probabilities of beliefs, and `[C, D]` means of classes."""
     probabilities = jax.vmap(mdp.fusion.class_probabilities)(belief)
     return probabilities, mdp.fusion.classes.mean
-
-
-def _title(task: Any, state: MapState | TeamState, number: int) -> str:
-    """Name, step and, of a team, time."""
-    parts = [f"{task.name}, {task.agent}", f"step {number} of {task.max_steps}"]
-    if isinstance(state, TeamState):
-        parts.append(f"{float(state.seconds):.1f} s")
-    return ", ".join(parts)
 
 
 def _class_colours(number: int) -> np.ndarray:

@@ -1,11 +1,11 @@
 """What a task is to those who learn in it: an MDP of one policy, as a few pure functions."""
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import map_mdp
@@ -98,7 +98,7 @@ class Environment(Protocol):
         """Actions in an episode, at most."""
         ...
 
-    def reset(self, key: Key) -> tuple[Float[Array, " S"], Any]:
+    def reset(self, key: Key) -> tuple[Float[Array, " S"], PyTree]:
         """Starts an episode.
 
         Args:
@@ -109,15 +109,15 @@ class Environment(Protocol):
         """
         ...
 
-    def observe(self, state: Any) -> Float[Array, " S"]:
+    def observe(self, state: PyTree) -> Float[Array, " S"]:
         """What the agent sees of a state."""
         ...
 
-    def action_mask(self, state: Any) -> Bool[Array, " A"]:
+    def action_mask(self, state: PyTree) -> Bool[Array, " A"]:
         """`[A]` bool, the actions that exist in a state."""
         ...
 
-    def step(self, key: Key, state: Any, action: Int[Array, ""]) -> tuple[Any, TimeStep]:
+    def step(self, key: Key, state: PyTree, action: Int[Array, ""]) -> tuple[PyTree, TimeStep]:
         """Takes an action. An episode that has ended is not restarted.
 
         Args:

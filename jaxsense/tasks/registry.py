@@ -1,16 +1,17 @@
 """The frozen tasks by name, and how one is frozen."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError, as_plain, from_plain, require_32_bits
 from jaxsense.core.types import Key, Samples
-from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
 from jaxsense.tasks import archive
@@ -31,7 +32,6 @@ TASKS = {
 _STATES, _STEPS = 1024, 12  # from which observations are scaled
 _LEAST_SPREAD = 1e-6  # below which a feature is constant
 _NONE = np.zeros((0, 0))
-_TEAM = "team"
 
 
 def registered() -> tuple[str, ...]:
@@ -168,7 +168,8 @@ def _read(name: str) -> tuple[Arrays, dict[str, object]]:
 
 def _agents(config: Config) -> tuple[str, ...]:
     """Who acts in a task with some settings."""
-    return (_TEAM,) if config.dqn.task == _TEAM else config.modalities
+    learner = models.make_agent(config).learner
+    return tuple(dict.fromkeys(map(learner, config.modalities)))
 
 
 def _made(
@@ -181,21 +182,23 @@ def _made(
     arrays: Arrays,
 ) -> Task:
     """The task of some settings, networks and looks; `arrays` hold returns of references."""
-
-    def returns(agent: str) -> jax.Array:
-        return jnp.asarray(arrays.get(f"returns/{agent}", _NONE))
-
-    mdp = make_mdp(config, parts, looks)
-    if isinstance(mdp, TeamMdp):
-        if agent not in (None, _TEAM):
-            raise ConfigError("agent", agent, f"must be {_TEAM}: one policy for all robots")
-        robots = jnp.array(config.modality_of_robot, jnp.int32)
-        return TeamTask(mdp, parts, scaling, returns(_TEAM), robots, name)
-    agent = config.modalities[0] if agent is None else agent
-    if agent not in config.modalities:
-        raise ConfigError("agent", agent, f"must be one of {', '.join(config.modalities)}")
-    modality = config.modalities.index(agent)
-    return MapTask(mdp, modality, parts, scaling, returns(agent), name, agent)
+    acting = _agents(config)
+    agent = acting[0] if agent is None else agent
+    if agent not in acting:
+        expected = "must be one of " if len(acting) > 1 else "must be "
+        raise ConfigError("agent", agent, expected + ", ".join(acting))
+    common: dict[str, PyTree] = {
+        "mdp": make_mdp(config, parts, looks),
+        "models": parts,
+        "scaling": scaling,
+        "returns": jnp.asarray(arrays.get(f"returns/{agent}", _NONE)),
+        "name": name,
+    }
+    kinds: dict[str, Callable[[], Task]] = {
+        "map": lambda: MapTask(**common, modality=config.modalities.index(agent), agent=agent),
+        "team": lambda: TeamTask(**common, robots=jnp.array(config.modality_of_robot, jnp.int32)),
+    }
+    return kinds[config.dqn.task]()
 
 
 def _scaling(key: Key, task: Task) -> Scaling:

@@ -3,13 +3,13 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, PyTree
 from scipy import stats
 
 from jaxsense.config import ConfigError
@@ -27,7 +27,7 @@ _UNTRACEABLE = (
 _RESAMPLES = 2000
 _LEVEL = 0.95
 
-Policy = Callable[[Key, jax.Array], Any]
+Policy = Callable[[Key, jax.Array], jax.Array]
 """`(key, observation [S]) -> []` action, an integer; a pure function that JAX can trace, or one
 from `on_host`."""
 
@@ -41,8 +41,8 @@ class Recurrent:
       memory: before the first action of an episode; a pytree of arrays.
     """
 
-    act: Act[Any]
-    memory: Any
+    act: Act[PyTree]
+    memory: PyTree
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,7 +167,7 @@ def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
         del key
         shape = jax.ShapeDtypeStruct((), jnp.int32)
 
-        def call(observations: Any) -> np.ndarray:
+        def call(observations: ArrayLike) -> np.ndarray:
             batch = np.asarray(observations)
             chosen = np.asarray(act(batch.reshape(-1, batch.shape[-1])))
             return chosen.astype(np.int32).reshape(batch.shape[:-1])
@@ -235,10 +235,12 @@ def _player(policy: Policy | Recurrent) -> Callable[[Key, Task, int], float]:
     return checked
 
 
-def _play(act: Act[Any], memory: Any, key: Key, task: Task, episodes: int) -> Float[Array, ""]:
+def _play(
+    act: Act[PyTree], memory: PyTree, key: Key, task: Task, episodes: int
+) -> Float[Array, ""]:
     """Mean return of some episodes; NaN if there is no such action."""
 
-    def checked(key: Key, memory: Any, observation: jax.Array) -> tuple[jax.Array, Any]:
+    def checked(key: Key, memory: PyTree, observation: jax.Array) -> tuple[jax.Array, PyTree]:
         try:
             action, memory = act(key, memory, observation)
         except _UNTRACEABLE as error:

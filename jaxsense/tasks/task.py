@@ -5,12 +5,12 @@ part of its name and changes with anything that changes a score.
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.dqn import environments, episodes, map_agent, policies, team_mdp
@@ -84,11 +84,11 @@ class Task(Environment, Protocol):
         """Whether the first reference is optimal."""
         ...
 
-    def features(self, state: Any) -> Float[Array, "N F"]:
+    def features(self, state: PyTree) -> Float[Array, "N F"]:
         """`[N, F]` what an observation holds of each PoI, not yet scaled."""
         ...
 
-    def learning(self, agent: Agent) -> environments.Environment[Any]:
+    def learning(self, agent: Agent) -> environments.Environment[PyTree]:
         """What `dqn.train` learns in.
 
         Args:
@@ -164,7 +164,7 @@ class MapTask(OneAgent):
         """`[N, 2D]` mean and standard deviation of each PoI's belief, not yet scaled."""
         return _of_belief(state.belief)
 
-    def learning(self, agent: Agent) -> environments.Environment[Any]:
+    def learning(self, agent: Agent) -> environments.Environment[PyTree]:
         """The map MDP, see `Task.learning`."""
         return agent.environment(self.mdp, self.modality)
 
@@ -266,7 +266,7 @@ class TeamTask:
         """`[N, F]` what the robot knows whose turn it is, not yet scaled."""
         return self.mdp.observe(state, state.agent).T
 
-    def learning(self, agent: Agent) -> environments.Environment[Any]:
+    def learning(self, agent: Agent) -> environments.Environment[PyTree]:
         """The team MDP with the robots of the task, see `Task.learning`."""
         return environments.TeamEnvironment(agent, self.mdp, self.robots)
 

@@ -196,7 +196,7 @@ def _surveyed_starts(key: Key, mdp: MapMdp, starts: Starts, number: int) -> MapS
 
 
 def tour_stages(config: Config) -> list[Stage]:
-    """Makes the stage of each network that orders looks, see `tours`."""
+    """Makes the stage of the network that orders looks, if any does, see `tours`."""
     return [_tour_stage(config, network) for network in make_agent(config).tour_networks]
 
 

@@ -3,18 +3,17 @@
 import dataclasses
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxsense.config import Config
 from jaxsense.core.types import Key, pytree
 
 _MAX_CHUNKS = 20
 
-Output = Any
+Output = PyTree
 """A pytree of arrays."""
 
 Outputs = dict[str, Output]

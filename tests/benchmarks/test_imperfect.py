@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import imperfect
+from benchmarks import imperfect, imperfect_tables
 from jaxsense import PRESETS
 from jaxsense.config import ConfigError, SearchConfig
 
@@ -130,24 +130,24 @@ RESULTS = {
 
 
 def test_break_points_stand_next_to_those_with_a_search():
-    head, _, row, _, about = imperfect.breaks(RESULTS).splitlines()
+    head, _, row, _, about = imperfect_tables.breaks(RESULTS).splitlines()
     assert head == "| error | no search | with a search |"
     assert row == "| both [m] | 0.005 (0.004 to ?) | - |"
     assert about.startswith("`python -m benchmarks.imperfect pretrained:noisy`: cpu with 2 cores;")
 
 
 def test_sizes_are_compared_with_no_error():
-    _, _, none, _, second, *_ = imperfect.of_sizes(RESULTS, ["both [m]"]).splitlines()
+    _, _, none, _, second, *_ = imperfect_tables.of_sizes(RESULTS, ["both [m]"]).splitlines()
     assert none == "| none | 0.990 | 2.50 | 40.0 | 0.990 | 2.50 | 40.0 |"
     assert second.startswith("| both [m]: 0.02 | 0.980, +0.500 ± 0.250 | 2.50, +0.50 ± 0.25 |")
     assert "| 0.985, +0.500 ± 0.250 |" in second
     alone = {**RESULTS, "curves": {"no search": RESULTS["curves"]["no search"]}}
-    assert "with a search" not in imperfect.of_sizes(alone, ["both [m]"])
+    assert "with a search" not in imperfect_tables.of_sizes(alone, ["both [m]"])
 
 
 def test_messages_are_shown_at_their_worst():
-    _, _, shared, worst, *_ = imperfect.of_messages(RESULTS).splitlines()
+    _, _, shared, worst, *_ = imperfect_tables.of_messages(RESULTS).splitlines()
     assert shared == "| one shared map | 0.990 | 0.990 | 0.050 | 2.50 | 40.0 |  |"
     assert worst.startswith("| loss: 0.9 | 0.980, +0.500 ± 0.250 |")
     assert worst.endswith("| 1.000 |")
-    assert len([*imperfect.tables(RESULTS)]) == 3
+    assert len([*imperfect_tables.tables(RESULTS)]) == 3

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import paying_once_mdp
+from toys import ONCE_Q, ONCE_SEEN, paying_once_mdp
 
 from jaxsense.config import DqnConfig
 from jaxsense.dqn import map_mdp, replay, team_mdp, training
@@ -38,16 +38,6 @@ def learning_in(mdp, config):
     return MapAgent(config.discount, mdp.num_pois, 2, config.hidden).environment(mdp, 0)
 
 
-SEEN = jnp.array([[[0], [0]], [[1], [0]], [[0], [1]], [[1], [1]]], bool)
-# A first look gains .8 and a second costs 1; with gamma = .5, for look 0, look 1 and NOP:
-Q = np.array(
-    [
-        [1.2, 1.2, 0.0],  # .8 + .5 x .8
-        [-0.6, 0.8, 0.0],  # -1 + .5 x .8; .8 + .5 x 0
-        [0.8, -0.6, 0.0],
-        [-1.0, -1.0, 0.0],  # -1 + .5 x 0
-    ]
-)
 SMALL = DqnConfig(
     hidden=(8,),
     num_envs=8,
@@ -69,7 +59,7 @@ LEARNING = learning_in(MDP, SMALL)
 def states():
     classes = jnp.zeros(2, int)
     reset = lambda seen: map_mdp.reset(jax.random.key(0), MDP, classes, seen)  # noqa: E731
-    return jax.jit(jax.vmap(reset))(SEEN)
+    return jax.jit(jax.vmap(reset))(ONCE_SEEN)
 
 
 @jax.jit
@@ -93,7 +83,7 @@ def probe():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_values_are_those_worked_by_hand(probe, seed):
     params = jax.tree.map(lambda x: x[seed], probe[0].params)
-    np.testing.assert_allclose(values(params), Q, atol=0.05)
+    np.testing.assert_allclose(values(params), ONCE_Q, atol=0.05)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

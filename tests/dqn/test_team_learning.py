@@ -6,15 +6,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import SENSORS, Fixed, classes_mdp, known_of, paying_once_mdp, policy
+from toys import (
+    ONCE_Q,
+    ONCE_SEEN,
+    PLACES,
+    SENSORS,
+    TRAVEL,
+    Fixed,
+    classes_mdp,
+    known_of,
+    paying_once_mdp,
+    policy,
+)
 
-from jaxsense.config import PRESETS, DqnConfig, TeamConfig, TravelConfig
+from jaxsense.config import PRESETS, DqnConfig, TeamConfig
 from jaxsense.dqn import losses, map_mdp, team_mdp, training
 from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.models import make_agent
 
-TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
 FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
 SMALL = DqnConfig(
     task="team", observe="bank", hidden=(8,), num_envs=8, epochs=12, chunk=12, updates=1, batch=8,
@@ -34,11 +44,11 @@ def learning_in(mdp, config=SMALL):
     return agent.environment(mdp, 0)
 
 
-# From the origin 6, 11 and 16 s to look, less the turns, see `test_team_mdp.py`.
+# From the origin 6, 11 and 16 s to look, less the turns, see `test_travel.py`.
 TWO = team_of(
     classes_mdp(partly_seen_starts=False),
     jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, jnp.pi / 2]]),
-    jnp.array([[1.9, 0.0], [0.0, 2.9], [-3.9, 0.0]]),
+    PLACES,
     num_pois=(3, 3),
 )
 
@@ -189,15 +199,6 @@ PROBE = replace(
     replay_capacity=4096, learning_rate=1e-2, final_learning_rate=1e-4, epsilon_min=0.5,
     target_period=20, num_starts=256,
 )  # fmt: skip
-SEEN = jnp.array([[[0], [0]], [[1], [0]], [[0], [1]], [[1], [1]]], bool)
-Q = np.array(
-    [
-        [1.2, 1.2, 0.0],  # .8 + .5 x .8
-        [-0.6, 0.8, 0.0],  # -1 + .5 x .8; .8 + .5 x 0
-        [0.8, -0.6, 0.0],
-        [-1.0, -1.0, 0.0],  # -1 + .5 x 0
-    ]
-)
 
 
 def test_a_robot_alone_learns_the_values_worked_by_hand():
@@ -215,7 +216,7 @@ def test_a_robot_alone_learns_the_values_worked_by_hand():
         x = agent.observe(known, team_mdp.alone(2, 0), jnp.int32(0))
         return agent.q(state.params, x)
 
-    np.testing.assert_allclose(learned(SEEN), Q, atol=0.1)
+    np.testing.assert_allclose(learned(ONCE_SEEN), ONCE_Q, atol=0.1)
 
 
 @pytest.mark.parametrize(("preset", "reward"), [("many", -0.05), ("team", -1.0)])

@@ -7,19 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from toys import SENSORS, Fixed, classes_mdp, noisy_mdp
+from toys import PLACES, SENSORS, TRAVEL, Fixed, classes_mdp, noisy_mdp
 
-from jaxsense.config import TeamConfig, TravelConfig
-from jaxsense.core.types import Belief
+from jaxsense.config import TeamConfig
 from jaxsense.dqn import map_mdp, team_mdp
 from jaxsense.dqn.team_mdp import Team, TeamMdp, TeamState
 
-TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
 NOP, CAMERA, LIDAR = 3, 0, 1
-# From the origin 1.0, 2.0 and 3.0 m to drive: 5, 10 and 15 s.
-PLACES = jnp.array([[1.9, 0.0], [0.0, 2.9], [-3.9, 0.0]])
 FIRST, SECOND = 0.2 - 1 / np.sqrt(40), 0.8  # gains of looks, see `toys.classes_mdp`
 
 
@@ -34,8 +28,6 @@ MDP = make_mdp()
 
 
 reset_map = jax.jit(map_mdp.reset)
-seconds_of_ways = jax.jit(team_mdp.travel_seconds)
-move = jax.jit(team_mdp.move)
 
 
 def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
@@ -69,78 +61,6 @@ def play(state, *actions):
         states.append(state)
         outcomes.append(outcome)
     return states, outcomes
-
-
-@pytest.mark.parametrize(
-    ("pose", "place", "seconds"),
-    [
-        # A quarter turn at 1 rad/s, 2 - .9 m at .2 m/s, and the look.
-        ((0, 0, 0), (0, 2), math.pi / 2 + 5.5 + 1),
-        ((0, 0, 0), (0, -2), math.pi / 2 + 5.5 + 1),
-        # From (1, 1) to (1, 3), from which the robot looks away by .5 rad.
-        ((1, 1, math.pi / 2 - 0.5), (1, 3), 0.5 + 5.5 + 1),
-        # The short way around: from 3 to -3 rad, 2 pi - 6.
-        ((0, 0, 3.0), (-2 * math.cos(0.14159265), -2 * math.sin(0.14159265)), 0.28319 + 5.5 + 1),
-        # A heading of two turns too many.
-        ((0, 0, 4 * math.pi), (2, 0), 5.5 + 1),
-        # Near enough: only turning and looking.
-        ((0, 0, 0), (0, 0.8), math.pi / 2 + 1),
-        # All at one place: only looking, whatever the heading.
-        ((1, 2, 0.7), (1, 2), 1.0),
-    ],
-)
-def test_time_until_a_look_as_worked_by_hand(pose, place, seconds):
-    pose, places = jnp.array(pose, jnp.float32), jnp.array([place], jnp.float32)
-    np.testing.assert_allclose(seconds_of_ways(TRAVEL, pose, places), [seconds], rtol=1e-4)
-
-
-def test_every_number_of_the_model_counts():
-    pose, places = jnp.zeros(3), jnp.array([[0.0, 2.0]])
-    model = TravelConfig(speed=0.4, turn_rate=2.0, view_distance=0.4, look_seconds=3.0)
-    expected = math.pi / 2 / 2 + (2 - 0.4) / 0.4 + 3
-    np.testing.assert_allclose(seconds_of_ways(model, pose, places)[0], expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "expected"),
-    [
-        (0.0, (0, 0, 0)),
-        (0.5, (0, 0, 0.5)),  # still turning, to the left
-        (math.pi / 2 + 2, (0, 0.4, math.pi / 2)),  # and 2 s of driving at .2 m/s
-        (math.pi / 2 + 5.5, (0, 1.1, math.pi / 2)),
-        (99.0, (0, 1.1, math.pi / 2)),  # it waits there
-    ],
-)
-def test_the_pose_on_the_way_as_worked_by_hand(seconds, expected):
-    moved = move(TRAVEL, jnp.zeros(3), jnp.array([0.0, 2.0]), jnp.float32(seconds))
-    np.testing.assert_allclose(moved, expected, atol=1e-6)
-    mirrored = move(TRAVEL, jnp.zeros(3), jnp.array([0.0, -2.0]), jnp.float32(seconds))
-    np.testing.assert_allclose(mirrored, np.array(expected) * (1, -1, -1), atol=1e-6)
-
-
-@jax.jit
-def in_two_parts(pose, place, share):
-    """The time of a way in one part; in two; and the pose at its end, in one and in two."""
-    whole = team_mdp.travel_seconds(TRAVEL, pose, place[None])[0]
-    before = share * (whole - TRAVEL.look_seconds)
-    between = team_mdp.move(TRAVEL, pose, place, before)
-    rest = team_mdp.travel_seconds(TRAVEL, between, place[None])[0]
-    end = team_mdp.move(TRAVEL, pose, place, whole)
-    return whole, before + rest, end, team_mdp.move(TRAVEL, between, place, rest)
-
-
-PLACE = st.floats(-3, 3, width=32)
-
-
-@settings(max_examples=100, deadline=None, derandomize=True, database=None)
-@given(st.tuples(PLACE, PLACE, PLACE), st.tuples(PLACE, PLACE), st.floats(0, 1, width=32))
-def test_a_way_in_two_parts_takes_as_long_as_in_one(pose, place, share):
-    numbers = (np.float32(x) for x in (pose, place, share))
-    one, two, end, end_of_two = in_two_parts(*numbers)
-    np.testing.assert_allclose(one, two, atol=1e-3)
-    np.testing.assert_allclose(end[:2], end_of_two[:2], atol=1e-3)
-    # A heading counts only up to full turns.
-    np.testing.assert_allclose(np.exp(1j * end[2]), np.exp(1j * end_of_two[2]), atol=2e-3)
 
 
 @jax.jit
@@ -330,109 +250,6 @@ def test_places_of_another_size_are_named():
         team_mdp.reset(jax.random.key(0), make_mdp(places=PLACES[:2]))
     with pytest.raises(AssertionError, match="poses"):
         team_mdp.reset(jax.random.key(0), replace(MDP, config=TeamConfig(robots_each=2)))
-
-
-BELIEF = Belief(jnp.array([[3.0], [-1.0], [0.5]]), jnp.array([[0.3], [2.0], [1.0]]))
-
-
-def team_of_three(**changed):
-    """A camera and a LiDAR at the origin, which heads for PoI 1, and a camera that has ended."""
-    team = Team(
-        positions=PLACES,
-        present=jnp.ones(3, bool),
-        poses=jnp.array([[0, 0, 0], [0, 0, math.pi / 2], [1.9, 0, 0]]),
-        modality=jnp.array([CAMERA, LIDAR, CAMERA]),
-        works=jnp.array([True, True, False]),
-        target=jnp.array([NOP, 1, 0]),
-    )
-    return replace(team, **changed)
-
-
-observe = jax.jit(
-    lambda team, agent, belief=BELIEF: team_mdp.observation(TRAVEL, belief, team, agent, 2)
-)
-
-
-def test_what_a_robot_knows_as_worked_by_hand():
-    turn, half = math.pi / 2, math.pi
-    # Seconds to PoIs 0, 1 and 2: 5, 10 and 15 of driving, 1 of looking, and the turns.
-    camera = np.array([6, 11 + turn, 16 + half]) / 10
-    lidar = np.exp(-np.array([6 + turn, 11, 16 + turn]) / 10)
-    # The camera that has ended stands at PoI 0 and counts nowhere.
-    expected = [
-        [3, -1, 0.5],
-        [0.3, 2, 1],
-        camera,
-        [0, 0, 0],  # no other camera heads for anything
-        [0, lidar[1], 0],
-        [0, 0, 0],  # nor could be anywhere
-        lidar,
-        [1, 1, 1],  # its own sensor is a camera
-        [0, 0, 0],
-        [1, 1, 1],
-        *np.asarray(PLACES).T,
-    ]
-    found = observe(team_of_three(), jnp.int32(0))
-    assert found.shape == (team_mdp.num_features(1, 2), 3)
-    np.testing.assert_allclose(found, np.array(expected), atol=1e-5)
-    np.testing.assert_allclose(team_mdp.own_seconds(found, 1), 10 * camera, rtol=1e-5)
-    # For the LiDAR the camera is the other one; it heads for PoI 2 now.
-    heading = team_of_three(target=jnp.array([2, 1, 0]))
-    found = observe(heading, jnp.int32(1))
-    np.testing.assert_allclose(found[3], [0, 0, np.exp(-camera[2])], atol=1e-5)
-    np.testing.assert_array_equal(found[4], 0)
-    np.testing.assert_allclose(found[5], np.exp(-camera), atol=1e-5)
-    np.testing.assert_array_equal(found[6], 0)
-    np.testing.assert_array_equal(found[7:9], [[0] * 3, [1] * 3])
-
-
-def test_of_robots_with_the_same_sensor_the_nearest_counts():
-    found = observe(team_of_three(works=jnp.ones(3, bool)), jnp.int32(1))
-    times = np.stack(
-        [
-            [6, 11 + math.pi / 2, 16 + math.pi],
-            # The second camera stands at PoI 0 and looks away from PoIs 1 and 2.
-            team_mdp.travel_seconds(TRAVEL, jnp.array([1.9, 0, 0]), PLACES),
-        ]
-    )
-    assert times[1, 0] == 1 < times[0, 0]
-    np.testing.assert_allclose(found[5], np.exp(-times.min(axis=0) / 10), atol=1e-5)
-    # It heads for PoI 0, where it is.
-    np.testing.assert_allclose(found[3], [np.exp(-0.1), 0, 0], atol=1e-5)
-
-
-def test_the_place_is_seen_from_the_robot():
-    moved = team_of_three(poses=jnp.array([[1.0, -2.0, 0.5], [0, 0, 0], [0, 0, 0]]))
-    found = observe(moved, jnp.int32(0))
-    np.testing.assert_allclose(found[-2:].T, np.asarray(PLACES) - (1.0, -2.0), atol=1e-6)
-
-
-@pytest.mark.parametrize("agent", [0, 1])
-def test_permuting_pois_permutes_what_is_known_of_them(agent):
-    order = jnp.array([2, 0, 1])
-    heading = team_of_three(present=jnp.array([True, True, False]))
-    there = replace(
-        heading,
-        positions=PLACES[order],
-        present=heading.present[order],
-        target=jnp.array([NOP, 2, 1]),  # PoI 1 is now the third, PoI 0 the second
-    )
-    belief = jax.tree.map(lambda x: x[order], BELIEF)
-    here = observe(heading, jnp.int32(agent))
-    np.testing.assert_array_equal(observe(there, jnp.int32(agent), belief), here[:, order])
-
-
-def test_of_an_absent_poi_nothing_is_known():
-    found = observe(team_of_three(present=jnp.array([True, False, True])), jnp.int32(0))
-    np.testing.assert_array_equal(found[:, 1], 0.0)
-    whole = observe(team_of_three(), jnp.int32(0))
-    np.testing.assert_array_equal(found[:, [0, 2]], whole[:, [0, 2]])
-
-
-def test_a_standard_deviation_of_zero_is_refused():
-    belief = replace(BELIEF, std=BELIEF.std.at[1].set(0.0))
-    with pytest.raises(ValueError, match=r"belief\.std = 0\.0"):
-        team_mdp.observation(TRAVEL, belief, team_of_three(), jnp.int32(0), 2)
 
 
 def test_an_episode_of_a_given_team_has_these_robots_and_no_other():

@@ -4,15 +4,19 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
-from jaxsense.config import MdpConfig
+from jaxsense.config import MdpConfig, TravelConfig
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import policies, rewards, team_mdp
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.policies import Known
 
 SENSORS = ("camera", "lidar")
+TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
+# From the origin 1.0, 2.0 and 3.0 m to drive: 5, 10 and 15 s.
+PLACES = jnp.array([[1.9, 0.0], [0.0, 2.9], [-3.9, 0.0]])
 
 
 @pytree
@@ -140,3 +144,16 @@ def paying_once_mdp(num_pois=2, max_steps=20):
     """
     fusion = Once(Belief(jnp.zeros(2), jnp.array([3.0, 4.0])), 1)
     return make_mdp(Certain(1), fusion, num_pois, max_steps=max_steps, partly_seen_starts=False)
+
+
+# Every state of two PoIs of `paying_once_mdp`. A first look gains .8 and a second costs 1; with
+# gamma = .5, for look 0, look 1 and NOP:
+ONCE_SEEN = jnp.array([[[0], [0]], [[1], [0]], [[0], [1]], [[1], [1]]], bool)
+ONCE_Q = np.array(
+    [
+        [1.2, 1.2, 0.0],  # .8 + .5 x .8
+        [-0.6, 0.8, 0.0],  # -1 + .5 x .8; .8 + .5 x 0
+        [0.8, -0.6, 0.0],
+        [-1.0, -1.0, 0.0],  # -1 + .5 x 0
+    ]
+)

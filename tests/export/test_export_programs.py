@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from exporting import ABSENT, CONFIG, played
 
-from benchmarks import exported
+from benchmarks import exported, moments
 from jaxsense import export
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
@@ -165,7 +165,7 @@ def test_the_map_is_read_as_jaxsense_reads_it(models, results):
 
 @pytest.mark.slow
 def test_decisions_are_those_of_missions(models, file):
-    found = exported.choices(CONFIG, models, 60)
+    found = moments.choices(CONFIG, models, 60)
     compared = exported.compare(CONFIG, models, file.read_bytes(), found)
     assert {*compared} == {"NumPy", "onnxruntime"}
     for programs in compared.values():

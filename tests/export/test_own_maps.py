@@ -11,7 +11,7 @@ import pytest
 from exporting import CONFIG, EXAMPLE
 
 import jaxsense
-from benchmarks import exported
+from benchmarks import exported, moments
 from jaxsense import export
 from jaxsense.config import CommunicationConfig
 from jaxsense.core import networks
@@ -126,7 +126,7 @@ def test_a_message_that_comes_twice_is_counted_once(archive, player):
 
 @pytest.mark.slow
 def test_decisions_by_own_maps_are_those_of_missions(models, archive):
-    found = exported.choices(OWN, models, 60)
+    found = moments.choices(OWN, models, 60)
     _, programs = robot_numpy.load(io.BytesIO(archive))
     for choice in found:
         merged = programs["merge"](sums=choice.sums)

@@ -1,96 +1,27 @@
-"""The figures of a latent space and of policies, on networks whose weights are set by hand."""
+"""The figures of a latent space and of beliefs, on networks whose weights are set by hand."""
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-import jaxsense
-from jaxsense.config import (
-    ArenaConfig,
-    Config,
-    DqnConfig,
-    EvaluationConfig,
-    FilterConfig,
-    JmvaeConfig,
-    MdpConfig,
+from by_hand import (
+    BANK,
+    CAMERA,
+    CLASS_MEANS,
+    CONFIG,
+    EXACT,
+    KEY,
+    LIDAR,
+    LN26,
+    PARAMS,
+    detections,
+    in_place,
 )
+
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn import map_mdp, optimum, policies
-from jaxsense.dqn.optimum import LookValues
-from jaxsense.models import make_in_place, make_jmvae, make_prior
-from jaxsense.training import comparison, measures, perception
-from jaxsense.training.mdp import held_out_mdp, models_of
-from jaxsense.training.perception import Detections
-from jaxsense.vae import filter
-
-# Classes: green cylinder, red cylinder, red cube. Three latent dimensions, of which one is unused.
-CONFIG = Config(
-    jmvae=JmvaeConfig(latent_size=3, hidden=(4,)),
-    mdp=MdpConfig(min_increase=0.0, max_steps=8),
-    dqn=DqnConfig(hidden=(2,)),
-    evaluation=EvaluationConfig(num_starts=16, num_repeats=8),
-)
-KEY = jax.random.key(0)
-GREEN, CUBE = 1, 1  # where features (red, green) and (cylinder, cube) hold them
-LN4, LN25, LN26 = np.log([4.0, 25.0, 26.0])
-
-
-def network(inputs, outputs, weights, bias=()):
-    """A hidden layer that passes on what is not negative, then outputs by their weights.
-
-    Args:
-      inputs: number of inputs.
-      outputs: number of outputs.
-      weights: `{(input, output): weight}`.
-      bias: `{output: bias}`.
-    """
-    kernel = np.zeros((4, outputs), np.float32)
-    for place, weight in weights.items():
-        kernel[place] = weight
-    biases = np.zeros(outputs, np.float32)
-    for output, each in dict(bias).items():
-        biases[output] = each
-    hidden = {"kernel": np.eye(inputs, 4, dtype=np.float32), "bias": np.zeros(4, np.float32)}
-    last = {"kernel": kernel, "bias": biases}
-    return {"params": {"Dense_0": hidden, "Dense_1": last}}
-
-
-PARAMS = {
-    "encoders": {
-        # (10 green, 10 cube, 0), of deviation 1, but 2 in two dimensions for a cube.
-        "camera+lidar": network(
-            4, 6, {(GREEN, 0): 10, (2 + CUBE, 1): 10, (3, 3): LN4, (3, 4): LN4}
-        ),
-        # Green is class 0; red lies between the classes 1 and 2, in the second dimension.
-        "camera": network(2, 6, {(GREEN, 0): 10, (0, 1): 5, (0, 4): LN25}),
-        # A cube is class 2; a cylinder lies between the classes 0 and 1, in the first.
-        "lidar": network(2, 6, {(CUBE, 1): 10, (0, 0): 5, (0, 3): LN26, (CUBE, 4): LN4}),
-    },
-    "decoders": {
-        "camera": network(3, 2, {(0, GREEN): 0.1}),
-        # Wrong by .6: too much of a cube.
-        "lidar": network(3, 2, {(1, CUBE): 0.1}, {CUBE: 0.6}),
-    },
-}
-# Two looks at each class. The second LiDAR look at class 0 tells half a cylinder.
-CAMERA = jnp.array([[[0, 1], [0, 1]], [[1, 0], [1, 0]], [[1, 0], [1, 0]]], jnp.float32)
-LIDAR = jnp.array([[[1, 0], [0.5, 0]], [[1, 0], [1, 0]], [[0, 1], [0, 1]]], jnp.float32)
-BANK = (CAMERA, LIDAR)
-CLASS_MEANS = jnp.array([[10.0, 0, 0], [0, 0, 0], [0, 10, 0]])
-
-
-def detections(bank=(), held_out=()):
-    """Detections that episodes do not start from."""
-    nothing: Any = ()
-    return Detections(bank, held_out, nothing, nothing)
-
-
-def in_place(means=CLASS_MEANS):
-    return make_in_place(CONFIG, PARAMS, Belief(means, jnp.ones((3, 3))))
+from jaxsense.training import measures, perception
 
 
 @jax.jit
@@ -206,171 +137,6 @@ def test_one_detection_that_is_not_a_number_shows_in_the_beliefs(modality):
         assert np.isnan(figures.sigma_norm[name][2])
 
 
-# One look at each class, so that nothing is left to chance but the starts.
-EXACT = tuple(x[:, :1] for x in BANK)
-NUM_STATES = 1728  # 3^3 x 2^6
-
-
-def with_bias(bias):
-    """A Q-network whose values are the same for every map."""
-    layers = {
-        "Dense_0": {"kernel": jnp.zeros((2 * 3 * 3, 2)), "bias": jnp.zeros(2)},
-        "Dense_1": {"kernel": jnp.zeros((2, 4)), "bias": bias},
-    }
-    return {"params": layers}
-
-
-def constant(gain, total):
-    """The same values of looks at every posterior."""
-    points = len(optimum.lattice(3))
-    tables = jnp.full(points, gain), jnp.full(points, total)
-    return LookValues(*tables, jnp.float32(gain), jnp.float32(total))
-
-
-def models_with(bias, values, fusion=None):
-    """What policies read, with a Q-network of the same values for every map."""
-    return models_of(
-        CONFIG, in_place() if fusion is None else fusion, values, (with_bias(bias),) * 2
-    )
-
-
-@jax.jit
-def play(modality, models, bank):
-    mdp = held_out_mdp(CONFIG, models.fusion, detections(held_out=bank))
-    return comparison.compare_policies(KEY, modality, models, mdp, CONFIG)
-
-
-# Every look of the camera pays until it has looked, by `optimal`.
-PAYS = constant(1.0, 1.0)
-
-
-@pytest.mark.slow
-def test_policies_are_played_from_every_state_and_from_random_starts():
-    # Where a look replaces the one before, the values of looks do not matter.
-    models = models_with(jnp.array([0.0, 0.0, 0.0, 1.0]), (PAYS, PAYS))
-    found = jax.tree.map(np.asarray, play(jnp.int32(0), models, EXACT))
-    of = {name: total for name, (total, _) in found.items()}
-    assert {x.shape for pair in found.values() for x in pair} == {(NUM_STATES + 16,)}
-    assert set(of) == {"latent", "optimal", "greedy", "naive", "random"}
-    np.testing.assert_array_equal(of["latent"], 0.0)  # always NOP
-    # The means over all states; a policy is at best as good.
-    optimal, naive, uniform = (
-        of[name][:NUM_STATES].mean() for name in ("optimal", "naive", "random")
-    )
-    assert optimal > naive > uniform
-    # Naive exploration goes on where the camera has not seen all: bits 0, 2 and 4 of the number of
-    # a state.
-    goes_on = np.arange(NUM_STATES) % 64 & 0b010101 != 0b010101
-    of_naive = found["naive"][1][:NUM_STATES]
-    np.testing.assert_array_equal(of_naive != 0, goes_on)
-    # The camera's own looks alone: no state pays more than three of the best, from a variance of
-    # 20 in three dimensions to sqrt(3).
-    most = 3 * (1 / 3**0.5 - 1 / 60**0.5)
-    assert max(total.max() for total in of.values()) <= most + 1e-4
-
-
-def test_values_that_are_not_numbers_give_totals_that_are_none():
-    models = models_with(jnp.array([0.0, jnp.nan, 0.0, 1.0]), (PAYS, PAYS))
-    found = jax.tree.map(np.asarray, play(jnp.int32(0), models, EXACT))
-    assert all(np.isnan(x).all() for x in found.pop("latent"))
-    assert all(np.isfinite(x).all() for pair in found.values() for x in pair)
-
-
-@pytest.mark.slow
-def test_where_looks_add_up_the_optimum_is_by_the_total_of_the_own_sensors_looks():
-    model, prior, classes = make_jmvae(CONFIG), make_prior(CONFIG), in_place().classes
-    fusion = filter.init(KEY, model, classes, prior, FilterConfig(hidden=(1,)))
-    # No look of the camera pays by its total, and every look of the LiDAR does.
-    models = models_with(jnp.zeros(4), (constant(1.0, -1.0), constant(-1.0, 1.0)), fusion)
-    total, _ = play(jnp.int32(0), models, EXACT)["optimal"]
-    np.testing.assert_array_equal(total, 0.0)
-    _, first = play(jnp.int32(1), models, EXACT)["optimal"]
-    assert np.all(first != 0)
-
-
-@pytest.fixture(scope="module")
-def same_policy():
-    """Totals and first rewards of four times the same policy, by the number of repeats."""
-    # Looks at a class are all different: what differs is their noise.
-    always = policies.Policy(lambda key, models, known: jnp.array([1.0, 0.0, 0.0, 0.0]))
-    bank = tuple(
-        jax.nn.softmax(3 * jax.random.normal(k, (3, 64, 2)))
-        for k in jax.random.split(jax.random.key(3))
-    )
-    models = models_with(jnp.zeros(4), (PAYS, PAYS))
-
-    @jax.jit
-    def compared(models, config):
-        mdp = held_out_mdp(config, models.fusion, detections(held_out=bank))
-        return comparison.compare_policies(
-            KEY, jnp.int32(0), models, mdp, config, {"mine": lambda *_: always.values(*[0] * 3)}
-        )
-
-    def found(repeats):
-        settings = EvaluationConfig(num_starts=4, num_repeats=repeats, num_states=8)
-        return compared(models, replace(CONFIG, evaluation=settings))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(policies, "POLICIES", dict.fromkeys(comparison.COMPARED, always))
-        patch.setattr(
-            comparison, "reference", lambda *_: lambda known, classes: always.values(*[0] * 3)
-        )
-        names = *comparison.COMPARED, "mine"
-        of_repeats = {n: found(n) for n in (1, 2, 9)}
-        return {n: np.array([by_name[name] for name in names]) for n, by_name in of_repeats.items()}
-
-
-def test_policies_are_compared_on_the_same_starts_and_the_same_looks(same_policy):
-    found = same_policy[1]
-    assert found.shape == (6, 2, 12)  # with one of our own
-    assert len(np.unique(found[0, 0])) > 6  # of 12; without a gain a look is worth -1
-    np.testing.assert_array_equal(found, found[[0] * 6])
-
-
-def test_naive_and_random_policies_are_played_an_eighth_as_often(same_policy):
-    # An eighth of nine, rounded up, is two.
-    often, seldom = same_policy[9][0], same_policy[2][0]
-    assert np.any(often != seldom)
-    np.testing.assert_array_equal(same_policy[9], [often, often, *[seldom] * 4])
-
-
-def test_the_learned_return_is_the_mean_over_random_starts():
-    @jax.jit
-    def returned(bias):
-        mdp = held_out_mdp(CONFIG, in_place(), detections(held_out=EXACT))
-        return comparison.learned_return(KEY, jnp.int32(0), with_bias(bias), mdp, CONFIG)
-
-    assert returned(jnp.array([0.0, 0.0, 0.0, 1.0])) == 0.0
-    # Eight looks at PoI 0, of which all but the first are in vain, and that one in some starts: it
-    # pays at most what a class that is known for certain is worth.
-    total = returned(jnp.array([1.0, 0.0, 0.0, 0.0]))
-    assert -8 < total < -7 + 1 / 3**0.5
-    assert np.isnan(returned(jnp.array([jnp.nan, 0.0, 0.0, 1.0])))
-
-
-def test_other_numbers_of_pois_are_played_an_eighth_as_often_but_always_once(monkeypatch):
-    played = []
-
-    def play(key, config, *, num_pois, **inputs):
-        assert inputs == {"modality": 0}
-        played.append((num_pois, config.evaluation.num_repeats, config.evaluation.num_states))
-
-    monkeypatch.setattr(comparison, "play_policies", play)
-    team = jaxsense.PRESETS["team"]
-    for repeats in (1, 96):
-        settings = replace(team.evaluation, num_repeats=repeats, num_pois=(5, 20))
-        comparison.play_numbers(KEY, replace(team, evaluation=settings), modality=0)
-    assert played == [(5, 1, 1), (20, 1, 1), (5, 12, 1), (20, 12, 1)]
-
-
-@pytest.mark.parametrize("num_pois", [None, 2, 5])
-def test_policies_are_played_with_the_number_of_pois_that_is_asked_for(num_pois):
-    mdp = held_out_mdp(CONFIG, in_place(), detections((), EXACT), num_pois)
-    assert mdp.num_pois == (num_pois or 3)
-    assert jax.eval_shape(map_mdp.reset, KEY, mdp).belief.mean.shape == (num_pois or 3, 3)
-    np.testing.assert_array_equal(mdp.looks.features[1], EXACT[1])
-
-
 @jax.jit
 def beliefs(config, fusion):
     return measures.beliefs(KEY, config, fusion=fusion, detections=detections(held_out=EXACT))
@@ -417,12 +183,3 @@ def test_exact_bayes_reads_the_same_looks():
     error = 4 * np.sqrt(share * (1 - share) / 600) * np.log(2)
     assert np.all(np.abs(found["bayes_nll"] - share * np.log(2)) < error)
     assert np.all(np.diff(found["bayes_nll"]) <= 1e-6)
-
-
-# Two PoIs of two classes and one sensor: 2^2 x 2^2 states, of which half hold both classes.
-SMALL = Config(
-    modalities=("camera",),
-    arena=ArenaConfig(num_pois=2, classes=("green cylinder", "red cylinder")),
-    jmvae=JmvaeConfig(reconstruction_weights=(1.0,)),
-    evaluation=EvaluationConfig(num_starts=3),
-)

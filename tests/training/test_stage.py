@@ -152,6 +152,7 @@ def test_a_filter_and_a_team_have_stages_of_their_own():
     dqn = dataclasses.replace(TINY.dqn, task="team", observe="bank")
     config = dataclasses.replace(TINY, jmvae=filtered, dqn=dqn)
     names = [stage.name for stage in training.stages.stages(config)]
+    assert len(set(names)) == len(names)
     plain = [stage.name for stage in training.stages.stages(TINY)]
     assert set(names) - set(plain) == {"filter", "dqn_team", "tours"}
     assert set(plain) - set(names) == {"dqn_camera", "dqn_lidar"}
