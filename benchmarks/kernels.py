@@ -120,8 +120,6 @@ def table(results: Mapping[str, Any]) -> str:
     for name, _ in longest.most_common():
         parts = [case["parts"].get(name, {"kernels": 0, "seconds": 0.0}) for case in cases.values()]
         rows.append([f"`{name}`", *(cell(part["kernels"], part["seconds"]) for part in parts)])
-    walls = (f"{1e3 * case['wall_s'] / steps:.2f}" for case in cases.values())
-    rows.append(["from begin to end of a step, ms", *walls])
     return studies.with_origin(studies.as_table(heads, rows), results)
 
 
