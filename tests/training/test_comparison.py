@@ -178,3 +178,26 @@ def test_policies_are_played_with_the_number_of_pois_that_is_asked_for(num_pois)
     assert mdp.num_pois == (num_pois or 3)
     assert jax.eval_shape(map_mdp.reset, KEY, mdp).belief.mean.shape == (num_pois or 3, 3)
     np.testing.assert_array_equal(mdp.looks.features[1], EXACT[1])
+
+
+def test_groups_of_episodes_change_nothing(monkeypatch):
+    def longest(x, y):
+        # Every episode takes as long as the longest of its group.
+        return x + 10.0 * y, jnp.full_like(x, jnp.max(x))
+
+    looks = jnp.array([3, 1, 2, 0, 4, 5])
+    starts = 9.0 - 3.0 * looks, jnp.arange(6.0)
+    monkeypatch.setattr(comparison, "_LEAST_GROUP", 2)
+    found, waited = comparison._in_groups(longest, looks, starts)
+    np.testing.assert_array_equal(found, longest(*starts)[0])
+    # Three groups, by looks: 0 and 1, 2 and 3, 4 and 5.
+    np.testing.assert_array_equal(waited, [3.0, 9.0, 3.0, 9.0, -3.0, -3.0])
+    monkeypatch.setattr(comparison, "_LEAST_GROUP", 4)
+    np.testing.assert_array_equal(comparison._in_groups(longest, looks, starts)[1], [9.0] * 6)
+
+
+def test_groups_need_not_divide_the_episodes(monkeypatch):
+    monkeypatch.setattr(comparison, "_LEAST_GROUP", 2)
+    looks = jnp.array([4, 3, 2, 1, 0])
+    found, _ = comparison._in_groups(lambda x: (x, x), looks, (jnp.arange(5.0),))
+    np.testing.assert_array_equal(found, jnp.arange(5.0))
