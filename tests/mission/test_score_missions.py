@@ -81,7 +81,7 @@ def test_differences_are_of_the_same_arenas(play):
     assert str(found).splitlines() == [
         "missions of each policy, in the same arenas: 4",
         "         right  looks per PoI  mean time [s]  difference from naive [s]",
-        "  mine   0.750           2.50           15.0          2.0 (-0.3 to 4.3)",
+        "  mine   0.750           2.50           15.0          2.0 (-0.3\u00a0to\u00a04.3)",
         "  naive  1.000           2.00           13.0                          -",
     ]
 
