@@ -1,46 +1,93 @@
-"""How well the travel model predicts missions in MJX: `python -m benchmarks.travel RUN`.
+"""`python -m benchmarks.travel RUN`: how well the travel model predicts missions in MJX.
 
-Plays missions of naive exploration with the models of a run, takes each trip from a decision to its
-look, and prints how long it took, how long the model predicts, and the best-fitting parameters.
+Plays missions of naive exploration, takes each trip from a decision to its look, and compares how
+long it took with what the model predicts, with its settings and with the parameters that fit best.
 """
 
 import dataclasses
 import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import rich.console
-import rich.table
 
+from benchmarks import measure, studies
 from jaxsense import Config, Models, mission
 from jaxsense.config import TravelConfig
+from jaxsense.config.checks import check_fields
+from jaxsense.config.options import Name
 from jaxsense.dqn import team_mdp
-from jaxsense.run import rundir
+from jaxsense.run import cli
 
+PROGRAM = "benchmarks.travel"
 _MISSIONS = 64
 
 
-def main(argv: list[str]) -> None:
-    """Prints the errors of the model."""
-    config, models = rundir.load(argv[0], trust=False)
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Compare the travel model with missions."""
+
+    run: Annotated[Path, Name("RUN")]
+    """The directory of a finished run, `latest`, or `pretrained:PRESET`."""
+    json: Path | None = None
+    """File to write; must be new."""
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The program."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    config, models = studies.load(PROGRAM, arguments.run)
+    if arguments.json is not None:
+        measure.reserve(PROGRAM, "json", arguments.json)
     poses, places, taken = trips(config, models)
-    table = rich.table.Table("model", "mean", "median error", "root mean square error")
-    for name, travel in {
-        "settings": config.team.travel,
-        "best fit": fit(poses, places, taken),
-    }.items():
-        predicted = np.asarray(_predict(travel, poses, places))
-        error = predicted - taken
-        table.add_row(
-            f"{name}: {travel}",
-            f"{predicted.mean():.2f} s",
-            f"{np.median(np.abs(error)):.2f} s",
-            f"{np.sqrt(np.mean(error**2)):.2f} s",
-        )
-    console = rich.console.Console()
-    console.print(table)
-    console.print(f"{len(taken)} trips of {taken.mean():.2f} s on average")
+    results = {
+        **studies.origin(PROGRAM, arguments),
+        "trips": len(taken),
+        "mean_s": float(taken.mean()),
+        "models": {
+            "settings": _errors(config.team.travel, poses, places, taken),
+            "best fit": _errors(fit(poses, places, taken), poses, places, taken),
+        },
+    }
+    studies.write(arguments.json, results)
+    print(table(results))
+
+
+def _errors(
+    travel: TravelConfig, poses: np.ndarray, places: np.ndarray, taken: np.ndarray
+) -> dict[str, Any]:
+    """Parameters of a model, the mean trip that it predicts, and its errors."""
+    predicted = np.asarray(_predict(travel, poses, places))
+    error = predicted - taken
+    return {
+        "parameters": dataclasses.asdict(travel),
+        "mean_s": float(predicted.mean()),
+        "median_error_s": float(np.median(np.abs(error))),
+        "root_mean_square_error_s": float(np.sqrt(np.mean(error**2))),
+    }
+
+
+def table(results: Mapping[str, Any]) -> str:
+    """Parameters and errors of the models, in Markdown.
+
+    Args:
+      results: the content of the JSON file.
+    """
+    units = {"speed": "m/s", "turn_rate": "rad/s", "view_distance": "m", "look_seconds": "s"}
+    parameters = [f"`{name}` [{unit}]" for name, unit in units.items()]
+    heads = ["model", *parameters, "mean trip", "median error", "root mean square error"]
+    rows = [["missions", *[""] * len(units), f"{results['mean_s']:.2f} s", "", ""]]
+    for name, model in results["models"].items():
+        values = [f"{model['parameters'][parameter]:.2f}" for parameter in units]
+        keys = "mean_s", "median_error_s", "root_mean_square_error_s"
+        rows.append([name, *values, *(f"{model[key]:.2f} s" for key in keys)])
+    return studies.with_origin(studies.as_table(heads, rows), results)
 
 
 def trips(config: Config, models: Models) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -114,4 +161,4 @@ def fit(poses: np.ndarray, places: np.ndarray, taken: np.ndarray) -> TravelConfi
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()
