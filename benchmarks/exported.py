@@ -36,7 +36,7 @@ with contextlib.suppress(ModuleNotFoundError):
     from jaxsense.interfaces import robot_onnx
 
     LOADERS["onnxruntime"] = robot_onnx.load
-SHOWN = ("decide", "detect_camera", "write_lidar", "classify")
+SHOWN = ("decide", "detect_camera", "detect_lidar", "write_lidar", "classify")
 """Programs in the tables of the pages."""
 _THREADS = "OPENBLAS_NUM_THREADS"  # of NumPy
 _TIMED = 200

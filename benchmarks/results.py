@@ -20,6 +20,7 @@ from benchmarks import (
     place,
     recorded,
     same_accuracy,
+    travel,
     where,
 )
 from benchmarks.digits import table as digits
@@ -142,6 +143,7 @@ TABLES: Mapping[str, _Tables] = {
     **{name: {None: pipeline.table} for name in _PIPELINE},
     "kernels.json": {None: kernels.table},
     "place.json": {None: place.table},
+    "travel.json": {None: travel.table},
     "curves.json": {None: same_accuracy.table},
     **{name: _IMPERFECT for name in ("imperfect_default.json", "imperfect_noisy.json")},
     "imperfect_trained.json": {None: partial(imperfect_tables.of_sizes, sweeps=["both [m]"])},
@@ -157,7 +159,7 @@ TABLES: Mapping[str, _Tables] = {
         "numpy": partial(
             exported.latencies,
             runs=("pretrained:default", "pretrained:noisy"),
-            programs=("detect_camera", "write_lidar", "decide", "classify"),
+            programs=("detect_camera", "detect_lidar", "write_lidar", "decide", "classify"),
         ),
     },
     "recorded.json": {None: recorded.table, "noise": recorded.of_noise},

@@ -56,7 +56,7 @@ def _table(found: list[Task]) -> Table:
         returns = f"{known[best]} {best}", *(known[name] for name in others)
         return task.name, [task.agent, *sizes, *returns]
 
-    columns = ["agent", "observation", "actions", "best known return", *others]
+    columns = ["agent", "observation", "actions", "reference", *others]
     return Table("Tasks of jaxsense.make(name, agent)", columns, [row(task) for task in found])
 
 

@@ -9,6 +9,7 @@ from scipy import stats
 from benchmarks.measure import describe
 
 _DIGITS = {"log-likelihood": 1, "seconds": 1, "seconds compiling": 1}
+_TIMES = "seconds", "seconds compiling"
 _NOISY = "seconds"  # of a machine that others may use: medians, and ratios of the same seed
 
 
@@ -21,16 +22,23 @@ def of_results(results: Mapping[str, Any]) -> str:
       results: the content of the JSON file.
     """
     models: Mapping[str, list[dict[str, float]]] = results["models"]
-    lines = [f"| | {' | '.join(models)} |", f"| ---{' | ---' * len(models)} |"]
+    pair = [*models][:2]
+    heads = [*models, *([f"{pair[0]} minus {pair[1]}, same seed"] if len(pair) > 1 else [])]
+    lines = [f"| | {' | '.join(heads)} |", f"| ---{' | ---' * len(heads)} |"]
     for figure in next(iter(models.values()))[0]:
         of_each = [[run[figure] for run in runs] for runs in models.values()]
         cell = _median if figure == _NOISY else _cell
         cells = [cell(values, _DIGITS.get(figure, 3)) for values in of_each]
+        if pair[1:]:
+            gaps = (
+                [x - y for x, y in zip(*of_each[:2], strict=True)] if figure not in _TIMES else []
+            )
+            cells.append(_cell(gaps, 1 + _DIGITS.get(figure, 3)) if gaps else "")
         lines.append(f"| {figure} | {' | '.join(cells)} |")
         if figure == _NOISY:
             ours = of_each[0]
             ratios = [[x / y for x, y in zip(each, ours, strict=True)] for each in of_each]
-            cells = [_median(values, 1) for values in ratios]
+            cells = [_median(values, 1) for values in ratios] + [""] * len(pair[1:])
             lines.append(
                 f"| ... over those of {next(iter(models))}, same seed | {' | '.join(cells)} |"
             )

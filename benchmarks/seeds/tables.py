@@ -114,7 +114,10 @@ def of_presets(
       presets: or other groups of runs, its columns.
       heads: of the columns, if they are not named after presets.
     """
-    names = heads or [f"`{preset}` preset" for preset in presets]
+    names = [*heads] or [f"`{preset}` preset" for preset in presets]
+    seeds = [_seeds(sorted(map(int, found[preset]))) for preset in presets]
+    if len(set(seeds)) > 1:
+        names = [f"{name}, {of}" for name, of in zip(names, seeds, strict=True)]
     rows = list(rows)
     paper = ["paper"] if any(row.paper for row in rows) else []
     lines = [_line("", *paper, *names), _line(*["---"] * (1 + len(paper) + len(presets)))]
@@ -198,6 +201,7 @@ OF_RAW_AND_LABELLED = [
         "{:.3f}",
     ),
     _CONSISTENT,
+    Row("missions", _of_policy("episodes", "latent"), "{:,}"),
     Row(
         "accuracy of the finished map, latent, greedy",
         _of_policy("accuracy", *_CHOOSING),

@@ -163,11 +163,11 @@ def test_the_table_shows_means_and_intervals():
     lines = table.of_results({**origin, "models": runs}).splitlines()
     # Standard error .1, and t = 12.706 for 1 degree of freedom.
     assert lines[:5] == [
-        "| | ours | theirs |",
-        "| --- | --- | --- |",
-        "| coherence | 0.400 ± 1.271 | 0.300 |",
-        "| seconds | 2.0 | 10.0 (8.0 to 12.0) |",
-        "| ... over those of ours, same seed | 1.0 | 5.0 (4.0 to 6.0) |",
+        "| | ours | theirs | ours minus theirs, same seed |",
+        "| --- | --- | --- | --- |",
+        "| coherence | 0.400 ± 1.271 | 0.300 | 0.1000 ± 1.2706 |",
+        "| seconds | 2.0 | 10.0 (8.0 to 12.0) |  |",
+        "| ... over those of ours, same seed | 1.0 | 5.0 (4.0 to 6.0) |  |",
     ]
     assert lines[-1].startswith("`python -m x`: cpu with ")
     assert "scipy" in lines[-1]

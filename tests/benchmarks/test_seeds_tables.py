@@ -61,7 +61,7 @@ def test_columns_may_have_other_names_than_presets(runs):
     found = gather([runs("paper", 100)], "wider") | gather([runs("paper", 101)])
     heads = ("wider", "as it is")
     table = tables.of_presets(found, tables.OF_FIGURES[:2], ("wider", "paper"), heads)
-    assert table.splitlines()[0] == "|  | paper | wider | as it is |"
+    assert table.splitlines()[0] == "|  | paper | wider, seed 100 | as it is, seed 101 |"
 
 
 def test_what_a_run_does_not_have_stays_empty(runs):
