@@ -57,7 +57,7 @@ def figures(page: str, has_settings: bool = False) -> list[str]:
 @pytest.mark.parametrize("page", PAGES)
 def test_figures_are_not_typed(page):
     found = figures((ROOT / page).read_text(encoding="utf-8"), Path(page).stem in PRESET_OF)
-    assert len(found) <= TYPED.get(page, 0), found
+    assert len(found) == TYPED.get(page, 0), found
 
 
 def test_what_counts_as_a_figure():
