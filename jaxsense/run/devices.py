@@ -347,7 +347,7 @@ def _empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
 def give_back_freed() -> None:
     """Gives memory that is free back to the system.
 
-    The compiler frees hundreds of megabytes in pieces, which glibc would keep for later.
+    The compiler and surveys free hundreds of megabytes in pieces, which glibc would keep for later.
     """
     # Other systems have no such function, or need none.
     with contextlib.suppress(OSError, AttributeError):

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxsense.config import Config
 from jaxsense.core.types import Key
+from jaxsense.run import devices
 from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import Programs, has_rows, is_saved, padded, program_name, workers_for
@@ -152,6 +153,7 @@ class _Loop:
         finally:
             for name in before:
                 self._held[name].used()
+            devices.give_back_freed()
 
     def _output(self, stage: Stage, before: dict[str, Future[None]]) -> Output:
         """The output of a stage, loaded if it was saved."""

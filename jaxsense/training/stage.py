@@ -98,13 +98,16 @@ class Stage:
 
     def select(self, outputs: Mapping[str, Output]) -> dict[str, Output]:
         """Inputs by argument, from the outputs of earlier stages by name."""
+        return {argument: _input(source, outputs) for argument, source in self.inputs.items()}
 
-        def of(source: str | tuple[str, ...] | int) -> Output:
-            if isinstance(source, int):
-                return jnp.int32(source)
-            return outputs[source] if isinstance(source, str) else tuple(map(of, source))
 
-        return {argument: of(source) for argument, source in self.inputs.items()}
+def _input(source: str | tuple[str, ...] | int, outputs: Mapping[str, Output]) -> Output:
+    # Not a function inside `select`: it would hold the outputs, and refer to itself.
+    if isinstance(source, int):
+        return jnp.int32(source)
+    if isinstance(source, str):
+        return outputs[source]
+    return tuple(_input(each, outputs) for each in source)
 
 
 @pytree

@@ -1,6 +1,8 @@
 """A stage: its keys, chunks and inputs, and how stages are composed."""
 
 import dataclasses
+import gc
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -157,3 +159,19 @@ def test_a_filter_and_a_team_have_stages_of_their_own():
     assert set(names) - set(plain) == {"filter", "dqn_team", "tours"}
     assert set(plain) - set(names) == {"dqn_camera", "dqn_lidar"}
     assert names.index("filter") + 1 == names.index("fusion")
+
+
+def test_inputs_that_were_selected_are_not_held():
+    class Output:
+        """Something that can be referred to weakly."""
+
+    outputs = {"first": Output(), "second": Output()}
+    references = [weakref.ref(output) for output in outputs.values()]
+    stage = Stage("third", lambda key: key, {"both": ("first", "second"), "index": 1})
+    gc.disable()
+    try:
+        stage.select(outputs)
+        outputs.clear()
+        assert [reference() for reference in references] == [None, None]
+    finally:
+        gc.enable()
