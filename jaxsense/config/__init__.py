@@ -6,7 +6,6 @@ what would be right. The attribute docstrings are the text of `--help`.
 
 from jaxsense.config.checks import ConfigError as ConfigError
 from jaxsense.config.checks import require_32_bits as require_32_bits
-from jaxsense.config.checks import require_function as require_function
 from jaxsense.config.learning import DetectorConfig as DetectorConfig
 from jaxsense.config.learning import DqnConfig as DqnConfig
 from jaxsense.config.learning import EvaluationConfig as EvaluationConfig

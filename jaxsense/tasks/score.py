@@ -12,7 +12,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 from scipy import stats
 
-from jaxsense.config import ConfigError, require_function
+from jaxsense.config import ConfigError
+from jaxsense.config.checks import require_function
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.tasks.registry import as_task, reference_returns
