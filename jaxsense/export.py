@@ -31,7 +31,7 @@ from jaxsense.run import cli, files, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import resampling, sensors
 from jaxsense.sim.sensors import Sensor
-from jaxsense.tasks import load_pretrained
+from jaxsense.tasks import PRETRAINED, load_pretrained
 
 PROGRAM = "jaxsense.export"
 _PLAYERS = (Path(onboard.__file__).with_name(f"robot_{name}.py") for name in ("numpy", "onnx"))
@@ -158,7 +158,11 @@ def load(run: Path, trust: bool = False) -> tuple[Config, Models, Path]:
     Raises:
       ConfigError: if there is no such run, or no such models.
     """
-    if (given := str(run)).startswith(cli.PRETRAINED):
+    given = str(run)
+    if given in PRETRAINED and not run.exists():
+        reason = f"must be the directory of a finished run, or {cli.PRETRAINED}{given}"
+        raise ConfigError("run", given, reason)
+    if given.startswith(cli.PRETRAINED):
         preset = given.removeprefix(cli.PRETRAINED)
         return *load_pretrained(preset), Path(f"{preset}.zip")
     run = cli.find_run(run)

@@ -7,6 +7,7 @@ that settings from Python, JSON and command lines pass one check.
 import contextlib
 import dataclasses
 import functools
+import inspect
 import types
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -152,6 +153,30 @@ def check_fields(section: object, bits: int = 31) -> None:
                 raise ConfigError(place, each, limits.expected(each))
 
 
+def require_function(field: str, value: object, number: int, expected: str) -> None:
+    """Checks that a value can be called with some arguments, without calling it.
+
+    Args:
+      field: name of the field.
+      value: the function.
+      number: how many arguments it takes, by position; not checked if Python cannot tell.
+      expected: what would be right.
+
+    Raises:
+      ConfigError: if it cannot be called, or not with so many arguments.
+    """
+    if not callable(value):
+        raise ConfigError(field, value, expected)
+    try:
+        signature = inspect.signature(value)
+    except (TypeError, ValueError):
+        return
+    try:
+        signature.bind(*range(number))
+    except TypeError:
+        raise ConfigError(field, value, expected) from None
+
+
 def require_32_bits() -> None:
     """Checks that JAX's 64-bit mode is off.
 
@@ -235,7 +260,11 @@ def _described(kind: object, *, many: bool = False) -> str:
 
 
 def _shown(value: object) -> str:
-    """A value in one short line."""
+    """A value in one short line; a function by its name."""
+    while isinstance(value, functools.partial):
+        value = value.func
+    if callable(value):
+        return getattr(value, "__name__", type(value).__name__)
     try:
         text = repr(value)
     except (RecursionError, ValueError):  # a thousand levels, or more than 4300 digits

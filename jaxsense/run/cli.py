@@ -14,6 +14,7 @@ import jax
 from jaxsense.config import Config, ConfigError, options, require_32_bits
 from jaxsense.run import kept
 from jaxsense.run.kept import Kept
+from jaxsense.tasks import pretrained
 
 T = TypeVar("T")
 
@@ -146,8 +147,9 @@ def find_run(path: Path) -> Path:
     Raises:
       ConfigError: if there is no finished run, or if the models that come with jaxsense are named.
     """
-    if (given := str(path)).startswith(PRETRAINED) and not path.exists():
-        demo = f"{options.command('jaxsense.demo')} --preset {given.removeprefix(PRETRAINED)}"
+    preset = (given := str(path)).removeprefix(PRETRAINED)
+    if (preset != given or preset in pretrained.PRETRAINED) and not path.exists():
+        demo = f"{options.command('jaxsense.demo')} --preset {preset}"
         reason = f"must be the directory of a finished run; play pretrained models with {demo}"
         raise ConfigError("run", given, reason)
     if path != Path("latest") or path.exists():

@@ -29,6 +29,7 @@ from jaxsense.models import Models
 from jaxsense.run import files
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.version import __version__, commit, versions
+from jaxsense.tasks.pretrained import PRETRAINED
 from jaxsense.training import stages
 from jaxsense.training.agents import learner, tour_stages
 
@@ -335,6 +336,10 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     """
     require_32_bits()
     path = Path(path)
+    preset = str(path).split(":")[-1]  # also of pretrained:PRESET
+    if preset in PRETRAINED and not path.exists():
+        reason = f"must be the directory of a finished run; or call load_pretrained({preset!r})"
+        raise ConfigError("run", str(path), reason)
     content = _read_config(path / "config.json", "run", path)
     _check_origin(content, "run", path)
     config = _settings_of(content, trust).config

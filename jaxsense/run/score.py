@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import MAX_EPISODES
@@ -86,8 +87,8 @@ def score_missions(
       The score.
 
     Raises:
-      ConfigError: if a policy is unknown or has a name that is taken, or the models are for another
-        number of PoIs.
+      ConfigError: if an argument is of another type, a policy is unknown or has a name that is
+        taken, or the models are for another number of PoIs.
       ValueError: if another argument is wrong, or a policy returns values of another shape or
         dtype.
       RuntimeError: if the values of a policy, the models or the beliefs are not finite.
@@ -135,13 +136,22 @@ def _require(
     checks.require_number("episodes", episodes)
     if episodes > MAX_EPISODES:
         raise ConfigError("episodes", episodes, f"must be from 1 to {MAX_EPISODES:,}")
-    if not 0 <= seed < 2**32:
-        raise ConfigError("seed", seed, "must be from 0 to 2^32 - 1")
+    is_whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+    if not is_whole or not 0 <= seed < 2**32:
+        raise ConfigError("seed", seed, "must be a whole number from 0 to 2^32 - 1")
+    if not isinstance(config, Config):
+        raise ConfigError("config", type(config), "must be Config, as from load_pretrained")
+    if not isinstance(models, Models):
+        raise ConfigError("models", type(models), "must be Models, as from load_pretrained")
+    if not isinstance(policies, Mapping):
+        raise ConfigError("policies", policies, "must be a dictionary from names to policies")
     for name, each in policies.items():
+        if not isinstance(name, str):
+            raise ConfigError("policies", name, "must be a text, the name of a policy")
         if not callable(each) and not isinstance(each, Policy):
             raise ConfigError("policies", name, "must be a function or a dqn.Policy")
     names = (*POLICIES, *policies)
-    if isinstance(against, str) or not against or not set(against) <= set(names):
+    if not isinstance(against, list | tuple) or not against or any(x not in names for x in against):
         reason = f"must be one or more of {', '.join(dict.fromkeys(names))}"
         raise ConfigError("against", against, reason)
     checks.require_one_each("models.detectors", models.detectors, config.modalities)

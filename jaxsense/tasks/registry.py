@@ -44,7 +44,11 @@ def about(name: str) -> str:
 
     Args:
       name: one of `registered()`.
+
+    Raises:
+      ConfigError: if there is no such task.
     """
+    _require_name(name)
     return TASKS[name]
 
 
@@ -95,10 +99,12 @@ def as_task(task: Task | str, agent: str | None = None) -> Task:
       agent: see `make`; only with a name.
 
     Raises:
-      ConfigError: if there is no such task or agent.
+      ConfigError: if there is no such task or agent, or if `task` is something else.
     """
     if isinstance(task, str):
         return make(task, agent)
+    if isinstance(task, type) or not hasattr(task, "play"):
+        raise ConfigError("task", task, f"must be from make, or one of {', '.join(TASKS)}")
     if agent is not None:
         raise ConfigError("agent", agent, "must be None with a task; pass it to make(name, agent)")
     return task
@@ -161,9 +167,14 @@ def reference_returns(task: Task, seeds: int, episodes: int) -> dict[str, np.nda
 
 def _read(name: str) -> tuple[Arrays, dict[str, object]]:
     """What a task's file holds, see `archive.read`."""
-    if name not in TASKS:
-        raise ConfigError("name", name, f"must be one of {', '.join(TASKS)}")
+    _require_name(name)
     return archive.read(DATA / f"{name}.npz")
+
+
+def _require_name(name: str) -> None:
+    """Raises `ConfigError` if there is no such task."""
+    if name not in tuple(TASKS):  # a list has no hash
+        raise ConfigError("name", name, f"must be one of {', '.join(TASKS)}")
 
 
 def _agents(config: Config) -> tuple[str, ...]:

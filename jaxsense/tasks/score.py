@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 from scipy import stats
 
 from jaxsense.config import ConfigError
+from jaxsense.config.checks import require_function
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.tasks.registry import as_task, reference_returns
@@ -24,6 +25,9 @@ _UNTRACEABLE = (
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
 )
+_IS_POLICY = "must be a function (key, observation) -> action, a Recurrent, or a list of them"
+_IS_RECURRENT = "must be a function (key, memory, observation) -> (action, memory)"
+_IS_ON_HOST = "must be a function of [B, S] observations that returns [B] integer actions"
 _RESAMPLES = 2000
 _LEVEL = 0.95
 
@@ -134,18 +138,24 @@ def score(
       The score. Its starts and looks are always the same, and no training should see them.
 
     Raises:
-      ConfigError: if there is no such task or agent.
-      ValueError: if a policy's actions are no scalar integers, or do not exist, or if JAX cannot
-        trace it.
+      ConfigError: if there is no such task or agent, or if a policy is not such a function or
+        returns values of another shape or dtype.
+      ValueError: if a policy's actions do not exist, or if JAX cannot trace it.
     """
     checks.require_number("episodes", episodes)
     task = as_task(task, agent)
+    if isinstance(policy, str):  # a sequence, too
+        raise ConfigError("policy", policy, _IS_POLICY)
     policies = [policy] * SEEDS if not isinstance(policy, Sequence) else list(policy)
     if not policies:
         raise ConfigError("policy", "[]", "must be one policy or several")
     seeds = len(policies)
     keys = [key_of_seed(seed) for seed in range(seeds)]
-    played = {id(each): _player(each) for each in policies}
+    own = {id(each): _recurrent(each) for each in policies}
+    seen = jax.ShapeDtypeStruct((task.observation_size,), jnp.float32)
+    for each in own.values():
+        jax.eval_shape(functools.partial(_choose, each.act), keys[0], each.memory, seen)
+    played = {name: _player(each) for name, each in own.items()}
     pairs = zip(keys, policies, strict=True)
     returns = [played[id(each)](key, task, episodes) for key, each in pairs]
     if episodes == EPISODES and seeds <= SEEDS:
@@ -160,17 +170,31 @@ def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
     """Wraps a policy that JAX cannot trace, for example one in NumPy or PyTorch.
 
     Args:
-      act: `[B, S]` float32 observations to `[B]` integer actions.
+      act: `[B, S]` float32 observations to `[B]` integer actions, for any B. It is called with
+        two observations of zeros before it plays.
+
+    Raises:
+      ConfigError: if `act` is not such a function. The policy raises it if `act` returns an array
+        of another shape or dtype.
     """
+    require_function("act", act, 1, _IS_ON_HOST)
+
+    def choose(observations: np.ndarray) -> np.ndarray:
+        actions = np.asarray(act(observations))
+        if actions.shape != observations.shape[:1] or actions.dtype.kind not in "iu":
+            expected = f"must return {len(observations)} integers for as many observations"
+            raise ConfigError("act", act, f"{expected}; not {actions.dtype}{[*actions.shape]}")
+        return actions.astype(np.int32)
 
     def policy(key: Key, observation: jax.Array) -> jax.Array:
         del key
         shape = jax.ShapeDtypeStruct((), jnp.int32)
+        # An error within a program would lose its message among many lines.
+        choose(np.zeros((2, *observation.shape), np.float32))
 
         def call(observations: ArrayLike) -> np.ndarray:
             batch = np.asarray(observations)
-            chosen = np.asarray(act(batch.reshape(-1, batch.shape[-1])))
-            return chosen.astype(np.int32).reshape(batch.shape[:-1])
+            return choose(batch.reshape(-1, batch.shape[-1])).reshape(batch.shape[:-1])
 
         return jax.pure_callback(call, shape, observation, vmap_method="broadcast_all")
 
@@ -211,15 +235,16 @@ def mean_return(key: Key, task: Task, policy: Policy | Recurrent, episodes: int)
       Mean return of an episode, without discount.
 
     Raises:
-      ValueError: if the policy's actions are no scalar integers, or do not exist.
+      ConfigError: if the policy is not such a function or returns values of another shape or
+        dtype.
+      ValueError: if its actions do not exist, or if JAX cannot trace it.
     """
     return _player(policy)(key, task, episodes)
 
 
 def _player(policy: Policy | Recurrent) -> Callable[[Key, Task, int], float]:
     """`mean_return` of a policy, which is compiled once for all keys."""
-    if not isinstance(policy, Recurrent):
-        policy = Recurrent(Partial(_forget, policy), ())
+    policy = _recurrent(policy)
     act, memory, play = policy.act, policy.memory, _play_compiled
     if not all(isinstance(leaf, _NUMBERS) for leaf in jax.tree.leaves(act)):
         # A program of its own, which goes when the policy does.
@@ -239,28 +264,67 @@ def _play(
     act: Act[PyTree], memory: PyTree, key: Key, task: Task, episodes: int
 ) -> Float[Array, ""]:
     """Mean return of some episodes; NaN if there is no such action."""
-
-    def checked(key: Key, memory: PyTree, observation: jax.Array) -> tuple[jax.Array, PyTree]:
-        try:
-            action, memory = act(key, memory, observation)
-        except _UNTRACEABLE as error:
-            expected = "must be a function that JAX can trace; wrap others in tasks.on_host"
-            raise ValueError(f"policy: {expected}") from error
-        action = jnp.asarray(action)
-        if action.shape or not jnp.issubdtype(action.dtype, jnp.integer):
-            found = f"{action.dtype}{list(action.shape)}"
-            raise ValueError(f"action = {found}: must be an integer of shape []")
-        return action.astype(jnp.int32), memory
-
-    keys = jax.random.split(key, episodes)
-    return jnp.mean(jax.vmap(lambda key: task.play(key, checked, memory))(keys))
+    keys, choose = jax.random.split(key, episodes), functools.partial(_choose, act)
+    return jnp.mean(jax.vmap(lambda key: task.play(key, choose, memory))(keys))
 
 
 _play_compiled = jax.jit(_play, static_argnums=4)
+
+
+def _recurrent(policy: Policy | Recurrent) -> Recurrent:
+    """The policy, with empty memory if it has none; raises `ConfigError` if it is neither."""
+    if isinstance(policy, Recurrent):
+        require_function("policy.act", policy.act, 3, _IS_RECURRENT)
+        return policy
+    require_function("policy", policy, 2, _IS_POLICY)
+    return Recurrent(Partial(_forget, policy), ())
+
+
+def _choose(
+    act: Act[PyTree], key: Key, memory: PyTree, observation: jax.Array
+) -> tuple[jax.Array, PyTree]:
+    """Action and memory of a policy, both checked while it is traced."""
+    try:
+        found = act(key, memory, observation)
+    except _UNTRACEABLE as error:
+        expected = "must be a function that JAX can trace; wrap others in tasks.on_host"
+        raise ValueError(f"policy: {expected}") from error
+    if not isinstance(found, tuple | list) or len(found) != 2:
+        raise _returned(act, "(action, memory)", _form(found))
+    action, after = found
+    structures = jax.tree.structure(memory), jax.tree.structure(after)
+    if structures[0] != structures[1]:
+        raise _returned(act, f"memory of structure {structures[0]}", str(structures[1]))
+    for old, new in zip(jax.tree.leaves(memory), jax.tree.leaves(after), strict=True):
+        # Loops promote a weak dtype, such as that of a Python number.
+        dtype = jnp.result_type(old, new) if old.weak_type else old.dtype
+        if (old.shape, dtype) != (jnp.shape(new), jnp.result_type(new)):
+            raise _returned(act, f"memory as before, {_form(old)}", _form(new))
+    return _checked(act, action), after
+
+
+def _checked(policy: Callable[..., object], action: object) -> Int[Array, ""]:
+    """The action; raises `ConfigError` about its policy unless it is a scalar integer."""
+    is_scalar = isinstance(action, _NUMBERS) and jnp.shape(action) == ()
+    if not is_scalar or not jnp.issubdtype(jnp.result_type(action), jnp.integer):
+        raise _returned(policy, "an integer of shape []", _form(action))
+    return jnp.asarray(action, jnp.int32)
+
+
+def _returned(policy: Callable[..., object], expected: str, found: str) -> ConfigError:
+    """The error about what a policy returned."""
+    return ConfigError("policy", policy, f"must return {expected}; not {found}")
+
+
+def _form(value: object) -> str:
+    """Dtype and shape of an array or a number; the type of something else."""
+    if isinstance(value, _NUMBERS):
+        return f"{jnp.result_type(value)}{[*jnp.shape(value)]}"
+    return type(value).__name__
 
 
 def _forget(
     policy: Policy, key: Key, memory: tuple[()], observation: jax.Array
 ) -> tuple[jax.Array, tuple[()]]:
     """A policy without memory."""
-    return policy(key, observation), memory
+    return _checked(policy, policy(key, observation)), memory

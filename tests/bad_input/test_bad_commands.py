@@ -249,6 +249,12 @@ OTHERS = [
         "run = 'pretrained:noisy': must be the directory of a finished run; play pretrained models "
         "with python -m jaxsense.demo --preset noisy",
     ),
+    (
+        evaluate,
+        ["noisy"],
+        "run = 'noisy': must be the directory of a finished run; play pretrained models with "
+        "python -m jaxsense.demo --preset noisy",
+    ),
     (evaluate, [""], "run = '': must be a path"),
     (evaluate, ["none"], "none is not a run directory: it has no config.json"),
     (evaluate, ["file"], "file is not a run directory: it has no config.json"),
@@ -282,6 +288,11 @@ OTHERS = [
     (evaluate, ["RUN", "--devices", "0"], "devices = 0: must be from 1 to"),
     (evaluate, ["RUN", "--cache", "file"], "cache = 'file': must be a directory"),
     (export, [], "missing argument RUN: the directory of a finished run, e.g. runs/2026"),
+    (
+        export,
+        ["noisy"],
+        "run = 'noisy': must be the directory of a finished run, or pretrained:noisy",
+    ),
     (export, ["none"], "none is not a run directory: it has no config.json"),
     (export, ["a\nb"], "run = 'a\\nb': must be a path of printable characters"),
     (export, ["RUN", "--out", "full"], "out = 'full': already exists; must be a new file"),

@@ -10,7 +10,7 @@ import pytest
 from refusals import INF, NAN, SMOKE
 
 import jaxsense
-from jaxsense import Belief, dqn, mission, sim, vae
+from jaxsense import Belief, dqn, mission, sim, tasks, vae
 from jaxsense.config import FilterConfig
 from jaxsense.interfaces import common
 from jaxsense.run import batches
@@ -58,10 +58,139 @@ def given_world():
     return World()
 
 
+def nop(key, observation):
+    return jnp.int32(3)
+
+
+def short(observation):
+    return jnp.int32(3)
+
+
+def values(key, models, known):
+    return jnp.zeros(len(known.looks) + 1)
+
+
+def returns(value, memory=None):
+    """A score of a policy that returns a value; with memory, a recurrent one."""
+    if memory is None:
+        return jaxsense.score("map-v0", lambda key, observation: value)
+    return jaxsense.score("map-v0", tasks.Recurrent(lambda key, m, observation: value, memory))
+
+
+def on_host(act):
+    """A score of a policy on the host."""
+    return jaxsense.score("map-v0", tasks.on_host(act))
+
+
+def of_missions(w, config=SMOKE, models=None, policies=None, **options):
+    """A score of missions, of a policy unless others are given."""
+    models, policies = models or w.models, policies or {"mine": values}
+    return jaxsense.score_missions(config, models, policies, **options)
+
+
+IS_POLICY = "must be a function (key, observation) -> action, a Recurrent, or a list of them"
+IS_TASK = "must be from make, or one of map-v0, many-v0, noisy-v0, team-v0"
 BAD = jnp.array([0, 1, 7])
 FUNCTIONS = {
     "load": (lambda w: jaxsense.load(""), ". is not a run directory: it has no config.json"),
     "load nul": (lambda w: jaxsense.load("\0"), "run = "),
+    "load preset": (
+        lambda w: jaxsense.load("noisy"),
+        "run = 'noisy': must be the directory of a finished run; or call load_pretrained('noisy')",
+    ),
+    "load pretrained": (
+        lambda w: jaxsense.load("pretrained:noisy"),
+        "run = 'pretrained:noisy': must be the directory of a finished run; or call "
+        "load_pretrained('noisy')",
+    ),
+    "make list": (lambda w: jaxsense.make(["noisy-v0"]), "name = ['noisy-v0']: must be one of map"),
+    "about": (lambda w: tasks.about("x"), "name = 'x': must be one of map-v0"),
+    "about list": (lambda w: tasks.about([]), "name = []: must be one of map-v0"),
+    "score name": (lambda w: jaxsense.score("map-v0", "greedy"), f"policy = 'greedy': {IS_POLICY}"),
+    "score none": (lambda w: jaxsense.score("map-v0", None), f"policy = None: {IS_POLICY}"),
+    "score number": (lambda w: jaxsense.score("map-v0", 3), f"policy = 3: {IS_POLICY}"),
+    "score names": (lambda w: jaxsense.score("map-v0", [nop, "x"]), f"policy = 'x': {IS_POLICY}"),
+    "score arguments": (lambda w: jaxsense.score("map-v0", short), f"policy = short: {IS_POLICY}"),
+    "score swapped": (lambda w: jaxsense.score(nop, "map-v0"), f"task = nop: {IS_TASK}"),
+    "score no task": (lambda w: jaxsense.score(None, nop), f"task = None: {IS_TASK}"),
+    "score tasks": (lambda w: jaxsense.score(["map-v0"], nop), f"task = ['map-v0']: {IS_TASK}"),
+    "score class": (lambda w: jaxsense.score(tasks.Task, nop), f"task = Task: {IS_TASK}"),
+    "score returns none": (
+        lambda w: returns(None),
+        "policy = <lambda>: must return an integer of shape []; not NoneType",
+    ),
+    "score returns real": (lambda w: returns(0.5), "an integer of shape []; not float32[]"),
+    "score returns bool": (lambda w: returns(True), "an integer of shape []; not bool[]"),
+    "score returns two": (lambda w: returns(BAD), "an integer of shape []; not int32[3]"),
+    "score returns memory": (lambda w: returns((0, 0)), "an integer of shape []; not tuple"),
+    "recurrent name": (
+        lambda w: jaxsense.score("map-v0", tasks.Recurrent("x", 0)),
+        "policy.act = 'x': must be a function (key, memory, observation) -> (action, memory)",
+    ),
+    "recurrent arguments": (
+        lambda w: jaxsense.score("map-v0", tasks.Recurrent(nop, 0)),
+        "policy.act = nop: must be a function (key, memory, observation) -> (action, memory)",
+    ),
+    "recurrent action": (
+        lambda w: returns(3, BAD),
+        "policy = <lambda>: must return (action, memory); not int32[]",
+    ),
+    "recurrent real": (
+        lambda w: returns((0.5, BAD), BAD),
+        "policy = <lambda>: must return an integer of shape []; not float32[]",
+    ),
+    "recurrent shape": (
+        lambda w: returns((3, BAD[:2]), BAD),
+        "policy = <lambda>: must return memory as before, int32[3]; not int32[2]",
+    ),
+    "recurrent dtype": (
+        lambda w: returns((3, BAD * 1.0), BAD),
+        "policy = <lambda>: must return memory as before, int32[3]; not float32[3]",
+    ),
+    "recurrent weak": (
+        lambda w: returns((3, jnp.int32(0)), 0.0),
+        "policy = <lambda>: must return memory as before, float32[]; not int32[]",
+    ),
+    "recurrent structure": (
+        lambda w: returns((3, (BAD, BAD)), BAD),
+        "must return memory of structure PyTreeDef(*); not PyTreeDef((*, *))",
+    ),
+    "on_host none": (lambda w: tasks.on_host(None), "act = None: must be a function of [B, S]"),
+    "on_host key": (lambda w: tasks.on_host(nop), "act = nop: must be a function of [B, S]"),
+    "on_host real": (
+        lambda w: on_host(lambda seen: np.full(len(seen), 3.7)),
+        "act = <lambda>: must return 2 integers for as many observations; not float64[2]",
+    ),
+    "on_host shape": (lambda w: on_host(lambda seen: 3), "for as many observations; not int64[]"),
+    "on_host rank": (
+        lambda w: on_host(lambda seen: np.zeros((len(seen), 1), int)),
+        "for as many observations; not int64[2, 1]",
+    ),
+    "missions function": (
+        lambda w: of_missions(w, policies=values),
+        "policies = values: must be a dictionary from names to policies",
+    ),
+    "missions key": (
+        lambda w: of_missions(w, policies={3: values}),
+        "policies = 3: must be a text, the name of a policy",
+    ),
+    "missions swapped": (
+        lambda w: of_missions(w, config=w.models, models=SMOKE),
+        "config = Models: must be Config, as from load_pretrained",
+    ),
+    "missions models": (
+        lambda w: of_missions(w, models=SMOKE),
+        "models = Config: must be Models, as from load_pretrained",
+    ),
+    "missions against": (lambda w: of_missions(w, against=3), "against = 3: must be one or more"),
+    "missions unhashable": (lambda w: of_missions(w, against=[[]]), "against = [[]]: must be one"),
+    **{
+        f"missions seed {seed!r}": (
+            lambda w, seed=seed: of_missions(w, seed=seed),
+            f"seed = {seed!r}: must be a whole number from 0 to 2^32 - 1",
+        )
+        for seed in (1.5, "1", True)
+    },
     "make_mdp few": (
         lambda w: jaxsense.make_mdp(SMOKE, w.models, jaxsense.Bank(w.bank[:1])),
         "looks has 1 entries: must be 2",

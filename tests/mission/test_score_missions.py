@@ -98,7 +98,7 @@ def test_differences_are_of_the_same_arenas(play):
         ),
         ({"mine": last_first}, {"against": []}, r"^against = \[\]: must be one or more of latent"),
         ({"mine": last_first}, {"episodes": 0}, r"^episodes = 0: must be"),
-        ({"mine": last_first}, {"seed": -1}, r"^seed = -1: must be from 0 to"),
+        ({"mine": last_first}, {"seed": -1}, r"^seed = -1: must be a whole number from 0 to"),
     ],
 )
 def test_a_wrong_argument_is_named(play, policies, options, expected):

@@ -1,5 +1,7 @@
 """Scores of policies in frozen tasks."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -102,7 +104,10 @@ def test_a_team_is_measured_against_its_best_rule():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((NAME, lambda key, seen: seen[0]), r"action = float32\[\]: must be an integer of shape"),
+        (
+            (NAME, lambda key, seen: seen[0]),
+            r"policy = <lambda>: must return an integer of shape \[\]; not float32\[\]",
+        ),
         ((NAME, lambda key, seen: jnp.int32(7)), r"action: must be from 0 to 3"),
         ((NAME, []), r"policy = '\[\]': must be one policy or several"),
         (("noisy-v1", nop), r"name = 'noisy-v1': must be one of"),
@@ -111,6 +116,29 @@ def test_a_team_is_measured_against_its_best_rule():
 def test_wrong_policies_and_names_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         jaxsense.score(*arguments, episodes=2)
+
+
+def test_all_policies_are_checked_before_one_is_compiled(monkeypatch):
+    def scalar(key, observation):
+        return observation[0]
+
+    # The package's function hides the module.
+    monkeypatch.setattr(importlib.import_module("jaxsense.tasks.score"), "_player", pytest.fail)
+    with pytest.raises(ConfigError, match="policy = scalar: must return an integer"):
+        jaxsense.score(NAME, [nop, scalar])
+
+
+def test_memory_may_start_as_a_python_number():
+    policy = tasks.Recurrent(lambda key, memory, seen: (jnp.int32(3), memory + 0.5), 0)
+    np.testing.assert_array_equal(jaxsense.score(NAME, [policy], episodes=1).returns, 0)
+
+
+def test_actions_from_the_host_stay_integers():
+    def turns_real(observations):
+        return np.full(len(observations), 2.7 if observations.any() else 2)
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match="act = turns_real: must return"):
+        jaxsense.score(NAME, [tasks.on_host(turns_real)], episodes=1)
 
 
 def test_an_agent_goes_with_a_name():
