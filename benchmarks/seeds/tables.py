@@ -162,6 +162,10 @@ def _of_policy(key: str, *policies: str) -> Value:
     return lambda figures: [figures["mission"][policy][key] for policy in policies]
 
 
+def _last_nll_over_bayes(figures: Figures) -> float:
+    return figures["nll_over_bayes"][-1]
+
+
 def _grouped(key: str) -> Value:
     return lambda figures: figures["grouped"] and figures["grouped"][key]
 
@@ -179,7 +183,7 @@ OF_RAW = [
     Row("accuracy of single looks, camera, LiDAR", _key("detectors"), "{:.4f}"),
     Row(
         "NLL after six random looks less that of exact Bayes",
-        lambda figures: figures["nll_over_bayes"][-1],
+        _last_nll_over_bayes,
         "{:.4f}",
     ),
     Row("accuracy of the finished map, latent", _of_policy("accuracy", "latent"), "{:.4f}"),
@@ -197,30 +201,21 @@ OF_RAW_AND_LABELLED = [
     Row("... four looks by each", _grouped("all_looks"), "{:.3f}"),
     Row(
         "NLL of the map less that of exact Bayes, after six random looks",
-        lambda figures: figures["nll_over_bayes"][-1],
+        _last_nll_over_bayes,
         "{:.3f}",
     ),
     _CONSISTENT,
     Row("missions", _of_policy("episodes", "latent"), "{:,}"),
-    Row(
-        "accuracy of the finished map, latent, greedy",
-        _of_policy("accuracy", *_CHOOSING),
-        "{:.3f}",
-    ),
-    Row(
-        "... naive, naive_2, naive_3",
-        _of_policy("accuracy", *_COUNTING),
-        "{:.3f}",
-    ),
-    Row(
-        "looks per PoI, latent, greedy",
-        _of_policy("observations_per_poi", *_CHOOSING),
-        "{:.2f}",
-    ),
-    Row(
-        "... naive, naive_2, naive_3",
-        _of_policy("observations_per_poi", *_COUNTING),
-        "{:.2f}",
+    *(
+        row
+        for label, key, form in (
+            ("accuracy of the finished map", "accuracy", "{:.3f}"),
+            ("looks per PoI", "observations_per_poi", "{:.2f}"),
+        )
+        for row in (
+            Row(f"{label}, {', '.join(_CHOOSING)}", _of_policy(key, *_CHOOSING), form),
+            Row(f"... {', '.join(_COUNTING)}", _of_policy(key, *_COUNTING), form),
+        )
     ),
     Row(
         "confidence minus accuracy, latent",
