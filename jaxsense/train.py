@@ -28,6 +28,7 @@ from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.run.together import Trainings
 from jaxsense.show import tables, tensorboard
 from jaxsense.show.artist import Artist
 from jaxsense.show.terminal import Display, print_table, say
@@ -252,10 +253,13 @@ def _train(
     left = list(itertools.compress(paths, processes.of_first_process(is_left)))
     most = 1 if jax.default_backend() == "cpu" else _MOST_TOGETHER
     size = max(1, min(len(left), most))  # all seeds may already be finished
+    trainings = Trainings(size, total=len(left))
     try:
         with (
             on_interrupt(stop),
-            pipeline.compiled(settings.config, monitor, workers, kept, size, policies) as programs,
+            pipeline.compiled(
+                settings.config, monitor, workers, kept, trainings, policies
+            ) as programs,
         ):
             for first in range(0, len(left), size):
                 with contextlib.ExitStack() as opened:

@@ -168,6 +168,11 @@ class Program:
         with contextlib.suppress(InvalidStateError):
             self._compiled.set_exception(error)
 
+    def release(self) -> None:
+        """Lets go of the compiled program, which holds tens of MiB; nobody may call it again."""
+        self._compiled = Future()
+        self.fail(RuntimeError(f"program {self._name} of {self._stage} was released"))
+
     def wait(self) -> Function:
         """Blocks until the program is compiled.
 

@@ -153,6 +153,7 @@ class _Loop:
         finally:
             for name in before:
                 self._held[name].used()
+            self._programs.used(stage)
             devices.give_back_freed()
 
     def _output(self, stage: Stage, before: dict[str, Future[None]]) -> Output:

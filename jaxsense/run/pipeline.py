@@ -20,6 +20,7 @@ from jaxsense.run.kept import Kept
 from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import OwnPolicies, Programs, compile_programs
+from jaxsense.run.together import Trainings
 from jaxsense.summary import compare
 from jaxsense.training.agents import learner
 from jaxsense.training.comparison import permutations
@@ -78,7 +79,7 @@ def compiled(
     monitor: Monitor,
     workers: Workers = ALONE,
     kept: Kept | None = None,
-    num_seeds: int = 1,
+    trainings: Trainings | None = None,
     policies: OwnPolicies | None = None,
 ) -> Iterator[Programs]:
     """The programs of runs with the same settings, compiled in the background.
@@ -88,7 +89,8 @@ def compiled(
       monitor: receives the time that it takes.
       workers: what shares scenes, missions and seeds.
       kept: where to keep compiled programs for later runs, if anywhere.
-      num_seeds: runs side by side, see `compile_programs`.
+      trainings: call the programs; if their total is given, the programs of a stage are let go of
+        after the last of them.
       policies: custom policies by name; keep no programs with these, whose code may change.
 
     Raises:
@@ -96,7 +98,7 @@ def compiled(
     """
     check(config, policies)
     with Compiler(monitor, kept) as compiler:
-        yield compile_programs(config, compiler, workers, num_seeds, policies)
+        yield compile_programs(config, compiler, workers, trainings, policies)
 
 
 def learn(

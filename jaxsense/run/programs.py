@@ -6,6 +6,8 @@ compiled programs already run. Shapes come from tracing: a stage's outputs are l
 
 import dataclasses
 import functools
+import threading
+from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import suppress
@@ -89,6 +91,11 @@ class StagePrograms:
     finish: Program | SharedProgram
     shapes: Future[Shapes]
 
+    def release(self) -> None:
+        """Lets go of the compiled programs."""
+        for program in (self.begin, self.advance, self.finish):
+            program.release()
+
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
@@ -100,8 +107,9 @@ class Programs:
       of_stages: their programs, by name.
       player: of the missions.
       workers: threads or devices that share rows and missions.
-      trainings: how many run side by side.
+      trainings: how many run side by side, and in all.
       policies: of missions, by name, in addition to `dqn.POLICIES`.
+      left: how often each stage's programs are still needed, if it is known.
     """
 
     config: Config
@@ -111,10 +119,20 @@ class Programs:
     workers: Workers
     trainings: Trainings
     policies: OwnPolicies | None = None
+    left: Counter[str] = dataclasses.field(default_factory=Counter)
+    _lock: threading.Lock = dataclasses.field(default_factory=threading.Lock)
 
     def of(self, stage: Stage) -> StagePrograms:
         """The programs of a stage."""
         return self.of_stages[program_name(stage.name)]
+
+    def used(self, stage: Stage) -> None:
+        """Notes that a training is done with a stage, and lets go of programs that none needs."""
+        name = program_name(stage.name)
+        with self._lock:
+            self.left[name] -= 1
+            if self.left[name] == 0:
+                self.of_stages[name].release()
 
     def fail(self, error: BaseException) -> None:
         """Raises an error wherever a program is awaited, now or later."""
@@ -130,7 +148,7 @@ def compile_programs(
     config: Config,
     compiler: Compiler,
     workers: Workers = ALONE,
-    num_seeds: int = 1,
+    trainings: Trainings | None = None,
     policies: OwnPolicies | None = None,
 ) -> Programs:
     """Starts to trace and compile the programs of a run in the background.
@@ -139,14 +157,14 @@ def compile_programs(
       config: all settings.
       compiler: compiles them.
       workers: what shares rows, missions and seeds.
-      num_seeds: trainings side by side; each calls the programs from its own threads.
+      trainings: call the programs, each from its own threads; by default one at a time.
       policies: of missions, by name, in addition to `dqn.POLICIES`.
     """
-    found, trainings = stages(config), Trainings(num_seeds)
+    found, trainings = stages(config), trainings or Trainings()
 
     def program(stage: Stage, part: str) -> Program | SharedProgram:
         alone = Program(compiler, program_name(stage.name), part)
-        is_shared = num_seeds > 1 and not has_rows(stage)
+        is_shared = trainings.number > 1 and not has_rows(stage)
         return SharedProgram(alone, trainings, workers) if is_shared else alone
 
     programs = Programs(
@@ -165,6 +183,9 @@ def compile_programs(
         workers=workers,
         trainings=trainings,
         policies=policies,
+        left=Counter(
+            program_name(stage.name) for stage in found for _ in range(trainings.total or 0)
+        ),
     )
 
     thread = ThreadPoolExecutor(1, "trace")

@@ -28,11 +28,13 @@ class Trainings:
 
     Attributes:
       number: maximum number of trainings at a time.
+      total: number of trainings in all, if it is known.
       active: number of trainings that are running.
     """
 
-    def __init__(self, number: int):
+    def __init__(self, number: int = 1, total: int | None = None):
         self.number = self.active = number
+        self.total = total
         self._lock = threading.Lock()
 
     def begin(self, number: int) -> None:
@@ -100,6 +102,10 @@ class SharedProgram:
     def fail(self, error: BaseException) -> None:
         """See `Program.fail`."""
         self._program.fail(error)
+
+    def release(self) -> None:
+        """See `Program.release`."""
+        self._program.release()
 
     def wait(self) -> Callable[..., PyTree]:
         """See `Program.wait`."""

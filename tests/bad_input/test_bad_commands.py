@@ -376,7 +376,7 @@ def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsy
     def fails(*_):
         raise error
 
-    compiled = SimpleNamespace(trainings=Trainings(1))
+    compiled = SimpleNamespace(trainings=Trainings())
     monkeypatch.setattr(pipeline, "compiled", lambda *_: contextlib.nullcontext(compiled))
     monkeypatch.setattr(pipeline, "learn", fails)
     argv = ["--preset", "smoke", "--quiet", "--cache", "None", "--out", str(tmp_path / "run")]

@@ -172,7 +172,7 @@ def test_train_passes_own_policies_on_and_keeps_no_programs(tmp_path, monkeypatc
     given = []
 
     @contextlib.contextmanager
-    def compiled(config, monitor, workers, kept, size, policies):
+    def compiled(config, monitor, workers, kept, trainings, policies):
         given.append((config.mission.policies, kept, policies))
         raise Stopped
         yield
