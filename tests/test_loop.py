@@ -16,6 +16,7 @@ from jaxsense.run import devices, loop, pipeline, programs
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.run.together import Trainings
 from jaxsense.training.stage import Progress, Stage
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
@@ -111,6 +112,36 @@ def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, monkeyp
     assert alive["fourth"] == ["second", "third"]
     assert [*found.outputs] == ["second", "third", "fourth"]
     np.testing.assert_array_equal(found.outputs["fourth"], [8, 8, 8])
+
+
+def test_programs_are_let_go_of_once_no_training_needs_them(monkeypatch):
+    # Stages of one kind share their programs.
+    kinds = [counting("dqn_camera"), counting("dqn_lidar"), counting("count")]
+    monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
+    monkeypatch.setattr(programs, "stages", lambda config: kinds)
+    monitor, trainings = Monitor(), Trainings(1, total=2)
+    with pipeline.compiled(SMOKE, monitor, trainings=trainings) as compiled:
+        shared = compiled.of(kinds[0])
+        assert shared is compiled.of(kinds[1])
+        every = [shared.advance, compiled.of(kinds[2]).finish]
+        alive = [weakref.ref(program.wait()) for program in every]
+        loop.train(KEY, SMOKE, compiled, monitor)
+        assert all(program() is not None for program in alive)
+        loop.train(KEY, SMOKE, compiled, monitor)
+        gc.collect()
+        assert all(program() is None for program in alive)
+        with pytest.raises(RuntimeError, match="program advance of dqn was released"):
+            shared.advance.wait()
+
+
+def test_programs_are_held_where_the_number_of_trainings_is_unknown(monkeypatch):
+    monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
+    monkeypatch.setattr(programs, "stages", lambda config: [counting("count")])
+    monitor = Monitor()
+    with pipeline.compiled(SMOKE, monitor) as compiled:
+        loop.train(KEY, SMOKE, compiled, monitor)
+        found = loop.train(KEY, SMOKE, compiled, monitor)
+    np.testing.assert_array_equal(found.outputs["count"], [6, 6])
 
 
 def test_the_first_state_of_a_training_is_held_no_longer_than_its_first_chunk(toy, monkeypatch):

@@ -20,6 +20,7 @@ from jaxsense.dqn.optimum import LookValues, steps_of_lattice
 from jaxsense.dqn.policies import Known, Trained
 
 _NUM_DRAWS = 1024
+_AT_ONCE = 1024  # simulated looks, to save memory
 _FINE = 16  # steps of a lattice between whose points values are right to a hundredth
 
 Reference = Callable[[Known, jax.Array], jax.Array]
@@ -75,7 +76,8 @@ def expected_rewards(
       bits m are set in the first index.
     """
 
-    def reward(key: Key, code: jax.Array, poi_class: jax.Array) -> jax.Array:
+    def reward(given: tuple[Key, jax.Array, jax.Array]) -> jax.Array:
+        key, code, poi_class = given
         reset_key, look_key = jax.random.split(key)
         bits = (code >> jnp.arange(mdp.num_modalities) & 1).astype(bool)
         seen = jnp.broadcast_to(bits, (mdp.num_pois, mdp.num_modalities))
@@ -86,7 +88,8 @@ def expected_rewards(
     # In one batch: one `vmap` in another takes three times as long to compile.
     shape = (2**mdp.num_modalities, mdp.num_classes, num_draws)
     codes, classes, _ = jnp.unravel_index(jnp.arange(math.prod(shape)), shape)
-    rewards = jax.vmap(reward)(jax.random.split(key, math.prod(shape)), codes, classes)
+    looks = (jax.random.split(key, math.prod(shape)), codes, classes)
+    rewards = jax.lax.map(reward, looks, batch_size=_AT_ONCE)  # networks read all N PoIs
     return rewards.reshape(shape).mean(axis=-1)
 
 
