@@ -221,7 +221,7 @@ def test_a_full_disk_ends_nothing(tmp_path, monkeypatch):
     def full(*args, **options):
         raise files.WriteError(28, "No space left on device")
 
-    monkeypatch.setattr(files, "write", full)
+    monkeypatch.setattr(files, "write_digested", full)
     assert call(Kept(tmp_path), lambda x: 2 * x, jnp.float32(3)) == 6
 
 

@@ -193,14 +193,14 @@ def test_a_missing_checkpoint_is_noticed(tmp_path):
 def test_a_process_that_is_killed_after_its_first_checkpoint_has_lost_no_list(
     tmp_path, monkeypatch
 ):
-    write = files.write
+    write = files.write_digested
 
     def killed(path, content):
         write(path, content)
         if path.name == "tree.msgpack":
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(files, "write", killed)
+    monkeypatch.setattr(files, "write_digested", killed)
     with pytest.raises(KeyboardInterrupt):
         Checkpoints(tmp_path).save("tree", TREE)
     monkeypatch.undo()

@@ -220,8 +220,7 @@ class Checkpoints:
             self._write(_LIST, sorted(names))
 
     def _write(self, name: str, content: PyTree) -> None:
-        packed = serialization.msgpack_serialize(content)
-        files.write(self._file(name), files.with_digest(packed))
+        files.write_digested(self._file(name), serialization.msgpack_serialize(content))
 
     def _load(self, name: str, restore: Callable[[PyTree], T]) -> T | None:
         """Applies `restore` to a checkpoint's content; see `load`."""

@@ -32,11 +32,21 @@ def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
     Raises:
       WriteError: if the file cannot be written; it is then unchanged.
     """
+    _write(path, (content.encode() if isinstance(content, str) else content,), mode)
+
+
+def write_digested(path: Path, content: bytes, mode: int = 0o666) -> None:
+    """Writes a file as `write` does, with the SHA-256 digest of its content before it."""
+    _write(path, (hashlib.sha256(content).digest(), content), mode)
+
+
+def _write(path: Path, parts: tuple[bytes, ...], mode: int) -> None:
+    """Writes a file of several parts, see `write`; to join them would copy them."""
     unfinished = _unfinished(path)
     try:
         unfinished.touch(mode, exist_ok=False)
         with unfinished.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
+            file.writelines(parts)
             file.flush()
             os.fsync(file.fileno())
         unfinished.replace(path)
@@ -164,16 +174,11 @@ def locked(directory: Path, on_wait: Callable[[str], None] | None = None) -> Ite
         lock.release()
 
 
-def with_digest(content: bytes) -> bytes:
-    """Prefixes a file's content with its SHA-256 digest."""
-    return hashlib.sha256(content).digest() + content
-
-
 def without_digest(whole: bytes) -> bytes:
     """Removes the digest from a file's content.
 
     Args:
-      whole: from `with_digest`.
+      whole: the bytes that `write_digested` wrote.
 
     Raises:
       ValueError: if the content is damaged.

@@ -156,7 +156,7 @@ class Kept:
             with record("lower"):
                 traced = Traced(export.export(jitted)(*shapes), results[-1])
                 content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
-                files.write(self._file(name, args), files.with_digest(content), mode=0o600)
+                files.write_digested(self._file(name, args), content, mode=0o600)
             return traced
         return None
 
