@@ -206,6 +206,13 @@ def test_a_single_wrong_bit_is_compiled_anew(tmp_path):
     assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
 
 
+def test_programs_are_held_by_their_name_and_settings(tmp_path):
+    call(Kept(tmp_path, "settings"), lambda x: 2 * x, jnp.float32(3))
+    assert Kept(tmp_path, "settings").holds("stage-run")
+    assert not Kept(tmp_path, "settings").holds("stage")
+    assert not Kept(tmp_path, "others").holds("stage-run")
+
+
 def test_what_jax_cannot_write_is_traced_every_time(tmp_path):
     kept = Kept(tmp_path)
 

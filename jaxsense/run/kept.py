@@ -80,7 +80,7 @@ class Kept:
         use_cache(directory)
         self.path = directory / "traced"
         _make_private(self.path)
-        self._depends = repr((settings, _SOURCE, _surroundings())).encode()
+        self._settings = _digest(repr((settings, _SOURCE, _surroundings())))
         # Another run may be removing some too.
         with contextlib.suppress(FileNotFoundError):
             self._forget_oldest()
@@ -95,6 +95,10 @@ class Kept:
         for path in sorted(ours, key=lambda path: path.stat().st_mtime)[:-_MAX_KEPT]:
             path.unlink(missing_ok=True)
         files.remove_unfinished(self.path)
+
+    def holds(self, name: str) -> bool:
+        """Whether a program of this name is cached with these settings, for whatever arguments."""
+        return any(self.path.glob(f"{name}-{self._settings}*"))
 
     def find(self, name: str, args: PyTree) -> Traced | None:
         """Finds a cached program.
@@ -162,9 +166,12 @@ class Kept:
 
     def _file(self, name: str, args: PyTree) -> Path:
         """The file of a program."""
-        shapes = repr(shapes_of(args)).encode()
-        digest = hashlib.sha256(self._depends + shapes).hexdigest()[:32]
-        return self.path / f"{name}-{digest}.stablehlo"
+        return self.path / f"{name}-{self._settings}{_digest(repr(shapes_of(args)))}.stablehlo"
+
+
+def _digest(text: str) -> str:
+    """Tells a text from others in the name of a file."""
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def use_cache(directory: Path) -> None:

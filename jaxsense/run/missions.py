@@ -33,6 +33,8 @@ from jaxsense.run.monitor import StageError
 
 Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
 
+LONGEST = "mission-go_on"
+"""The program that a CPU takes longest to compile, by its name in `kept.Kept`."""
 _SECOND = "naive"  # whose first mission is recorded as well as that of the first case
 
 

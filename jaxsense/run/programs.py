@@ -30,6 +30,7 @@ OwnPolicies = Mapping[str, Values | Policy]
 """Policies of a user, by name, see `dqn.policies.table`."""
 _ROWS = ("survey",)
 """Stages whose inputs and output have independent rows, so that devices can share them."""
+_PATIENCE = 0.2  # s; between two checks whether the run is over
 _ROWS_AT_ONCE = 512  # of each thread; their results take up little memory besides those of all
 _SAVED = ("novelty", "best_jmvae", "class_beliefs", "fusion", "look_values")
 """Stages without chunks whose output a run saves; it saves that of every stage with chunks."""
@@ -111,6 +112,7 @@ class Programs:
       trainings: how many run side by side, and in all.
       policies: of missions, by name, in addition to `dqn.POLICIES`.
       left: how often each stage's programs are still needed, if it is known.
+      detected: set once a training has done without the survey's scans.
     """
 
     config: Config
@@ -121,6 +123,7 @@ class Programs:
     trainings: Trainings
     policies: OwnPolicies | None = None
     left: Counter[str] = dataclasses.field(default_factory=Counter)
+    detected: threading.Event = dataclasses.field(default_factory=threading.Event)
     _lock: threading.Lock = dataclasses.field(default_factory=threading.Lock)
 
     def of(self, stage: Stage) -> StagePrograms:
@@ -130,6 +133,8 @@ class Programs:
     def used(self, stage: Stage) -> None:
         """Notes that a training is done with a stage, and lets go of programs that none needs."""
         name = program_name(stage.name)
+        if name == _LAST_WITH_SCANS:
+            self.detected.set()
         with self._lock:
             self.left[name] -= 1
             if self.left[name] == 0:
@@ -196,6 +201,7 @@ def compile_programs(
 
 
 _BEFORE_MISSIONS = 2  # stages that all others wait for
+_LAST_WITH_SCANS = "detections"  # the stage that runs trained detectors on the scans
 
 
 def _on_cpu() -> bool:
@@ -210,11 +216,17 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
             _trace_stage(programs, stage)
         # Missions come last, but take a CPU longest to compile. With an accelerator, cores are
         # free to compile, and everything waits for tracing.
-        if _on_cpu():
+        is_kept = compiler.kept is not None and compiler.kept.holds(missions.LONGEST)
+        is_first = _on_cpu() and not is_kept
+        if is_first:
             _trace_missions(programs, compiler)
         for stage in programs.stages[_BEFORE_MISSIONS:]:
             _trace_stage(programs, stage)
-        if not _on_cpu():
+        if _on_cpu() and is_kept:
+            # They load in seconds, but take as much memory as the scans.
+            while not programs.detected.wait(_PATIENCE):
+                compiler.check_open()
+        if not is_first:
             _trace_missions(programs, compiler)
     except BaseException as error:
         programs.fail(error)
