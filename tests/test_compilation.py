@@ -206,11 +206,24 @@ def test_a_single_wrong_bit_is_compiled_anew(tmp_path):
     assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
 
 
-def test_programs_are_held_by_their_name_and_settings(tmp_path):
+def test_what_is_released_is_not_compiled_any_more(monkeypatch):
+    program, queued = Program(Compiler(Monitor()), "stage", "run"), []
+    monkeypatch.setattr(Compiler, "submit", lambda self, work: queued.append(work))
+    program.compile(lambda x: x, jnp.float32(0))
+    program.release()
+    monkeypatch.setattr(
+        jax.stages.Lowered, "compile", lambda *_, **options: pytest.fail("compiled")
+    )
+    queued[0]()
+    with pytest.raises(RuntimeError, match="run of stage was released"):
+        program.wait()
+
+
+def test_programs_are_held_by_their_arguments(tmp_path):
     call(Kept(tmp_path, "settings"), lambda x: 2 * x, jnp.float32(3))
-    assert Kept(tmp_path, "settings").holds("stage-run")
-    assert not Kept(tmp_path, "settings").holds("stage")
-    assert not Kept(tmp_path, "others").holds("stage-run")
+    assert Kept(tmp_path, "settings").holds("stage-run", (jnp.float32(3),))
+    assert not Kept(tmp_path, "settings").holds("stage-run", (jnp.zeros(2),))
+    assert not Kept(tmp_path, "others").holds("stage-run", (jnp.float32(3),))
 
 
 def test_what_jax_cannot_write_is_traced_every_time(tmp_path):

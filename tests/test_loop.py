@@ -133,7 +133,7 @@ def test_programs_are_let_go_of_once_no_training_needs_them(monkeypatch):
         loop.train(KEY, SMOKE, compiled, monitor)
         gc.collect()
         assert all(program() is None for program in alive)
-        with pytest.raises(RuntimeError, match="program advance of dqn was released"):
+        with pytest.raises(RuntimeError, match="advance of dqn was released"):
             shared.advance.wait()
 
 
@@ -150,8 +150,7 @@ def test_programs_are_held_where_the_number_of_trainings_is_unknown(monkeypatch)
 @pytest.mark.parametrize("is_kept", [True, False])
 def test_kept_missions_are_loaded_when_no_stage_needs_the_scans(monkeypatch, tmp_path, is_kept):
     order, kept = [], Kept(tmp_path)
-    if is_kept:
-        monkeypatch.setattr(Kept, "holds", lambda self, name: name == missions.LONGEST)
+    monkeypatch.setattr(missions, "are_kept", lambda *_: is_kept)
 
     def last(key, config, x):
         order.append("last traced")
@@ -184,7 +183,7 @@ def test_kept_missions_are_loaded_when_no_stage_needs_the_scans(monkeypatch, tmp
 
 
 def test_a_run_that_ends_before_its_kept_missions_are_loaded_does_not_hang(monkeypatch, tmp_path):
-    monkeypatch.setattr(Kept, "holds", lambda self, name: True)
+    monkeypatch.setattr(missions, "are_kept", lambda *_: True)
     monkeypatch.setattr(programs, "stages", lambda config: [counting("count")])
     with pipeline.compiled(SMOKE, Monitor(), kept=Kept(tmp_path)) as compiled:
         compiled.of_stages["count"].finish.wait()

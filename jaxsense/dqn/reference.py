@@ -85,7 +85,7 @@ def expected_rewards(
         state = map_mdp.reset(reset_key, mdp, classes, seen)
         return map_mdp.step(look_key, mdp, state, jnp.int32(0), modality)[1].reward
 
-    # In one batch: one `vmap` in another takes three times as long to compile.
+    # Along one axis: one `vmap` in another takes three times as long to compile.
     shape = (2**mdp.num_modalities, mdp.num_classes, num_draws)
     codes, classes, _ = jnp.unravel_index(jnp.arange(math.prod(shape)), shape)
     looks = (jax.random.split(key, math.prod(shape)), codes, classes)

@@ -122,6 +122,8 @@ class Program:
         self._results = devices.of_all_parts(results, workers.parts)
 
         def compile_lowered() -> None:
+            if self._compiled.done():  # failed or released
+                return
             begin, loaded = self._clock.now, self._compiler.num_loaded
             try:
                 compiled = lowered.compile(compiler_options=devices.compiler_options(**options))
@@ -170,8 +172,9 @@ class Program:
 
     def release(self) -> None:
         """Lets go of the compiled program, which holds tens of MiB; nobody may call it again."""
-        self._compiled = Future()
-        self.fail(RuntimeError(f"program {self._name} of {self._stage} was released"))
+        released = Future[Function]()
+        released.set_exception(RuntimeError(f"{self._name} of {self._stage} was released"))
+        self._compiled = released
 
     def wait(self) -> Function:
         """Blocks until the program is compiled.

@@ -80,7 +80,7 @@ class Kept:
         use_cache(directory)
         self.path = directory / "traced"
         _make_private(self.path)
-        self._settings = _digest(repr((settings, _SOURCE, _surroundings())))
+        self._depends = repr((settings, _SOURCE, _surroundings())).encode()
         # Another run may be removing some too.
         with contextlib.suppress(FileNotFoundError):
             self._forget_oldest()
@@ -96,9 +96,9 @@ class Kept:
             path.unlink(missing_ok=True)
         files.remove_unfinished(self.path)
 
-    def holds(self, name: str) -> bool:
-        """Whether a program of this name is cached with these settings, for whatever arguments."""
-        return any(self.path.glob(f"{name}-{self._settings}*"))
+    def holds(self, name: str, args: PyTree) -> bool:
+        """Whether the directory holds a program's file, see `find`."""
+        return self._file(name, args).exists()
 
     def find(self, name: str, args: PyTree) -> Traced | None:
         """Finds a cached program.
@@ -166,12 +166,9 @@ class Kept:
 
     def _file(self, name: str, args: PyTree) -> Path:
         """The file of a program."""
-        return self.path / f"{name}-{self._settings}{_digest(repr(shapes_of(args)))}.stablehlo"
-
-
-def _digest(text: str) -> str:
-    """Tells a text from others in the name of a file."""
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+        shapes = repr(shapes_of(args)).encode()
+        digest = hashlib.sha256(self._depends + shapes).hexdigest()[:32]
+        return self.path / f"{name}-{digest}.stablehlo"
 
 
 def use_cache(directory: Path) -> None:

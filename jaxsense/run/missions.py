@@ -33,8 +33,7 @@ from jaxsense.run.monitor import StageError
 
 Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
 
-LONGEST = "mission-go_on"
-"""The program that a CPU takes longest to compile, by its name in `kept.Kept`."""
+_STAGE, _BEGIN = "mission", "begin"  # names of the programs in profiles and caches
 _SECOND = "naive"  # whose first mission is recorded as well as that of the first case
 
 
@@ -98,6 +97,37 @@ class _Found:
     is_finite: Bool[Array, " B"]
     has_values: Bool[Array, " B"]
     metrics: PyTree[Array]
+
+
+def are_kept(config: Config, compiler: Compiler, batch: int, workers: Workers = ALONE) -> bool:
+    """Whether the programs of a `Player` are cached, so that they need not be compiled.
+
+    Args:
+      config: all settings.
+      compiler: of the player.
+      batch: see `Player`.
+      workers: see `Player`.
+    """
+    if compiler.kept is None or workers.mesh is not None:
+        return False
+    begun = _begun(config, -(-batch // workers.number), None)
+    return compiler.kept.holds(f"{_STAGE}-{_BEGIN}", begun)
+
+
+def _begun(config: Config, number: int, models: Models | None) -> tuple[PyTree, ...]:
+    """Arguments with which the first program of a `Player` is traced.
+
+    Args:
+      config: all settings.
+      number: of missions side by side that a thread plays, or all devices of a mesh together.
+      models: see `Player`.
+    """
+    numbers = jax.ShapeDtypeStruct((number,), jnp.int32)
+    faults = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((number, *x.shape), x.dtype), no_faults(config)
+    )
+    shapes = jax.eval_shape(lambda: models or init(jax.random.key(0), config))
+    return jax.random.key(0), config, shapes, numbers, numbers, faults
 
 
 class Player:
@@ -183,28 +213,19 @@ class Player:
             first = jax.tree.map(first_of, states)
             return slots, _found(scenario, models, slots), Recording(first, records)
 
-        key, number = jax.random.key(0), share * parts
-        numbers = jax.ShapeDtypeStruct((number,), jnp.int32)
-        faults = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct((number, *x.shape), x.dtype), no_faults(config)
-        )
-        shapes = jax.eval_shape(lambda: models or init(jax.random.key(0), config))
+        begun = _begun(config, share * parts, models)
+        key, _, shapes, numbers, _, _ = begun
         whole = (0, 1, 2)
-        self._begin = Program(compiler, "mission", "begin")
+        self._begin = Program(compiler, _STAGE, _BEGIN)
         slots = self._begin.compile(
             begin,
-            key,
-            config,
-            shapes,
-            numbers,
-            numbers,
-            faults,
+            *begun,
             workers=together,
             whole=whole,
             runs_long=runs_long,
             wide_vectors=runs_long,
         )
-        self._go_on = Program(compiler, "mission", "go_on")
+        self._go_on = Program(compiler, _STAGE, "go_on")
         _, self._found, _ = self._go_on.compile(
             go_on,
             key,

@@ -216,7 +216,8 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
             _trace_stage(programs, stage)
         # Missions come last, but take a CPU longest to compile. With an accelerator, cores are
         # free to compile, and everything waits for tracing.
-        is_kept = compiler.kept is not None and compiler.kept.holds(missions.LONGEST)
+        batch, workers = _batch(programs), programs.workers
+        is_kept = missions.are_kept(programs.config, compiler, batch, workers)
         is_first = _on_cpu() and not is_kept
         if is_first:
             _trace_missions(programs, compiler)
@@ -233,14 +234,18 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
 
 
 def _trace_missions(programs: Programs, compiler: Compiler) -> None:
-    config = programs.config
-    number, workers = len(config.mission.policies) * config.mission.episodes, programs.workers
     with compiler.monitor.clock.record("trace", "mission"):
-        batch = batches.batch_of(config, number, workers)
-        # Room for the missions to record side by side.
-        batch = max(batch, min(number, films.AT_A_TIME * workers.number))
-        scenario = mission.make_mission(config, programs.policies)
-    programs.player.set_result(missions.Player(scenario, compiler, batch, workers))
+        scenario = mission.make_mission(programs.config, programs.policies)
+    player = missions.Player(scenario, compiler, _batch(programs), programs.workers)
+    programs.player.set_result(player)
+
+
+def _batch(programs: Programs) -> int:
+    """How many missions play side by side, with room for those to record."""
+    config, workers = programs.config, programs.workers
+    number = len(config.mission.policies) * config.mission.episodes
+    batch = batches.batch_of(config, number, workers)
+    return max(batch, min(number, films.AT_A_TIME * workers.number))
 
 
 def _trace_stage(programs: Programs, stage: Stage) -> None:
