@@ -47,6 +47,7 @@ class Needs:
             "peak memory [MiB]": self.memory_mib,
             "programs": len(self.operations),
             "operations of all programs": sum(self.operations.values()),
+            **{f"operations of {name}": number for name, number in self.operations.items()},
         }
 
 
@@ -74,14 +75,11 @@ def least(runs: list[Needs]) -> Needs:
 
 
 def compare(before: Needs, now: Needs) -> list[str]:
-    """Prints both, program by program, and returns the names of the figures that have grown."""
-    for name in sorted(before.operations.keys() | now.operations.keys()):
-        old, new = (needs.operations.get(name, 0) for needs in (before, now))
-        print(f"{name:40} {old:10,} {new:10,} operations")
+    """Prints both, and returns the names of the figures that are new or have grown."""
     grown = []
-    for name, new in now.figures.items():
-        old = before.figures[name]
-        print(f"{name:40} {old:10,.0f} {new:10,.0f} {new / old:8.2f} x")
+    for name, new in sorted(now.figures.items()):
+        old = before.figures.get(name, 0.0)
+        print(f"{name:50} {old:10,.0f} {new:10,.0f}")
         if new > _MOST * old:
             grown.append(name)
     return grown
@@ -96,6 +94,10 @@ def main() -> None:
     commit = baseline["commit"]
     has_commit = ["git", "-C", str(pipeline.ROOT), "cat-file", "-e", f"{commit}^{{commit}}"]
     if subprocess.run(has_commit, capture_output=True, check=False).returncode:
+        is_shallow = ["git", "-C", str(pipeline.ROOT), "rev-parse", "--is-shallow-repository"]
+        found = subprocess.run(is_shallow, capture_output=True, text=True, check=False).stdout
+        if found.strip() == "false":
+            sys.exit(f"{_BASELINE}: commit = {commit!r}: must be in the history")
         print(f"this checkout does not hold {commit}, the baseline: nothing is compared")
         return
     with tempfile.TemporaryDirectory() as folder:

@@ -1,0 +1,40 @@
+"""The check of what a run needs, compared with the baseline."""
+
+import dataclasses
+
+import pytest
+
+from benchmarks import growth
+
+BEFORE = growth.Needs(100.0, 1000.0, {"survey-begin": 1000, "mission-go_on": 30_000})
+
+
+def test_figures_may_grow_by_a_tenth(capsys):
+    now = growth.Needs(110.0, 1100.0, {"survey-begin": 1100, "mission-go_on": 33_000})
+    assert growth.compare(BEFORE, now) == []
+    assert "operations of survey-begin" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "grown"),
+    [
+        ({"cpu_s": 111.0}, ["CPU seconds"]),
+        ({"memory_mib": 1101.0}, ["peak memory [MiB]"]),
+        # Small next to the sum of all programs.
+        (
+            {"operations": {**BEFORE.operations, "survey-begin": 1101}},
+            ["operations of survey-begin"],
+        ),
+        (
+            {"operations": {**BEFORE.operations, "new-begin": 1}},
+            ["operations of new-begin", "programs"],
+        ),
+    ],
+)
+def test_what_has_grown_is_named(change, grown):
+    assert growth.compare(BEFORE, dataclasses.replace(BEFORE, **change)) == grown
+
+
+def test_the_least_of_several_runs_counts():
+    runs = [BEFORE, dataclasses.replace(BEFORE, cpu_s=90.0, memory_mib=1200.0)]
+    assert growth.least(runs) == dataclasses.replace(BEFORE, cpu_s=90.0)
