@@ -6,7 +6,7 @@ import pytest
 from summaries import CASE, EVALUATION, GROUPED, OF_SCANS, SUMMARY
 
 from benchmarks.seeds import __main__ as program
-from benchmarks.seeds import tables
+from benchmarks.seeds import rows, tables
 from benchmarks.seeds.runs import gather
 from jaxsense.config import ConfigError
 
@@ -44,7 +44,7 @@ def test_cells_go_from_the_minimum_to_the_maximum_of_the_seeds(runs):
     agent = {**SUMMARY["dqn"]["lidar"], "optimal_states": 1600}
     low["dqn"] = {"camera": SUMMARY["dqn"]["camera"], "lidar": agent}
     found = gather([runs("paper", 100), runs("paper", 101, low), runs("default", 100)])
-    table = tables.of_presets(found, tables.OF_README, ("paper", "default"))
+    table = tables.of_presets(found, rows.OF_README, ("paper", "default"))
     # The LiDAR of the summary tells the second class apart, and not the first.
     assert cells(table, "what each sensor") == ["9 cells", "8 of 9", "8 of 9"]
     assert cells(table, "sigma norm, unambiguous") == [
@@ -60,7 +60,7 @@ def test_cells_go_from_the_minimum_to_the_maximum_of_the_seeds(runs):
 def test_columns_may_have_other_names_than_presets(runs):
     found = gather([runs("paper", 100)], "wider") | gather([runs("paper", 101)])
     heads = ("wider", "as it is")
-    table = tables.of_presets(found, tables.OF_FIGURES[:2], ("wider", "paper"), heads)
+    table = tables.of_presets(found, rows.OF_FIGURES[:2], ("wider", "paper"), heads)
     assert table.splitlines()[0] == "|  | paper | wider, seed 100 | as it is, seed 101 |"
 
 
@@ -69,7 +69,7 @@ def test_what_a_run_does_not_have_stays_empty(runs):
     scans["mission"] = {**scans["mission"], "naive": CASE}
     labelled = {**SUMMARY, "mission": scans["mission"]}
     found = gather([runs("raw", 100, scans), runs("default", 100, labelled)])
-    table = tables.of_presets(found, tables.OF_RAW, ("raw", "default"))
+    table = tables.of_presets(found, rows.OF_RAW, ("raw", "default"))
     assert cells(table, "right at held-out") == ["", f"{GROUPED['pair']:.4f}", ""]
     assert cells(table, "least share") == ["", "0.500", "0.500"]
     assert cells(table, "NLL after six")[1] == "-1.7500"
