@@ -27,6 +27,7 @@ from benchmarks.digits import table as digits
 from benchmarks.fusions import table as fusions
 from benchmarks.raw import report as raw
 from benchmarks.seeds import rows, tables
+from benchmarks.seeds.plan import GROUPS
 from benchmarks.tasks import board
 
 _HERE = Path(__file__).parent
@@ -135,6 +136,8 @@ TABLES: Mapping[str, _Tables] = {
         "many": partial(tables.missions, preset="many", num_pois=8, robots=4),
         "team": partial(tables.missions, preset="team", num_pois=16, robots=2),
         "sizes": partial(tables.worth, names=tables.SIZES),
+        "runs": lambda _: tables.runs(GROUPS.values()),
+        "runs_of_raw_noisy": lambda _: tables.runs([GROUPS["raw_noisy"]]),
         "failures": partial(tables.failures, preset="default", num_pois=3, robots=2),
     },
     "tasks.json": {None: board.tables},

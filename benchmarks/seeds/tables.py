@@ -1,10 +1,12 @@
 """Tables in Markdown of what `benchmarks.seeds.runs` has gathered."""
 
 import re
+import textwrap
 from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
+from benchmarks.seeds.plan import Group
 from benchmarks.seeds.rows import Row
 from benchmarks.seeds.runs import Figures
 from benchmarks.studies import in_words
@@ -16,6 +18,28 @@ _OF_SUMMARY = (
     ("time, mean", "mean_time_s", "{:.1f} s"),
     ("collisions", "collisions", "{}"),
 )
+
+
+def runs(groups: Iterable[Group]) -> str:
+    """The commands that train and evaluate groups of runs, as a block of a page.
+
+    Args:
+      groups: from `plan`.
+    """
+    lines = []
+    for group in groups:
+        lines.append(f"# {group.name}: {_seeds([*group.seeds])}")
+        if group.shares is None:
+            lines += _wrapped(group.train("S"))
+        for words in group.evaluations:
+            lines += _wrapped(group.evaluate("RUN", words))
+    return "\n".join(f"    {line}" for line in lines)
+
+
+def _wrapped(command: str) -> list[str]:
+    """Lines of a command, with a backslash at the end of all but the last."""
+    lines = textwrap.wrap(command, 108, subsequent_indent="    ", break_on_hyphens=False)
+    return [*(f"{line} \\" for line in lines[:-1]), lines[-1]]
 
 
 def of_presets(
@@ -238,15 +262,22 @@ def _line(*cells: str) -> str:
 def _about(of_seeds: Iterable[tuple[str, Any]], command: str) -> str:
     """Command, seeds, commits, devices and versions of runs."""
     seeds, runs = zip(*of_seeds, strict=True)
-    commits = dict.fromkeys(run["commit"][:10] for run in runs)
+
+    def each(name: str) -> str:
+        """The values of the runs that hold one; those of earlier versions lack cores and date."""
+        return " and ".join(dict.fromkeys(str(run[name]) for run in runs if name in run))
+
     kinds = dict.fromkeys(kind for run in runs for kind in run["devices"])
+    cores, dates = each("cores"), each("date")
+    commits = dict.fromkeys(run["commit"][:10] for run in runs)
     at = ", ".join(
         f"{name} {' and '.join(dict.fromkeys(run['versions'][name] for run in runs))}"
         for name in ("python", "jax", "mujoco")
     )
     return (
-        f"`{command}`, {_seeds(sorted({int(seed) for seed in seeds}))}: {', '.join(kinds)}; commit "
-        f"{', '.join(commits)}; {at}."
+        f"`{command}`, {_seeds(sorted({int(seed) for seed in seeds}))}: {', '.join(kinds)}"
+        f"{f' with {cores} cores' if cores else ''}; commit {', '.join(commits)}"
+        f"{f' on {dates}' if dates else ''}; {at}."
     )
 
 

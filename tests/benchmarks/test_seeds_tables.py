@@ -57,6 +57,16 @@ def test_cells_go_from_the_minimum_to_the_maximum_of_the_seeds(runs):
     )
 
 
+def test_cores_and_dates_stand_below_the_table_for_runs_that_note_them(runs):
+    noted = {**SUMMARY, "cores": 16, "date": "2026-11-28"}
+    later = {**noted, "date": "2026-11-29"}
+    found = gather([runs("paper", 100, noted), runs("paper", 101, later), runs("paper", 102)])
+    assert found["paper"]["100"]["cores"] == 16
+    assert "date" not in found["paper"]["102"]
+    last = tables.of_presets(found, rows.OF_README, ("paper",)).splitlines()[-1]
+    assert ": cpu with 16 cores; commit 0123456789 on 2026-11-28 and 2026-11-29; python" in last
+
+
 def test_columns_may_have_other_names_than_presets(runs):
     found = gather([runs("paper", 100)], "wider") | gather([runs("paper", 101)])
     heads = ("wider", "as it is")
