@@ -72,8 +72,8 @@ _ARENAS = (
     "--arena.num-pois 3 --arena.side 4",
     "--arena.num-pois 8 --arena.side 4",
     *(
-        f"--arena.num-pois 16 --arena.side 6 --robots{' camera' * each}{' lidar' * each}"
-        for each in (2, 3)
+        " ".join(["--arena.num-pois 16 --arena.side 6 --robots", *robots])
+        for robots in (["camera"] * 2 + ["lidar"] * 2, ["camera"] * 3 + ["lidar"] * 3)
     ),
 )
 GROUPS: Mapping[str, Group] = {
