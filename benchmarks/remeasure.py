@@ -10,6 +10,7 @@ import collections
 import dataclasses
 import json
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -43,7 +44,6 @@ class Measurement:
       command: that makes it.
       device: kind that it was measured on, with a number if there were several accelerators.
       python: version that measured it.
-      runs: directories of the runs that it needs.
       writes: whether the command writes the file; otherwise it has an option `--json`.
     """
 
@@ -51,7 +51,6 @@ class Measurement:
     command: str
     device: str
     python: str
-    runs: tuple[str, ...] = ()
     writes: bool = False
 
     def measure(self) -> bool:
@@ -68,8 +67,7 @@ class Measurement:
 
 def _of_study(name: str, content: Any) -> Iterator[Measurement]:
     """One run of a program, which notes its own origin."""
-    runs = tuple(run for run in content.get("models", {}) if not run.startswith("pretrained:"))
-    yield _of(name, content["command"], content["device"], content["versions"], runs)
+    yield _of(name, content["command"], content["device"], content["versions"])
 
 
 def _of_rows(name: str, rows: Any) -> Iterator[Measurement]:
@@ -98,11 +96,9 @@ def _of_seeds(name: str, groups: Any) -> Iterator[Measurement]:
         yield dataclasses.replace(each, writes=True)
 
 
-def _of(
-    name: str, command: str, device: str, versions: Mapping[str, str], runs: tuple[str, ...] = ()
-) -> Measurement:
+def _of(name: str, command: str, device: str, versions: Mapping[str, str]) -> Measurement:
     kind = "cpu" if device.endswith("cpu") else device
-    return Measurement(name, command, kind, versions["python"], runs)
+    return Measurement(name, command, kind, versions["python"])
 
 
 _MADE: Mapping[str, Callable[[str, Any], Iterator[Measurement]]] = {
@@ -133,13 +129,14 @@ def here(measurements: list[Measurement]) -> list[Measurement]:
     number = collections.Counter((x.command, x.device) for x in measurements)
     found = []
     for each in measurements:
-        lacks = [run for run in each.runs if not Path(run).exists()]
+        runs = [word for word in shlex.split(each.command) if word.startswith("runs/")]
+        lacks = [run for run in runs if not Path(run).exists()]
         if each.device != device:
             reason = f"measured on {each.device}: run `{each.command}` there"
         elif number[each.command, each.device] > 1 and _minor(each.python) != python:
             reason = f"measured with Python {_minor(each.python)}: run `{each.command}` with it"
         elif lacks:
-            reason = f"needs {', '.join(lacks)}, for which its page has the command"
+            reason = f"needs {', '.join(lacks)}: train it with the command of the page"
         else:
             found.append(each)
             continue

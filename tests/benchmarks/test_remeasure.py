@@ -45,9 +45,8 @@ def store(name, content):
     (results.RESULTS / f"{name}.json").write_text(json.dumps(content))
 
 
-def study(command, device="cpu", python="3.11.7", **more):
-    versions = {"python": python}
-    return {"command": command, "device": device, "versions": versions, **more}
+def study(command, device="cpu", python="3.11.7"):
+    return {"command": command, "device": device, "versions": {"python": python}}
 
 
 def test_every_file_of_this_kind_of_device_is_measured_by_its_command(ran, capsys):
@@ -81,12 +80,12 @@ def test_files_of_another_python_and_of_missing_runs_are_left_out(ran, capsys):
     store("pipeline", study("python -m benchmarks.pipeline"))
     store("pipeline_newest", study("python -m benchmarks.pipeline", python="3.13.1"))
     store("where", study("python -m benchmarks.where", python="3.12.1"))
-    store("imperfect", study("python -m benchmarks.x", models={"runs/a": 0, "pretrained:b": 0}))
+    store("imperfect", study("python -m benchmarks.x runs/a pretrained:b"))
     remeasure.main([])
     assert [words[1] for words in ran[:2]] == ["benchmarks.pipeline", "benchmarks.where"]
     lines = [x for x in capsys.readouterr().out.splitlines() if x.startswith("left out")]
     assert lines == [
-        "left out: imperfect: needs runs/a, for which its page has the command",
+        "left out: imperfect: needs runs/a: train it with the command of the page",
         "left out: pipeline_newest: measured with Python 3.13: run `python -m benchmarks.pipeline` "
         "with it",
     ]
