@@ -52,15 +52,17 @@ def test_cells_go_from_the_minimum_to_the_maximum_of_the_seeds(runs):
     ]  # fmt: skip
     assert cells(table, "start states") == ["", "1,700; 1,600 to 1,700", "1,700; 1,700"]
     assert table.splitlines()[-1] == (
-        "`python -m jaxsense.train --preset PRESET --seed S`, seeds 100 to 101: cpu; commit "
-        "0123456789; python 3.11.7, jax 0.10.2, mujoco 3.17.0."
+        "`python -m jaxsense.train --preset PRESET --seed S`, seeds 100 to 101: cpu with 2 cores; "
+        "commit 0123456789 on 2026-11-26; python 3.11.7, jax 0.10.2, mujoco 3.17.0."
     )
 
 
 def test_cores_and_dates_stand_below_the_table_for_runs_that_note_them(runs):
     noted = {**SUMMARY, "cores": 16, "date": "2026-11-28"}
     later = {**noted, "date": "2026-11-29"}
-    found = gather([runs("paper", 100, noted), runs("paper", 101, later), runs("paper", 102)])
+    before = {name: x for name, x in SUMMARY.items() if name not in ("cores", "date")}
+    of_each = enumerate((noted, later, before), 100)
+    found = gather([runs("paper", seed, summary) for seed, summary in of_each])
     assert found["paper"]["100"]["cores"] == 16
     assert "date" not in found["paper"]["102"]
     last = tables.of_presets(found, rows.OF_README, ("paper",)).splitlines()[-1]
