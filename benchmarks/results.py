@@ -26,7 +26,8 @@ from benchmarks import (
 from benchmarks.digits import table as digits
 from benchmarks.fusions import table as fusions
 from benchmarks.raw import report as raw
-from benchmarks.seeds import tables
+from benchmarks.seeds import rows, tables
+from benchmarks.seeds.plan import GROUPS
 from benchmarks.tasks import board
 
 _HERE = Path(__file__).parent
@@ -116,25 +117,27 @@ TABLES: Mapping[str, _Tables] = {
     "digits.json": {None: digits.of_results},
     "fusions.json": {None: fusions.of_results},
     "seeds.json": {
-        "readme": partial(tables.of_presets, rows=tables.OF_README, presets=("paper", "default")),
+        "readme": partial(tables.of_presets, rows=rows.OF_README, presets=("paper", "default")),
         "worth": partial(tables.worth, names=tables.EVALUATED),
-        "paper": partial(tables.of_presets, rows=tables.OF_FIGURES, presets=("paper", "default")),
+        "paper": partial(tables.of_presets, rows=rows.OF_FIGURES, presets=("paper", "default")),
         "default": partial(tables.of_missions, preset="default"),
-        "raw": partial(tables.of_presets, rows=tables.OF_RAW, presets=("raw", "default")),
+        "raw": partial(tables.of_presets, rows=rows.OF_RAW, presets=("raw", "default")),
         **{
             f"raw_{preset}": partial(
                 tables.of_presets,
-                rows=tables.OF_RAW_AND_LABELLED,
+                rows=rows.OF_RAW_AND_LABELLED,
                 presets=(f"raw_{preset}", preset),
                 heads=("from scans", "with detectors"),
             )
             for preset in ("noisy", "many")
         },
         "noisy": partial(tables.missions, preset="noisy", num_pois=3, robots=2),
-        "maps": partial(tables.of_presets, rows=tables.OF_MAPS, presets=("noisy", "many")),
+        "maps": partial(tables.of_presets, rows=rows.OF_MAPS, presets=("noisy", "many")),
         "many": partial(tables.missions, preset="many", num_pois=8, robots=4),
         "team": partial(tables.missions, preset="team", num_pois=16, robots=2),
         "sizes": partial(tables.worth, names=tables.SIZES),
+        "runs": lambda _: tables.runs(GROUPS.values()),
+        "runs_of_raw_noisy": lambda _: tables.runs([GROUPS["raw_noisy"]]),
         "failures": partial(tables.failures, preset="default", num_pois=3, robots=2),
     },
     "tasks.json": {None: board.tables},

@@ -1,6 +1,10 @@
-"""Draws `figures/scan.svg`, a whole scan by each sensor and its window: `python docs/scan.py`."""
+"""Draws `figures/scan.svg`, a whole scan by each sensor and its window.
+
+python docs/scan.py [FILE]
+"""
 
 import functools
+import sys
 from pathlib import Path
 
 import jax
@@ -72,4 +76,4 @@ def _scan(simulated: world.World, modality: int) -> tuple[np.ndarray, jax.Array]
 
 
 if __name__ == "__main__":
-    PICTURE.write_bytes(drawing.svg(draw()))
+    (Path(sys.argv[1]) if sys.argv[1:] else PICTURE).write_bytes(drawing.svg(draw()))

@@ -2,7 +2,9 @@
 
 import contextlib
 import dataclasses
+import datetime
 import itertools
+import os
 import shlex
 import sys
 import tempfile
@@ -372,6 +374,8 @@ def _header(run: RunDirectory) -> Header:
         "seed": run.settings.seed,
         "versions": rundir.versions(),
         "devices": [device.device_kind for device in jax.devices()],
+        "cores": os.cpu_count() or 1,
+        "date": datetime.date.today().isoformat(),
     }
 
 

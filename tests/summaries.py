@@ -24,6 +24,8 @@ SUMMARY = {
     "seed": 90210,
     "versions": {"jaxsense": "0.1.0", "jax": "<0.10>"},
     "devices": ["cpu", "cpu"],
+    "cores": 2,
+    "date": "2026-11-26",
     "timing": {"total_s": 23.7, "stages": {"jmvae": {"compile_s": 1.5, "run_s": 4.5}}},
     "detectors": {"camera": DETECTOR, "lidar": DETECTOR},
     "jmvae": {

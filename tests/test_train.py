@@ -43,8 +43,8 @@ def test_run_directory_holds_everything(smoke_run):
 def test_summary_keeps_its_contract(smoke_run):
     summary = json.loads((smoke_run / "summary.json").read_text())
     assert set(summary) == {
-        "preset", "seed", "versions", "devices", "timing", "detectors", "jmvae", "belief", "dqn",
-        "mission",
+        "preset", "seed", "versions", "devices", "cores", "date", "timing", "detectors", "jmvae",
+        "belief", "dqn", "mission",
     }  # fmt: skip
     assert summary["preset"] == "smoke"
     assert summary["seed"] == 5

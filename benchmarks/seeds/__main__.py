@@ -1,18 +1,16 @@
 """The program, see `benchmarks.seeds`."""
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from benchmarks.seeds.runs import gather
+from benchmarks.seeds.runs import FILE, store
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
 from jaxsense.run import cli
 
 PROGRAM = "benchmarks.seeds"
-FILE = Path(__file__).parents[1] / "results" / "seeds.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,13 +34,7 @@ class Arguments:
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    found: dict[str, dict[str, Any]] = {}
-    if arguments.out.exists():
-        found = json.loads(arguments.out.read_text(encoding="utf-8"))
-    for group, of_seeds in gather(arguments.runs, arguments.group).items():
-        found[group] = dict(sorted((found.get(group, {}) | of_seeds).items()))
-    found = dict(sorted(found.items()))
-    arguments.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    store(arguments.runs, arguments.out, arguments.group)
 
 
 if __name__ == "__main__":

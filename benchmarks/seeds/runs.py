@@ -8,6 +8,8 @@ from typing import Any
 from jaxsense import summary
 from jaxsense.config import ConfigError
 
+FILE = Path(__file__).parents[1] / "results" / "seeds.json"
+"""Where the figures are stored."""
 Figures = Mapping[str, Any]
 """Of one run, by name: numbers, or lists with one for each agent."""
 
@@ -39,6 +41,8 @@ def gather(runs: Iterable[Path], group: str | None = None) -> dict[str, Any]:
             "commit": written["commit"],
             "versions": own["versions"],
             "devices": own["devices"],
+            # Runs of earlier versions lack these.
+            **{name: value for name, value in own.items() if name in ("cores", "date")},
             "figures": of_summary(own),
             "evaluations": {
                 name: {
@@ -49,6 +53,24 @@ def gather(runs: Iterable[Path], group: str | None = None) -> dict[str, Any]:
             },
         }
     return {name: dict(sorted(found[name].items())) for name in sorted(found)}
+
+
+def store(runs: Iterable[Path], file: Path, group: str | None = None) -> None:
+    """Writes figures into a file, in place of those of the same groups and seeds.
+
+    Args:
+      runs: see `gather`.
+      file: new, or with figures of other groups and seeds, which stay.
+      group: see `gather`.
+
+    Raises:
+      ConfigError: see `gather`.
+    """
+    found = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    for name, of_seeds in gather(runs, group).items():
+        found[name] = dict(sorted((found.get(name, {}) | of_seeds).items()))
+    text = json.dumps(dict(sorted(found.items())), indent=1)
+    file.write_text(f"{text}\n", encoding="utf-8")
 
 
 def of_summary(own: Mapping[str, Any]) -> Figures:

@@ -325,6 +325,9 @@ class Header(TypedDict):
     seed: Annotated[int, Metric("seed", "Source of all randomness; the first of several seeds.")]
     versions: Annotated[dict[str, str], Metric("versions", "Versions of Python and of libraries.")]
     devices: Annotated[list[str], Metric("devices", "Kind of each accelerator, or `cpu`.")]
+    # Runs of earlier versions lack the next two.
+    cores: NotRequired[Annotated[int, Metric("cores", "CPU cores of the machine.", 0)]]
+    date: NotRequired[Annotated[str, Metric("date", "Day on which the run ended.")]]
     seeds: NotRequired[
         Annotated[dict[str, Results], Metric("seeds", "Results of each of several seeds.")]
     ]

@@ -6,7 +6,7 @@ import pytest
 from summaries import CASE, EVALUATION, GROUPED, OF_SCANS, SUMMARY
 
 from benchmarks.seeds import __main__ as program
-from benchmarks.seeds import tables
+from benchmarks.seeds import rows, tables
 from benchmarks.seeds.runs import gather
 from jaxsense.config import ConfigError
 
@@ -44,7 +44,7 @@ def test_cells_go_from_the_minimum_to_the_maximum_of_the_seeds(runs):
     agent = {**SUMMARY["dqn"]["lidar"], "optimal_states": 1600}
     low["dqn"] = {"camera": SUMMARY["dqn"]["camera"], "lidar": agent}
     found = gather([runs("paper", 100), runs("paper", 101, low), runs("default", 100)])
-    table = tables.of_presets(found, tables.OF_README, ("paper", "default"))
+    table = tables.of_presets(found, rows.OF_README, ("paper", "default"))
     # The LiDAR of the summary tells the second class apart, and not the first.
     assert cells(table, "what each sensor") == ["9 cells", "8 of 9", "8 of 9"]
     assert cells(table, "sigma norm, unambiguous") == [
@@ -52,15 +52,27 @@ def test_cells_go_from_the_minimum_to_the_maximum_of_the_seeds(runs):
     ]  # fmt: skip
     assert cells(table, "start states") == ["", "1,700; 1,600 to 1,700", "1,700; 1,700"]
     assert table.splitlines()[-1] == (
-        "`python -m jaxsense.train --preset PRESET --seed S`, seeds 100 to 101: cpu; commit "
-        "0123456789; python 3.11.7, jax 0.10.2, mujoco 3.17.0."
+        "`python -m jaxsense.train --preset PRESET --seed S`, seeds 100 to 101: cpu with 2 cores; "
+        "commit 0123456789 on 2026-11-26; python 3.11.7, jax 0.10.2, mujoco 3.17.0."
     )
+
+
+def test_cores_and_dates_stand_below_the_table_for_runs_that_note_them(runs):
+    noted = {**SUMMARY, "cores": 16, "date": "2026-11-28"}
+    later = {**noted, "date": "2026-11-29"}
+    before = {name: x for name, x in SUMMARY.items() if name not in ("cores", "date")}
+    of_each = enumerate((noted, later, before), 100)
+    found = gather([runs("paper", seed, summary) for seed, summary in of_each])
+    assert found["paper"]["100"]["cores"] == 16
+    assert "date" not in found["paper"]["102"]
+    last = tables.of_presets(found, rows.OF_README, ("paper",)).splitlines()[-1]
+    assert ": cpu with 16 cores; commit 0123456789 on 2026-11-28 and 2026-11-29; python" in last
 
 
 def test_columns_may_have_other_names_than_presets(runs):
     found = gather([runs("paper", 100)], "wider") | gather([runs("paper", 101)])
     heads = ("wider", "as it is")
-    table = tables.of_presets(found, tables.OF_FIGURES[:2], ("wider", "paper"), heads)
+    table = tables.of_presets(found, rows.OF_FIGURES[:2], ("wider", "paper"), heads)
     assert table.splitlines()[0] == "|  | paper | wider, seed 100 | as it is, seed 101 |"
 
 
@@ -69,7 +81,7 @@ def test_what_a_run_does_not_have_stays_empty(runs):
     scans["mission"] = {**scans["mission"], "naive": CASE}
     labelled = {**SUMMARY, "mission": scans["mission"]}
     found = gather([runs("raw", 100, scans), runs("default", 100, labelled)])
-    table = tables.of_presets(found, tables.OF_RAW, ("raw", "default"))
+    table = tables.of_presets(found, rows.OF_RAW, ("raw", "default"))
     assert cells(table, "right at held-out") == ["", f"{GROUPED['pair']:.4f}", ""]
     assert cells(table, "least share") == ["", "0.500", "0.500"]
     assert cells(table, "NLL after six")[1] == "-1.7500"
