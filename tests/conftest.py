@@ -20,6 +20,8 @@ os.environ["XLA_FLAGS"] = " ".join(
         "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-constant-sinking",
     )
 )
+# Each operation would carry the lines of Python that it comes from through all of compiling.
+os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
 # What one worker, or a process that a test starts, has compiled serves all others.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxsense-tests-")

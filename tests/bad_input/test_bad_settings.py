@@ -8,6 +8,7 @@ import subprocess
 import sys
 from itertools import count
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -26,7 +27,7 @@ from refusals import (
     check_message,
 )
 
-from jaxsense import Attribute, Config, ConfigError, SensorConfig, Shape
+from jaxsense import Attribute, Config, ConfigError, SensorConfig, Shape, learn
 from jaxsense.config import COLOURS, SHAPES, ArenaConfig, CommunicationConfig, as_plain, from_plain
 from jaxsense.config.checks import Limits
 
@@ -639,20 +640,18 @@ def test_plain_settings_that_are_unknown_are_named(stored, expected):
     assert str(error.value) == expected
 
 
-PROGRAM_64 = """
-import jax
-from jaxsense import Config, learn
-try:
-    learn(jax.random.key(0), Config())
-except ValueError as error:
-    print(error)
-"""
+NO_64_BITS = "JAX_ENABLE_X64 = True: must be off, as jaxsense computes in 32 bits"
 
 
-@pytest.mark.parametrize("arguments", [["-c", PROGRAM_64], ["-m", "jaxsense.train"]])
-def test_64_bits_are_refused_in_one_line(arguments, tmp_path):
+def test_64_bits_are_refused():
+    key = jax.random.key(0)
+    with jax.enable_x64(True), pytest.raises(ConfigError, match=f"^{NO_64_BITS}"):
+        learn(key, Config())
+
+
+def test_64_bits_are_refused_in_one_line(tmp_path):
     done = subprocess.run(
-        [sys.executable, *arguments],
+        [sys.executable, "-m", "jaxsense.train"],
         env={**os.environ, "JAX_ENABLE_X64": "1"},
         cwd=tmp_path,
         capture_output=True,
@@ -660,5 +659,5 @@ def test_64_bits_are_refused_in_one_line(arguments, tmp_path):
         check=False,
     )
     (line,) = (done.stdout + done.stderr).splitlines()
-    assert "JAX_ENABLE_X64 = True: must be off, as jaxsense computes in 32 bits" in line
+    assert NO_64_BITS in line
     assert not list(tmp_path.iterdir())

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arenas import arena, known_layout, place, set_native  # noqa: F401
-from teams import CONFIG, NAIVE, with_config, with_gates
+from teams import CONFIG, NAIVE, alone, with_config, with_gates
 
 import jaxsense
 from jaxsense import mission
-from jaxsense.mission import decide
+from jaxsense.mission import act, decide
 
 
 @pytest.fixture(scope="session")
@@ -81,4 +81,19 @@ def decides(team, as_numpy):
     # JAX would compile another program for weakly typed numbers.
     return lambda models, state, **rules: jitted(
         jax.random.key(0), as_numpy(models), state, {**_RULES, **rules}
+    )
+
+
+@pytest.fixture(scope="session")
+def scan(team, models, as_numpy):
+    """A scan in a mission, by one program for all robots, networks and numbers."""
+
+    @jax.jit
+    def of_one(key, state, robot, models, config):
+        changed = with_config(team, config)
+        return alone(lambda key, state: act.scan(key, changed, models, state, robot))(key, state)
+
+    # JAX would compile another program for weakly typed numbers.
+    return lambda key, state, robot, models=models, config=CONFIG: of_one(
+        key, state, robot, as_numpy(models), config
     )

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, alone, with_config
+from teams import CONFIG
 
 from jaxsense.mission import act
 from jaxsense.mission.state import (
@@ -29,21 +29,6 @@ CAMERA, LIDAR = 0, 1
 AWAY = [0.0, 1.2, 0.0]
 IN_THE_VIEW = [0.4, 0.0, 0.0]
 BLIND = Faults(jnp.full(2, jnp.inf), jnp.full(2, 0.0))
-
-
-@pytest.fixture(scope="module")
-def scan(team, models, as_numpy):
-    """A scan in one mission, by one program for all robots, networks and numbers."""
-
-    @jax.jit
-    def of_one(key, state, robot, models, config):
-        changed = with_config(team, config)
-        return alone(lambda key, state: act.scan(key, changed, models, state, robot))(key, state)
-
-    # JAX would compile another program for weakly typed numbers.
-    return lambda key, state, robot, models=models, config=CONFIG: of_one(
-        key, state, robot, as_numpy(models), config
-    )
 
 
 @pytest.fixture(scope="module")

@@ -34,15 +34,6 @@ def facing(arena_of, set_robot):
     return make
 
 
-@pytest.fixture(scope="module")
-def scan(team, models):
-    @jax.jit
-    def of_one(key, state, robot):
-        return alone(lambda key, state: act.scan(key, team, models, state, robot))(key, state)
-
-    return lambda state, robot: of_one(jax.random.key(0), state, robot)
-
-
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
 @pytest.mark.parametrize(
     ("degrees", "error", "looks", "detections"),
@@ -57,14 +48,15 @@ def test_a_robot_scans_where_it_believes_the_poi_to_be(
     scan, facing, robot, degrees, error, looks, detections
 ):
     state = facing(robot, [0.0, 0.0, np.radians(degrees)], [0.0, 0.0, np.radians(error)])
-    robots = scan(state, robot).robots
+    robots = scan(jax.random.key(0), state, robot).robots
     assert (robots.looks[robot], robots.detections[robot]) == (looks, detections)
 
 
 def test_the_gate_is_given_the_distance_that_the_robot_believes(scan, facing):
     # The LiDAR's refuses what is 0.24 m nearer than expected.
     for error, detections in ((0.0, 1), (-0.1, 1), (-0.3, 0)):
-        robots = scan(facing(LIDAR, [0.0, 0.0, 0.0], [error, 0.0, 0.0]), LIDAR).robots
+        state = facing(LIDAR, [0.0, 0.0, 0.0], [error, 0.0, 0.0])
+        robots = scan(jax.random.key(0), state, LIDAR).robots
         assert (robots.looks[LIDAR], robots.detections[LIDAR]) == (1, detections)
 
 
@@ -163,7 +155,7 @@ def searches(team, certain):
 
 
 def test_a_look_is_remembered_at_the_place_that_the_robot_believes(scan, facing):
-    after = scan(facing(CAMERA, [0.0, 0.0, 0.0], [0.05, -0.02, 0.0]), CAMERA)
+    after = scan(jax.random.key(0), facing(CAMERA, [0.0, 0.0, 0.0], [0.05, -0.02, 0.0]), CAMERA)
     np.testing.assert_allclose(after.looked_from[0, CAMERA, 0], [0.05, -0.02], atol=1e-6)
 
 

@@ -270,6 +270,7 @@ def test_a_physics_step_from_recorded_states_is_that_of_c_mujoco(team, driven):
         np.testing.assert_allclose(qvel[e, 0], native.qvel, atol=1e-4)
 
 
+@pytest.mark.slow  # `ramp` and `drive` alone keep to them in other tests
 def test_limits_hold_at_every_physics_step(driven):
     *_, qpos, qvel, speeds = driven
     assert np.max(np.abs(speeds)) <= amiro.MAX_WHEEL_SPEED + 1e-4
