@@ -125,6 +125,21 @@ SOURCE = re.compile(r"\]\(\.\./(jaxsense(?:/(?!_)\w+)*)(?:\.py)?\)")
 NAMED = re.compile(r"(\[`(?:\w+\.)*(\w+)`\])\(\.\./(jaxsense(?:/\w+)+)\.py\)")
 
 
+# A line that links to a file outside of `docs`, such as the changelog, for readers on GitHub.
+OUTSIDE = re.compile(r"^.*\]\(\.\./((?:\w+/)*[A-Z]+\.md)\).*$", re.MULTILINE)
+
+
+def show_files(app: Sphinx, name: str, source: list[str]) -> None:
+    """Shows the file, without its title, where a line of a page links to it."""
+
+    def included(found: re.Match[str]) -> str:
+        with (Path(app.srcdir).parent / found[1]).open(encoding="utf-8") as file:
+            title = file.readline().strip()
+        return f'```{{include}} ../{found[1]}\n:start-after: "{title}"\n:relative-docs: docs/\n```'
+
+    source[0] = OUTSIDE.sub(included, source[0])
+
+
 def link_to_reference(app: Sphinx, name: str, source: list[str]) -> None:
     """Links to the reference where a page links to a source file."""
 
@@ -140,5 +155,6 @@ def link_to_reference(app: Sphinx, name: str, source: list[str]) -> None:
 def setup(app: Sphinx) -> None:
     """Registers what this file adds to Sphinx."""
     app.connect("source-read", link_to_reference)
+    app.connect("source-read", show_files)
     app.connect("autodoc-process-docstring", keep_colons, priority=400)
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))

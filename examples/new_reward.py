@@ -25,13 +25,12 @@ class Confident:
 
 
 if __name__ == "__main__":
-    config, key = jaxsense.PRESETS["smoke"], jax.random.key(0)
-    models = jaxsense.init(key, config)  # or those of `jaxsense.load("runs/...")`
+    config, models = jaxsense.load_pretrained("default")  # or those of `jaxsense.load("runs/...")`
+    key, settings = jax.random.key(0), jaxsense.PRESETS["smoke"].dqn  # a short training
     looks = jaxsense.Bank(jaxsense.detections(key, config, models, samples=64))
     mdp = dataclasses.replace(jaxsense.make_mdp(config, models, looks), reward=Confident())
     learning = models.agent.environment(mdp, modality=0)
-    settings = dataclasses.replace(config.dqn, target_period=5, epsilon_decay=0.9)
+    settings = dataclasses.replace(settings, target_period=5, epsilon_decay=0.9)
     state, info = jax.jit(lambda key: dqn.train(key, learning, settings))(key)
-    # Looks through untrained networks add nothing, and the agent stops taking them.
     for name, part in (("first", slice(1, 16)), ("last", slice(-15, None))):
         print(f"episode return in the {name} 15 epochs: {info.episode_return[part].mean():.3f}")

@@ -79,7 +79,7 @@ def test_example_of_the_jmvae_on_own_data_runs(tmp_path, monkeypatch, capsys):
     assert shapes == "(200, 2) (200, 2)"
     assert float(share.split()[-1]) > 0.99
     trained = names["params"]
-    run_example(ROOT / "docs" / "jmvae_details.md", 0, names)
+    run_example(page, 1, names)
     chex.assert_trees_all_equal(trained, names["params"])
 
 

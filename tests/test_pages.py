@@ -14,8 +14,8 @@ PAGES = [
     *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
     *sorted((ROOT / "docs").glob("*.md")),
 ]
-# GitHub shows their content as code: lists of pages, and pages that only the site shows.
-HARMLESS = {"toctree", "include", "eval-rst"}
+# GitHub shows their content as code: lists of pages.
+HARMLESS = {"toctree", "eval-rst"}
 
 
 def without_code(text):

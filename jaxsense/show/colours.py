@@ -17,11 +17,11 @@ SOFT = "#59616e"
 _ROBOT_COLOURS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
 _POLICY_COLOURS = {
     "latent": "#1558b0", "greedy": "#b84300", "bayes": "#00805f", "optimal": "#5e0d2b",
-    "nearest": "#d95fbe", "auction": "#2fa4e7", "rollout": "#b59a00", "naive": "#404040",
-    "naive_2": "#5c5c5c", "naive_3": "#737373", "random": "#858585",
+    "nearest": "#cd79aa", "auction": "#d00dd4", "rollout": "#b79710", "naive": "#523a05",
+    "naive_2": "#05475b", "naive_3": "#d00e4d", "random": "#1711c8",
 }  # fmt: skip
 _MARKERS = "oDs^vPX<>pd"
-_OTHER_POLICY = "#0891a8", "*"  # a custom one
+_OTHER_POLICY = "#0fb851", "*"  # a custom one
 _OWN = "starting, summing up", "0.45"
 _TRACING = "tracing, lowering", "#d9a400"
 _SAVING = "saving", "#7d8a12"
@@ -43,9 +43,9 @@ def modality_colour(modality: int) -> str:
 
 
 def policy_colour(name: str) -> str:
-    """The colour of a policy, the same in all plots; the simplest ones are grey.
+    """The colour of a policy, the same in all plots.
 
-    Those that are not grey differ also for those who see no red or no green.
+    Colours differ also for those who see no red or no green.
     """
     return _POLICY_COLOURS.get(name, _OTHER_POLICY[0])
 

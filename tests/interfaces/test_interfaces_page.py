@@ -1,21 +1,14 @@
 """Every example of `docs/interfaces.md` runs and prints what it says."""
 
-import dataclasses
 import importlib.util
 import re
-import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from archives import imports_from_archives
 
-import jaxsense
 from jaxsense import export
-from jaxsense.models import init
-from jaxsense.vae import gate
-from jaxsense.vae.detectors import Classifier
 
 PAGE = Path(__file__).parent.parent.parent / "docs" / "interfaces.md"
 SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
@@ -35,29 +28,12 @@ EXAMPLES = dict(zip(PACKAGES, OTHERS, strict=True))
 TASKS = dict(zip(OF_TASKS, SNIPPETS, strict=False))
 
 
-def colour_detector():
-    """A camera's detector made by hand: is there more red or more green in the window?"""
-    kernel = np.zeros((80, 3, 2), np.float32)
-    kernel[:, 0, 0] = kernel[:, 1, 1] = 1.0
-    params = {"params": {"Dense_0": {"kernel": kernel.reshape(-1, 2), "bias": np.zeros(2)}}}
-    offset, scale = jnp.zeros(240), jnp.float32(1.0)
-    passes_all = gate.init(jax.random.key(0), offset, scale, measures_distance=False)
-    return Classifier(params, offset, scale, passes_all, hidden=(), num_labels=2)
-
-
 @pytest.fixture(scope="module")
 def names():
-    """What the first example defines, with a camera that can tell colours apart."""
+    """What the first example, and that of a team, define."""
     found: dict = {}
-
-    def with_colours(key, config):
-        models = init(key, config)
-        return dataclasses.replace(models, detectors=(colour_detector(), models.detectors[1]))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jaxsense, "init", with_colours)
-        for example in (FIRST, TEAM):
-            exec(compile(example, PAGE.name, "exec"), found)
+    for example in (FIRST, TEAM):
+        exec(compile(example, PAGE.name, "exec"), found)
     return found
 
 
@@ -72,9 +48,8 @@ def test_examples_run(names, package, tmp_path, monkeypatch, capsys):
         importlib.import_module("torch").set_num_threads(1)  # more get into each other's way
     if package == "onnx":
         Path("robot.zip").write_bytes(export.archive(names["config"], names["models"]))
-        monkeypatch.setattr(sys, "path", [*sys.path])
-        monkeypatch.delitem(sys.modules, "robot_numpy", raising=False)
-    exec(compile(example, PAGE.name, "exec"), dict(names))
+    with imports_from_archives():
+        exec(compile(example, PAGE.name, "exec"), dict(names))
     (printed,) = re.findall(r"^print\(.*\)  # (.*)$", example, re.MULTILINE)
     assert capsys.readouterr().out == f"{printed}\n"
 
