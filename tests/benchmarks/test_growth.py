@@ -38,3 +38,29 @@ def test_what_has_grown_is_named(change, grown):
 def test_the_least_of_several_runs_counts():
     runs = [BEFORE, dataclasses.replace(BEFORE, cpu_s=90.0, memory_mib=1200.0)]
     assert growth.least(runs) == dataclasses.replace(BEFORE, cpu_s=90.0)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "times", "expected"),
+    [
+        ([100.0, 100.0], 2, []),
+        # A slow moment of the machine.
+        ([130.0, 125.0, 105.0], 3, []),
+        ([130.0, 125.0, 120.0, 118.0], 4, ["CPU seconds"]),
+    ],
+)
+def test_what_seems_to_have_grown_is_measured_again(
+    monkeypatch, tmp_path, seconds, times, expected
+):
+    old, now = tmp_path / "tree", tmp_path / "changed"
+    trained = []
+
+    def train(tree, place):
+        assert place.is_dir()
+        trained.append(tree)
+        cpu_s = 100.0 if tree == old else seconds[trained.count(now) - 1]
+        return dataclasses.replace(BEFORE, cpu_s=cpu_s)
+
+    monkeypatch.setattr(growth, "train", train)
+    assert growth.grown(old, now, tmp_path, pairs=2) == expected
+    assert trained == [old, now] * times
