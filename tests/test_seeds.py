@@ -74,7 +74,8 @@ def test_the_summary_of_several_seeds_is_over_all_of_them(seeds, capsys):
     mean, low, high = (
         summary["detectors"]["lidar"]["accuracy"][n] for n in ("mean", "low", "high")
     )
-    assert f"<td>{mean:.4f} ({low:.4f} to {high:.4f})</td>" in page
+    interval = f"{low:.4f}\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}{high:.4f}"
+    assert f"<td>{mean:.4f} ({interval})</td>" in page
     assert page.count("<img") == 2  # the curves, and accuracy against looks
     with pytest.raises(SystemExit):
         evaluate.main([str(seeds)])
