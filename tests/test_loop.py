@@ -1,5 +1,6 @@
 """The loop that drives the stages of a training from the host."""
 
+import dataclasses
 import gc
 import signal
 import subprocess
@@ -119,7 +120,8 @@ def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, monkeyp
 
 def test_programs_are_let_go_of_once_no_training_needs_them(monkeypatch):
     # Stages of one kind share their programs.
-    kinds = [counting("dqn_camera"), counting("dqn_lidar"), counting("count")]
+    names = "dqn_camera", "dqn_lidar"
+    kinds = [*(counting(name, shares="dqn") for name in names), counting("count")]
     monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
     monkeypatch.setattr(programs, "stages", lambda config: kinds)
     monitor, trainings = Monitor(), Trainings(1, total=2)
@@ -158,9 +160,10 @@ def test_kept_missions_are_loaded_when_no_stage_needs_the_scans(monkeypatch, tmp
 
     kinds = [
         counting("first"),
-        counting("scans"),
-        Stage("detections", lambda key, config, x: x, {"x": "scans"}),
-        Stage("last", last, {"x": "detections"}),
+        counting("scans", is_passing=True),
+        Stage("long", lambda key, config, x: x, {"x": "scans"}),
+        Stage("short", lambda key, config, x: x, {"x": "scans"}),
+        Stage("last", last, {"x": "short"}),
     ]
     used = programs.Programs.used
 
@@ -177,7 +180,7 @@ def test_kept_missions_are_loaded_when_no_stage_needs_the_scans(monkeypatch, tmp
         while "missions" not in order:
             time.sleep(0.01)
     if is_kept:
-        assert order.index("missions") > order.index("detections done")
+        assert order.index("missions") > max(map(order.index, ("long done", "short done")))
     else:
         assert order.index("missions") < order.index("last traced")
 
@@ -222,7 +225,7 @@ def test_rows_are_the_same_in_parts(toy, monkeypatch, number):
     monkeypatch.setattr(devices, "part", counted)
     first = Stage("first", lambda key, config: jnp.arange(2.0 * number).reshape(number, 2))
     survey = Stage("survey", lambda key, config, x: (x + 1, x.sum(axis=1)), {"x": "first"})
-    found, _, _ = toy(first, survey)
+    found, _, _ = toy(first, dataclasses.replace(survey, has_rows=True))
     x = np.arange(2.0 * number).reshape(number, 2)
     np.testing.assert_array_equal(found.outputs["survey"][0], x + 1)
     np.testing.assert_array_equal(found.outputs["survey"][1], x.sum(axis=1))
@@ -278,6 +281,10 @@ def test_a_training_that_is_not_finite_ends_what_follows_from_it(toy):
         toy(counting("count", 4), follows, counting("beside"))
 
 
+def chunked(name, chunks, **settings):
+    return Stage(name, lambda key, config: (), chunks=chunks, **settings)
+
+
 def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
     checkpoints, monitor = Checkpoints(tmp_path), Monitor()
 
@@ -287,7 +294,7 @@ def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
 
     start = {"x": np.zeros(2, np.float32)}
     with pytest.raises(StageError, match="jmvae: loss = nan at step 3 of 4"):
-        run_chunks("jmvae", start, 4, run, monitor, checkpoints)
+        run_chunks(chunked("jmvae", 4), start, run, monitor, checkpoints)
     done, state, curves = checkpoints.load_unfinished("jmvae", start)
     assert (done, curves) == (2, {"chunk": [0, 1]})
     np.testing.assert_array_equal(state["x"], [2, 2])
@@ -301,6 +308,7 @@ from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.kept import Kept
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor
+from jaxsense.training.stage import Stage
 
 clock = [0.0]
 time.monotonic = lambda: clock[0]
@@ -311,7 +319,8 @@ def run(chunk, state):
     clock[0] += 25.0
     return state + 1, {"chunk": [chunk]}
 
-run_chunks("jmvae", np.float32(0), 9, run, Monitor(), Checkpoints(Path(sys.argv[1])))
+stage = Stage("jmvae", lambda key, config: (), chunks=9)
+run_chunks(stage, np.float32(0), run, Monitor(), Checkpoints(Path(sys.argv[1])))
 """
 
 
@@ -334,7 +343,7 @@ def test_a_stop_is_heard_after_every_chunk(tmp_path):
         return state + 1, {}
 
     with pytest.raises(Stopped):
-        run_chunks("jmvae", np.float32(0), 4, run, monitor, checkpoints)
+        run_chunks(chunked("jmvae", 4), np.float32(0), run, monitor, checkpoints)
     assert checkpoints.load_unfinished("jmvae", np.float32(0))[:2] == (2, 2.0)
 
 
@@ -342,14 +351,18 @@ def test_a_training_that_is_over_is_saved_when_another_one_stops(tmp_path):
     checkpoints, monitor = Checkpoints(tmp_path), Monitor()
     monitor.stop()
     state, curves = run_chunks(
-        "camera", np.float32(0), 1, lambda i, x: (x + 1, {"i": [i]}), monitor, checkpoints
+        chunked("camera", 1),
+        np.float32(0),
+        lambda i, x: (x + 1, {"i": [i]}),
+        monitor,
+        checkpoints,
     )
     assert (state, curves) == (1, {"i": [0]})
 
     def never(chunk, state):
         raise AssertionError("trained again")
 
-    again = run_chunks("camera", np.float32(0), 1, never, Monitor(), checkpoints)
+    again = run_chunks(chunked("camera", 1), np.float32(0), never, Monitor(), checkpoints)
     assert again == (1, {"i": [0]})
 
 
@@ -361,7 +374,7 @@ def test_a_training_that_fails_ends_what_goes_on_beside_it(tmp_path):
         return state + 1, {}
 
     with pytest.raises(StageError, match="dqn_lidar"):
-        run_chunks("dqn_camera", np.float32(0), 9, run, monitor, checkpoints)
+        run_chunks(chunked("dqn_camera", 9), np.float32(0), run, monitor, checkpoints)
     assert checkpoints.load_unfinished("dqn_camera", np.float32(0))[:2] == (1, 1.0)
     monitor.begin(lambda *_: None)  # the next seed
     monitor.check_stop()
@@ -378,7 +391,7 @@ def test_nan_on_a_full_disk_tells_of_both(monkeypatch, tmp_path):
         raise StageError("jmvae: loss = nan at step 1 of 4")
 
     with pytest.raises(StageError, match=r"nan at step 1 of 4; .* No space left on device"):
-        run_chunks("jmvae", np.float32(0), 4, run, Monitor(), checkpoints)
+        run_chunks(chunked("jmvae", 4), np.float32(0), run, Monitor(), checkpoints)
 
 
 def test_saving_counts_for_the_programs_that_stages_share(tmp_path):
@@ -388,5 +401,6 @@ def test_saving_counts_for_the_programs_that_stages_share(tmp_path):
         monitor.stop()
         return state, {"chunk": [chunk]}
 
-    run_chunks("dqn_camera", np.float32(0), 1, run, monitor, Checkpoints(tmp_path))
+    stage = chunked("dqn_camera", 1, shares="dqn")
+    run_chunks(stage, np.float32(0), run, monitor, Checkpoints(tmp_path))
     assert [(span.kind, span.stage) for span in monitor.clock.spans] == [("save", "dqn")]

@@ -15,7 +15,7 @@ from jaxsense.core.types import Key
 from jaxsense.run import devices
 from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.programs import Programs, has_rows, is_saved, padded, program_name, workers_for
+from jaxsense.run.programs import Programs, padded, workers_for
 from jaxsense.summary.profile import Kind
 from jaxsense.training.stage import Output, Progress, Stage
 
@@ -144,7 +144,7 @@ class _Loop:
 
     def _record(self, kind: Kind, stage: Stage) -> AbstractContextManager[None]:
         """Records what is done for a stage, under the name of its programs."""
-        return self._clock.record(kind, program_name(stage.name))
+        return self._clock.record(kind, stage.program)
 
     def _run_stage(self, stage: Stage, before: dict[str, Future[None]]) -> None:
         """Finds the output of a stage, and lets go of those that no other stage needs."""
@@ -159,7 +159,7 @@ class _Loop:
     def _output(self, stage: Stage, before: dict[str, Future[None]]) -> Output:
         """The output of a stage, loaded if it was saved."""
         try:
-            found = self._load(stage) if is_saved(stage) else None
+            found = self._load(stage) if stage.is_saved else None
             if found is not None:
                 return found
             with self._record("wait_stages", stage):
@@ -170,7 +170,7 @@ class _Loop:
             output = (self._train if stage.chunks else self._begin)(stage, inputs)
             if not stage.is_optional:
                 self._monitor.check_finite(stage.name, "results", output)
-            if is_saved(stage):
+            if stage.is_saved:
                 self._save(stage, output)
             return output
         except StageError as error:
@@ -181,7 +181,7 @@ class _Loop:
         """The first state, or the output of a stage without steps."""
         key = stage.key(self._key)
         program, config = self._programs.of(stage).begin, self._config
-        if not has_rows(stage):
+        if not stage.has_rows:
             return stage.divide(config, program(key, config, inputs))
         number = len(jax.tree.leaves(inputs)[0])
         workers = workers_for(number, self._programs.workers)
@@ -208,9 +208,8 @@ class _Loop:
         try:
             # Nobody but `run_chunks` holds the first state, so that it can let go of it.
             state, curves = run_chunks(
-                stage.name,
+                stage,
                 self._begin(stage, inputs),
-                stage.chunks,
                 advance,
                 self._monitor,
                 self._checkpoints,
@@ -288,9 +287,8 @@ def _failed(shapes: Output) -> Output:
 
 
 def run_chunks(
-    stage: str,
+    stage: Stage,
     state: Output,
-    number: int,
     run: Callable[[int, Output], tuple[Output, Curves]],
     monitor: Monitor,
     checkpoints: Checkpoints,
@@ -298,9 +296,8 @@ def run_chunks(
     """Runs a training from where it was last saved.
 
     Args:
-      stage: its name.
+      stage: with chunks.
       state: first state.
-      number: of chunks.
       run: `(chunk, state) -> (state, metrics)`, deterministic.
       monitor: asked whether to stop.
       checkpoints: where to save the training once a minute, and when it stops.
@@ -313,16 +310,16 @@ def run_chunks(
       StageError: from `run`; the state before the chunk is saved.
     """
     done, curves = 0, Curves()
-    found = checkpoints.load_unfinished(stage, state)
+    found = checkpoints.load_unfinished(stage.name, state)
     if found is not None:
         done, state, curves = found
     saved = time.monotonic()
-    for chunk in range(done, number):
+    for chunk in range(done, stage.chunks):
         try:
             after, metrics = run(chunk, state)
         except StageError as error:
             try:
-                checkpoints.save_unfinished(stage, Unfinished(chunk, state, curves))
+                checkpoints.save_unfinished(stage.name, Unfinished(chunk, state, curves))
             except OSError as lost:
                 raise StageError(f"{error}; cannot save the last finite state ({lost})") from error
             raise
@@ -331,9 +328,9 @@ def run_chunks(
             curves.setdefault(name, []).extend(values)
         is_late = time.monotonic() - saved > _SAVE_PERIOD
         if is_late or monitor.is_stopping:
-            with monitor.clock.record("save", program_name(stage)):
-                checkpoints.save_unfinished(stage, Unfinished(chunk + 1, state, curves))
+            with monitor.clock.record("save", stage.program):
+                checkpoints.save_unfinished(stage.name, Unfinished(chunk + 1, state, curves))
             saved = time.monotonic()
-        if chunk + 1 < number:
+        if chunk + 1 < stage.chunks:
             monitor.check_stop()
     return state, curves

@@ -28,40 +28,8 @@ from jaxsense.training.stages import stages
 
 OwnPolicies = Mapping[str, Values | Policy]
 """Policies of a user, by name, see `dqn.policies.table`."""
-_ROWS = ("survey",)
-"""Stages whose inputs and output have independent rows, so that devices can share them."""
 _PATIENCE = 0.2  # s; between two checks whether the run is over
 _ROWS_AT_ONCE = 512  # of each thread; their results take up little memory besides those of all
-_SAVED = ("novelty", "best_jmvae", "class_beliefs", "fusion", "look_values")
-"""Stages without chunks whose output a run saves; it saves that of every stage with chunks."""
-_SHARED = ("jmvae", "dqn", "policies", "numbers")
-"""First words of the names of stages that have the same functions, and so the same programs."""
-
-
-def has_rows(stage: Stage) -> bool:
-    """Whether devices can share the rows of a stage."""
-    return stage.name in _ROWS
-
-
-def is_saved(stage: Stage) -> bool:
-    """Whether a run saves the output of a stage, and does not repeat the stage when it resumes."""
-    return stage.chunks > 0 or stage.name in _SAVED
-
-
-def _runs_long(stage: Stage) -> bool:
-    """Whether the code generator for programs that run long pays for a stage's chunks, on a CPU.
-
-    The JMVAE trains a tenth faster with it. Other trainings gain a twentieth at most, and take
-    half as long again and four times the memory to compile. Accelerators train faster than they
-    compile.
-    """
-    return _on_cpu() and program_name(stage.name) == "jmvae"
-
-
-def program_name(stage: str) -> str:
-    """The name of a stage's programs, which stages with the same functions share."""
-    kind = stage.partition("_")[0]
-    return kind if kind in _SHARED else stage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +80,9 @@ class Programs:
       trainings: how many run side by side, and in all.
       policies: of missions, by name, in addition to `dqn.POLICIES`.
       left: how often each stage's programs are still needed, if it is known.
-      detected: set once a training has done without the survey's scans.
+      with_scans: names of the stages that take what only some stages need, as scans are, and that
+        no training is done with yet.
+      without_scans: set once there are none.
     """
 
     config: Config
@@ -123,22 +93,23 @@ class Programs:
     trainings: Trainings
     policies: OwnPolicies | None = None
     left: Counter[str] = dataclasses.field(default_factory=Counter)
-    detected: threading.Event = dataclasses.field(default_factory=threading.Event)
+    with_scans: set[str] = dataclasses.field(default_factory=set)
+    without_scans: threading.Event = dataclasses.field(default_factory=threading.Event)
     _lock: threading.Lock = dataclasses.field(default_factory=threading.Lock)
 
     def of(self, stage: Stage) -> StagePrograms:
         """The programs of a stage."""
-        return self.of_stages[program_name(stage.name)]
+        return self.of_stages[stage.program]
 
     def used(self, stage: Stage) -> None:
         """Notes that a training is done with a stage, and lets go of programs that none needs."""
-        name = program_name(stage.name)
-        if name == _LAST_WITH_SCANS:
-            self.detected.set()
         with self._lock:
-            self.left[name] -= 1
-            if self.left[name] == 0:
-                self.of_stages[name].release()
+            self.with_scans.discard(stage.name)
+            if not self.with_scans:
+                self.without_scans.set()
+            self.left[stage.program] -= 1
+            if self.left[stage.program] == 0:
+                self.of(stage).release()
 
     def fail(self, error: BaseException) -> None:
         """Raises an error wherever a program is awaited, now or later."""
@@ -169,15 +140,16 @@ def compile_programs(
     found, trainings = stages(config), trainings or Trainings()
 
     def program(stage: Stage, part: str) -> Program | SharedProgram:
-        alone = Program(compiler, program_name(stage.name), part)
-        is_shared = trainings.number > 1 and not has_rows(stage)
+        alone = Program(compiler, stage.program, part)
+        is_shared = trainings.number > 1 and not stage.has_rows
         return SharedProgram(alone, trainings, workers) if is_shared else alone
 
+    passing = {stage.name for stage in found if stage.is_passing}
     programs = Programs(
         config=config,
         stages=found,
         of_stages={
-            program_name(stage.name): StagePrograms(
+            stage.program: StagePrograms(
                 begin=program(stage, "begin"),
                 advance=program(stage, "advance"),
                 finish=program(stage, "finish"),
@@ -189,9 +161,8 @@ def compile_programs(
         workers=workers,
         trainings=trainings,
         policies=policies,
-        left=Counter(
-            program_name(stage.name) for stage in found for _ in range(trainings.total or 0)
-        ),
+        left=Counter(stage.program for stage in found for _ in range(trainings.total or 0)),
+        with_scans={stage.name for stage in found if passing.intersection(stage.sources)},
     )
 
     thread = ThreadPoolExecutor(1, "trace")
@@ -201,7 +172,6 @@ def compile_programs(
 
 
 _BEFORE_MISSIONS = 2  # stages that all others wait for
-_LAST_WITH_SCANS = "detections"  # the stage that runs trained detectors on the scans
 
 
 def _on_cpu() -> bool:
@@ -225,7 +195,7 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
             _trace_stage(programs, stage)
         if _on_cpu() and is_kept:
             # They load in seconds, but take as much memory as the scans.
-            while not programs.detected.wait(_PATIENCE):
+            while not programs.without_scans.wait(_PATIENCE):
                 compiler.check_open()
         if not is_first:
             _trace_missions(programs, compiler)
@@ -251,6 +221,8 @@ def _batch(programs: Programs) -> int:
 def _trace_stage(programs: Programs, stage: Stage) -> None:
     """Traces the programs of a stage, unless an earlier stage shares them."""
     compiled, key, config = programs.of(stage), jax.random.key(0), programs.config
+    # Accelerators train faster than they compile.
+    runs_long = _on_cpu() and stage.runs_long
     if compiled.shapes.done():
         return
     outputs = {
@@ -270,7 +242,7 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
         return stage.finish(config, state, **inputs)
 
     divided = functools.partial(jax.eval_shape, functools.partial(stage.divide, config))
-    if isinstance(compiled.begin, Program) and has_rows(stage):
+    if isinstance(compiled.begin, Program) and stage.has_rows:
         number = len(jax.tree.leaves(inputs)[0])
         workers = workers_for(number, programs.workers)
         split = padded(inputs, workers)
@@ -283,7 +255,7 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
         compiled.shapes.set_result(Shapes(divided(state)))
         return
     _, progress = compiled.advance.compile(
-        advance, key, config, state, inputs, runs_long=_runs_long(stage), whole=(1,)
+        advance, key, config, state, inputs, runs_long=runs_long, whole=(1,)
     )
     output = compiled.finish.compile(finish, config, state, inputs, whole=(0,))
     compiled.shapes.set_result(Shapes(output, tuple(progress.metrics)))

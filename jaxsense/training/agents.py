@@ -168,6 +168,7 @@ def agent_stages(arena: Arena, config: Config) -> list[Stage]:
                 finish,
                 steps=config.dqn.epochs,
                 chunks=config.dqn.epochs // config.dqn.chunk,
+                shares="dqn",
             )
             for name, m in learners.items()
         ),

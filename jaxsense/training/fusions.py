@@ -46,7 +46,7 @@ def _in_place_stages(config: Config) -> list[Stage]:
     """The stage that makes the fusion in place."""
     del config
     given = {"params": "best_jmvae", "classes": "class_beliefs", "detections": "detections"}
-    return [Stage("fusion", fit_in_place, given)]
+    return [Stage("fusion", fit_in_place, given, is_kept=True)]
 
 
 def _filter_stages(config: Config) -> list[Stage]:
@@ -77,4 +77,10 @@ def _filter_stages(config: Config) -> list[Stage]:
         trained=trained,
     )
     # The key of a training depends on the name of its stage.
-    return [training, Stage("fusion", lambda key, config, *, fusion: fusion, {"fusion": "filter"})]
+    fusion = Stage("fusion", _filter, {"fusion": "filter"}, is_kept=True)
+    return [training, fusion]
+
+
+def _filter(key: Key, config: Config, *, fusion: Filter) -> Filter:
+    del key, config
+    return fusion

@@ -175,7 +175,8 @@ def survey_stage(arena: Arena) -> Stage:
         seen, windows, distances = looks.surveys(keys, world, classes, is_empty, places)
         return Survey(classes, seen, windows, distances)
 
-    return Stage("survey", survey, {"scenes": "scenes"}, divide=divide, is_passing=True)
+    given = {"scenes": "scenes"}
+    return Stage("survey", survey, given, divide=divide, is_passing=True, has_rows=True)
 
 
 def divide(config: Config, survey: Survey) -> Surveys:
@@ -340,7 +341,7 @@ def make_stages(config: Config, arena: Arena) -> list[Stage]:
         *(detector_stage(m, name, config) for m, name in enumerate(names)),
         Stage("detections", detect, {"surveys": "survey", "trained": names}),
         *jmvae_stages(config),
-        Stage("class_beliefs", class_beliefs, given),
+        Stage("class_beliefs", class_beliefs, given, is_kept=True),
         repeats.novelty_stage(arena, config),
     ]
 
@@ -357,7 +358,7 @@ def jmvae_stages(config: Config) -> list[Stage]:
     given = {"detections": "detections"}
     restarts = jmvae_restarts(config, given, init=init, problem=problem)
     names = tuple(stage.name for stage in restarts)
-    best = Stage("best_jmvae", _best_jmvae, {"restarts": names, **given})
+    best = Stage("best_jmvae", _best_jmvae, {"restarts": names, **given}, is_kept=True)
     return [*restarts, best]
 
 

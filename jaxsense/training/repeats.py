@@ -64,7 +64,9 @@ def novelty_stage(
     number = config.detector.num_repeats
     if not number:
         num_modalities = len(config.modalities)
-        return Stage("novelty", lambda key, config: novelty.independent(num_modalities))
+        return Stage(
+            "novelty", lambda key, config: novelty.independent(num_modalities), is_kept=True
+        )
 
     def begin(
         key: Key, config: Config, *, trained: tuple[Detector, ...], **given: Output
@@ -85,4 +87,4 @@ def novelty_stage(
         return Novelty(jnp.stack(strength), jnp.stack(length))
 
     names = tuple(f"detector_{name}" for name in config.modalities)
-    return Stage("novelty", begin, {"trained": names, **(inputs or {})})
+    return Stage("novelty", begin, {"trained": names, **(inputs or {})}, is_kept=True)

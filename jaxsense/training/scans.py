@@ -71,8 +71,8 @@ def make_stages(config: Config, arena: Arena) -> list[Stage]:
     return [
         Stage("views", views, {"surveys": "survey"}, is_passing=True),
         *restarts,
-        Stage("best_jmvae", _best, best),
-        Stage("class_beliefs", class_beliefs, {**learned, "surveys": "survey"}),
+        Stage("best_jmvae", _best, best, is_kept=True),
+        Stage("class_beliefs", class_beliefs, {**learned, "surveys": "survey"}, is_kept=True),
         Stage("shown", shown, clustered),
         *(_encoder_stage(m, name, config) for m, name in enumerate(detectors)),
         Stage("detections", detect, detected),

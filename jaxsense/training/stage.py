@@ -66,6 +66,12 @@ class Stage:
       is_optional: whether the stage may diverge, because a later one picks a finite one of several.
       is_passing: whether only other stages need the output, so that a run holds it no longer than
         they do.
+      is_kept: whether a run saves the output although the stage has no chunks.
+      has_rows: whether inputs and output have independent rows, which devices can share.
+      runs_long: whether a run compiles the chunks as programs that run much longer than they
+        compile.
+      shares: the name under which stages with the same functions share their programs; by default
+        the stage has its own.
       divide: `(config, output of begin) -> output`, for stages without chunks. It only slices rows,
         and a run calls it on the host, where slices are no copies.
     """
@@ -79,7 +85,21 @@ class Stage:
     chunks: int = 0
     is_optional: bool = False
     is_passing: bool = False
+    is_kept: bool = False
+    has_rows: bool = False
+    runs_long: bool = False
+    shares: str = ""
     divide: Callable[[Config, Output], Output] = _whole
+
+    @property
+    def program(self) -> str:
+        """Name of the stage's programs."""
+        return self.shares or self.name
+
+    @property
+    def is_saved(self) -> bool:
+        """Whether a run saves the output, and does not repeat the stage when it resumes."""
+        return self.chunks > 0 or self.is_kept
 
     @property
     def sources(self) -> tuple[str, ...]:

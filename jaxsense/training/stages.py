@@ -46,13 +46,16 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
         Stage("detector_metrics", measures.detector_metrics, detections),
         *fusions.make_stages(config),
         Stage("latent_space", measures.latent_space, {**fusion, **detections}),
-        Stage("look_values", agents.look_values, {**classes, **detections}),
+        Stage("look_values", agents.look_values, {**classes, **detections}, is_kept=True),
         Stage("beliefs", measures.beliefs, {**fusion, **detections}),
         *agents.agent_stages(arena, config),
         *agents.tour_stages(config),
-        *(Stage(f"policies_{n}", comparison.play_policies, x) for n, x in policies.items()),
         *(
-            Stage(f"numbers_{name}", comparison.play_numbers, inputs)
+            Stage(f"policies_{name}", comparison.play_policies, inputs, shares="policies")
+            for name, inputs in policies.items()
+        ),
+        *(
+            Stage(f"numbers_{name}", comparison.play_numbers, inputs, shares="numbers")
             for name, inputs in policies.items()
             if config.evaluation.num_pois
         ),

@@ -16,7 +16,6 @@ import jaxsense
 from jaxsense import training
 from jaxsense.run import loop, missions, pipeline
 from jaxsense.run.monitor import Monitor
-from jaxsense.run.programs import has_rows
 from jaxsense.training import learn
 
 TOLERANCE = 1e-5
@@ -59,7 +58,7 @@ def test_every_stage_of_learn_is_that_of_a_run(trained):
     for stage in programs.stages:
         inputs, compiled = stage.select(found.outputs), programs.of(stage)
         begin_keys, chunk_keys = jax.vmap(stage.key)(keys), keys
-        if has_rows(stage):
+        if stage.has_rows:
             inputs = jax.tree.map(lambda x: x[:2], inputs)
             of_run = jax.tree.map(lambda x: x[:2], found.outputs[stage.name].training)
         elif stage.chunks:
