@@ -179,6 +179,7 @@ def play(
     player, episodes = programs.player.result(), config.mission.episodes
     cases = mission.cases(config, player.mission.policies)
     played = {name: cases[name] for name in config.mission.policies}
+    monitor.clock.add_rest("start")
     found = player.play(mission_key(key), learned.models, played, episodes)
     (checkpoints or Checkpoints()).forget_unfinished()
     block = summary.missions(player.mission, found.metrics)
