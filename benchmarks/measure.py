@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from jaxsense.run import cli, devices, version
 from jaxsense.run.devices import Workers
-from jaxsense.show.drawing import png, svg
+from jaxsense.show import drawing
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
 
@@ -308,7 +308,7 @@ def save(program: str, option: str, path: Path, figure: Figure) -> None:
       path: of the file: an SVG if its name ends in `.svg`, else a PNG.
       figure: the picture.
     """
-    content = (svg if path.suffix == ".svg" else png)(figure)
+    content = drawing.encoded(figure, path)
     try:
         with path.open("xb") as file:
             file.write(content)

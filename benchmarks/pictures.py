@@ -137,7 +137,7 @@ def _of_recording(preset: str, picture: str) -> Written:
             f"python examples/laser_logs.py {run} {scans}",
             f'python -c "{compare}"',
         ),
-        {f"figures/{picture}": "scans.npz.residuals.png"},
+        {f"figures/{picture}": "scans.npz.residuals.svg"},
     )
 
 
@@ -200,8 +200,8 @@ DRAWINGS: tuple[Drawing, ...] = (
         noisy_calibration="calibration",
         noisy_policies="policies",
     ),
-    _of_recording("default", "recorded_residuals.png"),
-    _of_recording("recorded", "recorded_residuals_fitted.png"),
+    _of_recording("default", "recorded_residuals.svg"),
+    _of_recording("recorded", "recorded_residuals_fitted.svg"),
 )
 """What draws the pictures of `docs`."""
 

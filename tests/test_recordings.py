@@ -212,20 +212,20 @@ def test_recorded_windows_are_compared_with_simulated_ones(run, write, few):
         assert 0 < apart.recorded < 1.5 * apart.simulated
     # Each beam is off by .01 m, and so is each of the windows that it is compared with.
     assert found.of_sensors["lidar"].recorded == pytest.approx(0.0125, abs=0.003)
-    assert found.picture == path.with_name("recorded.npz.png")
-    assert found.residuals == path.with_name("recorded.npz.residuals.png")
+    assert found.picture == path.with_name("recorded.npz.svg")
+    assert found.residuals == path.with_name("recorded.npz.residuals.svg")
     for picture in (found.picture, found.residuals):
-        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert picture.read_bytes().startswith(b"<?xml")
     camera, lidar = str(found).splitlines()
     assert camera.startswith("camera: 8 recorded windows are 0.0")
     assert lidar.startswith(
         f"lidar: 8 recorded windows are {found.of_sensors['lidar'].recorded:.4f}"
     )
-    with pytest.raises(FileExistsError, match=r"recorded\.npz\.png"):
+    with pytest.raises(FileExistsError, match=r"recorded\.npz\.svg"):
         jaxsense.compare_scans(run, path)
     # One of the two is not written without the other.
     found.picture.unlink()
-    with pytest.raises(FileExistsError, match=r"recorded\.npz\.residuals\.png"):
+    with pytest.raises(FileExistsError, match=r"recorded\.npz\.residuals\.svg"):
         jaxsense.compare_scans(run, path)
     assert not found.picture.exists()
 
@@ -239,14 +239,14 @@ def test_another_scanner_is_farther_from_simulated_windows(run, write, few, tmp_
     content["lidar_poses"][-3:, 2] += np.pi
     content = {name: x for name, x in content.items() if not name.startswith("camera")}
     found = jaxsense.compare_scans(run, write(**content), tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").exists()
-    assert (tmp_path / "picture.residuals.png").exists()
+    for name in ("picture.png", "picture.residuals.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
     assert [*found.of_sensors] == ["lidar"]
     assert found.of_sensors["lidar"].looks == number - 3
     assert 0.13 < found.of_sensors["lidar"].recorded < 0.22
     content["lidar_poses"][:-3, 2] += np.pi
     with pytest.raises(ValueError, match="lidar_scans: no window around a PoI was recorded"):
-        jaxsense.compare_scans(run, write(**content), tmp_path / "another.png")
+        jaxsense.compare_scans(run, write(**content), tmp_path / "another.svg")
     assert not list(tmp_path.glob("another*"))
 
 

@@ -112,7 +112,7 @@ def test_recorded_scans_are_compared(recording, tmp_path, monkeypatch, capsys):
     run(COMPARED)
     printed = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in printed] == ["camera", "lidar"]
-    assert Path("recorded.npz.residuals.png").exists()
+    assert Path("recorded.npz.residuals.svg").exists()
 
 
 def test_a_detector_is_retrained_with_labelled_looks(recording, tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ dark page. What is black or white in a figure becomes the ink and the paper of `
 import io
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -25,8 +26,15 @@ _GAP = 1.25  # lines of text, between the names next to an axis
 _INCH = 72.0  # points
 
 
-def png(figure: Figure) -> bytes:
-    """A figure as a PNG file."""
+def encoded(figure: Figure, path: Path) -> bytes:
+    """A figure as an SVG file if the path ends in `.svg`, else as a PNG file.
+
+    Args:
+      figure: to encode.
+      path: of the file to write.
+    """
+    if path.suffix == ".svg":
+        return svg(figure)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=120)
     return content.getvalue()

@@ -40,8 +40,8 @@ class Comparison:
 
     Attributes:
       of_sensors: of each recorded sensor; print the comparison to read it.
-      picture: PNG file with recorded windows above the nearest simulated ones.
-      residuals: PNG file with the distributions of their differences.
+      picture: file with recorded windows above the nearest simulated ones.
+      residuals: file with the distributions of their differences.
     """
 
     of_sensors: Mapping[str, Apart]
@@ -68,8 +68,9 @@ def compare_scans(
     Args:
       run: directory of a finished run.
       file: a recording, see `run.recordings.read`.
-      picture: PNG file to write; by default it is named after `file`. The residuals are drawn in
-        another one next to it, whose name ends in `.residuals.png`.
+      picture: SVG or PNG file to write, by its ending; by default an SVG file named after `file`.
+        The residuals are drawn in another one next to it, whose name ends in `.residuals.svg`
+        or `.residuals.png`.
       trust: whether the run may import its custom sensors, see `load`.
 
     Raises:
@@ -81,16 +82,17 @@ def compare_scans(
 
     config, _ = load(run, trust)
     looks = recordings.read(config, file)
-    path = Path(f"{os.fspath(file)}.png" if picture is None else picture)
+    path = Path(f"{os.fspath(file)}.svg" if picture is None else picture)
     found = {
         name: _compare(config, m, looks)
         for m, name in enumerate(config.modalities)
         if name in looks.scans
     }
-    pairs, beside = [each for _, each in found.values()], path.with_suffix(".residuals.png")
+    pairs = [each for _, each in found.values()]
+    beside = path.with_suffix(f".residuals{path.suffix}")
     with files.new(path) as drawn, files.new(beside) as residuals:
-        drawn.write(drawing.png(scan_plots.windows(pairs)))
-        residuals.write(drawing.png(scan_plots.residuals(pairs)))
+        drawn.write(drawing.encoded(scan_plots.windows(pairs), path))
+        residuals.write(drawing.encoded(scan_plots.residuals(pairs), beside))
     return Comparison({name: apart for name, (apart, _) in found.items()}, path, beside)
 
 
