@@ -17,7 +17,7 @@ from pathlib import Path
 
 from jax import export
 
-from benchmarks import pipeline
+from benchmarks import history, pipeline
 from jaxsense.run import files
 
 _BASELINE = pipeline.ROOT / ".ci" / "baseline.json"
@@ -118,9 +118,7 @@ def main() -> None:
     commit = baseline["commit"]
     has_commit = ["git", "-C", str(pipeline.ROOT), "cat-file", "-e", f"{commit}^{{commit}}"]
     if subprocess.run(has_commit, capture_output=True, check=False).returncode:
-        is_shallow = ["git", "-C", str(pipeline.ROOT), "rev-parse", "--is-shallow-repository"]
-        told = subprocess.run(is_shallow, capture_output=True, text=True, check=False).stdout
-        if told.strip() == "false":
+        if history.is_whole():
             sys.exit(f"{_BASELINE}: commit = {commit!r}: must be in the history")
         print(f"this checkout does not hold {commit}, the baseline: nothing is compared")
         return

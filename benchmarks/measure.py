@@ -188,9 +188,18 @@ def describe(results: Mapping[str, Any]) -> str:
     Args:
       results: with the keys of `origin`.
     """
+    return f"`{results['command']}`: {where(results)}"
+
+
+def where(results: Mapping[str, Any]) -> str:
+    """The end of that sentence: where and when, without the command.
+
+    Args:
+      results: with the keys of `origin`.
+    """
     at = ", ".join(f"{name} {number}" for name, number in results["versions"].items())
     return (
-        f"`{results['command']}`: {results['device']} with {results['cores']} cores; commit "
+        f"{results['device']} with {results['cores']} cores; commit "
         f"{str(results['commit'])[:10]} on {results['date']}; {at}."
     )
 

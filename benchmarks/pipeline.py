@@ -20,6 +20,14 @@ PROGRAM = "benchmarks.pipeline"
 ROOT = Path(__file__).parents[1]
 _MISSIONS = ["--policy", "naive", "--arena.num-pois", "16", "--arena.side", "6"]
 _GIB = 2**20  # kB
+Figures = Mapping[str, float]
+"""What a command needs, by the names of `Needs`."""
+KEYS = {
+    "seconds": ("seconds", "{:.1f}"),
+    "cpu_s": ("CPU seconds", "{:.0f}"),
+    "memory_gib": ("peak memory [GiB]", "{:.2f}"),
+}
+"""What each figure is called in tables, and its format."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,8 +90,9 @@ class Arguments:
     """The earlier tree."""
     commands: tuple[str, ...] = ("cold", "warm", "team", "missions")
     """Which ones. `noisy`, besides, is for accelerators."""
-    pairs: int = limited(1, at_least=1)
-    """How often each tree is measured; the medians count."""
+    pairs: int = limited(3, at_least=1)
+    """How often each tree is measured; the earlier one first in every other pair. The medians
+    count."""
     json: Path | None = None
     """File to write; must be new."""
 
@@ -158,40 +167,58 @@ def pairs(
 ) -> Iterator[tuple[str, Mapping[str, object]]]:
     """Yields each command's name, and what both trees need for it.
 
+    The earlier tree runs first in every other pair, so that a machine that slows down or warms up
+    favours neither.
+
     Args:
       arguments: of the program.
       before: the earlier tree.
       place: an empty directory.
     """
     for name in arguments.commands:
-        found: dict[str, list[dict[str, float]]] = {"before": [], "now": []}
+        found: dict[str, list[Figures]] = {"before": [], "now": []}
         for i in range(arguments.pairs):
-            for side, tree in (("before", before), ("now", ROOT)):
+            sides = [("before", before), ("now", ROOT)]
+            for side, tree in sides if i % 2 == 0 else reversed(sides):
                 own = place / f"{name}-{i}-{side}"
                 own.mkdir()
                 found[side].append(dataclasses.asdict(measured(tree, COMMANDS[name], own)))
                 print(f"{name}, {side}: {found[side][-1]}", file=sys.stderr)
-        yield name, found
+        yield name, {**found, "ratios": ratios(found)}
+
+
+def ratios(found: Mapping[str, Sequence[Figures]]) -> dict[str, dict[str, Any]]:
+    """What this tree needs relative to the earlier one: in each pair, and the median.
+
+    Args:
+      found: the pairs' figures, `before` and `now`.
+    """
+    in_turn = list(zip(found["before"], found["now"], strict=True))
+    of_pairs = {key: [now[key] / before[key] for before, now in in_turn] for key in KEYS}
+    return {key: {"pairs": x, "median": statistics.median(x)} for key, x in of_pairs.items()}
 
 
 def table(results: Mapping[str, Any]) -> str:
-    """What both trees need, and its ratio, in Markdown.
+    """What both trees need, and the ratio of each pair's figures, in Markdown: medians and range.
 
     Args:
       results: the content of the JSON file.
     """
-    commit = results["options"]["commit"][:10]
+    before, now = (str(of["commit"])[:10] for of in (results["options"], results))
     heads = ["command"]
-    for what in ("seconds", "CPU seconds", "peak memory [GiB]"):
-        heads += [f"{what}: {commit}", "now", "ratio"]
+    for what, _ in KEYS.values():
+        heads += [f"{what}: {before}", now, "ratio"]
     rows = []
     for name, found in results["commands"].items():
         cells = [COMMANDS[name].name]
-        for key, form in (("seconds", "{:.1f}"), ("cpu_s", "{:.0f}"), ("memory_gib", "{:.2f}")):
-            before, now = (
-                statistics.median(each[key] for each in found[side]) for side in ("before", "now")
-            )
-            cells += [form.format(before), form.format(now), f"{now / before:.2f}"]
+        for key, (_, form) in KEYS.items():
+            cells += [
+                form.format(statistics.median(each[key] for each in found[side]))
+                for side in ("before", "now")
+            ]
+            of_pairs = found["ratios"][key]["pairs"]
+            span = f" ({min(of_pairs):.2f} to {max(of_pairs):.2f})" if len(of_pairs) > 1 else ""
+            cells.append(f"{found['ratios'][key]['median']:.2f}{span}")
         rows.append(cells)
     return studies.with_origin(studies.as_table(heads, rows), results)
 

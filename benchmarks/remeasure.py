@@ -72,9 +72,7 @@ def _of_study(name: str, content: Any) -> Iterator[Measurement]:
 
 def _of_rows(name: str, rows: Any) -> Iterator[Measurement]:
     """Rows of the benchmark of speed, in one command."""
-    peers = " --peers" if any(row["theirs"] is not None for row in rows) else ""
-    command = f"python -m benchmarks {' '.join(row['row'] for row in rows)}{peers}"
-    yield _of(name, command, rows[0]["device"], rows[0]["versions"])
+    yield _of(name, results.command(rows), rows[0]["device"], rows[0]["versions"])
 
 
 def _of_tasks(name: str, rows: Any) -> Iterator[Measurement]:

@@ -4,6 +4,7 @@ Each table stands between two comments, of which the first names a file of `benc
 if that file makes several, the table.
 """
 
+import collections
 import json
 import re
 from collections.abc import Callable, Mapping
@@ -14,17 +15,19 @@ from typing import Any
 from benchmarks import (
     exported,
     gate,
+    history,
     imperfect_tables,
     kernels,
+    measure,
     pipeline,
     place,
     recorded,
     same_accuracy,
+    studies,
     travel,
     where,
 )
 from benchmarks.digits import table as digits
-from benchmarks.fusions import table as fusions
 from benchmarks.raw import report as raw
 from benchmarks.seeds import rows, tables
 from benchmarks.seeds.plan import GROUPS
@@ -37,6 +40,8 @@ PAGES = (
     *sorted((_HERE.parent / "docs").glob("*.md")),
     _HERE / "RESULTS.md",
 )
+ROWS = ("cpu.json", "h100.json", "h200.json", "h100x2.json")
+"""What `python -m benchmarks` has written."""
 _BLOCK = re.compile(
     r"(<!-- (?P<file>[\w-]+\.json)(?: (?P<table>[\w-]+))? -->\n).*?(<!-- end -->)", re.DOTALL
 )
@@ -44,6 +49,8 @@ _BLOCK = re.compile(
 
 def main() -> None:
     """The program."""
+    for name in ROWS:
+        history.note(RESULTS / name)
     for page in PAGES:
         page.write_text(written(page.read_text(encoding="utf-8")), encoding="utf-8")
 
@@ -59,23 +66,27 @@ def written(page: str) -> str:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Rows of one machine as Markdown, with where and when they were measured below."""
-    lines = [
-        "| row | ours | peer | theirs | ratio | at once |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
+    """Rows as Markdown, and below how each commit, machine and set of versions measured its own.
+
+    Args:
+      rows: as `python -m benchmarks` writes them and `history.note` adds to them.
+    """
+    heads = ["row", "ours", "peer", "theirs", "ratio", "at once", "commit"]
+    cells = []
     for row in rows:
         theirs = row["theirs"] is not None
-        cells = [
-            f"`{row['row']}`",
-            _ours(row),
-            row["peer"] or "" if theirs else "",
-            number(row["theirs"]) if theirs else "",
-            f"{number(row['ratio'])} x" if theirs else "",
-            f"{row['batch']:,}",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([*lines, "", _about(rows)])
+        cells.append(
+            [
+                f"`{row['row']}`",
+                _ours(row),
+                row["peer"] or "" if theirs else "",
+                number(row["theirs"]) if theirs else "",
+                f"{number(row['ratio'])} x" if theirs else "",
+                f"{row['batch']:,}",
+                row["commit"][:10] + (", changed since" if row.get("changed") else ""),
+            ]
+        )
+    return "\n\n".join([studies.as_table(heads, cells), *_origins(rows)])
 
 
 def _ours(row: dict[str, Any]) -> str:
@@ -84,18 +95,22 @@ def _ours(row: dict[str, Any]) -> str:
     return ", ".join(f"{number(value)} {unit}" for unit, value in units.items())
 
 
-def _about(rows: list[dict[str, Any]]) -> str:
-    """Machine, commit, day and versions, one of each unless rows differ."""
-    device = max({row["device"] for row in rows}, key=len)
-    versions = {name: at for row in rows for name, at in row["versions"].items()}
-    commits = dict.fromkeys(f"{row['commit'][:10]} on {row['date']}" for row in rows)
-    command = f"python -m benchmarks {' '.join(row['row'] for row in rows)}"
+def _origins(rows: list[dict[str, Any]]) -> list[str]:
+    """A sentence for all rows that were measured together, with the command that measures them."""
+    groups = collections.defaultdict[str, list[dict[str, Any]]](list)
+    for row in rows:
+        groups[measure.where(row)].append(row)
+    return [f"`{command(group)}`: {origin}" for origin, group in groups.items()]
+
+
+def command(rows: list[dict[str, Any]]) -> str:
+    """Measures rows again.
+
+    Args:
+      rows: as `python -m benchmarks` writes them.
+    """
     peers = " --peers" if any(row["theirs"] is not None for row in rows) else ""
-    return (
-        f"`{command}{peers}`: {device} with {rows[0]['cores']} cores; commit {', '.join(commits)}; "
-        + ", ".join(f"{name} {at}" for name, at in versions.items())
-        + "."
-    )
+    return f"python -m benchmarks {' '.join(row['row'] for row in rows)}{peers}"
 
 
 def number(value: float) -> str:
@@ -113,9 +128,8 @@ _PIPELINE = [
     f"pipeline{of}.json" for of in ("", "_newest", "_missions", "_accelerator", "_evaluation")
 ]
 TABLES: Mapping[str, _Tables] = {
-    **{name: {None: table} for name in ("cpu.json", "h100.json", "h200.json", "h100x2.json")},
+    **{name: {None: table} for name in ROWS},
     "digits.json": {None: digits.of_results},
-    "fusions.json": {None: fusions.of_results},
     "seeds.json": {
         "readme": partial(tables.of_presets, rows=rows.OF_README, presets=("paper", "default")),
         "worth": partial(tables.worth, names=tables.EVALUATED),

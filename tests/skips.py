@@ -13,6 +13,8 @@ EXPECTED = (
     "mrpt-common",
     "Python 3.11 is not installed",
     "Python 3.12 is not installed",
+    # Away from the source, or in a shallow clone.
+    "the whole history",
 )
 """How the reasons of expected skips begin."""
 

@@ -31,7 +31,7 @@ class Arguments:
     missions: int = limited(128, at_least=0, at_most=1024)
     """Missions of each fusion and seed. Without any, no policies are trained either: only the NLL
     after looks is measured, in minutes."""
-    out: Path | None = None
+    json: Path | None = None
     """JSON file to write; must be new."""
 
     def __post_init__(self):
@@ -58,8 +58,8 @@ def _command(arguments: Arguments) -> str:
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    if arguments.out is not None:
-        reserve(PROGRAM, "out", arguments.out)
+    if arguments.json is not None:
+        reserve(PROGRAM, "json", arguments.json)
     workers = devices.start(None)
     console = rich.console.Console(stderr=True)
     config = settings(arguments.preset)
@@ -78,14 +78,14 @@ def main(argv: list[str] | None = None) -> None:
         found |= zip(others, executor.map(measure, others), strict=True)
     fusions = summarise(found, sizes(config))
     optimal = means(found, "optimal") if arguments.missions else {}
-    if arguments.out is not None:
+    if arguments.json is not None:
         results = {
             **origin(_command(arguments)),
             "optimal": optimal,
             "fusions": fusions,
             "seeds": found,
         }
-        arguments.out.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+        arguments.json.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
     print(as_markdown(fusions))
     print(*(f"optimal {figure}: {x['mean']:.3f}" for figure, x in optimal.items()), sep="\n")
 

@@ -205,7 +205,7 @@ def test_an_existing_file_is_not_overwritten(tmp_path, capsys):
     path = tmp_path / "out.json"
     path.write_text("precious")
     with pytest.raises(SystemExit):
-        __main__.main(["--out", str(path)])
+        __main__.main(["--json", str(path)])
     assert path.read_text() == "precious"
     assert "already exists; must be new" in capsys.readouterr().err
 
@@ -213,7 +213,7 @@ def test_an_existing_file_is_not_overwritten(tmp_path, capsys):
 @pytest.mark.slow  # compiles trainings and missions of five fusions
 def test_the_whole_benchmark_at_tiny_size(tmp_path, capsys):
     path = tmp_path / "out.json"
-    __main__.main(f"--preset smoke --seeds 0-1 --missions 2 --out {path}".split())
+    __main__.main(f"--preset smoke --seeds 0-1 --missions 2 --json {path}".split())
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"|  | {' | '.join(study.KINDS)} |"
     figures = {

@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from benchmarks import pipeline
+from benchmarks import pipeline, results
 from benchmarks.pipeline import Command, Needs
 from jaxsense import init, train
 
@@ -53,16 +53,43 @@ def test_the_policies_of_the_run_play_among_as_many_pois_as_the_evaluation_has()
     assert learned.agent.plays(16)
 
 
-def test_the_table_holds_medians_and_their_ratios(ran, tmp_path, monkeypatch, capsys):
+def test_pairs_take_turns_at_being_first_and_the_median_of_their_ratios_counts(
+    ran, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(pipeline, "unpack", lambda commit, folder: None)
     out = tmp_path / "pipeline.json"
-    pipeline.main(["0123456789ab", "--commands", "cold", "--pairs", "3", "--json", str(out)])
-    assert [words[0] for words in ran] == ["before", pipeline.ROOT.name] * 3
-    line = "| `train`, cold | 3.0 | 4.0 | 1.33 | 6 | 8 | 1.33 | 0.50 | 0.50 | 1.00 |"
-    shown = pipeline.table(json.loads(out.read_text()))
+    pipeline.main(["0123456789ab", "--commands", "cold", "--json", str(out)])
+    now = pipeline.ROOT.name
+    assert [words[0] for words in ran] == ["before", now, now, "before", "before", now]
+    stored = json.loads(out.read_text())
+    # Seconds: 1 and 2, then 4 and 3, then 5 and 6.
+    ratios = stored["commands"]["cold"]["ratios"]
+    assert ratios["seconds"] == {"pairs": [2.0, 0.75, 1.2], "median": 1.2}
+    assert ratios["cpu_s"] == ratios["seconds"]
+    assert ratios["memory_gib"] == {"pairs": [1.0, 1.0, 1.0], "median": 1.0}
+    line = (
+        "| `train`, cold | 4.0 | 3.0 | 1.20 (0.75 to 2.00) | 8 | 6 | 1.20 (0.75 to 2.00) "
+        "| 0.50 | 0.50 | 1.00 (1.00 to 1.00) |"
+    )
+    shown = pipeline.table({**stored, "commit": "fedcba9876543210"})
     assert line in shown
-    assert "| command | seconds: 0123456789 | now | ratio |" in shown
-    assert shown in capsys.readouterr().out
+    assert "| command | seconds: 0123456789 | fedcba9876 | ratio |" in shown
+    assert pipeline.table(stored) in capsys.readouterr().out
+
+
+def test_one_pair_has_no_range(ran, tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline, "unpack", lambda commit, folder: None)
+    out = tmp_path / "pipeline.json"
+    pipeline.main(["0123456789ab", "--commands", "cold", "--pairs", "1", "--json", str(out)])
+    line = "| `train`, cold | 1.0 | 2.0 | 2.00 | 2 | 4 | 2.00 | 0.50 | 0.50 | 1.00 |"
+    assert line in pipeline.table(json.loads(out.read_text()))
+
+
+@pytest.mark.parametrize("name", results._PIPELINE)
+def test_stored_ratios_are_those_of_their_pairs(name):
+    stored = json.loads((results.RESULTS / name).read_text(encoding="utf-8"))
+    for found in stored["commands"].values():
+        assert found["ratios"] == pipeline.ratios(found)
 
 
 @pytest.mark.parametrize(

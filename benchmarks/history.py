@@ -1,0 +1,108 @@
+"""Whether the code that rows measured has changed since the commits that they name."""
+
+import ast
+import json
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "jaxsense"
+_BODIES = ("sim/amiro.py", "sim/arena.py")
+_MOTION = (*_BODIES, "mission/groups.py", "mission/motion.py", "mission/navigation.py")
+_RAYS = ("sim/raycast.py",)
+_STEPS = ("looks.py", "mission", "models.py", "sim", "vae")
+_MISSIONS = (*_STEPS, "run/batches.py", "run/missions.py")
+_MAP = ("dqn/map_mdp.py", "vae/filter.py", "vae/fusion.py")
+_LEARNING = (*_MAP, "dqn/losses.py", "dqn/map_agent.py", "dqn/replay.py", "dqn/training.py")
+CODE: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(("physics", "physics_batch", "physics_warp", "physics_devices"), _BODIES),
+    **dict.fromkeys(("physics_solver", "physics_solver_batch", "physics_solver_warp"), _BODIES),
+    **dict.fromkeys(("physics_contacts", "physics_contacts_warp"), _MOTION),
+    **dict.fromkeys(("rays", "rays_warp", "rays_warp_bvh"), _RAYS),
+    **dict.fromkeys(("missions_under_way", "missions_many_under_way", "resets_many"), _STEPS),
+    **dict.fromkeys(("missions", "missions_devices"), _MISSIONS),
+    **dict.fromkeys(("missions_many", "missions_many_devices"), _MISSIONS),
+    "jmvae": ("core/networks.py", "core/supervised.py", "vae/gaussian.py", "vae/jmvae.py"),
+    **dict.fromkeys(("dqn_rejax", "dqn_sb3", "dqn_seeds"), _LEARNING),
+    **dict.fromkeys(("time_to_optimal_rejax", "time_to_optimal_sb3"), _LEARNING),
+    "dqn_live": (*_LEARNING, "looks.py", "sim", "vae/detectors.py"),
+    "team_mdp": (*_MAP, "dqn/team_mdp.py"),
+    **dict.fromkeys(("train", "train_warm"), (".",)),
+}
+"""Files and folders of the package that each row measures."""
+
+
+def is_whole() -> bool:
+    """Whether this is a checkout that holds all earlier commits."""
+    return (ROOT / ".git").exists() and _git("rev-parse", "--is-shallow-repository") == "false\n"
+
+
+def commits() -> list[str]:
+    """Hashes of the present commit and of all before it."""
+    return (_git("rev-list", "HEAD") or "").split()
+
+
+def has_changed(row: str, commit: str) -> bool:
+    """Whether the code that a row measures has changed, in more than what `program` leaves out.
+
+    Args:
+      row: its name.
+      commit: that it was measured by, of the history.
+    """
+    places = [f"{PACKAGE}/{place}" for place in CODE[row]]
+    paths = (_git("diff", "--name-only", commit, "--", *places) or "").split()
+    return any(_before(commit, path) != _now(path) for path in paths if path.endswith(".py"))
+
+
+def note(path: Path) -> None:
+    """Notes in each row of a file whether its code has changed, if the history is here to tell.
+
+    Args:
+      path: of the rows, as `python -m benchmarks` writes them.
+    """
+    if is_whole():
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        noted = [{**row, "changed": has_changed(row["row"], row["commit"])} for row in rows]
+        path.write_text(json.dumps(noted, indent=2) + "\n", encoding="utf-8")
+
+
+def program(source: str) -> str:
+    """What a module computes, without comments, docstrings, imports and types.
+
+    Args:
+      source: its text.
+    """
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.arg | ast.AnnAssign):
+            node.annotation = None  # pyright: ignore[reportAttributeAccessIssue]
+        if isinstance(node, ast.FunctionDef):
+            node.returns = None
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            # What is imported for types alone cannot be told from the rest.
+            node.body = [each for each in node.body if not _is_text(each)]
+    return ast.dump(tree)
+
+
+def _is_text(node: ast.stmt) -> bool:
+    """Whether a statement is a string or an import."""
+    is_string = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    return is_string or isinstance(node, ast.Import | ast.ImportFrom)
+
+
+def _before(commit: str, path: str) -> str | None:
+    source = _git("show", f"{commit}:{path}")
+    return None if source is None else program(source)
+
+
+def _now(path: str) -> str | None:
+    file = ROOT / path
+    return program(file.read_text(encoding="utf-8")) if file.exists() else None
+
+
+def _git(*words: str) -> str | None:
+    """What git prints; None if it fails."""
+    git = ["git", "-C", str(ROOT), *words]
+    found = subprocess.run(git, capture_output=True, encoding="utf-8", check=False)
+    return None if found.returncode else found.stdout
