@@ -1,7 +1,6 @@
 """Trainings side by side, whose calls of a program are made as one."""
 
 import time
-import weakref
 from concurrent.futures import ThreadPoolExecutor, wait
 
 import jax
@@ -137,13 +136,6 @@ def test_every_training_hears_why_there_is_no_program(shared):
     assert [str(error) for error in errors] == ["no such policy"] * 2
 
 
-def test_released_programs_are_let_go_of(shared):
-    program, _ = shared(Trainings(2))
-    compiled = weakref.ref(program.wait())
-    program.release()
-    assert compiled() is None
-
-
 @pytest.mark.parametrize("where", ["stack", "call", "split"])
 def test_an_error_of_a_call_reaches_all_who_made_it(shared, monkeypatch, where):
     program, _ = shared(Trainings(2))
@@ -236,7 +228,7 @@ def test_trainings_side_by_side_are_those_alone(train, alone):
 
 def test_a_training_that_fails_leaves_those_side_by_side(train, alone):
     reached = {seed: max(outputs.values()).item() for seed, outputs in alone.items()}
-    *others, failing = sorted(reached, key=reached.get)
+    *others, failing = sorted(reached, key=lambda seed: reached[seed])
     farthest = (reached[others[-1]] + reached[failing]) / 2
     found, steps = train([0, 1, 2], number=3, farthest=farthest)
     assert "loss = nan at step" in str(found[failing])
