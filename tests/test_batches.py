@@ -5,7 +5,9 @@ from dataclasses import replace
 import jax
 import pytest
 
-from jaxsense.config import PRESETS
+import jaxsense
+from jaxsense import mission
+from jaxsense.config import PRESETS, CommunicationConfig, ConfigError
 from jaxsense.run import batches, devices
 from jaxsense.run.devices import Workers
 
@@ -14,14 +16,81 @@ MANY = replace(CONFIG, arena=replace(CONFIG.arena, num_pois=16, side=6.0))
 GIB = 2**30
 
 
+def crowded(config, num_pois=64, robots=32, distances=20, own_maps=True):
+    """Settings of missions with the most PoIs, robots and viewpoints, or with fewer."""
+    distances = tuple(0.6 + 0.01 * i for i in range(distances))
+    own = replace(config.mission, communication=CommunicationConfig(own_maps=own_maps))
+    return replace(
+        config,
+        arena=replace(config.arena, num_pois=num_pois, side=10.0),
+        robots=robots * ("camera", "lidar"),
+        navigation=replace(config.navigation, view_distances=distances),
+        jmvae=replace(config.jmvae, fusion="filter"),
+        mission=own,
+    )
+
+
+LARGEST = crowded(PRESETS["many"])
+
+
+def bytes_of_state(config):
+    """Bytes of a mission's state, without simulating one."""
+    scenario = mission.make_mission(config)
+
+    def begin(key):
+        return mission.reset(key, scenario, jaxsense.init(key, config))
+
+    state = jax.eval_shape(begin, jax.random.key(0))
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
+
+
 def test_a_cpu_plays_what_its_caches_hold_and_at_most_a_third_at_once():
     assert batches.batch_of(CONFIG, 10_000) == 192
     assert batches.batch_of(CONFIG, 10_000, Workers(threads=2)) == 384
     assert batches.batch_of(CONFIG, 30, Workers(threads=2)) == 10
     assert batches.batch_of(CONFIG, 1) == 1
     # A roadmap of 60 PoIs takes 2.6 MB, of which 64 MiB hold 25.
-    crowded = replace(MANY, arena=replace(MANY.arena, num_pois=60, side=20.0))
-    assert batches.batch_of(crowded, 10_000) == 25
+    large = replace(MANY, arena=replace(MANY.arena, num_pois=60, side=20.0))
+    assert batches.batch_of(large, 10_000) == 25
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        pytest.param(MANY, id="PoIs"),
+        pytest.param(crowded(CONFIG, num_pois=16, distances=2, own_maps=False), id="robots"),
+        pytest.param(crowded(CONFIG, num_pois=8, distances=2), id="maps"),
+        pytest.param(LARGEST, id="largest", marks=pytest.mark.slow),
+    ],
+)
+def test_what_is_counted_is_what_a_mission_takes(config):
+    assert batches._bytes_of_state(config) == pytest.approx(bytes_of_state(config), rel=0.1)
+
+
+def test_the_largest_missions_fit_into_the_memory(monkeypatch):
+    of_one = batches._bytes_of_state(LARGEST)
+    assert of_one < GIB // 32
+    assert batches.batch_of(LARGEST, 10**6) == 8  # a quarter of a GiB
+    for memory in (GIB, 80 * GIB):
+        monkeypatch.setattr(devices, "memory", lambda: memory)  # noqa: B023
+        batch = batches.batch_of(LARGEST, 10**6)
+        assert 1 < batch <= 0.05 * memory / of_one < batch + 1
+    monkeypatch.setattr(devices, "memory", lambda: 2 * of_one)
+    assert batches.batch_of(LARGEST, 10**6) == 1
+
+
+@pytest.mark.parametrize(
+    ("larger", "expected"),
+    [
+        ({"num_pois": 65}, "arena.num_pois = 65: must be from 1 to 64"),
+        ({"robots": 33}, r"robots = \('camera', .*: must have 1 to 64 values"),
+        ({"distances": 21}, r"navigation.view_distances = \(0.6, .*: must have 1 to 20 values.*"),
+    ],
+)
+def test_missions_that_are_larger_are_refused(larger, expected):
+    # One line: the dot stands for no line break.
+    with pytest.raises(ConfigError, match=f"^{expected}$"):
+        crowded(PRESETS["many"], **larger)
 
 
 @pytest.mark.parametrize(

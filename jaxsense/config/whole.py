@@ -204,10 +204,14 @@ class Config(Section):
         require(3 <= lidar.window <= most, lidar, "window", expected)
 
     def _check_memory(self) -> None:
-        """No array that can become large may exceed a computer's memory."""
+        """No array that can become large may exceed a computer's memory.
+
+        Missions need no check: limits of PoIs, robots and viewpoints bound the state of one, and as
+        many play side by side as the memory holds.
+        """
         sections: list[Section] = [
             *(self.detector, self.jmvae, self.filter, self.team.tours),
-            *(self.dqn, self.evaluation, self.mission),
+            *(self.dqn, self.evaluation),
         ]
         for section in sections:
             for fields, number in section.arrays(self._sizes()).items():

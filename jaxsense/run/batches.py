@@ -1,9 +1,14 @@
-"""How many missions play side by side, and for how long between two looks at them."""
+"""How many missions play side by side, and for how long between two looks at them.
+
+The batch follows from the memory, so that no check of the settings needs to count missions: the
+limits of PoIs, robots and viewpoints bound the state of one, and `batch_of` how many there are.
+"""
 
 import math
 
 from jaxsense.config import NODES_PER_POI, VIEW_SIDES, Config
 from jaxsense.core import checks
+from jaxsense.mission.memory import MOST_LOOKS
 from jaxsense.run import devices
 from jaxsense.run.devices import ALONE, Workers
 
@@ -32,8 +37,9 @@ def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
       workers: share the missions.
 
     Returns:
-      Fewer than all, since some last long: on a CPU no more than its caches hold; on an accelerator
-      more, the more there are, as far as they fit into a small part of its memory.
+      Fewer than all, since some last long: on a CPU no more than its caches hold, but at least a
+      few; on an accelerator more, the more there are, as far as they fit into a small part of its
+      memory.
 
     Raises:
       ValueError: if `total` is not a number greater than 0.
@@ -43,16 +49,20 @@ def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
     if memory is None:
         most = min(_MOST_OF_CPU, max(_LEAST_OF_CPU, _CACHE // _bytes_of_state(config)))
         return min(most * workers.number, -(-total // 3))
-    share = int(_SHARE_OF_MEMORY * memory) // _bytes_of_state(config)
+    share = max(1, int(_SHARE_OF_MEMORY * memory) // _bytes_of_state(config))
     pays = math.isqrt(_AS_LONG_AS_NONE * total * workers.number)
     return min(total, pays, min(_MOST_OF_ACCELERATOR, share) * workers.number)
 
 
 def _bytes_of_state(config: Config) -> int:
-    """Bytes of a mission's roadmap and some more, about as many as its state takes."""
+    """Bytes of a mission's state, roughly: of its roadmap, its robots' maps and some more."""
+    robots, num_classes = len(config.carried), len(config.arena.classes)
     views = config.arena.num_pois * VIEW_SIDES * len(config.navigation.view_distances)
     nodes = config.arena.num_pois * NODES_PER_POI
-    return 2**13 + 4 * nodes**2 + nodes * views
+    numbers = nodes * (nodes + robots)
+    if config.mission.communication.own_maps:
+        numbers += robots * MOST_LOOKS * (robots + 2 * num_classes)
+    return 2**13 + 4 * numbers + nodes * views
 
 
 def runs_long(config: Config, total: int) -> bool:

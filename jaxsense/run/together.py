@@ -136,21 +136,24 @@ class SharedProgram:
             return calls
 
     def _run(self, calls: list[_Call]) -> None:
-        """Makes several calls as one, padded with copies of the first."""
-        rows = [args for args, _ in calls]
-        rows += rows[:1] * (self._trainings.number - len(rows))
-        stacked = [
-            column[0] if i in self._whole else jax.tree.map(lambda *x: jnp.stack(x), *column)
-            for i, column in enumerate(zip(*rows, strict=True))
-        ]
+        """Makes several calls as one; all of them get its error, if it has one."""
         try:
-            results = self._program(*stacked)
+            results = self._program(*self._stacked([args for args, _ in calls]))
+            of_each = [jax.tree.map(lambda x: x[i], results) for i in range(len(calls))]  # noqa: B023
         except BaseException as error:
             for _, future in calls:
                 future.set_exception(error)
             return
-        for i, (_, future) in enumerate(calls):
-            future.set_result(jax.tree.map(lambda x: x[i], results))  # noqa: B023
+        for (_, future), result in zip(calls, of_each, strict=True):
+            future.set_result(result)
+
+    def _stacked(self, rows: list[tuple[PyTree, ...]]) -> list[PyTree]:
+        """Arguments of several calls as those of one, padded with copies of the first."""
+        rows += rows[:1] * (self._trainings.number - len(rows))
+        return [
+            column[0] if i in self._whole else jax.tree.map(lambda *x: jnp.stack(x), *column)
+            for i, column in enumerate(zip(*rows, strict=True))
+        ]
 
 
 def _with_rows(x: jax.ShapeDtypeStruct, number: int) -> jax.ShapeDtypeStruct:

@@ -53,6 +53,25 @@ def test_expected_rewards_average_over_the_draws():
     assert len(np.unique(rewards)) == 12
 
 
+@pytest.mark.parametrize("num_draws", [256, 300])
+def test_expected_rewards_in_parts_are_those_of_all_looks_at_once(num_draws, monkeypatch):
+    mdp = noisy_mdp()  # every look gains a uniform number of its own
+    sizes = []
+
+    def at_once(function, looks, batch_size):
+        sizes.append((len(looks[0]), batch_size))
+        return jax.vmap(function)(looks)
+
+    def rewards():
+        return jax.jit(lambda: reference.expected_rewards(KEY, mdp, 0, num_draws=num_draws))()
+
+    in_parts = rewards()
+    monkeypatch.setattr(jax.lax, "map", at_once)
+    np.testing.assert_array_equal(in_parts, rewards())
+    # Looks by two modalities at three classes: 3 parts of 1,024, or these and a rest of 528.
+    assert sizes == [(4 * 3 * num_draws, 1024)]
+
+
 @pytest.mark.parametrize(
     ("rewards_of_classes", "expected"),
     [

@@ -1,4 +1,4 @@
-"""The recording of the first mission, however missions are split over devices."""
+"""Missions in batches: their results and the recording of the first, however they are split."""
 
 import dataclasses
 import importlib
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, NAIVE
+from teams import CONFIG, NAIVE, with_config
 
 from jaxsense import mission
 from jaxsense.core.types import Belief
@@ -22,6 +22,7 @@ from jaxsense.run.monitor import Monitor, StageError
 ROLLOUT = importlib.import_module("jaxsense.mission.rollout")
 KEY = jax.random.key(5)
 CHUNK = batches.chunk_of(CONFIG)
+SHORT = dataclasses.replace(CONFIG.mission, time_limit=30.0)
 LAST = 2 * CHUNK - 3  # control periods, within the second chunk
 
 
@@ -154,6 +155,26 @@ def test_results_do_not_depend_on_how_many_missions_play_at_once(split, play, mo
     chex.assert_trees_all_equal(few.recording, many.recording)
 
 
+@pytest.mark.slow  # the physics of two batch sizes is compiled
+def test_missions_with_physics_do_not_depend_on_how_many_play_at_once(team, models):
+    short = with_config(team, dataclasses.replace(CONFIG, mission=SHORT))
+    every = mission.cases(CONFIG)
+    cases = {name: every[name] for name in ("latent", "naive")}
+
+    def play(batch):
+        with Compiler(Monitor()) as compiler:
+            player = missions.Player(short, compiler, batch)
+            return player.play(KEY, models, cases, episodes=32)
+
+    few, many = play(8), play(64)
+    assert few.control_steps == many.control_steps
+    assert len(set(many.metrics["naive"]["time_s"].tolist())) > 3
+    # Products of more rows may be summed in another order: some last bits of 24, in every look.
+    for here, there in zip(*map(jax.tree.leaves, (few.metrics, many.metrics)), strict=True):
+        is_exact = here.dtype.kind != "f"
+        np.testing.assert_allclose(here, there, rtol=0 if is_exact else 1e-5)
+
+
 def test_a_map_that_is_not_finite_ends_the_missions(play, monkeypatch):
     def diverging(keys, team, models, states, parts):
         states, record = fake_step(keys, team, models, states, parts)
@@ -181,5 +202,4 @@ def test_values_that_are_not_finite_end_the_missions(play, monkeypatch):
 
 
 def test_a_short_time_limit_changes_no_program():
-    short = dataclasses.replace(CONFIG.mission, time_limit=1.0)
-    assert batches.chunk_of(dataclasses.replace(CONFIG, mission=short)) == CHUNK
+    assert batches.chunk_of(dataclasses.replace(CONFIG, mission=SHORT)) == CHUNK
