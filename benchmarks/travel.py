@@ -19,7 +19,7 @@ from jaxsense import Config, Models, mission
 from jaxsense.config import TravelConfig
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
-from jaxsense.dqn import team_mdp
+from jaxsense.dqn.travel import travel_seconds
 from jaxsense.run import cli
 
 PROGRAM = "benchmarks.travel"
@@ -131,7 +131,7 @@ def trips(config: Config, models: Models) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _predict(travel: TravelConfig, poses: np.ndarray, places: np.ndarray) -> jax.Array:
-    return jax.vmap(lambda pose, place: team_mdp.travel_seconds(travel, pose, place[None])[0])(
+    return jax.vmap(lambda pose, place: travel_seconds(travel, pose, place[None])[0])(
         jnp.asarray(poses), jnp.asarray(places)
     )
 
