@@ -70,6 +70,11 @@ class TeamState:
     looked: jax.Array
     seconds: jax.Array
 
+    @property
+    def teams(self) -> "tuple[TeamState]":
+        """States of teams in it: itself; a `MapState` has none."""
+        return (self,)
+
 
 Names = tuple[str, ...]
 """Names of the sensors, in the order of their indices."""
