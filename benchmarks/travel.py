@@ -43,8 +43,7 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     config, models = studies.load(PROGRAM, arguments.run)
-    if arguments.json is not None:
-        measure.reserve(PROGRAM, "json", arguments.json)
+    measure.reserve(PROGRAM, "json", arguments.json)
     poses, places, taken = trips(config, models)
     results = {
         **studies.origin(PROGRAM, arguments),
