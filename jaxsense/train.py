@@ -23,7 +23,7 @@ from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, command, read_some
-from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
+from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds, version
 from jaxsense.run.clock import Clock, process_start
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
@@ -32,7 +32,6 @@ from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
 from jaxsense.run.together import Trainings
-from jaxsense.run.version import versions
 from jaxsense.show import tables, tensorboard
 from jaxsense.show.artist import Artist
 from jaxsense.show.terminal import Display, print_table, say
@@ -374,7 +373,7 @@ def _header(run: RunDirectory) -> Header:
     return {
         "preset": run.settings.preset,
         "seed": run.settings.seed,
-        "versions": versions(),
+        "versions": version.versions(),
         "devices": [device.device_kind for device in jax.devices()],
         "cores": os.cpu_count() or 1,
         "date": datetime.date.today().isoformat(),
