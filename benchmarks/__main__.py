@@ -13,7 +13,7 @@ import rich.console
 import rich.table
 
 from benchmarks import ROWS
-from benchmarks.measure import Options, Row, reserve
+from benchmarks.measure import Options, Row, require_known, reserve
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
 from jaxsense.run import cli
@@ -42,11 +42,8 @@ class Arguments:
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    for name in arguments.names:
-        if name not in ROWS:
-            cli.fail(PROGRAM, f"name = {name!r}: must be one of {', '.join(ROWS)}")
-    if arguments.json is not None:
-        reserve(PROGRAM, "json", arguments.json)
+    require_known(PROGRAM, "name", arguments.names, ROWS)
+    reserve(PROGRAM, "json", arguments.json)
     # A device for each core. Called from another program, the devices may be fixed already.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", os.cpu_count())

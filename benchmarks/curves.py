@@ -284,8 +284,7 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     config, models = studies.load(PROGRAM, arguments.run)
-    if arguments.json is not None:
-        reserve(PROGRAM, "json", arguments.json)
+    reserve(PROGRAM, "json", arguments.json)
     train_key, play_key = jax.random.split(jax.random.key(arguments.seed))
     priced = of_costs(train_key, config, models, jnp.array(arguments.costs))
     own = {f"naive_{k}": Policy(policies.naive(k), is_unordered=True) for k in (4, NAIVE)}

@@ -266,8 +266,7 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     devices.start(None)
-    if arguments.json is not None:
-        reserve(PROGRAM, "json", arguments.json)
+    reserve(PROGRAM, "json", arguments.json)
     results = measure(arguments)
     studies.write(arguments.json, results)
     print(table(results))

@@ -256,8 +256,7 @@ def _table(results: Mapping[str, Any], cell: Callable[[str, str, str], str]) -> 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    if arguments.json is not None:
-        reserve(PROGRAM, "json", arguments.json)
+    reserve(PROGRAM, "json", arguments.json)
     results = measure_all(arguments)
     studies.write(arguments.json, results)
     print((of_search if arguments.search.applies else table)(results))

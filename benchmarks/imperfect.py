@@ -297,8 +297,7 @@ def main(argv: list[str] | None = None) -> None:
         changed(config, {"localisation": LocalisationConfig(search=arguments.search)})
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
-    if arguments.json is not None:
-        reserve(PROGRAM, "json", arguments.json)
+    reserve(PROGRAM, "json", arguments.json)
     origin = studies.origin(PROGRAM, arguments)
     results = {**origin, **measure(arguments, changed(config, exact), models)}
     studies.write(arguments.json, results)

@@ -72,11 +72,8 @@ class Part:
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    for name in arguments.cases:
-        if name not in CASES:
-            cli.fail(PROGRAM, f"cases = {name!r}: must be one of {', '.join(CASES)}")
-    if arguments.json is not None:
-        measure.reserve(PROGRAM, "json", arguments.json)
+    measure.require_known(PROGRAM, "cases", arguments.cases, CASES)
+    measure.reserve(PROGRAM, "json", arguments.json)
     jax.config.update("jax_default_matmul_precision", "highest")
     results: dict[str, Any] = {
         **measure.origin(studies.command(PROGRAM, arguments)),

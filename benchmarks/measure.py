@@ -7,7 +7,7 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -291,14 +291,31 @@ def seconds(run: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def reserve(program: str, option: str, path: Path) -> None:
+def require_known(program: str, option: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """Ends the program if a name is unknown, before anything is measured.
+
+    Args:
+      program: module that runs.
+      option: that holds the names.
+      names: what to check.
+      known: all that there are.
+    """
+    known = list(known)
+    for name in names:
+        if name not in known:
+            cli.fail(program, f"{option} = {name!r}: must be one of {', '.join(known)}")
+
+
+def reserve(program: str, option: str, path: Path | None) -> None:
     """Makes an empty list of results, or ends the program, before anything is measured.
 
     Args:
       program: module that runs.
       option: that names the file.
-      path: of the file; must be new.
+      path: of the file, which must be new; None if nobody asked for one.
     """
+    if path is None:
+        return
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write("[]\n")

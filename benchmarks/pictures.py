@@ -14,7 +14,7 @@ from typing import Annotated, Protocol
 
 from matplotlib.figure import Figure
 
-from benchmarks import commands, results, same_accuracy
+from benchmarks import commands, measure, results, same_accuracy
 from benchmarks.seeds.plan import GROUPS
 from benchmarks.tasks import jobs, plot, record
 from jaxsense.config.options import Name
@@ -240,9 +240,7 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     of_name = {Path(picture).name: x for x in DRAWINGS for picture in x.pictures}
-    for name in arguments.names:
-        if name not in of_name:
-            cli.fail(PROGRAM, f"names = {name!r}: must be one of {', '.join(of_name)}")
+    measure.require_known(PROGRAM, "names", arguments.names, of_name)
     named = [x for x in DRAWINGS if any(of_name[name] is x for name in arguments.names)]
     if failed := draw(named or untrained()):
         sys.exit(f"not drawn: {', '.join(failed)}; they are as they were")

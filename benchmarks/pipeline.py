@@ -226,11 +226,8 @@ def table(results: Mapping[str, Any]) -> str:
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    for name in arguments.commands:
-        if name not in COMMANDS:
-            cli.fail(PROGRAM, f"commands = {name!r}: must be one of {', '.join(COMMANDS)}")
-    if arguments.json is not None:
-        measure.reserve(PROGRAM, "json", arguments.json)
+    measure.require_known(PROGRAM, "commands", arguments.commands, COMMANDS)
+    measure.reserve(PROGRAM, "json", arguments.json)
     results = {
         **measure.origin(studies.command(PROGRAM, arguments)),
         "options": {"commit": arguments.commit, "pairs": arguments.pairs},

@@ -225,8 +225,7 @@ def main(argv: list[str] | None = None) -> None:
         if len(config.labels(name)) > 2:
             expected = f"must tell two labels apart by {name}, not more"
             cli.fail(PROGRAM, str(ConfigError("run", arguments.run, expected)))
-    if arguments.json is not None:
-        reserve(PROGRAM, "json", arguments.json)
+    reserve(PROGRAM, "json", arguments.json)
     accuracy = accuracies(config, models)
     results = {
         **studies.origin(PROGRAM, arguments),

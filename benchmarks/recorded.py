@@ -227,8 +227,7 @@ def main(argv: list[str] | None = None) -> None:
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     config, models = studies.load(PROGRAM, arguments.run)
     scans = rawlog.read_logs(arguments.logs)
-    if arguments.json is not None:
-        reserve(PROGRAM, "json", arguments.json)
+    reserve(PROGRAM, "json", arguments.json)
     fitted = recorded.fit_noise(config.lidar, scans.angles, scans.ranges)
     results = {
         **studies.origin(PROGRAM, arguments),

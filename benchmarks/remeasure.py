@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from benchmarks import commands, pictures, results
+from benchmarks import commands, measure, pictures, results
 from jaxsense.config.options import Name
 from jaxsense.run import cli
 
@@ -155,9 +155,7 @@ def main(argv: list[str] | None = None) -> None:
         )
         for path in sorted(results.RESULTS.glob("*.json"))
     }
-    for name in arguments.names:
-        if name not in stored:
-            cli.fail(PROGRAM, f"names = {name!r}: must be one of {', '.join(stored)}")
+    measure.require_known(PROGRAM, "names", arguments.names, stored)
     chosen = [each for name in arguments.names or stored for each in stored[name]]
     if not arguments.names:
         chosen = here(chosen)

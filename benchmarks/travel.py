@@ -19,7 +19,7 @@ from jaxsense import Config, Models, mission
 from jaxsense.config import TravelConfig
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
-from jaxsense.dqn import team_mdp
+from jaxsense.dqn.travel import travel_seconds
 from jaxsense.run import cli
 
 PROGRAM = "benchmarks.travel"
@@ -43,8 +43,7 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     config, models = studies.load(PROGRAM, arguments.run)
-    if arguments.json is not None:
-        measure.reserve(PROGRAM, "json", arguments.json)
+    measure.reserve(PROGRAM, "json", arguments.json)
     poses, places, taken = trips(config, models)
     results = {
         **studies.origin(PROGRAM, arguments),
@@ -131,7 +130,7 @@ def trips(config: Config, models: Models) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _predict(travel: TravelConfig, poses: np.ndarray, places: np.ndarray) -> jax.Array:
-    return jax.vmap(lambda pose, place: team_mdp.travel_seconds(travel, pose, place[None])[0])(
+    return jax.vmap(lambda pose, place: travel_seconds(travel, pose, place[None])[0])(
         jnp.asarray(poses), jnp.asarray(places)
     )
 

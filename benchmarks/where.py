@@ -220,8 +220,7 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     config, models = studies.load(PROGRAM, arguments.run)
-    if arguments.json is not None:
-        reserve(PROGRAM, "json", arguments.json)
+    reserve(PROGRAM, "json", arguments.json)
     play_key = jax.random.key(arguments.seed)
     train_key = jax.random.fold_in(play_key, 1)
     own = Curves(play_key, config, arguments.episodes, only=arguments.policies)

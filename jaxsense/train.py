@@ -23,13 +23,14 @@ from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, command, read_some
-from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
+from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds, version
 from jaxsense.run.clock import Clock, process_start
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import OwnPolicies, Programs
-from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.run.rundir import RunDirectory
+from jaxsense.run.settings import Settings, read_settings, resumable
 from jaxsense.run.together import Trainings
 from jaxsense.show import tables, tensorboard
 from jaxsense.show.artist import Artist
@@ -203,9 +204,9 @@ def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     given = read_some(Arguments, argv, ("resume", "file", "trust", "preset"))
     is_trusted = given.get("trust") is True
     if isinstance(resume := given.get("resume"), Path):
-        return rundir.resumable(resume, is_trusted)
+        return resumable(resume, is_trusted)
     if isinstance(file := given.get("file"), Path):
-        return rundir.read_settings(file, is_trusted)
+        return read_settings(file, is_trusted)
     preset = str(given.get("preset", "default"))
     if preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
@@ -372,7 +373,7 @@ def _header(run: RunDirectory) -> Header:
     return {
         "preset": run.settings.preset,
         "seed": run.settings.seed,
-        "versions": rundir.versions(),
+        "versions": version.versions(),
         "devices": [device.device_kind for device in jax.devices()],
         "cores": os.cpu_count() or 1,
         "date": datetime.date.today().isoformat(),

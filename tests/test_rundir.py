@@ -13,7 +13,8 @@ import pytest
 
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import rundir, version
-from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.run.rundir import RunDirectory
+from jaxsense.run.settings import Settings, read_settings, resumable
 
 SETTINGS = Settings("smoke", 3, PRESETS["smoke"])
 
@@ -48,7 +49,7 @@ def test_a_directory_that_cannot_be_made_is_named(tmp_path):
 def test_of_two_that_want_one_directory_the_second_is_refused(tmp_path):
     path = tmp_path / "run"
     with RunDirectory.create(path, SETTINGS) as run:
-        assert rundir.read_settings(run.path / "config.json") == SETTINGS
+        assert read_settings(run.path / "config.json") == SETTINGS
         (path / "config.json").unlink()  # as if the first one had not yet come so far
         with (
             pytest.raises(ConfigError, match="is being written by another process"),
@@ -74,7 +75,7 @@ def test_a_directory_of_somebody_gets_no_lock(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-@pytest.mark.parametrize("opens", [rundir.resumable, rundir.load])
+@pytest.mark.parametrize("opens", [resumable, rundir.load])
 def test_a_config_that_has_changed_since_the_run_began_is_refused(tmp_path, opens):
     path = tmp_path / "run"
     with RunDirectory.create(path, SETTINGS):
@@ -83,7 +84,7 @@ def test_a_config_that_has_changed_since_the_run_began_is_refused(tmp_path, open
     file.write_text(file.read_text().replace('"seed": 3', '"seed": 7'), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"config.json has changed since the run began"):
         opens(path)
-    assert rundir.read_settings(file).seed == 7  # for another run
+    assert read_settings(file).seed == 7  # for another run
 
 
 def test_a_line_that_a_killed_process_has_left_is_cut(tmp_path):
@@ -109,7 +110,7 @@ def test_a_place_that_is_not_there_any_more_is_named(tmp_path):
 def test_a_config_that_is_no_file_is_not_read(tmp_path):
     os.mkfifo(tmp_path / "config.json")
     with pytest.raises(ConfigError, match="Not a regular file"):
-        rundir.read_settings(tmp_path / "config.json")
+        read_settings(tmp_path / "config.json")
 
 
 def test_a_directory_with_something_like_an_unfinished_file_is_somebodys(tmp_path):

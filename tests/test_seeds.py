@@ -15,7 +15,8 @@ from jaxsense.run import pipeline
 from jaxsense.run import seeds as of_seeds
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.compilation import Program
-from jaxsense.run.rundir import RunDirectory, read_settings
+from jaxsense.run.rundir import RunDirectory
+from jaxsense.run.settings import read_settings
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import pytest
 import jaxsense
 from jaxsense import evaluate, export, train
 from jaxsense.config import PRESETS, ConfigError, SensorConfig
-from jaxsense.run import rundir
-from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.run.rundir import RunDirectory
+from jaxsense.run.settings import Settings, read_settings, resumable
 
 REFUSED = (
     "sensors.thermal.make = 'trap:make': names code that would be run; "
@@ -44,8 +44,8 @@ def run(tmp_path):
 
 READERS = {
     "load": jaxsense.load,
-    "read_settings": lambda run, **trust: rundir.read_settings(run / "config.json", **trust),
-    "resume": rundir.resumable,
+    "read_settings": lambda run, **trust: read_settings(run / "config.json", **trust),
+    "resume": resumable,
     "open": lambda run, **trust: RunDirectory.resume(run, **trust).__enter__(),
 }
 
@@ -97,7 +97,7 @@ def test_a_run_that_names_no_code_needs_none(tmp_path):
     settings = Settings("smoke", 0, PRESETS["smoke"])
     with RunDirectory.create(tmp_path / "plain", settings) as created:
         path = created.path
-    assert rundir.read_settings(path / "config.json") == settings
+    assert read_settings(path / "config.json") == settings
 
 
 def test_a_seed_of_several_must_have_the_settings_of_all(tmp_path, capsys):

@@ -44,8 +44,7 @@ def main(argv: list[str] | None = None) -> None:
         digits = data.load()
     except ImportError as error:
         cli.fail(PROGRAM, str(error))
-    if arguments.json is not None:
-        measure.reserve(PROGRAM, "json", arguments.json)
+    measure.reserve(PROGRAM, "json", arguments.json)
     kinds, packages = dict(OURS), ()
     peer = peers.load("multivae_digits", measure.Options(peers=arguments.peers))
     if peer is not None:

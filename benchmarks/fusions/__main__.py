@@ -58,8 +58,7 @@ def _command(arguments: Arguments) -> str:
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    if arguments.json is not None:
-        reserve(PROGRAM, "json", arguments.json)
+    reserve(PROGRAM, "json", arguments.json)
     workers = devices.start(None)
     console = rich.console.Console(stderr=True)
     config = settings(arguments.preset)

@@ -93,8 +93,7 @@ def trained(
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    if arguments.json is not None:
-        measure.reserve(PROGRAM, "json", arguments.json)
+    measure.reserve(PROGRAM, "json", arguments.json)
     # The trainings consume the keys of the seeds.
     simulate_key = jax.random.fold_in(jax.random.key(arguments.first_seed), 1)
     looks = simulate(simulate_key, arguments.scans)

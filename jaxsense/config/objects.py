@@ -23,8 +23,18 @@ class Shape(Checked, place="shape"):
 
     def check(self) -> None:
         """Checks that a cylinder is round; raises `ConfigError`."""
-        is_round = self.primitive == "box" or self.half_sides[0] == self.half_sides[1]
-        require(is_round, self, "half_sides", "must be the same number twice for a cylinder")
+        fits = not self.is_round or self.half_sides[0] == self.half_sides[1]
+        require(fits, self, "half_sides", "must be the same number twice for a cylinder")
+
+    @property
+    def is_round(self) -> bool:
+        """Whether it is a cylinder."""
+        return self.primitive == "cylinder"
+
+    @property
+    def at_any_yaw(self) -> tuple[str | float, ...]:
+        """What sensors can distinguish it by, as a PoI may have any yaw."""
+        return self.primitive, *sorted(self.half_sides)
 
 
 class Attribute(Checked, place="attribute"):

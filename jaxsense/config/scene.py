@@ -82,14 +82,11 @@ class ArenaConfig(Section, place="arena"):
             require(is_known, self, "classes", f'{name!r} must be "{form}" with {kinds}')
         is_once = len(set(self.classes)) == len(self.classes)
         require(is_once, self, "classes", "must name no class twice")
-        for name in self._words:
+        shapes = {word: shape.at_any_yaw for word, shape in self.shapes.items()}
+        for name, values in {**self._words, "shape": shapes}.items():
             of_values: dict[object, str] = {}
             for word in self.labels(name):
-                value = self._words[name][word]
-                # A PoI may have any yaw.
-                turned = sorted(value.half_sides) if isinstance(value, Shape) else ()
-                same = (value.primitive, *turned) if isinstance(value, Shape) else value
-                twin = of_values.setdefault(same, word)
+                twin = of_values.setdefault(values[word], word)
                 expected = (
                     f"must not use both {twin!r} and {word!r}, which no sensor can distinguish"
                 )

@@ -124,6 +124,11 @@ class MapState:
         """The state itself; of a `TeamState`, that of the map."""
         return self
 
+    @property
+    def teams(self) -> tuple[()]:
+        """States of teams in it: none; a `TeamState` is one."""
+        return ()
+
 
 @pytree
 class Outcome:

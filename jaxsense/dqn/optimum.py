@@ -134,7 +134,8 @@ def _rows(sums, steps: int):
         [min(math.comb(n, k), 2**31 - 1) for k in range(size + 1)] for n in range(steps + size)
     ]
     ranks = np.broadcast_to(np.arange(size, 0, -1), sums.shape)
-    choose = np.array(table, np.int32) if isinstance(sums, np.ndarray) else jnp.array(table)
+    arrays = sums.__array_namespace__()  # of NumPy or of JAX
+    choose = arrays.asarray(table, dtype=np.int32)
     return choose[sums + ranks - 1, ranks].sum(axis=-1)
 
 

@@ -119,16 +119,18 @@ class Policy:
         return values[:-1] - values[-1]
 
 
+def as_policy(policy: Values | Policy) -> Policy:
+    """A custom policy, of which a function alone has only values."""
+    return policy if isinstance(policy, Policy) else Policy(policy)
+
+
 def table(own: Mapping[str, Values | Policy] | None = None) -> dict[str, Policy]:
     """All policies by name: `POLICIES`, then your own.
 
     Raises:
       ConfigError: if a custom policy has the name of one of `POLICIES`.
     """
-    wrapped = {
-        name: each if isinstance(each, Policy) else Policy(each)
-        for name, each in (own or {}).items()
-    }
+    wrapped = {name: as_policy(each) for name, each in (own or {}).items()}
     for name, each in wrapped.items():
         if POLICIES.get(name, each) is not each:
             raise ConfigError("policies", name, f"must not be {', '.join(POLICIES)}")

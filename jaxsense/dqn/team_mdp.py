@@ -6,8 +6,7 @@ chooses next. For each robot this is a semi-Markov decision process (Sutton, Pre
 Artificial Intelligence 112, Sec. 3): an action takes the time until its look. The robot earns the
 rewards of its own looks in the map MDP minus a price of each second, discounted by time.
 
-Travel times follow a model with the settings `TravelConfig`: a robot turns, drives straight until
-it is near enough, and looks.
+Travel times follow a model, see `travel`.
 """
 
 import dataclasses
@@ -24,6 +23,7 @@ from jaxsense.core.types import Belief, Index, Key, pytree
 from jaxsense.dqn import map_mdp
 from jaxsense.dqn.map_mdp import MapMdp, MapState, Outcome
 from jaxsense.dqn.places import Places
+from jaxsense.dqn.travel import move, travel_seconds
 
 TIME_SCALE = 10.0
 """Unit of travel times in observations, in seconds."""
@@ -69,6 +69,11 @@ class TeamState:
     agent: jax.Array
     looked: jax.Array
     seconds: jax.Array
+
+    @property
+    def teams(self) -> "tuple[TeamState]":
+        """States of teams in it: itself; a `MapState` has none."""
+        return (self,)
 
 
 Names = tuple[str, ...]
@@ -116,25 +121,6 @@ class TeamMdp:
         return self.config.second_cost * seconds * jnp.sum(team.works)
 
 
-def travel_seconds(
-    config: TravelConfig, pose: Float[Array, "3"], places: Float[Array, "N 2"]
-) -> Float[Array, " N"]:
-    """Time until a robot has looked at PoIs, by the travel model.
-
-    Args:
-      config: the travel model.
-      pose: `[3]` x [m], y [m] and yaw [rad] of the robot.
-      places: `[N, 2]` positions of the PoIs, in metres.
-
-    Returns:
-      `[N]` seconds.
-    """
-    chex.assert_shape(pose, (3,), custom_message="pose")
-    chex.assert_shape(places, (None, 2), custom_message="places")
-    turn, path = jax.vmap(lambda place: _path(config, pose, place))(places)
-    return config.look_seconds + jnp.abs(turn) / config.turn_rate + path / config.speed
-
-
 def travel_times(config: TravelConfig, team: Team) -> Float[Array, "R N"]:
     """Time until each robot has looked at each PoI, see `travel_seconds`.
 
@@ -146,40 +132,6 @@ def travel_times(config: TravelConfig, team: Team) -> Float[Array, "R N"]:
       `[R, N]` seconds.
     """
     return jax.vmap(lambda pose: travel_seconds(config, pose, team.positions))(team.poses)
-
-
-def _path(config: TravelConfig, pose: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`[]` radians to turn and `[]` metres to drive until a robot is near enough to look."""
-    to_place = place - pose[:2]
-    turn = jnp.arctan2(to_place[1], to_place[0]) - pose[2]
-    turn = (turn + jnp.pi) % (2 * jnp.pi) - jnp.pi
-    # At zero distance the bearing is undefined: do not turn.
-    distance = jnp.linalg.norm(to_place)
-    turn = jnp.where(distance > 0, turn, 0.0)
-    return turn, jnp.maximum(distance - config.view_distance, 0.0)
-
-
-def move(
-    config: TravelConfig,
-    pose: Float[Array, "3"],
-    place: Float[Array, "2"],
-    seconds: Float[Array, ""],
-) -> Float[Array, "3"]:
-    """Pose of a robot some time after it set out for a PoI, by the travel model.
-
-    Args:
-      config: the travel model.
-      pose: `[3]` x [m], y [m] and yaw [rad] of the robot as it set out.
-      place: `[2]` position of the PoI, in metres.
-      seconds: `[]` since then.
-    """
-    turn, path = _path(config, pose, place)
-    turning = jnp.minimum(jnp.abs(turn) / config.turn_rate, seconds)
-    yaw = pose[2] + jnp.sign(turn) * turning * config.turn_rate
-    driven = jnp.minimum((seconds - turning) * config.speed, path)
-    to_place = place - pose[:2]
-    along = to_place / jnp.maximum(jnp.linalg.norm(to_place), 1e-6)
-    return jnp.append(pose[:2] + driven * along, yaw)
 
 
 def own_seconds(observed: Float[Array, "F N ..."], latent_size: int) -> Float[Array, "N ..."]:

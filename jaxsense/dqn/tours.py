@@ -24,6 +24,7 @@ from jaxsense.dqn import team_mdp
 from jaxsense.dqn.losses import pseudo_huber
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import TIME_SCALE, TeamMdp, TeamState
+from jaxsense.dqn.travel import travel_seconds
 
 
 class Policy(Protocol):
@@ -110,7 +111,7 @@ def _trial(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig) -> Trial
     is_open = values[:-1] > values[-1]
     travel = mdp.config.travel
     pose = state.team.poses[state.agent]
-    times = team_mdp.travel_seconds(travel, pose, state.team.positions)
+    times = travel_seconds(travel, pose, state.team.positions)
     rank = jnp.where(is_open, jax.random.gumbel(tried_key, (num_pois,)) - times / _NEAR, -jnp.inf)
     tried = jax.lax.top_k(rank, min(config.tries, num_pois))[1]
     seconds = jax.vmap(lambda poi: _seconds_to_end(play_key, mdp, policy, now, poi))(tried)

@@ -1,6 +1,7 @@
 """Spaces and starts, shared by the interfaces."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Protocol, TypeVar
 
 import jax
 import numpy as np
@@ -10,6 +11,23 @@ from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.tasks.environment import Environment, OneAgent
+
+B_co = TypeVar("B_co", covariant=True)
+D_co = TypeVar("D_co", covariant=True)
+
+
+class Spaces(Protocol[B_co, D_co]):
+    """Another library's module of spaces."""
+
+    @property
+    def Box(self) -> Callable[..., B_co]:  # noqa: N802
+        """Of an array of numbers within bounds."""
+        ...
+
+    @property
+    def Discrete(self) -> Callable[..., D_co]:  # noqa: N802
+        """Of a number of actions."""
+        ...
 
 
 def environment(mdp: MapMdp | Environment, modality: int | None) -> Environment:
@@ -30,11 +48,13 @@ def environment(mdp: MapMdp | Environment, modality: int | None) -> Environment:
     return mdp
 
 
-def spaces_of(spaces: Any, size: int, num_actions: int, bound: float) -> tuple[Any, Any]:
+def spaces_of(
+    spaces: Spaces[B_co, D_co], size: int, num_actions: int, bound: float
+) -> tuple[B_co, D_co]:
     """Spaces of observations and of actions.
 
     Args:
-      spaces: another library's module, with `Box` and `Discrete`.
+      spaces: another library's module.
       size: numbers in an observation.
       num_actions: a look at each PoI, and NOP.
       bound: observations are within plus and minus this.
@@ -42,11 +62,11 @@ def spaces_of(spaces: Any, size: int, num_actions: int, bound: float) -> tuple[A
     return spaces.Box(-bound, bound, (size,), np.float32), spaces.Discrete(num_actions)
 
 
-def environment_spaces(spaces: Any, played: Environment) -> tuple[Any, Any]:
+def environment_spaces(spaces: Spaces[B_co, D_co], played: Environment) -> tuple[B_co, D_co]:
     """Spaces of an environment of one policy, see `spaces_of`.
 
     Args:
-      spaces: another library's module, with `Box` and `Discrete`.
+      spaces: another library's module.
       played: the environment.
     """
     return spaces_of(spaces, played.observation_size, played.num_actions, played.bound)

@@ -69,8 +69,8 @@ class TaskEnv(Env):
         self._has_ended = False
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Starts an episode.
 
         Args:
@@ -88,7 +88,9 @@ class TaskEnv(Env):
         self._actions, self._has_ended = [], False
         return np.array(observation), self._info(mask)
 
-    def step(self, action: SupportsInt) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: SupportsInt
+    ) -> tuple[np.ndarray, float, bool, bool, dict[str, np.ndarray]]:
         """Takes an action.
 
         Args:
@@ -185,8 +187,8 @@ class MapVectorEnv(VectorEnv):
         self._played, self._starts = played, starts
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Starts new episodes.
 
         Args:
@@ -308,7 +310,9 @@ def _key(env: "Env | VectorEnv") -> Key:
     return jax.random.key(int(env.np_random.integers(2**32)))
 
 
-def _final(observations: np.ndarray, mask: np.ndarray, ended: np.ndarray) -> dict[str, Any]:
+def _final(
+    observations: np.ndarray, mask: np.ndarray, ended: np.ndarray
+) -> dict[str, np.ndarray | dict[str, np.ndarray]]:
     """Gymnasium's information about `[E]` bool `ended` episodes."""
     final = np.full(len(ended), None, object)
     for i in np.flatnonzero(ended):

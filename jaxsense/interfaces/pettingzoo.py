@@ -3,7 +3,8 @@
 `make("team-v0")` and `make_parallel("team-v0")` make a task.
 """
 
-from typing import Any, SupportsInt
+from collections.abc import Callable
+from typing import Any, SupportsInt, TypeVar
 
 import jax
 import numpy as np
@@ -19,6 +20,8 @@ from jaxsense.tasks.task import TeamTask
 with extra("pettingzoo"):
     from gymnasium import error, spaces  # pyright: ignore[reportMissingImports]
     from pettingzoo import AECEnv, ParallelEnv  # pyright: ignore[reportMissingImports]
+
+T = TypeVar("T")
 
 Infos = dict[str, dict[str, float | np.ndarray]]
 
@@ -90,7 +93,9 @@ class _Team:
             raise ValueError(f"{name} = {action!r}: must be in {self.action_space(agent)}")
         return int(action)
 
-    def _named(self, of_robots: jax.Array, kind: Any = np.array) -> dict[str, Any]:
+    def _named(
+        self, of_robots: jax.Array, kind: Callable[[np.ndarray], T] = np.array
+    ) -> dict[str, T]:
         """`[R, ...]` by the names of the robots that work."""
         of_each = self._robots.named(np.asarray(of_robots))
         return {agent: kind(of_each[agent]) for agent in self.agents}
@@ -110,7 +115,7 @@ class TeamAECEnv(_Team, AECEnv):
     and `action_mask`, `[N + 1]` int8, is 1 for the actions that the robot has.
     """
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+    def reset(self, seed: int | None = None, options: dict[str, object] | None = None) -> None:
         """Starts an episode.
 
         Args:
@@ -160,7 +165,7 @@ class TeamParallelEnv(_Team, ParallelEnv):
     """
 
     def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
+        self, seed: int | None = None, options: dict[str, object] | None = None
     ) -> tuple[dict[str, np.ndarray], Infos]:
         """Starts an episode.
 

@@ -21,7 +21,9 @@ from numpy.typing import ArrayLike
 
 Arrays = dict[str, np.ndarray]
 Program = Callable[..., Arrays]
-Step = tuple[Callable[..., Any], list[str], list[str]]
+Values = dict[str, Any]  # arrays and numbers by name
+Operator = Callable[..., Any]  # to an array, a number, or a list of arrays
+Step = tuple[Operator, list[str], list[str]]
 
 
 def load(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, Program]]:
@@ -84,7 +86,7 @@ def checked(
 def _program(
     name: str, graph: Mapping[str, Any], weights: Arrays, about: Mapping[str, Any]
 ) -> Program:
-    known: dict[str, Any] = dict(weights)
+    known: Values = dict(weights)
     steps: list[Step] = []
     # What depends on weights alone is computed once.
     for node in graph["nodes"]:
@@ -119,7 +121,7 @@ def _step(node: list[Any]) -> Step:
     return function, inputs, outputs
 
 
-def _play(steps: list[Step], values: dict[str, Any]) -> None:
+def _play(steps: list[Step], values: Values) -> None:
     """Applies operators in their order; `values` are all arrays by name."""
     for function, inputs, outputs in steps:
         found = function(*[values[name] for name in inputs]) if inputs else function(values)
@@ -129,13 +131,13 @@ def _play(steps: list[Step], values: dict[str, Any]) -> None:
             values.update(zip(outputs, found, strict=True))
 
 
-def _loop(body: Mapping[str, Any], inputs: list[str]) -> Callable[[dict[str, Any]], Any]:
+def _loop(body: Mapping[str, Any], inputs: list[str]) -> Operator:
     """ONNX's `Loop`: at most `most` steps, as long as the first output of the body is true."""
     steps = [_step(node) for node in body["nodes"]]
     most, goes_on, *first = inputs
     number = len(first)
 
-    def loop(values: dict[str, Any]) -> Any:
+    def loop(values: Values) -> Any:
         limit = int(values[most]) if most else sys.maxsize
         is_going, carry = bool(values[goes_on]), [values[name] for name in first]
         rows: list[list[np.ndarray]] = [[] for _ in body["outputs"][1 + number :]]
@@ -153,11 +155,11 @@ def _loop(body: Mapping[str, Any], inputs: list[str]) -> Callable[[dict[str, Any
     return loop
 
 
-def _branch(graphs: Mapping[str, Any], which: str) -> Callable[[dict[str, Any]], Any]:
+def _branch(graphs: Mapping[str, Any], which: str) -> Operator:
     """ONNX's `If`."""
     steps = {key: [_step(node) for node in graph["nodes"]] for key, graph in graphs.items()}
 
-    def branch(values: dict[str, Any]) -> Any:
+    def branch(values: Values) -> Any:
         key = "then_branch" if values[which] else "else_branch"
         _play(steps[key], values)
         found = [values[name] for name in graphs[key]["outputs"]]
@@ -203,11 +205,11 @@ def _cast(x: np.ndarray, to: str) -> np.ndarray:
     return np.asarray(x).astype(to)
 
 
-def _reduced(function: Callable[..., Any]) -> Callable[..., Any]:
+def _reduced(function: Operator) -> Operator:
     return lambda x, axes, keepdims: function(x, axis=tuple(axes.tolist()))
 
 
-OPERATORS: dict[str, Callable[..., Any]] = {
+OPERATORS: dict[str, Operator] = {
     "Add": np.add,
     "Sub": np.subtract,
     "Mul": np.multiply,

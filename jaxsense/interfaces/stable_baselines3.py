@@ -1,5 +1,6 @@
 """Gymnasium's vector environments for Stable-Baselines3: `pip install -e '.[sb3]'`."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,9 @@ with extra("sb3"):
         VectorEnv,
     )
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
+
+Indices = Iterable[int] | int | None
+Infos = list[dict[str, bool | np.ndarray]]
 
 
 class MapVecEnv(VecEnv):
@@ -46,14 +50,12 @@ class MapVecEnv(VecEnv):
         """Stores the actions."""
         self._actions = actions
 
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Takes the stored actions."""
         observations, rewards, terminations, truncations, infos = self.env.step(self._actions)
         dones = terminations | truncations
         cuts = truncations & ~terminations
-        of_each: list[dict[str, Any]] = [
-            {"TimeLimit.truncated": bool(truncated)} for truncated in cuts
-        ]
+        of_each: Infos = [{"TimeLimit.truncated": bool(truncated)} for truncated in cuts]
         for info, mask in zip(of_each, infos.get("action_mask", ()), strict=False):
             info["action_mask"] = mask
         for i in np.flatnonzero(dones):
@@ -64,7 +66,7 @@ class MapVecEnv(VecEnv):
         """Closes the environment."""
         self.env.close()
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """Returns the shared attribute once for each index.
 
         Args:
@@ -73,7 +75,7 @@ class MapVecEnv(VecEnv):
         """
         return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: Indices = None) -> None:
         """Sets the shared attribute.
 
         Args:
@@ -83,7 +85,9 @@ class MapVecEnv(VecEnv):
         """
         setattr(self.env, attr_name, value)
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **more: Any) -> list:
+    def env_method(
+        self, method_name: str, *args: object, indices: Indices = None, **more: object
+    ) -> list:
         """Calls the shared method and returns its result, or its row, once for each index.
 
         Args:
@@ -96,7 +100,7 @@ class MapVecEnv(VecEnv):
         has_rows = method_name == "action_masks"
         return [result[i] if has_rows else result for i in self._get_indices(indices)]
 
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
         """Returns False for each index: no environment has its own wrapper.
 
         Args:

@@ -7,7 +7,7 @@ chooses next.
 """
 
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import chex
 import jax
@@ -21,10 +21,13 @@ from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import team_mdp
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import common
+from jaxsense.interfaces.common import Spaces
 from jaxsense.tasks import make
 from jaxsense.tasks.environment import Scaling
 from jaxsense.tasks.task import TeamTask
 
+B = TypeVar("B")
+D = TypeVar("D")
 T = TypeVar("T")
 
 
@@ -77,11 +80,11 @@ class Robots:
     names: tuple[str, ...] = struct.field(pytree_node=False)
     modality: tuple[str, ...] = struct.field(pytree_node=False)
 
-    def spaces(self, spaces: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    def spaces(self, spaces: Spaces[B, D]) -> tuple[dict[str, B], dict[str, D]]:
         """Spaces of what each robot knows, `[S]`, and of its actions, see `common.spaces_of`.
 
         Args:
-          spaces: another library's module, with `Box` and `Discrete`.
+          spaces: another library's module.
 
         Returns:
           Both by the names of the robots.

@@ -97,7 +97,7 @@ def clearances(
 
     shapes = arena.shapes.values()
     half_sides = arena.poi_radius * jnp.array([shape.half_sides for shape in shapes])
-    is_box = jnp.array([shape.primitive == "box" for shape in shapes])[layout.shape]
+    is_round = jnp.array([shape.is_round for shape in shapes])[layout.shape]
     half_u, half_v = half_sides[layout.shape].T
     from_x, from_y = x - layout.position[None, :, 0], y - layout.position[None, :, 1]
     cos, sin = jnp.cos(layout.yaw)[None], jnp.sin(layout.yaw)[None]
@@ -106,7 +106,7 @@ def clearances(
     outside = jnp.hypot(jnp.maximum(along, 0.0), jnp.maximum(across, 0.0))
     to_box = outside + jnp.minimum(jnp.maximum(along, across), 0.0)
     to_cylinder = jnp.hypot(from_x, from_y) - half_u[None]
-    to_poi = jnp.min(jnp.where(is_box[None], to_box, to_cylinder), axis=-1)
+    to_poi = jnp.min(jnp.where(is_round[None], to_cylinder, to_box), axis=-1)
 
     apart = jnp.hypot(x - x.T, y - y.T) - amiro.BODY_RADIUS
     to_robot = jnp.min(jnp.where(jnp.eye(len(poses), dtype=bool), jnp.inf, apart), axis=-1)

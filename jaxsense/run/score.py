@@ -11,7 +11,7 @@ from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.dqn.policies import POLICIES, Known, Policy, Trained, Values
+from jaxsense.dqn.policies import POLICIES, Known, Policy, Trained, Values, as_policy
 from jaxsense.mission import cases, make_mission
 from jaxsense.models import Models
 from jaxsense.run import batches, devices, missions
@@ -162,7 +162,7 @@ def _require(
 
 def _checked(name: str, policy: Values | Policy) -> Policy:
     """The policy, which names itself if its values have another shape or dtype."""
-    wrapped = policy if isinstance(policy, Policy) else Policy(policy)
+    wrapped = as_policy(policy)
 
     def values(key: Key, models: Trained, known: Known) -> jax.Array:
         found = jnp.asarray(wrapped.values(key, models, known))

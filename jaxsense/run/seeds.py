@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxsense.config import Config, ConfigError
-from jaxsense.run import rundir
 from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.run.rundir import RunDirectory
+from jaxsense.run.settings import Settings, read_settings
 from jaxsense.training.agents import learner
 
 _MOST = 10_000
@@ -52,7 +52,7 @@ def check(run: RunDirectory) -> None:
         if path == run.path or not (path / "config.json").exists():
             continue
         # The settings are only compared: no custom sensor is made.
-        if rundir.read_settings(path / "config.json", trust=True) != _settings_of(run, seed):
+        if read_settings(path / "config.json", trust=True) != _settings_of(run, seed):
             reason = f"must have the settings of {run.path / 'config.json'}, with seed {seed}"
             raise ConfigError("resume", str(path), reason)
 

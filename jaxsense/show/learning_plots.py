@@ -1,6 +1,7 @@
 """The plots of what was learned: the paper's Fig. 5, and calibration."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -28,6 +29,14 @@ _EXPLORING = "#8c8c8c"
 _OPTIMAL_LINE, _NAIVE_LINE, _RANDOM_LINE = "--", ":", (0, (1, 4))
 
 
+class _Kind(NamedTuple):
+    """How rewards are drawn: their name, and from `[K, epochs]` the epochs and `[K, E]` heights."""
+
+    label: str
+    colour: str
+    points: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
 def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:
     """The paper's Fig. 5: reward of whole episodes over the epochs, with other policies as lines.
 
@@ -51,7 +60,7 @@ def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     names: list[_Names] = []
     for ax, (title, of_panel, agent) in zip(axes, panels, strict=True):
-        drawn = (_draw_rewards(ax, kind, np.atleast_2d(x)) for kind, x in of_panel.items())
+        drawn = (_draw_rewards(ax, _KINDS[kind], np.atleast_2d(x)) for kind, x in of_panel.items())
         names.append([name for of_kind in drawn for name in of_kind])
         if agent is not None:
             names[-1] += _draw_references(ax, agent)
@@ -82,18 +91,12 @@ def _bottom(agent: Agent) -> float:
     return min(naive, mean(agent["return"])) - max(0.5, optimal - naive)
 
 
-def _draw_rewards(ax: Axes, kind: str, values: np.ndarray) -> _Names:
+def _draw_rewards(ax: Axes, kind: _Kind, values: np.ndarray) -> _Names:
     """Draws `[K, epochs]` rewards: the mean, and of several seeds its 95% interval."""
     if len(values) == 0:
         return []
-    if kind == "reward":
-        colour, label = _EXPLORING, "exploring"
-        shown = np.array([_smoothed(of_seed) for of_seed in values])
-        epochs = np.arange(values.shape[1] - shown.shape[1], values.shape[1])
-    else:
-        colour, label = policy_colour("latent"), "without exploration"
-        epochs = np.flatnonzero(np.isfinite(values).any(axis=0))
-        shown = values[:, epochs]
+    label, colour, points = kind
+    epochs, shown = points(values)
     middle = shown.mean(axis=0)
     ax.plot(epochs, middle, color=colour, label=label, linewidth=1.2)
     if len(shown) > 1:
@@ -121,6 +124,24 @@ def _smoothed(reward: np.ndarray) -> np.ndarray:
     number = np.convolve(np.isfinite(reward), np.ones(window), mode="valid")
     total = np.convolve(np.nan_to_num(reward), np.ones(window), mode="valid")
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
+def _explored(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Epochs at whose end running means of exploring episodes stand, and these means."""
+    shown = np.array([_smoothed(of_seed) for of_seed in values])
+    return np.arange(values.shape[1] - shown.shape[1], values.shape[1]), shown
+
+
+def _evaluated(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Epochs in which a learned policy was played, and its rewards."""
+    epochs = np.flatnonzero(np.isfinite(values).any(axis=0))
+    return epochs, values[:, epochs]
+
+
+_KINDS = {
+    "reward": _Kind("exploring", _EXPLORING, _explored),
+    "evaluation": _Kind("without exploration", policy_colour("latent"), _evaluated),
+}
 
 
 def calibration(config: Config, reliability: Mapping[str, Reliability], belief: Beliefs) -> Figure:

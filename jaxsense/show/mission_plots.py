@@ -1,8 +1,8 @@
 """The plots of missions: policies compared in the same arenas, and in other arenas and teams."""
 
 import math
-from collections.abc import Iterable
-from typing import cast
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, cast
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,6 +15,17 @@ from jaxsense.summary.compare import at_most
 from jaxsense.summary.metrics import Number, mean
 
 _REFERENCES = ("auction", "naive")  # of the times of teams, the first that played everywhere
+
+
+class _Count(NamedTuple):
+    """What the axis of a panel counts, and its name."""
+
+    label: str
+    of: Callable[[Evaluation], int]
+
+
+_POIS = _Count("PoIs", lambda place: place["num_pois"])
+_ROBOTS = _Count("robots", lambda place: len(place["robots"]))
 
 
 def policies(block: Missions, num_pois: int) -> Figure:
@@ -86,17 +97,17 @@ def teams(places: Iterable[Evaluation]) -> Figure:
     """
     ordered = sorted(places, key=_num_missions)
     shown = [*{(p["num_pois"], p["side"], *p["robots"]): p for p in ordered}.values()]
-    shown.sort(key=lambda place: (place["num_pois"], len(place["robots"])))
+    shown.sort(key=lambda place: (_POIS.of(place), _ROBOTS.of(place)))
     everywhere = set.intersection(*(set(policies_of(place["mission"])) for place in shown))
     reference = next((name for name in _REFERENCES if name in everywhere), None)
     of_arenas = [
-        (f"{group[0]['num_pois']} PoIs in {group[0]['side']:g} m", "robots", group)
+        (f"{group[0]['num_pois']} PoIs in {group[0]['side']:g} m", _ROBOTS, group)
         for group in _groups(shown, "num_pois", "side")
-        if len({len(place["robots"]) for place in group}) > 1
+        if len({_ROBOTS.of(place) for place in group}) > 1
     ]
     drawn = [place for _, _, group in of_arenas for place in group]
     panels = [
-        (f"robots: {counted(group[0]['robots'])}", "num_pois", group)
+        (f"robots: {counted(group[0]['robots'])}", _POIS, group)
         for group in _groups(shown, "robots")
         if len(group) > 1 or group[0] not in drawn
     ]
@@ -105,9 +116,9 @@ def teams(places: Iterable[Evaluation]) -> Figure:
     rows = math.ceil(len(panels) / columns)
     figure = Figure(figsize=(5 * columns, 4 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax, (title, key, group) in zip(axes, panels, strict=False):
+    for ax, (title, count, group) in zip(axes, panels, strict=False):
         ax.set(title=title)
-        _draw_times(ax, group, key, reference)
+        _draw_times(ax, group, count, reference)
     for ax in axes[len(panels) :]:
         ax.set_axis_off()
     return figure
@@ -130,11 +141,9 @@ def counted(robots: list[str]) -> str:
     return ", ".join(f"{robots.count(modality)} {modality}" for modality in dict.fromkeys(robots))
 
 
-def _draw_times(ax: Axes, places: list[Evaluation], key: str, reference: str | None) -> None:
+def _draw_times(ax: Axes, places: list[Evaluation], count: _Count, reference: str | None) -> None:
     """Draws a line for each policy: the time against the number of PoIs or of robots."""
-
-    def number(place: Evaluation) -> int:
-        return place["num_pois"] if key == "num_pois" else len(place["robots"])
+    label, number = count
 
     def time(place: Evaluation, name: str) -> float:
         return mean(cases(place["mission"])[name]["time_s"])
@@ -151,7 +160,6 @@ def _draw_times(ax: Axes, places: list[Evaluation], key: str, reference: str | N
         style = {"color": colour, "linewidth": 2.5 if is_own else 1.2, "zorder": 3 if is_own else 2}
         ax.plot([*map(number, played)], times, policy_marker(name) + line, label=name, **style)
         ends.append((name, times[-1], colour))
-    label = "PoIs" if key == "num_pois" else "robots"
     ticks = sorted(set(numbers))
     texts = [str(n) for n in ticks]
     if reference:

@@ -41,21 +41,20 @@ def frame(task: Task, state: MapState | TeamState, actions: Sequence[int]) -> np
       `[H, W, 3]` uint8 sRGB.
     """
     mdp: MapMdp = task.mdp.map
-    teams = [state] if isinstance(state, TeamState) else []
     found = _read(mdp, state.map.belief)
     shown, probabilities, classes = jax.tree.map(np.asarray, (state.map.belief, *found))
     colours = _class_colours(mdp.num_classes)
     present = np.asarray(task.action_mask(state))[:-1]
-    number = 2 + len(teams)
+    number = 2 + len(state.teams)
     figure = Figure(figsize=(_SIZE * number, _SIZE), dpi=_DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots(1, number)
     title = f"{task.name}, {task.agent}", f"step {len(actions)} of {task.max_steps}"
-    figure.suptitle(", ".join([*title, *(f"{float(each.seconds):.1f} s" for each in teams)]))
+    figure.suptitle(", ".join([*title, *(f"{float(each.seconds):.1f} s" for each in state.teams)]))
     nearest = colours[np.argmax(probabilities, axis=1)]
     _draw_beliefs(axes[0], shown, classes, colours, nearest, present)
     _draw_probabilities(axes[1], probabilities, state.map, actions, colours, present)
-    for each in teams:
+    for each in state.teams:
         truth = colours[np.asarray(each.map.classes)]
         team = jax.tree.map(np.asarray, each.team)
         _draw_places(axes[2], team, int(each.agent), nearest, truth)

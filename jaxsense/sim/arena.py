@@ -173,11 +173,10 @@ def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
     """Writes the MJCF of one solid of one PoI."""
     u, v = (share * config.poi_radius for share in shape.half_sides)
     half_height = config.poi_height / 2
-    is_box = shape.primitive == "box"
-    size = f"{u} {v} {half_height}" if is_box else f"{u} {half_height}"
+    size = f"{u} {half_height}" if shape.is_round else f"{u} {v} {half_height}"
     solid = f'<geom name="{name}" type="{shape.primitive}" size="{size}"'
     collides = 'class="obstacle"/>'
-    if is_box or not contacts:
+    if not (shape.is_round and contacts):
         return f'<body name="{name}" mocap="true">{solid} {collides}</body>'
     # MJX finds contacts with cylinders iteratively, with capsules in closed form. At the height of
     # a robot's collider, both have the same cross-section.

@@ -327,7 +327,7 @@ def _hits(
 
     def of(shape: Shape) -> jax.Array:
         half = radius * jnp.array(shape.half_sides)[None]
-        section = raycast.CrossSection(centre[None], axis, half, (0,), shape.primitive != "box")
+        section = raycast.CrossSection(centre[None], axis, half, (0,), shape.is_round)
         return raycast.cast(section, np.zeros(2), angles).distance
 
     return jnp.stack([of(shape) for shape in shapes])

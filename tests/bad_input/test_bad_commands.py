@@ -25,7 +25,8 @@ from jaxsense import ConfigError, evaluate, export, train
 from jaxsense.run import pipeline
 from jaxsense.run.files import WriteError
 from jaxsense.run.monitor import StageError
-from jaxsense.run.rundir import RunDirectory, Settings, read_settings
+from jaxsense.run.rundir import RunDirectory
+from jaxsense.run.settings import Settings, read_settings
 from jaxsense.run.together import Trainings
 
 SECONDS = 10.0

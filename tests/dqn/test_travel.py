@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from toys import TRAVEL
 
 from jaxsense.config import TravelConfig
-from jaxsense.dqn import team_mdp
+from jaxsense.dqn import travel
 
-seconds_of_ways = jax.jit(team_mdp.travel_seconds)
-move = jax.jit(team_mdp.move)
+seconds_of_ways = jax.jit(travel.travel_seconds)
+move = jax.jit(travel.move)
 
 
 @pytest.mark.parametrize(
@@ -67,12 +67,12 @@ def test_the_pose_on_the_way_as_worked_by_hand(seconds, expected):
 @jax.jit
 def in_two_parts(pose, place, share):
     """The time of a way in one part; in two; and the pose at its end, in one and in two."""
-    whole = team_mdp.travel_seconds(TRAVEL, pose, place[None])[0]
+    whole = travel.travel_seconds(TRAVEL, pose, place[None])[0]
     before = share * (whole - TRAVEL.look_seconds)
-    between = team_mdp.move(TRAVEL, pose, place, before)
-    rest = team_mdp.travel_seconds(TRAVEL, between, place[None])[0]
-    end = team_mdp.move(TRAVEL, pose, place, whole)
-    return whole, before + rest, end, team_mdp.move(TRAVEL, between, place, rest)
+    between = travel.move(TRAVEL, pose, place, before)
+    rest = travel.travel_seconds(TRAVEL, between, place[None])[0]
+    end = travel.move(TRAVEL, pose, place, whole)
+    return whole, before + rest, end, travel.move(TRAVEL, between, place, rest)
 
 
 PLACE = st.floats(-3, 3, width=32)

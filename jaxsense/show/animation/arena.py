@@ -102,7 +102,7 @@ class ArenaView:
         group = add(parent, "g", transform=f"translate({x:.1f} {y:.1f})")
         shape = list(arena.shapes.values())[int(layout.shape[n])]
         u, v = (radius * share for share in shape.half_sides)
-        if shape.primitive == "cylinder":
+        if shape.is_round:
             add(group, "circle", r=u, fill=colour)
         else:
             turn = f"rotate({-np.degrees(float(layout.yaw[n])):.1f})"

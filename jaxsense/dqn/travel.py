@@ -1,0 +1,64 @@
+"""The travel model: how long robots take to their looks, with the settings `TravelConfig`.
+
+A robot turns to a PoI, drives straight until it is near enough, and looks.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsense.config import TravelConfig
+
+
+def travel_seconds(
+    config: TravelConfig, pose: Float[Array, "3"], places: Float[Array, "N 2"]
+) -> Float[Array, " N"]:
+    """Time until a robot has looked at PoIs, by the travel model.
+
+    Args:
+      config: the travel model.
+      pose: `[3]` x [m], y [m] and yaw [rad] of the robot.
+      places: `[N, 2]` positions of the PoIs, in metres.
+
+    Returns:
+      `[N]` seconds.
+    """
+    chex.assert_shape(pose, (3,), custom_message="pose")
+    chex.assert_shape(places, (None, 2), custom_message="places")
+    turn, path = jax.vmap(lambda place: _path(config, pose, place))(places)
+    return config.look_seconds + jnp.abs(turn) / config.turn_rate + path / config.speed
+
+
+def move(
+    config: TravelConfig,
+    pose: Float[Array, "3"],
+    place: Float[Array, "2"],
+    seconds: Float[Array, ""],
+) -> Float[Array, "3"]:
+    """Pose of a robot some time after it set out for a PoI, by the travel model.
+
+    Args:
+      config: the travel model.
+      pose: `[3]` x [m], y [m] and yaw [rad] of the robot as it set out.
+      place: `[2]` position of the PoI, in metres.
+      seconds: `[]` since then.
+    """
+    turn, path = _path(config, pose, place)
+    turning = jnp.minimum(jnp.abs(turn) / config.turn_rate, seconds)
+    yaw = pose[2] + jnp.sign(turn) * turning * config.turn_rate
+    driven = jnp.minimum((seconds - turning) * config.speed, path)
+    to_place = place - pose[:2]
+    along = to_place / jnp.maximum(jnp.linalg.norm(to_place), 1e-6)
+    return jnp.append(pose[:2] + driven * along, yaw)
+
+
+def _path(config: TravelConfig, pose: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`[]` radians to turn and `[]` metres to drive until a robot is near enough to look."""
+    to_place = place - pose[:2]
+    turn = jnp.arctan2(to_place[1], to_place[0]) - pose[2]
+    turn = (turn + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    # At zero distance the bearing is undefined: do not turn.
+    distance = jnp.linalg.norm(to_place)
+    turn = jnp.where(distance > 0, turn, 0.0)
+    return turn, jnp.maximum(distance - config.view_distance, 0.0)
