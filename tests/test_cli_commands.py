@@ -162,10 +162,14 @@ class Player:
         return Played({name: MEASURED}, recording(), 60)
 
 
+@pytest.fixture(scope="module")
+def models():
+    return jaxsense.init(jax.random.key(0), CONFIG)
+
+
 @pytest.fixture
-def played(monkeypatch, tmp_path):
+def played(models, monkeypatch, tmp_path):
     """Directory in which the demo plays missions of `smoke` that cost nothing."""
-    models = jaxsense.init(jax.random.key(0), CONFIG)
 
     def load(preset):
         jaxsense.load_pretrained(preset)

@@ -27,6 +27,14 @@ SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
 
 
 @pytest.fixture
+def collect():
+    """Collects garbage, but none from before the test: a worker holds gigabytes of programs."""
+    gc.freeze()
+    yield gc.collect
+    gc.unfreeze()
+
+
+@pytest.fixture
 def toy(monkeypatch, tmp_path):
     """Trains toy stages: their programs are compiled as those of a run, without missions."""
     monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
@@ -93,7 +101,7 @@ def test_stages_are_given_what_those_before_return(toy):
     np.testing.assert_array_equal(found.outputs["both"], [49, 49])
 
 
-def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, monkeypatch):
+def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, collect, monkeypatch):
     double = lambda key, config, x: 2 * x  # noqa: E731
     stages = [
         Stage("first", lambda key, config: jnp.ones(3), is_passing=True),
@@ -104,7 +112,7 @@ def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, monkeyp
     begun, alive, begin = {}, {}, loop._Loop._begin
 
     def watched(self, stage, inputs):
-        gc.collect()
+        collect()
         alive[stage.name] = [name for name, output in begun.items() if output() is not None]
         output = begin(self, stage, inputs)
         begun[stage.name] = weakref.ref(output)
@@ -118,7 +126,7 @@ def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, monkeyp
     np.testing.assert_array_equal(found.outputs["fourth"], [8, 8, 8])
 
 
-def test_programs_are_let_go_of_once_no_training_needs_them(monkeypatch):
+def test_programs_are_let_go_of_once_no_training_needs_them(collect, monkeypatch):
     # Stages of one kind share their programs.
     names = "dqn_camera", "dqn_lidar"
     kinds = [*(counting(name, shares="dqn") for name in names), counting("count")]
@@ -133,7 +141,7 @@ def test_programs_are_let_go_of_once_no_training_needs_them(monkeypatch):
         loop.train(KEY, SMOKE, compiled, monitor)
         assert all(program() is not None for program in alive)
         loop.train(KEY, SMOKE, compiled, monitor)
-        gc.collect()
+        collect()
         assert all(program() is None for program in alive)
         with pytest.raises(RuntimeError, match="advance of dqn was released"):
             shared.advance.wait()
@@ -194,7 +202,9 @@ def test_a_run_that_ends_before_its_kept_missions_are_loaded_does_not_hang(monke
         compiled.player.result(timeout=60)
 
 
-def test_the_first_state_of_a_training_is_held_no_longer_than_its_first_chunk(toy, monkeypatch):
+def test_the_first_state_of_a_training_is_held_no_longer_than_its_first_chunk(
+    toy, collect, monkeypatch
+):
     begun, alive, begin, report = [], [], loop._Loop._begin, loop._Loop._report
 
     def watched(self, stage, inputs):
@@ -203,7 +213,7 @@ def test_the_first_state_of_a_training_is_held_no_longer_than_its_first_chunk(to
         return state
 
     def reported(self, *args):
-        gc.collect()
+        collect()
         alive.append(begun[0]() is not None)
         return report(self, *args)
 

@@ -80,8 +80,9 @@ def candidates(
     shares = np.linspace(-1.0, 1.0, 2 * steps + 1)
     of_distances = jnp.asarray(-((_DEVIATIONS * shares) ** 2) / 2)
     rays = window.reshape(wide.window, -1)
+    of_windows = np.arange(number)[:, None] + np.arange(sensor.window)
     return Candidates(
-        windows=jnp.stack([rays[i : i + sensor.window].reshape(-1) for i in range(number)]),
+        windows=rays[of_windows].reshape(number, -1),
         distances=distance + search.position * shares,
         log_prior=of_distances[:, None] + of_bearings[None],
     )

@@ -117,10 +117,8 @@ def test_its_name_is_that_of_the_task(env):
 
 
 def test_live_observations_trace():
-    models = init(jax.random.key(0), small.CONFIG)
-    env = MapEnv(make_mdp(small.CONFIG, models).map, 0)
-
     def play(key):
+        env = MapEnv(make_mdp(small.CONFIG, init(key, small.CONFIG)).map, 0)
         _, state = env.reset(key, env.default_params)
         return env.step(key, state, 0, env.default_params)
 

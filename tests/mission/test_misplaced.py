@@ -128,9 +128,11 @@ def test_a_robot_that_searches_tries_other_distances(searches, facing):
 def test_a_robot_that_searches_looks_from_farther_away(team, facing):
     # It is .35 m from the PoI, and looks from .3 m and farther.
     state = facing(CAMERA, [0.45, 0.0, 0.0], [0.0, 0.0, 0.0])
+    sees = jax.jit(
+        lambda config, state: decide.sees(with_config(team, config), state, CAMERA, jnp.int32(0))
+    )
     for position, expected in ((0.0, True), (0.04, True), (0.06, False)):
-        config = searching(SearchConfig(position=position))
-        assert bool(decide.sees(with_config(team, config), state, CAMERA, jnp.int32(0))) is expected
+        assert bool(sees(searching(SearchConfig(position=position)), state)) is expected
 
 
 def searching(search):
@@ -225,8 +227,7 @@ def test_a_mission_starts_with_constant_errors(team, models):
 
 def test_errors_must_be_of_all_robots(team, models, arena_of):
     state = arena_of(POSITIONS, POSES)
+    start = functools.partial(mission.start, team, models)
+    given = state.scene, state.classes, state.policy, state.faults
     with pytest.raises(AssertionError, match="pose_error"):
-        mission.start(
-            *(team, models, state.scene, state.classes, state.policy, state.faults),
-            pose_error=jnp.zeros((3, 3)),
-        )
+        jax.eval_shape(lambda: start(*given, pose_error=jnp.zeros((3, 3))))

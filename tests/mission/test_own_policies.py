@@ -93,11 +93,15 @@ def test_every_policy_of_the_table_is_played(own, decides, models, arena_of):
     state = arena_of(POSITIONS, POSES)
     state = replace(state, times_seen=jnp.array([[1, 0], [0, 1], [0, 0]], jnp.int32))
     key, settings = jax.random.key(0), CONFIG.mission
-    known = decide.known_to(own, models, state, 0)
     assert [*own.policies] == [*POLICIES, *OWN]
-    opinions = lambda: [choice.ask(key, p, models, known) for p in own.policies.values()]  # noqa: E731
-    choose_all = jax.jit(lambda: [choice.choose(settings, each, known) for each in opinions()])
-    chosen = np.array(choose_all())
+
+    @jax.jit
+    def choose_all(state):
+        known = decide.known_to(own, models, state, 0)
+        opinions = [choice.ask(key, policy, models, known) for policy in own.policies.values()]
+        return [choice.choose(settings, each, known) for each in opinions]
+
+    chosen = np.array(choose_all(state))
     played = [decides(replace(state, policy=jnp.int32(i))) for i in range(len(chosen))]
     np.testing.assert_array_equal([after.robots.target[0] for after in played], chosen)
     assert len(set(chosen)) > 2

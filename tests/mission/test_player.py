@@ -44,37 +44,55 @@ WORKERS = {
 }
 
 
+@pytest.fixture(scope="module")
+def begun(team, models):
+    """A mission of which all missions here have the shapes."""
+    return jax.jit(lambda: mission.reset(KEY, team, models, NAIVE))()
+
+
+@pytest.fixture(scope="module")
+def players():
+    """Players with compiled programs, by workers, batch and step."""
+    return {}
+
+
 @pytest.fixture
-def play(team, models, monkeypatch):
-    """Plays nine missions of some policies with `fake_step`, four at a time."""
-    state = jax.jit(lambda: mission.reset(KEY, team, models, NAIVE))()
+def play(team, models, begun, players, monkeypatch):
+    """Plays nine missions of some policies with `fake_step` or another one, four at a time."""
 
     def fake_reset(key, team, models, policy, faults):
-        poses = jax.random.normal(key, state.scene.poses.shape)
+        poses = jax.random.normal(key, begun.scene.poses.shape)
         belief = jax.tree.map(lambda x: jnp.tile(x, (3, 1)), models.fusion.prior)
-        scene = dataclasses.replace(state.scene, poses=poses)
-        classes = jax.random.randint(key, state.classes.shape, 0, 4)
+        scene = dataclasses.replace(begun.scene, poses=poses)
+        classes = jax.random.randint(key, begun.classes.shape, 0, 4)
         changed = {"scene": scene, "belief": belief, "classes": classes, "policy": policy}
-        return dataclasses.replace(state, **changed)
+        return dataclasses.replace(begun, **changed)
 
     def measure(team, models, s):
         return {"steps": s.steps, "poses": s.scene.poses}
 
-    monkeypatch.setattr(ROLLOUT, "step", fake_step)
-    monkeypatch.setattr(missions, "reset", fake_reset)
-    monkeypatch.setattr(missions, "measure", measure)
-
-    def run(workers, models=models, batch=4, episodes=9, policies=("naive",)):
+    def player_of(split, batch, step):
+        monkeypatch.setattr(ROLLOUT, "step", step)
+        monkeypatch.setattr(missions, "reset", fake_reset)
+        monkeypatch.setattr(missions, "measure", measure)
         with Compiler(Monitor()) as compiler:
-            player = missions.Player(team, compiler, batch, workers)
+            player = missions.Player(team, compiler, batch, WORKERS[split]())
             waited = []
             wait = missions.Program.wait
             with monkeypatch.context() as patch:
                 patch.setattr(missions.Program, "wait", lambda p: (waited.append(p), wait(p)))
                 player.wait()
             assert len(set(waited)) == 2  # before anything is timed
-            cases = mission.cases(CONFIG)
-            return player.play(KEY, models, {name: cases[name] for name in policies}, episodes)
+        return player
+
+    def run(
+        split="one device", models=models, batch=4, episodes=9, policies=("naive",), step=fake_step
+    ):
+        case = split, batch, step
+        if case not in players:
+            players[case] = player_of(*case)
+        cases = mission.cases(CONFIG)
+        return players[case].play(KEY, models, {name: cases[name] for name in policies}, episodes)
 
     return run
 
@@ -94,13 +112,13 @@ def walk_of(episode, shape):
 def test_missions_begin_with_the_models_that_play_them(play, models):
     prior = Belief(jnp.array([0.5, -1.0]), jnp.array([2.0, 3.0]))
     fusion = dataclasses.replace(models.fusion, prior=prior)
-    end = play(Workers(), dataclasses.replace(models, fusion=fusion)).recording.end
+    end = play(models=dataclasses.replace(models, fusion=fusion)).recording.end
     np.testing.assert_array_equal(end.belief.mean, [[0.5, -1.0]] * 3)
 
 
 @pytest.mark.parametrize("split", WORKERS)
 def test_the_whole_first_mission_is_recorded(split, play):
-    played = play(WORKERS[split]())
+    played = play(split)
     np.testing.assert_array_equal(played.metrics["naive"]["steps"], np.full(9, LAST))
     records, end = played.recording.records, played.recording.end
     walk = walk_of(0, end.scene.poses.shape)
@@ -115,7 +133,7 @@ def test_the_whole_first_mission_is_recorded(split, play):
 
 @pytest.mark.parametrize("split", WORKERS)
 def test_naive_exploration_is_recorded_with_the_first_mission(split, play, team):
-    played = play(WORKERS[split](), policies=("random", "latent", "naive"))
+    played = play(split, policies=("random", "latent", "naive"))
     for recording, name in ((played.recording, "random"), (played.naive, "naive")):
         walk = walk_of(0, recording.end.scene.poses.shape)
         np.testing.assert_allclose(recording.records.poses[:LAST], walk, atol=1e-4)
@@ -126,29 +144,30 @@ def test_naive_exploration_is_recorded_with_the_first_mission(split, play, team)
 
 
 def test_without_room_or_naive_exploration_one_mission_is_recorded(play):
-    assert play(Workers(), policies=("random", "naive"), batch=1, episodes=2).naive is None
-    assert play(Workers(), policies=("random", "latent"), episodes=2).naive is None
-    assert play(Workers(), policies=("naive", "random"), episodes=2).naive is None
+    assert play(policies=("random", "naive"), batch=1, episodes=2).naive is None
+    assert play(policies=("random", "latent"), episodes=2).naive is None
+    assert play(policies=("naive", "random"), episodes=2).naive is None
 
 
 def test_events_of_a_mission_do_not_depend_on_when_it_is_played(play):
     """Missions 4 to 8 take the places of missions that are over."""
-    poses = play(Workers()).metrics["naive"]["poses"]
+    poses = play().metrics["naive"]["poses"]
     for episode in (0, 3, 4, 8):
         walk = walk_of(episode, poses.shape[1:])
         np.testing.assert_allclose(poses[episode], walk[-1], atol=1e-4)
 
 
-@pytest.mark.parametrize("split", WORKERS)
-def test_results_do_not_depend_on_how_many_missions_play_at_once(split, play, monkeypatch):
-    def uneven(keys, team, models, states, parts):
-        # Every mission lasts as long as the first robot's position in the beginning tells.
-        states, records = fake_step(keys, team, models, states, parts)
-        last = CHUNK // 2 + jnp.abs(states.classes.sum(axis=-1)) * CHUNK // 2
-        return dataclasses.replace(states, done=states.steps >= last), records
+def uneven(keys, team, models, states, parts):
+    """Every mission lasts as long as its classes tell."""
+    states, records = fake_step(keys, team, models, states, parts)
+    last = CHUNK // 2 + jnp.abs(states.classes.sum(axis=-1)) * CHUNK // 2
+    return dataclasses.replace(states, done=states.steps >= last), records
 
-    monkeypatch.setattr(ROLLOUT, "step", uneven)
-    few, many = (play(WORKERS[split](), batch=batch, episodes=64) for batch in (8, 64))
+
+@pytest.mark.parametrize("split", WORKERS)
+def test_results_do_not_depend_on_how_many_missions_play_at_once(split, play):
+    few = play(split, batch=8, episodes=64, step=uneven)
+    many = play(batch=64, episodes=64, step=uneven)
     assert len(set(many.metrics["naive"]["steps"].tolist())) > 3
     chex.assert_trees_all_equal(few.metrics, many.metrics)
     assert few.control_steps == many.control_steps == many.metrics["naive"]["steps"].sum()
@@ -175,7 +194,7 @@ def test_missions_with_physics_do_not_depend_on_how_many_play_at_once(team, mode
         np.testing.assert_allclose(here, there, rtol=0 if is_exact else 1e-5)
 
 
-def test_a_map_that_is_not_finite_ends_the_missions(play, monkeypatch):
+def test_a_map_that_is_not_finite_ends_the_missions(play):
     def diverging(keys, team, models, states, parts):
         states, record = fake_step(keys, team, models, states, parts)
         is_bad = (states.steps > CHUNK)[:, None, None]
@@ -184,21 +203,19 @@ def test_a_map_that_is_not_finite_ends_the_missions(play, monkeypatch):
         )
         return dataclasses.replace(states, belief=belief), record
 
-    monkeypatch.setattr(ROLLOUT, "step", diverging)
     with pytest.raises(StageError, match="mission: beliefs after 2 chunks are not finite"):
-        play(Workers())
+        play(step=diverging)
 
 
-def test_values_that_are_not_finite_end_the_missions(play, monkeypatch):
+def test_values_that_are_not_finite_end_the_missions(play):
     def lost(keys, team, models, states, parts):
         states, record = fake_step(keys, team, models, states, parts)
         target = jnp.where((states.steps > CHUNK)[:, None], -1, states.robots.target)
         robots = dataclasses.replace(states.robots, target=target)
         return dataclasses.replace(states, robots=robots), record
 
-    monkeypatch.setattr(ROLLOUT, "step", lost)
     with pytest.raises(StageError, match="mission: values of policy naive are not finite"):
-        play(Workers())
+        play(step=lost)
 
 
 def test_a_short_time_limit_changes_no_program():

@@ -206,8 +206,13 @@ def test_what_is_measured_of_three_robots(many, models, start_of):
         detections=jnp.array([3, 1, 0]),
     )
     means = jnp.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
-    known = with_class_beliefs(models, Belief(means, jnp.full((3, 2), 0.3)))
-    found = mission.measure(many, known, replace(state, robots=robots, done=jnp.bool_(True)))
+
+    @jax.jit
+    def measure(classes, state):
+        return mission.measure(many, with_class_beliefs(models, classes), state)
+
+    ended = replace(state, robots=robots, done=jnp.bool_(True))
+    found = measure(Belief(means, jnp.full((3, 2), 0.3)), ended)
     np.testing.assert_array_equal(found["detections"], [3, 1, 0])
     assert found["observations_per_poi"] == 2
     assert set(found["told"]) == {"camera", "lidar"}

@@ -130,7 +130,7 @@ def test_all_policies_are_checked_before_one_is_compiled(monkeypatch):
 
 def test_memory_may_start_as_a_python_number():
     policy = tasks.Recurrent(lambda key, memory, seen: (jnp.int32(3), memory + 0.5), 0)
-    np.testing.assert_array_equal(jaxsense.score(NAME, [policy], episodes=1).returns, 0)
+    np.testing.assert_array_equal(jaxsense.score(NAME, [policy]).returns, 0)
 
 
 def test_actions_from_the_host_stay_integers():

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tiny import learn_by_stages
 
-from jaxsense import PRESETS, Config, learn, looks, training
+from jaxsense import PRESETS, Config, looks, training
 from jaxsense.config import ConfigError, DetectorConfig, FilterConfig, JmvaeConfig
 from jaxsense.core import supervised
 from jaxsense.models import make_shape
@@ -45,7 +46,7 @@ def begun(stage: Stage, config: Config, outputs) -> Any:
 def learned():
     """All stages up to `grouped`, with a single JMVAE."""
     once = dataclasses.replace(TINY, jmvae=dataclasses.replace(TINY.jmvae, restarts=1))
-    return jax.jit(lambda key: learn(key, once, until="grouped"))(KEY)
+    return learn_by_stages(KEY, once, until="grouped")
 
 
 def test_the_restart_with_the_lowest_finite_loss_is_kept():
@@ -253,9 +254,14 @@ def test_no_two_starts_of_live_episodes_show_the_same_pois(monkeypatch):
     windows = tuple(jnp.zeros((total, 3, 1)) for _ in range(2))
     classes, scenes = jnp.repeat(group[:, None], 3, axis=1) % 3, cast("Any", group)
     survey = perception.Survey(classes, scenes, windows, jnp.ones((total, 2, 3)))
-    surveyed = perception.divide(config, survey)
     monkeypatch.setattr(looks, "detect_all", lambda trained, windows: windows)
-    found = perception.detect(KEY, config, surveys=surveyed, trained=()).starts
+
+    @jax.jit
+    def starts(survey):
+        surveyed = perception.divide(config, survey)
+        return perception.detect(KEY, config, surveys=surveyed, trained=()).starts
+
+    found = starts(survey)
     np.testing.assert_array_equal(found.scenes, num_train // 3 + np.arange(64))
     assert num_bank == 3 * 64  # none of those to measure on
     np.testing.assert_array_equal(found.classes[:, 0], found.scenes % 3)
