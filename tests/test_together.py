@@ -169,7 +169,7 @@ def walking(name, farthest=np.inf):
         loss = jnp.where(state > farthest, jnp.nan, state)
         return state, Progress(jnp.stack([loss, loss]), {})
 
-    return Stage(name, begin, advance=advance, steps=5, chunks=3)
+    return Stage(name, begin, advance=advance, steps=5, chunks=3, shares="dqn")
 
 
 @pytest.fixture
