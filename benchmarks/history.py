@@ -8,9 +8,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "jaxsense"
+_COMPILED = ("run/devices.py",)  # with these options
 _BODIES = ("sim/amiro.py", "sim/arena.py")
 _MOTION = (*_BODIES, "mission/groups.py", "mission/motion.py", "mission/navigation.py")
-_RAYS = ("sim/raycast.py",)
+_RAYS = (*_BODIES, "sim/raycast.py", "sim/sensors.py")
 _STEPS = ("looks.py", "mission", "models.py", "sim", "vae")
 _MISSIONS = (*_STEPS, "run/batches.py", "run/missions.py")
 _MAP = ("dqn/map_mdp.py", "vae/filter.py", "vae/fusion.py")
@@ -30,7 +31,7 @@ CODE: Mapping[str, tuple[str, ...]] = {
     "team_mdp": (*_MAP, "dqn/team_mdp.py"),
     **dict.fromkeys(("train", "train_warm"), (".",)),
 }
-"""Files and folders of the package that each row measures."""
+"""Files and folders of the package that each row measures, besides what compiles all of them."""
 
 
 def is_whole() -> bool:
@@ -48,11 +49,17 @@ def has_changed(row: str, commit: str) -> bool:
 
     Args:
       row: its name.
-      commit: that it was measured by, of the history.
+      commit: that it was measured by.
+
+    Raises:
+      ValueError: if the commit is not in the history.
     """
-    places = [f"{PACKAGE}/{place}" for place in CODE[row]]
-    paths = (_git("diff", "--name-only", commit, "--", *places) or "").split()
-    return any(_before(commit, path) != _now(path) for path in paths if path.endswith(".py"))
+    places = [f"{PACKAGE}/{place}" for place in (*_COMPILED, *CODE[row])]
+    paths = _git("diff", "--name-only", commit, "--", *places)
+    if paths is None:
+        raise ValueError(f"commit = {commit!r} of row {row}: must be one of the history")
+    modules = [path for path in paths.split() if path.endswith(".py")]
+    return any(_before(commit, path) != _now(path) for path in modules)
 
 
 def note(path: Path) -> None:

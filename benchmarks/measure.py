@@ -101,10 +101,8 @@ class Row:
         values = dataclasses.asdict(self)
         if values.pop("is_bound"):
             values["peer"] = f"{self.peer} (stopped)"
-        return {
-            **values,
-            **provenance(f"python -m benchmarks {self.row}" + (" --peers" if self.peer else "")),
-        }
+        peers = " --peers" if self.theirs is not None else ""
+        return {**values, **provenance(f"python -m benchmarks {self.row}{peers}")}
 
 
 def batches(

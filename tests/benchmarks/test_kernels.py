@@ -50,8 +50,9 @@ def test_the_table_adds_up_the_parts_of_a_step():
     }
     lines = kernels.table(results).splitlines()
     assert lines[0] == "| kernels in a step; ms | 384 missions, 3 PoIs | 8,192 missions, 16 PoIs |"
-    assert lines[2:5] == [
+    assert lines[2:6] == [
         "| all | 3; 3.00 | 2; 1.00 |",
+        "| wall clock, without the profiler | 4.00 | 5.00 |",
         # The longest parts first.
         "| `steer` | 2; 1.00 | 2; 1.00 |",
         "| `move` | 1; 2.00 | 0; 0.00 |",

@@ -184,19 +184,22 @@ def test_code_changes_between_commits(repository):
     second = repository("raycast.py", "'''About x.'''\nx = 1  # m")
     assert history.commits() == [second, first]
     assert not history.has_changed("rays", first)
-    repository("arena.py", "y = 1")
+    repository("drives.py", "y = 1")
     assert not history.has_changed("rays", first)
+    repository("arena.py", "y = 1")
     assert history.has_changed("physics", first)  # a file that did not exist
     (history.ROOT / "jaxsense" / "sim" / "raycast.py").write_text("x = 2")  # not yet committed
     assert history.has_changed("rays", first)
     assert history.has_changed("resets_many", first)  # measures the folder
+    with pytest.raises(ValueError, match=r"commit = '0000.*' of row rays: must be one of the hist"):
+        history.has_changed("rays", "0" * 40)
 
 
 def test_rows_note_changes(repository):
     commit = repository("raycast.py", "x = 1")
-    repository("arena.py", "y = 1")
+    repository("drives.py", "y = 1")
     path = history.ROOT / "cpu.json"
-    rows = [{"row": name, "commit": commit} for name in ("rays", "physics")]
+    rows = [{"row": name, "commit": commit} for name in ("rays", "resets_many")]
     path.write_text(json.dumps(rows))
     history.note(path)
     assert [row["changed"] for row in json.loads(path.read_text())] == [False, True]
