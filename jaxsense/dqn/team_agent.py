@@ -160,9 +160,11 @@ class TeamAgent:
         """Values of a robot's actions that rank PoIs by predicted completion time.
 
         A look is worthwhile if its Q-value, were it the only one left, exceeds the price of the
-        travel time, see `worth`. Its value is then minus the predicted seconds of `tours`; that of
-        NOP is lower, and those of other looks are lowest. Without `tour_params`, the values are
-        those of `values`, and lowest for looks that are worth nothing.
+        travel time. If none is, those are that would be if no other robot were at work, see
+        `worth`: a robot that leaves a PoI to one that is nearer stays until that look was enough.
+        The value of a worthwhile look is minus the predicted seconds of `tours`; that of NOP is
+        lower, and those of other looks are lowest. Without `tour_params`, the values are those of
+        `values`, and lowest for looks that are worth nothing.
 
         Args:
           params: of the Q-network.
@@ -173,12 +175,13 @@ class TeamAgent:
           robot: `[]` int32, the robot that chooses.
         """
         seen = self.observe(belief, team, robot)
+        is_useless = self.worth(params, classes, belief, team, robot) <= 0
         if not tour_params:
             values = self.values(params, seen)
-            is_useless = self.worth(params, classes, belief, team, robot) <= 0
             return jnp.append(jnp.where(is_useless, _NOT_WORTH_IT, values[:-1]), values[-1])
         after = self._q_alone(params, classes, belief, team, robot)
-        is_worth_it = self._less_way(after, seen) > 0
+        is_own = (self._less_way(after, seen) > 0) & team.present
+        is_worth_it = jnp.where(jnp.any(is_own), is_own, ~is_useless)
         seconds = tours.seconds(self.network, tour_params[0], seen, self.latent_size)
         of_pois = jnp.where(is_worth_it, -seconds, 2 * _NOT_WORTH_IT)
         # Comparisons with NaN are false; propagate it instead.

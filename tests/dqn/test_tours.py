@@ -180,6 +180,32 @@ def test_looks_that_pay_come_in_the_order_of_their_tours(monkeypatch, after, cos
     assert np.argsort(-values)[: len(order)].tolist() == order
 
 
+@pytest.mark.parametrize(
+    ("unknown", "chosen"), [([True, True, True], 2), ([True, False, False], 0)]
+)
+def test_a_robot_stays_until_the_look_of_a_nearer_one_was_enough(monkeypatch, unknown, chosen):
+    """The network leaves the first PoI to another robot, as soon as one heads for a PoI."""
+
+    def q(self, params, observed):
+        sigma = sigmas(observed, self.network.features)
+        is_headed_for = observed.reshape(self.network.features, 3, *observed.shape[1:])[6] > 0
+        of_first = jnp.where(jnp.any(is_headed_for), -5.0, 5.0)
+        of_each = jnp.stack([of_first, *jnp.full(2, 5.0)]).reshape(3, *[1] * (sigma.ndim - 1))
+        values = jnp.where(sigma > 0.3, of_each, 0.0)
+        return jnp.concatenate([values, jnp.zeros_like(values[:1])])
+
+    replace_q(monkeypatch, q)
+    monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
+    std = np.where(np.array(unknown)[:, None], 1.0, 0.2).astype(np.float32)
+    team = replace(AT_ORIGIN["team"], target=np.array([3, 0]))
+    belief = Belief(CLASSES.mean[[0, 0, 0]], np.broadcast_to(std, (3, 2)))
+    given = {**AT_ORIGIN, "belief": belief, "team": team}
+    values = jax.jit(lambda: AGENT.decide({}, ({},), classes=CLASSES, **given))()
+    assert np.argmax(values) == chosen
+    # What is known, or left to the other while there is more to do, comes below NOP.
+    assert [bool(x) for x in values[:3] > values[3]] == [chosen == 0, *unknown[1:]]
+
+
 def test_nan_of_the_q_network_stays_visible(monkeypatch):
     values = decided(monkeypatch, [jnp.nan, 1.0, 1.0], 0.0)
     np.testing.assert_array_equal(np.isnan(values), [True, False, False, False])
