@@ -28,6 +28,7 @@ from benchmarks import (
     where,
 )
 from benchmarks.digits import table as digits
+from benchmarks.fusions import table as fusions
 from benchmarks.raw import report as raw
 from benchmarks.seeds import rows, tables
 from benchmarks.seeds.plan import GROUPS
@@ -130,6 +131,7 @@ _PIPELINE = [
 TABLES: Mapping[str, _Tables] = {
     **{name: {None: table} for name in ROWS},
     "digits.json": {None: digits.of_results},
+    "fusions.json": {None: fusions.of_results},
     "seeds.json": {
         "readme": partial(tables.of_presets, rows=rows.OF_README, presets=("paper", "default")),
         "worth": partial(tables.worth, names=tables.EVALUATED),

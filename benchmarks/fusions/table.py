@@ -1,10 +1,12 @@
 """Means over seeds, and the table of all fusions."""
 
 from collections.abc import Mapping
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 from scipy import stats
+
+from benchmarks.measure import describe
 
 REFERENCE = "filter"
 """The fusion that the others are compared with."""
@@ -86,6 +88,15 @@ def as_markdown(fusions: Mapping[str, OfFusion]) -> str:
         cells = [_cell(each, figure, name == REFERENCE) for name, each in fusions.items()]
         rows.append([figure, *cells])
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def of_results(results: Mapping[str, Any]) -> str:
+    """The table of a JSON file, and how it came.
+
+    Args:
+      results: the content of the file.
+    """
+    return f"{as_markdown(results['fusions'])}\n{describe(results)}"
 
 
 def _cell(found: OfFusion, figure: str, is_reference: bool) -> str:
