@@ -45,7 +45,7 @@ def notebook(name):
     return next(path for path in NOTEBOOKS if path.stem == name)
 
 
-@pytest.mark.slow  # compiles a score; the same functions run in the examples of the page of tasks
+@pytest.mark.slow  # compiles a score; before a release, as the examples of the page of tasks
 def test_the_tasks(tmp_path, monkeypatch, capsys):
     run(notebook("tasks"), tmp_path, monkeypatch)
     printed = capsys.readouterr().out

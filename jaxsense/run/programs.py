@@ -28,6 +28,7 @@ from jaxsense.training.stages import stages
 
 OwnPolicies = Mapping[str, Values | Policy]
 """Policies of a user, by name, see `dqn.policies.table`."""
+_BEFORE_MISSIONS = 2  # stages that all others wait for
 _PATIENCE = 0.2  # s; between two checks whether the run is over
 _ROWS_AT_ONCE = 512  # of each thread; their results take up little memory besides those of all
 
@@ -80,8 +81,8 @@ class Programs:
       trainings: how many run side by side, and in all.
       policies: of missions, by name, in addition to `dqn.POLICIES`.
       left: how often each stage's programs are still needed, if it is known.
-      with_scans: names of the stages that take what only some stages need, as scans are, and that
-        no training is done with yet.
+      with_scans: names of the stages that read a passing output, as the scans are, see
+        `Stage.is_passing`, and that no training is done with yet.
       without_scans: set once there are none.
     """
 
@@ -171,9 +172,6 @@ def compile_programs(
     return programs
 
 
-_BEFORE_MISSIONS = 2  # stages that all others wait for
-
-
 def _on_cpu() -> bool:
     """Whether the programs run on a CPU; accelerators train faster than they compile."""
     return jax.default_backend() == "cpu"
@@ -221,8 +219,6 @@ def _batch(programs: Programs) -> int:
 def _trace_stage(programs: Programs, stage: Stage) -> None:
     """Traces the programs of a stage, unless an earlier stage shares them."""
     compiled, key, config = programs.of(stage), jax.random.key(0), programs.config
-    # Accelerators train faster than they compile.
-    runs_long = _on_cpu() and stage.runs_long
     if compiled.shapes.done():
         return
     outputs = {
@@ -254,6 +250,7 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
     if not stage.chunks:
         compiled.shapes.set_result(Shapes(divided(state)))
         return
+    runs_long = _on_cpu() and stage.runs_long
     _, progress = compiled.advance.compile(
         advance, key, config, state, inputs, runs_long=runs_long, whole=(1,)
     )

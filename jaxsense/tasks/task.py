@@ -127,6 +127,11 @@ class Task(Environment, Protocol):
         ...
 
 
+def _as_made(task: Task) -> str:
+    """How to make a task; its numbers would fill pages."""
+    return f"jaxsense.make({task.name!r}, {task.agent!r})"
+
+
 @pytree
 class MapTask(OneAgent):
     """A task in the map MDP: one agent looks at PoIs until it has seen enough.
@@ -144,6 +149,8 @@ class MapTask(OneAgent):
     returns: jax.Array
     name: str = struct.field(pytree_node=False)
     agent: str = struct.field(pytree_node=False)
+
+    __repr__ = _as_made
 
     @property
     def bound(self) -> float:
@@ -226,6 +233,8 @@ class TeamTask:
     returns: jax.Array
     robots: jax.Array
     name: str = struct.field(pytree_node=False)
+
+    __repr__ = _as_made
 
     @property
     def agent(self) -> str:

@@ -127,6 +127,12 @@ def test_stored_returns_of_references_are_what_they_reach(name, agent):
         assert abs(np.mean(returns) - task.returns[row, 0]) < error
 
 
+@pytest.mark.parametrize("agent", ["camera", "team"])
+def test_a_task_is_printed_as_it_is_made(agent):
+    name = "team-v0" if agent == "team" else "map-v0"
+    assert repr(jaxsense.make(name, agent)) == f"jaxsense.make('{name}', '{agent}')"
+
+
 def test_unknown_tasks_and_agents_are_refused():
     with pytest.raises(ConfigError, match=r"name = 'noisy': must be one of map-v0"):
         jaxsense.make("noisy")
