@@ -36,12 +36,13 @@ def main() -> None:
     """Traces trainings and a mission, and prints what was checked and refused, as JSON."""
     import shapes
 
-    with jaxtyping.install_import_hook("jaxsense", "shapes.checked"):
-        import jaxsense
+    # It stays: `jaxsense` imports its modules when they are first used.
+    jaxtyping.install_import_hook("jaxsense", "shapes.checked")
     import jax
     import jax.numpy as jnp
     from training.tiny import KEY, TINY
 
+    import jaxsense
     from jaxsense import mission, vae
 
     team = dataclasses.replace(
