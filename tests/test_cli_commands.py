@@ -305,8 +305,8 @@ def test_wheel_and_sdist_run_without_the_source(tmp_path):
     python = str(place / "bin" / "python")
     run(python, "-m", "pip", "install", "--quiet", "hatchling")
     run(python, "-m", "hatchling", "build", "-d", str(tmp_path / "dist"), cwd=ROOT)
-    files = sorted((tmp_path / "dist").iterdir())
-    assert [file.suffix for file in files] == [".gz", ".whl"]
+    files = [*(tmp_path / "dist").iterdir()]
+    assert sorted(file.suffix for file in files) == [".gz", ".whl"]
     for file in files:
         target = tmp_path / file.suffix[1:]
         install = [python, "-m", "pip", "install", "--quiet", "--no-deps", "--target"]
