@@ -150,7 +150,9 @@ class MapTask(OneAgent):
     name: str = struct.field(pytree_node=False)
     agent: str = struct.field(pytree_node=False)
 
-    __repr__ = _as_made
+    def __repr__(self) -> str:
+        """See `_as_made`."""
+        return _as_made(self)
 
     @property
     def bound(self) -> float:
@@ -234,7 +236,9 @@ class TeamTask:
     robots: jax.Array
     name: str = struct.field(pytree_node=False)
 
-    __repr__ = _as_made
+    def __repr__(self) -> str:
+        """See `_as_made`."""
+        return _as_made(self)
 
     @property
     def agent(self) -> str:
