@@ -162,3 +162,30 @@ def test_what_nobody_reads_is_left_out_and_the_same_is_computed_once():
     assert [node.operator for node in found.graph.nodes] == ["Exp", "Add"]
     with pytest.raises(NotImplementedError, match="primitive sin has no ONNX translation"):
         program(lambda m, x: {"y": jnp.sin(x)}, WEIGHTS, {"x": FLOATS}, Constants({}))
+
+
+def from_the_end(x):
+    return jax.lax.scan(lambda total, row: (total + row, total), x[0], x[:2], reverse=True)[1]
+
+
+def one_of_three(x):
+    branches = [lambda x: x, lambda x: 2 * x, lambda x: 3 * x]
+    return jax.lax.switch(x[0, 0].astype(jnp.int32), branches, x)
+
+
+@pytest.mark.parametrize(
+    ("function", "reason"),
+    [
+        (lambda x: ~x.astype(jnp.int32), "Not of bits"),
+        (lambda x: jax.lax.round(x, jax.lax.RoundingMethod.AWAY_FROM_ZERO), "rounding away"),
+        (lambda x: jax.lax.select_n(x.astype(jnp.int32) % 3, x, 2 * x, 3 * x), "a choice among"),
+        (one_of_three, "a choice among"),
+        (lambda x: x.at[0, jnp.argmax(x[0])].get(mode="fill", fill_value=0.0), "gather that fills"),
+        (lambda x: x.at[x[0].astype(jnp.int32)].set(0.0), "scatter of several rows"),
+        (from_the_end, "a scan from the end"),
+    ],
+)
+def test_what_has_no_translation_is_refused(function, reason):
+    rows = "float32", (3, 3)
+    with pytest.raises(NotImplementedError, match=f"{reason}.* has no ONNX translation"):
+        program(lambda m, x: {"y": function(x)}, WEIGHTS, {"x": rows}, Constants({}))
