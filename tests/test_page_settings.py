@@ -1,17 +1,70 @@
-"""Tables of settings state the values of the presets."""
+"""Pages state the settings of the presets and the constants of the code."""
 
 import re
 from pathlib import Path
 
 import pytest
 
+import jaxsense
 from jaxsense import PRESETS
+from jaxsense.dqn import tours
+from jaxsense.mission.cases import FAULT_TIME
+from jaxsense.sim import amiro, search
+from jaxsense.summary import compare, make
+from jaxsense.training import perception
+from jaxsense.vae import gate, novelty
 
 ROOT = Path(__file__).parents[1]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "benchmarks" / "RESULTS.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
 PRESET_OF = {"getting-started": "noisy", "differences": "paper", "imperfect": "default"}
 HEAD = "| setting | value |"
 AFTER = {"`jmvae.steps`, `batch`, `learning_rate`": [0.0]}  # what the rate falls to
 WORDS = {"yes": True, "on": True, "no": False, "off": False}
+_VALUE = r"-?\d[\d,]*(?:\.\d+)?(?: (?:m|s|nats|degrees?))?"
+_GROUP = rf"(?:`\w+`(?:, `\w+`)*: )?{_VALUE}"
+INLINE = re.compile(rf"`(\w+\.[\w.]+)`\s+\(({_GROUP}(?:; {_GROUP})*)\)")
+"""A setting in prose: "`mdp.look_cost` (0.05; `noisy`: 0.1)". A value for which no preset is named
+is that of the page's preset."""
+
+
+def _constants():
+    """What prose says with numbers that are constants of the code, in the code's numbers."""
+    default = PRESETS["default"]
+    lidar, camera, viewpoint = default.lidar, default.camera, default.viewpoint
+    unambiguous, near = f"{100 * make._UNAMBIGUOUS:.0f}", make._AS_GOOD
+    lost, rejected = f"{100 * gate._MAX_LOST:g} %", f"{100 * (1 - gate._MAX_PASSED):g} %"
+    yield f"{lidar.num_beams} beams over {lidar.field_of_view:g} degrees"
+    yield f"from {lidar.min_range} to {lidar.max_range:g} m"
+    yield f"{camera.num_pixels} pixels over {camera.field_of_view:g} degrees"
+    yield f"{viewpoint.min_distance} to {viewpoint.max_distance} m"
+    yield f"Robots are {amiro.BODY_TOP:.3f} m high, or {amiro.LIDAR_TOP} m with a LiDAR"
+    yield f"at most {lost} of those at PoIs, and fewer if it rejects {rejected} of those at nothing"
+    yield f"exceeds the accuracy by at most {novelty._TOLERANCE} in both halves"
+    yield f"an error of at most {perception._EXACT} nats"
+    yield f"{compare._MOST_TIMES} times that of exact Bayes plus {compare._MOST_NATS} nats"
+    yield f"more than {100 * make._ERROR:g} % and two standard errors"
+    yield f"within {near} of the optimal policy's"
+    yield f"within {near} of optimal"
+    yield f"more than {unambiguous} % of its held-out detections"
+    yield f"over {unambiguous}% of looks leave this class"
+    yield f"pseudo-Huber loss with a scale of {tours._ERROR:g} s"
+    yield f"control periods of {default.mission.control_period} s"
+    yield f"unknown to all, after {FAULT_TIME:g} s"
+    yield f"distance of {search._NEAREST} m no wider than at {search._NEAREST} m"
+    yield f"at most {100 * search._STEP:g} cm apart"
+    for task in ("noisy-v0", "many-v0"):
+        yield f"a look costs {jaxsense.make(task).mdp.reward.look_cost} nats"
+    yield f"each second of a robot's work costs {jaxsense.make('team-v0').mdp.config.second_cost}"
+
+
+CONSTANTS = {
+    text: re.compile(rf"(?<![\w.]){re.escape(text)}(?!\w)".replace(r"\ ", r"\s+"))
+    for text in _constants()
+}
 
 
 def rows(page):
@@ -50,6 +103,20 @@ def stated(cell):
     ]
 
 
+def groups(cell, preset):
+    """The presets and the number of each value in the brackets of `INLINE`."""
+    for group in cell.split("; "):
+        number = re.search(rf"{_VALUE}$", group)[0].split()[0]
+        yield re.findall(r"`(\w+)`", group) or [preset], float(number.replace(",", ""))
+
+
+INLINES = [
+    (page.stem, preset, name, value)
+    for page in PAGES
+    for name, cell in INLINE.findall(page.read_text(encoding="utf-8"))
+    for presets, value in groups(cell, PRESET_OF.get(page.stem, "default"))
+    for preset in presets
+]
 TABLES = [
     (preset, names, cell)
     for page, preset in PRESET_OF.items()
@@ -68,3 +135,21 @@ def test_tables_of_settings_are_found():
     assert len(TABLES) > 30
     assert ("noisy", "`lidar.range_noise`", "0.02 m") in TABLES
     assert stated("1,024,000 or 0.5, yes, `bank`") == [1024000.0, 0.5, True, "bank"]
+
+
+@pytest.mark.parametrize(("page", "preset", "name", "value"), INLINES)
+def test_settings_in_prose_are_those_of_the_presets(page, preset, name, value):
+    assert set(settings(preset, f"`{name}`")) == {value}
+
+
+def test_settings_in_prose_are_found():
+    assert len(INLINES) > 20
+    found = INLINE.findall("`a.b` (1,024; `noisy`, `many`: 0.2 m), `a.b` (twice), `b` (0.3)")
+    assert found == [("a.b", "1,024; `noisy`, `many`: 0.2 m")]
+    assert [*groups(found[0][1], "paper")] == [(["paper"], 1024.0), (["noisy", "many"], 0.2)]
+
+
+@pytest.mark.parametrize("text", CONSTANTS)
+def test_constants_of_the_code_are_stated_on_pages(text):
+    """A phrase that no page has any more must go; one whose number changed counts as typed."""
+    assert any(CONSTANTS[text].search(page.read_text(encoding="utf-8")) for page in PAGES)
