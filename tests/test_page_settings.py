@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import jaxsense
-from jaxsense import PRESETS
+from jaxsense import PRESETS, demo
 from jaxsense.dqn import tours
 from jaxsense.mission.cases import FAULT_TIME
 from jaxsense.sim import amiro, search
@@ -58,6 +58,8 @@ def _constants():
     yield f"at most {100 * search._STEP:g} cm apart"
     for task in ("noisy-v0", "many-v0"):
         yield f"a look costs {jaxsense.make(task).mdp.reward.look_cost} nats"
+    yield f"the arena of `--seed {demo.Arguments().seed}`"
+    yield f"`--seed`, by default {demo.Arguments().seed},"
     yield f"each second of a robot's work costs {jaxsense.make('team-v0').mdp.config.second_cost}"
 
 
