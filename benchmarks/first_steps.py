@@ -114,12 +114,11 @@ def main(argv: list[str] | None = None) -> None:
     if arguments.json is not None:
         measure.require_commit(PROGRAM)
     measure.reserve(PROGRAM, "json", arguments.json)
+    # First: a commit that is made meanwhile is not what is measured.
+    results = measure.origin(studies.command(PROGRAM, arguments))
     with tempfile.TemporaryDirectory() as folder:
-        imports = of_imports(arguments.repeats, Path(folder) / "imports")
-        steps = {name: of_step(name, Path(folder) / name) for name in arguments.steps}
-    # Last: what is measured needs the memory of the accelerator.
-    origin = measure.origin(studies.command(PROGRAM, arguments))
-    results = {**origin, "imports": imports, "steps": steps}
+        results["imports"] = of_imports(arguments.repeats, Path(folder) / "imports")
+        results["steps"] = {name: of_step(name, Path(folder) / name) for name in arguments.steps}
     studies.write(arguments.json, results)
     print(table(results))
 

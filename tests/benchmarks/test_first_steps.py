@@ -50,7 +50,9 @@ def test_the_program_is_the_first_of_the_readme(ran, tmp_path):
 def test_imports_take_turns_and_the_median_of_what_they_add_counts(
     ran, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(measure.version, "commit", lambda: "0123456789abcdef")
+    # Another commit is made while the first import runs.
+    commit = lambda: "fedcba9876543210" if ran else "0123456789abcdef"  # noqa: E731
+    monkeypatch.setattr(measure.version, "commit", commit)
     out = tmp_path / "first_steps.json"
     first_steps.main(["--steps", "demo", "--repeats", "3", "--json", str(out)])
     programs = [words[-1] for words, _, _ in ran]
