@@ -34,7 +34,7 @@ from jaxsense.models import make_agent
 from jaxsense.run import cli, devices
 from jaxsense.sim.world import Scene, make_world
 from jaxsense.training import agents
-from jaxsense.training.perception import Detections, Starts
+from jaxsense.training.detections import Detections, Starts
 from jaxsense.training.stage import Stage, compose
 
 PROGRAM = "benchmarks.curves"

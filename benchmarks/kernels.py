@@ -11,7 +11,7 @@ import re
 import shlex
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -20,6 +20,7 @@ import jax
 
 from benchmarks import measure, studies
 from benchmarks.missions import Playing, of_many_pois, playing, untrained
+from jaxsense.config import Config
 from jaxsense.config.checks import check_fields, limited
 from jaxsense.run import cli, devices
 
@@ -31,13 +32,13 @@ _OTHER = "other"
 Parts: TypeAlias = dict[str, "Part"]
 
 
-CASES: Mapping[str, tuple[str, int]] = {
-    "few": ("default", 384),
-    "many": ("default", 16384),
-    "pois": ("16 PoIs", 8192),
+CASES: Mapping[str, tuple[Callable[[], Config], int]] = {
+    "few": (partial(untrained, "default"), 384),
+    "many": (partial(untrained, "default"), 16384),
+    "pois": (of_many_pois, 8192),
+    "robots": (partial(of_many_pois, robots=("camera", "lidar") * 3), 2048),
 }
 """Settings and number of missions, by the names of the option `cases`."""
-_CONFIGS = {"default": partial(untrained, "default"), "16 PoIs": of_many_pois}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,8 +46,8 @@ class Arguments:
     """Count the kernels of a control step, part by part, and their milliseconds."""
 
     cases: tuple[str, ...] = tuple(CASES)
-    """Which missions: `few` (384) and `many` (16,384) with the settings of `default`, or 8,192 with
-    16 PoIs (`pois`)."""
+    """Which missions: `few` (384) and `many` (16,384) with the settings of `default`, 8,192 with 16
+    PoIs (`pois`), or 2,048 with six robots among 16 PoIs (`robots`)."""
     policy: str = "naive"
     """What chooses looks."""
     steps: int = limited(20, at_least=1)
@@ -84,7 +85,7 @@ def main(argv: list[str] | None = None) -> None:
     }
     for name in arguments.cases:
         settings, batch = CASES[name]
-        missions = playing(_CONFIGS[settings](), arguments.policy, batch, arguments.steps)
+        missions = playing(settings(), arguments.policy, batch, arguments.steps)
         wall, parts = profile(missions.compiled(devices.compiler_options()), missions)
         results["cases"][name] = {
             "wall_s": wall,
@@ -111,7 +112,9 @@ def table(results: Mapping[str, Any]) -> str:
     heads = ["kernels in a step; ms"]
     for name in cases:
         settings, batch = CASES[name]
-        heads.append(f"{batch:,} missions, {'3 PoIs' if settings == 'default' else settings}")
+        config = settings()
+        robots, num_pois = len(config.carried), config.arena.num_pois
+        heads.append(f"{batch:,} missions, {robots} robots, {num_pois} PoIs")
 
     def cell(number: int, seconds: float) -> str:
         return f"{number / steps:,.0f}; {1e3 * seconds / steps:.2f}"

@@ -304,6 +304,17 @@ def require_known(program: str, option: str, names: Iterable[str], known: Iterab
             cli.fail(program, f"{option} = {name!r}: must be one of {', '.join(known)}")
 
 
+def require_commit(program: str) -> None:
+    """Ends the program, before anything is measured, if no commit holds the code that runs.
+
+    Args:
+      program: module that runs.
+    """
+    found = version.commit()
+    if found is None or found.endswith("-dirty"):
+        cli.fail(program, f"commit = {found!r}: must be one without changes")
+
+
 def reserve(program: str, option: str, path: Path | None) -> None:
     """Makes an empty list of results, or ends the program, before anything is measured.
 

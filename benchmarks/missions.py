@@ -139,11 +139,15 @@ def untrained(preset: str) -> Config:
     return dataclasses.replace(config, mission=settings)
 
 
-def of_many_pois() -> Config:
-    """Settings of two robots among 16 PoIs."""
+def of_many_pois(robots: tuple[str, ...] | None = None) -> Config:
+    """Settings of two robots, or others, among 16 PoIs in an arena of 6 m.
+
+    Args:
+      robots: see `Config.robots`.
+    """
     config = untrained("team")
     arena = dataclasses.replace(config.arena, num_pois=16, side=6.0)
-    return dataclasses.replace(config, arena=arena)
+    return dataclasses.replace(config, arena=arena, robots=robots)
 
 
 @dataclasses.dataclass(frozen=True)

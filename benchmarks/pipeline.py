@@ -123,14 +123,28 @@ def run(tree: Path, words: Sequence[str], place: Path) -> Needs:
       words: behind `python -m`.
       place: working directory.
     """
-    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    return python(tree, ("-m", *words), place)
+
+
+def python(
+    tree: Path, words: Sequence[str], place: Path, variables: Mapping[str, str] | None = None
+) -> Needs:
+    """Runs Python with a tree of the source, or ends the program if it fails.
+
+    Args:
+      tree: the source.
+      words: behind `python`.
+      place: working directory.
+      variables: of the environment, in place of this program's.
+    """
+    environment = {**os.environ, **(variables or {}), "PYTHONPATH": str(tree)}
     begin = time.perf_counter()
     process = subprocess.Popen(
-        [sys.executable, "-m", *words], cwd=place, env=environment, stdout=subprocess.DEVNULL
+        [sys.executable, *words], cwd=place, env=environment, stdout=subprocess.DEVNULL
     )
     _, status, usage = os.wait4(process.pid, 0)
     if status:
-        sys.exit(f"python -m {' '.join(words)}, in {tree}, has failed")
+        sys.exit(f"python {' '.join(words)}, in {tree}, has failed")
     seconds = time.perf_counter() - begin
     return Needs(seconds, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / _GIB)
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from benchmarks import (
     exported,
+    first_steps,
     gate,
     history,
     imperfect_tables,
@@ -160,6 +161,7 @@ TABLES: Mapping[str, _Tables] = {
     "gate.json": {None: gate.table, "search": gate.of_search},
     "where.json": {None: where.table, "accuracy": where.of_accuracies},
     **{name: {None: pipeline.table} for name in _PIPELINE},
+    "first_steps.json": {None: first_steps.table},
     "kernels.json": {None: kernels.table},
     "place.json": {None: place.table},
     "travel.json": {None: travel.table},

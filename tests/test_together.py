@@ -1,21 +1,27 @@
 """Trainings side by side, whose calls of a program are made as one."""
 
+import contextlib
+import json
 import time
 from concurrent.futures import ThreadPoolExecutor, wait
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
+from jaxsense import train as command
 from jaxsense.config import PRESETS
 from jaxsense.run import devices, loop, pipeline, programs, together
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.run.together import SharedProgram, Trainings
-from jaxsense.training.stage import Progress, Stage
+from jaxsense.training.stage import Progress, Stage, compose
 
 SMOKE, SCALE = PRESETS["smoke"], np.float32(2)
 ROWS = np.arange(10, dtype=np.float32).reshape(5, 2)
@@ -43,10 +49,15 @@ def scaled(scale, x):
 
 
 @pytest.fixture
-def shared(monkeypatch):
-    """Makes a program of `scaled` for trainings that wait for each other for `PATIENCE`."""
+def patient(monkeypatch):
+    """Trainings wait for each other for `PATIENCE`, and look every 10 ms for whom to wait."""
     monkeypatch.setattr(together, "_PATIENCE", PATIENCE)
     monkeypatch.setattr(together, "wait", lambda futures, timeout: wait(futures, timeout=0.01))
+
+
+@pytest.fixture
+def shared(patient):
+    """Makes a program of `scaled` for trainings."""
     with Compiler(Monitor()) as compiler:
 
         def make(trainings, workers=ALONE):
@@ -254,3 +265,107 @@ def test_a_training_goes_on_without_those_that_were_side_by_side(train, alone):
     train([0, 1], stop=(1, "dqn_lidar", 2), saved=True)
     found, _ = train([1], saved=True)
     assert found == {1: alone[1]}
+
+
+def after(key, config, *, walked):
+    """A stage for those whose walk has not failed."""
+    return walked + jax.random.uniform(key)
+
+
+def walks(farthest=np.inf):
+    return [
+        walking("dqn_camera", farthest),
+        Stage("after", after, {"walked": "dqn_camera"}),
+    ]
+
+
+@pytest.fixture
+def write(monkeypatch, tmp_path, patient):
+    """Trains seeds in one group of the command; gives what it tells, pictures, and summaries."""
+    monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
+
+    def learn(key, config, programs, monitor, checkpoints):
+        outputs = loop.train(key, config, programs, monitor, checkpoints).outputs
+        return SimpleNamespace(results={name: x.item() for name, x in outputs.items()})
+
+    def play(key, config, programs, monitor, learned, checkpoints):
+        return SimpleNamespace(missions=-learned.results["after"])
+
+    monkeypatch.setattr(pipeline, "learn", learn)
+    monkeypatch.setattr(pipeline, "play", play)
+
+    def run(seeds, number, farthest=np.inf):
+        drawn = {}
+        report = SimpleNamespace(
+            of_training=lambda config, learned: {"curve": learned.results["after"]},
+            of_missions=lambda config, learned, played: {"film": played.missions},
+            write=lambda run, pictures, found, clock: drawn.update({run.settings.seed: pictures}),
+        )
+        monkeypatch.setattr(command, "_report", lambda: report)
+        monkeypatch.setattr(programs, "stages", lambda config: walks(farthest))
+        arguments, monitor = command.parse(["--preset", "smoke", "--quiet"]), Monitor()
+        trainings = Trainings(number, total=len(seeds))
+        with (
+            pipeline.compiled(SMOKE, monitor, trainings=trainings) as compiled,
+            contextlib.ExitStack() as opened,
+        ):
+            runs = [
+                opened.enter_context(
+                    RunDirectory.create(tmp_path / str(seed), Settings("smoke", seed, SMOKE))
+                )
+                for seed in seeds
+            ]
+            failed = command._train_together(
+                arguments, runs, compiled, monitor, Console(quiet=True)
+            )
+        summaries = {
+            seed: json.loads((tmp_path / str(seed) / "summary.json").read_text(encoding="utf-8"))
+            for seed in seeds
+            if (tmp_path / str(seed) / "summary.json").exists()
+        }
+        return failed, drawn, summaries
+
+    return run
+
+
+@jax.jit
+def walked(seed):
+    """Outputs of a seed alone, in one program."""
+    return compose(jax.random.key(seed), SMOKE, walks()).outputs
+
+
+def test_the_command_writes_of_each_seed_what_it_gets_alone(write, tmp_path):
+    seeds = [7, 3, 5]
+    begin = time.monotonic()
+    failed, drawn, summaries = write(seeds, number=4)  # the last group of many seeds
+    assert time.monotonic() - begin < PATIENCE / 2
+    assert failed == {}
+    expected = {seed: {name: x.item() for name, x in walked(seed).items()} for seed in seeds}
+    assert len({outputs["after"] for outputs in expected.values()}) == 3
+    for seed in seeds:
+        found, after = summaries[seed], expected[seed]["after"]
+        assert found["seed"] == seed
+        assert {name: found[name] for name in expected[seed]} == expected[seed]
+        assert found["mission"] == -after
+        assert drawn[seed] == {"curve": after, "film": -after}
+        lines = (tmp_path / str(seed) / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+        reported = [json.loads(line) for line in lines]
+        assert [each["step"] for each in reported if "loss" in each] == [2, 4, 5]
+        assert reported[-1]["loss"] == pytest.approx(expected[seed]["dqn_camera"])
+
+
+def test_the_command_writes_other_seeds_when_one_fails(write, tmp_path, capsys):
+    reached = {seed: walked(seed)["dqn_camera"].item() for seed in (7, 3, 5)}
+    *others, failing = sorted(reached, key=lambda seed: reached[seed])
+    farthest = (reached[others[-1]] + reached[failing]) / 2
+    begin = time.monotonic()
+    failed, drawn, summaries = write([7, 3, 5], number=3, farthest=farthest)
+    assert time.monotonic() - begin < PATIENCE / 2
+    ((seed, reason),) = failed.items()
+    assert seed == failing
+    assert "loss = nan at step 5 of 5" in reason
+    assert f"earlier checkpoints are in {tmp_path / str(failing)}" in capsys.readouterr().err
+    assert {seed: found["after"] for seed, found in summaries.items()} == {
+        seed: walked(seed)["after"].item() for seed in others
+    }
+    assert set(drawn) == set(others)

@@ -29,8 +29,8 @@ from jaxsense.models import make_agent, make_bayes, make_prior
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import comparison
+from jaxsense.training.detections import Detections, Starts
 from jaxsense.training.mdp import held_out_mdp, mdp_of
-from jaxsense.training.perception import Detections, Starts
 from jaxsense.training.stage import Output, Progress, Stage, chunk_size, num_chunks
 from jaxsense.vae import readout
 from jaxsense.vae.detectors import Detector

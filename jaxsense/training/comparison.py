@@ -18,8 +18,8 @@ from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Known, Policy, Values
 from jaxsense.dqn.reference import reference
 from jaxsense.models import Models, make_agent, make_bayes
+from jaxsense.training.detections import Detections
 from jaxsense.training.mdp import held_out_mdp, models_of
-from jaxsense.training.perception import Detections
 from jaxsense.training.stage import Output
 
 COMPARED = ("latent", "optimal", "greedy", "naive", "random")

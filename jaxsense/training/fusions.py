@@ -8,8 +8,8 @@ from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key
 from jaxsense.models import make_in_place, make_jmvae, make_prior
+from jaxsense.training.detections import Detections
 from jaxsense.training.fits import fit_stage
-from jaxsense.training.perception import Detections
 from jaxsense.training.stage import Output, Stage
 from jaxsense.vae import filter
 from jaxsense.vae.filter import Filter

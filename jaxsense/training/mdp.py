@@ -10,7 +10,7 @@ from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models, make_agent, make_bayes
-from jaxsense.training.perception import Detections
+from jaxsense.training.detections import Detections
 from jaxsense.vae import novelty
 
 

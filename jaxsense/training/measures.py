@@ -12,7 +12,7 @@ from jaxsense.config import Config
 from jaxsense.core.types import Belief, Fusion, Key, Reliability, Samples, call, pytree
 from jaxsense.models import make_bayes
 from jaxsense.training import histories
-from jaxsense.training.perception import Detections
+from jaxsense.training.detections import Detections
 from jaxsense.vae import calibration, latent
 
 _HISTORIES_AT_ONCE = 512

@@ -19,12 +19,13 @@ from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.models import make_frame, make_prior, make_readout, make_shape
 from jaxsense.sim import sensors
 from jaxsense.sim.arena import Arena
-from jaxsense.training import gating, perception, repeats
+from jaxsense.training import detections, gating, repeats
+from jaxsense.training.detections import Detections
 from jaxsense.training.fits import fit_stage, jmvae_restarts
 from jaxsense.training.gating import Examples
-from jaxsense.training.perception import Detections, Scenes, Survey, Surveys
 from jaxsense.training.repeats import Repeated
 from jaxsense.training.stage import Stage
+from jaxsense.training.surveys import Scenes, Survey, Surveys, num_scenes
 from jaxsense.vae import clusters, frames, leave_one_out
 from jaxsense.vae import gate as gates
 from jaxsense.vae.frames import Scaling
@@ -61,7 +62,7 @@ class Views:
 
 
 def make_stages(config: Config, arena: Arena) -> list[Stage]:
-    """Makes the stages from surveys to detections and novelty; see `perception.make_stages`."""
+    """Makes the stages from surveys to detections and novelty."""
     detectors = tuple(f"detector_{name}" for name in config.modalities)
     learned = {"params": "best_jmvae", "views": "views"}
     restarts = _jmvae_stages(config)
@@ -104,7 +105,7 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
 def _num_training(config: Config) -> int:
     """Training scenes to learn from, in whole groups; the others calibrate the encoders."""
     together = config.jmvae.num_together
-    return together * config.detector.num_training(perception.num_scenes(config)[0] // together)
+    return together * config.detector.num_training(num_scenes(config)[0] // together)
 
 
 def grouped(windows: Float[Array, "S N F"], config: Config) -> Float[Array, "P K F"]:
@@ -263,7 +264,7 @@ def shown(
       classes: `[C, D]` mean joint posterior of each class.
     """
     del key
-    num_train, num_bank, _, _ = perception.num_scenes(config)
+    num_train, num_bank, _, _ = num_scenes(config)
 
     def of_scenes(survey: Survey, part: slice) -> jax.Array:
         if part.start == part.stop:
@@ -293,7 +294,7 @@ def detect(
       trained: one encoder for each modality.
       shown: what all looks at the PoIs show.
     """
-    return perception.detect(key, config, surveys=surveys, trained=trained, taken_for=shown.bank)
+    return detections.detect(key, config, surveys=surveys, trained=trained, taken_for=shown.bank)
 
 
 def repeated(key: Key, config: Config, *, scenes: Scenes, shown: Shown) -> Repeated:
@@ -302,7 +303,7 @@ def repeated(key: Key, config: Config, *, scenes: Scenes, shown: Shown) -> Repea
     Args:
       key: not used.
       config: all settings.
-      scenes: see `perception.draw_scenes`.
+      scenes: see `surveys.draw_scenes`.
       shown: what all looks at the PoIs show.
     """
     del key
@@ -311,7 +312,7 @@ def repeated(key: Key, config: Config, *, scenes: Scenes, shown: Shown) -> Repea
     number, together = config.detector.num_repeats, config.jmvae.num_together
     # One scene of each group; from the first again if there are fewer.
     rows = jnp.arange(number) * together % len(shown.bank)
-    of_bank = perception.num_scenes(config)[0] + rows
+    of_bank = num_scenes(config)[0] + rows
     return Repeated(classes[of_bank], places[of_bank], shown.bank[rows, 0])
 
 
@@ -349,7 +350,7 @@ def accuracies(
       `pair` after one look by each sensor, and `all_looks` after `jmvae.looks` by each.
     """
     del key
-    _, num_bank, num_held_out, _ = perception.num_scenes(config)
+    _, num_bank, num_held_out, _ = num_scenes(config)
     part = slice(num_bank, num_bank + num_held_out)
     truth = surveys.others.classes[part][:: config.jmvae.num_together].reshape(-1)
 

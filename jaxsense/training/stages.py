@@ -12,10 +12,30 @@ from jaxsense.core.types import Key
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
-from jaxsense.training import agents, comparison, fusions, measures, perception, scans
+from jaxsense.training import (
+    agents,
+    comparison,
+    detections,
+    fusions,
+    jmvaes,
+    measures,
+    repeats,
+    scans,
+    surveys,
+)
 from jaxsense.training.stage import Learned, Output, Stage, compose, key_of
 
-_LEARNS_FROM = {"detections": perception.make_stages, "scans": scans.make_stages}
+
+def _from_detections(config: Config, arena: Arena) -> list[Stage]:
+    """The stages from surveys to class beliefs and novelty; see `scans.make_stages`."""
+    return [
+        *detections.make_stages(config),
+        *jmvaes.make_stages(config),
+        repeats.novelty_stage(arena, config),
+    ]
+
+
+_LEARNS_FROM = {"detections": _from_detections, "scans": scans.make_stages}
 
 
 def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
@@ -26,7 +46,7 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
       arena: from `sim.make_world(config)`; compiled anew by default.
     """
     arena = make_world(config).arena if arena is None else arena
-    detections, fusion = {"detections": "detections"}, {"fusion": "fusion"}
+    detected, fusion = {"detections": "detections"}, {"fusion": "fusion"}
     classes = {"classes": "class_beliefs"}
     policies = {
         name: {
@@ -34,20 +54,20 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
             "q_network": agents.learner(config, name),
             "look_values": "look_values",
             **fusion,
-            **detections,
+            **detected,
         }
         for m, name in enumerate(config.modalities)
     }
     return [
-        Stage("scenes", perception.draw_scenes, is_passing=True),
-        perception.survey_stage(arena),
-        Stage("examples", perception.split_examples, {"surveys": "survey"}, is_passing=True),
+        Stage("scenes", surveys.draw_scenes, is_passing=True),
+        surveys.survey_stage(arena),
+        Stage("examples", detections.split_examples, {"surveys": "survey"}, is_passing=True),
         *_LEARNS_FROM[config.jmvae.learns_from](config, arena),
-        Stage("detector_metrics", measures.detector_metrics, detections),
+        Stage("detector_metrics", measures.detector_metrics, detected),
         *fusions.make_stages(config),
-        Stage("latent_space", measures.latent_space, {**fusion, **detections}),
-        Stage("look_values", agents.look_values, {**classes, **detections}, is_kept=True),
-        Stage("beliefs", measures.beliefs, {**fusion, **detections}),
+        Stage("latent_space", measures.latent_space, {**fusion, **detected}),
+        Stage("look_values", agents.look_values, {**classes, **detected}, is_kept=True),
+        Stage("beliefs", measures.beliefs, {**fusion, **detected}),
         *agents.agent_stages(arena, config),
         *agents.tour_stages(config),
         *(

@@ -2,10 +2,12 @@
 
 from types import SimpleNamespace
 
+import jax
 import pytest
 
 from benchmarks import kernels
 from benchmarks.kernels import Part
+from jaxsense import init, mission
 
 TEXT = """
   %fusion.1 = f32[] fusion(), metadata={op_name="jit(f)/mission.steer/mission.move/add"}
@@ -45,11 +47,14 @@ def test_the_table_adds_up_the_parts_of_a_step():
         **{"device": "cpu", "versions": {"jax": "0.10.2"}, "steps": 20},
         "cases": {
             "few": {"wall_s": 0.08, "parts": {"steer": steer, "move": move}},
-            "pois": {"wall_s": 0.1, "parts": {"steer": steer}},
+            "robots": {"wall_s": 0.1, "parts": {"steer": steer}},
         },
     }
     lines = kernels.table(results).splitlines()
-    assert lines[0] == "| kernels in a step; ms | 384 missions, 3 PoIs | 8,192 missions, 16 PoIs |"
+    assert lines[0] == (
+        "| kernels in a step; ms | 384 missions, 2 robots, 3 PoIs "
+        "| 2,048 missions, 6 robots, 16 PoIs |"
+    )
     assert lines[2:6] == [
         "| all | 3; 3.00 | 2; 1.00 |",
         "| wall clock, without the profiler | 4.00 | 5.00 |",
@@ -59,8 +64,25 @@ def test_the_table_adds_up_the_parts_of_a_step():
     ]
 
 
+def test_six_robots_are_counted_in_missions_that_can_begin(monkeypatch, capsys):
+    counted = []
+
+    def playing(config, policy, batch, steps):
+        scenario = mission.make_mission(config)
+        begin = lambda key: mission.reset(key, scenario, init(key, config), scenario.policy(policy))  # noqa: E731
+        begun = jax.eval_shape(begin, jax.random.key(0))
+        counted.append((batch, len(begun.scene.poses), len(begun.classes), config.arena.side))
+        return SimpleNamespace(compiled=lambda options: None)
+
+    monkeypatch.setattr(kernels, "playing", playing)
+    monkeypatch.setattr(kernels, "profile", lambda program, missions: (1.0, {"ask": Part(20, 0.5)}))
+    kernels.main(["--cases", "robots"])
+    assert counted == [(2048, 6, 16, 6.0)]
+    assert "| 2,048 missions, 6 robots, 16 PoIs |" in capsys.readouterr().out
+
+
 def test_unknown_cases_are_refused(capsys):
     with pytest.raises(SystemExit) as stop:
         kernels.main(["--cases", "few", "fewer"])
     assert stop.value.code == 2
-    assert "cases = 'fewer': must be one of few, many, pois" in capsys.readouterr().err
+    assert "cases = 'fewer': must be one of few, many, pois, robots" in capsys.readouterr().err

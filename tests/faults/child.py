@@ -31,8 +31,8 @@ from jaxsense.dqn.training import DqnState
 from jaxsense.run import cli
 from jaxsense.run.compilation import Program
 from jaxsense.show import plots
-from jaxsense.training.perception import Survey
 from jaxsense.training.stage import Progress
+from jaxsense.training.surveys import Survey
 
 NAN_STEP = 17
 TRAININGS: dict[str, tuple[Any, str, type]] = {

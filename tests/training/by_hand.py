@@ -9,7 +9,7 @@ import numpy as np
 from jaxsense.config import Config, DqnConfig, EvaluationConfig, JmvaeConfig, MdpConfig
 from jaxsense.core.types import Belief
 from jaxsense.models import make_in_place
-from jaxsense.training.perception import Detections
+from jaxsense.training.detections import Detections
 
 # Classes: green cylinder, red cylinder, red cube. Three latent dimensions, of which one is unused.
 CONFIG = Config(

@@ -15,7 +15,7 @@ from jaxsense.config import MdpConfig, TeamConfig, ToursConfig
 from jaxsense.core.types import Belief
 from jaxsense.dqn import training as dqn
 from jaxsense.training import comparison
-from jaxsense.training.perception import Detections
+from jaxsense.training.detections import Detections
 
 BANK = dataclasses.replace(TINY, dqn=dataclasses.replace(TINY.dqn, observe="bank"))
 

@@ -21,7 +21,7 @@ from by_hand import (
 )
 
 from jaxsense.core.types import Belief, pytree
-from jaxsense.training import measures, perception
+from jaxsense.training import jmvaes, measures
 
 
 @jax.jit
@@ -90,7 +90,7 @@ def test_beliefs_of_classes_are_means_over_the_bank_that_is_given():
     @jax.jit
     def beliefs(bank):
         given = detections(bank)
-        return perception.class_beliefs(KEY, CONFIG, params=PARAMS, detections=given)
+        return jmvaes.class_beliefs(KEY, CONFIG, params=PARAMS, detections=given)
 
     found = beliefs(BANK)
     np.testing.assert_allclose(found.mean, CLASS_MEANS, atol=1e-5)

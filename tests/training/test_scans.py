@@ -14,9 +14,10 @@ from jaxsense.config import ConfigError, DetectorConfig, FilterConfig, JmvaeConf
 from jaxsense.core import supervised
 from jaxsense.models import make_shape
 from jaxsense.sim import world as worlds
-from jaxsense.training import perception, scans
+from jaxsense.training import detections, scans
 from jaxsense.training.scans import Shown
 from jaxsense.training.stage import Stage
+from jaxsense.training.surveys import Survey, divide, draw_scenes, num_scenes
 from jaxsense.vae import detectors, leave_one_out, novelty
 
 SMOKE = PRESETS["smoke"]
@@ -68,9 +69,9 @@ def test_every_stage_follows_those_that_it_takes_from():
 
 
 def test_scenes_come_in_groups_that_show_the_same_pois():
-    draw = jax.jit(perception.draw_scenes)
+    draw = jax.jit(draw_scenes)
     keys, classes, is_empty, places = draw(KEY, TINY)
-    number = sum(perception.num_scenes(TINY)[:3])
+    number = sum(num_scenes(TINY)[:3])
     assert number % 3 == 0
     grouped = classes[:number].reshape(-1, 3, classes.shape[1])
     np.testing.assert_array_equal(grouped, jnp.repeat(grouped[:, :1], 3, axis=1))
@@ -147,7 +148,7 @@ def test_encoders_are_detectors(learned):
 def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypatch):
     """A PoI that looks like another class goes there, whatever its label."""
     outputs, listed = learned.outputs, stages_of(TINY)
-    num_bank = perception.num_scenes(TINY)[1]
+    num_bank = num_scenes(TINY)[1]
     shown = jnp.arange(num_bank * TINY.arena.num_pois).reshape(num_bank, -1) % 3
     monkeypatch.setattr(looks, "detect_all", lambda trained, windows: tuple(
         jnp.concatenate([shown, jnp.full((len(w) - num_bank, TINY.arena.num_pois), 9)])[..., None]
@@ -177,7 +178,7 @@ def test_a_jmvae_of_scans_needs_a_filter():
 
 def test_what_all_looks_show_is_the_class_nearest_to_their_posterior(learned):
     outputs, shape = learned.outputs, make_shape(TINY)
-    num_bank = perception.num_scenes(TINY)[1]
+    num_bank = num_scenes(TINY)[1]
     classes = np.asarray(outputs["class_beliefs"].mean)
 
     posterior = jax.jit(lambda given: leave_one_out.posterior(outputs["best_jmvae"], shape, given))
@@ -209,7 +210,7 @@ def test_encoders_are_calibrated_with_looks_that_nothing_learned_from(learned, m
     outputs, stage = learned.outputs, stages_of(TINY)["detector_camera"]
     windows = np.asarray(outputs["survey"].training.windows[0])
     num_train, _, size = windows.shape
-    assert num_train == perception.num_scenes(TINY)[0] == 42
+    assert num_train == num_scenes(TINY)[0] == 42
     given = []
 
     def calibrate(encoder, *given_here):
@@ -248,18 +249,18 @@ def test_calibration_leaves_a_group_to_learn_from():
 def test_no_two_starts_of_live_episodes_show_the_same_pois(monkeypatch):
     dqn = dataclasses.replace(SMOKE.dqn, observe="live", num_starts=64)
     config = dataclasses.replace(TINY, dqn=dqn)
-    num_train, num_bank, num_held_out, num_empty = perception.num_scenes(config)
+    num_train, num_bank, num_held_out, num_empty = num_scenes(config)
     total = num_train + num_bank + num_held_out + num_empty
     group = jnp.arange(total) // 3
     windows = tuple(jnp.zeros((total, 3, 1)) for _ in range(2))
     classes, scenes = jnp.repeat(group[:, None], 3, axis=1) % 3, cast("Any", group)
-    survey = perception.Survey(classes, scenes, windows, jnp.ones((total, 2, 3)))
+    survey = Survey(classes, scenes, windows, jnp.ones((total, 2, 3)))
     monkeypatch.setattr(looks, "detect_all", lambda trained, windows: windows)
 
     @jax.jit
     def starts(survey):
-        surveyed = perception.divide(config, survey)
-        return perception.detect(KEY, config, surveys=surveyed, trained=()).starts
+        surveyed = divide(config, survey)
+        return detections.detect(KEY, config, surveys=surveyed, trained=()).starts
 
     found = starts(survey)
     np.testing.assert_array_equal(found.scenes, num_train // 3 + np.arange(64))
@@ -271,9 +272,9 @@ REPEATING = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector
 
 
 def test_repeated_looks_are_at_pois_of_the_bank_and_show_what_all_looks_show(learned):
-    scenes, num_train = learned.outputs["scenes"], perception.num_scenes(TINY)[0]
+    scenes, num_train = learned.outputs["scenes"], num_scenes(TINY)[0]
     _, classes, _, places = scenes
-    num_bank = perception.num_scenes(TINY)[1]
+    num_bank = num_scenes(TINY)[1]
     bank = (classes[num_train : num_train + num_bank] + 1) % 3  # nowhere the true class
     found = scans.repeated(KEY, REPEATING, scenes=scenes, shown=Shown(bank[:0], bank))
     assert found.classes.shape == (30, 3)

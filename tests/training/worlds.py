@@ -16,8 +16,8 @@ from jaxsense.config import (
     SensorConfig,
     Shape,
 )
-from jaxsense.training import fusions, measures, perception
-from jaxsense.training.perception import Detections
+from jaxsense.training import fusions, jmvaes, measures
+from jaxsense.training.detections import Detections
 from jaxsense.training.stage import Stage, compose
 
 SHAPES = {
@@ -117,8 +117,7 @@ def learn(key, config, detections):
     given, fusion = {"detections": "detections"}, {"fusion": "fusion"}
     stages = [
         Stage("detections", lambda key, config: detections),
-        *perception.jmvae_stages(config),
-        Stage("class_beliefs", perception.class_beliefs, {"params": "best_jmvae", **given}),
+        *jmvaes.make_stages(config),
         *fusions.make_stages(config),
         Stage("latent_space", measures.latent_space, {**fusion, **given}),
         Stage("beliefs", measures.beliefs, {**fusion, **given}),

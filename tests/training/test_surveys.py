@@ -1,0 +1,124 @@
+"""Surveys of scenes, and what each of them is for."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny import KEY, SMOKE, TINY, stage_of
+
+from jaxsense import looks, training
+from jaxsense.config import DetectorConfig, JmvaeConfig
+from jaxsense.core import supervised
+from jaxsense.sim.world import make_world
+from jaxsense.training.surveys import Survey, num_scenes
+from jaxsense.vae import detectors
+
+
+@pytest.fixture
+def surveys(monkeypatch) -> Survey:
+    """A survey whose windows, and scenes, hold the key that the scene was simulated with."""
+
+    def survey(keys, world, classes, is_empty, places):
+        key = jax.random.key_data(keys)[:, -1].astype(jnp.uint32)
+        windows = jnp.broadcast_to(key[:, None, None], (*classes.shape, 1))
+        number, num_pois = classes.shape
+        # Expected at 2 m in empty scenes, and at 1 m in all others.
+        distances = jnp.broadcast_to(1.0 + is_empty[:, None, None], (number, 2, num_pois))
+        return key, (windows, windows), distances
+
+    monkeypatch.setattr(looks, "surveys", survey)
+    return surveys_of(scenes())
+
+
+@functools.cache
+def scenes():
+    return jax.jit(stage_of("scenes", MEASURED).begin)(KEY, MEASURED)
+
+
+def surveys_of(scenes):
+    survey = stage_of("survey", MEASURED)
+    return jax.jit(lambda scenes: survey.begin(KEY, MEASURED, scenes=scenes))(scenes)
+
+
+def test_scenes_are_as_empty_whoever_works_them_out(surveys):
+    """Threads and devices share the rows of a survey."""
+    half = len(scenes()[0]) // 2
+    parts = [
+        surveys_of(jax.tree.map(lambda x: x[part], scenes()))  # noqa: B023
+        for part in (slice(half), slice(half, None))
+    ]
+    together = np.concatenate([part.distances for part in parts])
+    np.testing.assert_array_equal(together, surveys.distances)
+    assert (together[:half] == 1).all()
+    assert (together == 2).any()
+
+
+MEASURED = dataclasses.replace(
+    SMOKE,
+    detector=DetectorConfig(num_scans=31, num_held_out=25, steps=1),
+    jmvae=JmvaeConfig(samples_per_class=10),
+    dqn=dataclasses.replace(SMOKE.dqn, observe="live", num_starts=2 * SMOKE.dqn.num_envs),
+)
+
+
+def used(arrays):
+    return set(np.concatenate([np.ravel(x) for x in jax.tree.leaves(arrays)]).tolist())
+
+
+def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeypatch):
+    assert len(used(surveys.scenes)) == sum(num_scenes(MEASURED))  # no key twice
+    trained_on, shown_to_gates = [], []
+
+    def fit(key, state, problem, number):
+        trained_on.append(np.asarray(problem.detector.windows))
+        shown_to_gates.append(np.asarray(problem.gate.shown.windows))
+        return state, jnp.zeros(number)
+
+    listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
+    monkeypatch.setattr(supervised, "fit", fit)
+    monkeypatch.setattr(detectors, "detect", lambda detector, window: window)
+    divided = listed["survey"].divide(MEASURED, surveys)
+    examples = jax.jit(listed["examples"].begin)(KEY, MEASURED, surveys=divided)
+    given = {"surveys": divided, "examples": examples}
+    for name in ("detector_camera", "detector_lidar"):
+        state = listed[name].begin(KEY, MEASURED, **given)
+        listed[name].advance(KEY, MEASURED, state, **given)
+    detections = jax.jit(listed["detections"].begin)
+    found = detections(KEY, MEASURED, surveys=divided, trained=(None, None))
+
+    seen, bank, held_out = used(trained_on), used(found.bank), used(found.held_out)
+    starts, plotted = used(found.starts.scenes), used(found.windows)
+    assert seen.isdisjoint(bank)
+    assert held_out.isdisjoint(seen | bank | starts)
+    assert starts.isdisjoint(seen)
+    assert plotted <= held_out
+    # All of them were looked at.
+    assert len(seen) >= 31 / 3
+    # Gates learn from the same scenes, and from empty ones that nothing else uses.
+    checks = used(examples[0].checks.windows)
+    assert used(shown_to_gates) == seen
+    assert checks <= bank | starts
+    assert set(examples[0].distances.tolist()) == {1.0}
+    is_empty = np.asarray(surveys.distances[:, 0, 0]) == 2
+    assert is_empty.sum() == num_scenes(MEASURED)[3] == 2  # of 11 to train on
+    empty = used(surveys.scenes[is_empty])
+    assert empty.isdisjoint(seen | bank | held_out | starts)
+    assert used(np.float32(list(empty))) <= used(examples[0].nothing.windows)
+    assert [x.shape[:2] for x in found.held_out] == [(3, 9), (3, 9)]
+
+
+@pytest.mark.slow
+def test_a_scene_is_the_same_whoever_works_it_out():
+    listed = {stage.name: stage for stage in training.stages.stages(TINY, make_world(TINY).arena)}
+    scenes = listed["scenes"].begin(KEY, TINY)
+    survey = jax.jit(listed["survey"].begin)
+    first, second = (
+        survey(KEY, TINY, scenes=jax.tree.map(lambda x: x[i : i + 4], scenes))  # noqa: B023
+        for i in (0, 2)
+    )
+    same = jax.tree.map(lambda x, y: np.abs(x[2:] - y[:2]).max(), first.scenes, second.scenes)
+    assert max(jax.tree.leaves(same)) < 1e-6
+    assert np.abs(first.scenes.poses[0] - first.scenes.poses[1]).max() > 0.01
