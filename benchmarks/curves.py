@@ -214,7 +214,7 @@ class Curves:
         self, keys: Key, config: Config, models: Models, states: MissionState
     ) -> MissionState:
         scenario = self._with(config)
-        return mission.rollout_batch(keys, scenario, models, states, _CHUNK, len(keys))[0]
+        return mission.rollout_batch(keys, scenario, models, states, _CHUNK, 1)[0]
 
     def _result(self, config: Config, models: Models, state: MissionState) -> dict[str, jax.Array]:
         found = mission.measure(self._with(config), models, state)

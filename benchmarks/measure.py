@@ -1,5 +1,6 @@
 """What every row is measured with: compile time apart, both sides in turn, medians."""
 
+import contextlib
 import dataclasses
 import datetime
 import importlib.metadata
@@ -19,6 +20,7 @@ from matplotlib.figure import Figure
 
 from jaxsense.run import cli, devices, version
 from jaxsense.run.devices import Workers
+from jaxsense.run.kept import shapes_of, trace
 from jaxsense.show import drawing
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
@@ -215,8 +217,10 @@ def compiled(
     With workers, arguments and outputs are split among them along their first axis; of threads, the
     side gives the outputs of each.
     """
-    function = devices.spread(function, workers.mesh)
     if workers.mesh is not None:
+        share = devices.part(shapes_of(args), 0, workers.shares)
+        alone = trace(function, share, lambda _: contextlib.nullcontext())
+        function = devices.spread(alone or function, workers.mesh)
         args = jax.device_put(args, NamedSharding(workers.mesh, PartitionSpec(devices.AXIS)))
     threads = workers.threads
     parts = [devices.part(args, i, threads) for i in range(threads)]

@@ -175,7 +175,7 @@ class Playing:
 
     def go_on(self, keys: jax.Array, models: Models, states: MissionState) -> MissionState:
         """Runs `steps` control periods of all missions."""
-        return rollout_batch(keys, self.scenario, models, states, self.steps, len(keys))[0]
+        return rollout_batch(keys, self.scenario, models, states, self.steps, 1)[0]
 
     def compiled(self, options: devices.Options) -> jax.stages.Compiled:
         """The program of `go_on`."""

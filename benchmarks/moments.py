@@ -68,7 +68,7 @@ def choices(config: Config, models: Models, number: int, seed: int = 0) -> list[
 
     @functools.partial(jax.jit, compiler_options=devices.compiler_options())
     def advance(keys: jax.Array, states: MissionState) -> MissionState:
-        return mission.rollout_batch(keys, scenario, models, states, 1, every=_MISSIONS)[0]
+        return mission.rollout_batch(keys, scenario, models, states, 1, 1)[0]
 
     observe = [
         jax.jit(jax.vmap(_observer(scenario, models, robot)))

@@ -99,7 +99,7 @@ def trips(config: Config, models: Models) -> tuple[np.ndarray, np.ndarray, np.nd
     @jax.jit
     def play(keys: jax.Array):
         states = jax.vmap(lambda key: mission.reset(key, scenario, models, naive))(keys)
-        _, records = mission.rollout_batch(keys, scenario, models, states, steps, 1)
+        _, records = mission.rollout_batch(keys, scenario, models, states, steps)
         return states.scene.poses, states.scene.layout.position, records
 
     first, positions, record = jax.tree.map(

@@ -1,5 +1,6 @@
 """Work split over devices and over processes gives what one device gives."""
 
+import contextlib
 import os
 import re
 import signal
@@ -22,6 +23,7 @@ from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import devices, processes
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import Workers
+from jaxsense.run.kept import Kept, trace
 from jaxsense.run.monitor import Monitor
 from jaxsense.sim import arena as arenas
 
@@ -51,27 +53,47 @@ def drive(speeds):
 SPEEDS = np.arange(16.0, dtype=np.float32).reshape(4, 2, 2)
 
 
+def test_a_device_loops_as_often_as_its_own_rows_need():
+    turns = []
+
+    def collatz(x):
+        def step(x):
+            jax.debug.callback(lambda: turns.append(1))
+            return jnp.where(x % 2 == 0, x // 2, 3 * x + 1)
+
+        return jax.lax.while_loop(lambda x: jnp.any(x > 1), step, x)
+
+    jax.jit(devices.spread(collatz, devices.make_mesh(2)))(jnp.array([2, 16]))
+    jax.effects_barrier()
+    assert len(turns) == 1 + 4
+
+
 def test_a_step_of_the_physics_is_spread_over_two_host_devices():
-    # Under `shard_map`, jaxlib 0.11.2 crashes while it compiles this.
-    together = jax.jit(devices.spread(drive, devices.make_mesh(2)))(SPEEDS)
+    # If `shard_map` saw its constants, jaxlib 0.11.2 would crash while it compiles this.
+    alone = trace(drive, (SPEEDS[:2],), lambda _: contextlib.nullcontext())
+    together = jax.jit(devices.spread(alone, devices.make_mesh(2)))(SPEEDS)
     assert together.sharding.num_devices == 2
     np.testing.assert_allclose(together, jax.jit(drive)(SPEEDS), rtol=1e-5)
 
 
-@pytest.mark.parametrize("workers", [Workers(threads=3), Workers(mesh=None)])
-def test_workers_share_the_rows_of_a_program(workers):
-    seen = []
+@pytest.mark.parametrize(
+    "make", [lambda: Workers(threads=3), Workers, lambda: Workers(mesh=devices.make_mesh(2))]
+)
+@pytest.mark.parametrize("is_kept", [False, True])
+def test_workers_share_the_rows_of_a_program(make, is_kept, tmp_path):
+    workers, seen = make(), []
 
     def function(scale, x):
         seen.append(x.shape)
         return {"scaled": scale * x, "sums": x.sum(axis=1)}
 
     scale, x = jnp.float32(2), np.arange(12.0, dtype=np.float32).reshape(6, 2)
-    with Compiler(Monitor()) as compiler:
+    kept = Kept(tmp_path / "cache") if is_kept else None
+    with Compiler(Monitor(), kept) as compiler:
         program = Program(compiler, "stage", "run")
         shapes = program.compile(function, scale, x, workers=workers, whole=(0,))
         output = program(scale, x)
-    assert seen == [(6 // workers.number, 2)]
+    assert set(seen) == {(6 // workers.number, 2)}
     assert (shapes["scaled"].shape, shapes["sums"].shape) == ((6, 2), (6,))
     np.testing.assert_array_equal(output["scaled"], 2 * x)
     np.testing.assert_array_equal(output["sums"], [1, 5, 9, 13, 17, 21])

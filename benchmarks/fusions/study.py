@@ -271,7 +271,7 @@ def _play(scenario: Mission, number: int, key: Key, models: Models) -> dict[str,
     def go_on(carry: tuple[jax.Array, MissionState]) -> tuple[jax.Array, MissionState]:
         chunk, states = carry
         keys = jax.random.split(jax.random.fold_in(play_key, chunk), number)
-        return chunk + 1, mission.rollout_batch(keys, scenario, models, states, _CHUNK, number)[0]
+        return chunk + 1, mission.rollout_batch(keys, scenario, models, states, _CHUNK, 1)[0]
 
     _, states = jax.lax.while_loop(
         lambda carry: ~jnp.all(carry[1].done), go_on, (jnp.int32(0), states)

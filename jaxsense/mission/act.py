@@ -221,7 +221,6 @@ def scan(
     models: Models,
     states: MissionState,
     robot: Index,
-    parts: int = 1,
 ) -> MissionState:
     """Scans the PoI that a robot faces, and updates the map, in B missions side by side.
 
@@ -231,7 +230,6 @@ def scan(
       models: trained models.
       states: `[B]` current states.
       robot: index of the robot, the same in all missions.
-      parts: see `groups.where_due`.
 
     Returns:
       The `[B]` next states.
@@ -258,7 +256,7 @@ def scan(
 
         return call(look_with, which, len(carried))
 
-    looks = where_due(aims.scans & ~states.done, look, nothing, (states, aims), parts)
+    looks = where_due(aims.scans & ~states.done, look, nothing, (states, aims))
     write = jax.vmap(lambda state, aim, look: _write(mission, state, aim, look, robot))
     return write(states, aims, looks)
 

@@ -30,9 +30,7 @@ class _Motion:
 
 
 @jax.named_scope("mission.move")
-def move(
-    mission: Mission, states: MissionState, parts: int = 1
-) -> tuple[MissionState, Float[Array, " B"]]:
+def move(mission: Mission, states: MissionState) -> tuple[MissionState, Float[Array, " B"]]:
     """Simulates one control period of B missions side by side.
 
     Contacts cost several times as much as everything else, and the planner avoids them. All robots
@@ -42,7 +40,6 @@ def move(
     Args:
       mission: the mission.
       states: `[B]` current states.
-      parts: number of devices that share the batch, see `groups.where_due`.
 
     Returns:
       The `[B]` next states, and `[B]` the smallest free distance around any robot in the period, in
@@ -56,7 +53,7 @@ def move(
     inputs = motion, robots.wanted, layout
     free = _integrate(mission, mission.free_arena, *inputs)
     among = lambda rows, _: _integrate(mission, mission.world.arena, *rows)  # noqa: E731
-    motion = where_due(is_near, among, free, inputs, parts)
+    motion = where_due(is_near, among, free, inputs)
     states = dataclasses.replace(
         states,
         scene=dataclasses.replace(states.scene, poses=motion.poses),

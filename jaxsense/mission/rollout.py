@@ -46,7 +46,7 @@ def rollout(
     """
     checks.require_number("steps", steps)
     alone = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
-    batch = rollout_batch(key[None], mission, models, alone, steps, every=1)
+    batch = rollout_batch(key[None], mission, models, alone, steps)
     return jax.tree.map(lambda x: x[0], batch)
 
 
@@ -56,9 +56,7 @@ def rollout_batch(
     models: Models,
     states: MissionState,
     steps: int,
-    every: int,
-    parts: int = 1,
-    recorded: int = 1,
+    recorded: int | None = None,
 ) -> tuple[MissionState, Record]:
     """Runs B missions side by side, and records some of them.
 
@@ -68,21 +66,15 @@ def rollout_batch(
       models: trained models.
       states: `[B]` first states.
       steps: number of control periods; static.
-      every: records the first missions of each group of this size; divides B. With one group per
-        device, no device waits for another's record.
-      parts: number of devices that share the batch, see `groups.where_due`.
-      recorded: how many of each group to record.
+      recorded: how many of the first missions to record; static, all by default.
 
     Returns:
-      The `[B]` last states, and `[recorded * B / every, steps]` records.
+      The `[B]` last states, and `[recorded, steps]` records.
     """
 
-    def first(x: jax.Array) -> jax.Array:
-        return x.reshape(-1, every, *x.shape[1:])[:, :recorded].reshape(-1, *x.shape[1:])
-
     def go_on(states: MissionState, keys: Key):
-        states, records = step(keys, mission, models, states, parts)
-        return states, jax.tree.map(first, records)
+        states, records = step(keys, mission, models, states)
+        return states, jax.tree.map(lambda x: x[:recorded], records)
 
     step_keys = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(keys)
     states, records = jax.lax.scan(go_on, states, step_keys)
@@ -91,7 +83,7 @@ def rollout_batch(
 
 @jax.named_scope("mission.step")
 def step(
-    keys: Key, mission: Mission, models: Models, states: MissionState, parts: int = 1
+    keys: Key, mission: Mission, models: Models, states: MissionState
 ) -> tuple[MissionState, Record]:
     """Runs one control period of B missions side by side.
 
@@ -103,7 +95,6 @@ def step(
       mission: the mission.
       models: trained models.
       states: `[B]` current states.
-      parts: number of devices that share the batch, see `groups.where_due`.
 
     Returns:
       The `[B]` next states and records.
@@ -115,7 +106,7 @@ def step(
     # One after the other, so that no robot scans what another has just identified.
     all_robots = jnp.arange(num_robots)
     states, courses = jax.lax.scan(
-        lambda states, robot: _act(robot[1], mission, models, states, robot[0], parts),
+        lambda states, robot: _act(robot[1], mission, models, states, robot[0]),
         states,
         (all_robots, robot_keys),
     )
@@ -123,7 +114,7 @@ def step(
     steer = jax.vmap(functools.partial(act.steer, mission), (None, 0, 0))
     wanted = jax.vmap(steer, (0, None, 1))(states, all_robots, courses)
     robots = dataclasses.replace(states.robots, wanted=wanted)
-    states, clearance = move(mission, dataclasses.replace(states, robots=robots), parts)
+    states, clearance = move(mission, dataclasses.replace(states, robots=robots))
     states = _drift(drift_keys, mission, before, states)
     robots = states.robots
     is_idle = jnp.all((robots.phase == ENDED) | (robots.phase == FAILED), axis=-1)
@@ -155,7 +146,6 @@ def _act(
     models: Models,
     states: MissionState,
     robot: Int[Array, ""],
-    parts: int,
 ) -> tuple[MissionState, Course]:
     """Decides, sets a course and scans for one robot of each of B missions."""
 
@@ -171,11 +161,11 @@ def _act(
     states = jax.vmap(lambda state: _fail(mission, state, robot))(states)
     due = jax.vmap(lambda state: decide.is_due(mission, state, robot))(states) & ~states.done
     inputs, targets = (choice_keys, states), states.robots.target[:, robot]
-    chosen = where_due(due, choose, targets, inputs, parts, kinds=states.policy)
-    robots = where_due(due, set_out, states.robots, (states, chosen), parts)
+    chosen = where_due(due, choose, targets, inputs, kinds=states.policy)
+    robots = where_due(due, set_out, states.robots, (states, chosen))
     states = dataclasses.replace(states, robots=robots)
     states, course = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
-    return act.scan(scan_keys, mission, models, states, robot, parts), course
+    return act.scan(scan_keys, mission, models, states, robot), course
 
 
 @jax.named_scope("mission.drift")

@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from jaxsense.run import devices
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.run.kept import Function, Kept, shapes_of
+from jaxsense.run.kept import Function, Kept, shapes_of, trace
 from jaxsense.run.monitor import Monitor
 
 _LOADED = "/jax/compilation_cache/cache_hits"
@@ -116,10 +116,8 @@ class Program:
         """
         self._compiler.check_open()
         self._workers, self._whole = workers, whole
-        function = devices.spread(function, workers.mesh, whole)
-        args = devices.part(args, 0, workers.parts, whole)
         lowered, results = self._lower(function, args)
-        self._results = devices.of_all_parts(results, workers.parts)
+        self._results = devices.of_all_parts(results, workers.shares)
 
         def compile_lowered() -> None:
             if self._compiled.done():  # failed or released
@@ -140,20 +138,28 @@ class Program:
         return self._results
 
     def _lower(self, function: Function, args: PyTree) -> tuple[jax.stages.Lowered, PyTree]:
-        """A function ready to be compiled, and the shapes of its results; see `compile`."""
-        kept = self._compiler.kept
-        # A program split over devices cannot be called from one that is not.
-        if kept is not None and self._workers.mesh is None:
+        """A function ready to be compiled, and the shapes of a share's results; see `compile`."""
+        workers, whole, kept = self._workers, self._whole, self._compiler.kept
+        call, share = (
+            devices.part(args, 0, number, whole) for number in (workers.parts, workers.shares)
+        )
+        found = None
+        if kept is not None:
             name = f"{self._stage}-{self._name}"
-            found = kept.find_or_trace(name, function, args, self._record)
-            if found is not None:
-                with self._record("lower"):
-                    return jax.jit(found.__call__).lower(*shapes_of(args)), found.results
+            found = kept.find_or_trace(name, function, share, self._record)
+        elif workers.mesh is not None:
+            found = trace(function, share, self._record)
         places = self._places(len(args)) if self._is_of_many else None
+        spread = devices.spread(found.__call__ if found else function, workers.mesh, whole)
+        jitted = jax.jit(spread, in_shardings=places)
+        if found is not None:
+            with self._record("lower"):
+                return jitted.lower(*shapes_of(call)), found.results
         with self._record("trace"):
-            traced = jax.jit(function, in_shardings=places).trace(*args)
+            traced = jitted.trace(*call)
+            results = jax.eval_shape(function, *share)
         with self._record("lower"):
-            return traced.lower(), traced.out_info
+            return traced.lower(), results
 
     @property
     def _is_of_many(self) -> bool:

@@ -98,6 +98,11 @@ class Workers:
         """Number of parts of a batch, each of which takes a call."""
         return self.threads * self.calls
 
+    @property
+    def shares(self) -> int:
+        """Number of shares of a batch; devices of a mesh each take one of every part."""
+        return self.number * self.calls
+
 
 ALONE = Workers()
 
@@ -222,14 +227,12 @@ def put(args: tuple[PyTree, ...], places: tuple[NamedSharding, ...]) -> tuple[Py
 def spread(
     function: Callable[..., PyTree], mesh: Mesh | None, whole: tuple[int, ...] = ()
 ) -> Callable[..., PyTree]:
-    """Splits a function's inputs and outputs along their first axis, with a part on each device.
-
-    XLA's partitioner decides how. Under `shard_map`, jaxlib 0.11.2 crashes while it compiles a step
-    of MJX, on a CPU and on accelerators: its Shardy drops inputs that the body does not use
-    (`ManualComputationUnusedInputsPattern`), and MJX closes over a hundred constants.
+    """Calls a function on each device with a part of its rows, independently of the other devices.
 
     Args:
-      function: of pytrees of arrays, whose first axis is a batch of independent rows.
+      function: of pytrees of arrays, whose first axis is a batch of independent rows. With MJX
+        inside, it must be one that `kept.trace` returns: jaxlib 0.11.2 crashes while it compiles a
+        step of MJX whose constants `shard_map` sees, on a CPU and on accelerators.
       mesh: from `make_mesh`; its size must divide the batch. Without a mesh, the batch stays whole.
       whole: positions of arguments that every device gets undivided.
 
@@ -240,10 +243,11 @@ def spread(
         return function
 
     def partitioned(*args: PyTree) -> PyTree:
-        rows = NamedSharding(mesh, PartitionSpec(AXIS))
-        constrain = jax.lax.with_sharding_constraint
-        args = tuple(x if i in whole else constrain(x, rows) for i, x in enumerate(args))
-        return constrain(function(*args), rows)
+        rows, each = PartitionSpec(AXIS), PartitionSpec()
+        places = tuple(each if i in whole else rows for i in range(len(args)))
+        # The rows of devices are different, which nobody needs to check.
+        split = jax.shard_map(function, mesh=mesh, in_specs=places, out_specs=rows, check_vma=False)
+        return split(*args)
 
     return partitioned
 

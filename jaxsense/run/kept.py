@@ -136,39 +136,54 @@ class Kept:
           record: what is recorded: "load", and if the program is new, "trace" and "lower".
 
         Returns:
-          The program; None if it cannot be exported or written.
+          The program; None if it cannot be exported.
         """
         with record("load"):
             found = self.find(name, args)
         if found is not None:
             return found
-        leaves, structure = jax.tree.flatten(args)
-        results: list[object] = []
-
-        def flat(*leaves: jax.Array) -> list[jax.Array]:
-            output = function(*jax.tree.unflatten(structure, leaves))
-            results.append(jax.tree.structure(output))
-            return jax.tree.leaves(output)
-
-        # A run must not end because the next one will be slower: on a full disk, or where a
-        # program calls something that JAX cannot export.
-        with contextlib.suppress(Exception):
-            jitted, shapes = jax.jit(flat), shapes_of(leaves)
-            # Exporting would trace too; JAX does so once.
-            with record("trace"):
-                jitted.trace(*shapes)
-            with record("lower"):
-                traced = Traced(export.export(jitted)(*shapes), results[-1])
+        traced = trace(function, args, record)
+        # A run must not end because the next one will be slower, for example on a full disk.
+        with contextlib.suppress(Exception), record("lower"):
+            if traced is not None:
                 content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
                 files.write_digested(self._file(name, args), content, mode=0o600)
-            return traced
-        return None
+        return traced
 
     def _file(self, name: str, args: PyTree) -> Path:
         """The file of a program."""
         shapes = repr(shapes_of(args)).encode()
         digest = hashlib.sha256(self._depends + shapes).hexdigest()[:32]
         return self.path / f"{name}-{digest}.stablehlo"
+
+
+def trace(function: Function, args: PyTree, record: Recorder) -> Traced | None:
+    """Traces a program and lowers it, apart from whatever calls it.
+
+    Args:
+      function: what to trace.
+      args: its arguments or their shapes.
+      record: what is recorded: "trace" and "lower".
+
+    Returns:
+      The program; None if it calls something that JAX cannot export.
+    """
+    leaves, structure = jax.tree.flatten(args)
+    results: list[object] = []
+
+    def flat(*leaves: jax.Array) -> list[jax.Array]:
+        output = function(*jax.tree.unflatten(structure, leaves))
+        results.append(jax.tree.structure(output))
+        return jax.tree.leaves(output)
+
+    with contextlib.suppress(Exception):
+        jitted, shapes = jax.jit(flat), shapes_of(leaves)
+        # Exporting would trace too; JAX does so once.
+        with record("trace"):
+            jitted.trace(*shapes)
+        with record("lower"):
+            return Traced(export.export(jitted)(*shapes), results[-1])
+    return None
 
 
 def use_cache(directory: Path) -> None:

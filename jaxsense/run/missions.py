@@ -108,7 +108,7 @@ def are_kept(config: Config, compiler: Compiler, batch: int, workers: Workers = 
       batch: see `Player`.
       workers: see `Player`.
     """
-    if compiler.kept is None or workers.mesh is not None:
+    if compiler.kept is None:
         return False
     begun = _begun(config, -(-batch // workers.number), None)
     return compiler.kept.holds(f"{_STAGE}-{_BEGIN}", begun)
@@ -161,10 +161,9 @@ class Player:
         """
         self.mission, self._monitor, self._workers = mission, compiler.monitor, workers
         config, self._share = mission.config, -(-batch // workers.number)
-        # Devices of a mesh run one program together; a thread sees only its own rows.
+        # Devices of a mesh take each call together; threads take their own.
         together = Workers(mesh=workers.mesh)
-        share, parts = self._share, together.number
-        recorded = min(films.AT_A_TIME, share)
+        recorded = min(films.AT_A_TIME, self._share)
         chunk = chunk_of(config)
         self._lock = threading.Lock()
 
@@ -198,22 +197,15 @@ class Player:
             taken: jax.Array,
         ) -> tuple[_Slots, _Found, Recording]:
             scenario = with_numbers(config)
-            slots = _refilled(slots, reserve, taken, parts)
+            slots = _refilled(slots, reserve, taken)
             keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(slots.episode)
             keys = jax.vmap(jax.random.fold_in)(keys, slots.chunks)
-            states, records = rollout_batch(
-                keys, scenario, models, slots.states, chunk, share, parts, recorded
-            )
+            states, records = rollout_batch(keys, scenario, models, slots.states, chunk, recorded)
             slots = _Slots(slots.episode, slots.chunks + 1, states)
-
-            def first_of(x: jax.Array) -> jax.Array:
-                of_parts = x.reshape(parts, share, *x.shape[1:])[:, :recorded]
-                return of_parts.reshape(parts * recorded, *x.shape[1:])
-
-            first = jax.tree.map(first_of, states)
+            first = jax.tree.map(lambda x: x[:recorded], states)
             return slots, _found(scenario, models, slots), Recording(first, records)
 
-        begun = _begun(config, share * parts, models)
+        begun = _begun(config, self._share * together.number, models)
         key, _, shapes, numbers, _, _ = begun
         whole = (0, 1, 2)
         self._begin = Program(compiler, _STAGE, _BEGIN)
@@ -364,19 +356,12 @@ class _Call:
         return Played(metrics, recording, self._control_steps, *others)
 
 
-def _refilled(slots: _Slots, reserve: _Slots, taken: jax.Array, parts: int) -> _Slots:
-    """Slots with missions of the reserve of their own part where `taken` is not -1."""
-    number = len(taken) // parts
-
-    def of_part(own: jax.Array, reserved: jax.Array, taken: jax.Array) -> jax.Array:
-        new = reserved[jnp.maximum(taken, 0)]
-        is_new = (taken >= 0).reshape(-1, *[1] * (own.ndim - 1))
-        return jnp.where(is_new, new, own)
+def _refilled(slots: _Slots, reserve: _Slots, taken: jax.Array) -> _Slots:
+    """Slots with missions of the reserve where `taken` is not -1."""
 
     def refill(own: jax.Array, reserved: jax.Array) -> jax.Array:
-        own, reserved = (x.reshape(parts, number, *x.shape[1:]) for x in (own, reserved))
-        filled = jax.vmap(of_part)(own, reserved, taken.reshape(parts, number))
-        return filled.reshape(-1, *own.shape[2:])
+        is_new = (taken >= 0).reshape(-1, *[1] * (own.ndim - 1))
+        return jnp.where(is_new, reserved[jnp.maximum(taken, 0)], own)
 
     return jax.tree.map(refill, slots, reserve)
 

@@ -16,32 +16,26 @@ def draw(given, kind):
     return {"drawn": rows["x"] + jax.vmap(jax.random.uniform)(keys)}
 
 
-@pytest.mark.parametrize(("total", "parts"), [(1, 1), (5, 1), (40, 1), (300, 1), (40, 2)])
+@pytest.mark.parametrize("total", [1, 5, 40, 300])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.6, 1.0])
-def test_rows_that_are_due_are_worked_out_and_the_others_stay(total, parts, share):
+def test_rows_that_are_due_are_worked_out_and_the_others_stay(total, share):
     rng = np.random.default_rng(total)
     due = rng.random(total) < share
     before, x = rng.normal(size=(2, total)).astype(np.float32)
     keys = jax.random.split(jax.random.key(total), total)
     find = jax.jit(
-        lambda due, before, keys, x: where_due(
-            due, draw, {"drawn": before}, (keys, {"x": x}), parts=parts
-        )
+        lambda due, before, keys, x: where_due(due, draw, {"drawn": before}, (keys, {"x": x}))
     )
     CALLS.clear()
     found = find(due, before, keys, x)["drawn"]
     jax.effects_barrier()
     expected = np.where(due, x + jax.vmap(jax.random.uniform)(keys), before)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
-    # In groups of 8, or a sixteenth of them all; parts wait for the one with the most.
-    share_of_part = total // parts
-    size = min(share_of_part, max(8, share_of_part // 16))
-    most = due.reshape(parts, -1).sum(axis=1).max()
-    assert [0] * -(-most // size) == CALLS
+    size = min(total, max(8, total // 16))  # of a group
+    assert [0] * -(-due.sum() // size) == CALLS
 
 
-@pytest.mark.parametrize("parts", [1, 2])
-def test_the_rows_of_a_group_are_of_one_kind(parts):
+def test_the_rows_of_a_group_are_of_one_kind():
     rng = np.random.default_rng(0)
     kinds, x = rng.integers(0, 5, 60), rng.normal(size=60).astype(np.float32)
     due = (rng.random(60) < 0.7) & (kinds != 3)
@@ -52,12 +46,12 @@ def test_the_rows_of_a_group_are_of_one_kind(parts):
         branches = [lambda rows, k=k: k * rows for k in range(5)]
         return jax.lax.switch(kind, branches, rows)
 
-    find = jax.jit(lambda due, x, kinds: where_due(due, times_kind, x, x, parts, kinds))
+    find = jax.jit(lambda due, x, kinds: where_due(due, times_kind, x, x, kinds))
     found = find(due, x, kinds.astype(np.int32))
     jax.effects_barrier()
     np.testing.assert_allclose(found, np.where(due, kinds * x, x))
     # In order, each in groups of 8; none of a kind of which no row is due.
-    numbers = [max(np.sum((due & (kinds == k)).reshape(parts, -1), axis=1)) for k in range(5)]
+    numbers = [np.sum(due & (kinds == k)) for k in range(5)]
     assert [k for k in range(5) for _ in range(-(-numbers[k] // 8))] == CALLS
 
 

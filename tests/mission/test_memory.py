@@ -297,7 +297,7 @@ def test_without_losses_and_delay_missions_are_those_of_a_shared_map(team, own_m
         @jax.jit
         def run(keys):
             begin = lambda key: mission.reset(key, changed, own_models, LATENT)  # noqa: E731
-            return mission.rollout_batch(keys, changed, own_models, jax.vmap(begin)(keys), 150, 1)
+            return mission.rollout_batch(keys, changed, own_models, jax.vmap(begin)(keys), 150)
 
         return as_numpy(run(jax.random.split(jax.random.key(1), 6)))
 

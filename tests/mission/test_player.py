@@ -26,7 +26,7 @@ SHORT = dataclasses.replace(CONFIG.mission, time_limit=30.0)
 LAST = 2 * CHUNK - 3  # control periods, within the second chunk
 
 
-def fake_step(keys, team, models, states, parts):
+def fake_step(keys, team, models, states):
     """No physics, which would take long to compile: every robot walks where chance takes it."""
     moves = jax.vmap(lambda key: jax.random.normal(key, states.scene.poses.shape[1:]))(keys)
     moves = jnp.where(states.done[:, None, None], 0.0, moves)
@@ -157,9 +157,9 @@ def test_events_of_a_mission_do_not_depend_on_when_it_is_played(play):
         np.testing.assert_allclose(poses[episode], walk[-1], atol=1e-4)
 
 
-def uneven(keys, team, models, states, parts):
+def uneven(keys, team, models, states):
     """Every mission lasts as long as its classes tell."""
-    states, records = fake_step(keys, team, models, states, parts)
+    states, records = fake_step(keys, team, models, states)
     last = CHUNK // 2 + jnp.abs(states.classes.sum(axis=-1)) * CHUNK // 2
     return dataclasses.replace(states, done=states.steps >= last), records
 
@@ -195,8 +195,8 @@ def test_missions_with_physics_do_not_depend_on_how_many_play_at_once(team, mode
 
 
 def test_a_map_that_is_not_finite_ends_the_missions(play):
-    def diverging(keys, team, models, states, parts):
-        states, record = fake_step(keys, team, models, states, parts)
+    def diverging(keys, team, models, states):
+        states, record = fake_step(keys, team, models, states)
         is_bad = (states.steps > CHUNK)[:, None, None]
         belief = dataclasses.replace(
             states.belief, std=jnp.where(is_bad, jnp.nan, states.belief.std)
@@ -208,8 +208,8 @@ def test_a_map_that_is_not_finite_ends_the_missions(play):
 
 
 def test_values_that_are_not_finite_end_the_missions(play):
-    def lost(keys, team, models, states, parts):
-        states, record = fake_step(keys, team, models, states, parts)
+    def lost(keys, team, models, states):
+        states, record = fake_step(keys, team, models, states)
         target = jnp.where((states.steps > CHUNK)[:, None], -1, states.robots.target)
         robots = dataclasses.replace(states.robots, target=target)
         return dataclasses.replace(states, robots=robots), record

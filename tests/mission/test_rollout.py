@@ -35,7 +35,7 @@ TOGETHER = sum(number for _, _, number in CASES.values())
 def go_on(team, models):
     """One control period after another, in arenas side by side."""
 
-    return jax.jit(lambda keys, states: mission.rollout_batch(keys, team, models, states, CHUNK, 1))
+    return jax.jit(lambda keys, states: mission.rollout_batch(keys, team, models, states, CHUNK))
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def test_a_batch_is_its_members_one_by_one(team, models, played):
     # Thirteen, more than decide or scan at once.
     states = played[1]
     keys = jax.random.split(jax.random.key(9), len(states.steps))
-    together = jax.jit(lambda k, s: mission.rollout_batch(k, team, models, s, CHUNK, 1))
+    together = jax.jit(lambda k, s: mission.rollout_batch(k, team, models, s, CHUNK))
     alone = jax.jit(lambda k, s: mission.rollout(k, team, models, s, CHUNK))
     ends, records = together(keys, states)
     assert np.sum(records.scanned) > 10
