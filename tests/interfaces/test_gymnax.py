@@ -15,6 +15,7 @@ from jaxsense import make
 from jaxsense.dqn import map_mdp, observation
 from jaxsense.interfaces.gymnax import MapEnv
 from jaxsense.looks import make_mdp
+from jaxsense.models import init
 
 LIDAR = 1
 
@@ -116,10 +117,8 @@ def test_its_name_is_that_of_the_task(env):
 
 
 def test_live_observations_trace():
-    models, _ = small.trained()
-
     def play(key):
-        env = MapEnv(make_mdp(small.CONFIG, models).map, 0)
+        env = MapEnv(make_mdp(small.CONFIG, init(key, small.CONFIG)).map, 0)
         _, state = env.reset(key, env.default_params)
         return env.step(key, state, 0, env.default_params)
 
