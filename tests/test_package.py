@@ -21,6 +21,7 @@ def run_example(path: Path, which: int = -1, names: dict | None = None) -> dict:
     return names
 
 
+@pytest.mark.slow  # simulates arenas; `test_looks` and `test_map_mdp` take the same steps
 def test_example_of_the_readme_runs(capsys):
     names = run_example(ROOT / "README.md")
     assert capsys.readouterr().out == "(64, 3, 2) (64,)\n"

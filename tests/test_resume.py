@@ -18,28 +18,34 @@ from jaxsense import train
 from jaxsense.run.rundir import RunDirectory
 
 # In the JMVAE, `test_seeds` stops a run.
-INTERRUPTIONS = [("detector_", 30), ("dqn_", 40)]
+INTERRUPTIONS = {"detector": ("detector_", 30), "dqn": ("dqn_", 40)}
 
 
-@pytest.fixture(scope="module")
-def stops(tmp_path_factory, cache, smoke_run):
-    """A run of a config, stopped in its first and in its last training, and what was printed."""
+@pytest.fixture(
+    scope="module",
+    # `test_loop` hears a stop after every chunk of any training.
+    params=[("dqn",), pytest.param(("detector", "dqn"), marks=pytest.mark.slow)],
+    ids="-".join,
+)
+def stops(request, tmp_path_factory, cache, smoke_run):
+    """A run of a config, stopped in some trainings, and what was printed each time."""
     path = tmp_path_factory.mktemp("runs") / "stopped"
     few = path.with_name("few.json")  # all else is as in the preset
     few.write_text(json.dumps({"preset": "smoke", "seed": 5, "config": {"dqn": {"epochs": 60}}}))
     start = ["--config", str(few), "--quiet", "--out", str(path)]
-    printed = io.StringIO()
-    for stage, step in INTERRUPTIONS:
+    printed = []
+    for stage, step in map(INTERRUPTIONS.__getitem__, request.param):
+        printed.append(io.StringIO())
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(RunDirectory, "append_metrics", interrupting(at(stage, step)))
             before = signal.getsignal(signal.SIGINT)
-            with contextlib.redirect_stderr(printed), pytest.raises(SystemExit) as stop:
+            with contextlib.redirect_stderr(printed[-1]), pytest.raises(SystemExit) as stop:
                 train.main([*start, *cache])
         assert signal.getsignal(signal.SIGINT) is before
         assert stop.value.code == 130
         assert not (path / "summary.json").exists()
         start = ["--resume", str(path), "--quiet"]
-    return path, printed.getvalue()
+    return path, [each.getvalue() for each in printed]
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +90,8 @@ def test_a_stopped_run_goes_on_and_ends_the_same(resumed, smoke_run):
 
 def test_a_stopped_run_says_how_to_go_on(stops):
     path, printed = stops
-    assert printed.count(f"python -m jaxsense.train --resume {path}") == len(INTERRUPTIONS)
+    for each in printed:
+        assert each.count(f"python -m jaxsense.train --resume {path}") == 1
 
 
 @pytest.mark.parametrize(

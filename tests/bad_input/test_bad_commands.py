@@ -12,12 +12,12 @@ from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 
-import jax
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import ANYTHING, NUMBERS, SMOKE, check_message
 from smoke import save_models
+from untrained import untrained
 
 import jaxsense
 from benchmarks import __main__ as benchmarks
@@ -36,9 +36,8 @@ SECONDS = 10.0
 def run(tmp_path_factory):
     """The directory of a run that trained nothing, without a summary."""
     path = tmp_path_factory.mktemp("runs") / "run"
-    models = jaxsense.init(jax.random.key(0), SMOKE)
     with RunDirectory.create(path, Settings("smoke", 0, SMOKE)) as created:
-        save_models(created, models)
+        save_models(created, untrained(SMOKE))
     return path
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusals import INF, NAN, SMOKE
+from untrained import untrained
 
 import jaxsense
 from jaxsense import Belief, dqn, mission, sim, tasks, vae
@@ -26,7 +27,7 @@ class World:
 
     def __init__(self):
         self.key = jax.random.key(0)
-        self.models = jaxsense.init(self.key, SMOKE)
+        self.models = untrained(SMOKE)
         self.params, self.model = self.models.jmvae, jaxsense.make_jmvae(SMOKE)
         self.world = sim.make_world(SMOKE)
         self.camera, self.lidar = self.world.sensors

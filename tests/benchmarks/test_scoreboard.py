@@ -185,7 +185,7 @@ def test_the_clock_stands_still_while_policies_play(monkeypatch):
     monkeypatch.setattr(record.time, "process_time", lambda: next(times))
     recorder = Recorder(make("map-v0"), "mine", 1.0, episodes=2)
     for steps in (0, 64, 128):
-        recorder(steps, {0: nop, 1: nop})
+        recorder(steps, {0: Partial(nop), 1: Partial(nop)})
     # From 101 to 105 s and from 106 to 207 s, shared by two seeds.
     assert [p.seconds for p in recorder.points if p.seed == 1] == [0, 2, 2 + 101 / 2]
     assert recorder.points[-1] == Point("map-v0", "camera", "mine", 1, 128, 52.5, 0.0, 0.0)

@@ -313,7 +313,12 @@ def test_without_tours_a_look_no_better_than_one_at_a_known_poi_comes_last(monke
 
 def test_no_two_networks_start_alike():
     config = PRESETS["team"]
-    models = init(jax.random.key(0), config)
-    firsts = [jax.tree.leaves(x)[-1] for x in (*models.q_networks, *models.tours)]
+
+    @jax.jit
+    def last_leaves(key):
+        models = init(key, config)
+        return [jax.tree.leaves(x)[-1] for x in (*models.q_networks, *models.tours)]
+
+    firsts = last_leaves(jax.random.key(0))
     for i, one in enumerate(firsts):
         assert all(not np.array_equal(one, other) for other in firsts[i + 1 :])

@@ -164,7 +164,8 @@ def test_gymnax_has_every_task():
     assert params.max_steps_in_episode == make("map-v0").max_steps
 
 
-@pytest.mark.parametrize("name", ["map-v0", "team-v0"])
+# What maps and teams do is the task's; `test_gymnax` steps through a map.
+@pytest.mark.parametrize("name", [pytest.param("map-v0", marks=pytest.mark.slow), "team-v0"])
 def test_a_step_of_gymnax_is_the_tasks(name):
     gymnax = pytest.importorskip("jaxsense.interfaces.gymnax", reason="needs jaxsense[gymnax]")
     task, env = make(name), gymnax.make_env(name)

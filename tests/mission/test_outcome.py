@@ -43,7 +43,8 @@ def test_figures_as_worked_by_hand(team, known, ended):
     )
     state = replace(ended, belief=Belief(mean, std), robots=robots, contacts=jnp.int32(4))
     state = replace(state, times_seen=jnp.array([[1, 0]] * 3))
-    found = mission.measure(team, known, state)
+    measure = jax.jit(lambda state: mission.measure(team, known, state))
+    found = measure(state)
     np.testing.assert_array_equal(found["is_right"], [True, True, False])
     np.testing.assert_array_equal(found["ambiguous"], [False, True, False])
     # Colours: green, red and, wrongly, green; shapes: round, round and, wrongly, round.
@@ -55,7 +56,7 @@ def test_figures_as_worked_by_hand(team, known, ended):
     # 1 / .5 + 1 / sqrt(.09 + 1.44) + 1 / .5
     np.testing.assert_allclose(found["information"], 4 + 1 / np.sqrt(1.53), rtol=1e-5)
     # What nobody has seen is neither right nor reported.
-    unseen = mission.measure(team, known, replace(state, times_seen=jnp.zeros((3, 2), int)))
+    unseen = measure(replace(state, times_seen=jnp.zeros((3, 2), int)))
     assert not np.any(unseen["is_right"])
     assert not np.any(unseen["ambiguous"])
     assert unseen["told"]["camera"] == 0

@@ -60,9 +60,14 @@ def test_a_q_network_takes_its_best_action():
     agent = task.models.agent
     params = agent.init(jax.random.key(1))
     policy = tasks.greedy(task, agent, params)
-    observations = jax.vmap(lambda key: task.reset(key)[0])(jax.random.split(jax.random.key(2), 64))
-    chosen = jax.vmap(lambda x: policy(jax.random.key(0), x))(observations)
-    values = jax.vmap(lambda x: agent.values(params, task.inputs(x)))(observations)
+
+    @jax.jit
+    @jax.vmap
+    def start(key):
+        observation, _ = task.reset(key)
+        return policy(key, observation), agent.values(params, task.inputs(observation))
+
+    chosen, values = start(jax.random.split(jax.random.key(2), 64))
     np.testing.assert_array_equal(chosen, values.argmax(axis=1))
     assert len(np.unique(chosen)) > 1
 

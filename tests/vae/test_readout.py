@@ -70,15 +70,16 @@ def test_a_belief_that_is_only_near_the_prior_is_read_by_its_moments():
 @functools.cache
 def held_and_read(prototypes):
     """Class probabilities as they are read from a belief that holds others, by classes' means."""
-    mean = jnp.array(prototypes, jnp.float32)
-    classes = Belief(mean, jnp.full(mean.shape, 0.3))
-    prior = Belief(jnp.zeros(mean.shape[1]), jnp.full(mean.shape[1], 4.5))
-    found = readout.make(classes)
+    mean = np.array(prototypes, np.float32)
 
     @jax.jit
-    @jax.vmap
     def back(probabilities):
-        return found.class_probabilities(readout.mixture(classes, probabilities), prior)
+        classes = Belief(jnp.array(mean), jnp.full(mean.shape, 0.3))
+        prior = Belief(jnp.zeros(mean.shape[1]), jnp.full(mean.shape[1], 4.5))
+        found = readout.make(classes)
+        return jax.vmap(lambda p: found.class_probabilities(readout.mixture(classes, p), prior))(
+            probabilities
+        )
 
     return back
 
@@ -88,7 +89,7 @@ def looked_at(labels, prototypes, looks):
     rng, number, histories = np.random.default_rng(0), len(prototypes), 2000
     back = held_and_read(tuple(map(tuple, prototypes)))
     truth, exact = rng.integers(number, size=histories), np.zeros((histories, number))
-    known = back(jnp.full((histories, number), 1 / number))
+    known = back(np.full((histories, number), 1 / number, np.float32))
     for look in range(looks):
         of_class = np.array(labels[look % len(labels)])
         quality = rng.uniform(0.3, 4.0, size=(histories, 1))
