@@ -11,7 +11,9 @@ from benchmarks.missions import (
     missions_many,
     missions_many_devices,
     missions_many_under_way,
+    missions_many_under_way_devices,
     missions_under_way,
+    missions_under_way_devices,
     resets_many,
 )
 from benchmarks.physics import (
@@ -49,6 +51,8 @@ ROWS: dict[str, Callable[[Options], Row]] = {
     "missions_many": missions_many,
     "missions_many_under_way": missions_many_under_way,
     "missions_many_devices": missions_many_devices,
+    "missions_under_way_devices": missions_under_way_devices,
+    "missions_many_under_way_devices": missions_many_under_way_devices,
     "resets_many": resets_many,
     "jmvae": jmvae,
     "dqn_rejax": dqn_rejax,

@@ -22,6 +22,7 @@ CODE: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("physics_contacts", "physics_contacts_warp"), _MOTION),
     **dict.fromkeys(("rays", "rays_warp", "rays_warp_bvh"), _RAYS),
     **dict.fromkeys(("missions_under_way", "missions_many_under_way", "resets_many"), _STEPS),
+    **dict.fromkeys(("missions_under_way_devices", "missions_many_under_way_devices"), _STEPS),
     **dict.fromkeys(("missions", "missions_devices"), _MISSIONS),
     **dict.fromkeys(("missions_many", "missions_many_devices"), _MISSIONS),
     "jmvae": ("core/networks.py", "core/supervised.py", "vae/gaussian.py", "vae/jmvae.py"),

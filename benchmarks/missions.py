@@ -48,6 +48,18 @@ def missions_many_under_way(options: Options) -> Row:
     return _go_on("missions_many_under_way", options, of_many_pois(), _MISSIONS_OF_MANY)
 
 
+def missions_under_way_devices(options: Options) -> Row:
+    """`missions_under_way` on all devices, against one of them."""
+    config = untrained("default")
+    return _go_on("missions_under_way_devices", options, config, _MISSIONS, against_one=True)
+
+
+def missions_many_under_way_devices(options: Options) -> Row:
+    """`missions_many_under_way` on all devices, against one of them."""
+    name, config = "missions_many_under_way_devices", of_many_pois()
+    return _go_on(name, options, config, _MISSIONS_OF_MANY, against_one=True)
+
+
 def missions_devices(options: Options) -> Row:
     """`missions` on all devices, against one of them that plays the same ones."""
     return _play("missions_devices", options, untrained("default"), _MISSIONS, against_one=True)
@@ -89,24 +101,32 @@ def _play(
         return measure.compare(name, _UNIT, [ours], theirs, options, peer=peer)
 
 
-def _go_on(name: str, options: Options, config: Config, accelerator: int) -> Row:
+def _go_on(
+    name: str, options: Options, config: Config, accelerator: int, against_one: bool = False
+) -> Row:
     """Some control periods of missions after their first seconds."""
-    (batch,) = measure.batches(options, quick=4, cpu=(384,), accelerator=(accelerator,))
+    devices_of_sides = [devices.start(None)] + [devices.start(1)] * against_one
+    number = jax.device_count() if jax.default_backend() != "cpu" else 1
+    (batch,) = measure.batches(options, quick=4, cpu=(384,), accelerator=(number * accelerator,))
     missions = playing(config, "naive", batch, _PERIODS)
 
     def go_on(keys: jax.Array, states: MissionState) -> MissionState:
         return missions.go_on(keys, missions.models, states)
 
-    side = measure.compiled(
-        go_on,
-        missions.keys,
-        missions.states,
-        work=batch * _PERIODS,
-        batch=batch,
-        workers=devices.start(None),
-        wide_vectors=True,
+    ours, *theirs = (
+        measure.compiled(
+            go_on,
+            missions.keys,
+            missions.states,
+            work=batch * _PERIODS,
+            batch=batch,
+            workers=workers,
+            wide_vectors=True,
+        )
+        for workers in devices_of_sides
     )
-    return measure.compare(name, _UNIT, [side], [], options)
+    peer = "one device" if against_one else None
+    return measure.compare(name, _UNIT, [ours], theirs, options, peer=peer)
 
 
 def resets_many(options: Options) -> Row:
