@@ -8,7 +8,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "jaxsense"
-_COMPILED = ("run/devices.py",)  # with these options
+_COMPILED = ("run/devices.py:compiler_options",)
+_SPREAD = ("run/devices.py:spread", "run/kept.py:trace")
 _BODIES = ("sim/amiro.py", "sim/arena.py")
 _MOTION = (*_BODIES, "mission/groups.py", "mission/motion.py", "mission/navigation.py")
 _RAYS = (*_BODIES, "sim/raycast.py", "sim/sensors.py")
@@ -17,14 +18,17 @@ _MISSIONS = (*_STEPS, "run/batches.py", "run/missions.py")
 _MAP = ("dqn/map_mdp.py", "vae/filter.py", "vae/fusion.py")
 _LEARNING = (*_MAP, "dqn/losses.py", "dqn/map_agent.py", "dqn/replay.py", "dqn/training.py")
 CODE: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(("physics", "physics_batch", "physics_warp", "physics_devices"), _BODIES),
+    **dict.fromkeys(("physics", "physics_batch", "physics_warp"), _BODIES),
+    "physics_devices": (*_BODIES, *_SPREAD),
     **dict.fromkeys(("physics_solver", "physics_solver_batch", "physics_solver_warp"), _BODIES),
     **dict.fromkeys(("physics_contacts", "physics_contacts_warp"), _MOTION),
     **dict.fromkeys(("rays", "rays_warp", "rays_warp_bvh"), _RAYS),
     **dict.fromkeys(("missions_under_way", "missions_many_under_way", "resets_many"), _STEPS),
-    **dict.fromkeys(("missions_under_way_devices", "missions_many_under_way_devices"), _STEPS),
-    **dict.fromkeys(("missions", "missions_devices"), _MISSIONS),
-    **dict.fromkeys(("missions_many", "missions_many_devices"), _MISSIONS),
+    **dict.fromkeys(
+        ("missions_under_way_devices", "missions_many_under_way_devices"), (*_STEPS, *_SPREAD)
+    ),
+    **dict.fromkeys(("missions", "missions_many"), _MISSIONS),
+    **dict.fromkeys(("missions_devices", "missions_many_devices"), (*_MISSIONS, *_SPREAD)),
     "jmvae": ("core/networks.py", "core/supervised.py", "vae/gaussian.py", "vae/jmvae.py"),
     **dict.fromkeys(("dqn_rejax", "dqn_sb3", "dqn_seeds"), _LEARNING),
     **dict.fromkeys(("time_to_optimal_rejax", "time_to_optimal_sb3"), _LEARNING),
@@ -32,7 +36,8 @@ CODE: Mapping[str, tuple[str, ...]] = {
     "team_mdp": (*_MAP, "dqn/team_mdp.py"),
     **dict.fromkeys(("train", "train_warm"), (".",)),
 }
-"""Files and folders of the package that each row measures, besides what compiles all of them."""
+"""Files and folders of the package that each row measures, besides what compiles all of them; of a
+file, everything or the function behind the colon."""
 
 
 def is_whole() -> bool:
@@ -55,12 +60,15 @@ def has_changed(row: str, commit: str) -> bool:
     Raises:
       ValueError: if the commit is not in the history.
     """
-    places = [f"{PACKAGE}/{place}" for place in (*_COMPILED, *CODE[row])]
-    paths = _git("diff", "--name-only", commit, "--", *places)
-    if paths is None:
-        raise ValueError(f"commit = {commit!r} of row {row}: must be one of the history")
-    modules = [path for path in paths.split() if path.endswith(".py")]
-    return any(_before(commit, path) != _now(path) for path in modules)
+    for place in (*_COMPILED, *CODE[row]):
+        path, _, function = f"{PACKAGE}/{place}".partition(":")
+        paths = _git("diff", "--name-only", commit, "--", path)
+        if paths is None:
+            raise ValueError(f"commit = {commit!r} of row {row}: must be one of the history")
+        modules = [path for path in paths.split() if path.endswith(".py")]
+        if any(_before(commit, path, function) != _now(path, function) for path in modules):
+            return True
+    return False
 
 
 def note(path: Path) -> None:
@@ -75,13 +83,17 @@ def note(path: Path) -> None:
         path.write_text(json.dumps(noted, indent=2) + "\n", encoding="utf-8")
 
 
-def program(source: str) -> str:
+def program(source: str, function: str = "") -> str:
     """What a module computes, without comments, docstrings, imports and types.
 
     Args:
       source: its text.
+      function: the only one that counts; all by default.
     """
     tree = ast.parse(source)
+    if function:
+        named = [each for each in tree.body if isinstance(each, ast.FunctionDef)]
+        tree.body = [each for each in named if each.name == function]
     for node in ast.walk(tree):
         if isinstance(node, ast.arg | ast.AnnAssign):
             node.annotation = None  # pyright: ignore[reportAttributeAccessIssue]
@@ -99,14 +111,14 @@ def _is_text(node: ast.stmt) -> bool:
     return is_string or isinstance(node, ast.Import | ast.ImportFrom)
 
 
-def _before(commit: str, path: str) -> str | None:
+def _before(commit: str, path: str, function: str) -> str | None:
     source = _git("show", f"{commit}:{path}")
-    return None if source is None else program(source)
+    return None if source is None else program(source, function)
 
 
-def _now(path: str) -> str | None:
+def _now(path: str, function: str) -> str | None:
     file = ROOT / path
-    return program(file.read_text(encoding="utf-8")) if file.exists() else None
+    return program(file.read_text(encoding="utf-8"), function) if file.exists() else None
 
 
 def _git(*words: str) -> str | None:

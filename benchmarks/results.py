@@ -42,7 +42,7 @@ PAGES = (
     *sorted((_HERE.parent / "docs").glob("*.md")),
     _HERE / "RESULTS.md",
 )
-ROWS = ("cpu.json", "h100.json", "h200.json", "h100x2.json")
+ROWS = ("cpu.json", "h100.json", "h100x2.json")
 """What `python -m benchmarks` has written."""
 _BLOCK = re.compile(
     r"(<!-- (?P<file>[\w-]+\.json)(?: (?P<table>[\w-]+))? -->\n).*?(<!-- end -->)", re.DOTALL

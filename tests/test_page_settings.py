@@ -11,7 +11,7 @@ from jaxsense.dqn import tours
 from jaxsense.mission.cases import FAULT_TIME
 from jaxsense.sim import amiro, search
 from jaxsense.summary import compare, make
-from jaxsense.training import perception
+from jaxsense.training import jmvaes
 from jaxsense.vae import gate, novelty
 
 ROOT = Path(__file__).parents[1]
@@ -44,7 +44,7 @@ def _constants():
     yield f"Robots are {amiro.BODY_TOP:.3f} m high, or {amiro.LIDAR_TOP} m with a LiDAR"
     yield f"at most {lost} of those at PoIs, and fewer if it rejects {rejected} of those at nothing"
     yield f"exceeds the accuracy by at most {novelty._TOLERANCE} in both halves"
-    yield f"an error of at most {perception._EXACT} nats"
+    yield f"an error of at most {jmvaes._EXACT} nats"
     yield f"{compare._MOST_TIMES} times that of exact Bayes plus {compare._MOST_NATS} nats"
     yield f"more than {100 * make._ERROR:g} % and two standard errors"
     yield f"within {near} of the optimal policy's"
