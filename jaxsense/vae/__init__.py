@@ -25,4 +25,5 @@ from jaxsense.vae.jmvae import train as train
 from jaxsense.vae.latent import nearest_class as nearest_class
 from jaxsense.vae.latent import plausible_classes as plausible_classes
 from jaxsense.vae.latent import sigma_norm as sigma_norm
+from jaxsense.vae.likelihood import log_likelihood as log_likelihood
 from jaxsense.vae.readout import mixture as mixture
