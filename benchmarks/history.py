@@ -13,8 +13,10 @@ _SPREAD = ("run/devices.py:spread", "run/kept.py:trace")
 _BODIES = ("sim/amiro.py", "sim/arena.py")
 _MOTION = (*_BODIES, "mission/groups.py", "mission/motion.py", "mission/navigation.py")
 _RAYS = (*_BODIES, "sim/raycast.py", "sim/sensors.py")
-_STEPS = ("looks.py", "mission", "models.py", "sim", "vae")
-_MISSIONS = (*_STEPS, "run/batches.py", "run/missions.py")
+_CHOICES = ("dqn/policies.py", "dqn/reference.py", "dqn/rewards.py", "dqn/rules.py")
+_STEPS = (*_CHOICES, "core", "looks.py", "mission", "models.py", "sim", "vae")
+_PLAYER = ("run/batches.py", "run/films.py", "run/ledger.py", "run/missions.py")
+_MISSIONS = (*_STEPS, *_PLAYER, "run/devices.py:side_by_side")
 _MAP = ("dqn/map_mdp.py", "vae/filter.py", "vae/fusion.py")
 _LEARNING = (*_MAP, "dqn/losses.py", "dqn/map_agent.py", "dqn/replay.py", "dqn/training.py")
 CODE: Mapping[str, tuple[str, ...]] = {
@@ -66,9 +68,17 @@ def has_changed(row: str, commit: str) -> bool:
         if paths is None:
             raise ValueError(f"commit = {commit!r} of row {row}: must be one of the history")
         modules = [path for path in paths.split() if path.endswith(".py")]
-        if any(_before(commit, path, function) != _now(path, function) for path in modules):
+        if any(_has_changed(commit, path, function) for path in modules):
             return True
     return False
+
+
+def _has_changed(commit: str, path: str, function: str) -> bool:
+    """Whether a module has; a new one counts where others use it, which then have changed."""
+    before, file = _git("show", f"{commit}:{path}"), ROOT / path
+    if before is None or not file.exists():
+        return before is not None
+    return program(before, function) != program(file.read_text(encoding="utf-8"), function)
 
 
 def note(path: Path) -> None:
@@ -88,12 +98,11 @@ def program(source: str, function: str = "") -> str:
 
     Args:
       source: its text.
-      function: the only one that counts; all by default.
+      function: the only one that counts, with what it uses of the module; all by default.
     """
     tree = ast.parse(source)
     if function:
-        named = [each for each in tree.body if isinstance(each, ast.FunctionDef)]
-        tree.body = [each for each in named if each.name == function]
+        tree.body = _used_by(function, tree.body)
     for node in ast.walk(tree):
         if isinstance(node, ast.arg | ast.AnnAssign):
             node.annotation = None  # pyright: ignore[reportAttributeAccessIssue]
@@ -105,20 +114,27 @@ def program(source: str, function: str = "") -> str:
     return ast.dump(tree)
 
 
+def _used_by(function: str, statements: list[ast.stmt]) -> list[ast.stmt]:
+    """The statements that define a function and what it uses."""
+    names, used = {function}, list[ast.stmt]()
+    while found := [x for x in statements if x not in used and names & _defined(x)]:
+        used += found
+        names |= {x.id for each in found for x in ast.walk(each) if isinstance(x, ast.Name)}
+    return [x for x in statements if x in used]
+
+
+def _defined(node: ast.stmt) -> set[str]:
+    """Names that a statement of a module defines."""
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        return {node.name}
+    targets = node.targets if isinstance(node, ast.Assign) else []
+    return {target.id for target in targets if isinstance(target, ast.Name)}
+
+
 def _is_text(node: ast.stmt) -> bool:
     """Whether a statement is a string or an import."""
     is_string = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
     return is_string or isinstance(node, ast.Import | ast.ImportFrom)
-
-
-def _before(commit: str, path: str, function: str) -> str | None:
-    source = _git("show", f"{commit}:{path}")
-    return None if source is None else program(source, function)
-
-
-def _now(path: str, function: str) -> str | None:
-    file = ROOT / path
-    return program(file.read_text(encoding="utf-8"), function) if file.exists() else None
 
 
 def _git(*words: str) -> str | None:

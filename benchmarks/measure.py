@@ -220,7 +220,7 @@ def compiled(
     if workers.mesh is not None:
         share = devices.part(shapes_of(args), 0, workers.shares)
         alone = trace(function, share, lambda _: contextlib.nullcontext())
-        function = devices.spread(alone or function, workers.mesh)
+        function = devices.spread(alone.__call__, workers.mesh)
         args = jax.device_put(args, NamedSharding(workers.mesh, PartitionSpec(devices.AXIS)))
     threads = workers.threads
     parts = [devices.part(args, i, threads) for i in range(threads)]

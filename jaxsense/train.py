@@ -254,7 +254,9 @@ def _train(
     paths = seeds.paths(run).items()
     is_left = np.array([not (path / "summary.json").exists() for _, path in paths])
     left = list(itertools.compress(paths, processes.of_first_process(is_left)))
-    most = 1 if jax.default_backend() == "cpu" else _MOST_TOGETHER
+    # Threads of several processes would stack seeds in different orders.
+    is_alone = jax.default_backend() == "cpu" or jax.process_count() > 1
+    most = 1 if is_alone else _MOST_TOGETHER
     size = max(1, min(len(left), most))  # all seeds may already be finished
     trainings = Trainings(size, total=len(left))
     try:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from same_figures import different_across_compilers
-from smoke import without_times
+from smoke import SMOKE, without_times
 
 from jaxsense import train
 from jaxsense.config import PRESETS, ConfigError
@@ -93,7 +93,7 @@ def test_workers_share_the_rows_of_a_program(make, is_kept, tmp_path):
         program = Program(compiler, "stage", "run")
         shapes = program.compile(function, scale, x, workers=workers, whole=(0,))
         output = program(scale, x)
-    assert set(seen) == {(6 // workers.number, 2)}
+    assert seen == [(6 // workers.number, 2)]
     assert (shapes["scaled"].shape, shapes["sums"].shape) == ((6, 2), (6,))
     np.testing.assert_array_equal(output["scaled"], 2 * x)
     np.testing.assert_array_equal(output["sums"], [1, 5, 9, 13, 17, 21])
@@ -141,6 +141,16 @@ def two_processes(options):
         )
         for i in range(2)
     ]
+
+
+@pytest.mark.slow  # compiles a whole run
+def test_two_devices_share_a_run(tmp_path, monkeypatch, smoke_run):
+    monkeypatch.setattr(devices, "start", lambda _: Workers(mesh=devices.make_mesh(2)))
+    cache = ["--cache", str(tmp_path / "cache")]
+    for name in ("shared", "again"):  # the second time with the programs of the first
+        train.main([*SMOKE, *cache, "--out", str(tmp_path / name)])
+        found = without_times(tmp_path / name)
+        assert not different_across_compilers(found, without_times(smoke_run))
 
 
 @pytest.mark.slow  # two processes compile a whole run

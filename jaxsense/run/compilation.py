@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from jaxsense.run import devices
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.run.kept import Function, Kept, shapes_of, trace
+from jaxsense.run.kept import Function, Kept, Traced, shapes_of, trace
 from jaxsense.run.monitor import Monitor
 
 _LOADED = "/jax/compilation_cache/cache_hits"
@@ -139,37 +139,48 @@ class Program:
 
     def _lower(self, function: Function, args: PyTree) -> tuple[jax.stages.Lowered, PyTree]:
         """A function ready to be compiled, and the shapes of a share's results; see `compile`."""
-        workers, whole, kept = self._workers, self._whole, self._compiler.kept
+        workers, whole = self._workers, self._whole
         call, share = (
             devices.part(args, 0, number, whole) for number in (workers.parts, workers.shares)
         )
-        found = None
-        if kept is not None:
-            name = f"{self._stage}-{self._name}"
-            found = kept.find_or_trace(name, function, share, self._record)
-        elif workers.mesh is not None:
-            found = trace(function, share, self._record)
-        places = self._places(len(args)) if self._is_of_many else None
-        spread = devices.spread(found.__call__ if found else function, workers.mesh, whole)
-        jitted = jax.jit(spread, in_shardings=places)
+        found = self._found_or_traced(function, share)
         if found is not None:
+            spread = devices.spread(found.__call__, workers.mesh, whole)
             with self._record("lower"):
+                jitted = jax.jit(spread, in_shardings=self._places(len(args)))
                 return jitted.lower(*shapes_of(call)), found.results
         with self._record("trace"):
-            traced = jitted.trace(*call)
-            results = jax.eval_shape(function, *share)
+            traced = jax.jit(function).trace(*call)
         with self._record("lower"):
-            return traced.lower(), results
+            return traced.lower(), traced.out_info
 
-    @property
-    def _is_of_many(self) -> bool:
-        """Whether several processes run the program together."""
-        return self._workers.mesh is not None and jax.process_count() > 1
+    def _found_or_traced(self, function: Function, share: tuple[PyTree, ...]) -> Traced | None:
+        """The program apart from what calls it, which only caches and meshes need."""
+        if (kept := self._compiler.kept) is not None:
+            name = f"{self._stage}-{self._name}"
+            found = kept.find_or_trace(name, function, share, self._record)
+            if found is not None:
+                return found
+        if self._workers.mesh is None:
+            return None
+        try:
+            return trace(function, share, self._record)
+        except NotImplementedError as error:
+            reason = f"{self._stage}: cannot be split over several devices; use one ({error})"
+            raise NotImplementedError(reason) from error
 
-    def _places(self, number: int) -> tuple[jax.sharding.NamedSharding, ...]:
-        """Where each of a number of arguments lies, if several processes run the program."""
-        assert self._workers.mesh is not None
-        return devices.shardings(self._workers.mesh, number, self._whole)
+    def _places(self, number: int) -> tuple[jax.sharding.NamedSharding, ...] | None:
+        """Where each of a number of arguments lies on a mesh; None without one."""
+        mesh = self._workers.mesh
+        return None if mesh is None else devices.shardings(mesh, number, self._whole)
+
+    def _put(self, args: tuple[PyTree, ...]) -> tuple[PyTree, ...]:
+        """Arguments where a mesh needs them."""
+        places = self._places(len(args))
+        if places is None:
+            return args
+        put = devices.put if jax.process_count() > 1 else jax.device_put
+        return put(args, places)
 
     def fail(self, error: BaseException) -> None:
         """Makes all calls raise an error, unless the program is compiled already."""
@@ -203,12 +214,11 @@ class Program:
     def run(self, *args: PyTree) -> PyTree[jax.Array]:
         """Runs a program that threads do not share, and leaves its results on the devices."""
         compiled = self.wait()
-        if self._is_of_many:
-            args = devices.put(args, self._places(len(args)))
-        return compiled(*args)
+        # JAX itself places what one process runs, and in missions most of it lies there already.
+        return compiled(*(args if jax.process_count() == 1 else self._put(args)))
 
     def __call__(self, *args: PyTree) -> PyTree:
-        """Runs the program, and blocks until its results are ready."""
+        """Runs the program, and blocks until its results are ready, on the host if it is split."""
         compiled = self.wait()
         number = self._workers.parts
 
@@ -216,7 +226,7 @@ class Program:
             return jax.block_until_ready(compiled(*devices.part(args, i, number, self._whole)))
 
         with self._record("run"):
-            if self._is_of_many:
-                args = devices.put(args, self._places(len(args)))
+            args = self._put(args)
             output = devices.joined(run, number, self._workers.threads, self._results)
-            return devices.fetched(output) if self._is_of_many else output
+            # Other programs run on one device.
+            return output if self._workers.mesh is None else devices.fetched(output)

@@ -100,7 +100,7 @@ class Workers:
 
     @property
     def shares(self) -> int:
-        """Number of shares of a batch; devices of a mesh each take one of every part."""
+        """Number of equal shares of a batch, one for each worker and call."""
         return self.number * self.calls
 
 
@@ -200,6 +200,16 @@ def shardings(mesh: Mesh, number: int, whole: tuple[int, ...]) -> tuple[NamedSha
         NamedSharding(mesh, PartitionSpec() if i in whole else PartitionSpec(AXIS))
         for i in range(number)
     )
+
+
+def put_everywhere(values: PyTree, mesh: Mesh | None) -> PyTree[jax.Array]:
+    """Puts values on the device that runs programs, or on every device of a mesh.
+
+    Args:
+      values: arrays or numbers.
+      mesh: of this process, from `make_mesh`; None for a single device.
+    """
+    return jax.device_put(values, None if mesh is None else NamedSharding(mesh, PartitionSpec()))
 
 
 def put(args: tuple[PyTree, ...], places: tuple[NamedSharding, ...]) -> tuple[PyTree, ...]:

@@ -142,10 +142,12 @@ class Kept:
             found = self.find(name, args)
         if found is not None:
             return found
-        traced = trace(function, args, record)
-        # A run must not end because the next one will be slower, for example on a full disk.
-        with contextlib.suppress(Exception), record("lower"):
-            if traced is not None:
+        # A run must not end because the next one will be slower: where a program calls something
+        # that JAX cannot export, or on a full disk.
+        traced = None
+        with contextlib.suppress(Exception):
+            traced = trace(function, args, record)
+            with record("lower"):
                 content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
                 files.write_digested(self._file(name, args), content, mode=0o600)
         return traced
@@ -157,7 +159,7 @@ class Kept:
         return self.path / f"{name}-{digest}.stablehlo"
 
 
-def trace(function: Function, args: PyTree, record: Recorder) -> Traced | None:
+def trace(function: Function, args: PyTree, record: Recorder) -> Traced:
     """Traces a program and lowers it, apart from whatever calls it.
 
     Args:
@@ -165,8 +167,8 @@ def trace(function: Function, args: PyTree, record: Recorder) -> Traced | None:
       args: its arguments or their shapes.
       record: what is recorded: "trace" and "lower".
 
-    Returns:
-      The program; None if it calls something that JAX cannot export.
+    Raises:
+      NotImplementedError: if it calls something that JAX cannot export, such as the host.
     """
     leaves, structure = jax.tree.flatten(args)
     results: list[object] = []
@@ -176,14 +178,12 @@ def trace(function: Function, args: PyTree, record: Recorder) -> Traced | None:
         results.append(jax.tree.structure(output))
         return jax.tree.leaves(output)
 
-    with contextlib.suppress(Exception):
-        jitted, shapes = jax.jit(flat), shapes_of(leaves)
-        # Exporting would trace too; JAX does so once.
-        with record("trace"):
-            jitted.trace(*shapes)
-        with record("lower"):
-            return Traced(export.export(jitted)(*shapes), results[-1])
-    return None
+    jitted, shapes = jax.jit(flat), shapes_of(leaves)
+    # Exporting would trace too; JAX does so once.
+    with record("trace"):
+        jitted.trace(*shapes)
+    with record("lower"):
+        return Traced(export.export(jitted)(*shapes), results[-1])
 
 
 def use_cache(directory: Path) -> None:

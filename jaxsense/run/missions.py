@@ -119,7 +119,7 @@ def _begun(config: Config, number: int, models: Models | None) -> tuple[PyTree, 
 
     Args:
       config: all settings.
-      number: of missions side by side that a thread plays, or all devices of a mesh together.
+      number: of missions side by side, in a call or in a share of it.
       models: see `Player`.
     """
     numbers = jax.ShapeDtypeStruct((number,), jnp.int32)
@@ -256,7 +256,8 @@ class Player:
             self.wait()
             with self._monitor.clock.record("run", "mission"):
                 # Loaded models lie on the host, and every chunk would transfer them again.
-                models = jax.device_put(models)
+                mesh = self._workers.mesh if jax.process_count() == 1 else None
+                models = devices.put_everywhere(models, mesh)
                 call = _Call(key, models, played, episodes, self._found.metrics)
                 devices.side_by_side(lambda lane: self._play(call, lane), self._workers.threads)
                 return call.result()

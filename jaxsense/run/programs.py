@@ -277,7 +277,7 @@ def padded(inputs: PyTree, workers: Workers) -> PyTree:
       inputs: arrays or their shapes.
       workers: share the rows.
     """
-    number = workers.number * workers.calls
+    number = workers.shares
 
     def pad(x: jax.Array | jax.ShapeDtypeStruct) -> jax.Array | jax.ShapeDtypeStruct:
         rows = -(-x.shape[0] // number) * number

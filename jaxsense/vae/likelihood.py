@@ -37,18 +37,20 @@ def log_likelihood(
       In nats.
 
     Raises:
-      ValueError: if no modality is present or `samples` is not positive.
+      ValueError: if no modality is present, `reconstruction_weights` has not one for each, or
+        `samples` is not positive.
     """
     checks.require_number("samples", samples)
+    given = tuple(reconstruction_weights)
+    checks.require_one_each("reconstruction_weights", given, model.modalities)
     posterior = jmvae.posterior(params, model, features)
-    weights = jnp.asarray(reconstruction_weights)
 
     def log_weight(noise: Float[Array, " D"]) -> Float[Array, ""]:
         z = posterior.mean + posterior.std * noise
         decoded = jmvae.decode(params, model, z)
         of_features = sum(
             _log_normal((x - mean) * jnp.sqrt(weight)) + 0.5 * x.shape[-1] * jnp.log(weight)
-            for x, mean, weight in zip(features, decoded, weights, strict=True)
+            for x, mean, weight in zip(features, decoded, given, strict=True)
             if x is not None
         )
         return of_features + _log_normal(z) - _log_normal(noise) + jnp.sum(jnp.log(posterior.std))

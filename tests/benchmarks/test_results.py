@@ -112,10 +112,13 @@ def rate(x: Array) -> Array:
     assert history.program(before) == history.program(after)
     assert history.program(before) != history.program(after.replace("2 * x", "3 * x"))
     assert history.program(before) != history.program(after.replace("rate(x", "rate(y"))
-    other = f"FACTOR = 3\n{after}\ndef other():\n    return 1\n"
+    other = f"FACTOR = 3\n{after}\ndef other():\n    return FACTOR\n"
     assert history.program(before, "rate") == history.program(other, "rate")
     changed = other.replace("2 * x", "3 * x")
     assert history.program(before, "rate") != history.program(changed, "rate")
+    later = other.replace("FACTOR = 3", "FACTOR = 4")
+    assert history.program(other, "rate") == history.program(later, "rate")
+    assert history.program(other, "other") != history.program(later, "other")
 
 
 def test_the_code_of_every_row_is_known():
@@ -192,8 +195,10 @@ def test_code_changes_between_commits(repository):
     assert not history.has_changed("rays", first)
     repository("drives.py", "y = 1")
     assert not history.has_changed("rays", first)
-    repository("arena.py", "y = 1")
-    assert history.has_changed("physics", first)  # a file that did not exist
+    third = repository("arena.py", "y = 1")
+    assert not history.has_changed("physics", first)  # nothing uses the new module
+    repository("arena.py", "y = 2")
+    assert history.has_changed("physics", third)
     (history.ROOT / "jaxsense" / "sim" / "raycast.py").write_text("x = 2")  # not yet committed
     assert history.has_changed("rays", first)
     assert history.has_changed("resets_many", first)  # measures the folder
@@ -202,8 +207,9 @@ def test_code_changes_between_commits(repository):
 
 
 def test_rows_note_changes(repository):
-    commit = repository("raycast.py", "x = 1")
-    repository("drives.py", "y = 1")
+    repository("raycast.py", "x = 1")
+    commit = repository("drives.py", "y = 1")
+    repository("drives.py", "y = 2")
     path = history.ROOT / "cpu.json"
     rows = [{"row": name, "commit": commit} for name in ("rays", "resets_many")]
     path.write_text(json.dumps(rows))

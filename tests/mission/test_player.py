@@ -180,18 +180,19 @@ def test_missions_with_physics_do_not_depend_on_how_many_play_at_once(team, mode
     every = mission.cases(CONFIG)
     cases = {name: every[name] for name in ("latent", "naive")}
 
-    def play(batch):
+    def play(batch, split="one device"):
         with Compiler(Monitor()) as compiler:
-            player = missions.Player(short, compiler, batch)
+            player = missions.Player(short, compiler, batch, WORKERS[split]())
             return player.play(KEY, models, cases, episodes=32)
 
-    few, many = play(8), play(64)
-    assert few.control_steps == many.control_steps
+    many = play(64)
     assert len(set(many.metrics["naive"]["time_s"].tolist())) > 3
-    # Products of more rows may be summed in another order: some last bits of 24, in every look.
-    for here, there in zip(*map(jax.tree.leaves, (few.metrics, many.metrics)), strict=True):
-        is_exact = here.dtype.kind != "f"
-        np.testing.assert_allclose(here, there, rtol=0 if is_exact else 1e-5)
+    for few in (play(8), play(16, "mesh")):
+        assert few.control_steps == many.control_steps
+        # Products of more rows may be summed in another order: some last bits of 24, in every look.
+        for here, there in zip(*map(jax.tree.leaves, (few.metrics, many.metrics)), strict=True):
+            is_exact = here.dtype.kind != "f"
+            np.testing.assert_allclose(here, there, rtol=0 if is_exact else 1e-5)
 
 
 def test_a_map_that_is_not_finite_ends_the_missions(play):
