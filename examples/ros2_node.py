@@ -41,6 +41,7 @@ STILL_FOR = 0.1  # s, within which a robot that stands still moves by no more th
 SILENCE = 5.0  # s, after which a robot that tells nothing counts as failed
 PATIENCE = 60.0  # s, after which a robot that has not looked gives its viewpoint up
 NEW = 0.5  # share of a look that must be new
+MAX_STEPS = 3.0  # of the run's beams, from one beam of the robot's scanner to the next
 
 _ENCODINGS = {"rgb8": [0, 1, 2], "rgba8": [0, 1, 2], "bgr8": [2, 1, 0], "bgra8": [2, 1, 0]}
 
@@ -275,7 +276,12 @@ class Robot:
 
         Returns:
           The look by which it has updated the map, for `report`; None if there was none.
+
+        Raises:
+          ValueError: if the beams of a laser scanner are too far apart to be resampled.
         """
+        if scan.readings.ndim == 1:
+            self._require_dense(scan.angles)
         elapsed, moved = scan.stamp - self._last_stamp, np.abs(scan.pose - self._last_pose)
         self._last_pose, self._last_stamp = np.array(scan.pose), scan.stamp
         # Over a long time, a mean speed says little about that of now.
@@ -360,6 +366,14 @@ class Robot:
     def _heading(self) -> int:
         """The target, as `decide` reads it."""
         return len(self.team["positions"]) if self.target is None else self.target
+
+    def _require_dense(self, angles: np.ndarray) -> None:
+        """Raises `ValueError` if beams are too far apart."""
+        own = self.contents["sensors"][self.name]["angles"]
+        step, own_step = (np.degrees(np.median(np.abs(np.diff(each)))) for each in (angles, own))
+        if step > MAX_STEPS * own_step:
+            expected = f"must be at most {MAX_STEPS * own_step:.2f}; train with the scanner's beams"
+            raise ValueError(f"step between beams = {step:.2f} degrees: {expected}")
 
     def _along_own_rays(self, scan: Scan) -> np.ndarray:
         """The scan along the rays that `detect` reads."""
@@ -465,12 +479,16 @@ def connect(node: Any, robot: Robot) -> Any:
         stamp = Time.from_msg(header.stamp)
         try:
             pose, _ = pose_of(transform("map", "base_link", stamp))
-            mounting = transform("base_link", header.frame_id, Time())
+            robot.mounting, robot.is_upside_down = pose_of(
+                transform("base_link", header.frame_id, Time()), is_optical
+            )
+            look = robot.see(now(), Scan(stamp.nanoseconds * 1e-9, pose, angles, readings))
         except TransformException as error:
             node.get_logger().warning(f"no pose for a scan: {error}")
             return
-        robot.mounting, robot.is_upside_down = pose_of(mounting, is_optical)
-        look = robot.see(now(), Scan(stamp.nanoseconds * 1e-9, pose, angles, readings))
+        except ValueError as error:
+            node.get_logger().error(f"ignores the scans: {error}", once=True)
+            return
         if look is not None:
             team.publish(String(data=robot.report(look)))
         elif robot.goal is not None and now() - set_out_at > PATIENCE:

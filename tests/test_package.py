@@ -74,9 +74,13 @@ def test_examples_of_single_functions_run(capsys):
 def test_example_of_the_jmvae_on_own_data_runs(capsys):
     names = run_example(ROOT / "docs" / "jmvae.md")
     assert names["losses"][-50:].mean() < 0.5 * names["losses"][:50].mean()
-    shapes, share = capsys.readouterr().out.splitlines()
+    shapes, share, likelihood = capsys.readouterr().out.splitlines()
     assert shapes == "(200, 2) (200, 2)"
     assert float(share.split()[-1]) > 0.99
+    # Between that of sixteen independent features, which are scaled, and the density of the
+    # decoders, of variance .1, at their means.
+    independent, at_means = 8 * np.log(1 / (2 * np.pi)) - 8, 8 * np.log(10 / (2 * np.pi))
+    assert independent < float(likelihood.split()[-1]) < at_means
     chex.assert_trees_all_equal(names["params"], names["restored"])
 
 

@@ -1,4 +1,4 @@
-"""Tasks that stay as they are, so that scores of different people compare.
+"""Tasks that stay as they are, so that scores from different people can be compared.
 
 A task is an MDP with frozen networks whose looks are drawn from stored detections. Its version is
 part of its name and changes with anything that changes a score.

@@ -359,7 +359,8 @@ def train(
         classes with a look each: `[N, 1, D_m]`.
       config: weights, batch, learning rate and number of steps; the other settings are not used.
         A modality's decoder is a Gaussian whose variance is one over its reconstruction weight, so
-        with `beta` 1 and `annealing` 0 the loss is the bound of Suzuki et al. 2017.
+        with `beta` 1 and `annealing` 0 the loss is the negative bound of Suzuki et al. 2017, up to
+        a constant.
 
     Returns:
       The parameters and the `[steps]` losses.

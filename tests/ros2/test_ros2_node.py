@@ -105,6 +105,21 @@ def test_scans_of_other_numbers_of_beams_are_resampled(ros2, robot, stub):
     np.testing.assert_allclose(stub.asked[0]["readings"], 1 + 0.001 * np.degrees(OWN), rtol=1e-5)
 
 
+def test_a_scanner_that_is_too_coarse_is_refused_before_the_robot_drives(ros2, robot, stub):
+    assert ros2.MAX_STEPS == resampling.MAX_STEPS
+    # The run's beams are 10 degrees apart; from left to right, as some drivers have it.
+    for step, is_dense in ((29.9, True), (30.1, False)):
+        angles = np.radians(100 - step * np.arange(6))
+        scan = ros2.Scan(9.0, np.zeros(3), angles, np.ones(6))
+        if is_dense:
+            assert robot.see(9.0, scan) is None
+        else:
+            expected = "step between beams = 30.10 degrees: must be at most 30.00"
+            with pytest.raises(ValueError, match=expected):
+                robot.see(9.0, scan)
+    assert stub.asked == []
+
+
 def test_beams_that_were_not_recorded_are_not_numbers(ros2, robot, stub):
     see(ros2, robot, arrive(robot), OWN[:5], np.ones(5))
     np.testing.assert_array_equal(stub.asked[0]["readings"], [1] * 5 + [np.nan] * 4)
@@ -285,15 +300,42 @@ def test_a_message_that_is_no_report_changes_nothing(robot, report):
     jax.tree.map(np.testing.assert_array_equal, (robot.team, robot.known, robot._heard_at), before)
 
 
-def test_a_message_that_is_no_report_does_not_end_the_node(ros2, robot, monkeypatch):
+@pytest.fixture
+def node(monkeypatch):
+    """A node of `rclpy`, for which the packages of ROS are stand-ins."""
     for name in ("geometry_msgs", "rclpy", "sensor_msgs", "std_msgs", "tf2_ros"):
         for part in ("", ".duration", ".msg", ".qos", ".time"):
             monkeypatch.setitem(sys.modules, name + part, MagicMock())
     node = MagicMock()
     node.get_clock().now().nanoseconds = 10**9
-    ros2.connect(node, robot)
+    return node
+
+
+def callback_of(node, topic):
     given = (call.args for call in node.create_subscription.call_args_list)
-    (hear,) = (callback for _, topic, callback, _ in given if topic == "team")
+    (callback,) = (callback for _, each, callback, _ in given if each == topic)
+    return callback
+
+
+def test_a_coarse_scan_gets_one_line_and_no_goal(ros2, robot, node, monkeypatch):
+    monkeypatch.setattr(ros2, "pose_of", lambda *_: (np.zeros(3), False))
+    sys.modules["rclpy.time"].Time.from_msg.return_value.nanoseconds = 10**9
+    sys.modules["tf2_ros"].TransformException = OSError
+    ros2.connect(node, robot)
+    on_scan, goals = callback_of(node, "scan"), node.create_publisher.return_value
+    for step, number in ((math.radians(35), 0), (OWN[1] - OWN[0], 1)):
+        scan = LaserScan(OWN[0], step, np.ones(9))
+        scan.header = MagicMock()
+        on_scan(scan)
+        assert goals.publish.call_count == number
+    (said,) = node.get_logger().error.call_args_list
+    assert "ignores the scans: step between beams = 35.00 degrees" in said.args[0]
+    assert said.kwargs == {"once": True}
+
+
+def test_a_message_that_is_no_report_does_not_end_the_node(ros2, robot, node):
+    ros2.connect(node, robot)
+    hear = callback_of(node, "team")
     hear(SimpleNamespace(data="nonsense"))
     (warned,) = node.get_logger().warning.call_args_list
     assert "ignored a message on `team`: no report of a robot" in warned.args[0]
