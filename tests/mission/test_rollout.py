@@ -1,11 +1,13 @@
 """Whole missions of the naive policy, which needs no training, with and without failures."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from teams import CONFIG, LATENT, NAIVE
+from teams import CONFIG
 
 from jaxsense import mission
 from jaxsense.mission import act, navigation
@@ -13,6 +15,7 @@ from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
 from jaxsense.sim import amiro
 from jaxsense.sim import arena as arenas
 
+LATENT, NAIVE = 0, 1
 STEPS, CHUNK = 240, 40
 NUM_POIS = CONFIG.arena.num_pois
 PERIOD = CONFIG.mission.control_period
@@ -29,6 +32,13 @@ CASES = {
 }
 NUM_ARENAS = CASES["healthy"][2]
 TOGETHER = sum(number for _, _, number in CASES.values())
+
+
+@pytest.fixture(scope="module")
+def team(team):
+    """With the policies that play, since every other one takes long to compile."""
+    policies = {name: team.policies[name] for name in ("latent", "naive")}
+    return dataclasses.replace(team, policies=policies)
 
 
 @pytest.fixture(scope="module")
