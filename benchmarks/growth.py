@@ -8,21 +8,31 @@ says why.
 import argparse
 import dataclasses
 import json
-import pickle
-import re
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from jax import export
-
 from benchmarks import history, pipeline
-from jaxsense.run import files
 
 _BASELINE = pipeline.ROOT / ".ci" / "baseline.json"
 _MOST = 1.1  # times the baseline
-_OPERATION = re.compile(r"^\s*(%[\w:#, %]+ = |return)", re.MULTILINE)
+_OPERATION = r"(?m)^\s*(%[\w:#, %]+ = |return)"
+# What `jaxsense.run.kept.Kept` has written names classes of its own tree.
+_COUNT = """
+import json, pickle, re, sys
+from pathlib import Path
+from jax import export
+from jaxsense.run import files
+
+traced, found, operation = sys.argv[1:]
+numbers = {}
+for path in Path(traced).glob("*.stablehlo"):
+    _, flat = pickle.loads(files.without_digest(path.read_bytes()))
+    module = export.deserialize(bytearray(flat)).mlir_module()
+    numbers[path.name.rpartition("-")[0]] = len(re.findall(operation, module))
+Path(found).write_text(json.dumps(numbers), encoding="utf-8")
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,15 +66,10 @@ def train(tree: Path, place: Path) -> Needs:
     words = ["jaxsense.train", "--preset", "smoke", "--quiet"]
     words += ["--cache", str(place / "cache"), "--out", str(place / "run")]
     needs = pipeline.run(tree, words, place)
-    programs = (place / "cache" / "traced").glob("*.stablehlo")
-    operations = {path.name.rpartition("-")[0]: _operations(path) for path in programs}
+    traced, found = place / "cache" / "traced", place / "operations.json"
+    pipeline.python(tree, ("-c", _COUNT, str(traced), str(found), _OPERATION), place)
+    operations = json.loads(found.read_text(encoding="utf-8"))
     return Needs(needs.cpu_s, 1024 * needs.memory_gib, operations)
-
-
-def _operations(path: Path) -> int:
-    """Number of operations of a cached program, see `jaxsense.run.kept.Kept`."""
-    _, flat = pickle.loads(files.without_digest(path.read_bytes()))
-    return len(_OPERATION.findall(export.deserialize(bytearray(flat)).mlir_module()))
 
 
 def least(runs: list[Needs]) -> Needs:
