@@ -72,11 +72,16 @@ def train(tree: Path, place: Path) -> Needs:
     return Needs(needs.cpu_s, 1024 * needs.memory_gib, operations)
 
 
-def least(runs: list[Needs]) -> Needs:
-    """The smallest figures of several runs of the same tree, as noise only adds to them."""
-    return Needs(
-        min(run.cpu_s for run in runs), min(run.memory_mib for run in runs), runs[0].operations
+def least(before: list[Needs], after: list[Needs]) -> tuple[Needs, Needs]:
+    """Figures of the pairs in which each has grown least, as machines change their speed."""
+    pairs = list(zip(before, after, strict=True))
+    cpu_s = min(((old.cpu_s, new.cpu_s) for old, new in pairs), key=lambda x: x[1] / x[0])
+    memory = min(
+        ((old.memory_mib, new.memory_mib) for old, new in pairs), key=lambda x: x[1] / x[0]
     )
+    operations = before[0].operations, after[0].operations
+    old, new = map(Needs, cpu_s, memory, operations)
+    return old, new
 
 
 def compare(before: Needs, now: Needs) -> list[str]:
@@ -108,7 +113,7 @@ def grown(old: Path, now: Path, place: Path, pairs: int) -> list[str]:
             needs.append(train(tree, place / f"{i}-{name}"))
         if i + 1 >= pairs:
             print(f"{'':50} {'before':>10} {'now':>10}")
-            found = compare(least(before), least(after))
+            found = compare(*least(before, after))
             if not found:
                 break
     return found

@@ -35,9 +35,15 @@ def test_what_has_grown_is_named(change, grown):
     assert growth.compare(BEFORE, dataclasses.replace(BEFORE, **change)) == grown
 
 
-def test_the_least_of_several_runs_counts():
-    runs = [BEFORE, dataclasses.replace(BEFORE, cpu_s=90.0, memory_mib=1200.0)]
-    assert growth.least(runs) == dataclasses.replace(BEFORE, cpu_s=90.0)
+def test_the_pair_in_which_a_figure_has_grown_least_counts():
+    # The machine was fast during one run of the earlier tree, and slow during the second pair.
+    before = [dataclasses.replace(BEFORE, cpu_s=cpu_s) for cpu_s in (80.0, 150.0)]
+    after = [dataclasses.replace(BEFORE, cpu_s=100.0), dataclasses.replace(BEFORE, cpu_s=155.0)]
+    after[1] = dataclasses.replace(after[1], memory_mib=1200.0)
+    old, new = growth.least(before, after)
+    assert (old.cpu_s, new.cpu_s) == (150.0, 155.0)
+    assert (old.memory_mib, new.memory_mib) == (1000.0, 1000.0)
+    assert growth.compare(old, new) == []
 
 
 @pytest.mark.parametrize(
