@@ -75,8 +75,7 @@ def _play(
     name: str, options: Options, config: Config, accelerator: int, against_one: bool = False
 ) -> Row:
     """As many missions as each accelerator plays at once; fewer on a CPU."""
-    devices_of_sides = [devices.start(None)] + [devices.start(1)] * against_one
-    number = jax.device_count() if jax.default_backend() != "cpu" else 1
+    devices_of_sides, number = _sides(against_one)
     (total,) = measure.batches(options, quick=4, cpu=(768,), accelerator=(number * accelerator,))
     # Until it is trained, a gate lets everything above minus infinity pass.
     models = jax.tree.map(jnp.nan_to_num, init(jax.random.key(0), config))
@@ -105,8 +104,7 @@ def _go_on(
     name: str, options: Options, config: Config, accelerator: int, against_one: bool = False
 ) -> Row:
     """Some control periods of missions after their first seconds."""
-    devices_of_sides = [devices.start(None)] + [devices.start(1)] * against_one
-    number = jax.device_count() if jax.default_backend() != "cpu" else 1
+    devices_of_sides, number = _sides(against_one)
     (batch,) = measure.batches(options, quick=4, cpu=(384,), accelerator=(number * accelerator,))
     missions = playing(config, "naive", batch, _PERIODS)
 
@@ -127,6 +125,12 @@ def _go_on(
     )
     peer = "one device" if against_one else None
     return measure.compare(name, _UNIT, [ours], theirs, options, peer=peer)
+
+
+def _sides(against_one: bool) -> tuple[list[Workers], int]:
+    """All devices, perhaps also one of them; and the number of accelerators, 1 for a CPU."""
+    of_sides = [devices.start(None)] + [devices.start(1)] * against_one
+    return of_sides, 1 if jax.default_backend() == "cpu" else jax.device_count()
 
 
 def resets_many(options: Options) -> Row:
