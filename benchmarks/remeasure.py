@@ -102,7 +102,7 @@ def _of(name: str, command: str, device: str, versions: Mapping[str, str]) -> Me
 _MADE: Mapping[str, Callable[[str, Any], Iterator[Measurement]]] = {
     "tasks": _of_tasks,
     "seeds": _of_seeds,
-    **dict.fromkeys(("cpu", "h100", "h100x2"), _of_rows),
+    **{Path(name).stem: _of_rows for name in results.ROWS},
 }
 """What reads from the content of a file how it was made; a study by default."""
 

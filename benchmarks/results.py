@@ -29,6 +29,7 @@ from benchmarks import (
     where,
 )
 from benchmarks.digits import table as digits
+from benchmarks.faults import table as faults
 from benchmarks.fusions import table as fusions
 from benchmarks.raw import report as raw
 from benchmarks.seeds import rows, tables
@@ -42,7 +43,7 @@ PAGES = (
     *sorted((_HERE.parent / "docs").glob("*.md")),
     _HERE / "RESULTS.md",
 )
-ROWS = ("cpu.json", "h100.json", "h100x2.json")
+ROWS = ("cpu.json", "h100.json", "h200x2.json")
 """What `python -m benchmarks` has written."""
 _BLOCK = re.compile(
     r"(<!-- (?P<file>[\w-]+\.json)(?: (?P<table>[\w-]+))? -->\n).*?(<!-- end -->)", re.DOTALL
@@ -161,6 +162,7 @@ TABLES: Mapping[str, _Tables] = {
     "gate.json": {None: gate.table, "search": gate.of_search},
     "where.json": {None: where.table, "accuracy": where.of_accuracies},
     **{name: {None: pipeline.table} for name in _PIPELINE},
+    "faults.json": {None: faults.table},
     "first_steps.json": {None: first_steps.table},
     "kernels.json": {None: kernels.table},
     "place.json": {None: place.table},

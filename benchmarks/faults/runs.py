@@ -40,7 +40,7 @@ class Runs:
 
     def start(self, *arguments: str, child: tuple[str, ...] = (), **options: Any) -> "Process":
         """Begins to train."""
-        module = "tests.faults.child" if child else "jaxsense.train"
+        module = "benchmarks.faults.child" if child else "jaxsense.train"
         cache = () if "--cache" in arguments else ("--cache", str(self.folder / "cache"))
         return Process([sys.executable, "-m", module, *child, *arguments, *cache], **options)
 

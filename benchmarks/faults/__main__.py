@@ -1,6 +1,6 @@
-"""`python -m tests.faults`: makes runs go wrong in many ways, and prints what became of them."""
+"""`python -m benchmarks.faults`: makes runs go wrong, and prints what became of them."""
 
-import argparse
+import dataclasses
 import itertools
 import json
 import os
@@ -16,9 +16,15 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from benchmarks import measure, studies
+from benchmarks.faults.child import NAN_STEP, TRAININGS
+from benchmarks.faults.runs import Process, Runs, lines, require, summary, wait_for
+from benchmarks.faults.table import table
 from jaxsense.config import PRESETS
-from tests.faults.child import NAN_STEP, TRAININGS
-from tests.faults.runs import Process, Runs, lines, require, summary, wait_for
+from jaxsense.config.checks import check_fields, limited
+from jaxsense.run import cli
+
+PROGRAM = "benchmarks.faults"
 
 STAGES = (
     "survey", "detector_camera-advance", "detections", "jmvae-advance", "latent_space",
@@ -182,7 +188,7 @@ def disk_full_after(runs: Runs, program: str) -> None:
     path = runs.path(f"disk {program}")
     require(runs.train(*SMOKE, "--out", str(path)).returncode == 0, "a plain run")
     before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
-    command = [sys.executable, "-m", "tests.faults.child", "disk", program, str(path)]
+    command = [sys.executable, "-m", "benchmarks.faults.child", "disk", program, str(path)]
     ended = Process(command).finish()
     require(ended.returncode == 2, f"{program}: {ended.returncode} {ended.stderr}")
     (line,) = lines(ended.stderr)
@@ -263,36 +269,54 @@ def trials(runs: Runs, is_quick: bool) -> Iterator[Trial]:
     yield trial("two writers of a cache with files of the user", shared_cache)
 
 
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Make runs go wrong in many ways, and print what became of them."""
+
+    quick: bool = False
+    """Try a few faults of each kind."""
+    only: str = ""
+    """Try the faults whose row of the table holds this text."""
+    jobs: int = limited(2, at_least=1)
+    """How many trials run at a time."""
+    json: Path | None = None
+    """File to write; must be new, and the source without changes since its commit."""
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+def attempt(trial: Trial) -> str:
+    """What a trial finds; nothing if the run ended as it must."""
+    try:
+        trial[1]()
+    except Exception as error:  # whatever it is
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
 def main(argv: list[str] | None = None) -> bool:
-    """Runs all trials and prints a table; returns whether all have passed."""
-    parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a few of each kind")
-    parser.add_argument("--only", default="", help="rows that hold this text")
-    parser.add_argument("--jobs", type=int, default=2, help="trials at a time")
-    arguments = parser.parse_args(argv)
-    failures, table = list[str](), dict[str, list[bool]]()
+    """Tries everything and prints a table; returns whether all runs ended as they must."""
+    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    if arguments.json is not None:
+        measure.require_commit(PROGRAM)
+    measure.reserve(PROGRAM, "json", arguments.json)
+    # First: a commit that is made meanwhile is not what is tried.
+    results = measure.origin(studies.command(PROGRAM, arguments))
+    passed: dict[str, list[bool]] = {}
     with tempfile.TemporaryDirectory() as folder:
         runs = Runs(Path(folder))
         runs.whole(*SMOKE)
         chosen = [t for t in trials(runs, arguments.quick) if arguments.only in t[0]]
-
-        def attempt(trial: Trial) -> tuple[str, str]:
-            try:
-                trial[1]()
-            except Exception as error:  # whatever a trial finds belongs into the table
-                return trial[0], f"{type(error).__name__}: {error}"
-            return trial[0], ""
-
         with ThreadPoolExecutor(arguments.jobs) as executor:
-            for row, failure in executor.map(attempt, chosen):
-                table.setdefault(row, []).append(not failure)
+            for (row, _), failure in zip(chosen, executor.map(attempt, chosen), strict=True):
+                passed.setdefault(row, []).append(not failure)
                 if failure:
-                    failures.append(f"{row}: {failure}")
-                    print(failures[-1], file=sys.stderr, flush=True)
-    print("| fault | as it must |\n| --- | --- |")
-    for row, passed in table.items():
-        print(f"| {row} | {sum(passed)} of {len(passed)} |")
-    return not failures
+                    print(f"{row}: {failure}", file=sys.stderr, flush=True)
+    results["passed"] = passed
+    studies.write(arguments.json, results)
+    print(table(results))
+    return all(itertools.chain.from_iterable(passed.values()))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""`python -m tests.faults.child FAULT STAGE ARGUMENTS...`: a training that meets a fault.
+"""`python -m benchmarks.faults.child FAULT STAGE ARGUMENTS...`: a training that meets a fault.
 
 The fault strikes in this process, at the first program of a stage that has run; in the stage
 `write` when the plots are about to be drawn. `gradient` makes one array of a training's
