@@ -10,5 +10,5 @@ function is pure, takes its random key first and works on one example: add `vmap
 
 import lazy_loader
 
-# On demand, as `__init__.pyi` says: MuJoCo takes longer to import than all else together.
+# On demand, as `__init__.pyi` says: MuJoCo takes longer to import than everything else.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

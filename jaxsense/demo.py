@@ -142,13 +142,13 @@ def _page(
 
 def _sentence(policy: str, robots: int) -> str:
     """What the animations show."""
-    naive = f"under naive exploration each of the {robots} robots looks at every PoI (point of "
+    naive = f"under naive exploration, each of the {robots} robots looks at every PoI (point of "
     naive += "interest) once"
     if policy == _REFERENCE:
         return f"{naive[0].upper()}{naive[1:]}, and what it sees goes into the shared map."
-    chooses = {"latent": "a learned policy asks the shared map which look is worth most"}
-    how = chooses.get(policy, f"the policy {policy} chooses which look comes next")
-    return f"In the first animation {how}, and ends when none pays; {naive}."
+    chooses = {"latent": "a learned policy takes the look that is worth most on the shared map"}
+    how = chooses.get(policy, f"the policy {policy} chooses each look")
+    return f"In the first animation, {how}, and stops when no look pays; {naive}."
 
 
 def _has_display() -> bool:

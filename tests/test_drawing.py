@@ -10,6 +10,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from jaxsense.show import drawing
+from jaxsense.show.colours import ON_DARK
 
 STYLE = "{http://www.w3.org/2000/svg}style"
 
@@ -54,7 +55,7 @@ def contrast(one, other):
     return (lighter + 0.05) / (darker + 0.05)
 
 
-@pytest.mark.parametrize("colour", ["#1558b0", "#5e0d2b", "#660d0d", "C0", "black", "0.35"])
+@pytest.mark.parametrize("colour", [*ON_DARK, "#660d0d", "C0", "black", "0.35"])
 def test_what_is_dark_on_white_stands_out_on_a_dark_page(colour):
     assert contrast(drawing.on_dark(colour), drawing.on_dark("white")) >= 4
 

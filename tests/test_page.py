@@ -123,7 +123,7 @@ def test_main_results_stand_beside_what_they_are_compared_with(tmp_path):
     cards = {
         "1.68": "naive 2.00, -16\u00a0%",
         "13.8": "naive 15.0, -8\u00a0%, rollout 14.2",
-        "99.8\u00a0%": "random 50.0\u00a0%",
+        "99.8\u00a0%": "naive 99.8\u00a0%, random 50.0\u00a0%",
         "1,700": "camera",
     }
     for number, beside in cards.items():

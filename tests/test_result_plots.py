@@ -8,7 +8,7 @@ from matplotlib.colors import to_rgb
 
 from jaxsense.config import PRESETS
 from jaxsense.dqn import POLICIES
-from jaxsense.show import colours, learning_plots, mission_plots
+from jaxsense.show import colours, drawing, learning_plots, mission_plots
 from jaxsense.training.measures import reliability
 
 CONFIG = PRESETS["smoke"]
@@ -138,9 +138,12 @@ def test_a_policy_has_one_colour_and_marker_that_all_can_tell_apart(sight):
     names = [*POLICIES, "my own"]
     for each in (colours.policy_colour, colours.policy_marker):
         assert len({each(name) for name in names}) == len(names)
-    seen = [lab(colours.policy_colour(name), sight) for name in names]
-    apart = np.linalg.norm(np.subtract.outer(seen, seen).diagonal(axis1=1, axis2=3), axis=-1)
-    assert apart[np.triu_indices(len(seen), 1)].min() > 13  # some five times what can be noticed
+    light = [colours.policy_colour(name) for name in names]
+    for page in (light, [drawing.on_dark(colour) for colour in light]):
+        seen = [lab(colour, sight) for colour in page]
+        apart = np.linalg.norm(np.subtract.outer(seen, seen).diagonal(axis1=1, axis2=3), axis=-1)
+        # Some five times what can be noticed.
+        assert apart[np.triu_indices(len(seen), 1)].min() > 13
 
 
 def test_every_place_of_missions_stands_in_a_picture_of_times():

@@ -16,12 +16,17 @@ SOFT = "#59616e"
 
 _ROBOT_COLOURS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
 _POLICY_COLOURS = {
-    "latent": "#1558b0", "greedy": "#b84300", "bayes": "#00805f", "optimal": "#5e0d2b",
-    "nearest": "#cd79aa", "auction": "#d00dd4", "rollout": "#b79710", "naive": "#523a05",
-    "naive_2": "#05475b", "naive_3": "#d00e4d", "random": "#1711c8",
+    "latent": ("#1558b0", "#2a7cc6"), "greedy": ("#b84300", "#bd5f21"),
+    "bayes": ("#00805f", "#2c8c71"), "optimal": ("#5e0d2b", "#f05983"),
+    "nearest": ("#cd79aa", "#cc69a4"), "auction": ("#d00dd4", "#d93fff"),
+    "rollout": ("#b79710", "#b7960a"), "naive": ("#523a05", "#917b4f"),
+    "naive_2": ("#05475b", "#47def1"), "naive_3": ("#d00e4d", "#ff8bb5"),
+    "random": ("#1711c8", "#af9aff"),
 }  # fmt: skip
 _MARKERS = "oDs^vPX<>pd"
-_OTHER_POLICY = "#0fb851", "*"  # a custom one
+_OTHER_POLICY = ("#0fb851", "#0cc75f"), "*"  # a custom one
+ON_DARK = dict([*_POLICY_COLOURS.values(), _OTHER_POLICY[0]])
+"""Counterparts of the colours of policies on a dark page, where they must differ as well."""
 _OWN = "starting, summing up", "0.45"
 _TRACING = "tracing, lowering", "#d9a400"
 _SAVING = "saving", "#7d8a12"
@@ -45,9 +50,9 @@ def modality_colour(modality: int) -> str:
 def policy_colour(name: str) -> str:
     """The colour of a policy, the same in all plots.
 
-    Colours differ also for those who see no red or no green.
+    Colours differ also for those who see no red or no green, and so do those of `ON_DARK`.
     """
-    return _POLICY_COLOURS.get(name, _OTHER_POLICY[0])
+    return _POLICY_COLOURS.get(name, _OTHER_POLICY[0])[0]
 
 
 def policy_marker(name: str) -> str:

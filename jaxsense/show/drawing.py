@@ -16,7 +16,7 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 
-from jaxsense.show.colours import RGB
+from jaxsense.show.colours import ON_DARK, RGB
 
 _PAPER, _INK = "#16181d", "#e6e8ec"  # of a dark page, as in `style.css`
 _LEAST_CONTRAST = 4.0  # of a colour with dark paper
@@ -74,13 +74,15 @@ def _style(text: str) -> str:
 def on_dark(colour: str) -> str:
     """The counterpart of a colour on a dark page, as `#rrggbb`.
 
-    Greys from white to black become those from dark paper to light ink. Other colours become
-    lighter until they stand out.
+    Greys from white to black become those from dark paper to light ink. Colours of policies have
+    counterparts of their own. Other colours become lighter until they stand out.
 
     Args:
       colour: any that matplotlib knows.
     """
     rgb = to_rgb(colour)
+    if to_hex(rgb) in ON_DARK:
+        return ON_DARK[to_hex(rgb)]
     if max(rgb) - min(rgb) < _GREY:
         return to_hex(_mixed(to_rgb(_INK), to_rgb(_PAPER), float(np.mean(rgb))))
     shades = [_mixed(rgb, (1.0, 1.0, 1.0), share) for share in np.linspace(0, 1, 21)]

@@ -36,8 +36,8 @@ _PAPER = {
 _RULES = ("nearest", "auction", "rollout")  # written by hand, and learned by none
 _NO_BOUND = (
     "The optimal policy decides by the expected rewards of looks, not by what the map made of "
-    "them: on a poor map, or from few starts, another policy can get more. With a lead of over 1 % "
-    "and two standard errors, the table would name no optimal policy."
+    "them: on a poor map, or from few starts, another policy can get more. If it led by more than "
+    "1 % and two standard errors, the table would name no optimal policy."
 )
 _YES_OR_NO = {0.0: "no", 1.0: "yes"}
 
@@ -178,10 +178,10 @@ def failures(block: Missions) -> Table:
 _AGAINST = {"against naive": "Difference of the median time from that of naive exploration."}
 _UNFINISHED = {
     "unfinished": (
-        "Number of missions that ended otherwise than by the choice of all robots. `time limit`: "
+        "Number of missions that did not end because every robot chose to. `time limit`: "
         "after `mission.time_limit`; `unreachable`: a robot gave up a PoI that it could not get "
         "to; `undetected`: it gave one up after looks that showed nothing; `exhausted`: it left "
-        "one at which looks paid, but none from anywhere would have been new; `robot failed`: the "
+        "one at which looks still paid, as no view of it would have been new; `robot failed`: the "
         "others finished; `no robot left`: all failed."
     ),
     "in bold": "The best value of the policies that label as many PoIs right as the best one.",
@@ -251,12 +251,13 @@ def cards(results: Results) -> list[tuple[str, str, str]]:
         for key, what, others in (
             ("observations_per_poi", "looks per PoI", ("naive",)),
             ("time_s", "seconds per mission", ("naive", *rules)),
-            ("accuracy", "of PoIs right", ("random",)),
+            ("accuracy", "of PoIs right", ("naive", "random")),
         ):
             beside = []
             for name in (each for each in others if each in played):
                 beside.append(f"{name} {_short(key, played[name][key])}")
-                beside += [_percent(own[key], played[name][key])] if name == "naive" else []
+                if name == "naive" and key != "accuracy":
+                    beside.append(_percent(own[key], played[name][key]))
             found.append((_short(key, own[key]), what, ", ".join(beside)))
     for modality, agent in results["dqn"].items():
         states = f"{mean(agent['num_states']):,.0f} states of the map"

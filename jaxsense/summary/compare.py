@@ -184,13 +184,14 @@ def detection_sizes(block: Missions) -> str:
 
 
 def verdict(played: dict[str, Case]) -> str | None:
-    """Says how fast the latent policy is compared with naive exploration and the fastest policy.
+    """Compares the latent policy with naive exploration, and its time with the fastest policy's.
 
     Args:
       played: cases in the same arenas.
 
     Returns:
-      A sentence about median times; None unless both policies were played.
+      A sentence about median times and, if it differs, one about accuracy; None unless both
+      policies were played.
     """
     if not {REFERENCE, "naive"} <= set(played):
         return None
@@ -203,8 +204,6 @@ def verdict(played: dict[str, Case]) -> str | None:
         return f"{abs(percent):.0f} % {'faster' if percent < 0 else 'slower'} than "
 
     text = f"By median times, the latent policy is {against('naive')}naive exploration"
-    if mean(own["accuracy"]) <= mean(played["naive"]["accuracy"]) - AS_ACCURATE:
-        text += ", but labels fewer PoIs right"
     faster = {
         name: mean(case["time_s"])
         for name, case in played.items()
@@ -216,4 +215,13 @@ def verdict(played: dict[str, Case]) -> str | None:
     if faster:
         best = min(faster, key=lambda name: faster[name])
         text += f" (and {against(best)}{best})"
+    right, usual = mean(own["accuracy"]), mean(played["naive"]["accuracy"])
+    if abs(right - usual) >= AS_ACCURATE:
+        text += (
+            f". It labels {_percent(right)} of the PoIs right, naive exploration {_percent(usual)}"
+        )
     return f"{text}."
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}\u00a0%"

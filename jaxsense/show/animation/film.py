@@ -26,7 +26,7 @@ _PHASES = ("choosing", "driving to", "looking at", "backing off from", "done", "
 _NOTES = (
     "Ellipse: 1-sigma belief in a numbered PoI.",
     "PoIs that are certain stand at their class.",
-    "Dotted circle: PoIs that nobody has seen.",
+    "Dotted circle: PoIs that no robot has seen.",
 )
 _STYLE = """
 .film{--paper:#fff;--ink:#1d2129;--soft:#59616e;--floor:#f2f4f7;color-scheme:light dark}
