@@ -57,12 +57,13 @@ def of_presets(
       heads: of the columns, if they are not named after presets.
     """
     names = [*heads] or [f"`{preset}` preset" for preset in presets]
-    seeds = [_seeds(sorted(map(int, found[preset]))) for preset in presets]
+    seeds = [_of_seeds(found[preset]) for preset in presets]
+    shown = names
     if len(set(seeds)) > 1:
-        names = [f"{name}, {of}" for name, of in zip(names, seeds, strict=True)]
+        shown = [f"{name}, {of}" for name, of in zip(names, seeds, strict=True)]
     rows = list(rows)
     paper = ["paper"] if any(row.paper for row in rows) else []
-    lines = [_line("", *paper, *names), _line(*["---"] * (1 + len(paper) + len(presets)))]
+    lines = [_line("", *paper, *shown), _line(*["---"] * (1 + len(paper) + len(presets)))]
     for row in rows:
         cells = [row.paper for _ in paper] + [
             _cell(row, [each["figures"] for each in found[preset].values()])
@@ -71,8 +72,8 @@ def of_presets(
         ]
         lines.append(_line(row.label, *cells))
     command = "python -m jaxsense.train --preset PRESET --seed S"
-    runs = [each for preset in presets for each in found[preset].items()]
-    return "\n".join([*lines, "", _about(runs, command)])
+    columns = {name: found[preset] for name, preset in zip(names, presets, strict=True)}
+    return "\n".join([*lines, "", _about(columns, command)])
 
 
 def _cell(row: Row, runs: list[Figures]) -> str:
@@ -115,7 +116,7 @@ def of_missions(found: Mapping[str, Any], preset: str) -> str:
         lines.append(_line(label, *cells))
     number = max(run["latent"]["episodes"] for run in runs)
     command = f"python -m jaxsense.train --preset {preset} --seed S --mission.episodes {number}"
-    return "\n".join([*lines, "", _about(found[preset].items(), command)])
+    return "\n".join([*lines, "", _about({preset: found[preset]}, command)])
 
 
 _POLICIES = {
@@ -167,7 +168,7 @@ def worth(found: Mapping[str, Any], names: Mapping[Played, str]) -> str:
       names: of the columns.
     """
     played = {of: _evaluated(found, *of) for of in names}
-    heads = [f"{names[of]}, {_seeds(sorted(map(int, runs)))}" for of, runs in played.items()]
+    heads = [f"{names[of]}, {_of_seeds(runs)}" for of, runs in played.items()]
     lines = [_line("policy", *heads), _line(*["---"] * (1 + len(heads)))]
     for policy, what in _POLICIES.items():
         cells = []
@@ -183,9 +184,8 @@ def worth(found: Mapping[str, Any], names: Mapping[Played, str]) -> str:
         if any(cell != "not played" for cell in cells):
             lines.append(_line(f"`{policy}`, {what}", *cells))
     command = "python -m jaxsense.evaluate RUN"
-    used = dict.fromkeys((group, seed) for (group, *_), runs in played.items() for seed in runs)
-    origin = _about([(seed, found[group][seed]) for group, seed in used], command)
-    return "\n".join([*lines, "", origin])
+    columns = {names[of]: {x: found[of[0]][x] for x in runs} for of, runs in played.items()}
+    return "\n".join([*lines, "", _about(columns, command)])
 
 
 def missions(found: Mapping[str, Any], preset: str, num_pois: int, robots: int) -> str:
@@ -206,8 +206,8 @@ def missions(found: Mapping[str, Any], preset: str, num_pois: int, robots: int) 
             cells.append("; ".join(_interval(x["longer"]) for x in shown if x["longer"]))
             lines.append(_line(f"`{policy}`", *cells))
     command = f"python -m jaxsense.evaluate RUN` of `python -m jaxsense.train --preset {preset}"
-    used = [(seed, found[preset][seed]) for seed in runs]
-    return "\n".join([*lines, "", _about(used, command)])
+    used = {seed: found[preset][seed] for seed in runs}
+    return "\n".join([*lines, "", _about({preset: used}, command)])
 
 
 _OF_CASES = (("right", "accuracy", "{:.3f}"), *_OF_SUMMARY[1:])
@@ -232,7 +232,8 @@ def failures(found: Mapping[str, Any], preset: str, num_pois: int, robots: int) 
             _line(label, *(_range(form, [x[key] for x in shown]) for _, key, form in _OF_CASES))
         )
     command = f"python -m jaxsense.evaluate RUN` of `python -m jaxsense.train --preset {preset}"
-    return "\n".join([*lines, "", _about([(x, found[preset][x]) for x in runs], command)])
+    used = {seed: found[preset][seed] for seed in runs}
+    return "\n".join([*lines, "", _about({preset: used}, command)])
 
 
 def _interval(of: Mapping[str, float]) -> str:
@@ -259,9 +260,23 @@ def _line(*cells: str) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _about(of_seeds: Iterable[tuple[str, Any]], command: str) -> str:
-    """Command, seeds, commits, devices and versions of runs."""
-    seeds, runs = zip(*of_seeds, strict=True)
+def _about(columns: Mapping[str, Mapping[str, Any]], command: str) -> str:
+    """The command, and how the runs of each column were made, once if all were made alike.
+
+    Args:
+      columns: runs by their seeds, by the names of the columns.
+      command: of all.
+    """
+    made = {name: _made([*runs.values()]) for name, runs in columns.items()}
+    if len(set(made.values())) > 1:
+        each = (f"- {name}, {_of_seeds(columns[name])}: {made[name]}." for name in columns)
+        return "\n".join([f"`{command}`:", "", *each])
+    seeds = _of_seeds(ChainMap(*map(dict, columns.values())))
+    return f"`{command}`, {seeds}: {next(iter(made.values()))}."
+
+
+def _made(runs: list[Mapping[str, Any]]) -> str:
+    """Devices, commits and versions of runs."""
 
     def each(name: str) -> str:
         """The values of the runs that hold one; those of earlier versions lack cores and date."""
@@ -275,10 +290,13 @@ def _about(of_seeds: Iterable[tuple[str, Any]], command: str) -> str:
         for name in ("python", "jax", "mujoco")
     )
     return (
-        f"`{command}`, {_seeds(sorted({int(seed) for seed in seeds}))}: {', '.join(kinds)}"
-        f"{f' with {cores} cores' if cores else ''}; commit {', '.join(commits)}"
-        f"{f' on {dates}' if dates else ''}; {at}."
+        f"{', '.join(kinds)}{f' with {cores} cores' if cores else ''}; commit "
+        f"{', '.join(commits)}{f' on {dates}' if dates else ''}; {at}"
     )
+
+
+def _of_seeds(runs: Iterable[str]) -> str:
+    return _seeds(sorted(map(int, runs)))
 
 
 def _seeds(numbers: list[int]) -> str:

@@ -69,6 +69,20 @@ def test_cores_and_dates_stand_below_the_table_for_runs_that_note_them(runs):
     assert ": cpu with 16 cores; commit 0123456789 on 2026-11-28 and 2026-11-29; python" in last
 
 
+def test_columns_that_were_made_otherwise_tell_how_each_was(runs):
+    later = {**SUMMARY, "date": "2026-11-29"}
+    found = gather([runs("paper", 100), runs("paper", 101), runs("default", 100, later)])
+    table = tables.of_presets(found, rows.OF_README, ("paper", "default"))
+    where = "python 3.11.7, jax 0.10.2, mujoco 3.17.0."
+    assert table.split("\n\n")[1:] == [
+        "`python -m jaxsense.train --preset PRESET --seed S`:",
+        "- `paper` preset, seeds 100 to 101: cpu with 2 cores; commit 0123456789 on 2026-11-26; "
+        f"{where}\n"
+        "- `default` preset, seed 100: cpu with 2 cores; commit 0123456789 on 2026-11-29; "
+        f"{where}",
+    ]
+
+
 def test_columns_may_have_other_names_than_presets(runs):
     found = gather([runs("paper", 100)], "wider") | gather([runs("paper", 101)])
     heads = ("wider", "as it is")
