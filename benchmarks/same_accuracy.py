@@ -152,7 +152,7 @@ def draw(blocks: list[dict]) -> Figure:
             wrong = 100 * (1 - np.array(block["accuracy"]))[order]
             axis.plot(
                 np.array(block[key])[order],
-                np.maximum(wrong, 0.05),
+                wrong,
                 color="k" if name == "oracle" else policy_colour(name),
                 marker=policy_marker(name),
                 linewidth=2.5 if name == "latent" else 1.2,

@@ -58,7 +58,7 @@ def _constants():
     yield f"at most {100 * search._STEP:g} cm apart"
     for task in ("noisy-v0", "many-v0"):
         yield f"a look costs {jaxsense.make(task).mdp.reward.look_cost} nats"
-    yield f"`--seed` draws the arena; in that of the default, {demo.Arguments().seed},"
+    yield f"`--seed` selects the arena; in the default one, {demo.Arguments().seed},"
     yield f"`--seed`, by default {demo.Arguments().seed},"
     yield f"each second of a robot's work costs {jaxsense.make('team-v0').mdp.config.second_cost}"
 

@@ -63,7 +63,7 @@ def killed(runs: Runs, name: str, arguments: list[str], seed: int) -> None:
 
 
 def stopped(runs: Runs, fault: str, stage: str, *more: str) -> None:
-    """A signal in a stage: status 130, one line, and the run goes on."""
+    """A signal in a stage: status 130, one line, and the run continues."""
     path, arguments = runs.path(f"{fault} {stage} {len(more)}"), [*SMOKE, *more]
     ended = runs.train(*arguments, "--out", str(path), child=(fault, stage))
     require(ended.returncode == 130, f"{fault} in {stage}: status {ended.returncode}")
@@ -72,7 +72,7 @@ def stopped(runs: Runs, fault: str, stage: str, *more: str) -> None:
 
 
 def disk_full(runs: Runs, stage: str) -> None:
-    """No room: one line, and the run goes on when there is room."""
+    """No room: one line, and the run continues when there is room."""
     path = runs.path(f"disk {stage}")
     ended = runs.train(*SMOKE, "--out", str(path), child=("disk", stage))
     require(ended.returncode == 2, f"disk full in {stage}: {ended.returncode} {ended.stderr}")
@@ -82,7 +82,7 @@ def disk_full(runs: Runs, stage: str) -> None:
 
 
 def not_finite(runs: Runs, stage: str, number: int) -> None:
-    """NaN in one array: caught, with its stage named, and the run goes on from what was sound."""
+    """NaN in one array: caught, with its stage named, and the run continues from what was sound."""
     path = runs.path(f"nan {stage} {number}")
     ended = runs.train(*SMOKE, "--out", str(path), child=(f"nan{number}", stage))
     require(ended.returncode == 2, f"NaN in {stage}: status {ended.returncode}")
@@ -111,7 +111,7 @@ def gradient(runs: Runs, stage: str, number: int) -> None:
 
 
 def damaged(runs: Runs, how: str, name: str) -> None:
-    """A checkpoint that is damaged: named, and the run goes on to the same summary."""
+    """A checkpoint that is damaged: named, and the run continues to the same summary."""
     path = runs.path(f"{how} {name}")
     ended = runs.train(*SMOKE, "--out", str(path), child=("ctrl-c", name))
     require(ended.returncode == 130, f"status {ended.returncode}")

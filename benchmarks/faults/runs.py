@@ -56,7 +56,7 @@ class Runs:
             return self._whole[name]
 
     def seconds(self, *arguments: str) -> float:
-        """How long a run takes from when it has a `config.json`, beside another one."""
+        """How long a run takes from when it has a `config.json`, while another one runs."""
         self.whole(*arguments)
         with self._lock:
             name = "-".join(arguments)
