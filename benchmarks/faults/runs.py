@@ -71,7 +71,7 @@ class Runs:
             return self._seconds[name]
 
     def check_resumed(self, path: Path, *arguments: str) -> None:
-        """Goes on with a run, which must end as if nothing had gone wrong."""
+        """Resumes a run, which must end as if nothing had gone wrong."""
         again = ["--resume", str(path), "--quiet"]
         if not (path / "config.json").exists():
             again = [*arguments, "--out", str(path)]
