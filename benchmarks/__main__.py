@@ -13,10 +13,10 @@ import rich.console
 import rich.table
 
 from benchmarks import ROWS
-from benchmarks.measure import Options, Row, require_known, reserve
+from benchmarks.measure import Options, Row, require_commit, require_known, reserve
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
-from jaxsense.run import cli
+from jaxsense.run import cli, version
 
 PROGRAM = "benchmarks"
 _WIDTH_OF_FILES = 160
@@ -31,7 +31,8 @@ class Arguments:
     peers: bool = False
     """Also measure other libraries on the same work, in turn."""
     json: Path | None = None
-    """File to write; must be new."""
+    """File to write; must be new and, unless sizes are tiny, the source without changes since its
+    commit."""
     quick: bool = False
     """Use tiny sizes, to check that everything runs."""
 
@@ -43,7 +44,10 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     require_known(PROGRAM, "name", arguments.names, ROWS)
+    if arguments.json is not None and not arguments.quick:
+        require_commit(PROGRAM)
     reserve(PROGRAM, "json", arguments.json)
+    commit = version.commit()
     # A device for each core. Called from another program, the devices may be fixed already.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", os.cpu_count())
@@ -59,7 +63,7 @@ def main(argv: list[str] | None = None) -> None:
         if arguments.json is not None:
             # After each row, so that what was measured before a failure is kept.
             arguments.json.write_text(
-                json.dumps([row.as_json() for row in rows], indent=2) + "\n", encoding="utf-8"
+                json.dumps([row.as_json(commit) for row in rows], indent=2) + "\n", encoding="utf-8"
             )
     _print_table(console, rows)
 

@@ -108,7 +108,8 @@ def grown(old: Path, now: Path, place: Path, pairs: int) -> list[str]:
     """
     before, after, found = list[Needs](), list[Needs](), list[str]()
     for i in range(2 * pairs):
-        for name, tree, needs in (("old", old, before), ("now", now, after)):
+        # The first of a pair has the machine in another state than the second.
+        for name, tree, needs in (("old", old, before), ("now", now, after))[:: (-1) ** i]:
             (place / f"{i}-{name}").mkdir()
             needs.append(train(tree, place / f"{i}-{name}"))
         if i + 1 >= pairs:

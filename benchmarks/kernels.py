@@ -76,6 +76,8 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     measure.require_known(PROGRAM, "cases", arguments.cases, CASES)
+    if arguments.json is not None:
+        measure.require_commit(PROGRAM)
     measure.reserve(PROGRAM, "json", arguments.json)
     jax.config.update("jax_default_matmul_precision", "highest")
     results: dict[str, Any] = {

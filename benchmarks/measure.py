@@ -95,16 +95,20 @@ class Row:
     is_bound: bool = False
     also: dict[str, float] = dataclasses.field(default_factory=dict)
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self, commit: str | None) -> dict[str, object]:
         """The public keys, and when, where and how it was measured.
 
         The name of a peer that was stopped says so.
+
+        Args:
+          commit: of the code that was measured, read before: there may be another one by now.
         """
         values = dataclasses.asdict(self)
         if values.pop("is_bound"):
             values["peer"] = f"{self.peer} (stopped)"
         peers = " --peers" if self.theirs is not None else ""
-        return {**values, **provenance(f"python -m benchmarks {self.row}{peers}")}
+        command = f"python -m benchmarks {self.row}{peers}"
+        return {**values, **provenance(command), "commit": commit}
 
 
 def batches(

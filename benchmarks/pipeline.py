@@ -241,6 +241,8 @@ def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     measure.require_known(PROGRAM, "commands", arguments.commands, COMMANDS)
+    if arguments.json is not None:
+        measure.require_commit(PROGRAM)
     measure.reserve(PROGRAM, "json", arguments.json)
     results = {
         **measure.origin(studies.command(PROGRAM, arguments)),

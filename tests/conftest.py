@@ -20,6 +20,8 @@ os.environ["XLA_FLAGS"] = " ".join(
         "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-constant-sinking",
     )
 )
+# Before JAX creates its backend, as the programs do: more than any test runs side by side.
+os.environ["NPROC"] = str(max(8, os.cpu_count() or 1))
 # Each operation would carry the lines of Python that it comes from through all of compiling.
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
 # What one worker, or a process that a test starts, has compiled serves all others.

@@ -1,6 +1,7 @@
 """How many missions play side by side."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import pytest
@@ -109,6 +110,14 @@ def test_an_accelerator_plays_more_the_more_there_are(monkeypatch, memory, total
         expected = int(0.05 * memory) // batches._bytes_of_state(CONFIG)
         assert 1 < expected < 32_768
     assert found == expected
+
+
+@pytest.mark.parametrize("stats", [None, {}, {"bytes_limit": 7 * GIB}])
+def test_an_accelerator_may_not_tell_its_memory(monkeypatch, stats):
+    assert devices.memory() is None
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_devices", lambda: [SimpleNamespace(memory_stats=lambda: stats)])
+    assert devices.memory() == (stats or {"bytes_limit": 8 * GIB})["bytes_limit"]
 
 
 def test_two_accelerators_play_twice_what_one_holds(monkeypatch):

@@ -286,13 +286,40 @@ def test_the_first_process_checks_its_options_before_others_join(tmp_path, monke
         assert expected in capsys.readouterr().err
 
 
-def test_a_system_that_cannot_tell_its_cores(monkeypatch):
-    monkeypatch.setenv("NPROC", "7")
-    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    assert devices.start(3) == Workers(threads=3)
+@pytest.mark.parametrize(
+    ("pool", "number", "expected"), [(7, 3, 3), (3, 3, 2), (2, 2, 1), (1, 1, 1)]
+)
+def test_the_pool_of_a_backend_has_more_members_than_programs(monkeypatch, pool, number, expected):
+    monkeypatch.setenv("NPROC", str(pool))
+    assert devices.start(number) == Workers(threads=expected)
+    # Its default is the number of cores.
     monkeypatch.delenv("NPROC")
-    devices.start(64)
+    monkeypatch.setattr(devices, "_cores", lambda: pool)
+    assert devices.start(number) == Workers(threads=expected)
+    assert "NPROC" not in os.environ
+
+
+def test_the_pool_is_made_large_enough_before_there_is_a_backend(monkeypatch):
+    monkeypatch.setattr(devices, "_has_backend", lambda: False)
+    # On a system that cannot tell which cores a process may use.
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.delenv("NPROC")
+    assert devices.start(64) == Workers(threads=64)
     assert os.environ["NPROC"] == str(max(128, os.cpu_count()))
+
+
+def test_a_backend_is_noticed_and_nothing_changes():
+    number = jax.config.jax_num_cpu_devices
+    assert devices._has_backend()
+    assert jax.config.jax_num_cpu_devices == number
+    script = """
+import jax
+from jaxsense.run import devices
+number = jax.config.jax_num_cpu_devices
+assert not devices._has_backend()
+assert jax.config.jax_num_cpu_devices == number
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):
@@ -315,6 +342,7 @@ def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):
 DECOMPOSED = """
 import jax, jax.numpy as jnp
 from jaxsense.run import devices
+{before}
 workers = devices.start(2)
 matrices = jnp.stack([jnp.eye(18)] * 288)
 again = lambda _, x: jnp.linalg.cholesky(x @ x)
@@ -324,10 +352,12 @@ for _ in range(3):
 """
 
 
-def test_programs_side_by_side_do_not_wait_for_each_other_for_ever():
+@pytest.mark.parametrize("before", ["", "jax.devices()  # with a pool of as many as cores"])
+def test_programs_side_by_side_do_not_wait_for_each_other_for_ever(before):
     # Cholesky decompositions as in the physics of six robots.
     environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
-    subprocess.run([sys.executable, "-c", DECOMPOSED], env=environment, check=True, timeout=120)
+    script = DECOMPOSED.format(before=before)
+    subprocess.run([sys.executable, "-c", script], env=environment, check=True, timeout=120)
 
 
 def test_parts_are_joined_where_jax_can_take_them_over():

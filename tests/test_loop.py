@@ -291,6 +291,23 @@ def test_a_training_that_is_not_finite_ends_what_follows_from_it(toy):
         toy(counting("count", 4), follows, counting("beside"))
 
 
+def test_an_error_of_any_kind_stops_the_other_stages(toy, monkeypatch):
+    begin = loop._Loop._begin
+
+    def fails_or_waits(self, stage, inputs):
+        if stage.name == "full":
+            raise OSError(28, "No space left on device")
+        for _ in range(1000):
+            if self._monitor.is_stopping:
+                return begin(self, stage, inputs)
+            time.sleep(0.01)
+        raise AssertionError("it was not stopped")
+
+    monkeypatch.setattr(loop._Loop, "_begin", fails_or_waits)
+    with pytest.raises(OSError, match="No space left"):
+        toy(counting("count"), Stage("full", lambda key, config: jnp.zeros(2)))
+
+
 def chunked(name, chunks, **settings):
     return Stage(name, lambda key, config: (), chunks=chunks, **settings)
 

@@ -122,9 +122,12 @@ class Program:
         def compile_lowered() -> None:
             if self._compiled.done():  # failed or released
                 return
-            begin, loaded = self._clock.now, self._compiler.num_loaded
+            begin = self._clock.now
             try:
-                compiled = lowered.compile(compiler_options=devices.compiler_options(**options))
+                # First, for it compiles and loads programs itself.
+                supported = devices.compiler_options(**options)
+                loaded = self._compiler.num_loaded
+                compiled = lowered.compile(compiler_options=supported)
             except Exception as error:
                 self.fail(error)
                 return

@@ -25,10 +25,20 @@ Row = TypeVar("Row", jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 
 Options: TypeAlias = dict[str, Any]  # JAX declares fewer types than it takes
 AXIS = "devices"
-NUM_THREADS = min(os.cpu_count() or 1, 8)
 _MAX_DEVICES = 256
+_LEAST_MEMORY = 2**33  # bytes, of an accelerator
 _ALIGNED = 64  # bytes
 _PASSES_OVER_LOOPS = "while-loop-invariant-code-motion,while-loop-constant-sinking"
+
+
+def _cores() -> int:
+    """Number of cores that this process may use."""
+    is_known = hasattr(os, "sched_getaffinity")
+    return len(os.sched_getaffinity(0)) if is_known else os.cpu_count() or 1
+
+
+NUM_THREADS = min(_cores(), 8)
+"""Number of threads that share work on a CPU by default."""
 
 
 def compiler_options(*, runs_long: bool = False, wide_vectors: bool = False) -> Options:
@@ -125,7 +135,7 @@ def start(number: int | None) -> Workers:
 
     Args:
       number: of accelerators, or of threads on a CPU. By default all accelerators, or as many
-        threads as cores, at most 8.
+        threads as cores, at most 8. See `threads` for when fewer are used.
 
     Returns:
       The workers that share scenes and missions. A training stays on one device, because exchanging
@@ -136,9 +146,9 @@ def start(number: int | None) -> Workers:
     """
     jax.config.update("jax_default_matmul_precision", "highest")
     check(number)
-    _make_room(number or NUM_THREADS)
+    number_of_threads = threads(number or NUM_THREADS)
     if jax.default_backend() == "cpu" and jax.process_count() == 1:
-        return Workers(threads=number or NUM_THREADS)
+        return Workers(threads=number_of_threads)
     there = jax.device_count()
     number = there if number is None else number
     if number > there:
@@ -148,23 +158,39 @@ def start(number: int | None) -> Workers:
     return Workers(mesh=make_mesh(number) if number > 1 else None)
 
 
-def _make_room(threads: int) -> None:
-    """Makes XLA's thread pool larger than the number of programs that run side by side.
+def threads(wanted: int = NUM_THREADS) -> int:
+    """How many programs may run side by side on a CPU: fewer than XLA's thread pool has members.
 
     A member of the pool splits a large batch of Cholesky decompositions, as in the physics of six
     robots, among the pool, and waits for the others. If every member does so, all wait forever.
-    XLA reads the size when it creates the backend; its default is the number of cores.
+    XLA reads the size when it creates the backend, so until then this makes the pool large enough;
+    its default is the number of cores.
+
+    Args:
+      wanted: number of programs.
     """
-    # A process may be restricted to some of the cores.
-    is_known = hasattr(os, "sched_getaffinity")
-    cores = len(os.sched_getaffinity(0)) if is_known else os.cpu_count() or 1
-    os.environ.setdefault("NPROC", str(max(2 * threads, cores)))
+    if not _has_backend():
+        os.environ.setdefault("NPROC", str(max(2 * wanted, _cores())))
+    given = os.environ.get("NPROC", "")
+    return min(wanted, max(1, (int(given) if given.isdecimal() else _cores()) - 1))
+
+
+def _has_backend() -> bool:
+    """Whether JAX has created its backend: then it refuses another number of CPU devices."""
+    number = jax.config.values["jax_num_cpu_devices"]
+    try:
+        jax.config.update("jax_num_cpu_devices", number + 2)
+    except RuntimeError:
+        return True
+    jax.config.update("jax_num_cpu_devices", number)
+    return False
 
 
 def memory() -> int | None:
-    """Bytes that an accelerator may hold; None for a CPU."""
-    stats = None if jax.default_backend() == "cpu" else jax.local_devices()[0].memory_stats()
-    return None if stats is None else stats.get("bytes_limit")
+    """Bytes that an accelerator may hold, few if it does not tell; None for a CPU."""
+    if jax.default_backend() == "cpu":
+        return None
+    return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", _LEAST_MEMORY)
 
 
 def make_mesh(number: int | None = None) -> Mesh:

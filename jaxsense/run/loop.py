@@ -173,7 +173,9 @@ class _Loop:
             if stage.is_saved:
                 self._save(stage, output)
             return output
-        except StageError as error:
+        except Stopped:
+            raise
+        except Exception as error:
             self._monitor.fail(error)
             raise
 

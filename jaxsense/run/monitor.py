@@ -55,7 +55,7 @@ class Monitor:
 
     def begin(self, listener: Listener) -> None:
         """Begins another run: forgets a failure and replaces the listener."""
-        self._failure: StageError | None = None
+        self._failure: Exception | None = None
         self._one_listener = listener
 
     def beside(self, listener: Listener) -> "Monitor":
@@ -73,7 +73,7 @@ class Monitor:
         """Asks the stages to save their training and stop."""
         self._stop.set()
 
-    def fail(self, failure: StageError) -> None:
+    def fail(self, failure: Exception) -> None:
         """Stops the stages that run concurrently with a failed one."""
         self._failure = failure
 
@@ -87,7 +87,7 @@ class Monitor:
 
         Raises:
           Stopped: if it was asked to stop.
-          StageError: if a stage has failed.
+          Exception: that of a stage which has failed.
         """
         if self._failure is not None:
             raise self._failure

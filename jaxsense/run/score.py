@@ -120,8 +120,8 @@ def _score(config: Config, found: Mapping[str, Measured], reference: str) -> Mis
 
 
 def _workers() -> Workers:
-    """All threads of a CPU, or one accelerator."""
-    return Workers(threads=devices.NUM_THREADS) if jax.default_backend() == "cpu" else ALONE
+    """Threads of a CPU, or one accelerator."""
+    return Workers(threads=devices.threads()) if jax.default_backend() == "cpu" else ALONE
 
 
 def _require(

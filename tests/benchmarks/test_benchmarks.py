@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks import ROWS, __main__, peers
 from benchmarks.measure import Options, Side, compare, make_row
-from jaxsense.run import devices
+from jaxsense.run import devices, version
 
 QUICK = ("physics_batch", "rays", "rays_warp", "jmvae")
 KEYS = {
@@ -155,7 +155,7 @@ def test_peers_are_not_loaded_unless_asked_for(monkeypatch, capsys):
     ("argv", "expected"),
     [
         (["nonsense"], "name = 'nonsense': must be one of physics"),
-        (["--json", "no/such/folder/rows.json"], "cannot be written"),
+        (["--quick", "--json", "no/such/folder/rows.json"], "cannot be written"),
         (["--jsn", "rows.json"], "--jsn"),
     ],
 )
@@ -172,9 +172,17 @@ def test_an_existing_file_is_not_overwritten(tmp_path, capsys):
     path = tmp_path / "rows.json"
     path.write_text("precious")
     with pytest.raises(SystemExit):
-        __main__.main(["--json", str(path)])
+        __main__.main(["--quick", "--json", str(path)])
     assert path.read_text() == "precious"
     assert "already exists" in capsys.readouterr().err
+
+
+def test_rows_to_keep_are_of_a_commit(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(version, "commit", lambda: "0123456789-dirty")
+    with pytest.raises(SystemExit):
+        __main__.main(["--json", str(tmp_path / "rows.json")])
+    assert "commit = '0123456789-dirty': must be one without changes" in capsys.readouterr().err
+    assert not (tmp_path / "rows.json").exists()
 
 
 def test_a_ratio_is_how_many_times_faster_we_are():
@@ -185,7 +193,8 @@ def test_a_ratio_is_how_many_times_faster_we_are():
 
 def test_a_stopped_peer_is_told_in_the_json():
     row = make_row("a", "s", 1.0, theirs=9.0, peer="X", compile_s=1.0, batch=1, is_bound=True)
-    assert row.as_json()["peer"] == "X (stopped)"
+    written = row.as_json("0123456789")
+    assert (written["peer"], written["commit"]) == ("X (stopped)", "0123456789")
 
 
 def test_sides_take_turns_and_the_fastest_of_each_counts():
