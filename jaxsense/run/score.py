@@ -71,7 +71,9 @@ def score_missions(
     """Evaluates policies in missions, next to built-in policies in the same arenas.
 
     The arenas are those of `python -m jaxsense.evaluate` with the same seed. Compiling the missions
-    takes most of the time of a few hundred; one call for several policies compiles once.
+    takes most of the time of a few hundred; one call for several policies compiles once. On a CPU,
+    the missions share one thread fewer than there are cores, at most 8; to use all cores, set the
+    environment variable `NPROC` to a larger number, the size of XLA's thread pool, before JAX runs.
 
     Args:
       config: settings of the arena, the robots and their sensors.
