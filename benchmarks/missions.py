@@ -24,7 +24,9 @@ from jaxsense.summary import profile
 _UNIT = "control-steps/s"
 # For each accelerator.
 _MISSIONS, _MISSIONS_OF_MANY = 16384, 8192
-_PERIODS_BEFORE = 40  # 4 s of missions that last 14 s
+_MISSIONS_OF_CPU = 768
+PERIODS_BEFORE = 40
+"""Control periods before what is measured under way: 4 s of missions that last 14 s."""
 _PERIODS = 20  # to measure
 
 
@@ -76,14 +78,17 @@ def _play(
 ) -> Row:
     """As many missions as each accelerator plays at once; fewer on a CPU."""
     devices_of_sides, number = _sides(against_one)
-    (total,) = measure.batches(options, quick=4, cpu=(768,), accelerator=(number * accelerator,))
+    (total,) = measure.batches(
+        options, quick=4, cpu=(_MISSIONS_OF_CPU,), accelerator=(number * accelerator,)
+    )
     # Until it is trained, a gate lets everything above minus infinity pass.
     models = jax.tree.map(jnp.nan_to_num, init(jax.random.key(0), config))
     scenario, cases = mission.make_mission(config), {"naive": mission.cases(config)["naive"]}
 
     def side(compiler: Compiler, workers: Workers) -> Side:
         batch = batches.batch_of(config, total, workers)
-        player = Player(scenario, compiler, batch, workers, runs_long=True)
+        runs_long = batches.runs_long(config, total)
+        player = Player(scenario, compiler, batch, workers, runs_long)
         player.wait()
 
         def run() -> Played:
@@ -119,7 +124,7 @@ def _go_on(
             work=batch * _PERIODS,
             batch=batch,
             workers=workers,
-            wide_vectors=True,
+            wide_vectors=batches.runs_long(config, batch),
         )
         for workers in devices_of_sides
     )
@@ -149,7 +154,8 @@ def resets_many(options: Options) -> Row:
             work=batch,
             batch=batch,
             workers=devices.start(None),
-            wide_vectors=True,
+            # As in `missions_many`.
+            wide_vectors=batches.runs_long(config, _MISSIONS_OF_CPU),
         )
         for batch in sizes
     ]
@@ -219,7 +225,7 @@ def playing(config: Config, policy: str, batch: int, steps: int) -> Playing:
 
     states = begin(jax.random.split(jax.random.key(1), batch))
     keys = jax.random.split(jax.random.key(2), batch)
-    before = Playing(scenario, models, keys, states, _PERIODS_BEFORE)
+    before = Playing(scenario, models, keys, states, PERIODS_BEFORE)
     states = before.compiled(devices.compiler_options())(*before.args)
     keys = jax.random.split(jax.random.key(3), batch)
     return Playing(scenario, models, keys, states, steps)

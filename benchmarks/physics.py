@@ -15,8 +15,9 @@ from mujoco import mjx
 
 from benchmarks import measure, peers
 from benchmarks.measure import Options, Row, Side
+from benchmarks.missions import PERIODS_BEFORE, untrained
 from benchmarks.peers import native
-from jaxsense import PRESETS, Config, init, mission
+from jaxsense import Config, init, mission
 from jaxsense.mission import Mission, MissionState, navigation
 from jaxsense.mission.motion import move
 from jaxsense.mission.rollout import step as mission_step
@@ -29,13 +30,8 @@ from jaxsense.sim.arena import Arena, Layout
 _UNIT = "steps/s"
 _FREE_TOLERANCE = 1e-3  # m and rad over 1 s, float32 against float64
 _CONTACT_TOLERANCE = 5e-3  # m and rad, for all but one in a hundred, see the tests of the arena
-_PERIODS_BEFORE = 40  # 4 s of missions that last 14 s
 _MOST_PLAYED = 384  # missions; more are copies of these
-_UNTRAINED = dataclasses.replace(
-    PRESETS["default"],
-    # Untrained detectors are never confident; what they detect does not matter here.
-    mission=dataclasses.replace(PRESETS["default"].mission, least_confidence=0.0),
-)
+_UNTRAINED = untrained("default")
 
 
 @struct.dataclass
@@ -242,10 +238,10 @@ def _played(batch: int, periods: int) -> tuple[Mission, MissionState]:
         def skip(states: MissionState, keys: jax.Array):
             return step(states, keys)[0], None
 
-        number = _PERIODS_BEFORE + periods
+        number = PERIODS_BEFORE + periods
         step_keys = jax.vmap(lambda key: jax.random.split(key, number), out_axes=1)(play_keys)
-        states, _ = jax.lax.scan(skip, states, step_keys[:_PERIODS_BEFORE])
-        played = jax.lax.scan(step, states, step_keys[_PERIODS_BEFORE:])[1]
+        states, _ = jax.lax.scan(skip, states, step_keys[:PERIODS_BEFORE])
+        played = jax.lax.scan(step, states, step_keys[PERIODS_BEFORE:])[1]
         return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), played)
 
     fast_to_compile = {"xla_backend_optimization_level": 0}
