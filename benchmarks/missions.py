@@ -24,7 +24,8 @@ from jaxsense.summary import profile
 _UNIT = "control-steps/s"
 # For each accelerator.
 _MISSIONS, _MISSIONS_OF_MANY = 16384, 8192
-_MISSIONS_OF_CPU = 768
+# On a CPU; so many that `evaluate` compiles faster programs, see `batches.runs_long`.
+_OF_CPU, _OF_CPU_OF_MANY = 5632, 1024
 PERIODS_BEFORE = 40
 """Control periods before what is measured under way: 4 s of missions that last 14 s."""
 _PERIODS = 20  # to measure
@@ -32,12 +33,12 @@ _PERIODS = 20  # to measure
 
 def missions(options: Options) -> Row:
     """Missions of the policy `naive` with the settings of `default`, from begin to end."""
-    return _play("missions", options, untrained("default"), _MISSIONS)
+    return _play("missions", options, untrained("default"), _MISSIONS, _OF_CPU)
 
 
 def missions_many(options: Options) -> Row:
     """The same with 16 PoIs in an arena of 6 m."""
-    return _play("missions_many", options, of_many_pois(), _MISSIONS_OF_MANY)
+    return _play("missions_many", options, of_many_pois(), _MISSIONS_OF_MANY, _OF_CPU_OF_MANY)
 
 
 def missions_under_way(options: Options) -> Row:
@@ -64,23 +65,27 @@ def missions_many_under_way_devices(options: Options) -> Row:
 
 def missions_devices(options: Options) -> Row:
     """`missions` on all devices, against one of them that plays the same ones."""
-    return _play("missions_devices", options, untrained("default"), _MISSIONS, against_one=True)
+    config = untrained("default")
+    return _play("missions_devices", options, config, _MISSIONS, _OF_CPU, against_one=True)
 
 
 def missions_many_devices(options: Options) -> Row:
     """`missions_many` on all devices, against one of them that plays the same ones."""
-    config = of_many_pois()
-    return _play("missions_many_devices", options, config, _MISSIONS_OF_MANY, against_one=True)
+    name, config, on_cpu = "missions_many_devices", of_many_pois(), _OF_CPU_OF_MANY
+    return _play(name, options, config, _MISSIONS_OF_MANY, on_cpu, against_one=True)
 
 
 def _play(
-    name: str, options: Options, config: Config, accelerator: int, against_one: bool = False
+    name: str,
+    options: Options,
+    config: Config,
+    accelerator: int,
+    cpu: int,
+    against_one: bool = False,
 ) -> Row:
-    """As many missions as each accelerator plays at once; fewer on a CPU."""
+    """As many missions as each accelerator plays at once, or fewer on a CPU."""
     devices_of_sides, number = _sides(against_one)
-    (total,) = measure.batches(
-        options, quick=4, cpu=(_MISSIONS_OF_CPU,), accelerator=(number * accelerator,)
-    )
+    (total,) = measure.batches(options, quick=4, cpu=(cpu,), accelerator=(number * accelerator,))
     # Until it is trained, a gate lets everything above minus infinity pass.
     models = jax.tree.map(jnp.nan_to_num, init(jax.random.key(0), config))
     scenario, cases = mission.make_mission(config), {"naive": mission.cases(config)["naive"]}
@@ -124,7 +129,7 @@ def _go_on(
             work=batch * _PERIODS,
             batch=batch,
             workers=workers,
-            wide_vectors=batches.runs_long(config, batch),
+            wide_vectors=True,
         )
         for workers in devices_of_sides
     )
@@ -154,8 +159,7 @@ def resets_many(options: Options) -> Row:
             work=batch,
             batch=batch,
             workers=devices.start(None),
-            # As in `missions_many`.
-            wide_vectors=batches.runs_long(config, _MISSIONS_OF_CPU),
+            wide_vectors=True,
         )
         for batch in sizes
     ]
