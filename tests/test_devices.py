@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -337,6 +338,17 @@ def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):
     assert devices.start(1) == Workers()
     workers = devices.start(None)
     assert workers.mesh.size == workers.number == 2
+
+
+def test_calls_are_asked_to_end_when_they_are_interrupted(monkeypatch):
+    def pressed(futures, timeout):
+        raise KeyboardInterrupt
+
+    stopped = threading.Event()
+    monkeypatch.setattr(devices, "wait", pressed)
+    with pytest.raises(KeyboardInterrupt):
+        devices.side_by_side(lambda i: stopped.wait(10), 2, stop=stopped.set)
+    assert stopped.is_set()
 
 
 DECOMPOSED = """

@@ -288,13 +288,19 @@ def spread(
     return partitioned
 
 
-def side_by_side(function: Callable[[int], T], number: int, threads: int | None = None) -> list[T]:
+def side_by_side(
+    function: Callable[[int], T],
+    number: int,
+    threads: int | None = None,
+    stop: Callable[[], None] = lambda: None,
+) -> list[T]:
     """Calls a function with 0, 1 and so on, in several threads, to use all cores.
 
     Args:
       function: of an index.
       number: of calls.
       threads: how many calls run at once; all by default.
+      stop: asks the calls to end, when Ctrl-C has been pressed, which waits for them.
 
     Returns:
       The results, in order.
@@ -303,9 +309,13 @@ def side_by_side(function: Callable[[int], T], number: int, threads: int | None 
         return [function(0)]
     with ThreadPoolExecutor(threads or number) as executor:
         futures = [executor.submit(function, i) for i in range(number)]
-        # A wait without timeout may not notice Ctrl-C.
-        while wait(futures, timeout=0.2).not_done:
-            pass
+        try:
+            # A wait without timeout may not notice Ctrl-C.
+            while wait(futures, timeout=0.2).not_done:
+                pass
+        except BaseException:
+            stop()
+            raise
         return [future.result() for future in futures]
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import threading
+from collections.abc import Callable
 from typing import TypeAlias
 
 import jax
@@ -259,7 +260,11 @@ class Player:
                 mesh = self._workers.mesh if jax.process_count() == 1 else None
                 models = devices.put_everywhere(models, mesh)
                 call = _Call(key, models, played, episodes, self._found.metrics)
-                devices.side_by_side(lambda lane: self._play(call, lane), self._workers.threads)
+                devices.side_by_side(
+                    lambda lane: self._play(call, lane),
+                    self._workers.threads,
+                    stop=call.failed.set,
+                )
                 return call.result()
 
     def _play(self, call: "_Call", lane: int) -> None:
@@ -286,11 +291,14 @@ class Player:
                 if lane == 0:
                     call.films.record(playing, first)
                 ended = ledger.end(found.done)
-                call.end(playing[ended], jax.tree.map(lambda x: x[ended], found))  # noqa: B023
-                self._monitor.progress("mission", call.num_done, call.total)
+                call.end(playing[ended], jax.tree.map(lambda x: x[ended], found), self._report)  # noqa: B023
             except BaseException:
                 call.failed.set()
                 raise
+
+    def _report(self, done: int, total: int) -> None:
+        """Reports how many missions of a call are done."""
+        self._monitor.progress("mission", done, total)
 
     def _check(self, call: "_Call", ledger: Ledger, found: _Found) -> None:
         """Raises `StageError` if beliefs or values of a policy were not finite in a mission."""
@@ -335,8 +343,10 @@ class _Call:
         faults = jax.tree.map(lambda x: x[missions], self._faults)
         return missions % self._episodes, self.policies[missions], faults
 
-    def end(self, missions: Int[np.ndarray, " E"], found: _Found) -> None:
-        """Keeps the results of missions that are done."""
+    def end(
+        self, missions: Int[np.ndarray, " E"], found: _Found, report: Callable[[int, int], None]
+    ) -> None:
+        """Keeps the results of missions that are done, and reports their number and that of all."""
 
         def put(rows: np.ndarray, new: np.ndarray) -> None:
             rows[missions] = new
@@ -345,6 +355,8 @@ class _Call:
         with self._lock:
             self.num_done += len(missions)
             self._control_steps += int(found.steps.sum())
+            # Here, so that no lane reports fewer than another one before it.
+            report(self.num_done, self.total)
 
     def result(self) -> Played:
         """The results of all missions, which must be done."""

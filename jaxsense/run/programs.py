@@ -185,13 +185,13 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
         # Missions come last, but take a CPU longest to compile. With an accelerator, cores are
         # free to compile, and everything waits for tracing.
         batch, workers = _batch(programs), programs.workers
-        is_kept = missions.are_kept(programs.config, compiler, batch, workers)
+        is_kept = _on_cpu() and missions.are_kept(programs.config, compiler, batch, workers)
         is_first = _on_cpu() and not is_kept
         if is_first:
             _trace_missions(programs, compiler)
         for stage in programs.stages[_BEFORE_MISSIONS:]:
             _trace_stage(programs, stage)
-        if _on_cpu() and is_kept:
+        if is_kept:
             # They load in seconds, but take as much memory as the scans.
             while not programs.without_scans.wait(_PATIENCE):
                 compiler.check_open()
