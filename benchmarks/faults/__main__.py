@@ -302,8 +302,8 @@ def main(argv: list[str] | None = None) -> bool:
         measure.require_commit(PROGRAM)
     measure.reserve(PROGRAM, "json", arguments.json)
     # First: a commit that is made meanwhile is not what is tried.
-    results = measure.origin(studies.command(PROGRAM, arguments))
     passed: dict[str, list[bool]] = {}
+    results = {**measure.origin(studies.command(PROGRAM, arguments)), "passed": passed}
     with tempfile.TemporaryDirectory() as folder:
         runs = Runs(Path(folder))
         runs.whole(*SMOKE)
@@ -313,8 +313,8 @@ def main(argv: list[str] | None = None) -> bool:
                 passed.setdefault(row, []).append(not failure)
                 if failure:
                     print(f"{row}: {failure}", file=sys.stderr, flush=True)
-    results["passed"] = passed
-    studies.write(arguments.json, results)
+                # After each trial, so that what was tried before a failure is kept.
+                studies.write(arguments.json, results)
     print(table(results))
     return all(itertools.chain.from_iterable(passed.values()))
 

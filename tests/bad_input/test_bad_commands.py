@@ -303,9 +303,9 @@ OTHERS = [
     (benchmarks, ["x"], "name = 'x': must be one of physics"),
     (benchmarks, [""], "name = '': must be one of physics"),
     (benchmarks, ["--json", ""], "json = '': must be a path"),
-    (benchmarks, ["--json", "file"], "json = 'file': already exists; must be new"),
-    (benchmarks, ["--json", "full"], "json = 'full': already exists; must be new"),
-    (benchmarks, ["--json", "none/x"], "json = 'none/x': cannot be written"),
+    (benchmarks, ["--quick", "--json", "file"], "json = 'file': already exists; must be new"),
+    (benchmarks, ["--quick", "--json", "full"], "json = 'full': already exists; must be new"),
+    (benchmarks, ["--quick", "--json", "none/x"], "json = 'none/x': cannot be written"),
     (benchmarks, ["--json"], "argument --json: expected one argument"),
     (benchmarks, ["--peer"], "unknown option --peer; did you mean --peers?"),
 ]
