@@ -69,6 +69,8 @@ def train(tree: Path, place: Path) -> Needs:
     traced, found = place / "cache" / "traced", place / "operations.json"
     pipeline.python(tree, ("-c", _COUNT, str(traced), str(found), _OPERATION), place)
     operations = json.loads(found.read_text(encoding="utf-8"))
+    if not operations:
+        sys.exit(f"{traced}: must hold the programs of a training")
     return Needs(needs.cpu_s, 1024 * needs.memory_gib, operations)
 
 

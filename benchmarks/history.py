@@ -82,15 +82,20 @@ def _has_changed(commit: str, path: str, function: str) -> bool:
 
 
 def note(path: Path) -> None:
-    """Notes in each row of a file whether its code has changed, if the history is here to tell.
+    """Notes in a file whether the code it measures has changed, if the history is here to tell.
 
     Args:
-      path: of the rows, as `python -m benchmarks` writes them.
+      path: of rows, as `python -m benchmarks` writes them, or of whole commands, as
+        `python -m benchmarks.pipeline` does.
     """
-    if is_whole():
-        rows = json.loads(path.read_text(encoding="utf-8"))
-        noted = [{**row, "changed": has_changed(row["row"], row["commit"])} for row in rows]
-        path.write_text(json.dumps(noted, indent=2) + "\n", encoding="utf-8")
+    if not is_whole():
+        return
+    content = json.loads(path.read_text(encoding="utf-8"))
+    if isinstance(content, list):
+        noted = [{**row, "changed": has_changed(row["row"], row["commit"])} for row in content]
+    else:
+        noted = {**content, "changed": has_changed("train", content["commit"])}
+    path.write_text(json.dumps(noted, indent=2) + "\n", encoding="utf-8")
 
 
 def program(source: str, function: str = "") -> str:

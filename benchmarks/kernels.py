@@ -9,6 +9,7 @@ import dataclasses
 import os
 import re
 import shlex
+import statistics
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -88,7 +89,9 @@ def main(argv: list[str] | None = None) -> None:
     for name in arguments.cases:
         settings, batch = CASES[name]
         missions = playing(settings(), arguments.policy, batch, arguments.steps)
-        wall, parts = profile(missions.compiled(devices.compiler_options()), missions)
+        # As the rows of missions under way.
+        options = devices.compiler_options(runs_long=True, wide_vectors=True)
+        wall, parts = profile(missions.compiled(options), missions)
         results["cases"][name] = {
             "wall_s": wall,
             "parts": {part: dataclasses.asdict(of) for part, of in parts.items()},
@@ -137,10 +140,10 @@ def table(results: Mapping[str, Any]) -> str:
 
 
 def profile(program: jax.stages.Compiled, missions: Playing) -> tuple[float, Parts]:
-    """Seconds of a call of a program without the profiler, and its parts with it."""
+    """Median seconds of a call of a program without the profiler, and its parts with it."""
     run = lambda: jax.block_until_ready(program(*missions.args))  # noqa: E731
     run()
-    wall = measure.seconds(run)
+    wall = statistics.median(measure.seconds(run) for _ in range(measure.Options().repeats))
     with tempfile.TemporaryDirectory() as place:
         with jax.profiler.trace(place):
             run()

@@ -6,6 +6,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from benchmarks import measure
 from benchmarks.measure import Options, Row, Side
@@ -121,18 +122,16 @@ def _go_on(
     def go_on(keys: jax.Array, states: MissionState) -> MissionState:
         return missions.go_on(keys, missions.models, states)
 
-    ours, *theirs = (
-        measure.compiled(
-            go_on,
-            missions.keys,
-            missions.states,
-            work=batch * _PERIODS,
-            batch=batch,
-            workers=workers,
-            wide_vectors=True,
+    def side(workers: Workers) -> Side:
+        args = missions.keys, missions.states
+        made = measure.compiled(
+            go_on, *args, work=0, batch=batch, workers=workers, wide_vectors=True
         )
-        for workers in devices_of_sides
-    )
+        after = measure.joined(made.run())
+        # Missions that have ended make no more steps.
+        return dataclasses.replace(made, work=int(np.sum(after.steps - missions.states.steps)))
+
+    ours, *theirs = map(side, devices_of_sides)
     peer = "one device" if against_one else None
     return measure.compare(name, _UNIT, [ours], theirs, options, peer=peer)
 

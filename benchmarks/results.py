@@ -44,6 +44,10 @@ PAGES = (
 )
 ROWS = ("cpu.json", "h100.json", "h200x2.json")
 """What `python -m benchmarks` has written."""
+PIPELINE = tuple(
+    f"pipeline{of}.json" for of in ("", "_newest", "_missions", "_accelerator", "_evaluation")
+)
+"""What `python -m benchmarks.pipeline` has."""
 _BLOCK = re.compile(
     r"(<!-- (?P<file>[\w-]+\.json)(?: (?P<table>[\w-]+))? -->\n).*?(<!-- end -->)", re.DOTALL
 )
@@ -51,7 +55,7 @@ _BLOCK = re.compile(
 
 def main() -> None:
     """The program."""
-    for name in ROWS:
+    for name in (*ROWS, *PIPELINE):
         history.note(RESULTS / name)
     for page in PAGES:
         page.write_text(written(page.read_text(encoding="utf-8")), encoding="utf-8")
@@ -126,9 +130,6 @@ _IMPERFECT: _Tables = {
     "constant": partial(imperfect_tables.of_sizes, sweeps=["both [m]"]),
     "drifts": partial(imperfect_tables.of_sizes, sweeps=["both drifts [m]"]),
 }
-_PIPELINE = [
-    f"pipeline{of}.json" for of in ("", "_newest", "_missions", "_accelerator", "_evaluation")
-]
 TABLES: Mapping[str, _Tables] = {
     **{name: {None: table} for name in ROWS},
     "digits.json": {None: digits.of_results},
@@ -160,7 +161,7 @@ TABLES: Mapping[str, _Tables] = {
     "tasks.json": {None: board.tables},
     "gate.json": {None: gate.table, "search": gate.of_search},
     "where.json": {None: where.table, "accuracy": where.of_accuracies},
-    **{name: {None: pipeline.table} for name in _PIPELINE},
+    **{name: {None: pipeline.table} for name in PIPELINE},
     "first_steps.json": {None: first_steps.table},
     "kernels.json": {None: kernels.table},
     "place.json": {None: place.table},

@@ -1,6 +1,7 @@
 """How many missions play side by side."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -118,6 +119,14 @@ def test_an_accelerator_may_not_tell_its_memory(monkeypatch, stats):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "local_devices", lambda: [SimpleNamespace(memory_stats=lambda: stats)])
     assert devices.memory() == (stats or {"bytes_limit": 8 * GIB})["bytes_limit"]
+
+
+def test_the_smaller_of_two_accelerators_counts(monkeypatch):
+    tell = [partial(dict, bytes_limit=n * GIB) for n in (9, 7)]
+    cards = [SimpleNamespace(memory_stats=each) for each in tell]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_devices", lambda: cards)
+    assert devices.memory() == 7 * GIB
 
 
 def test_two_accelerators_play_twice_what_one_holds(monkeypatch):

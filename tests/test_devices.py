@@ -45,6 +45,16 @@ def test_a_spread_function_gives_what_it_gives_alone():
     assert devices.spread(function, None) is function
 
 
+def test_values_that_every_device_has_are_sent_once():
+    mesh = devices.make_mesh(2)
+    there = devices.put_everywhere({"x": np.arange(3.0), "key": jax.random.key(1)}, mesh)
+    assert all(x.sharding.is_fully_replicated for x in jax.tree.leaves(there))
+    assert there["x"].sharding.num_devices == 2
+    (again,) = devices.put((there,), devices.shardings(mesh, 1, whole=(0,)))
+    assert again["x"] is there["x"]
+    assert devices.put_everywhere(np.arange(3.0), None).sharding.num_devices == 1
+
+
 def drive(speeds):
     """`[B, 3 R]` velocities after a step of the physics with `[B, R, 2]` wheel speeds."""
     arena = arenas.build(CONFIG.arena, (False, True), obstacles=False)

@@ -185,7 +185,8 @@ class Record:
       detected: `[R]` bool, the scan updated the map.
       belief: `[N, D]` the map.
       seen: `[N, M]` bool.
-      clearance: `[]` smallest free distance around any robot during it, in metres.
+      clearance: `[]` smallest free distance around any robot during it, in metres. After
+        the mission's end, of a motion that the state does not take.
     """
 
     time: Float[Array, ""]

@@ -187,10 +187,11 @@ def _has_backend() -> bool:
 
 
 def memory() -> int | None:
-    """Bytes that an accelerator may hold, few if it does not tell; None for a CPU."""
+    """Bytes that each accelerator may hold, few if it does not tell; None for a CPU."""
     if jax.default_backend() == "cpu":
         return None
-    return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", _LEAST_MEMORY)
+    told = [device.memory_stats() or {} for device in jax.local_devices()]
+    return min(each.get("bytes_limit", _LEAST_MEMORY) for each in told)
 
 
 def make_mesh(number: int | None = None) -> Mesh:
@@ -232,10 +233,12 @@ def put_everywhere(values: PyTree, mesh: Mesh | None) -> PyTree[jax.Array]:
     """Puts values on the device that runs programs, or on every device of a mesh.
 
     Args:
-      values: arrays or numbers.
-      mesh: of this process, from `make_mesh`; None for a single device.
+      values: arrays or numbers, the same in every process.
+      mesh: from `make_mesh`; None for a single device.
     """
-    return jax.device_put(values, None if mesh is None else NamedSharding(mesh, PartitionSpec()))
+    if mesh is None:
+        return jax.device_put(values)
+    return put((values,), shardings(mesh, 1, whole=(0,)))[0]
 
 
 def put(args: tuple[PyTree, ...], places: tuple[NamedSharding, ...]) -> tuple[PyTree, ...]:

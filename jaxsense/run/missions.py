@@ -257,8 +257,7 @@ class Player:
             self.wait()
             with self._monitor.clock.record("run", "mission"):
                 # Loaded models lie on the host, and every chunk would transfer them again.
-                mesh = self._workers.mesh if jax.process_count() == 1 else None
-                models = devices.put_everywhere(models, mesh)
+                models = devices.put_everywhere(models, self._workers.mesh)
                 call = _Call(key, models, played, episodes, self._found.metrics)
                 devices.side_by_side(
                     lambda lane: self._play(call, lane),

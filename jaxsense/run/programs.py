@@ -204,15 +204,20 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
 def _trace_missions(programs: Programs, compiler: Compiler) -> None:
     with compiler.monitor.clock.record("trace", "mission"):
         scenario = mission.make_mission(programs.config, programs.policies)
-    player = missions.Player(scenario, compiler, _batch(programs), programs.workers)
-    programs.player.set_result(player)
+    batch, workers = _batch(programs), programs.workers
+    runs_long = batches.runs_long(programs.config, _num_missions(programs.config))
+    programs.player.set_result(missions.Player(scenario, compiler, batch, workers, runs_long))
+
+
+def _num_missions(config: Config) -> int:
+    """How many missions a run plays."""
+    return len(config.mission.policies) * config.mission.episodes
 
 
 def _batch(programs: Programs) -> int:
     """How many missions play side by side, with room for those to record."""
-    config, workers = programs.config, programs.workers
-    number = len(config.mission.policies) * config.mission.episodes
-    batch = batches.batch_of(config, number, workers)
+    number, workers = _num_missions(programs.config), programs.workers
+    batch = batches.batch_of(programs.config, number, workers)
     return max(batch, min(number, films.AT_A_TIME * workers.number))
 
 

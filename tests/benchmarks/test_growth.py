@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from benchmarks import growth
+from benchmarks import growth, pipeline
 
 BEFORE = growth.Needs(100.0, 1000.0, {"survey-begin": 1000, "mission-go_on": 30_000})
 
@@ -44,6 +44,16 @@ def test_the_pair_in_which_a_figure_has_grown_least_counts():
     assert (old.cpu_s, new.cpu_s) == (150.0, 155.0)
     assert (old.memory_mib, new.memory_mib) == (1000.0, 1000.0)
     assert growth.compare(old, new) == []
+
+
+def test_a_tree_that_leaves_no_programs_is_not_compared(monkeypatch, tmp_path):
+    def python(tree, words, place):
+        (place / "operations.json").write_text("{}")
+
+    monkeypatch.setattr(pipeline, "run", lambda *_: pipeline.Needs(1.0, 1.0, 1.0))
+    monkeypatch.setattr(pipeline, "python", python)
+    with pytest.raises(SystemExit, match="traced: must hold the programs of a training"):
+        growth.train(tmp_path, tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,8 @@ def test_pairs_take_turns_at_being_first_and_the_median_of_their_ratios_counts(
     shown = pipeline.table({**stored, "commit": "fedcba9876543210"})
     assert line in shown
     assert "| command | seconds: 0123456789 | fedcba9876 | ratio |" in shown
+    changed = pipeline.table({**stored, "commit": "fedcba9876543210", "changed": True})
+    assert "| fedcba9876, changed since | ratio |" in changed
     assert pipeline.table(stored) in capsys.readouterr().out
 
 
@@ -86,7 +88,7 @@ def test_one_pair_has_no_range(ran, tmp_path, monkeypatch):
     assert line in pipeline.table(json.loads(out.read_text()))
 
 
-@pytest.mark.parametrize("name", results._PIPELINE)
+@pytest.mark.parametrize("name", results.PIPELINE)
 def test_stored_ratios_are_those_of_their_pairs(name):
     stored = json.loads((results.RESULTS / name).read_text(encoding="utf-8"))
     for found in stored["commands"].values():

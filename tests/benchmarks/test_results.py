@@ -156,7 +156,7 @@ def test_results_name_commits_of_the_history(path, past):
     assert not lost, "measure again with a committed tree, and keep its commit"
 
 
-@pytest.mark.parametrize("name", results.ROWS)
+@pytest.mark.parametrize("name", [*results.ROWS, *results.PIPELINE])
 def test_rows_tell_whether_their_code_has_changed(name, past, tmp_path):
     stored = (results.RESULTS / name).read_text(encoding="utf-8")
     (tmp_path / name).write_text(stored, encoding="utf-8")
@@ -215,6 +215,16 @@ def test_rows_note_changes(repository):
     path.write_text(json.dumps(rows))
     history.note(path)
     assert [row["changed"] for row in json.loads(path.read_text())] == [False, True]
+
+
+def test_whole_commands_note_changes(repository):
+    commit = repository("raycast.py", "x = 1")
+    path = history.ROOT / "pipeline.json"
+    path.write_text(json.dumps({"commit": commit, "commands": {}}))
+    for text, expected in (("x = 1  # m", False), ("x = 2", True)):
+        repository("raycast.py", text)
+        history.note(path)
+        assert json.loads(path.read_text())["changed"] is expected
 
 
 def test_without_the_history_rows_stay_as_they_are(tmp_path, monkeypatch):

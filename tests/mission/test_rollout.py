@@ -114,6 +114,14 @@ def reasons(state):
     return [mission.REASONS[code] for code in jax.vmap(mission.reason)(state)]
 
 
+def test_the_smallest_clearance_is_that_of_the_records_until_the_end(healthy):
+    _, end, record = healthy
+    is_over = np.arange(STEPS) >= end.steps[:, None]
+    assert is_over.any(axis=1).all()
+    until_end = np.where(is_over, np.inf, record.clearance)
+    np.testing.assert_array_equal(until_end.min(axis=1), end.min_clearance)
+
+
 def test_every_robot_visits_every_poi_once_and_ends(healthy):
     _, end, record = healthy
     assert reasons(end) == ["finished"] * NUM_ARENAS
