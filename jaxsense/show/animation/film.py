@@ -149,7 +149,7 @@ def _draw(
     )
     strip(half, timeline, clock.tolist(), x=SIZE, y=25, class_="film-title film-end")
     _draw_robots(half, timeline, arena, config, record, below)
-    note = "Bars: class probabilities; dots: who saw it."
+    note = "Bars: probabilities; dots: sensors that saw it."
     add(half, "text", note, y=below + _LINE * len(config.carried), class_="film-note")
     half = _half(parent, 1, "the shared map", timeline, record, latent)
     for line, note in enumerate(_NOTES):
