@@ -31,7 +31,7 @@ _AVERAGES = "What learning is worth"  # section of the README
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Plays a mission with trained robots, and again with naive exploration, on one page."""
+    """Plays a mission with trained robots and again with naive exploration, and shows both."""
 
     preset: str = "default"
     """Preset with which the robots were trained: `default`, `noisy`, `many`, `raw` or `team`."""

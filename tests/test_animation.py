@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import re
+from pathlib import Path
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -371,3 +372,17 @@ def test_the_map_begins_with_the_prior_of_the_fusion():
     (ring,) = (e for e in moving.iter(f"{SVG}ellipse") if e.get("fill") == "none")
     for name in ("cx", "cy", "rx"):
         assert float(ring.get(name)) == pytest.approx(first[name], abs=0.1)
+
+
+def notes(film):
+    """What the film says below its views, moving and still."""
+    found = [e for e in film.iter(f"{SVG}text") if e.get("class") == "film-note"]
+    return sorted(e.text for e in found if e.text)
+
+
+@pytest.mark.parametrize("name", ["mission.svg", "figures/team_mission.svg"])
+def test_films_of_the_pages_say_what_films_say_today(picture, name):
+    docs = Path(__file__).parents[1] / "docs"
+    shown = ElementTree.parse(docs / name).getroot()
+    assert len(notes(picture)) == 8
+    assert notes(shown) == notes(picture)

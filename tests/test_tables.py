@@ -55,7 +55,7 @@ def test_only_where_a_policy_is_above_optimal_a_note_says_why(changes, expected)
         {**SUMMARY, "dqn": {"camera": camera, "lidar": {**camera, **changes}}}
     ).note
     assert note.startswith(expected)
-    assert ("another policy can get more" in note) == bool(expected)
+    assert ("another policy can score higher" in note) == bool(expected)
 
 
 def test_policies_have_the_names_that_users_type():

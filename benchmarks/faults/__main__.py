@@ -48,17 +48,19 @@ IN_ONE_SECOND = ["20250101-000000-smoke", "20250101-000000-smoke-2"]
 
 def killed(runs: Runs, name: str, arguments: list[str], seed: int) -> None:
     """`kill -9` at a random moment of a run that has begun and not ended, then `--resume`."""
-    path, moment = runs.path(name), random.Random(seed).uniform(0.0, runs.seconds(*arguments))
+    path, share = runs.path(name), random.Random(seed).uniform(0.0, 1.0)
+    seconds = runs.seconds(*arguments)
     while True:
         process = runs.start(*arguments, "--out", str(path))
         wait_for(path / "config.json", process)
-        time.sleep(moment)
-        process.kill()
+        begin = time.monotonic()
+        process.kill_after(share * seconds)
         is_killed = process.finish().returncode == -signal.SIGKILL
         if is_killed and not (path / "summary.json").exists():
             break
         shutil.rmtree(path)
-        moment *= 0.9
+        # It ended first: other runs no longer slow it down.
+        seconds = 0.9 * (time.monotonic() - begin)
     runs.check_resumed(path, *arguments)
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -109,8 +110,10 @@ class Process:
         """Whether it no longer runs."""
         return self._process.poll() is not None
 
-    def kill(self) -> None:
-        """As `kill -9`."""
+    def kill_after(self, seconds: float) -> None:
+        """As `kill -9` after some time, unless it has ended by then."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(seconds)
         self._process.send_signal(signal.SIGKILL)
 
     def finish(self) -> subprocess.CompletedProcess[str]:

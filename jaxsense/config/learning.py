@@ -79,7 +79,7 @@ class JmvaeConfig(Section, place="jmvae"):
     `filter` accumulates looks, see section `filter`."""
     restarts: int = limited(3, at_least=1, at_most=1000)
     """Number of trainings from different random parameters. The run keeps the one with the lowest
-    loss among those whose beliefs give class probabilities back exactly, or among all if the JMVAE
+    loss among those whose beliefs reproduce class probabilities exactly, or among all if the JMVAE
     learns from scans."""
     looks: int = limited(4, at_least=2, at_most=100)
     """Number of looks by each sensor at a PoI, if the JMVAE learns from scans."""

@@ -39,7 +39,7 @@ def pytree(cls: type[T]) -> type[T]:
 
 @pytree
 class Belief:
-    """Belief in a point of interest: a diagonal Gaussian in the latent space.
+    """Belief about a point of interest: a diagonal Gaussian in the latent space.
 
     May have leading axes, for example `[N]` for a map of N points of interest.
 

@@ -32,7 +32,7 @@ class Learned:
     """What a look changes.
 
     Attributes:
-      belief: `[D]` belief in its PoI after all looks.
+      belief: `[D]` belief about its PoI after all looks.
       log_posterior: `[C]` the same by exact Bayes.
       evidence: `[C]` of the look, as far as it is new; None where all robots share a map.
     """

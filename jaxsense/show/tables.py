@@ -35,9 +35,9 @@ _PAPER = {
 }
 _RULES = ("nearest", "auction", "rollout")  # written by hand, and learned by none
 _NO_BOUND = (
-    "The optimal policy decides by the expected rewards of looks, not by what the map made of "
-    "them: on a poor map, or from few starts, another policy can get more. If it led by more than "
-    "1 % and two standard errors, the table would name no optimal policy."
+    "The optimal policy maximises the expected rewards of looks, but rewards are read from the "
+    "map: on a poor map, or over few starts, another policy can score higher. If it led by more "
+    "than 1 % and two standard errors, the table would name no optimal policy."
 )
 _YES_OR_NO = {0.0: "no", 1.0: "yes"}
 
@@ -140,7 +140,7 @@ def unambiguous(results: Results, classes: tuple[str, ...]) -> Table:
             part.replace(" ", "\u00a0") for part in (here, f"({consistent:.1%}, {norm:.2f})")
         )
 
-    caption = "Is a class certain?" + is_paper * " Here / in the paper's Table I"
+    caption = "Classes identified with certainty" + is_paper * " Here / in the paper's Table I"
     rows = [(label, [cell(c, name) for name in columns]) for c, label in enumerate(classes)]
     brackets = "Share of looks that leave exactly the classes that this sensor cannot tell apart; "
     brackets += "mean sigma norm, in the paper's Fig. 4 from 1.05 to 1.25."
@@ -181,10 +181,10 @@ _UNFINISHED = {
         "Number of missions that did not end because every robot chose to. `time limit`: "
         "after `mission.time_limit`; `unreachable`: a robot gave up a PoI that it could not get "
         "to; `undetected`: it gave one up after looks that showed nothing; `exhausted`: it left "
-        "one at which looks still paid, as no view of it would have been new; `robot failed`: the "
+        "one that was still worth a look, because no look would have been new; `robot failed`: the "
         "others finished; `no robot left`: all failed."
     ),
-    "in bold": "The best value of the policies that label as many PoIs right as the best one.",
+    "in bold": "The best value among policies that are as accurate as the best one.",
 }
 
 
@@ -250,7 +250,7 @@ def cards(results: Results) -> list[tuple[str, str, str]]:
         rules = _fastest_rule(played)
         for key, what, others in (
             ("observations_per_poi", "looks per PoI", ("naive",)),
-            ("time_s", "seconds per mission", ("naive", *rules)),
+            ("time_s", "median seconds per mission", ("naive", *rules)),
             ("accuracy", "of PoIs right", ("naive", "random")),
         ):
             beside = []

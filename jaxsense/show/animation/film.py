@@ -24,8 +24,8 @@ _TOP, _LINE = 38, 26
 _ICON = 14  # px, length of a field of view next to the name of a robot
 _PHASES = ("choosing", "driving to", "looking at", "backing off from", "done", "failed")
 _NOTES = (
-    "Ellipse: 1-sigma belief in a numbered PoI.",
-    "PoIs that are certain stand at their class.",
+    "Ellipse: 1-sigma belief about a numbered PoI.",
+    "Identified PoIs are listed at their class.",
     "Dotted circle: PoIs that no robot has seen.",
 )
 _STYLE = """
