@@ -10,6 +10,7 @@ from test_page_settings import CONSTANTS, INLINE, PRESET_OF
 ROOT = Path(__file__).parents[1]
 PAGES = [
     "README.md",
+    "CONTRIBUTING.md",
     "benchmarks/RESULTS.md",
     *sorted(f"docs/{x.name}" for x in (ROOT / "docs").glob("*.md")),
 ]
