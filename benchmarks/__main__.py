@@ -16,7 +16,7 @@ from benchmarks import ROWS
 from benchmarks.measure import Options, Row, require_commit, require_known, reserve
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
-from jaxsense.run import cli, version
+from jaxsense.run import cli, devices, version
 
 PROGRAM = "benchmarks"
 _WIDTH_OF_FILES = 160
@@ -51,8 +51,8 @@ def main(argv: list[str] | None = None) -> None:
     # A device for each core. Called from another program, the devices may be fixed already.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", os.cpu_count())
-    # As the programs have it.
-    jax.config.update("jax_default_matmul_precision", "highest")
+    # Before anything uses JAX, so that all cores may take part.
+    devices.start(None)
     console = rich.console.Console()
     if not console.is_terminal:
         console.width = _WIDTH_OF_FILES

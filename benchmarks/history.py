@@ -8,6 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "jaxsense"
+_BENCHMARKS = "benchmarks"
 _COMPILED = ("run/devices.py:compiler_options",)
 _SPREAD = ("run/devices.py:spread", "run/kept.py:trace")
 _BODIES = ("sim/amiro.py", "sim/arena.py")
@@ -15,8 +16,15 @@ _MOTION = (*_BODIES, "mission/groups.py", "mission/motion.py", "mission/navigati
 _RAYS = (*_BODIES, "sim/raycast.py", "sim/sensors.py")
 _CHOICES = ("dqn/policies.py", "dqn/reference.py", "dqn/rewards.py", "dqn/rules.py")
 _STEPS = (*_CHOICES, "core", "looks.py", "mission", "models.py", "sim", "vae")
+_UNDER_WAY = (*_STEPS, f"{_BENCHMARKS}/missions.py:_go_on")
 _PLAYER = ("run/batches.py", "run/films.py", "run/ledger.py", "run/missions.py")
-_MISSIONS = (*_STEPS, *_PLAYER, "run/devices.py:side_by_side")
+_MISSIONS = (
+    *_STEPS,
+    *_PLAYER,
+    *(f"run/devices.py:{name}" for name in ("side_by_side", "put_everywhere", "fetched")),
+    "run/compilation.py:Program",
+    f"{_BENCHMARKS}/missions.py:_play",
+)
 _MAP = ("dqn/map_mdp.py", "vae/filter.py", "vae/fusion.py")
 _LEARNING = (*_MAP, "dqn/losses.py", "dqn/map_agent.py", "dqn/replay.py", "dqn/training.py")
 CODE: Mapping[str, tuple[str, ...]] = {
@@ -25,9 +33,10 @@ CODE: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("physics_solver", "physics_solver_batch", "physics_solver_warp"), _BODIES),
     **dict.fromkeys(("physics_contacts", "physics_contacts_warp"), _MOTION),
     **dict.fromkeys(("rays", "rays_warp", "rays_warp_bvh"), _RAYS),
-    **dict.fromkeys(("missions_under_way", "missions_many_under_way", "resets_many"), _STEPS),
+    "resets_many": _STEPS,
+    **dict.fromkeys(("missions_under_way", "missions_many_under_way"), _UNDER_WAY),
     **dict.fromkeys(
-        ("missions_under_way_devices", "missions_many_under_way_devices"), (*_STEPS, *_SPREAD)
+        ("missions_under_way_devices", "missions_many_under_way_devices"), (*_UNDER_WAY, *_SPREAD)
     ),
     **dict.fromkeys(("missions", "missions_many"), _MISSIONS),
     **dict.fromkeys(("missions_devices", "missions_many_devices"), (*_MISSIONS, *_SPREAD)),
@@ -39,7 +48,7 @@ CODE: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("train", "train_warm"), (".",)),
 }
 """Files and folders of the package that each row measures, besides what compiles all of them; of a
-file, everything or the function behind the colon."""
+file, everything or the function or class behind the colon. Of missions also what measures them."""
 
 
 def is_whole() -> bool:
@@ -63,7 +72,8 @@ def has_changed(row: str, commit: str) -> bool:
       ValueError: if the commit is not in the history.
     """
     for place in (*_COMPILED, *CODE[row]):
-        path, _, function = f"{PACKAGE}/{place}".partition(":")
+        whole = place if place.startswith(f"{_BENCHMARKS}/") else f"{PACKAGE}/{place}"
+        path, _, function = whole.partition(":")
         paths = _git("diff", "--name-only", commit, "--", path)
         if paths is None:
             raise ValueError(f"commit = {commit!r} of row {row}: must be one of the history")
@@ -81,20 +91,20 @@ def _has_changed(commit: str, path: str, function: str) -> bool:
     return program(before, function) != program(file.read_text(encoding="utf-8"), function)
 
 
-def note(path: Path) -> None:
+def note(path: Path, measures: str | None = None) -> None:
     """Notes in a file whether the code it measures has changed, if the history is here to tell.
 
     Args:
-      path: of rows, as `python -m benchmarks` writes them, or of whole commands, as
-        `python -m benchmarks.pipeline` does.
+      path: of rows, as `python -m benchmarks` writes them, or of something else with a commit.
+      measures: row whose code something else measures.
     """
     if not is_whole():
         return
     content = json.loads(path.read_text(encoding="utf-8"))
-    if isinstance(content, list):
+    if measures is None:
         noted = [{**row, "changed": has_changed(row["row"], row["commit"])} for row in content]
     else:
-        noted = {**content, "changed": has_changed("train", content["commit"])}
+        noted = {**content, "changed": has_changed(measures, content["commit"])}
     path.write_text(json.dumps(noted, indent=2) + "\n", encoding="utf-8")
 
 

@@ -199,12 +199,13 @@ def where(results: Mapping[str, Any]) -> str:
     """The end of that sentence: where and when, without the command.
 
     Args:
-      results: with the keys of `origin`.
+      results: with the keys of `origin`, and perhaps that of `history.note`.
     """
     at = ", ".join(f"{name} {number}" for name, number in results["versions"].items())
+    changed = ", whose code has changed since" if results.get("changed") else ""
     return (
         f"{results['device']} with {results['cores']} cores; commit "
-        f"{str(results['commit'])[:10]} on {results['date']}; {at}."
+        f"{str(results['commit'])[:10]} on {results['date']}{changed}; {at}."
     )
 
 
@@ -218,15 +219,16 @@ def compiled(
 ) -> Side:
     """Compiles a function for its arguments; the side runs it on them and blocks on the outputs.
 
-    With workers, arguments and outputs are split among them along their first axis; of threads, the
-    side gives the outputs of each.
+    With workers, arguments and outputs are split among them along their first axis, among as many
+    threads as divide it; of threads, the side gives the outputs of each.
     """
     if workers.mesh is not None:
         share = devices.part(shapes_of(args), 0, workers.shares)
         alone = trace(function, share, lambda _: contextlib.nullcontext())
         function = devices.spread(alone.__call__, workers.mesh)
         args = jax.device_put(args, NamedSharding(workers.mesh, PartitionSpec(devices.AXIS)))
-    threads = workers.threads
+    rows = len(jax.tree.leaves(args)[0])
+    threads = max(n for n in range(1, workers.threads + 1) if rows % n == 0)
     parts = [devices.part(args, i, threads) for i in range(threads)]
     options = devices.compiler_options(runs_long=True, wide_vectors=wide_vectors)
     begin = time.perf_counter()
@@ -237,7 +239,8 @@ def compiled(
         work_on = lambda i: jax.block_until_ready(program(*parts[i]))  # noqa: E731
         return devices.side_by_side(work_on, threads)
 
-    return Side(run, work, batch, compile_s, workers.number)
+    number = threads if workers.mesh is None else workers.number
+    return Side(run, work, batch, compile_s, number)
 
 
 def compare(

@@ -219,7 +219,6 @@ def table(results: Mapping[str, Any]) -> str:
       results: the content of the JSON file.
     """
     before, now = (str(of["commit"])[:10] for of in (results["options"], results))
-    now += ", changed since" if results.get("changed") else ""
     heads = ["command"]
     for what, _ in KEYS.values():
         heads += [f"{what}: {before}", now, "ratio"]

@@ -48,6 +48,13 @@ PIPELINE = tuple(
     f"pipeline{of}.json" for of in ("", "_newest", "_missions", "_accelerator", "_evaluation")
 )
 """What `python -m benchmarks.pipeline` has."""
+CHANGES: Mapping[str, str | None] = {
+    **dict.fromkeys(ROWS),
+    **dict.fromkeys((*PIPELINE, "first_steps.json"), "train"),
+    "kernels.json": "missions_under_way",
+}
+"""Files that tell whether their code has changed, and the row whose code they measure, or None if
+they hold rows."""
 _BLOCK = re.compile(
     r"(<!-- (?P<file>[\w-]+\.json)(?: (?P<table>[\w-]+))? -->\n).*?(<!-- end -->)", re.DOTALL
 )
@@ -55,8 +62,8 @@ _BLOCK = re.compile(
 
 def main() -> None:
     """The program."""
-    for name in (*ROWS, *PIPELINE):
-        history.note(RESULTS / name)
+    for name, measures in CHANGES.items():
+        history.note(RESULTS / name, measures)
     for page in PAGES:
         page.write_text(written(page.read_text(encoding="utf-8")), encoding="utf-8")
 
@@ -105,7 +112,8 @@ def _origins(rows: list[dict[str, Any]]) -> list[str]:
     """A sentence for all rows that were measured together, with the command that measures them."""
     groups = collections.defaultdict[str, list[dict[str, Any]]](list)
     for row in rows:
-        groups[measure.where(row)].append(row)
+        # Each row tells of its own code.
+        groups[measure.where({**row, "changed": False})].append(row)
     return [f"`{command(group)}`: {origin}" for origin, group in groups.items()]
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,12 +86,14 @@ def _made(run: Path) -> dict[str, object]:
     return {name: found.get(name) for name in ("preset", "seed", "commit", "versions")}
 
 
-def write(file: Path | None, results: Mapping[str, object]) -> None:
+def write(
+    file: Path | None, results: Mapping[str, object] | Sequence[Mapping[str, object]]
+) -> None:
     """Writes results to the file that `measure.reserve` has made, if one was asked for.
 
     Args:
       file: the file.
-      results: with the keys of `origin`.
+      results: with the keys of `origin`; perhaps of several calls.
     """
     if file is not None:
         file.write_text(json.dumps(results, indent=1, default=str) + "\n", encoding="utf-8")

@@ -109,18 +109,17 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     console = rich.console.Console()
     key = jax.random.key(arguments.seed)
     with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
-        number = arguments.episodes * len(played)
+        begin, number = time.perf_counter(), arguments.episodes * len(played)
         batch = batches.batch_of(config, number, workers)
         runs_long = batches.runs_long(config, number)
         player = missions.Player(scenario, compiler, batch, workers, runs_long)
         player.wait()
-        begin = time.perf_counter()
+        compiled = time.perf_counter()
         try:
             found = player.play(key, models, played, arguments.episodes)
         except StageError as error:
             cli.fail(PROGRAM, str(error))
-        seconds = time.perf_counter() - begin
-        compiling = profile.of_stages(compiler.monitor.clock.spans)["mission"]["compile_s"]
+        seconds = time.perf_counter() - compiled
     block = summary.missions(scenario, found.metrics)
     draw = functools.partial(
         animation.draw,
@@ -140,7 +139,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     with contextlib.suppress(OSError):  # as in `say`
         _print(console, block, arguments.episodes)
     say(
-        f"{number} missions in {seconds:.1f} s after {compiling:.0f} s of compilation: "
+        f"{number} missions in {seconds:.1f} s after {compiled - begin:.0f} s of compilation: "
         f"{rate:.0f} control steps/s, "
         f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
     )

@@ -1,5 +1,8 @@
 """What a stage tells the outside: time, progress and bad ends."""
 
+from concurrent.futures import Future
+from threading import Timer
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -31,6 +34,16 @@ def test_another_run_has_a_listener_of_its_own():
     monitor.begin(lambda *report: heard.append(("second", *report)))
     monitor.progress("dqn", 1, 2)
     assert heard == [("first", "jmvae", 1, 2, {}), ("second", "dqn", 1, 2, {})]
+
+
+def test_a_wait_ends_with_the_result_or_when_the_run_must_stop():
+    monitor, future = Monitor(), Future[int]()
+    Timer(0.05, future.set_result, (3,)).start()
+    assert monitor.wait_for(future) == 3
+    Timer(0.05, monitor.stop).start()
+    with pytest.raises(Stopped):
+        monitor.wait_for(Future[int]())
+    assert monitor.wait_for(future) == 3  # is there already
 
 
 def test_stages_stop_if_they_are_asked_to_and_if_one_of_them_has_failed():

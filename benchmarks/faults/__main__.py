@@ -282,7 +282,8 @@ class Arguments:
     jobs: int = limited(2, at_least=1)
     """How many trials run at a time."""
     json: Path | None = None
-    """File to write; must be new, and the source without changes since its commit."""
+    """File to write; must be new, or with `--only` one whose rows are tried again, and the source
+    without changes since its commit."""
 
     def __post_init__(self):
         check_fields(self)
@@ -297,12 +298,21 @@ def attempt(trial: Trial) -> str:
     return ""
 
 
+def _before(arguments: Arguments) -> list[dict[str, Any]]:
+    """What earlier calls have stored; of none, the file is reserved."""
+    path = arguments.json
+    if path is None or not (arguments.only and path.is_file()):
+        measure.reserve(PROGRAM, "json", path)
+        return []
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
 def main(argv: list[str] | None = None) -> bool:
     """Tries everything and prints a table; returns whether all runs ended as they must."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     if arguments.json is not None:
         measure.require_commit(PROGRAM)
-    measure.reserve(PROGRAM, "json", arguments.json)
+    before = _before(arguments)
     # First: a commit that is made meanwhile is not what is tried.
     passed: dict[str, list[bool]] = {}
     results = {**measure.origin(studies.command(PROGRAM, arguments)), "passed": passed}
@@ -316,8 +326,8 @@ def main(argv: list[str] | None = None) -> bool:
                 if failure:
                     print(f"{row}: {failure}", file=sys.stderr, flush=True)
                 # After each trial, so that what was tried before a failure is kept.
-                studies.write(arguments.json, results)
-    print(table(results))
+                studies.write(arguments.json, [*before, results])
+    print(table([results]))
     return all(itertools.chain.from_iterable(passed.values()))
 
 

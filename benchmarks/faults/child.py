@@ -66,12 +66,15 @@ def fill_disk() -> None:
 
 
 def poisoned(tree: Any, number: int) -> Any:
-    """NaN in place of the last number of one array of floats, for any `number` one of them."""
+    """NaN in place of the first number of one array of floats, for any `number` one of them.
+
+    Last rows may only fill up the calls of several threads, and are dropped.
+    """
     leaves, structure = jax.tree.flatten(tree)
     floats = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, np.floating)]
     chosen = floats[number % len(floats)]
     leaves[chosen] = np.array(leaves[chosen])
-    leaves[chosen].reshape(-1)[-1] = np.nan
+    leaves[chosen].reshape(-1)[0] = np.nan
     return jax.tree.unflatten(structure, leaves)
 
 

@@ -1,16 +1,18 @@
 """The table of all faults."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from benchmarks import studies
+from benchmarks import measure, studies
 
 
-def table(results: Mapping[str, Any]) -> str:
+def table(results: Sequence[Mapping[str, Any]]) -> str:
     """How many trials of each fault ended as they must, in Markdown.
 
     Args:
-      results: the content of the JSON file.
+      results: contents of JSON files; a later one replaces the rows that it has tried again.
     """
-    rows = [[fault, f"{sum(found)} of {len(found)}"] for fault, found in results["passed"].items()]
-    return studies.with_origin(studies.as_table(["fault", "passed"], rows), results)
+    passed = {fault: found for each in results for fault, found in each["passed"].items()}
+    rows = [[fault, f"{sum(found)} of {len(found)}"] for fault, found in passed.items()]
+    origins = (measure.describe(each) for each in results)
+    return "\n\n".join([studies.as_table(["fault", "passed"], rows), *origins])

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import threading
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor
 from types import TracebackType
 
 import jax
@@ -209,9 +209,7 @@ class Program:
         if not self._compiled.done():
             self._monitor.announce(self._stage)
             with self._record("wait_program"):
-                while not self._compiled.done():
-                    self._monitor.check_stop()
-                    wait((self._compiled,), timeout=0.2)
+                return self._monitor.wait_for(self._compiled)
         return self._compiled.result()
 
     def run(self, *args: PyTree) -> PyTree[jax.Array]:

@@ -249,7 +249,7 @@ class _Loop:
                 return None
             self._curves[stage.name] = {name: x.tolist() for name, x in curves.items()}
         output = self._programs.of(stage).shapes.result().output
-        with self._record("load", stage):
+        with self._record("read", stage):
             return self._checkpoints.load_or_forget(stage.name, output)
 
     def _no_curves(self, stage: Stage) -> Curves:

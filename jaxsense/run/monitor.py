@@ -2,6 +2,8 @@
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, wait
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxsense.run.clock import Clock
+
+T = TypeVar("T")
 
 Listener = Callable[[str, int, int, dict[str, float]], None]
 """`(stage, done, total, metrics)`, called from the host between two chunks of work."""
@@ -81,6 +85,20 @@ class Monitor:
     def is_stopping(self) -> bool:
         """Whether the stages must stop."""
         return self._stop.is_set() or self._failure is not None
+
+    def wait_for(self, future: Future[T]) -> T:
+        """The result of a future, once it is there.
+
+        Args:
+          future: of something that runs in another thread.
+
+        Raises:
+          Stopped, Exception: see `check_stop`.
+        """
+        while not future.done():
+            self.check_stop()
+            wait((future,), timeout=0.2)
+        return future.result()
 
     def check_stop(self) -> None:
         """Checks whether the run continues.

@@ -122,7 +122,7 @@ def learn(
     """
     trained = train(key, config, programs, monitor, checkpoints)
     with monitor.clock.record("wait_program", "mission"):
-        scenario = programs.player.result().mission
+        scenario = monitor.wait_for(programs.player).mission
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
     beliefs = summary.beliefs(trained.outputs["beliefs"])

@@ -12,18 +12,20 @@ from jaxsense.config import parse_json
 from jaxsense.summary.blocks import StageTiming
 
 Kind = Literal[
-    "import", "start", "trace", "lower", "compile", "load", "run", "summarise", "save", "draw",
-    "wait_stages", "wait_program", "wait_saving", "wait_drawing",
+    "import", "start", "trace", "lower", "compile", "load", "read", "run", "summarise", "save",
+    "draw", "wait_stages", "wait_program", "wait_saving", "wait_drawing",
 ]  # fmt: skip
-"""What a thread does: `load` reads a traced or compiled program from the cache, or a checkpoint."""
+"""What a thread does: `load` reads a traced or compiled program from the cache, `read` a
+checkpoint."""
 
 MAIN = "MainThread"
 FILE = "timing.json"
 _MOST_NAMED = 3  # stages
 _NAMES: dict[Kind, str] = {
     "import": "importing", "start": "starting", "trace": "tracing", "lower": "lowering",
-    "compile": "compiling", "load": "loading", "run": "running", "summarise": "summing up",
-    "save": "saving", "draw": "drawing", "wait_stages": "waiting for stages",
+    "compile": "compiling", "load": "loading", "read": "reading the checkpoint of",
+    "run": "running", "summarise": "summing up", "save": "saving", "draw": "drawing",
+    "wait_stages": "waiting for stages",
     "wait_program": "waiting for programs of", "wait_saving": "waiting for saving",
     "wait_drawing": "waiting for drawing",
 }  # fmt: skip

@@ -5,15 +5,18 @@ import importlib
 import io
 import json
 import math
+import os
 import subprocess
 import sys
 import types
 
+import numpy as np
 import pytest
 
 from benchmarks import ROWS, __main__, peers
-from benchmarks.measure import Options, Side, compare, make_row
+from benchmarks.measure import Options, Side, compare, compiled, joined, make_row
 from jaxsense.run import devices, version
+from jaxsense.run.devices import Workers
 
 QUICK = ("physics_batch", "rays", "rays_warp", "jmvae")
 KEYS = {
@@ -207,3 +210,36 @@ def test_sides_take_turns_and_the_fastest_of_each_counts():
     row = compare("row", "x/s", ours, [side("b", 1.0)], Options(), peer="B")
     assert calls[-2 * Options().repeats :] == ["a", "b"] * Options().repeats
     assert row.batch == 1
+
+
+def test_all_cores_take_part_in_the_first_row():
+    # Once JAX has a backend, it is too late; see `devices.threads`.
+    code = """
+import jax
+from benchmarks import ROWS, __main__
+from benchmarks.measure import make_row
+from jaxsense.run import devices
+
+devices._cores = lambda: 2
+
+def row(options):
+    assert jax.default_backend() == "cpu"
+    assert devices.threads(2) == 2
+    return make_row("jmvae", "samples/s", 1.0, compile_s=0.0, batch=1)
+
+ROWS["jmvae"] = row
+__main__.main(["jmvae"])
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_as_many_threads_share_a_row_as_divide_its_batch():
+    workers = Workers(threads=3)
+    double = lambda x: 2 * x  # noqa: E731
+    side = compiled(double, np.arange(4.0), work=4, batch=4, workers=workers)
+    assert side.num_devices == 2
+    np.testing.assert_array_equal(joined(side.run()), [0, 2, 4, 6])
+    assert compiled(double, np.arange(6.0), work=6, batch=6, workers=workers).num_devices == 3

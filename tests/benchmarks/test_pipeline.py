@@ -76,7 +76,8 @@ def test_pairs_take_turns_at_being_first_and_the_median_of_their_ratios_counts(
     assert line in shown
     assert "| command | seconds: 0123456789 | fedcba9876 | ratio |" in shown
     changed = pipeline.table({**stored, "commit": "fedcba9876543210", "changed": True})
-    assert "| fedcba9876, changed since | ratio |" in changed
+    assert "; commit fedcba9876 on 20" in changed
+    assert ", whose code has changed since; python" in changed
     assert pipeline.table(stored) in capsys.readouterr().out
 
 

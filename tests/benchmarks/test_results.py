@@ -1,6 +1,7 @@
 """The tables of `benchmarks/RESULTS.md`."""
 
 import json
+import re
 import subprocess
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import jaxsense
 from benchmarks import ROWS, history, results
 
+ROOT = Path(__file__).parents[2]
 PACKAGE = Path(jaxsense.__file__).parent  # which may be installed elsewhere
 ROW = {
     "row": "rays", "unit": "rays/s", "ours": 1234567.8, "peer": "mujoco", "theirs": 45678.9,
@@ -125,9 +127,10 @@ def test_the_code_of_every_row_is_known():
     assert history.CODE.keys() == ROWS.keys()
     for places in history.CODE.values():
         for place in (*places, *history._COMPILED):
-            path, _, function = place.partition(":")
-            assert (PACKAGE / path).exists(), place
-            assert not function or f"\ndef {function}(" in (PACKAGE / path).read_text("utf-8")
+            path, _, name = place.partition(":")
+            file = ROOT / path if path.startswith("benchmarks/") else PACKAGE / path
+            assert file.exists(), place
+            assert not name or re.search(rf"\n(def|class) {name}\b", file.read_text("utf-8"))
 
 
 def commits(content):
@@ -156,11 +159,11 @@ def test_results_name_commits_of_the_history(path, past):
     assert not lost, "measure again with a committed tree, and keep its commit"
 
 
-@pytest.mark.parametrize("name", [*results.ROWS, *results.PIPELINE])
+@pytest.mark.parametrize("name", results.CHANGES)
 def test_rows_tell_whether_their_code_has_changed(name, past, tmp_path):
     stored = (results.RESULTS / name).read_text(encoding="utf-8")
     (tmp_path / name).write_text(stored, encoding="utf-8")
-    history.note(tmp_path / name)
+    history.note(tmp_path / name, results.CHANGES[name])
     noted = (tmp_path / name).read_text(encoding="utf-8")
     assert noted == stored, "run python -m benchmarks.results"
 
@@ -223,7 +226,7 @@ def test_whole_commands_note_changes(repository):
     path.write_text(json.dumps({"commit": commit, "commands": {}}))
     for text, expected in (("x = 1  # m", False), ("x = 2", True)):
         repository("raycast.py", text)
-        history.note(path)
+        history.note(path, "train")
         assert json.loads(path.read_text())["changed"] is expected
 
 

@@ -54,7 +54,8 @@ def test_the_largest_part_and_what_was_waited_for_are_told():
 
 def test_stages_count_all_threads():
     loaded = span("load", 0, 0.25, "dqn", "compile_0")
-    assert profile.of_stages([*SPANS, loaded, span("load", 0, 9)]) == {
+    read = span("read", 0, 9, "dqn", "dqn")  # a checkpoint: nothing is compiled
+    assert profile.of_stages([*SPANS, loaded, read, span("load", 0, 9)]) == {
         "jmvae": {"compile_s": 5.0, "run_s": 2.0},
         "dqn": {"compile_s": 4.25, "run_s": 0.0},
     }
