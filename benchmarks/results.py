@@ -29,6 +29,7 @@ from benchmarks import (
     where,
 )
 from benchmarks.digits import table as digits
+from benchmarks.faults import table as faults
 from benchmarks.fusions import table as fusions
 from benchmarks.raw import report as raw
 from benchmarks.seeds import rows, tables
@@ -170,6 +171,7 @@ TABLES: Mapping[str, _Tables] = {
     "gate.json": {None: gate.table, "search": gate.of_search},
     "where.json": {None: where.table, "accuracy": where.of_accuracies},
     **{name: {None: pipeline.table} for name in PIPELINE},
+    "faults.json": {None: faults.table},
     "first_steps.json": {None: first_steps.table},
     "kernels.json": {None: kernels.table},
     "place.json": {None: place.table},

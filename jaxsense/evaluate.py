@@ -25,6 +25,7 @@ from jaxsense.run.programs import OwnPolicies
 from jaxsense.show import animation, drawing, mission_plots, page, tables
 from jaxsense.show.terminal import Display, print_table, say
 from jaxsense.summary import compare, profile
+from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.read import EVALUATIONS
 
 PROGRAM = "jaxsense.evaluate"
@@ -175,8 +176,10 @@ def _write(
         blocks = {**(before["mission"] if before else {}), **missions}
         found = _evaluation(config, compare.compared(blocks))
         rundir.write_json(path, found)
-        plot = mission_plots.policies(found["mission"], found["num_pois"])
-        files.write(path.with_suffix(".svg"), drawing.svg(plot))
+        # Robots that are alone or fail are not drawn.
+        if policies_of(found["mission"]):
+            plot = mission_plots.policies(found["mission"], found["num_pois"])
+            files.write(path.with_suffix(".svg"), drawing.svg(plot))
         report = _report(run, trained)
     return [*written, f"The metrics are in {path}, and with all others in {report}."]
 

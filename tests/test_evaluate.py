@@ -93,6 +93,17 @@ def test_policies_that_play_in_the_same_arenas_share_a_file(evaluated, tmp_path)
     assert page.count("Evaluation: 3 PoIs in 3 m") == 2
 
 
+def test_an_evaluation_of_robots_that_are_alone_has_no_plot_of_policies(evaluated, tmp_path):
+    path = tmp_path / "run"
+    shutil.copytree(evaluated[0], path)
+    alone = {"camera_alone": read(path)["mission"]["nearest"]}
+    write(evaluate.Arguments(path, episodes=1, seed=3), alone)
+    of_seed = NAME.replace("seed-0", "seed-3")
+    assert set(read(path, of_seed)["mission"]) == {"camera_alone"}
+    assert not (path / "evaluations" / of_seed).with_suffix(".svg").exists()
+    assert "camera_alone" in (path / "report.html").read_text(encoding="utf-8")
+
+
 def test_an_evaluation_waits_for_another_one_that_writes_and_says_so(evaluated, tmp_path, capsys):
     path = tmp_path / "run"
     shutil.copytree(evaluated[0], path)

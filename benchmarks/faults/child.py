@@ -29,7 +29,7 @@ from jaxsense.core import supervised
 from jaxsense.core.supervised import FitState
 from jaxsense.dqn import training as dqn_training
 from jaxsense.dqn.training import DqnState
-from jaxsense.run import cli
+from jaxsense.run import cli, rundir
 from jaxsense.run.compilation import Program
 from jaxsense.show import plots
 from jaxsense.training.stage import Progress
@@ -175,7 +175,7 @@ if __name__ == "__main__":
         poison_gradients(stage, int(fault.removeprefix("gradient")))
         cli.run(lambda: train.main(argv))
     elif fault == "clock":
-        train.datetime = StoppedClock
+        rundir.datetime = StoppedClock
         cli.run(lambda: train.main(argv))
     else:
         strike_at(stage, fault)
