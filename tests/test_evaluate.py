@@ -96,10 +96,12 @@ def test_policies_that_play_in_the_same_arenas_share_a_file(evaluated, tmp_path)
 def test_an_evaluation_of_robots_that_are_alone_has_no_plot_of_policies(evaluated, tmp_path):
     path = tmp_path / "run"
     shutil.copytree(evaluated[0], path)
-    alone = {"camera_alone": read(path)["mission"]["nearest"]}
+    blocks = read(path)["mission"]
+    alone = {"camera_alone": blocks["nearest"]}
+    alone["bytes_per_detection"] = blocks["bytes_per_detection"]
     write(evaluate.Arguments(path, episodes=1, seed=3), alone)
     of_seed = NAME.replace("seed-0", "seed-3")
-    assert set(read(path, of_seed)["mission"]) == {"camera_alone"}
+    assert set(read(path, of_seed)["mission"]) == set(alone)
     assert not (path / "evaluations" / of_seed).with_suffix(".svg").exists()
     assert "camera_alone" in (path / "report.html").read_text(encoding="utf-8")
 
