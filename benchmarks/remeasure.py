@@ -70,6 +70,11 @@ def _of_study(name: str, content: Any) -> Iterator[Measurement]:
     yield _of(name, content["command"], content["device"], content["versions"])
 
 
+def _of_faults(name: str, calls: Any) -> Iterator[Measurement]:
+    """All faults in one command; later ones have tried some again."""
+    yield from _of_study(name, calls[0])
+
+
 def _of_rows(name: str, rows: Any) -> Iterator[Measurement]:
     """Rows of the benchmark of speed, in one command."""
     yield _of(name, results.command(rows), rows[0]["device"], rows[0]["versions"])
@@ -100,6 +105,7 @@ def _of(name: str, command: str, device: str, versions: Mapping[str, str]) -> Me
 
 
 _MADE: Mapping[str, Callable[[str, Any], Iterator[Measurement]]] = {
+    "faults": _of_faults,
     "tasks": _of_tasks,
     "seeds": _of_seeds,
     **{Path(name).stem: _of_rows for name in results.ROWS},

@@ -209,7 +209,7 @@ def test_own_policies_reach_the_programs_of_a_run(monkeypatch):
 
 
 def test_own_policies_reach_the_missions_of_a_run(team, monkeypatch):
-    played = lambda mission, compiler, batch, workers: mission  # noqa: E731
+    played = lambda mission, compiler, batch, workers, runs_long: mission  # noqa: E731
     monkeypatch.setattr(programs.missions, "Player", played)
     run = SimpleNamespace(config=CONFIG, policies=OWN, workers=ALONE, player=Future())
     with Compiler(Monitor()) as compiler:
