@@ -46,15 +46,12 @@ def compiler_options(*, runs_long: bool = False, wide_vectors: bool = False) -> 
 
     On a CPU, level 1 compiles a third faster than level 3, with equally fast programs. The older
     code generator, which a program can choose up to JAX 0.10, saves another third, but its programs
-    may be a third slower. Passes that move what is invariant out of loops, one level of nested
-    loops at a time, and constants back in have all others run again after each level, which is a
-    sixth of the compile time. On an accelerator, autotuning of matrix products would take most of
-    the time.
+    may be a third slower. Passes that move invariants out of nested loops repeat all others, for a
+    sixth of the compile time. On an accelerator, autotuning would take most of it.
 
     Args:
       runs_long: whether the program runs much longer than it compiles.
-      wide_vectors: whether a CPU that can takes vectors of 512 bits: roadmaps then take half as
-        long, but Q-learning a sixth longer.
+      wide_vectors: of 512 bits on a CPU: roadmaps take half as long, Q-learning a sixth longer.
 
     Returns:
       The options that the installed compiler supports; none if JAX is set to compile quickly.
@@ -138,8 +135,7 @@ def start(number: int | None) -> Workers:
         threads as cores, at most 8. See `threads` for when fewer are used.
 
     Returns:
-      The workers that share scenes and missions. A training stays on one device, because exchanging
-      gradients takes longer than computing them.
+      The workers that share scenes and missions. A training stays on one device.
 
     Raises:
       ConfigError: if there are fewer devices.
@@ -369,7 +365,7 @@ def fetched(values: PyTree[jax.Array]) -> PyTree[np.ndarray]:
 def joined(
     run: Callable[[int], PyTree], number: int, threads: int, shapes: PyTree[jax.ShapeDtypeStruct]
 ) -> PyTree[np.ndarray]:
-    """Joins the results of parts, on the host if there are several, each once it is there.
+    """Joins the results of parts, on the host if there are several.
 
     Args:
       run: computes the part with an index.
@@ -398,10 +394,7 @@ def _empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
 
 
 def give_back_freed() -> None:
-    """Gives memory that is free back to the system.
-
-    The compiler and surveys free hundreds of megabytes in pieces, which glibc would keep for later.
-    """
+    """Gives the system back what compiler and surveys have freed, which glibc would keep."""
     # Other systems have no such function, or need none.
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
