@@ -43,10 +43,10 @@ PAGES = (
     *sorted((_HERE.parent / "docs").glob("*.md")),
     _HERE / "RESULTS.md",
 )
-ROWS = ("cpu.json", "h100.json", "h200x2.json")
+ROWS = ("cpu.json", "h100.json", "h200.json", "h200x2.json")
 """What `python -m benchmarks` has written."""
 PIPELINE = tuple(
-    f"pipeline{of}.json" for of in ("", "_newest", "_missions", "_accelerator", "_evaluation")
+    f"pipeline{of}.json" for of in ("", "_newest", "_missions", "_accelerator")
 )
 """What `python -m benchmarks.pipeline` has."""
 CHANGES: Mapping[str, str | None] = {
