@@ -20,7 +20,7 @@ from benchmarks.measure import save
 from jaxsense.config.checks import check_fields, limited, require
 from jaxsense.config.options import Name
 from jaxsense.run import cli
-from jaxsense.show.colours import MARKERS
+from jaxsense.show.colours import series
 
 PROGRAM = "benchmarks.imperfect_plot"
 _LABELS = {
@@ -93,7 +93,7 @@ def draw(
     figure = Figure(figsize=(3 * len(sweeps), 2.4 * len(figures)), layout="constrained")
     axes = figure.subplots(len(figures), len(sweeps), sharex="col", sharey="row", squeeze=False)
     for i, (name, each) in enumerate(found.items()):
-        style = {"color": f"C{i}", "marker": MARKERS[i % len(MARKERS)], "label": name}
+        style = {**series(i), "label": name}
         for column, sweep in zip(axes.T, sweeps, strict=True):
             for axis, figure_name in zip(column, figures, strict=True):
                 _draw_curve(axis, of_curves[name][sweep], each["usual"], figure_name, style)

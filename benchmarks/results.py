@@ -45,9 +45,7 @@ PAGES = (
 )
 ROWS = ("cpu.json", "h100.json", "h200.json", "h200x2.json")
 """What `python -m benchmarks` has written."""
-PIPELINE = tuple(
-    f"pipeline{of}.json" for of in ("", "_newest", "_missions", "_accelerator")
-)
+PIPELINE = tuple(f"pipeline{of}.json" for of in ("", "_newest", "_missions", "_accelerator"))
 """What `python -m benchmarks.pipeline` has."""
 CHANGES: Mapping[str, str | None] = {
     **dict.fromkeys(ROWS),

@@ -146,6 +146,13 @@ def test_a_policy_has_one_colour_and_marker_that_all_can_tell_apart(sight):
         assert apart[np.triu_indices(len(seen), 1)].min() > 13
 
 
+def test_curves_that_belong_to_no_policy_differ_as_policies_do():
+    styles = [colours.series(number) for number in range(len(POLICIES))]
+    assert len({style["color"] for style in styles}) == len(styles)
+    assert len({style["marker"] for style in styles}) == len(styles)
+    assert colours.series(len(POLICIES)) == styles[0]
+
+
 def test_every_place_of_missions_stands_in_a_picture_of_times():
     def place(number, robots, seconds, side=CONFIG.arena.side, episodes=8):
         times = {"latent": seconds, "naive": seconds + 1}

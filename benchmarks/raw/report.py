@@ -32,11 +32,11 @@ from jaxsense import PRESETS
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
 from jaxsense.run import cli
-from jaxsense.show.colours import MARKERS, class_colour
+from jaxsense.show.colours import class_colour, series
 from jaxsense.summary.compare import bounds, interval
 
 PROGRAM = "benchmarks.raw.report"
-_COLOURS = {"paper": "C3", "paper, standardised": "C1", "ours, sum of squares": "C2"}
+_LINES = "ours", "paper", "ours, sum of squares", "paper, standardised"
 _KNOWN = 1 / 3, 2 / 3  # accuracies of chance, and of one who knows the colour or the shape alone
 _ALL_LOOKS, _SINGLE_LOOKS, _DECODERS = range(3)  # networks whose gradients are measured
 
@@ -214,7 +214,6 @@ def draw(found: Found) -> Figure:
         ylabel="right after one look by each sensor",
         ylim=(0.25, 1.02),
     )
-    axes["ratio"].legend(fontsize="small", loc="lower left")
     for name in OF_DEPTH:
         each = [found["depth", f"{name}, depth {depth}"] for depth in DEPTHS]
         _line(axes["units"], np.log2(DEPTHS), [of["units"] for of in each], name)
@@ -222,7 +221,6 @@ def draw(found: Found) -> Figure:
             of_network = [_gradient(of, network) for of in each]
             _line(axes["gradient"], np.log2(DEPTHS), of_network, name, style)
     axes["units"].set(ylabel="active units, of 2", ylim=(-0.1, 2.1))
-    axes["units"].legend(fontsize="small", loc="lower left")
     axes["gradient"].set(
         xlabel="hidden layers of every network",
         ylabel="gradient of the first layer over the last's\n(solid: encoder, dashed: decoders)",
@@ -232,6 +230,15 @@ def draw(found: Found) -> Figure:
         axes[name].set_xticks(np.log2(DEPTHS), [str(depth) for depth in DEPTHS])
     for axis in axes.values():
         axis.grid(alpha=0.3)
+    # The axes have some lines in common.
+    handles = {
+        name: line
+        for axis in (axes["ratio"], axes["units"])
+        for line, name in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        handles.values(), handles, loc="outside upper right", ncols=len(handles), frameon=False
+    )
     return figure
 
 
@@ -241,7 +248,7 @@ def _draw_ablation(axis: Axes, found: Found) -> None:
         values = np.array(found["ablation", variant.name]["pair"])
         low, high = bounds(values)
         is_named = variant.name in (PAPER.name, OURS.name)
-        colour = "C0" if variant.name.startswith(OURS.name) else "C3"
+        colour = series(0 if variant.name.startswith(OURS.name) else 1)["color"]
         axis.plot(values, np.full(len(values), place), ".", color=colour, alpha=0.3)
         axis.plot([low, high], [place, place], color=colour, linewidth=2.5)
         axis.plot(values.mean(), place, "o", color=colour, markersize=9 if is_named else 6)
@@ -255,10 +262,10 @@ def _draw_ablation(axis: Axes, found: Found) -> None:
 def _line(axis: Axes, places: np.ndarray, each: list, name: str, style: str = "-") -> None:
     """Means over the seeds with their range, at `[K]` places."""
     values = np.array(each, float)
-    colour = _COLOURS.get(name, "C0")
-    marker = MARKERS[[*_COLOURS, "ours"].index(name)]
-    axis.plot(places, values.mean(axis=1), style, color=colour, marker=marker, label=name)
-    axis.fill_between(places, values.min(axis=1), values.max(axis=1), color=colour, alpha=0.15)
+    of_line = series(_LINES.index(name))
+    axis.plot(places, values.mean(axis=1), style, label=name, **of_line)
+    low, high = values.min(axis=1), values.max(axis=1)
+    axis.fill_between(places, low, high, color=of_line["color"], alpha=0.15)
 
 
 def draw_posteriors(found: Found) -> Figure:

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks.tasks.record import Point
-from jaxsense.show.colours import MARKERS
+from jaxsense.show.colours import series
 from jaxsense.show.drawing import name_ends
 from jaxsense.tasks import estimate
 
@@ -40,7 +40,7 @@ def draw(points: Iterable[Point]) -> Figure:
         for name, curve in _grouped(found, lambda point: point.learner).items():
             last = _draw_curve(axis, name, learners[name], curve)
             text = name if last >= _LOWEST else f"{name}: {last:.2f}"
-            ends.append((text, last, f"C{learners[name]}"))
+            ends.append((text, last, series(learners[name])["color"]))
         axis.axhline(1.0, color="0.5", linestyle=":")
         axis.set(title=f"{task}, {agent}", ylim=(_LOWEST, 1.05))
         axis.xaxis.set_major_formatter(lambda steps, _: f"{steps / 1000:g}")
@@ -59,12 +59,11 @@ def _draw_curve(axis: Axes, name: str, number: int, points: Sequence[Point]) -> 
     """Draws the curve of a learner in one task, and gives its last value."""
     of_steps = _grouped(points, lambda point: point.steps)
     found = [estimate(np.array([p.fraction for p in each])) for each in of_steps.values()]
-    steps, colour = list(of_steps), f"C{number}"
+    steps, style = list(of_steps), series(number)
     values = [each.value for each in found]
-    marker = MARKERS[number % len(MARKERS)]
-    axis.plot(steps, values, color=colour, marker=marker, markersize=3, linewidth=1, label=name)
+    axis.plot(steps, values, markersize=3, linewidth=1, label=name, **style)
     low, high = [each.low for each in found], [each.high for each in found]
-    axis.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
+    axis.fill_between(steps, low, high, color=style["color"], alpha=0.2, linewidth=0)
     return values[-1]
 
 

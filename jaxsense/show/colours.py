@@ -10,7 +10,7 @@ from jaxsense.config import ArenaConfig
 from jaxsense.summary.profile import Kind
 
 RGB = tuple[float, float, float]
-MARKERS = "oDs^"
+MARKERS = "oDs^vPX<>pd"
 SOFT = "#59616e"
 """Colour of what matters less."""
 
@@ -23,7 +23,6 @@ _POLICY_COLOURS = {
     "naive_2": ("#05475b", "#47def1"), "naive_3": ("#d00e4d", "#ff8bb5"),
     "random": ("#1711c8", "#af9aff"),
 }  # fmt: skip
-_MARKERS = "oDs^vPX<>pd"
 _OTHER_POLICY = ("#0fb851", "#0cc75f"), "*"  # a custom one
 ON_DARK = dict([*_POLICY_COLOURS.values(), _OTHER_POLICY[0]])
 """Counterparts of the colours of policies on a dark page, where they must differ as well."""
@@ -57,13 +56,24 @@ def policy_colour(name: str) -> str:
 
 def policy_marker(name: str) -> str:
     """The marker of a policy, the same in all plots."""
-    markers = dict(zip(_POLICY_COLOURS, _MARKERS, strict=True))
+    markers = dict(zip(_POLICY_COLOURS, MARKERS, strict=True))
     return markers.get(name, _OTHER_POLICY[1])
+
+
+def series(number: int) -> dict[str, str]:
+    """The colour and marker of a curve that belongs to no policy, sensor or class, by its number.
+
+    They are those of policies, one after another, since they differ for everybody.
+    """
+    return {
+        "color": [*_POLICY_COLOURS.values()][number % len(_POLICY_COLOURS)][0],
+        "marker": MARKERS[number % len(MARKERS)],
+    }
 
 
 def class_marker(index: int) -> str:
     """The marker of a class, by its place in `arena.classes`."""
-    return _MARKERS[index % len(_MARKERS)]
+    return MARKERS[index % len(MARKERS)]
 
 
 def class_colour(arena: ArenaConfig, label: str) -> RGB:

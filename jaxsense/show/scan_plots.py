@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxsense.config import Config
-from jaxsense.show.colours import SOFT, as_hex, as_srgb, class_colour
+from jaxsense.show.colours import SOFT, as_hex, as_srgb, class_colour, series
 from jaxsense.show.pairs import Pairs
 
 _CLASSES, _COLUMNS = 4, 6  # side by side
@@ -89,7 +89,7 @@ def windows(of_sensors: Sequence[Pairs]) -> Figure:
                     ax.imshow(as_srgb(values)[None], aspect="auto", interpolation="nearest")
                     ax.set(yticks=[], xticks=[])
                 else:
-                    ax.plot(values, ".", color=f"C{kind}", markersize=2)
+                    ax.plot(values, ".", color=series(kind)["color"], markersize=2)
                     ax.set_ylim(0, 1.05 * max(readings.max(), 1e-6))
             for ax in row[number:]:
                 ax.set_axis_off()
@@ -123,15 +123,17 @@ def _draw_residuals(histogram: Axes, sizes: Axes, found: Pairs) -> None:
         label = f"{name}, median {median:+.4f}"
         bins = np.linspace(-end, end, _BINS)
         weights = np.full(len(each), 1 / len(each))
+        colour = series(i)["color"]
         histogram.hist(
-            each, bins.tolist(), weights=weights, histtype="step", color=f"C{i}", label=label
+            each, bins.tolist(), weights=weights, histtype="step", color=colour, label=label
         )
         size = np.sort(np.abs(each))
-        sizes.plot(size, 1 - np.arange(len(size)) / len(size), color=f"C{i}", label=name)
+        sizes.plot(size, 1 - np.arange(len(size)) / len(size), color=colour)
     reading = f"residual of {found.sensor.name}{unit}"
     histogram.set(xlabel=reading, ylabel="share of rays", yscale="log")
     sizes.set(xlabel=f"size of the {reading}", ylabel="share of rays of at least this size")
     sizes.set(xscale="log", yscale="log", xlim=(_SMALLEST * end, None))
+    above = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+    histogram.legend(fontsize=8, ncols=2, frameon=False, **above)
     for axis in (histogram, sizes):
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
