@@ -1,4 +1,4 @@
-"""`python -m benchmarks.film RUN --plot FILE`: animates one mission of the learned policy."""
+"""`python -m benchmarks.film RUN --plot FILE`: animates one mission."""
 
 import dataclasses
 import sys
@@ -8,7 +8,7 @@ from typing import Annotated
 import jax
 import rich.console
 
-from benchmarks import studies
+from benchmarks import measure, studies
 from jaxsense import mission
 from jaxsense.config import ConfigError
 from jaxsense.config.checks import check_fields, require
@@ -21,7 +21,6 @@ from jaxsense.show import animation
 from jaxsense.show.terminal import Display
 
 PROGRAM = "benchmarks.film"
-_POLICY = "latent"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +31,8 @@ class Arguments:
     """The directory of a finished run, `latest`, or `pretrained:PRESET`."""
     plot: Path = Path("mission.svg")
     """Animation to write; must be new."""
+    policy: str = "latent"
+    """What decides where the robots look; the learned policy by default."""
     seed: int = 0
     """Seed of the arena and of all noise."""
     arena: ArenaArguments = ArenaArguments()  # noqa: RUF009 (frozen, in another file)
@@ -50,7 +51,8 @@ def main(argv: list[str] | None = None) -> None:
     config, models = studies.load(PROGRAM, arguments.run)
     sizes = dataclasses.asdict(arguments.arena)
     arena = {name: value for name, value in sizes.items() if value is not None}
-    title = f"{_POLICY} policy"
+    policy = arguments.policy
+    title = f"{policy} policy"
     try:
         if arena or arguments.robots:
             config = dataclasses.replace(
@@ -59,18 +61,19 @@ def main(argv: list[str] | None = None) -> None:
                 robots=arguments.robots or config.robots,
                 mdp=dataclasses.replace(config.mdp, partly_seen_starts=False),
             )
-            title = f"{_POLICY}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
+            title = f"{policy}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
         scenario = mission.make_mission(config)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
-    case = mission.cases(config, scenario.policies)[_POLICY]
+    cases = mission.cases(config, scenario.policies)
+    measure.require_known(PROGRAM, "policy", (policy,), cases)
+    played = {policy: cases[policy]}
     with (
         Display(rich.console.Console()) as display,
         Compiler(Monitor(display.show), cli.keep_programs(PROGRAM, cli.CACHE, config)) as compiler,
     ):
         player = missions.Player(scenario, compiler, batch=1)
-        played = player.play(jax.random.key(arguments.seed), models, {_POLICY: case}, episodes=1)
-    recording = played.recording
+        recording = player.play(jax.random.key(arguments.seed), models, played, 1).recording
     film = animation.draw(
         config, recording.records, recording.end, models.fusion, scenario.fields_of_view, title
     )

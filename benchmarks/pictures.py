@@ -151,7 +151,9 @@ def _film(words: str, picture: str) -> Written:
 _TEAM = " ".join(["--robots", *["camera"] * 3, *["lidar"] * 3])
 _IMPERFECT = ("imperfect_default", "imperfect_noisy")
 DRAWINGS: tuple[Drawing, ...] = (
-    _film("pretrained:default --seed 2", "mission.svg"),  # in whose arena robots skip looks
+    # In whose arena robots skip looks.
+    _film("pretrained:default --seed 2", "mission.svg"),
+    _film("pretrained:default --seed 2 --policy naive", "mission_naive.svg"),
     _film(
         f"pretrained:team --arena.num-pois 16 --arena.side 6 {_TEAM}", "figures/team_mission.svg"
     ),

@@ -380,7 +380,7 @@ def notes(film):
     return sorted(e.text for e in found if e.text)
 
 
-@pytest.mark.parametrize("name", ["mission.svg", "figures/team_mission.svg"])
+@pytest.mark.parametrize("name", ["mission.svg", "mission_naive.svg", "figures/team_mission.svg"])
 def test_films_of_the_pages_say_what_films_say_today(picture, name):
     docs = Path(__file__).parents[1] / "docs"
     shown = ElementTree.parse(docs / name).getroot()

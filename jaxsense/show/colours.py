@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,7 +61,7 @@ def policy_marker(name: str) -> str:
     return markers.get(name, _OTHER_POLICY[1])
 
 
-def series(number: int) -> dict[str, str]:
+def series(number: int) -> dict[str, Any]:
     """The colour and marker of a curve that belongs to no policy, sensor or class, by its number.
 
     They are those of policies, one after another, since they differ for everybody.
