@@ -144,6 +144,7 @@ TABLES: Mapping[str, _Tables] = {
     "seeds.json": {
         "readme": partial(tables.of_presets, rows=rows.OF_README, presets=("paper", "default")),
         "worth": partial(tables.worth, names=tables.EVALUATED),
+        "table_one": partial(tables.table_one, presets=("paper", "default")),
         "paper": partial(tables.of_presets, rows=rows.OF_FIGURES, presets=("paper", "default")),
         "default": partial(tables.of_missions, preset="default"),
         "raw": partial(tables.of_presets, rows=rows.OF_RAW, presets=("raw", "default")),

@@ -13,12 +13,12 @@ FILE = Path(__file__).parents[1] / "results" / "seeds.json"
 Figures = Mapping[str, Any]
 """Of one run, by name: numbers, or lists with one for each agent."""
 
-_PAPER = {
+TABLE_ONE = {
     "camera": [True, False, False],
     "lidar": [False, False, True],
     "joint": [True, True, True],
 }
-"""Table I: which classes each encoder tells apart."""
+"""Table I of the paper: which classes each encoder tells apart."""
 
 
 def gather(runs: Iterable[Path], group: str | None = None) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def of_summary(own: Mapping[str, Any]) -> Figures:
         found["table_one"] = sum(
             is_clear == of_paper
             for name, clear in jmvae["unambiguous"].items()
-            for is_clear, of_paper in zip(clear, _PAPER.get(name, ()), strict=False)
+            for is_clear, of_paper in zip(clear, TABLE_ONE.get(name, ()), strict=False)
         )
         for name, wanted in ("unambiguous", True), ("ambiguous", False):
             found[name] = [sigma for is_clear, sigma in cells if is_clear == wanted]

@@ -8,8 +8,9 @@ from typing import Any, TypeAlias
 
 from benchmarks.seeds.plan import Group
 from benchmarks.seeds.rows import Row
-from benchmarks.seeds.runs import Figures
-from benchmarks.studies import in_words
+from benchmarks.seeds.runs import TABLE_ONE, Figures
+from benchmarks.studies import as_table, in_words
+from jaxsense import PRESETS
 
 _OF_SUMMARY = (
     ("accuracy of the finished map", "accuracy", "{:.4f}"),
@@ -74,6 +75,31 @@ def of_presets(
     command = "python -m jaxsense.train --preset PRESET --seed S"
     columns = {name: found[preset] for name, preset in zip(names, presets, strict=True)}
     return "\n".join([*lines, "", _about(columns, command)])
+
+
+def table_one(found: Mapping[str, Any], presets: tuple[str, ...]) -> str:
+    """Table I of the paper, and how many of its cells the trainings of presets reproduce.
+
+    Args:
+      found: from `gather`.
+      presets: their names.
+    """
+    heads = "class", "camera", "LiDAR", "camera & LiDAR"
+    cells = zip(*(TABLE_ONE[name] for name in ("camera", "lidar", "joint")), strict=True)
+    rows = [
+        [f"{label} ({number})", *(str(is_clear).lower() for is_clear in of_class)]
+        for number, (label, of_class) in enumerate(
+            zip(PRESETS["paper"].arena.classes, cells, strict=True), 1
+        )
+    ]
+    number = sum(map(len, TABLE_ONE.values()))
+    lines = [f"Cells of {number} that each training reproduces:", ""]
+    for preset in presets:
+        same = [run["figures"]["table_one"] for run in found[preset].values()]
+        lines.append(f"- `{preset}`, {_of_seeds(found[preset])}: {_range('{}', same)}")
+    command = "python -m jaxsense.train --preset PRESET --seed S"
+    about = _about({f"`{preset}` preset": found[preset] for preset in presets}, command)
+    return "\n".join([as_table([*heads], rows), "", *lines, "", about])
 
 
 def _cell(row: Row, runs: list[Figures]) -> str:

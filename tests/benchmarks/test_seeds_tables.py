@@ -57,6 +57,15 @@ def test_cells_go_from_the_minimum_to_the_maximum_of_the_seeds(runs):
     )
 
 
+def test_table_one_says_what_the_paper_says_and_how_many_cells_are_the_same(runs):
+    found = gather([runs("paper", 100), runs("paper", 101)])
+    table = tables.table_one(found, ("paper",))
+    assert cells(table, "green cylinder (1)") == ["true", "false", "true"]
+    assert cells(table, "red cylinder (2)") == ["false", "false", "true"]
+    assert cells(table, "red cube (3)") == ["false", "true", "true"]
+    assert "- `paper`, seeds 100 to 101: 8" in table.splitlines()
+
+
 def test_cores_and_dates_stand_below_the_table_for_runs_that_note_them(runs):
     noted = {**SUMMARY, "cores": 16, "date": "2026-11-28"}
     later = {**noted, "date": "2026-11-29"}
