@@ -83,7 +83,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     Args:
       rows: as `python -m benchmarks` writes them and `history.note` adds to them.
     """
-    heads = ["row", "ours", "peer", "theirs", "ratio", "at once", "commit"]
+    heads = ["row", "ours", "peer", "theirs", "ratio", "batch", "commit"]
     cells = []
     for row in rows:
         theirs = row["theirs"] is not None

@@ -42,7 +42,7 @@ def _constants():
     yield f"{camera.num_pixels} pixels over {camera.field_of_view:g} degrees"
     yield f"{viewpoint.min_distance} to {viewpoint.max_distance} m"
     yield f"Robots are {amiro.BODY_TOP:.3f} m high, or {amiro.LIDAR_TOP} m with a LiDAR"
-    yield f"at most {lost} of those at PoIs, and fewer if it rejects {rejected} of those at nothing"
+    yield f"at most {lost} of those at PoIs, or fewer if that is enough to reject {rejected} of"
     yield f"exceeds the accuracy by at most {novelty._TOLERANCE} in both halves"
     yield f"an error of at most {jmvaes._EXACT} nats"
     yield f"{compare._MOST_TIMES} times that of exact Bayes plus {compare._MOST_NATS} nats"
@@ -58,7 +58,7 @@ def _constants():
     yield f"at most {100 * search._STEP:g} cm apart"
     for task in ("noisy-v0", "many-v0"):
         yield f"a look costs {jaxsense.make(task).mdp.reward.look_cost} nats"
-    yield f"`--seed` selects the arena; in the default one, {demo.Arguments().seed},"
+    yield f"`--seed` selects the arena; with the default, {demo.Arguments().seed},"
     yield f"`--seed`, by default {demo.Arguments().seed},"
     yield f"each second of a robot's work costs {jaxsense.make('team-v0').mdp.config.second_cost}"
 

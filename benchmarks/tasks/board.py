@@ -145,7 +145,7 @@ def _about(rows: Sequence[Row]) -> list[str]:
         found.setdefault(text, []).append(each.policy)
     lines = [f"{', '.join(dict.fromkeys(names))}: {text}." for text, names in found.items()]
     minutes = round(sum(each.wall_seconds or 0.0 for each in rows) / 60)
-    took = f"All trainings, compilations and evaluations took {minutes} minute"
+    took = f"Training, compiling and evaluating took {minutes} minute"
     return [*lines, f"{took}{'s' if minutes != 1 else ''} of a core."] if rows else []
 
 

@@ -78,9 +78,9 @@ class JmvaeConfig(Section, place="jmvae"):
     """How a look updates a belief. `in_place`, as in the paper, keeps the last look of each sensor.
     `filter` accumulates looks, see section `filter`."""
     restarts: int = limited(3, at_least=1, at_most=1000)
-    """Number of trainings from different random parameters. The run keeps the one with the lowest
-    loss among those whose beliefs reproduce class probabilities exactly, or among all if the JMVAE
-    learns from scans."""
+    """Number of times to train, from different random parameters. The run keeps the result with the
+    lowest loss among those whose beliefs reproduce class probabilities exactly, or among all if the
+    JMVAE learns from scans."""
     looks: int = limited(4, at_least=2, at_most=100)
     """Number of looks by each sensor at a PoI, if the JMVAE learns from scans."""
     samples_per_class: int = limited(10000, at_least=1)
