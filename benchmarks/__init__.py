@@ -30,7 +30,6 @@ from benchmarks.physics import (
 from benchmarks.rays import rays, rays_warp, rays_warp_bvh
 from benchmarks.team import team_mdp
 from benchmarks.time_to_optimal import time_to_optimal_rejax, time_to_optimal_sb3
-from benchmarks.train import train, train_warm
 
 ROWS: dict[str, Callable[[Options], Row]] = {
     "physics": physics,
@@ -62,7 +61,5 @@ ROWS: dict[str, Callable[[Options], Row]] = {
     "team_mdp": team_mdp,
     "time_to_optimal_rejax": time_to_optimal_rejax,
     "time_to_optimal_sb3": time_to_optimal_sb3,
-    "train": train,
-    "train_warm": train_warm,
 }
 """Every row by its name, in the order of the table."""

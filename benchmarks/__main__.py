@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -50,7 +49,7 @@ def main(argv: list[str] | None = None) -> None:
     commit = version.commit()
     # A device for each core. Called from another program, the devices may be fixed already.
     with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", os.cpu_count())
+        jax.config.update("jax_num_cpu_devices", devices.cores())
     # Before anything uses JAX, so that all cores may take part.
     devices.start(None)
     console = rich.console.Console()

@@ -10,7 +10,6 @@ with some probability, along the shortest tour. `benchmarks.same_accuracy` compa
 import dataclasses
 import itertools
 import math
-import os
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -185,7 +184,7 @@ class Curves:
         made = mission.make_mission(config, own)
         chosen = {name: x for name, x in made.policies.items() if only is None or name in only}
         self.scenario = dataclasses.replace(made, policies=chosen)
-        threads = os.cpu_count() if jax.default_backend() == "cpu" else 1
+        threads = devices.cores() if jax.default_backend() == "cpu" else 1
         self._keys = jnp.split(jax.random.split(key, episodes), math.gcd(episodes, threads or 1))
         options = devices.compiler_options()  # compiling takes longer than playing
         start = jax.vmap(self._start, in_axes=(0, None, None, None))

@@ -16,36 +16,42 @@ _MOTION = (*_BODIES, "mission/groups.py", "mission/motion.py", "mission/navigati
 _RAYS = (*_BODIES, "sim/raycast.py", "sim/sensors.py")
 _CHOICES = ("dqn/policies.py", "dqn/reference.py", "dqn/rewards.py", "dqn/rules.py")
 _STEPS = (*_CHOICES, "core", "looks.py", "mission", "models.py", "sim", "vae")
-_UNDER_WAY = (*_STEPS, f"{_BENCHMARKS}/missions.py:_go_on")
 _PLAYER = ("run/batches.py", "run/films.py", "run/ledger.py", "run/missions.py")
 _MISSIONS = (
     *_STEPS,
     *_PLAYER,
     *(f"run/devices.py:{name}" for name in ("side_by_side", "put_everywhere", "fetched")),
     "run/compilation.py:Program",
-    f"{_BENCHMARKS}/missions.py:_play",
 )
 _MAP = ("dqn/map_mdp.py", "vae/filter.py", "vae/fusion.py")
 _LEARNING = (*_MAP, "dqn/losses.py", "dqn/map_agent.py", "dqn/replay.py", "dqn/training.py")
+
+
+def _measured_by(*rows: str, code: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """Rows with their code and the functions of their names, which measure them."""
+    return {row: (*code, f"{_BENCHMARKS}/missions.py:{row}") for row in rows}
+
+
+WHOLE = "whole commands"
+"""Stands for a row that measures the whole package."""
 CODE: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("physics", "physics_batch", "physics_warp"), _BODIES),
     "physics_devices": (*_BODIES, *_SPREAD),
     **dict.fromkeys(("physics_solver", "physics_solver_batch", "physics_solver_warp"), _BODIES),
     **dict.fromkeys(("physics_contacts", "physics_contacts_warp"), _MOTION),
     **dict.fromkeys(("rays", "rays_warp", "rays_warp_bvh"), _RAYS),
-    "resets_many": _STEPS,
-    **dict.fromkeys(("missions_under_way", "missions_many_under_way"), _UNDER_WAY),
-    **dict.fromkeys(
-        ("missions_under_way_devices", "missions_many_under_way_devices"), (*_UNDER_WAY, *_SPREAD)
+    **_measured_by("resets_many", "missions_under_way", "missions_many_under_way", code=_STEPS),
+    **_measured_by(
+        "missions_under_way_devices", "missions_many_under_way_devices", code=(*_STEPS, *_SPREAD)
     ),
-    **dict.fromkeys(("missions", "missions_many"), _MISSIONS),
-    **dict.fromkeys(("missions_devices", "missions_many_devices"), (*_MISSIONS, *_SPREAD)),
+    **_measured_by("missions", "missions_many", code=_MISSIONS),
+    **_measured_by("missions_devices", "missions_many_devices", code=(*_MISSIONS, *_SPREAD)),
     "jmvae": ("core/networks.py", "core/supervised.py", "vae/gaussian.py", "vae/jmvae.py"),
     **dict.fromkeys(("dqn_rejax", "dqn_sb3", "dqn_seeds"), _LEARNING),
     **dict.fromkeys(("time_to_optimal_rejax", "time_to_optimal_sb3"), _LEARNING),
     "dqn_live": (*_LEARNING, "looks.py", "sim", "vae/detectors.py"),
     "team_mdp": (*_MAP, "dqn/team_mdp.py"),
-    **dict.fromkeys(("train", "train_warm"), (".",)),
+    WHOLE: (".",),
 }
 """Files and folders of the package that each row measures, besides what compiles all of them; of a
 file, everything or the function or class behind the colon. Of missions also what measures them."""
@@ -134,15 +140,22 @@ def _used_by(function: str, statements: list[ast.stmt]) -> list[ast.stmt]:
     names, used = {function}, list[ast.stmt]()
     while found := [x for x in statements if x not in used and names & _defined(x)]:
         used += found
-        names |= {x.id for each in found for x in ast.walk(each) if isinstance(x, ast.Name)}
+        names |= {name for each in found for name in _used(each)}
     return [x for x in statements if x in used]
+
+
+def _used(node: ast.stmt) -> set[str]:
+    """Names that a statement of a module uses, without arguments of functions."""
+    names = {x.id for x in ast.walk(node) if isinstance(x, ast.Name)}
+    return names - {x.arg for x in ast.walk(node) if isinstance(x, ast.arg)}
 
 
 def _defined(node: ast.stmt) -> set[str]:
     """Names that a statement of a module defines."""
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
         return {node.name}
-    targets = node.targets if isinstance(node, ast.Assign) else []
+    targets = [node.target] if isinstance(node, ast.AnnAssign) else []
+    targets += node.targets if isinstance(node, ast.Assign) else []
     return {target.id for target in targets if isinstance(target, ast.Name)}
 
 

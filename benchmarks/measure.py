@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import datetime
 import importlib.metadata
-import os
 import platform
 import statistics
 import time
@@ -158,7 +157,7 @@ def provenance(command: str) -> dict[str, object]:
     return {
         "commit": version.commit(),
         "date": datetime.date.today().isoformat(),
-        "cores": os.cpu_count(),
+        "cores": devices.cores(),
         "command": command,
     }
 
@@ -177,11 +176,8 @@ def origin(command: str, packages: tuple[str, ...] = ()) -> dict[str, object]:
       packages: distributions that it needs next to those of `versions`.
     """
     return {
-        "command": command,
-        "commit": version.commit(),
-        "date": datetime.date.today().isoformat(),
+        **provenance(command),
         "device": jax.devices()[0].device_kind,
-        "cores": os.cpu_count(),
         "versions": versions(packages),
     }
 

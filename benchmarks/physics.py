@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import os
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
@@ -334,7 +333,7 @@ def _native_sides(
         mocap_pos=np.asarray(placed.mocap_pos)[:, : arena.mj_model.nmocap].reshape(batch, -1),
         mocap_quat=np.asarray(placed.mocap_quat)[:, : arena.mj_model.nmocap].reshape(batch, -1),
     )
-    cores = os.cpu_count() or 1
+    cores = devices.cores()
     return [
         Side(simulate(arena.mj_model, inputs, threads), batch * steps, batch)
         for threads in (cores, 2 * cores)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import os
 from collections.abc import Callable, Sequence
 
 import jax
@@ -166,7 +165,7 @@ def _native_sides(world: World, placed: mjx.Data) -> list[Side]:
 
     return [
         Side(native.cast(model, scans, threads), number, len(scans))
-        for threads in sorted({1, os.cpu_count() or 1})
+        for threads in sorted({1, devices.cores()})
     ]
 
 

@@ -11,7 +11,7 @@ from benchmarks import measure
 from jaxsense import Config, Models, export
 from jaxsense.config import ConfigError, parse_json
 from jaxsense.run import cli
-from jaxsense.tasks import pretrained
+from jaxsense.tasks import registry
 
 PRETRAINED = "pretrained:"
 """What precedes the preset of models that travel with the package, in place of a run."""
@@ -81,7 +81,7 @@ def origin(program: str, arguments: Any, packages: tuple[str, ...] = ()) -> dict
 def _made(run: Path) -> dict[str, object]:
     """What made the models of a run."""
     if (name := str(run)).startswith(PRETRAINED):
-        return dataclasses.asdict(pretrained.origin(name.removeprefix(PRETRAINED)))
+        return dataclasses.asdict(registry.origin(name.removeprefix(PRETRAINED)))
     found: Any = parse_json((cli.find_run(run) / "config.json").read_text(encoding="utf-8"))
     return {name: found.get(name) for name in ("preset", "seed", "commit", "versions")}
 

@@ -539,6 +539,8 @@ def main() -> None:
     try:
         robot = load(arguments.archive, arguments.robot, np.array(arguments.pois))
     except (OSError, zipfile.BadZipFile, KeyError, ImportError) as error:
+        if not arguments.archive.exists():
+            parser.error(f"{arguments.archive}: no such file")
         parser.error(f"{arguments.archive}: must be a file of `jaxsense export` ({error})")
     except ValueError as error:
         parser.error(str(error))

@@ -162,7 +162,7 @@ def plausible(
 def main() -> None:
     """Runs the program."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("file", type=Path, help="from `python -m jaxsense.export`")
+    parser.add_argument("file", type=Path, help="from `jaxsense export`")
     parser.add_argument("--onnx", action="store_true", help="with onnxruntime instead of NumPy")
     arguments = parser.parse_args()
     path, name = arguments.file, "robot_onnx" if arguments.onnx else "robot_numpy"
@@ -173,7 +173,9 @@ def main() -> None:
     except (OSError, zipfile.BadZipFile, json.JSONDecodeError, KeyError, ImportError) as error:
         if isinstance(error, ImportError) and error.name == "onnxruntime":
             sys.exit("--onnx needs onnxruntime: pip install onnxruntime")
-        sys.exit(f"{path}: must be a file of `python -m jaxsense.export` ({error})")
+        if not path.exists():
+            sys.exit(f"{path}: no such file")
+        sys.exit(f"{path}: must be a file of `jaxsense export` ({error})")
     for name, program in contents["programs"].items():
         print(f"{name}({', '.join(program['inputs'])}): {program['about']}")
     num_classes = len(contents["classes"])

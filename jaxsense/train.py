@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import datetime
 import itertools
-import os
 import shlex
 import sys
 import tempfile
@@ -377,7 +376,7 @@ def _header(run: RunDirectory) -> Header:
         "seed": run.settings.seed,
         "versions": version.versions(),
         "devices": [device.device_kind for device in jax.devices()],
-        "cores": os.cpu_count() or 1,
+        "cores": devices.cores(),
         "date": datetime.date.today().isoformat(),
     }
 

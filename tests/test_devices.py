@@ -178,6 +178,15 @@ def test_two_processes_share_a_run(tmp_path):
     assert found["mission"]["naive"]["episodes"] == 4
 
 
+def test_a_process_without_a_device_is_refused_in_all_processes(tmp_path):
+    out = tmp_path / "run"
+    processes = two_processes(["--preset", "smoke", "--devices", "1", "--out", str(out)])
+    ended = [process.communicate(timeout=100) for process in processes]
+    assert [process.returncode for process in processes] == [2, 2], ended
+    assert all("devices = 1: must be from 2 to 2" in errors for _, errors in ended)
+    assert not out.exists()
+
+
 @pytest.mark.slow  # two processes compile three runs
 def test_two_processes_stop_and_resume_several_seeds(tmp_path):
     seeds = tmp_path / "seeds"

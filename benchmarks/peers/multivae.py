@@ -1,6 +1,5 @@
 """MultiVae's JMVAE (PyTorch), with our layers, in a plain training loop."""
 
-import os
 from collections.abc import Callable
 
 import numpy as np
@@ -13,6 +12,7 @@ from pythae.models.nn import BaseDecoder, BaseEncoder  # pyright: ignore[reportM
 
 from benchmarks.measure import Options, Side
 from jaxsense.config import JmvaeConfig
+from jaxsense.run import devices
 from jaxsense.vae.jmvae import Jmvae
 
 _STEPS, _STEPS_QUICK = 200, 2
@@ -42,7 +42,7 @@ def sides(
 
         return Side(run, steps * config.batch, config.batch)
 
-    return [side(threads) for threads in sorted({1, os.cpu_count() or 1})]
+    return [side(threads) for threads in sorted({1, devices.cores()})]
 
 
 def _make_training(

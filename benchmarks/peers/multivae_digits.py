@@ -1,7 +1,6 @@
 """MultiVae's JMVAE, MVAE, MMVAE and MoPoE on the digits, with our layers, in a plain loop."""
 
 import dataclasses
-import os
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
@@ -23,6 +22,7 @@ from multivae.models import (  # pyright: ignore[reportMissingImports]
 from benchmarks.digits.data import Digits, Views
 from benchmarks.digits.models import Budget, Kind, Run, Subset
 from benchmarks.peers.multivae import Decoder, Encoder, JointEncoder
+from jaxsense.run import devices
 from jaxsense.vae import Jmvae
 
 _TRIAL = 20  # steps that find out how many threads are faster
@@ -62,7 +62,7 @@ class Theirs:
             _train(network, digits, budget, min(budget.steps, _TRIAL))
             return time.perf_counter() - begin
 
-        return min(sorted({1, os.cpu_count() or 1}), key=seconds)
+        return min(sorted({1, devices.cores()}), key=seconds)
 
     def _network(self, digits: Digits, budget: Budget) -> Any:
         shape = Jmvae(digits.names, digits.sizes, budget.latent_size, budget.hidden)

@@ -84,8 +84,13 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
           all, is the duration of the step.
 
         Raises:
-          ValueError: if an action is no integer, or does not exist and is not traced.
+          ValueError: if a robot has no action, or if an action is no integer, or does not exist and
+            is not traced.
         """
+        if not set(self.agents) <= set(actions):
+            raise ValueError(
+                f"actions of {sorted(actions)}: must have one of each of {self.agents}"
+            )
         chosen = jnp.stack([jnp.asarray(actions[agent]) for agent in self.agents])
         after, outcome = team.step(key, self.robots.mdp, state.team, chosen)
         dones = outcome.terminated | outcome.truncated

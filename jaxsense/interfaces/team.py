@@ -189,7 +189,7 @@ def step(
       state: the current state.
       actions: `[R]` int32, of which only that of robot `state.agent` counts. A PoI that is not
         present counts as NOP. Traced actions are not checked: one that does not exist has a reward
-        of NaN.
+        of NaN, in the step in which the robot would look.
 
     Returns:
       The next state and the outcome. The robot that has looked, which chooses next, earns the

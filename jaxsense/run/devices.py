@@ -31,13 +31,13 @@ _ALIGNED = 64  # bytes
 _PASSES_OVER_LOOPS = "while-loop-invariant-code-motion,while-loop-constant-sinking"
 
 
-def _cores() -> int:
+def cores() -> int:
     """Number of cores that this process may use."""
     is_known = hasattr(os, "sched_getaffinity")
     return len(os.sched_getaffinity(0)) if is_known else os.cpu_count() or 1
 
 
-NUM_THREADS = min(_cores(), 8)
+NUM_THREADS = min(cores(), 8)
 """Number of threads that share work on a CPU by default."""
 
 
@@ -47,7 +47,7 @@ def compiler_options(*, runs_long: bool = False, wide_vectors: bool = False) -> 
     On a CPU, level 1 compiles a third faster than level 3, with equally fast programs. The older
     code generator, which a program can choose up to JAX 0.10, saves another third, but its programs
     may be a third slower. Passes that move invariants out of nested loops repeat all others, for a
-    sixth of the compile time. On an accelerator, autotuning would take most of it.
+    sixth of the compile time. On an accelerator, only programs that run long are autotuned.
 
     Args:
       runs_long: whether the program runs much longer than it compiles.
@@ -131,26 +131,27 @@ def start(number: int | None) -> Workers:
     """Selects the devices of a program.
 
     Args:
-      number: of accelerators, or of threads on a CPU. By default all accelerators, or as many
-        threads as cores, at most 8. See `threads` for when fewer are used.
+      number: of accelerators, at least one of each process, or of threads on a CPU. By default all
+        accelerators, or as many threads as cores, at most 8; see `threads` for when fewer are used.
 
     Returns:
       The workers that share scenes and missions. A training stays on one device.
 
     Raises:
-      ConfigError: if there are fewer devices.
+      ConfigError: if there are fewer devices, or a process would have none.
     """
     jax.config.update("jax_default_matmul_precision", "highest")
     check(number)
     number_of_threads = threads(number or NUM_THREADS)
     if jax.default_backend() == "cpu" and jax.process_count() == 1:
         return Workers(threads=number_of_threads)
-    there = jax.device_count()
+    owners = [device.process_index for device in jax.devices()]
+    least, there = 1 + owners.index(max(owners)), len(owners)
     number = there if number is None else number
-    if number > there:
+    if not least <= number <= there:
         # All processes refuse; one that ends without the others makes them abort.
         processes.leave(processes.LEAVE_TIMEOUT)
-        raise ConfigError("devices", number, f"must be from 1 to {there}")
+        raise ConfigError("devices", number, f"must be from {least} to {there}")
     return Workers(mesh=make_mesh(number) if number > 1 else None)
 
 
@@ -166,9 +167,9 @@ def threads(wanted: int = NUM_THREADS) -> int:
       wanted: number of programs.
     """
     if not _has_backend():
-        os.environ.setdefault("NPROC", str(max(2 * wanted, _cores())))
+        os.environ.setdefault("NPROC", str(max(2 * wanted, cores())))
     given = os.environ.get("NPROC", "")
-    return min(wanted, max(1, (int(given) if given.isdecimal() else _cores()) - 1))
+    return min(wanted, max(1, (int(given) if given.isdecimal() else cores()) - 1))
 
 
 def _has_backend() -> bool:
@@ -191,13 +192,10 @@ def memory() -> int | None:
 
 
 def make_mesh(number: int | None = None) -> Mesh:
-    """A row of devices.
+    """A row of devices, with the axis `AXIS`.
 
     Args:
       number: of devices over all processes; all by default.
-
-    Returns:
-      The mesh, with the axis `AXIS`.
 
     Raises:
       ValueError: if there are fewer devices.
@@ -262,7 +260,7 @@ def put(args: tuple[PyTree, ...], places: tuple[NamedSharding, ...]) -> tuple[Py
 def spread(
     function: Callable[..., PyTree], mesh: Mesh | None, whole: tuple[int, ...] = ()
 ) -> Callable[..., PyTree]:
-    """Calls a function on each device with a part of its rows, independently of the other devices.
+    """Calls a function on each device with a part of its rows, independent of the other devices.
 
     Args:
       function: of pytrees of arrays, whose first axis is a batch of independent rows. With MJX

@@ -46,8 +46,8 @@ class Played:
       metrics: `[episodes, ...]` metrics of each case; see `mission.measure`.
       recording: the first mission of the first case.
       control_steps: total number of control periods, until each mission's end.
-      naive: the same mission under naive exploration; None if it was not played or did not begin
-        together with the first one, for which there must be room.
+      naive: the same mission under naive exploration; None if it was not played, or if the first
+        worker did not begin it together with the first one.
     """
 
     metrics: dict[str, Measured]

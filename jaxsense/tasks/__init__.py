@@ -6,10 +6,10 @@ from jaxsense.tasks.learning import greedy as greedy
 from jaxsense.tasks.pretrained import PRETRAINED as PRETRAINED
 from jaxsense.tasks.pretrained import Origin as Origin
 from jaxsense.tasks.pretrained import load_pretrained as load_pretrained
-from jaxsense.tasks.pretrained import origin as origin
 from jaxsense.tasks.registry import about as about
 from jaxsense.tasks.registry import agents as agents
 from jaxsense.tasks.registry import make as make
+from jaxsense.tasks.registry import origin as origin
 from jaxsense.tasks.registry import registered as registered
 from jaxsense.tasks.score import Estimate as Estimate
 from jaxsense.tasks.score import Recurrent as Recurrent

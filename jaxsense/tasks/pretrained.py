@@ -58,19 +58,6 @@ def load_pretrained(preset: str) -> tuple[Config, Models]:
     return config, Models(**parts, bayes=make_bayes(config), agent=make_agent(config))
 
 
-def origin(preset: str) -> Origin:
-    """Returns the origin of the models of `load_pretrained`.
-
-    Args:
-      preset: one of `PRETRAINED`.
-
-    Raises:
-      ConfigError: if there are no such models.
-    """
-    _, about = archive.read(_file(preset))
-    return Origin(**about["origin"])  # pyright: ignore[reportCallIssue]
-
-
 def write(file: Path, config: Config, trained: Models, made: Origin) -> None:
     """Writes what `load_pretrained` reads.
 

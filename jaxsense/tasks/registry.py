@@ -17,7 +17,7 @@ from jaxsense.models import Models
 from jaxsense.tasks import archive
 from jaxsense.tasks.archive import Arrays
 from jaxsense.tasks.environment import Scaling
-from jaxsense.tasks.pretrained import DATA, Origin
+from jaxsense.tasks.pretrained import DATA, PRETRAINED, Origin
 from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, key_of_seed
 from jaxsense.training.mdp import models_of
 
@@ -50,6 +50,22 @@ def about(name: str) -> str:
     """
     _require_name(name)
     return TASKS[name]
+
+
+def origin(name: str) -> Origin:
+    """Returns the origin of a task, or of the models of `load_pretrained`.
+
+    Args:
+      name: one of `registered()` or of `PRETRAINED`.
+
+    Raises:
+      ConfigError: if there is no such task and there are no such models.
+    """
+    known = (*PRETRAINED, *TASKS)
+    if name not in known:
+        raise ConfigError("name", name, f"must be one of {', '.join(known)}")
+    _, about = archive.read(DATA / f"{name}.npz")
+    return Origin(**about["origin"])  # pyright: ignore[reportCallIssue]
 
 
 def agents(name: str) -> tuple[str, ...]:

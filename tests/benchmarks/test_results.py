@@ -123,8 +123,23 @@ def rate(x: Array) -> Array:
     assert history.program(other, "other") != history.program(later, "other")
 
 
+def test_a_function_uses_constants_with_types_and_not_what_its_arguments_are_called():
+    module = """A: int = 1
+
+def rate(other):
+    return A * other
+
+def other():
+    return 2
+"""
+    for text, differs in (("A: int = 3", True), ("A: float = 1", False)):
+        after = module.replace("A: int = 1", text)
+        assert (history.program(module, "rate") != history.program(after, "rate")) == differs
+    assert history.program(module, "rate") == history.program(module.replace("2", "3"), "rate")
+
+
 def test_the_code_of_every_row_is_known():
-    assert history.CODE.keys() == ROWS.keys()
+    assert history.CODE.keys() == {*ROWS, history.WHOLE}
     for places in history.CODE.values():
         for place in (*places, *history._COMPILED):
             path, _, name = place.partition(":")
@@ -226,7 +241,7 @@ def test_whole_commands_note_changes(repository):
     path.write_text(json.dumps({"commit": commit, "commands": {}}))
     for text, expected in (("x = 1  # m", False), ("x = 2", True)):
         repository("raycast.py", text)
-        history.note(path, "train")
+        history.note(path, history.WHOLE)
         assert json.loads(path.read_text())["changed"] is expected
 
 

@@ -51,7 +51,10 @@ def test_the_example_plays_a_map_and_refuses_other_files(file, tmp_path, player)
     (tmp_path / "text").write_text("no archive")
     done = run_alone("example['main']()", player, tmp_path / "text", *options)
     assert done.returncode == 1
-    assert "must be a file of `python -m jaxsense.export`" in done.stderr
+    assert "must be a file of `jaxsense export`" in done.stderr
+    done = run_alone("example['main']()", player, tmp_path / "nothing", *options)
+    assert done.returncode == 1
+    assert done.stderr.endswith("nothing: no such file\n")
 
 
 def test_the_example_names_the_missing_onnxruntime(file):

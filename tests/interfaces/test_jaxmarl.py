@@ -267,6 +267,13 @@ def test_actions_that_do_not_exist_are_refused_or_reward_nan(env, step_env, acti
         assert np.isnan([*rewards.values()]).any()
 
 
+def test_a_robot_without_an_action_is_named(env):
+    _, state = env.reset(jax.random.key(3))
+    first, *_ = AGENTS
+    with pytest.raises(ValueError, match=rf"actions of \['{first}'\]: must have one of each of"):
+        env.step_env(jax.random.key(4), state, {first: 0})
+
+
 def test_other_sensors_than_those_of_the_settings_are_named(team_env):
     with pytest.raises(
         ValueError, match=r"modalities \('camera', 'lidar'\): must be a TeamMdp with \('camera',\)"

@@ -39,11 +39,14 @@ def test_the_program_refuses_what_is_no_place(ros2, monkeypatch, capsys, poi):
     assert "argument --pois: invalid point value" in capsys.readouterr().err
 
 
-def test_the_program_refuses_what_is_no_archive(ros2, monkeypatch, capsys):
-    monkeypatch.setattr(ros2.sys, "argv", ["ros2_node.py", "nothing.zip", "--pois", "0,1"])
-    with imports_from_archives(), pytest.raises(SystemExit):
-        ros2.main()
-    assert "nothing.zip: must be a file of `jaxsense export`" in capsys.readouterr().err
+def test_the_program_refuses_what_is_no_archive(ros2, monkeypatch, capsys, tmp_path):
+    text = tmp_path / "text.zip"
+    text.write_text("no archive")
+    for file, words in ((text, "must be a file of `jaxsense export`"), ("x.zip", "no such file")):
+        monkeypatch.setattr(ros2.sys, "argv", ["ros2_node.py", str(file), "--pois", "0,1"])
+        with imports_from_archives(), pytest.raises(SystemExit):
+            ros2.main()
+        assert f"{file}: {words}" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # compiles scans in a simulated arena

@@ -51,8 +51,12 @@ def test_models_tell_classes_apart(preset):
 def test_unknown_models_are_refused():
     with pytest.raises(ConfigError, match="preset = 'smoke': must be one of default, noisy"):
         jaxsense.load_pretrained("smoke")
-    with pytest.raises(ConfigError, match="preset = 'x': must be one of"):
+    with pytest.raises(ConfigError, match=r"name = 'x': must be one of default, .*noisy-v0"):
         tasks.origin("x")
+
+
+def test_a_task_tells_its_origin():
+    assert tasks.origin("noisy-v0").command.startswith("python -m ")
 
 
 @pytest.mark.slow
