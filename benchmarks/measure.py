@@ -223,7 +223,8 @@ def compiled(
         alone = trace(function, share, lambda _: contextlib.nullcontext())
         function = devices.spread(alone.__call__, workers.mesh)
         args = jax.device_put(args, NamedSharding(workers.mesh, PartitionSpec(devices.AXIS)))
-    rows = len(jax.tree.leaves(args)[0])
+    # A single worker also takes what has no rows, such as a key.
+    rows = len(jax.tree.leaves(args)[0]) if workers.threads > 1 else 1
     threads = max(n for n in range(1, workers.threads + 1) if rows % n == 0)
     parts = [devices.part(args, i, threads) for i in range(threads)]
     options = devices.compiler_options(runs_long=True, wide_vectors=wide_vectors)
