@@ -314,7 +314,7 @@ def test_the_pool_of_a_backend_has_more_members_than_programs(monkeypatch, pool,
     assert devices.start(number) == Workers(threads=expected)
     # Its default is the number of cores.
     monkeypatch.delenv("NPROC")
-    monkeypatch.setattr(devices, "_cores", lambda: pool)
+    monkeypatch.setattr(devices, "cores", lambda: pool)
     assert devices.start(number) == Workers(threads=expected)
     assert "NPROC" not in os.environ
 
