@@ -227,7 +227,7 @@ from benchmarks import ROWS, __main__
 from benchmarks.measure import make_row
 from jaxsense.run import devices
 
-devices._cores = lambda: 2
+devices.cores = lambda: 2
 
 def row(options):
     assert jax.default_backend() == "cpu"
