@@ -10,6 +10,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "jaxsense"
 _BENCHMARKS = "benchmarks"
 _COMPILED = ("run/devices.py:compiler_options",)
+_CHECKS = f"{PACKAGE}/core/checks.py"
 _SPREAD = ("run/devices.py:spread", "run/kept.py:trace")
 _BODIES = ("sim/amiro.py", "sim/arena.py")
 _MOTION = (*_BODIES, "mission/groups.py", "mission/motion.py", "mission/navigation.py")
@@ -83,7 +84,7 @@ def has_changed(row: str, commit: str) -> bool:
         paths = _git("diff", "--name-only", commit, "--", path)
         if paths is None:
             raise ValueError(f"commit = {commit!r} of row {row}: must be one of the history")
-        modules = [path for path in paths.split() if path.endswith(".py")]
+        modules = [x for x in paths.split() if x.endswith(".py") and x != _CHECKS]
         if any(_has_changed(commit, path, function) for path in modules):
             return True
     return False
@@ -115,7 +116,9 @@ def note(path: Path, measures: str | None = None) -> None:
 
 
 def program(source: str, function: str = "") -> str:
-    """What a module computes, without comments, docstrings, imports and types.
+    """What a module computes, without comments, docstrings, imports, types and checks.
+
+    Checks of arguments run while JAX traces a function; its program has none of them.
 
     Args:
       source: its text.
@@ -124,7 +127,7 @@ def program(source: str, function: str = "") -> str:
     tree = ast.parse(source)
     if function:
         tree.body = _used_by(function, tree.body)
-    for node in ast.walk(tree):
+    for node in ast.walk(_WithoutChecks().visit(tree)):
         if isinstance(node, ast.arg | ast.AnnAssign):
             node.annotation = None  # pyright: ignore[reportAttributeAccessIssue]
         if isinstance(node, ast.FunctionDef):
@@ -133,6 +136,16 @@ def program(source: str, function: str = "") -> str:
             # What is imported for types alone cannot be told from the rest.
             node.body = [each for each in node.body if not _is_text(each)]
     return ast.dump(tree)
+
+
+class _WithoutChecks(ast.NodeTransformer):
+    """Leaves out statements that only call a function of `core.checks` or chex."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        called = node.value.func if isinstance(node.value, ast.Call) else None
+        module = called.value if isinstance(called, ast.Attribute) else None
+        is_check = isinstance(module, ast.Name) and module.id in {"checks", "chex"}
+        return None if is_check else node
 
 
 def _used_by(function: str, statements: list[ast.stmt]) -> list[ast.stmt]:

@@ -5,7 +5,6 @@ from stored features of such scans. Single looks have the same distribution in b
 one scene share its light, which drifts over positions.
 """
 
-import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
@@ -151,7 +150,7 @@ def _require_fitting(config: Config, looks: Looks) -> None:
         checks.require_one_each("looks", looks.features, config.modalities)
         for name, features in zip(config.modalities, looks.features, strict=True):
             shape = len(config.arena.classes), None, len(config.labels(name))
-            chex.assert_shape(features, shape, custom_message=f"looks of {name}")
+            checks.require_shape(f"looks of {name}", features, shape)
             checks.require_number("looks at each class", features.shape[1])
             checks.require_finite("looks", features)
     if isinstance(looks, Live):

@@ -320,7 +320,10 @@ def test_the_latest_run_is_the_newest_finished_one_in_runs(program, tmp_path, mo
             (run / "summary.json").write_text("{}")
             os.utime(run / "summary.json", (10 - number, 10 - number))
     line = error_line(["latest"], capsys, program)
-    assert "run = 'runs/third': was written by an older jaxsense" in line
+    older = "run = 'runs/third': was written by an older jaxsense"
+    assert older in line
+    with pytest.raises(ConfigError, match=older):
+        jaxsense.load("latest")
     # A directory of that name comes first.
     Path("latest").mkdir()
     assert "latest is not a run directory" in error_line(["latest"], capsys, program)

@@ -155,7 +155,7 @@ def test_models_and_looks_of_other_settings_are_refused_in_one_line(models, chan
 
 @pytest.mark.parametrize("shape", [(2, 5, 2), (3, 5, 3), (3, 5)])
 def test_a_bank_of_the_wrong_shape_is_named(models, shape):
-    with pytest.raises(AssertionError, match="looks of lidar"):
+    with pytest.raises(ValueError, match="looks of lidar"):
         looks.make_mdp(CONFIG, models, Bank((numbered_bank()[0], jnp.zeros(shape))))
 
 

@@ -4,11 +4,15 @@ Traced values are unknown: their checks pass and cost nothing.
 """
 
 from collections.abc import Callable, Sequence
+from types import EllipsisType
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike
+
+_ARRAYS = jax.Array | np.ndarray | np.generic | float | int
 
 
 def require(
@@ -77,6 +81,39 @@ def require_probabilities(name: str, value: object) -> None:
         require(f"sum of {name}", total, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
 
 
+def require_shape(name: str, value: object, shape: Sequence[int | EllipsisType | None]) -> None:
+    """Checks the shape of an array, also of a traced one.
+
+    Args:
+      name: name of the argument.
+      value: the array, or a number if it may have no axes.
+      shape: its sizes; None for an axis of any size, `...` at either end for any axes.
+
+    Raises:
+      ValueError: names the shape; if only leading axes are too many, also `jax.vmap`.
+    """
+    found = np.shape(value) if isinstance(value, _ARRAYS) else None
+    if found is None:
+        raise ValueError(f"{name} = {value!r}: must be an array of shape {_text(shape)}")
+    axes = [axis for axis in shape if axis is not ...]
+    given = found[-len(axes) :] if shape[:1] == (...,) and axes else found[: len(axes)]
+    number_fits = len(found) >= len(axes) if ... in shape else len(found) == len(axes)
+    if number_fits and _fit(given, axes):
+        return
+    is_batch = len(found) > len(axes) and _fit(found[len(found) - len(axes) :], axes)
+    advice = ", for one example; use jax.vmap for more" if is_batch and ... not in shape else ""
+    raise ValueError(f"{name} has the shape {found}: must be {_text(shape)}{advice}")
+
+
+def _fit(found: Sequence[int], axes: Sequence[object]) -> bool:
+    return all(axis in (None, size) for size, axis in zip(found, axes, strict=True))
+
+
+def _text(shape: Sequence[object]) -> str:
+    words = ["any" if axis is None else "..." if axis is ... else str(axis) for axis in shape]
+    return f"({', '.join(words)}{',' * (len(words) == 1)})"
+
+
 def require_index(name: str, value: object, number: int) -> None:
     """Checks that all numbers are indices of a sequence.
 
@@ -124,6 +161,20 @@ def require_number(name: str, value: object) -> None:
     """
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name} = {value!r}: must be a whole number greater than 0")
+
+
+def require_tuple(name: str, value: object) -> None:
+    """Checks that a value is a tuple.
+
+    Args:
+      name: name of the argument.
+      value: the value.
+
+    Raises:
+      ValueError: if it is something else; JAX cannot hash a list.
+    """
+    if not isinstance(value, tuple):
+        raise ValueError(f"{name} = {value!r}: must be a tuple")
 
 
 def require_one_each(name: str, values: Sequence[object], modalities: Sequence[str]) -> None:

@@ -1,9 +1,10 @@
 """The temporal-difference loss of a Q-network."""
 
-import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from jaxsense.core import checks
 
 
 def td_error(
@@ -25,8 +26,10 @@ def td_error(
     Returns:
       `[...]` target minus value.
     """
-    chex.assert_equal_shape([a_tm1, r_t, discount_t])
-    chex.assert_shape([q_tm1, q_t], (None, *a_tm1.shape))
+    checks.require_shape("r_t", r_t, a_tm1.shape)
+    checks.require_shape("discount_t", discount_t, a_tm1.shape)
+    checks.require_shape("q_tm1", q_tm1, (None, *a_tm1.shape))
+    checks.require_shape("q_t", q_t, q_tm1.shape)
     target = r_t + discount_t * jnp.max(q_t, axis=0)
     # Cheaper than indexing, whose gradient is a scatter.
     actions = jnp.arange(q_tm1.shape[0]).reshape(-1, *[1] * a_tm1.ndim)

@@ -7,7 +7,6 @@ has one.
 import dataclasses
 from collections.abc import Callable
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -204,7 +203,7 @@ def observation(belief: Belief) -> Float[Array, " S"]:
     Raises:
       ValueError: if a standard deviation is not positive.
     """
-    chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
-    chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
+    checks.require_shape("belief.mean", belief.mean, (None, None))
+    checks.require_shape("belief.std", belief.std, belief.mean.shape)
     checks.require_positive("belief.std", belief.std)
     return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)

@@ -8,7 +8,6 @@ is no operation (NOP) and ends the episode.
 import dataclasses
 from typing import Protocol
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -213,7 +212,7 @@ def reset_with_looks(
         random_classes, random_seen = random_start(start_key, mdp)
         classes = random_classes if classes is None else classes
         seen = random_seen if seen is None else seen
-    chex.assert_shape(classes, (mdp.num_pois,), custom_message="classes")
+    checks.require_shape("classes", classes, (mdp.num_pois,))
     checks.require_index("classes", classes, mdp.num_classes)
     scene = mdp.looks.scene(scene_key, classes)
     pois = jnp.arange(mdp.num_pois)
@@ -246,7 +245,7 @@ def begin(
     Raises:
       ValueError: if `seen` is not bool.
     """
-    chex.assert_shape(seen, (mdp.num_pois, mdp.num_modalities), custom_message="seen")
+    checks.require_shape("seen", seen, (mdp.num_pois, mdp.num_modalities))
     if seen.dtype != bool:
         raise ValueError(f"seen of dtype {seen.dtype}: must be bool")
     first = jax.random.randint(key, (mdp.num_pois,), 0, mdp.num_modalities)
@@ -308,11 +307,11 @@ def step(
 def _check_step(mdp: MapMdp, state: MapState, action: jax.Array, modality: Index) -> None:
     """Checks the arguments of `step` against the MDP."""
     checks.require_index("modality", modality, mdp.num_modalities)
-    chex.assert_rank(action, 0, custom_message="action")
+    checks.require_shape("action", action, ())
     checks.require_index("action", action, mdp.num_pois + 1)
     shape = (mdp.num_pois, *mdp.fusion.prior.mean.shape)
     for part in (state.belief.mean, state.belief.std):
-        chex.assert_shape(part, shape, custom_message="state.belief")
+        checks.require_shape("state.belief", part, shape)
 
 
 def _random_seen(key: Key, shape: tuple[int, int], is_partial: bool) -> jax.Array:

@@ -16,7 +16,6 @@ import itertools
 import math
 from collections.abc import Callable
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -152,8 +151,8 @@ def interpolate(table: Float[Array, " P"], probabilities: Float[Array, " C"]) ->
     Raises:
       ValueError: if no lattice of these classes has P points.
     """
-    chex.assert_rank(probabilities, 1, custom_message="probabilities")
-    chex.assert_rank(table, 1, custom_message="table")
+    checks.require_shape("probabilities", probabilities, (None,))
+    checks.require_shape("table", table, (None,))
     steps = steps_of_lattice(len(probabilities), len(table))
     number = _num_points(steps, len(probabilities))
     if len(table) != number:
@@ -213,9 +212,9 @@ def value_iteration(
     Raises:
       ValueError: if a likelihood is not finite or `horizon` is not positive.
     """
-    chex.assert_rank(likelihoods, 3, custom_message="likelihoods")
+    checks.require_shape("likelihoods", likelihoods, (None, None, None))
     number, num_looks, _ = likelihoods.shape
-    chex.assert_shape(likelihoods, (number, num_looks, number), custom_message="likelihoods")
+    checks.require_shape("likelihoods", likelihoods, (number, num_looks, number))
     checks.require_finite("likelihoods", likelihoods)
     checks.require_number("horizon", horizon)
     points = jnp.asarray(lattice(number, max_points), jnp.float32)

@@ -4,11 +4,11 @@ Transitions are columns, drawn in blocks of neighbouring environments: copying a
 memory is many times faster than picking single numbers.
 """
 
-import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsense.core import checks
 from jaxsense.core.types import Transition, pytree
 
 
@@ -46,11 +46,8 @@ def add(replay: Replay, transitions: Transition) -> Replay:
       transitions: `[S, E]` states, `[E]` other fields.
     """
     rounds, blocks, rows, width = replay.columns.shape
-    chex.assert_shape(
-        [transitions.s_tm1, transitions.s_t],
-        ((rows - 3) // 2, blocks * width),
-        custom_message="transitions",
-    )
+    checks.require_shape("transitions.s_tm1", transitions.s_tm1, ((rows - 3) // 2, blocks * width))
+    checks.require_shape("transitions.s_t", transitions.s_t, transitions.s_tm1.shape)
     scalars = transitions.a_tm1, transitions.r_t, transitions.discount_t
     columns = jnp.concatenate([transitions.s_tm1, transitions.s_t, jnp.stack(scalars)])
     in_blocks = jnp.moveaxis(columns.reshape(rows, blocks, width), 1, 0)
@@ -72,7 +69,7 @@ def sample(draws: Float[Array, "B 2"], replay: Replay) -> Transition:
     Returns:
       `[S, B * W]` states, and `[B * W]` other fields.
     """
-    chex.assert_shape(draws, (None, 2), custom_message="draws")
+    checks.require_shape("draws", draws, (None, 2))
     rounds, blocks, rows, width = replay.columns.shape
     filled = jnp.minimum(replay.count, rounds)
     size = draws.shape[0]

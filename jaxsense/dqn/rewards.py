@@ -2,7 +2,6 @@
 
 from typing import Protocol
 
-import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -114,7 +113,7 @@ def information(std: Float[Array, "... D"]) -> Float[Array, "..."]:
     Raises:
       ValueError: if a standard deviation is not positive.
     """
-    chex.assert_shape(std, (..., None), custom_message="std")
+    checks.require_shape("std", std, (..., None))
     checks.require_positive("std", std)
     return 1.0 / jnp.linalg.norm(std, axis=-1)
 

@@ -11,7 +11,6 @@ Travel times follow a model, see `travel`.
 
 import dataclasses
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -175,7 +174,7 @@ def observation(
     Raises:
       ValueError: if a standard deviation is not positive.
     """
-    chex.assert_rank(belief.mean, 2, custom_message="belief.mean")
+    checks.require_shape("belief.mean", belief.mean, (None, None))
     checks.require_positive("belief.std", belief.std)
     times = travel_times(config, team)
     soon = jnp.exp(-times / TIME_SCALE)
@@ -260,13 +259,13 @@ def reset(key: Key, mdp: TeamMdp, modality: Int[Array, " R"] | None = None) -> T
         alone = jax.random.bernoulli(alone_key, config.alone)
         modality, works = _random_team(team_key, mdp, alone)
     else:
-        chex.assert_rank(modality, 1, custom_message="modality")
+        checks.require_shape("modality", modality, (None,))
         checks.require_index("modality", modality, mdp.map.num_modalities)
         alone, works = jnp.bool_(False), jnp.ones(modality.shape, bool)
     num_robots = len(modality)
     positions, poses = mdp.places.draw(place_key, num_robots)
-    chex.assert_shape(positions, (num_pois, 2), custom_message="positions")
-    chex.assert_shape(poses, (num_robots, 3), custom_message="poses")
+    checks.require_shape("positions", positions, (num_pois, 2))
+    checks.require_shape("poses", poses, (num_robots, 3))
 
     some_key, share_key, looks_key = jax.random.split(seen_key, 3)
     starts_late = alone | jax.random.bernoulli(some_key, config.partly_seen)
@@ -333,7 +332,7 @@ def step(
     Raises:
       ValueError: if there is no such action.
     """
-    chex.assert_rank(action, 0, custom_message="action")
+    checks.require_shape("action", action, ())
     checks.require_index("action", action, mdp.map.num_pois + 1)
     num_pois, team, travel = mdp.map.num_pois, state.team, mdp.config.travel
     robots = jnp.arange(team.poses.shape[0])

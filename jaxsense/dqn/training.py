@@ -8,12 +8,12 @@ import functools
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
 
 from jaxsense.config import DqnConfig
+from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Key, Transition, pytree
 from jaxsense.dqn import losses, replay
@@ -175,7 +175,7 @@ def train_chunk(
       The next state and the `[chunk]` infos.
     """
     for part in jax.tree.leaves(prepared):
-        chex.assert_axis_dimension(part, 0, config.num_starts, custom_message="prepared")
+        checks.require_shape("prepared", part, (config.num_starts, ...))
     shares = jax.tree.map(lambda x: x.reshape(config.num_envs, -1, *x.shape[1:]), prepared)
     draws = _draw(key, config)
     epoch = functools.partial(_epoch, environment, config, shares)
@@ -269,7 +269,7 @@ def _explore(
     observations = jax.vmap(environment.observe, out_axes=-1)
     s_tm1 = observations(started)
     values = environment.agent.values(params, s_tm1)
-    chex.assert_shape(values, (environment.num_actions, None))
+    checks.require_shape("values of the agent", values, (environment.num_actions, None))
     highest = jnp.argmax(values, axis=0).astype(jnp.int32)
     a_tm1 = jnp.where(draws.coin < epsilon, _explored(environment, started, draws.action), highest)
 

@@ -3,12 +3,12 @@
 A robot turns to a PoI, drives straight until it is near enough, and looks.
 """
 
-import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsense.config import TravelConfig
+from jaxsense.core import checks
 
 
 def travel_seconds(
@@ -24,8 +24,8 @@ def travel_seconds(
     Returns:
       `[N]` seconds.
     """
-    chex.assert_shape(pose, (3,), custom_message="pose")
-    chex.assert_shape(places, (None, 2), custom_message="places")
+    checks.require_shape("pose", pose, (3,))
+    checks.require_shape("places", places, (None, 2))
     turn, path = jax.vmap(lambda place: _path(config, pose, place))(places)
     return config.look_seconds + jnp.abs(turn) / config.turn_rate + path / config.speed
 

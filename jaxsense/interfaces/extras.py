@@ -16,7 +16,7 @@ def extra(name: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         package = (error.name or name).partition(".")[0]
-        message = f"{package} is not installed: pip install -e '.[{name}]'"
+        message = f"{package} is not installed: pip install 'jaxsense[{name}]'"
         raise ModuleNotFoundError(message, name=package) from None
 
 

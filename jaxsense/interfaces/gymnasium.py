@@ -1,4 +1,4 @@
-"""Tasks and the map MDP in Gymnasium: `pip install -e '.[gymnasium]'`.
+"""Tasks and the map MDP in Gymnasium: `pip install 'jaxsense[gymnasium]'`.
 
 The import registers every task as `jaxsense/NAME`, for `gymnasium.make` and `make_vec`.
 """

@@ -1,4 +1,4 @@
-"""Tasks and the map MDP in gymnax 1.x: `pip install -e '.[gymnax]'`.
+"""Tasks and the map MDP in gymnax 1.x: `pip install 'jaxsense[gymnax]'`.
 
 The import registers every task by its name, for `gymnax.make("noisy-v0", agent="camera")`.
 """

@@ -1,4 +1,4 @@
-"""A team as an environment of jaxmarl 0.2: `pip install -e '.[jaxmarl]'`.
+"""A team as an environment of jaxmarl 0.2: `pip install 'jaxsense[jaxmarl]'`.
 
 `make("team-v0")` makes a task; the names that `jaxmarl.make` knows are fixed.
 """

@@ -1,4 +1,4 @@
-"""A team as environments of PettingZoo: `pip install -e '.[pettingzoo]'`.
+"""A team as environments of PettingZoo: `pip install 'jaxsense[pettingzoo]'`.
 
 `make("team-v0")` and `make_parallel("team-v0")` make a task.
 """

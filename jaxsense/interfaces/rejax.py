@@ -1,4 +1,4 @@
-"""Tasks and the map MDP as rejax 0.1.3 trains them: `pip install -e '.[rejax]'`."""
+"""Tasks and the map MDP as rejax 0.1.3 trains them: `pip install 'jaxsense[rejax]'`."""
 
 import jax
 from jax.typing import ArrayLike

@@ -1,4 +1,4 @@
-"""Gymnasium's vector environments for Stable-Baselines3: `pip install -e '.[sb3]'`."""
+"""Gymnasium's vector environments for Stable-Baselines3: `pip install 'jaxsense[sb3]'`."""
 
 from collections.abc import Iterable
 from typing import Any

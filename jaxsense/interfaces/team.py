@@ -9,7 +9,6 @@ chooses next.
 from collections.abc import Iterable
 from typing import TypeVar
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -199,7 +198,7 @@ def step(
       ValueError: if an action does not exist.
     """
     num_robots, num_pois = len(state.team.works), mdp.map.num_pois
-    chex.assert_shape(actions, (num_robots,), custom_message="actions")
+    checks.require_shape("actions", actions, (num_robots,))
     checks.require_index("actions", actions, num_pois + 1)
     action = team_mdp.existing(state, actions[state.agent])
     after, outcome = team_mdp.step(key, mdp, state, action)

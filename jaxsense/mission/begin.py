@@ -1,6 +1,5 @@
 """The start of missions."""
 
-import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -97,15 +96,15 @@ def start(
     config = mission.config
     num_robots, num_pois = len(config.carried), config.arena.num_pois
     num_classes = len(config.arena.classes)
-    chex.assert_shape(classes, (num_pois,), custom_message="classes")
+    checks.require_shape("classes", classes, (num_pois,))
     checks.require_index("classes", classes, num_classes)
     checks.require_index("policy", policy, len(mission.policies))
-    chex.assert_shape(scene.poses, (num_robots, 3), custom_message="scene.poses")
+    checks.require_shape("scene.poses", scene.poses, (num_robots, 3))
     _check_faults(faults, num_robots)
     paths = roadmap.build(config, scene.layout) if paths is None else paths
     own_maps = config.mission.communication.own_maps
     pose_error = jnp.zeros((num_robots, 3)) if pose_error is None else pose_error
-    chex.assert_shape(pose_error, (num_robots, 3), custom_message="pose_error")
+    checks.require_shape("pose_error", pose_error, (num_robots, 3))
     return MissionState(
         scene=scene,
         pose_error=pose_error,
@@ -135,7 +134,7 @@ def _check_faults(faults: Faults, num_robots: int) -> None:
     """Raises `ValueError` if a time is negative; there must be one for each robot."""
     for name in ("stops_at", "blind_at"):
         times = getattr(faults, name)
-        chex.assert_shape(times, (num_robots,), custom_message=f"faults.{name}")
+        checks.require_shape(f"faults.{name}", times, (num_robots,))
         expected = "must be seconds, infinite for never"
         checks.require(f"faults.{name}", times, lambda x: x >= 0, expected)
 

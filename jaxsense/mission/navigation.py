@@ -7,13 +7,13 @@ goal soonest. A command is a forward speed [m/s] and a turn rate [rad/s].
 
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsense.config import ArenaConfig, NavigationConfig
+from jaxsense.core import checks
 from jaxsense.core.types import Index, others
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
@@ -91,7 +91,7 @@ def clearances(
     Returns:
       `[R]` metres to the nearest wall or PoI, and `[R]` to the nearest robot.
     """
-    chex.assert_shape(poses, (None, 3), custom_message="poses")
+    checks.require_shape("poses", poses, (None, 3))
     x, y = poses[:, :1], poses[:, 1:2]
     to_wall = arena.side / 2 - jnp.max(jnp.abs(poses[:, :2]), axis=-1)
 
@@ -177,8 +177,8 @@ def drive_to(
     Returns:
       `[2]` wanted command.
     """
-    chex.assert_shape(waypoint, (2,), custom_message="waypoint")
-    chex.assert_equal_shape_prefix([poses, commands], 1, custom_message="commands")
+    checks.require_shape("waypoint", waypoint, (2,))
+    checks.require_shape("commands", commands, (len(poses), 2))
     pose, present = poses[robot], commands[robot]
     arcs = _arcs(settings, present[1], seconds)
     frame = _Frame(pose, jnp.cos(pose[2]), jnp.sin(pose[2]))

@@ -9,12 +9,12 @@ of the paper's move_base that knows the map of the arena.
 import functools
 import math
 
-import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsense.config import NODES_PER_POI, VIEW_SIDES, Config
+from jaxsense.core import checks
 from jaxsense.core.types import Index, pytree
 from jaxsense.sim import viewpoints
 from jaxsense.sim.arena import Layout
@@ -139,7 +139,7 @@ def reachable(
       roadmap: of the layout.
       position: `[2]` of a robot, in metres.
     """
-    chex.assert_shape(position, (2,), custom_message="position")
+    checks.require_shape("position", position, (2,))
     goals = roadmap.viewpoints.reshape(-1, 2)
     ends = jnp.concatenate([goals, roadmap.nodes])
     is_clear = _is_clear(position[None], ends, layout.position, _radius(config) - _MARGIN)[0]
@@ -197,7 +197,7 @@ def _first(
     goals: Float[Array, "G 2"],
 ) -> tuple[Float[Array, " G"], Float[Array, " K"]]:
     """Lengths of free straight lines from a position to goals and to all nodes, else infinite."""
-    chex.assert_shape(position, (2,), custom_message="position")
+    checks.require_shape("position", position, (2,))
     ends = jnp.concatenate([goals, roadmap.nodes])
     length = _straight(position[None], ends, layout.position, _radius(config) - _MARGIN)[0]
     return length[: len(goals)], length[len(goals) :]

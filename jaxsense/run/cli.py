@@ -12,7 +12,7 @@ from typing import NoReturn, TypeVar
 import jax
 
 from jaxsense.config import Config, ConfigError, options, require_32_bits
-from jaxsense.run import kept
+from jaxsense.run import kept, rundir
 from jaxsense.run.kept import Kept
 from jaxsense.tasks import pretrained
 
@@ -152,14 +152,7 @@ def find_run(path: Path) -> Path:
         demo = f"{options.command('jaxsense.demo')} --preset {preset}"
         reason = f"must be the directory of a finished run; play pretrained models with {demo}"
         raise ConfigError("run", given, reason)
-    if path != Path("latest") or path.exists():
-        return path
-    configs = Path("runs").glob("*/config.json")
-    begun = {each.stat().st_mtime_ns: each.parent for each in configs}
-    finished = {time: run for time, run in begun.items() if (run / "summary.json").exists()}
-    if not finished:
-        raise ConfigError("run", "latest", "there is no finished run in runs/")
-    return finished[max(finished)]
+    return rundir.newest(path)
 
 
 def keep_programs(

@@ -234,11 +234,27 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
     files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
+def newest(path: Path) -> Path:
+    """Returns a path; for `latest`, that of the newest finished run in `runs/`.
+
+    Raises:
+      ConfigError: if there is no finished run.
+    """
+    if path != Path("latest") or path.exists():
+        return path
+    configs = Path("runs").glob("*/config.json")
+    begun = {each.stat().st_mtime_ns: each.parent for each in configs}
+    finished = {time: run for time, run in begun.items() if (run / "summary.json").exists()}
+    if not finished:
+        raise ConfigError("run", "latest", "there is no finished run in runs/")
+    return finished[max(finished)]
+
+
 def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     """Reads the settings and the trained models of a finished run.
 
     Args:
-      path: the run's directory.
+      path: the run's directory, or `latest` for the newest finished one in `runs/`.
       trust: whether its `config.json` may name custom sensors, whose code runs.
 
     Returns:
@@ -254,6 +270,7 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     if preset in PRETRAINED and not path.exists():
         reason = f"must be the directory of a finished run; or call load_pretrained({preset!r})"
         raise ConfigError("run", str(path), reason)
+    path = newest(path)
     settings = of_run(path, trust)
     config = settings.config
     shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))

@@ -16,7 +16,7 @@ def require() -> None:
     try:
         importlib.import_module("tensorboardX")
     except ImportError:
-        reason = "needs tensorboardX: pip install -e '.[tensorboard]'"
+        reason = "needs tensorboardX: pip install 'jaxsense[tensorboard]'"
         raise ConfigError("tensorboard", True, reason) from None
 
 

@@ -8,7 +8,6 @@ part of the layout, so a new layout or class never recompiles anything.
 import dataclasses
 import functools
 
-import chex
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -201,8 +200,9 @@ def make_layout(
     Raises:
       ValueError: if a position or a yaw is not finite, or there is no such class.
     """
-    chex.assert_shape(position, (config.num_pois, 2), custom_message="position")
-    chex.assert_shape([yaw, classes], (config.num_pois,), custom_message="yaw, classes")
+    checks.require_shape("position", position, (config.num_pois, 2))
+    checks.require_shape("yaw", yaw, (config.num_pois,))
+    checks.require_shape("classes", classes, (config.num_pois,))
     checks.require_finite("position", position)
     checks.require_finite("yaw", yaw)
     checks.require_index("classes", classes, len(config.classes))
@@ -227,7 +227,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
     Returns:
       The layout, with random yaws.
     """
-    chex.assert_shape(classes, (config.num_pois,), custom_message="classes")
+    checks.require_shape("classes", classes, (config.num_pois,))
     per_side = min(
         int(np.ceil(np.sqrt(2 * config.num_pois))), int(np.floor(config.side / config.poi_pitch))
     )
@@ -283,7 +283,7 @@ def put(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
       layout: the PoIs.
       poses: x [m], y [m] and yaw [rad] of each robot.
     """
-    chex.assert_shape(poses, (arena.num_robots, 3), custom_message="poses")
+    checks.require_shape("poses", poses, (arena.num_robots, 3))
     check_layout(arena.config, layout)
     shown = layout.shape[:, None] == jnp.arange(len(arena.config.shapes))[None]
     height = jnp.where(shown, arena.config.poi_height / 2, _STORE)
@@ -307,13 +307,11 @@ def check_layout(config: ArenaConfig, layout: Layout) -> None:
       layout: the layout.
 
     Raises:
-      AssertionError: if an array of the layout has another shape; the message names it.
+      ValueError: if an array of the layout has another shape; the message names it.
     """
     shapes = {"position": (2,), "yaw": (), "shape": (), "colour": (3,)}
     for name, shape in shapes.items():
-        chex.assert_shape(
-            getattr(layout, name), (config.num_pois, *shape), custom_message=f"layout.{name}"
-        )
+        checks.require_shape(f"layout.{name}", getattr(layout, name), (config.num_pois, *shape))
 
 
 def robot_poses(data: mjx.Data) -> Float[Array, "R 3"]:
@@ -332,7 +330,7 @@ def drive(arena: Arena, data: mjx.Data, wheel_speeds: Float[Array, "R 2"]) -> mj
     Returns:
       The next MJX state.
     """
-    chex.assert_shape(wheel_speeds, (arena.num_robots, 2), custom_message="wheel_speeds")
+    checks.require_shape("wheel_speeds", wheel_speeds, (arena.num_robots, 2))
     # MJX relies on rank promotion, which the caller may have forbidden.
     with jax.numpy_rank_promotion("allow"):
         return mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds)))

@@ -5,12 +5,12 @@ it depends on where and when a camera looks. Only reading noise is on by default
 cost nothing while off.
 """
 
-import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsense.config import CameraConfig, LidarConfig
+from jaxsense.core import checks
 from jaxsense.core.types import Key
 
 
@@ -27,7 +27,7 @@ def measured_ranges(
     Returns:
       Measured ranges, in metres; `max_range` without a return.
     """
-    chex.assert_rank(distance, 1, custom_message="distance")
+    checks.require_shape("distance", distance, (None,))
     is_disturbed = config.mixed_pixels > 0 or config.dropout > 0
     met = _disturbed(key, distance, config) if is_disturbed else distance
     spread = config.range_noise

@@ -6,7 +6,6 @@ is thus a set of circles and rectangles, whose intersections with a ray have a c
 
 import functools
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -150,8 +149,10 @@ def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> H
     Raises:
       ValueError: if the origin is not finite, or a direction is no unit vector.
     """
-    chex.assert_shape(origin, (2,), custom_message="origin")
-    chex.assert_equal_shape(direction, custom_message="direction")
+    checks.require_shape("origin", origin, (2,))
+    checks.require_shape("y of direction", direction[1], jnp.shape(direction[0]))
+    checks.require_number("number of outlines", len(section.geom))
+    checks.require_index("num_circles", int(section.num_circles), len(section.geom) + 1)
     checks.require_finite("origin", origin)
     for part in direction:
         checks.require_finite("direction", part)

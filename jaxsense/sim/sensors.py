@@ -9,7 +9,6 @@ import abc
 import dataclasses
 import importlib
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -322,8 +321,8 @@ def scan(
     Raises:
       ValueError: if the sensor reads the light's conditions, and they have not been drawn.
     """
-    chex.assert_shape(directions, (2, None), custom_message="directions")
-    chex.assert_shape(light.direction, (3,), custom_message="light.direction")
+    checks.require_shape("directions", directions, (2, None))
+    checks.require_shape("light.direction", light.direction, (3,))
     check_layout(arena.config, layout)
     pose = robot_poses(data)[robot]
     section = _section(arena, data, sensor.height, robot, twin)

@@ -1,12 +1,12 @@
 """Poses from which a sensor faces a PoI, in range and free of collisions."""
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsense.config import ArenaConfig, ViewpointConfig
+from jaxsense.core import checks
 from jaxsense.core.types import Index, Key
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
@@ -39,8 +39,8 @@ def random_viewpoint(
       The pose, x [m], y [m] and yaw [rad], and the bearing of the PoI in the robot's frame as the
       robot believes it, in radians.
     """
-    chex.assert_shape(others, (None, 2), custom_message="others")
-    chex.assert_rank(poi, 0, custom_message="poi")
+    checks.require_shape("others", others, (None, 2))
+    checks.require_shape("poi", poi, ())
     # A single draw, because each use of the random generator takes long to compile.
     draws = jax.random.uniform(key, (2 * NUM_CANDIDATES + 2,))
     near, far = config.min_distance, config.max_distance
@@ -83,8 +83,9 @@ def moved_viewpoint(
       The pose and the believed bearing of the PoI, as in `random_viewpoint`. The pose is at the
       place itself if no free one at that distance is in range and shows the PoI.
     """
-    chex.assert_shape(position, (2,), custom_message="position")
-    chex.assert_rank([poi, distance], 0, custom_message="poi, distance")
+    checks.require_shape("position", position, (2,))
+    checks.require_shape("poi", poi, ())
+    checks.require_shape("distance", distance, ())
     draws = jax.random.uniform(key, (NUM_CANDIDATES + 2,))
     direction, target = jnp.pi * (2 * draws[:-2] - 1), layout.position[poi]
     x = position[0] + distance * jnp.cos(direction)
@@ -119,8 +120,8 @@ def bearing(
     Returns:
       The angle from the robot's heading, positive to the left, in radians within -pi and pi.
     """
-    chex.assert_shape(pose, (3,), custom_message="pose")
-    chex.assert_shape(position, (2,), custom_message="position")
+    checks.require_shape("pose", pose, (3,))
+    checks.require_shape("position", position, (2,))
     offset = position - pose[:2]
     angle = jnp.arctan2(offset[1], offset[0]) - pose[2]
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
@@ -150,7 +151,7 @@ def free_room(
       The smallest margin to walls, robots and PoIs, in metres; 0 or less where a robot would be too
       close to something, or something hides part of the PoI.
     """
-    chex.assert_equal_shape([x, y], custom_message="x, y")
+    checks.require_shape("y", y, jnp.shape(x))
     reach = amiro.BODY_RADIUS + clearance
     to_wall = arena.side / 2 - jnp.maximum(jnp.abs(x), jnp.abs(y)) - reach
     target = layout.position[poi]

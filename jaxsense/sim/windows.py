@@ -1,6 +1,5 @@
 """Windows: the part of a scan around a PoI that the detector reads."""
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +23,7 @@ def window_of(
     Returns:
       The values of the window's rays.
     """
-    chex.assert_rank(bearing, 0, custom_message="bearing")
+    checks.require_shape("bearing", bearing, ())
     *shape, num_rays = values.shape
     start = _first_ray(sensor, bearing)
     # One slice of all rays a stride apart: XLA would recompute an array of indices, starting from
@@ -64,7 +63,7 @@ def cut_out(
     """
     channels = () if sensor.channels == 1 else (sensor.channels,)
     shape = (len(sensor.angles), *channels)
-    chex.assert_shape(readings, shape, custom_message=f"readings of {sensor.name}")
+    checks.require_shape(f"readings of {sensor.name}", readings, shape)
     is_turn = "must be from -pi to pi: it is in radians"
     checks.require("bearing", bearing, lambda x: np.abs(x) <= np.pi, is_turn)
     dtype = jnp.result_type(readings)
@@ -112,7 +111,7 @@ def as_window(sensor: Sensor, readings: Float[Array, "window *channels"]) -> Flo
       The readings as one vector, limited to `sensor.window_limit`. A distance of 0 counts as no
       return, that is as infinite: drivers of laser scanners write it for one.
     """
-    chex.assert_axis_dimension(readings, 0, sensor.window, custom_message="readings")
+    checks.require_shape("readings", readings, (sensor.window, ...))
     if sensor.measures_distance:
         readings = jnp.where(readings == 0, jnp.inf, readings)
     return jnp.minimum(readings, sensor.window_limit).reshape(-1)

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -134,7 +133,7 @@ def look(
     """
     if not 0 <= robot < len(world.sensors):
         raise ValueError(f"robot = {robot}: must be one of the {len(world.sensors)} robots")
-    chex.assert_rank(poi, 0, custom_message="poi")
+    checks.require_shape("poi", poi, ())
     checks.require_index("poi", poi, world.arena.config.num_pois)
     checks.require_finite("scene.poses", scene.poses)
     viewpoint_key, noise_key = jax.random.split(key)
@@ -172,7 +171,7 @@ def look_again(
     Raises:
       ValueError: if there is no such PoI.
     """
-    chex.assert_rank(poi, 0, custom_message="poi")
+    checks.require_shape("poi", poi, ())
     checks.require_index("poi", poi, world.arena.config.num_pois)
     distance_key, viewpoint_key, noise_key = jax.random.split(key, 3)
     pose, bearing = viewpoints.moved_viewpoint(

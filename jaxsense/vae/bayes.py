@@ -1,6 +1,5 @@
 """Exact Bayes over the classes, and the product of experts, to compare fusion with."""
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,8 +31,8 @@ def log_likelihoods(features: _Features, label_of_class: _Labels) -> Float[Array
     Raises:
       ValueError: if a label does not exist or the features are not probabilities.
     """
-    chex.assert_rank(features, 1, custom_message="features")
-    chex.assert_rank(label_of_class, 1, custom_message="label_of_class")
+    checks.require_shape("features", features, (None,))
+    checks.require_shape("label_of_class", label_of_class, (None,))
     checks.require_index("label_of_class", label_of_class, len(features))
     checks.require_probabilities("features", features)
     label_of_class = jnp.asarray(label_of_class)
@@ -62,8 +61,8 @@ def bayes_update(
     Raises:
       ValueError: if all classes are excluded or a logarithm is NaN; see also `log_likelihoods`.
     """
-    chex.assert_rank(log_weights, 1, custom_message="log_weights")
-    chex.assert_shape(label_of_class, log_weights.shape, custom_message="label_of_class")
+    checks.require_shape("log_weights", log_weights, (None,))
+    checks.require_shape("label_of_class", label_of_class, log_weights.shape)
     # Rejects -inf (all classes excluded) and NaN.
     checks.require_finite("largest of log_weights", jnp.max(log_weights))
     found = log_likelihoods(features, label_of_class)
@@ -128,7 +127,7 @@ def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Beli
       ValueError: if a belief is not finite, or a standard deviation is not positive.
     """
     for name, each in (("belief", belief), ("posterior", posterior), ("prior", prior)):
-        chex.assert_shape(each.std, each.mean.shape, custom_message=name)
+        checks.require_shape(name, each.std, each.mean.shape)
         checks.require_finite(f"{name}.mean", each.mean)
         checks.require_positive(f"{name}.std", each.std)
     of_belief, of_posterior, of_prior = (x.std**-2 for x in (belief, posterior, prior))

@@ -1,9 +1,9 @@
 """Quality of predicted probabilities: likelihood, calibration error, reliability diagram."""
 
-import chex
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxsense.core import checks
 from jaxsense.core.types import Reliability
 
 MIN_PROBABILITY = 1e-12
@@ -19,8 +19,8 @@ def negative_log_likelihood(
       probabilities: `[S, L]` of each label.
       labels: `[S]` int32 true labels.
     """
-    chex.assert_rank(probabilities, 2, custom_message="probabilities")
-    chex.assert_shape(labels, (len(probabilities),), custom_message="labels")
+    checks.require_shape("probabilities", probabilities, (None, None))
+    checks.require_shape("labels", labels, (len(probabilities),))
     right = jnp.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
     return -jnp.mean(jnp.log(jnp.maximum(right, MIN_PROBABILITY)))
 
@@ -49,8 +49,8 @@ def reliability(probabilities: Float[Array, "S L"], labels: Int[Array, " S"]) ->
       probabilities: `[S, L]` of each label.
       labels: `[S]` int32 true labels.
     """
-    chex.assert_rank(probabilities, 2, custom_message="probabilities")
-    chex.assert_shape(labels, (len(probabilities),), custom_message="labels")
+    checks.require_shape("probabilities", probabilities, (None, None))
+    checks.require_shape("labels", labels, (len(probabilities),))
     confidence = jnp.max(probabilities, axis=1)
     is_right = jnp.argmax(probabilities, axis=1) == labels
     bins = jnp.clip(jnp.ceil(confidence * _BINS).astype(jnp.int32) - 1, 0, _BINS - 1)

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Protocol
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -11,7 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import DetectorConfig
-from jaxsense.core import networks, supervised
+from jaxsense.core import checks, networks, supervised
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Key, pytree
 from jaxsense.vae import gate as gates
@@ -85,7 +84,7 @@ def init(
       config: sizes of the network.
       measures_distance: whether the readings are distances, see `Gate`.
     """
-    chex.assert_rank(windows, 2, custom_message="windows")
+    checks.require_shape("windows", windows, (None, None))
     params = networks.init(key, MLP(config.hidden, num_labels), windows.shape[1])
     offset, scale = networks.statistics(windows)
     # Folded in: `key` draws the network of the labels.
@@ -162,7 +161,7 @@ def search(
       log_prior: `[J, K]` logarithm of the prior, up to a constant; minus infinity for what is not
         to be considered.
     """
-    chex.assert_shape(log_prior, (len(distances), len(windows)), custom_message="log_prior")
+    checks.require_shape("log_prior", log_prior, (len(distances), len(windows)))
     is_valid = jnp.isfinite(windows).all(axis=1)
     given = jnp.where(is_valid[:, None], windows, 0.0)
     is_distance = jnp.isfinite(distances) & (distances > 0)
@@ -181,7 +180,7 @@ def search(
 
 def _standard(detector: Classifier, window: Float[Array, " F"]) -> Float[Array, " F"]:
     """A window standardised by those of the training."""
-    chex.assert_shape(window, detector.offset.shape, custom_message="window")
+    checks.require_shape("window", window, detector.offset.shape)
     return (window - detector.offset) / detector.scale
 
 
@@ -263,7 +262,7 @@ def retrain(
         kind = type(detector).__name__
         raise TypeError(f"detector is a {kind}; must be a Classifier, which learns from labels")
     windows, labels = jnp.asarray(windows), jnp.asarray(labels)
-    chex.assert_equal_shape_prefix([windows, labels], 1)
+    checks.require_shape("labels", labels, (len(windows),))
     number = config.num_training(len(labels))
     if not 0 < number < len(labels):
         expected = f"must leave some of {len(labels)} windows to train with, and some to judge by"
@@ -294,7 +293,7 @@ def calibrate(
     Returns:
       The detector whose probabilities make these labels most likely.
     """
-    chex.assert_equal_shape_prefix([windows, labels], 1)
+    checks.require_shape("labels", labels, (len(windows),))
     standard = (windows - detector.offset[None]) / detector.scale
     predicted = networks.apply(_network(detector), detector.params, standard.T)
 

@@ -11,7 +11,6 @@ weights among those that `readout` reads without error: a belief is a sufficient
 
 from collections.abc import Mapping
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -83,10 +82,10 @@ class Filter:
         model = self.model
         checks.require_modality(modality, model.modalities)
         name = f"features of {model.modalities[modality]}"
-        chex.assert_shape(features, (model.feature_sizes[modality],), custom_message=name)
+        checks.require_shape(name, features, (model.feature_sizes[modality],))
         checks.require_probabilities("features", features)
-        chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
-        chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
+        checks.require_shape("belief.mean", belief.mean, (model.latent_size,))
+        checks.require_shape("belief.std", belief.std, (model.latent_size,))
         found = self.log_likelihood(self.networks, features, modality)
         before = jnp.log(self.class_probabilities(belief))
         return readout.mixture(self.classes, jax.nn.softmax(before + weight * found))
@@ -138,10 +137,10 @@ def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterC
       prior: `[D]` belief before any look.
       config: sizes of the networks.
     """
-    chex.assert_shape(classes.mean, (None, model.latent_size), custom_message="classes.mean")
-    chex.assert_shape(classes.std, classes.mean.shape, custom_message="classes.std")
-    chex.assert_shape(prior.mean, (model.latent_size,), custom_message="prior.mean")
-    chex.assert_shape(prior.std, (model.latent_size,), custom_message="prior.std")
+    checks.require_shape("classes.mean", classes.mean, (None, model.latent_size))
+    checks.require_shape("classes.std", classes.std, classes.mean.shape)
+    checks.require_shape("prior.mean", prior.mean, (model.latent_size,))
+    checks.require_shape("prior.std", prior.std, (model.latent_size,))
     read = readout.make(classes, readout.directions(model.feature_sizes))
     network = MLP(config.hidden, read.of_classes.shape[1])
     keys = jax.random.split(key, len(model.modalities))

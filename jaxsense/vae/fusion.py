@@ -7,7 +7,6 @@ fusion is a class with the attributes and methods of `core.types.Fusion`.
 import itertools
 from collections.abc import Mapping
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,9 +112,9 @@ def fuse(
       ValueError: if `features` has another length than `model.modalities`, all are None, or one
         does not hold probabilities; if the belief is not finite or its width not positive.
     """
-    chex.assert_shape(belief.std, (model.latent_size,), custom_message="belief.std")
-    chex.assert_shape(belief.mean, (model.latent_size,), custom_message="belief.mean")
-    chex.assert_shape(seen, (len(model.modalities),), custom_message="seen")
+    checks.require_shape("belief.std", belief.std, (model.latent_size,))
+    checks.require_shape("belief.mean", belief.mean, (model.latent_size,))
+    checks.require_shape("seen", seen, (len(model.modalities),))
     checks.require_finite("belief.mean", belief.mean)
     checks.require_positive("belief.std", belief.std)
     generated = jmvae.decode(params, model, belief.mean)

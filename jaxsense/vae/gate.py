@@ -2,14 +2,13 @@
 
 import dataclasses
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import DetectorConfig
-from jaxsense.core import networks
+from jaxsense.core import checks, networks
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Key, pytree
 
@@ -85,7 +84,7 @@ def passes(gate: Gate, window: Float[Array, " F"], distance: Float[Array, ""]) -
     Returns:
       False if it shows something else, or a number is not finite or the distance not above 0.
     """
-    chex.assert_rank(distance, 0, custom_message="distance")
+    checks.require_shape("distance", distance, ())
     is_valid = jnp.isfinite(window).all() & jnp.isfinite(distance) & (distance > 0)
     return is_valid & (logits(gate, window, distance) >= gate.threshold)
 

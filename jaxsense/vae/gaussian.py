@@ -1,6 +1,5 @@
 """Diagonal Gaussians: divergence, sampling, products and moment matching."""
 
-import chex
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -22,10 +21,10 @@ def kl_divergence(mean_p: _Row, log_var_p: _Row, mean_q: _Row, log_var_q: _Row) 
     Returns:
       `[]` in nats.
     """
-    chex.assert_rank(mean_p, 1, custom_message="mean_p")
-    chex.assert_shape(log_var_p, mean_p.shape, custom_message="log_var_p")
-    chex.assert_shape(mean_q, mean_p.shape, custom_message="mean_q")
-    chex.assert_shape(log_var_q, mean_p.shape, custom_message="log_var_q")
+    checks.require_shape("mean_p", mean_p, (None,))
+    checks.require_shape("log_var_p", log_var_p, mean_p.shape)
+    checks.require_shape("mean_q", mean_q, mean_p.shape)
+    checks.require_shape("log_var_q", log_var_q, mean_p.shape)
     ratio = jnp.exp(log_var_p - log_var_q)
     distance = (mean_p - mean_q) ** 2 * jnp.exp(-log_var_q)
     return 0.5 * jnp.sum(ratio + distance - 1.0 - log_var_p + log_var_q)
@@ -52,8 +51,8 @@ def sample(noise: _Columns, mean: _Columns, log_var: _Columns) -> Float[Array, "
       mean: `[D, ...]`.
       log_var: `[D, ...]` logarithm of the variances.
     """
-    chex.assert_shape(log_var, mean.shape, custom_message="log_var")
-    chex.assert_shape(noise, mean.shape, custom_message="noise")
+    checks.require_shape("log_var", log_var, mean.shape)
+    checks.require_shape("noise", noise, mean.shape)
     return mean + jnp.exp(0.5 * log_var) * noise
 
 
@@ -72,8 +71,8 @@ def product(
     Returns:
       `[D]` mean and `[D]` log-variance.
     """
-    chex.assert_rank(means, 2, custom_message="means")
-    chex.assert_shape(log_vars, means.shape, custom_message="log_vars")
+    checks.require_shape("means", means, (None, None))
+    checks.require_shape("log_vars", log_vars, means.shape)
     precisions = jnp.exp(-jnp.minimum(log_vars, 0.0))
     precision = 1.0 + jnp.sum(precisions - 1.0, axis=0)
     return jnp.sum(precisions * means, axis=0) / precision, -jnp.log(precision)
@@ -97,8 +96,8 @@ def moment_match(
     Raises:
       ValueError: if there is no component, or a standard deviation is not positive.
     """
-    chex.assert_rank(mean, 2, custom_message="mean")
-    chex.assert_shape(std, mean.shape, custom_message="std")
+    checks.require_shape("mean", mean, (None, None))
+    checks.require_shape("std", std, mean.shape)
     checks.require_number("number of components", len(mean))
     checks.require_positive("std", std)
     variance = jnp.mean(std**2, axis=0) + jnp.var(mean, axis=0)

@@ -9,7 +9,6 @@ two modalities these are the joint encoder and the two uni-modal encoders of the
 import dataclasses
 import itertools
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -46,6 +45,9 @@ class Jmvae:
     max_subset: int | None = None
 
     def __post_init__(self):
+        checks.require_tuple("modalities", self.modalities)
+        checks.require_tuple("feature_sizes", self.feature_sizes)
+        checks.require_tuple("hidden", self.hidden)
         if not self.modalities:
             raise ValueError("modalities = (): must name one or more modalities")
         if len(self.feature_sizes) != len(self.modalities):
@@ -155,7 +157,7 @@ def _check_features(model: Jmvae, features: Features) -> None:
         raise ValueError(f"features = {features}: must hold one modality or more")
     for name, size, feature in zip(model.modalities, model.feature_sizes, features, strict=True):
         if feature is not None:
-            chex.assert_shape(feature, (size,), custom_message=f"features of {name}")
+            checks.require_shape(f"features of {name}", feature, (size,))
             checks.require_finite(f"features of {name}", feature)
 
 
@@ -170,7 +172,7 @@ def decode(params: Params, model: Jmvae, z: Float[Array, " D"]) -> tuple[Float[A
     Returns:
       For each modality `[D_m]`.
     """
-    chex.assert_shape(z, (model.latent_size,), custom_message="z")
+    checks.require_shape("z", z, (model.latent_size,))
     return _decode(params, model, z)
 
 
@@ -273,7 +275,7 @@ def losses(
     checks.require_one_each("reconstruction_weights", reconstruction_weights, model.modalities)
     batch = noise.shape[-1]
     for x, size in zip(features, model.feature_sizes, strict=True):
-        chex.assert_shape(x, (size, batch), custom_message="features")
+        checks.require_shape("features", x, (size, batch))
 
     *others, every = model.subsets
     mean, log_var = _encode(params, model, every, features)

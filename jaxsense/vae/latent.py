@@ -1,6 +1,5 @@
 """Metrics of a latent space, and the classes that are plausible given a belief."""
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +21,7 @@ def sigma_norm(std: Float[Array, "*S D"]) -> Float[Array, "*S"]:
     Raises:
       ValueError: if a standard deviation is not positive.
     """
-    chex.assert_shape(std, (..., None), custom_message="std")
+    checks.require_shape("std", std, (..., None))
     checks.require_positive("std", std)
     return jnp.linalg.norm(std, axis=-1)
 
@@ -33,7 +32,7 @@ def active_units(mean: Float[Array, "S D"]) -> Int[Array, ""]:
     A dimension counts when the variance of its `[S, D]` posterior means over the data exceeds 0.01
     (Burda, Grosse and Salakhutdinov 2016, Sec. 5.2).
     """
-    chex.assert_rank(mean, 2, custom_message="mean")
+    checks.require_shape("mean", mean, (None, None))
     return jnp.sum(jnp.var(mean, axis=0) > ACTIVE_VARIANCE)
 
 
@@ -72,9 +71,9 @@ def nearest_class(belief: Belief, class_means: Float[Array, "C D"]) -> Int[Array
 
 def _check_belief(belief: Belief, class_means: jax.Array) -> None:
     """Raises an error unless shapes fit and values describe Gaussians."""
-    chex.assert_rank(belief.mean, 1, custom_message="belief.mean")
-    chex.assert_shape(belief.std, belief.mean.shape, custom_message="belief.std")
-    chex.assert_shape(class_means, (None, *belief.mean.shape), custom_message="class_means")
+    checks.require_shape("belief.mean", belief.mean, (None,))
+    checks.require_shape("belief.std", belief.std, belief.mean.shape)
+    checks.require_shape("class_means", class_means, (None, *belief.mean.shape))
     checks.require_finite("belief.mean", belief.mean)
     checks.require_finite("class_means", class_means)
     checks.require_positive("belief.std", belief.std)

@@ -10,7 +10,6 @@ whose errors have a correlation r is worth `k / (1 + (k - 1) r)` independent one
 follow its increments closely, with an `a` for each r. Both numbers are learned from repeated looks.
 """
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -107,8 +106,8 @@ def fit(
     Raises:
       ValueError: if a class does not exist.
     """
-    chex.assert_rank(found, 3, custom_message="found")
-    chex.assert_shape(positions, (*found.shape[:2], 2), custom_message="positions")
+    checks.require_shape("found", found, (None, None, None))
+    checks.require_shape("positions", positions, (*found.shape[:2], 2))
     checks.require_index("classes", classes, found.shape[2])
     apart = jnp.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
     is_earlier = np.tri(found.shape[1], k=-1, dtype=bool)

@@ -11,7 +11,6 @@ latent directions of their own.
 import functools
 from collections.abc import Sequence
 
-import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -45,7 +44,7 @@ def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
     Raises:
       ValueError: if `probabilities` are not within 0 and 1, or their sum is not 1.
     """
-    chex.assert_shape(probabilities, classes.mean.shape[:1], custom_message="probabilities")
+    checks.require_shape("probabilities", probabilities, classes.mean.shape[:1])
     checks.require_probabilities("probabilities", probabilities)
     mean = _dot(probabilities, classes.mean)
     spread = classes.std**2 + (classes.mean - mean[None]) ** 2
@@ -126,7 +125,7 @@ def make(classes: Belief, most: int | None = None) -> Readout:
         direction less than each sensor has labels, see `directions`; by default, all that the
         moments have.
     """
-    chex.assert_rank(classes.mean, 2, custom_message="classes.mean")
+    checks.require_shape("classes.mean", classes.mean, (None, None))
     moments = _moments(classes)
     offset = jnp.mean(moments, axis=0)
     _, singular, axes = jnp.linalg.svd(moments - offset[None], full_matrices=False)

@@ -116,6 +116,11 @@ def rate(x: Array) -> Array:
     assert history.program(before) != history.program(after.replace("rate(x", "rate(y"))
     other = f"FACTOR = 3\n{after}\ndef other():\n    return FACTOR\n"
     assert history.program(before, "rate") == history.program(other, "rate")
+    checked = other.replace("return 2", "checks.require_finite('x', x)\n    return 2")
+    assert checked != other
+    assert history.program(checked, "rate") == history.program(other, "rate")
+    called = other.replace("return 2", "log.write('x', x)\n    return 2")
+    assert history.program(called, "rate") != history.program(other, "rate")
     changed = other.replace("2 * x", "3 * x")
     assert history.program(before, "rate") != history.program(changed, "rate")
     later = other.replace("FACTOR = 3", "FACTOR = 4")

@@ -59,5 +59,5 @@ def test_sizes_that_no_lattice_has_are_named():
     for number in (0, -1, 1.5):
         with pytest.raises(ValueError, match=r"num_classes = .*: must be a whole number"):
             optimum.steps_of_lattice(number)
-    with pytest.raises(AssertionError, match="probabilities"):
+    with pytest.raises(ValueError, match="probabilities"):
         optimum.interpolate(jnp.zeros(513), jnp.full((1, 2), 0.5))

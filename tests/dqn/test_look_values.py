@@ -380,7 +380,7 @@ def solve_now(likelihoods, horizon):
 @pytest.mark.parametrize(
     ("likelihoods", "horizon", "error", "expected"),
     [
-        (LIKELIHOODS[..., :2], 2, AssertionError, "likelihoods"),
+        (LIKELIHOODS[..., :2], 2, ValueError, "likelihoods"),
         (ONE_NAN, 2, ValueError, "likelihoods = nan: must be finite"),
         (np.full_like(LIKELIHOODS, -np.inf), 2, ValueError, "likelihoods = -inf: must be finite"),
         (LIKELIHOODS, 0, ValueError, "horizon = 0: must be a whole number greater than 0"),

@@ -42,7 +42,7 @@ def test_td_errors_of_many_transitions_are_those_of_each():
 
 
 def test_values_of_other_transitions_than_the_actions_raise():
-    with pytest.raises(AssertionError):
+    with pytest.raises(ValueError, match="q_tm1 has the shape"):
         td_error(Q_TM1[:, None], Q_T)
 
 

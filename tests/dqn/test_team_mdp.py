@@ -246,9 +246,9 @@ def test_an_action_that_does_not_exist_is_refused(action, expected):
 
 
 def test_places_of_another_size_are_named():
-    with pytest.raises(AssertionError, match="positions"):
+    with pytest.raises(ValueError, match="positions"):
         team_mdp.reset(jax.random.key(0), make_mdp(places=PLACES[:2]))
-    with pytest.raises(AssertionError, match="poses"):
+    with pytest.raises(ValueError, match="poses"):
         team_mdp.reset(jax.random.key(0), replace(MDP, config=TeamConfig(robots_each=2)))
 
 

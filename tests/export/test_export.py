@@ -80,7 +80,7 @@ def test_the_comparison_needs_numpy_alone(monkeypatch, capsys):
 def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnx", None)
     line = error_line([str(run), "--out", str(tmp_path / "x.zip")], capsys, export)
-    assert line == "jaxsense.export: onnx is not installed: pip install -e '.[export]'"
+    assert line == "jaxsense.export: onnx is not installed: pip install 'jaxsense[export]'"
     assert not [*tmp_path.iterdir()]
 
 

@@ -37,7 +37,7 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch, module, package,
         monkeypatch.delattr(interfaces, name, raising=False)
     with pytest.raises(ModuleNotFoundError) as error:
         importlib.import_module(f"jaxsense.interfaces.{module}")
-    assert str(error.value) == f"{package} is not installed: pip install -e '.[{extra}]'"
+    assert str(error.value) == f"{package} is not installed: pip install 'jaxsense[{extra}]'"
 
 
 class Mocked:

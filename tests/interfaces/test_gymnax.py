@@ -135,7 +135,7 @@ def test_a_sensor_that_is_not_there_is_named(modality):
 @pytest.mark.parametrize("action", [1.7, jnp.float32(1), np.array([0, 1])])
 def test_an_action_that_is_no_integer_is_refused(env, action):
     _, state = env.reset(jax.random.key(0))
-    with pytest.raises((ValueError, AssertionError), match="action"):
+    with pytest.raises(ValueError, match="action"):
         env.step(jax.random.key(1), state, action)
 
 

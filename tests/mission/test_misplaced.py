@@ -229,5 +229,5 @@ def test_errors_must_be_of_all_robots(team, models, arena_of):
     state = arena_of(POSITIONS, POSES)
     start = functools.partial(mission.start, team, models)
     given = state.scene, state.classes, state.policy, state.faults
-    with pytest.raises(AssertionError, match="pose_error"):
+    with pytest.raises(ValueError, match="pose_error"):
         jax.eval_shape(lambda: start(*given, pose_error=jnp.zeros((3, 3))))

@@ -265,8 +265,18 @@ def test_batch_of_rays_equals_a_loop_of_singles(arena, known_scan):
 def test_wrong_shapes_are_named_while_tracing(arena, place, known_layout):
     data = place(known_layout, jnp.zeros((2, 3)))
     section = sim.cross_section(arena, data, 0.1, 0)
-    with pytest.raises(AssertionError, match="origin"):
+    with pytest.raises(ValueError, match="origin"):
         jax.eval_shape(sim.cast, section, jnp.zeros(3), jnp.float32(0))
+
+
+def test_a_scene_has_outlines_and_no_more_circles_than_those(arena, place, known_layout):
+    section = sim.cross_section(arena, place(known_layout, jnp.zeros((2, 3))), 0.1, 0)
+    nothing = section.replace(geom=(), num_circles=0)
+    with pytest.raises(ValueError, match=r"number of outlines = 0: must be .* greater than 0"):
+        sim.cast(nothing, np.zeros(2), 0.0)
+    number = len(section.geom)
+    with pytest.raises(ValueError, match=rf"num_circles = {number + 1}: .* from 0 to {number}"):
+        sim.cast(section.replace(num_circles=number + 1), np.zeros(2), 0.0)
 
 
 def test_turned_as_worked_by_hand():

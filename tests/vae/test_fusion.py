@@ -161,11 +161,11 @@ def test_a_prior_has_mean_zero_and_the_given_variance():
 def test_wrong_shapes_raise_errors_that_name_the_argument():
     params, new = init(jax.random.key(0), TWO), look(TWO, 0)
     seen = jnp.array([False, False])
-    with pytest.raises(AssertionError, match="belief"):
+    with pytest.raises(ValueError, match="belief"):
         in_place(TWO, params).update(Belief(jnp.zeros((1, 2)), jnp.ones((1, 2))), seen, new, 0)
-    with pytest.raises(AssertionError, match="seen"):
+    with pytest.raises(ValueError, match="seen"):
         update(in_place(TWO, params), OLD, jnp.array([False]), new, modality=0)
-    with pytest.raises(AssertionError, match="features of camera"):
+    with pytest.raises(ValueError, match="features of camera"):
         update(in_place(TWO, params), OLD, seen, jnp.zeros(3), modality=0)
 
 

@@ -144,11 +144,11 @@ def test_bad_input_raises_an_error_that_names_it():
         jmvae.encode(params, TWO, (None, None))
     with pytest.raises(ValueError, match=r"features has 3 entries: must be 2"):
         jmvae.encode(params, TWO, (x, w, w))
-    with pytest.raises(AssertionError, match="features of lidar"):
+    with pytest.raises(ValueError, match="features of lidar"):
         jmvae.encode(params, TWO, (x, w[:1]))
-    with pytest.raises(AssertionError, match="features of camera"):
+    with pytest.raises(ValueError, match="features of camera"):
         jmvae.encode(params, TWO, (x[None], w))
-    with pytest.raises(AssertionError, match="z"):
+    with pytest.raises(ValueError, match="z"):
         jmvae.decode(params, TWO, jnp.zeros(3))
     with pytest.raises(ValueError, match="reconstruction_weights"):
         jmvae.loss(
