@@ -23,7 +23,7 @@ _WIDTH_OF_FILES = 160
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Measure each stage, and with --peers those who do the same, and print one table."""
+    """Measures each stage, and with --peers those who do the same, and prints one table."""
 
     names: Annotated[tuple[str, ...], Name("ROWS")] = ()
     """Rows to measure; all by default. A wrong one lists them."""

@@ -47,7 +47,7 @@ _MOST_POIS = 6  # whose orders the oracle tries; it does not play with more
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Play every policy with several costs of a look, and compare them at the same accuracy."""
+    """Plays every policy with several costs of a look, and compares them at the same accuracy."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, `latest`, or `pretrained:PRESET`."""

@@ -48,7 +48,7 @@ Arrays = dict[str, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Compare what exported runs say with the runs themselves, in states of missions."""
+    """Compares what exported runs say with the runs themselves, in states of missions."""
 
     runs: Annotated[tuple[Path, ...], Name("RUNS")] = limited(
         tuple(Path(f"pretrained:{name}") for name in ("default", "noisy", "many")),
@@ -233,7 +233,7 @@ def table(results: Mapping[str, Any], programs: Collection[str] | None = None) -
                         *(_microseconds(x) for x in each),
                     ]
                 )
-    heads = ["run", "program", "other answers", "error", *players]
+    heads = ["run", "program", "different answers", "error", *players]
     return studies.with_origin(studies.as_table(heads, rows), results)
 
 

@@ -25,7 +25,7 @@ PROGRAM = "benchmarks.film"
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Animate a mission of trained robots."""
+    """Animates a mission of trained robots."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, `latest`, or `pretrained:PRESET`."""

@@ -37,7 +37,7 @@ STEPS: Mapping[str, tuple[str, Callable[[], tuple[str, ...]]]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Measure what a newcomer waits for: imports, the README's first program and the demo."""
+    """Measures what a newcomer waits for: imports, the README's first program and the demo."""
 
     steps: tuple[str, ...] = tuple(STEPS)
     """Which steps, besides imports: the README's first `program`, and the `demo`."""

@@ -44,7 +44,7 @@ _SEED = 29
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Count looks at PoIs and at nothing that are answered with a class."""
+    """Counts looks at PoIs and at nothing that are accepted."""
 
     runs: Annotated[tuple[Path, ...], Name("RUNS")] = limited(
         (Path("pretrained:default"), Path("pretrained:noisy")), min_items=1

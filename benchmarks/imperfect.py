@@ -42,7 +42,7 @@ _DELAY_OF_LOSSES, _LOSS_OF_DELAYS = 2.0, 0.5  # s and share, of the sweeps of bo
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Play missions with errors of localisation and with messages that are lost or late."""
+    """Plays missions with errors of localisation and with messages that are lost or late."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, `latest`, or `pretrained:PRESET`."""

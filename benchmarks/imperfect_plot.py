@@ -34,7 +34,7 @@ _LABELS = {
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Draw accuracy, NLL and time over errors of pose, losses and delays."""
+    """Draws accuracy, NLL and time over errors of pose, losses and delays."""
 
     files: Annotated[tuple[Path, ...], Name("FILES")] = ()
     """Files with the figures."""

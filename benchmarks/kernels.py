@@ -44,7 +44,7 @@ CASES: Mapping[str, tuple[Callable[[], Config], int]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Count the kernels of a control step, part by part, and their milliseconds."""
+    """Counts the kernels of a control step, part by part, and their milliseconds."""
 
     cases: tuple[str, ...] = tuple(CASES)
     """Which missions: `few` (384) and `many` (16,384) with the settings of `default`, 8,192 with 16

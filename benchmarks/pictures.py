@@ -214,7 +214,7 @@ def _read(name: str) -> dict:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Draw pictures of README and of the pages anew."""
+    """Draws the pictures of the README and the documentation anew."""
 
     names: Annotated[tuple[str, ...], Name("NAMES")] = ()
     """Pictures, such as `scan.svg`; by default all that need no training."""

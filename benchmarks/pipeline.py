@@ -84,7 +84,7 @@ COMMANDS: Mapping[str, Command] = {
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Measure whole commands by this tree and by an earlier one, in turn."""
+    """Measures whole commands by this tree and by an earlier one, in turn."""
 
     commit: Annotated[str, Name("COMMIT")]
     """The earlier tree."""

@@ -46,7 +46,7 @@ _LOG_ODDS = np.linspace(-15.0, 15.0, 301)
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Compare the best choice of where to look again with rules."""
+    """Compares the best choice of where to look again with rules."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, `latest`, or `pretrained:PRESET`."""

@@ -32,7 +32,7 @@ _SEED = 31
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Count looks through real laser scans that are answered, and that are right."""
+    """Counts looks through real laser scans that the gate accepts, and that are right."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, `latest`, or `pretrained:PRESET`."""
@@ -101,7 +101,7 @@ class Recorded:
         return recorded.resample(self.sensor, angles, ranges[:, :: self.every] + self.offset)
 
     def empty(self, key: jax.Array) -> dict[str, float]:
-        """Shares of looks at nothing that are answered with a class, by the expected distance."""
+        """Shares of looks at nothing that pass the gate, by the expected distance."""
         keys = jax.random.split(key, (len(self.scans.ranges), _VIEWS))
         draw = jax.vmap(jax.vmap(lambda k: recorded.random_view(k, self.config, self.scans.angles)))
         bearings, distances = (np.asarray(x) for x in draw(keys))
@@ -115,8 +115,8 @@ class Recorded:
         of_random, _ = self.detect(scans, bearings, distances.reshape(-1))
         of_measured, _ = self.detect(scans[is_near], bearings[is_near], there[is_near])
         return {
-            f"random distance, {len(scans)} looks": float(np.mean(of_random)),
-            f"at the measured distance, {int(is_near.sum())} looks": float(np.mean(of_measured)),
+            f"random distance, {len(scans):,} looks": float(np.mean(of_random)),
+            f"at the measured distance, {int(is_near.sum()):,} looks": float(np.mean(of_measured)),
         }
 
     def shown(self, key: jax.Array, errors: recorded.Errors, rows: np.ndarray) -> Shown:
@@ -184,13 +184,13 @@ def figures(
     empty_key, shown_key, *keys = jax.random.split(jax.random.key(_SEED), 5)
     real = Recorded(config, models, scans)
     of_empty = real.empty(empty_key)
-    found |= {f"nothing there, {name}: answered": share for name, share in of_empty.items()}
+    found |= {f"nothing there, {name}: passes": share for name, share in of_empty.items()}
     errors = recorded.errors(config, scans.angles, scans.ranges)
     looks = real.shown(shown_key, errors, np.arange(len(scans.ranges)))
     is_there, label = real.detect(looks.scans, looks.bearings, looks.distances)
     is_there, is_right = np.asarray(is_there), np.asarray(label == looks.labels)
-    found[f"PoI, {len(looks.labels)} looks: answered"] = float(np.mean(is_there))
-    found["PoI: shape right, of those answered"] = float(np.mean(is_right[is_there]))
+    found[f"PoI, {len(looks.labels):,} looks: passes"] = float(np.mean(is_there))
+    found["PoI: shape right, of those that pass"] = float(np.mean(is_right[is_there]))
     others = {
         "half of the scans": real,
         "a beam each degree": Recorded(config, models, scans, every=2),

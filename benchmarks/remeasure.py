@@ -28,7 +28,7 @@ PROGRAM = "benchmarks.remeasure"
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Measure stored results again, and write the pages anew."""
+    """Measures stored results again, and writes the pages anew."""
 
     names: Annotated[tuple[str, ...], Name("NAMES")] = ()
     """Files of `benchmarks/results` without their ending; by default all that this kind of device

@@ -28,7 +28,7 @@ _MISSIONS = 64
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Compare the travel model with missions."""
+    """Compares the travel model with missions."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, `latest`, or `pretrained:PRESET`."""

@@ -42,7 +42,7 @@ _KEYS = {"accuracy": 3, "confidence": 3, "looks": 2, "time": 1}
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Play missions in which robots look from other places."""
+    """Plays missions in which robots look from other places."""
 
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, `latest`, or `pretrained:PRESET`."""

@@ -53,14 +53,14 @@ class Arguments:
     """The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
     newest one in `runs/`."""
     episodes: int = 256
-    """Number of missions of each policy."""
+    """Number of missions per policy."""
     seed: int = 0
     """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
     policy: str = "all"
     """What to play: `latent`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3`,
     `random`, `nearest`, `auction` or `rollout`; `policies` for all of these; `ROBOT_alone`,
-    `ROBOT_stops` or `ROBOT_blind`, such as `camera_alone`, for the latent policy in missions in
-    which that robot is alone, stops or goes blind after 6 s; or `all` for everything."""
+    `ROBOT_stops` or `ROBOT_blind`, such as `camera_alone`, for the latent policy in missions
+    where that robot works alone, or stops or goes blind after 6 s; or `all` for everything."""
     arena: ArenaArguments = ArenaArguments()
     robots: tuple[str, ...] | None = None
     """Sensors of the robots, one per robot, for example `camera camera lidar`; the run's by

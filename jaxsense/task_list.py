@@ -37,7 +37,7 @@ def main(argv: list[str] | None = None) -> None:
         say(f"{name}: {tasks.about(name)}.")
     say(
         f"Returns are interquartile means over {tasks.SEEDS} seeds of {tasks.EPISODES:,} episodes, "
-        f"stored with the tasks. {SCOREBOARD} in the source tree has other policies'."
+        f"stored with the tasks. {SCOREBOARD} in the source tree lists other policies."
     )
     say('Next, in Python: jaxsense.score("noisy-v0", policy)')
 

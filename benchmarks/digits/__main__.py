@@ -21,7 +21,7 @@ _SAMPLES = 200  # of z for the likelihood of each digit
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Train JMVAEs on six views of digits, and print one table."""
+    """Trains JMVAEs on six views of digits, and prints one table."""
 
     peers: bool = False
     """Also train MultiVae's models."""

@@ -31,7 +31,7 @@ STAGES = (
     "dqn-advance", "policies", "mission-go_on", "write",
 )  # fmt: skip
 """Where faults strike: the programs of `jaxsense.run.programs`, and the plots."""
-PRESSED = {"ctrl-c": "Ctrl-C", "ctrl-c-twice": "two Ctrl-C", "sigterm": "SIGTERM"}
+PRESSED = {"ctrl-c": "Ctrl-C", "ctrl-c-twice": "Ctrl-C twice", "sigterm": "SIGTERM"}
 STOPPED = "jmvae-advance", "dqn-advance", "mission-go_on"
 """Where a run is stopped whose checkpoints are then damaged."""
 POISONED = {
@@ -260,12 +260,14 @@ def trials(runs: Runs, is_quick: bool) -> Iterator[Trial]:
         yield trial(f"NaN in gradients of {stage}", gradient, stage, i)
     for program in ("evaluate", "export"):
         yield trial(f"disk full in `{program}`", disk_full_after, program)
-    yield trial("a directory that is read-only", read_only)
-    yield trial("HOME that cannot be made", surroundings, "home", {"HOME": "/dev/null/home"}, False)
-    yield trial("HOME that is read-only", surroundings, "ro-home", {"HOME": "/proc"}, False)
+    yield trial("a read-only directory", read_only)
+    yield trial(
+        "HOME that cannot be created", surroundings, "home", {"HOME": "/dev/null/home"}, False
+    )
+    yield trial("a read-only HOME", surroundings, "ro-home", {"HOME": "/proc"}, False)
     yield trial("no HOME, no TERM", surroundings, "bare", {"HOME": None, "TERM": None}, False)
     ascii_locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    yield trial("a locale of ASCII", surroundings, "ascii", ascii_locale, True)
+    yield trial("an ASCII locale", surroundings, "ascii", ascii_locale, True)
     yield trial("two runs in one second", two_in_one_second)
     yield trial("two evaluations of one run", two_evaluations)
     yield trial("two writers of a cache with files of the user", shared_cache)
@@ -273,7 +275,7 @@ def trials(runs: Runs, is_quick: bool) -> Iterator[Trial]:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Make runs go wrong in many ways, and print what became of them."""
+    """Makes runs go wrong in many ways, and prints what became of them."""
 
     quick: bool = False
     """Try a few faults of each kind."""

@@ -27,7 +27,7 @@ _COMPILED_AT_ONCE = 4
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Train variants of the JMVAE of scans."""
+    """Trains variants of the JMVAE of scans."""
 
     tables: tuple[Literal["ablation", "ratio", "depth"], ...] = limited(
         ("ablation", "ratio", "depth"), min_items=1

@@ -49,7 +49,7 @@ Found = dict[tuple[str, str], Figures]
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Print tables of trained variants, and draw them."""
+    """Prints tables of trained variants, and draws them."""
 
     files: Annotated[tuple[Path, ...], Name("FILES")] = ()
     """Files with the figures."""
@@ -139,7 +139,7 @@ def of_depth(found: Found) -> str:
       found: figures of all variants.
     """
     heads = ["", "depth", "right, one look by each", "units", "gradient, encoder: first steps",
-             "all steps", "decoders: first steps", "all steps", "weights, least layer",
+             "all steps", "decoders: first steps", "all steps", "weights, layer that shrinks most",
              "dead units, worst layer: at the start", "at the end"]  # fmt: skip
 
     def row(name: str, depth: int) -> list[str]:

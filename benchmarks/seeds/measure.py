@@ -23,7 +23,7 @@ _DONE = "evaluated.txt"  # in a run directory: options of its evaluations so far
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Train, evaluate and gather the runs behind the tables over seeds."""
+    """Trains, evaluates and gathers the runs behind the tables over seeds."""
 
     groups: Annotated[tuple[str, ...], Name("GROUPS")] = ()
     """Groups of `benchmarks.seeds.plan`; all by default."""

@@ -50,7 +50,7 @@ _SIGMAS = [
     for name, paper in (("unambiguous", "from 1.05"), ("ambiguous", "to 1.25"))
 ]
 _CONSISTENT = Row(
-    "least share of looks that leave the right classes open (`consistent`)",
+    "minimum share of looks that leave exactly the right classes open (`consistent`)",
     lambda figures: min(x for each in figures["consistent"].values() for x in each),
     "{:.3f}",
 )
@@ -121,7 +121,7 @@ OF_RAW = [
     Row("latent dimensions in use, of 2", _key("active_units"), "{}"),
     Row("accuracy of single looks, camera, LiDAR", _key("detectors"), "{:.4f}"),
     Row(
-        "NLL after six random looks less that of exact Bayes",
+        "NLL after six random looks minus that of exact Bayes",
         _last_nll_over_bayes,
         "{:.4f}",
     ),
@@ -139,7 +139,7 @@ OF_RAW_AND_LABELLED = [
     Row("right at held-out PoIs, one look by each sensor", _grouped("pair"), "{:.3f}"),
     Row("... four looks by each", _grouped("all_looks"), "{:.3f}"),
     Row(
-        "NLL of the map less that of exact Bayes, after six random looks",
+        "NLL of the map minus that of exact Bayes, after six random looks",
         _last_nll_over_bayes,
         "{:.3f}",
     ),
@@ -165,7 +165,7 @@ OF_RAW_AND_LABELLED = [
 OF_MAPS = [
     Row("accuracy of single looks, camera, LiDAR", _key("detectors"), "{:.3f}"),
     Row(
-        "NLL of the map less that of exact Bayes, after one to six random looks",
+        "NLL of the map minus that of exact Bayes, after one to six random looks",
         _key("nll_over_bayes"),
         "{:.3f}",
         pooled=True,

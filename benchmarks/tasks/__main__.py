@@ -29,22 +29,22 @@ STEPS = {
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Train in the frozen tasks, and write the scoreboard. Rows of other learners stay."""
+    """Trains in the frozen tasks and writes the scoreboard. Keeps the rows of other learners."""
 
     learners: Annotated[tuple[str, ...], Name("LEARNERS")] = ()
     """Learners to train; all by default."""
     only: tuple[str, ...] = ()
     """Tasks to train in; all by default."""
     seeds: int = limited(10, at_least=1, at_most=10)
-    """Trainings of each learner in each task, with seeds from 0."""
+    """Number of seeds for each learner and task, starting from `--first-seed`."""
     first_seed: int = limited(0, at_least=0, at_most=1_000_000)
-    """Their first seed. Choose settings with others than the default."""
+    """First seed. Use seeds other than the default to choose settings."""
     jobs: int = limited(2, at_least=1, at_most=1024)
-    """Trainings side by side, each on a core of its own."""
+    """Number of trainings to run in parallel, each on its own core."""
     out: Path | None = None
     """Folder of results; by default the repository's, with the tables and the picture."""
     page: bool = False
-    """Train nothing; make the picture and the tables again."""
+    """Train nothing; only remake the picture and the tables."""
     quick: bool = False
     """Take as few steps as possible, to check that everything runs. Needs `--out`."""
 

@@ -99,7 +99,7 @@ def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
       common: options to show, in this order; by default all, by section.
     """
     shown = {option.name: option for option in _options(base)}
-    words = [name for name in shown if not name.startswith("-")]
+    words = [each.usage for name, each in shown.items() if not name.startswith("-")]
     parser = argparse.ArgumentParser(
         usage=" ".join([f"{command(program)} [OPTIONS]", *words]),
         description=_plain(base.__doc__ or ""),
@@ -149,6 +149,12 @@ class _Option:
             return kind, None
         inner = get_args(kind)
         return inner[0], "*" if ... in inner else len(inner)
+
+    @property
+    def usage(self) -> str:
+        """A positional argument as a usage line shows it."""
+        several = f"{self.name} ..." if self.words[1] == "*" else self.name
+        return several if self.default is dataclasses.MISSING else f"[{several}]"
 
     @property
     def off(self) -> str:

@@ -49,7 +49,7 @@ class Fusion(TypedDict):
 
     accuracy: Annotated[
         float | None,
-        Metric("fusion: right", "Share of fused beliefs whose most likely class is right.", 4),
+        Metric("fusion: right", "Share of fused beliefs nearest to the right class.", 4),
     ]
     mean_error: Annotated[
         float | None,
@@ -270,7 +270,9 @@ class Case(TypedDict):
         Annotated[
             float | None,
             Metric(
-                "reported as ambiguous", "For a robot alone: share of PoIs it cannot tell apart."
+                "reported as ambiguous",
+                "For a robot alone: share of the PoIs of confusable classes that the map shows as "
+                "ambiguous.",
             ),
         ]
     ]

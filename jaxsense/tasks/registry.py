@@ -22,9 +22,9 @@ from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, key_of
 from jaxsense.training.mdp import models_of
 
 TASKS = {
-    "map-v0": "the paper's map of three PoIs, whose looks are almost certain",
+    "map-v0": "the paper's map of three PoIs, with detections that are almost always confident",
     "many-v0": "eight PoIs of sixteen classes; each sensor distinguishes four labels",
-    "noisy-v0": "uncertain looks, which beliefs accumulate",
+    "noisy-v0": "the same map with uncertain detections, from which beliefs accumulate evidence",
     "team-v0": "robots with a camera and a LiDAR drive among three to eight PoIs; time has a cost",
 }
 """The frozen tasks, and what is special in each."""

@@ -106,7 +106,7 @@ def test_what_a_run_does_not_have_stays_empty(runs):
     found = gather([runs("raw", 100, scans), runs("default", 100, labelled)])
     table = tables.of_presets(found, rows.OF_RAW, ("raw", "default"))
     assert cells(table, "right at held-out") == ["", f"{GROUPED['pair']:.4f}", ""]
-    assert cells(table, "least share") == ["", "0.500", "0.500"]
+    assert cells(table, "minimum share") == ["", "0.500", "0.500"]
     assert cells(table, "NLL after six")[1] == "-1.7500"
     assert cells(table, "time, median") == ["", "13.8 s, 13.8 s", "13.8 s, 13.8 s"]
 

@@ -82,8 +82,8 @@ def test_programs_are_shown_with_their_latencies():
 
 
 def test_real_scans_are_shown_with_their_noise():
-    found = {**ORIGIN, "shares": {"PoI: answered": 0.99}, "noise": {"dropout": 0.000241}}
-    assert "| PoI: answered | 0.9900 |" in recorded.table(found)
+    found = {**ORIGIN, "shares": {"PoI: passes": 0.99}, "noise": {"dropout": 0.000241}}
+    assert "| PoI: passes | 0.9900 |" in recorded.table(found)
     assert "| `lidar.dropout` | 0.00024 |" in recorded.of_noise(found)
 
 

@@ -32,7 +32,7 @@ def _played(monkeypatch):
     monkeypatch.setattr(gate, "answered", lambda *_: shares)
     monkeypatch.setattr(place, "accuracies", lambda *_: {"camera": 0.9, "lidar": 0.8})
     monkeypatch.setattr(place, "seconds_at", lambda *_: [1.0, 2.0, 3.0])
-    monkeypatch.setattr(recorded, "figures", lambda *_: {"PoI: answered": 0.5})
+    monkeypatch.setattr(recorded, "figures", lambda *_: {"PoI: passes": 0.5})
 
 
 @pytest.mark.usefixtures("_played")
