@@ -93,7 +93,7 @@ GROUPS: Mapping[str, Group] = {
         Group(
             "team_sizes",
             "team",
-            _TWO,
+            _THREE,
             evaluations=tuple(
                 f"{arena} --seed 1 --episodes 512 --policy policies" for arena in _ARENAS
             ),
