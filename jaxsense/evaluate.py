@@ -175,6 +175,7 @@ def _write(
         before = summary.read_evaluations(run).get(path.stem)
         blocks = {**(before["mission"] if before else {}), **missions}
         found = _evaluation(config, compare.compared(blocks))
+        found["origin"] = rundir.origin()
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
         if policies_of(found["mission"]):

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import datetime
 import itertools
 import shlex
 import sys
@@ -22,7 +21,7 @@ from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, command, read_some
-from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds, version
+from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
 from jaxsense.run.clock import Clock, process_start
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
@@ -374,10 +373,7 @@ def _header(run: RunDirectory) -> Header:
     return {
         "preset": run.settings.preset,
         "seed": run.settings.seed,
-        "versions": version.versions(),
-        "devices": [device.device_kind for device in jax.devices()],
-        "cores": devices.cores(),
-        "date": datetime.date.today().isoformat(),
+        **rundir.origin(),
     }
 
 

@@ -49,9 +49,17 @@ OF_SEEDS = {
 OF_A_TEAM = {**SUMMARY, "dqn": {"camera": {**AGENT, "other_numbers": {"8": RETURNS}}}}
 GROUPED = {"pair": 0.9995, "all_looks": 1.0}
 OF_SCANS = {**SUMMARY, "jmvae": {**SUMMARY["jmvae"], "grouped": GROUPED}}
+ORIGIN = {
+    "versions": {"python": "3.12.3", "jax": "0.11.2", "mujoco": "3.17.0"},
+    "devices": ["NVIDIA H200"],
+    "cores": 16,
+    "date": "2026-11-30",
+    "commit": "fedcba9876543210",
+}
 EVALUATION = {
     "num_pois": 16,
     "side": 6.0,
     "robots": ["camera", "camera", "lidar"],
+    "origin": ORIGIN,
     "mission": {"latent": {**CASE, "seed": 7, "accuracy": 0.75}, "bytes_per_detection": BYTES},
 }

@@ -23,7 +23,7 @@ from smoke import MISSION_KEYS, error_line
 import jaxsense
 from jaxsense import dqn, evaluate, export, mission
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.run import batches, cli, devices, files, missions
+from jaxsense.run import batches, cli, devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
 from jaxsense.show import animation
@@ -53,7 +53,9 @@ def test_evaluate_writes_a_file_of_its_own_and_leaves_the_runs_figures(evaluated
     path, before, _ = evaluated
     assert json.loads((path / "summary.json").read_text()) == before
     found = read(path)
-    blocks = found.pop("mission")
+    blocks, origin = found.pop("mission"), found.pop("origin")
+    assert origin == rundir.origin()
+    assert origin["devices"] == ["cpu"] * len(jax.devices())
     assert found == {"num_pois": 3, "side": 3.0, "robots": ["camera", "lidar"]}
     assert set(blocks) == {*dqn.POLICIES, "bytes_per_detection"}
     for policy in dqn.POLICIES:

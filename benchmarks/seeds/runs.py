@@ -47,6 +47,7 @@ def gather(runs: Iterable[Path], group: str | None = None) -> dict[str, Any]:
             "evaluations": {
                 name: {
                     **{key: each[key] for key in ("num_pois", "robots")},
+                    **({"origin": each["origin"]} if "origin" in each else {}),
                     "mission": _of_missions(each["mission"]),
                 }
                 for name, each in summary.read_evaluations(run).items()

@@ -210,7 +210,7 @@ def worth(found: Mapping[str, Any], names: Mapping[Played, str]) -> str:
         if any(cell != "not played" for cell in cells):
             lines.append(_line(f"`{policy}`, {what}", *cells))
     command = "python -m jaxsense.evaluate RUN"
-    columns = {names[of]: {x: found[of[0]][x] for x in runs} for of, runs in played.items()}
+    columns = {names[of]: _origins(found, *of) for of in played}
     return "\n".join([*lines, "", _about(columns, command)])
 
 
@@ -232,7 +232,7 @@ def missions(found: Mapping[str, Any], preset: str, num_pois: int, robots: int) 
             cells.append("; ".join(_interval(x["longer"]) for x in shown if x["longer"]))
             lines.append(_line(f"`{policy}`", *cells))
     command = f"python -m jaxsense.evaluate RUN` of `python -m jaxsense.train --preset {preset}"
-    used = {seed: found[preset][seed] for seed in runs}
+    used = _origins(found, preset, num_pois, robots)
     return "\n".join([*lines, "", _about({preset: used}, command)])
 
 
@@ -258,7 +258,7 @@ def failures(found: Mapping[str, Any], preset: str, num_pois: int, robots: int) 
             _line(label, *(_range(form, [x[key] for x in shown]) for _, key, form in _OF_CASES))
         )
     command = f"python -m jaxsense.evaluate RUN` of `python -m jaxsense.train --preset {preset}"
-    used = {seed: found[preset][seed] for seed in runs}
+    used = _origins(found, preset, num_pois, robots)
     return "\n".join([*lines, "", _about({preset: used}, command)])
 
 
@@ -271,15 +271,35 @@ def _evaluated(
     found: Mapping[str, Any], group: str, num_pois: int, robots: int
 ) -> dict[str, dict[str, Any]]:
     """Policies and their missions by the seeds that were evaluated with so many PoIs and robots."""
-    of_seeds = {
-        seed: [
-            x["mission"]
-            for x in run["evaluations"].values()
-            if (x["num_pois"], len(x["robots"])) == (num_pois, robots)
-        ]
-        for seed, run in found[group].items()
+    return {
+        seed: dict(ChainMap(*(each["mission"] for each in evaluations)))
+        for seed, evaluations in _of_size(found[group], num_pois, robots).items()
     }
-    return {seed: dict(ChainMap(*of_seed)) for seed, of_seed in of_seeds.items() if of_seed}
+
+
+def _origins(
+    found: Mapping[str, Any], group: str, num_pois: int, robots: int
+) -> dict[str, Mapping[str, Any]]:
+    """How `_evaluated` was made; of those that do not say, how the runs were trained."""
+    return {
+        seed: evaluations[-1].get("origin", found[group][seed])
+        for seed, evaluations in _of_size(found[group], num_pois, robots).items()
+    }
+
+
+def _of_size(
+    runs: Mapping[str, Any], num_pois: int, robots: int
+) -> dict[str, list[Mapping[str, Any]]]:
+    """The evaluations with so many PoIs and robots, by the seeds of the runs that have some."""
+    found = {
+        seed: [
+            each
+            for each in run["evaluations"].values()
+            if (each["num_pois"], len(each["robots"])) == (num_pois, robots)
+        ]
+        for seed, run in runs.items()
+    }
+    return {seed: each for seed, each in found.items() if each}
 
 
 def _line(*cells: str) -> str:

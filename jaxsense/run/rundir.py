@@ -13,9 +13,10 @@ from jaxtyping import PyTree
 from jaxsense import models
 from jaxsense.config import Config, ConfigError, require_32_bits
 from jaxsense.models import Models
-from jaxsense.run import files
+from jaxsense.run import devices, files, version
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.settings import Settings, as_json, of_run, resumable
+from jaxsense.summary import Origin
 from jaxsense.tasks.pretrained import PRETRAINED
 from jaxsense.training import stages
 from jaxsense.training.agents import learner, tour_stages
@@ -232,6 +233,17 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
       ValueError: if a number is not finite.
     """
     files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def origin() -> Origin:
+    """How figures of this process are made."""
+    found: Origin = {
+        "versions": version.versions(),
+        "devices": [device.device_kind for device in jax.devices()],
+        "cores": devices.cores(),
+        "date": datetime.now().date().isoformat(),
+    }
+    return {**found, "commit": commit} if (commit := version.commit()) else found
 
 
 def newest(path: Path) -> Path:

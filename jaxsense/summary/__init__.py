@@ -6,6 +6,7 @@ from jaxsense.summary.blocks import Case as Case
 from jaxsense.summary.blocks import Evaluation as Evaluation
 from jaxsense.summary.blocks import Learned as Learned
 from jaxsense.summary.blocks import Missions as Missions
+from jaxsense.summary.blocks import Origin as Origin
 from jaxsense.summary.blocks import Results as Results
 from jaxsense.summary.blocks import Summary as Summary
 from jaxsense.summary.blocks import Timing as Timing

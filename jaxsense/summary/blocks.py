@@ -311,25 +311,33 @@ class Results(Learned):
     mission: Missions
 
 
+class Origin(TypedDict):
+    """How figures were made."""
+
+    versions: Annotated[dict[str, str], Metric("versions", "Versions of Python and of libraries.")]
+    devices: Annotated[list[str], Metric("devices", "Kind of each accelerator, or `cpu`.")]
+    # Runs of earlier versions lack the next three; the last is only known in a checkout.
+    cores: NotRequired[Annotated[int, Metric("cores", "CPU cores of the machine.", 0)]]
+    date: NotRequired[Annotated[str, Metric("date", "Day on which the figures were finished.")]]
+    commit: NotRequired[Annotated[str, Metric("commit", "Commit of the source tree.")]]
+
+
 class Evaluation(TypedDict):
     """Missions of `evaluate` in the same arenas: `RUN/evaluations/NAME.json`."""
 
     num_pois: Annotated[int, Metric("PoIs", "Number of points of interest.", 0)]
     side: Annotated[float, Metric("side [m]", "Side of the arena.", 2)]
     robots: Annotated[list[str], Metric("robots", "Modality of each robot.")]
+    # Of the last call that wrote the file; those of earlier versions lack it.
+    origin: NotRequired[Origin]
     mission: Missions
 
 
-class Header(TypedDict):
+class Header(Origin):
     """The keys of a summary about the run itself."""
 
     preset: Annotated[str, Metric("preset", "Preset that the settings started from.")]
     seed: Annotated[int, Metric("seed", "Source of all randomness; the first of several seeds.")]
-    versions: Annotated[dict[str, str], Metric("versions", "Versions of Python and of libraries.")]
-    devices: Annotated[list[str], Metric("devices", "Kind of each accelerator, or `cpu`.")]
-    # Runs of earlier versions lack the next two.
-    cores: NotRequired[Annotated[int, Metric("cores", "CPU cores of the machine.", 0)]]
-    date: NotRequired[Annotated[str, Metric("date", "Day on which the run ended.")]]
     seeds: NotRequired[
         Annotated[dict[str, Results], Metric("seeds", "Results of each of several seeds.")]
     ]

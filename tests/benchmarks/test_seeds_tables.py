@@ -139,6 +139,12 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     ]  # fmt: skip
     assert cells(shown, "`auction`")[-1] == "0.5 (-0.2 to 1.4); 0.5 (-0.2 to 1.4)"
     assert "--preset many" in shown.splitlines()[-1]
+    # Evaluations tell how they were made; those that do not were made with their runs.
+    assert "NVIDIA H200 with 16 cores; commit fedcba9876 on 2026-11-30" in shown.splitlines()[-1]
+    for run in found["many"].values():
+        del run["evaluations"]["a"]["origin"]
+    shown = tables.missions(found, "many", 8, 3)
+    assert "cpu with 2 cores; commit 0123456789 on 2026-11-26" in shown.splitlines()[-1]
 
 
 def test_teams_of_other_sizes_are_other_columns(runs):

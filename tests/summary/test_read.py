@@ -59,6 +59,9 @@ def test_evaluations_are_read_in_the_order_of_their_names(tmp_path):
         ("here", EVALUATION),
         ("there", EVALUATION),
     ]
+    before = {name: value for name, value in EVALUATION.items() if name != "origin"}
+    written(tmp_path, before, "evaluations/here.json")
+    assert summary.read_evaluations(tmp_path)["here"] == before
     wrong = {**EVALUATION, "mission": {"latent": {**CASE, "time_s": None}}}
     written(tmp_path, wrong, "evaluations/here.json")
     with pytest.raises(ConfigError, match=r"must hold the evaluations/here\.json of a finished"):
