@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
 
 import jax
@@ -107,18 +107,40 @@ class Kind(Protocol):
         ...
 
 
+def init_as_pytorch(key: jax.Array, model: Jmvae) -> Params:
+    """Initial parameters as PyTorch draws them: all uniform, up to `1 / sqrt(inputs)`.
+
+    Args:
+      key: random key.
+      model: the shape.
+    """
+    params = vae.init(key, model)
+    layers = jax.tree.structure(params, is_leaf=_is_layer)
+    keys = jax.tree.unflatten(layers, jax.random.split(key, layers.num_leaves))
+
+    def draw(layer: Mapping[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
+        inputs, outputs = layer["kernel"].shape
+        drawn = jax.random.uniform(key, (inputs + 1, outputs), minval=-1.0) / jnp.sqrt(inputs)
+        return {"kernel": drawn[1:], "bias": drawn[0]}
+
+    return jax.tree.map(draw, params, keys, is_leaf=_is_layer)
+
+
+def _is_layer(part: object) -> bool:
+    return isinstance(part, Mapping) and "kernel" in part
+
+
 @dataclasses.dataclass(frozen=True)
 class Ours:
     """Our JMVAE.
 
     Attributes:
       max_subset: see `Jmvae`.
-      last_scale: see `vae.init`; PyTorch's initial weights are also smaller than ours.
-        `benchmarks.digits.scale` compares some.
+      init: `(key, model) -> initial parameters`.
     """
 
     max_subset: int | None
-    last_scale: float = 0.1
+    init: Callable[[jax.Array, Jmvae], Params]
 
     def runs(self, digits: Digits, budget: Budget, seeds: range) -> Iterator[Run]:
         """Trains once for each seed, see `Kind`; all by one program."""
@@ -137,8 +159,7 @@ class Ours:
 
         def train(key: jax.Array, bank: tuple[jax.Array, ...]) -> Params:
             init_key, train_key = jax.random.split(key)
-            params = vae.init(init_key, model, last_scale=self.last_scale)
-            return vae.train(train_key, params, model, bank, config)[0]
+            return vae.train(train_key, self.init(init_key, model), model, bank, config)[0]
 
         bank = tuple(jax.device_put(x[:, None]) for x in digits.train)
         begin = time.perf_counter()
@@ -180,5 +201,5 @@ class _Trained:
 _encode = jax.vmap(vae.encode, (None, None, 0))
 _decode = jax.jit(jax.vmap(vae.decode, (None, None, 0)), static_argnums=1)
 
-OURS: Mapping[str, Kind] = {"jaxsense JMVAE": Ours(1)}
-"""Ours by name, with the same encoders as MultiVae's."""
+OURS: Mapping[str, Kind] = {"jaxsense JMVAE": Ours(1, init_as_pytorch)}
+"""Ours by name, with the same encoders and the same distribution of initial weights as theirs."""

@@ -4,6 +4,8 @@ import dataclasses
 import json
 import math
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -11,6 +13,7 @@ from scipy import stats
 from benchmarks import measure as machine
 from benchmarks.digits import __main__, data, measures, models, scale, table
 from benchmarks.digits.models import Budget
+from jaxsense import vae
 
 BUDGET = Budget(latent_size=4, hidden=(8,), steps=100, batch=64, learning_rate=1e-2)
 VARIANCE = BUDGET.variance
@@ -24,6 +27,23 @@ def digits():
     centres = np.array([[3.0, 0.0], [0.0, 3.0], [-3.0, -3.0]])[labels]
     views = [centres @ rng.standard_normal((2, d)) + rng.normal(0, 0.5, (120, d)) for d in (4, 3)]
     return data.split(("noise", "a", "b"), (rng.standard_normal((120, 2)), *views), labels)
+
+
+def test_initial_weights_are_drawn_as_pytorch_draws_them():
+    model = vae.Jmvae(("a", "b"), (100, 25), 16, (64,))
+    of_key = [models.init_as_pytorch(jax.random.key(i), model) for i in range(2)]
+    assert jax.tree.map(jnp.shape, of_key[0]) == jax.tree.map(
+        jnp.shape, vae.init(jax.random.key(0), model)
+    )
+    layers = of_key[0]["encoders"]["b"]["params"]
+    for layer, inputs in (("Dense_0", 25), ("Dense_1", 64)):
+        # Of a uniform draw up to the limit, the standard deviation is limit / sqrt(3).
+        limit = 1 / math.sqrt(inputs)
+        for name in ("kernel", "bias"):
+            drawn = np.asarray(layers[layer][name])
+            assert 0.8 * limit < np.abs(drawn).max() <= limit
+            np.testing.assert_allclose(drawn.std(), limit / math.sqrt(3), rtol=0.25)
+    assert not np.allclose(*(x["encoders"]["b"]["params"]["Dense_0"]["kernel"] for x in of_key))
 
 
 def test_the_split_takes_three_quarters_of_each_label_and_scales_by_them(digits):
@@ -128,7 +148,10 @@ def test_a_linear_classifier_by_hand():
 @pytest.fixture(scope="module")
 def found(digits):
     """Figures of ours with an encoder for each view, and with one for every subset."""
-    kinds = {"alone": models.Ours(1), "subsets": models.Ours(None)}
+    kinds = {
+        "alone": models.Ours(1, models.init_as_pytorch),
+        "subsets": models.Ours(None, vae.init),
+    }
     rows = list(__main__.trained(kinds, digits, BUDGET, seeds=2, samples=20))
     return [[row[name] for row in rows] for name in kinds]
 
