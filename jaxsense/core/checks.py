@@ -6,6 +6,7 @@ Traced values are unknown: their checks pass and cost nothing.
 from collections.abc import Callable, Sequence
 from types import EllipsisType
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,21 +93,20 @@ def require_shape(name: str, value: object, shape: Sequence[int | EllipsisType |
     Raises:
       ValueError: names the shape; if only leading axes are too many, also `jax.vmap`.
     """
-    found = np.shape(value) if isinstance(value, _ARRAYS) else None
-    if found is None:
+    if not isinstance(value, _ARRAYS):
         raise ValueError(f"{name} = {value!r}: must be an array of shape {_text(shape)}")
-    axes = [axis for axis in shape if axis is not ...]
-    given = found[-len(axes) :] if shape[:1] == (...,) and axes else found[: len(axes)]
-    number_fits = len(found) >= len(axes) if ... in shape else len(found) == len(axes)
-    if number_fits and _fit(given, axes):
-        return
-    is_batch = len(found) > len(axes) and _fit(found[len(found) - len(axes) :], axes)
-    advice = ", for one example; use jax.vmap for more" if is_batch and ... not in shape else ""
-    raise ValueError(f"{name} has the shape {found}: must be {_text(shape)}{advice}")
+    if not _has(value, shape):
+        is_batch = ... not in shape and _has(value, (..., *shape))
+        advice = ", for one example; use jax.vmap for more" if is_batch else ""
+        raise ValueError(f"{name} has the shape {np.shape(value)}: must be {_text(shape)}{advice}")
 
 
-def _fit(found: Sequence[int], axes: Sequence[object]) -> bool:
-    return all(axis in (None, size) for size, axis in zip(found, axes, strict=True))
+def _has(value: object, shape: Sequence[int | EllipsisType | None]) -> bool:
+    try:
+        chex.assert_shape(value, tuple(shape))
+    except AssertionError:
+        return False
+    return True
 
 
 def _text(shape: Sequence[object]) -> str:
