@@ -1,13 +1,22 @@
 """Pages state the settings of the presets and the constants of the code."""
 
+import dataclasses
+import json
+import math
 import re
 from pathlib import Path
 
 import pytest
 
 import jaxsense
-from jaxsense import PRESETS, demo
-from jaxsense.dqn import tours
+from benchmarks import exported, recorded
+from benchmarks.fusions import study
+from benchmarks.raw import training, variants
+from benchmarks.results import RESULTS
+from benchmarks.seeds.plan import GROUPS
+from jaxsense import PRESETS, demo, sim, tasks
+from jaxsense.dqn import optimum, reference, tours
+from jaxsense.mission import memory
 from jaxsense.mission.cases import FAULT_TIME
 from jaxsense.sim import amiro, search
 from jaxsense.summary import compare, make
@@ -33,6 +42,8 @@ is that of the page's preset."""
 
 def _constants():
     """What prose says with numbers that are constants of the code, in the code's numbers."""
+    yield from _sizes()
+    yield from _of_studies()
     default = PRESETS["default"]
     lidar, camera, viewpoint = default.lidar, default.camera, default.viewpoint
     unambiguous, near = f"{100 * make._UNAMBIGUOUS:.0f}", make._AS_GOOD
@@ -61,6 +72,68 @@ def _constants():
     yield f"`--seed` selects the arena; with the default, {demo.Arguments().seed},"
     yield f"`--seed` (default: {demo.Arguments().seed})"
     yield f"each second of a robot's work costs {jaxsense.make('team-v0').mdp.config.second_cost}"
+
+
+def _sizes():
+    """The same, of how much is drawn, trained, played or stored."""
+    default, paper, noisy = (PRESETS[name] for name in ("default", "paper", "noisy"))
+    classes, pois, sensors = len(default.arena.classes), default.arena.num_pois, 2
+    states = classes**pois * 2 ** (pois * sensors)
+    distinct = math.factorial(pois) * 2 ** (pois * sensors)
+    played = {
+        name: re.findall(r"--episodes (\d+)", " ".join(group.evaluations))[-1]
+        for name, group in GROUPS.items()
+        if group.evaluations
+    }
+    assert played["noisy"] == played["team"]
+    yield f"N is {played['default']} for `default`, {played['noisy']} for `noisy` and `team`, and"
+    yield f"{played['many']} for `many`"
+    yield f"each in {played['team_sizes']} missions"
+    number = int(GROUPS["noisy"].options["--mission.episodes"])
+    yield f"{number:,} missions of each policy with uncertain sensors"
+    yield f"{tasks.EPISODES:,} episodes with each of ten seeds"
+    yield f"make {states:,} start states"
+    yield f"{states:,}, every combination"
+    yield f"classes and looks, {states:,} for three PoIs"
+    yield f"the paper's {distinct}"
+    yield f"the {distinct} are also counted"
+    yield f"Sec. IV, {distinct} states of the map"
+    stratified = f"{default.evaluation.num_states:,}"
+    yield f"if there are more than {stratified}, a run examines a stratified sample of {stratified}"
+    yield f"here {stratified} instead of {states:,};"
+    steps = optimum.steps_of_lattice(2, noisy.evaluation.value_points)
+    looks = noisy.evaluation.value_looks
+    yield f"`noisy` uses {looks} looks, and probabilities in steps of 1/{steps}"
+    yield f"{paper.dqn.num_envs} steps and {paper.dqn.updates} gradient steps each"
+    yield f"the multiple of {paper.dqn.num_envs} nearest"
+    yield f"{default.dqn.num_starts // default.dqn.num_envs} for each environment"
+    yield f"with {reference._NUM_DRAWS} simulated looks"
+    (states_asked,) = (x for x in dataclasses.fields(exported.Arguments) if x.name == "states")
+    yield f"in {states_asked.default:,} states in which a robot chooses"
+    yield f"A robot remembers {memory.MOST_LOOKS} looks"
+
+
+def _of_studies():
+    """The same, of benchmarks."""
+    yield f"the same {study._HISTORIES:,} histories"
+    found = json.loads((RESULTS / "recorded.json").read_text(encoding="utf-8"))
+    yield f"{found['scans']} real laser scans"
+    yield f"four logs with {found['scans']} scans"
+    yield f"fitted to the {found['scans']} scans"
+    camera, lidar = (x.window * x.channels for x in sim.sensors.make(PRESETS["default"]))
+    yield f"explain {camera} numbers from a camera or {lidar} from a LiDAR"
+    yield f"both sensors have {camera} of them"
+    of_scans = json.loads((RESULTS / "raw_ablation.json").read_text(encoding="utf-8"))
+    yield f"{of_scans['steps']:,} gradient steps, on {of_scans['scans']:,} scans by each sensor"
+    yield f"along a cosine, {of_scans['steps']:,} steps"
+    yield f"Each gradient step uses {variants._PER_STEP} looks"
+    yield f"{training._HELD_OUT:,} PoIs are held out"
+    sizes = variants.OURS.jmvae.hidden
+    yield f"{', '.join(map(str, sizes))} | {', '.join(map(str, sizes))} | ours"
+    yield f"hidden layers of {sizes[0]} units"
+    heaviest = max(max(x.jmvae.reconstruction_weights) for x in variants.ABLATION)
+    yield f"weights of {heaviest:,.0f} cost little"
+    yield f"learn from {recorded._LABELLED} windows"
 
 
 CONSTANTS = {

@@ -30,6 +30,11 @@ NOT_PROSE = [
         r"(?:(?:,| and| or) \d+\.\d+)*"
     ),
     re.compile(r"95 %"),
+    re.compile(r"[Ss]eeds? \d+(?:(?:,| to| and) \d+)*"),
+    re.compile(r"(?<!\d)(?:19[5-9]|20[0-3])\d(?!,?\d)|#\d+|SHA-\d+"),  # years and names
+    # What others have published, and what a byte, an exit status or a register can hold.
+    re.compile(r"512 random environments|361 beams|2,000 handwritten digits|1,500\s+digits"),
+    re.compile(r"6 to 240 features|the other 500|status 130|\b(?:188|255)\b|vectors of 512 bits"),
 ]
 SETTINGS = re.compile(r"^\| setting \| value \|.*\n(?:\|.*\n)*", re.MULTILINE)
 """Tables whose second column `test_page_settings` compares with a preset."""
@@ -39,11 +44,14 @@ UNIT = (
     r"|x(?= [a-z])"
 )
 FIGURE = re.compile(
-    rf"(?<![\w.])-?(?:(?:\d+(?:,\d{{3}})*(?:\.\d+)?|\.\d+)\s?(?:{UNIT})|\d*\.\d+(?![\w.]*\d))"
+    rf"(?<![\w.])-?(?:(?:\d+(?:,\d{{3}})*(?:\.\d+)?|\.\d+)\s?(?:{UNIT})|\d*\.\d+(?![\w.]*\d)"
+    r"|\d{1,3}(?:,\d{3})+(?![\w,]*\d)|\d{3,}(?![\w,]*\d))"
 )
+"""Numbers with a unit or a fraction, and those of three digits or more."""
 THEIRS = {"the paper and its code", "theirs"}
 """Columns of `docs/differences.md` with what the paper and its authors' code say."""
-SAID = {"0.3", "1.0", "0.01", "0.95", "0.001", "0.99", "0.995"}
+SAID = {"0.3", "1.0", "0.01", "0.95", "0.001", "0.99", "0.995", "128", "384"}
+SAID |= {"200", "300", "512", "1024", "1,000,000"}
 """The numbers that they do say: Korthals et al. 2018; notebook `dqn4mmvae` of `tik0/vae_tools`."""
 
 
@@ -59,7 +67,7 @@ def without_theirs(page: str) -> str:
             column = next((i for i, name in enumerate(names) if name in THEIRS), 0)
         elif column:
             cells[column] = re.sub(
-                r"(?<![\w.])\d+\.\d+(?![\w.]*\d)(?! ?%)",
+                r"(?<![\w.])(?:\d+\.\d+|\d{1,3}(?:,\d{3})+|\d{3,})(?![\w.,]*\d)(?! ?%)",
                 lambda number: "" if number[0] in SAID else number[0],
                 cells[column],
             )
@@ -85,7 +93,9 @@ def test_figures_are_not_typed(page):
 
 
 def test_what_counts_as_a_figure():
-    assert figures("takes 3.5 s, 12 %, 1,024 of 0.98 GiB") == ["3.5 s", "12 %", "0.98 GiB"]
+    assert figures("takes 3.5 s, 12 %, 1,024 of 0.98 GiB; 512, 99, in 2018, seeds 100 to 109") == [
+        "3.5 s", "12 %", "1,024", "0.98 GiB", "512",
+    ]  # fmt: skip
     assert figures("in 3 minutes, 2 hours, 5 cm; 4 times, 8 x slower, 1 degree, .5, 2 x 2") == [
         "3 minutes", "2 hours", "5 cm", "4 times", "8 x", "1 degree", ".5",
     ]  # fmt: skip
