@@ -16,7 +16,12 @@ _BODIES = ("sim/amiro.py", "sim/arena.py")
 _MOTION = (*_BODIES, "mission/groups.py", "mission/motion.py", "mission/navigation.py")
 _RAYS = (*_BODIES, "sim/raycast.py", "sim/sensors.py")
 _CHOICES = ("dqn/policies.py", "dqn/reference.py", "dqn/rewards.py", "dqn/rules.py")
-_STEPS = (*_CHOICES, "core", "looks.py", "mission", "models.py", "sim", "vae")
+_BELIEFS = (
+    *(f"vae/{name}.py" for name in ("bayes", "calibration", "detectors", "filter", "fusion")),
+    *(f"vae/{name}.py" for name in ("gate", "gaussian", "novelty", "readout")),
+    *(f"vae/jmvae.py:{name}" for name in ("posterior", "decode")),
+)
+_STEPS = (*_CHOICES, "core", "looks.py", "mission", "models.py", "sim", *_BELIEFS)
 _PLAYER = ("run/batches.py", "run/films.py", "run/ledger.py", "run/missions.py")
 _MISSIONS = (
     *_STEPS,
@@ -47,7 +52,7 @@ CODE: Mapping[str, tuple[str, ...]] = {
     ),
     **_measured_by("missions", "missions_many", code=_MISSIONS),
     **_measured_by("missions_devices", "missions_many_devices", code=(*_MISSIONS, *_SPREAD)),
-    "jmvae": ("core/networks.py", "core/supervised.py", "vae/gaussian.py", "vae/jmvae.py"),
+    "jmvae": ("core/networks.py", "core/supervised.py", "vae/gaussian.py", "vae/jmvae.py:train"),
     **dict.fromkeys(("dqn_rejax", "dqn_sb3", "dqn_seeds"), _LEARNING),
     **dict.fromkeys(("time_to_optimal_rejax", "time_to_optimal_sb3"), _LEARNING),
     "dqn_live": (*_LEARNING, "looks.py", "sim", "vae/detectors.py"),

@@ -1,6 +1,6 @@
 """Spaces and starts, shared by the interfaces."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar
 
 import jax
@@ -110,3 +110,10 @@ def start(key: Key, played: Environment, starts: PyTree) -> tuple[Float[Array, "
     row = jax.random.randint(key, (), 0, rows)
     state = jax.tree.map(lambda x: x[row], starts)
     return played.observe(state), state
+
+
+def checked_mode(mode: str | None, modes: Sequence[str]) -> str | None:
+    """A mode to render in, one of some; raises `ValueError` if it is another."""
+    if mode not in (None, *modes):
+        raise ValueError(f"render_mode = {mode!r}: must be {' or '.join([*modes, 'None'])}")
+    return mode

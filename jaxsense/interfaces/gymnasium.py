@@ -16,9 +16,10 @@ from jaxsense.core.types import Key
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.interfaces import common
 from jaxsense.interfaces.extras import extra
-from jaxsense.show.task_plots import frame
+from jaxsense.show.task_plots import frame, frames
 from jaxsense.tasks import Environment, Task, TimeStep, registered
 from jaxsense.tasks.registry import as_task
+from jaxsense.tasks.task import MapTask, TeamTask
 
 with extra("gymnasium"):
     from gymnasium import (  # pyright: ignore[reportMissingImports]
@@ -57,9 +58,7 @@ class TaskEnv(Env):
           ConfigError: if there is no such task or agent.
           ValueError: if there is no such mode.
         """
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode = {render_mode!r}: must be rgb_array or None")
-        self.render_mode = render_mode
+        self.render_mode = common.checked_mode(render_mode, self.metadata["render_modes"])
         self.task = as_task(task, agent)
         self.observation_space, self.action_space = common.environment_spaces(spaces, self.task)
         self._key: Key | None = None
@@ -158,6 +157,7 @@ class MapVectorEnv(VectorEnv):
         starts: PyTree = None,
         # Quoted: where the site is built without Gymnasium, a stand-in has no `|`.
         autoreset_mode: "AutoresetMode | str" = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
     ):
         """Makes the environments; `reset` must be called before the first step.
 
@@ -168,6 +168,7 @@ class MapVectorEnv(VectorEnv):
           starts: from `interfaces.prepared_starts`, to start each episode from a random one; by
             default each start is new, at the cost of several steps.
           autoreset_mode: when an ended episode restarts, as in `gymnasium.vector`.
+          render_mode: see `TaskEnv`; only with a task.
 
         Raises:
           ValueError: if there is no such sensor or mode, or no environment.
@@ -175,7 +176,10 @@ class MapVectorEnv(VectorEnv):
         played = common.environment(mdp, modality)
         checks.require_number("num_envs", num_envs)
         self.num_envs = num_envs
-        self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
+        self._task: Task | None = played if isinstance(played, MapTask | TeamTask) else None
+        modes = ["rgb_array"] if self._task else []
+        self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": modes}
+        self.render_mode = common.checked_mode(render_mode, modes)
         single = common.environment_spaces(spaces, played)
         self.single_observation_space, self.single_action_space = single
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -183,6 +187,7 @@ class MapVectorEnv(VectorEnv):
         self._states: PyTree = None
         self._mask = np.ones((num_envs, played.num_actions), np.int8)
         self._ended = np.zeros(num_envs, bool)
+        self._actions: list[list[int]] = [[] for _ in range(num_envs)]  # to draw
         self._key = jax.random.key(0)
         self._played, self._starts = played, starts
 
@@ -236,6 +241,9 @@ class MapVectorEnv(VectorEnv):
             self._key, self._played, self._states, actions.astype(np.int32)
         )
         self._mask = np.array(mask, np.int8)
+        if self.render_mode is not None:
+            for before, action in zip(self._actions, actions, strict=True):
+                before.append(int(action))
         observations = np.array(outcome.observation)
         rewards = np.array(outcome.reward, np.float64)
         terminations, truncations = np.array(outcome.terminated), np.array(outcome.truncated)
@@ -255,6 +263,14 @@ class MapVectorEnv(VectorEnv):
         """`[E, N + 1]` bool, the actions that exist, see `TaskEnv.action_masks`."""
         return self._mask.astype(bool)
 
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A picture of each map, see `TaskEnv.render`."""
+        if self._task is None or self.render_mode is None:
+            return None
+        if self._states is None:
+            raise error.ResetNeeded("render before reset")
+        return frames(self._task, self._states, self._actions)
+
     def _check_step(self, actions: np.ndarray) -> None:
         """Raises what `step` raises."""
         if self._states is None:
@@ -271,6 +287,8 @@ class MapVectorEnv(VectorEnv):
             self._key, self._played, self._starts, self._states, mask
         )
         self._ended = self._ended & ~mask
+        for i in np.flatnonzero(mask):
+            self._actions[i] = []
         self._mask = np.array(found, np.int8)
         return np.array(observations)
 
@@ -285,6 +303,7 @@ def make_vec(
     agent: str | None = None,
     starts: int | None = None,
     autoreset_mode: "AutoresetMode | str" = AutoresetMode.NEXT_STEP,
+    render_mode: str | None = None,
 ) -> MapVectorEnv:
     """Makes a vector environment: `gymnasium.make_vec("jaxsense/noisy-v0", num_envs=64)`.
 
@@ -295,6 +314,7 @@ def make_vec(
       starts: number of prepared starts, to start each episode from a random one; by default each
         start is new, at the cost of several steps.
       autoreset_mode: see `MapVectorEnv`.
+      render_mode: see `TaskEnv`.
 
     Raises:
       ConfigError: if there is no such task or agent.
@@ -302,7 +322,7 @@ def make_vec(
     """
     found = as_task(task, agent)
     prepared = None if starts is None else common.prepared_starts(jax.random.key(0), found, starts)
-    return MapVectorEnv(found, None, num_envs, prepared, autoreset_mode)
+    return MapVectorEnv(found, None, num_envs, prepared, autoreset_mode, render_mode)
 
 
 def _key(env: "Env | VectorEnv") -> Key:

@@ -56,6 +56,9 @@ class _Team:
         """Space of a robot's actions: each PoI, and NOP."""
         return self.action_spaces[agent]
 
+    def render(self) -> None:
+        """Draws nothing: there is no `render_mode`."""
+
     def _begin(self, seed: int | None) -> tuple[dict[str, np.ndarray], Infos]:
         """Starts an episode; observations and infos of all robots."""
         if seed is not None or self._key is None:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -67,6 +68,19 @@ def _read(mdp: MapMdp, belief: Belief) -> tuple[jax.Array, jax.Array]:
     """`[N, C]` class probabilities of beliefs, and `[C, D]` means of classes."""
     probabilities = jax.vmap(mdp.fusion.class_probabilities)(belief)
     return probabilities, mdp.fusion.classes.mean
+
+
+def frames(task: Task, states: PyTree, actions: Sequence[Sequence[int]]) -> tuple[np.ndarray, ...]:
+    """Pictures of a batch of states, see `frame`.
+
+    Args:
+      task: whose states they are.
+      states: `[E, ...]`.
+      actions: of each episode so far.
+    """
+    of_host = jax.device_get(states)
+    each = (jax.tree.map(lambda x, i=i: x[i], of_host) for i in range(len(actions)))
+    return tuple(frame(task, state, taken) for state, taken in zip(each, actions, strict=True))
 
 
 def _class_colours(number: int) -> np.ndarray:

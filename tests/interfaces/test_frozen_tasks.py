@@ -105,6 +105,22 @@ def test_a_picture_of_gymnasium_shows_what_changes(gymnasium):
     assert gymnasium.make("jaxsense/map-v0").unwrapped.render() is None
 
 
+def test_vector_environments_draw_each_map(gymnasium):
+    envs = gymnasium.make_vec("jaxsense/map-v0", num_envs=2, render_mode="rgb_array")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.render()
+    envs.reset(seed=3)
+    before = envs.render()
+    assert [picture.dtype for picture in before] == [np.uint8] * 2
+    envs.step(np.array([0, 3]))  # the second episode ends
+    after = envs.render()
+    assert all(np.any(x != y) for x, y in zip(before, after, strict=True))
+    assert envs._actions == [[0], [3]]
+    envs.step(np.array([1, 0]))  # and starts anew
+    assert envs._actions == [[0, 1], []]
+    assert gymnasium.make_vec("jaxsense/map-v0", num_envs=2).render() is None
+
+
 def test_what_cannot_be_in_gymnasium_is_told(gymnasium):
     env = gymnasium.make("jaxsense/map-v0", render_mode="rgb_array").unwrapped
     for act in (lambda: env.step(0), env.render):
@@ -117,6 +133,8 @@ def test_what_cannot_be_in_gymnasium_is_told(gymnasium):
     assert env.step(3)[2]
     with pytest.raises(gymnasium.error.ResetNeeded, match="after the end"):
         env.step(0)
+    with pytest.raises(ValueError, match="render_mode = 'ansi': must be rgb_array or None"):
+        gymnasium.make_vec("jaxsense/map-v0", num_envs=1, render_mode="ansi")
     with pytest.raises(ValueError, match="render_mode = 'ansi': must be rgb_array or None"):
         type(env)("map-v0", render_mode="ansi")
     with pytest.raises(ConfigError, match="agent = 'sonar': must be one of camera, lidar"):
