@@ -22,14 +22,28 @@ _EMPTY = "pass"
 _IMPORTS = tuple(f"import {name}" for name in ("jaxsense", "jaxsense.vae", "jaxsense.dqn"))
 
 
-def first_program() -> str:
-    """The first Python program of the README."""
-    page = (pipeline.ROOT / "README.md").read_text(encoding="utf-8")
-    return re.findall(r"```python\n(.*?)```", page, re.DOTALL)[0]
+def first_program(page: str) -> tuple[str, ...]:
+    """The words behind `python` that run the first program of a page.
+
+    Args:
+      page: its path in the source tree.
+    """
+    text = (pipeline.ROOT / page).read_text(encoding="utf-8")
+    return "-c", re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
 
 
 STEPS: Mapping[str, tuple[str, Callable[[], tuple[str, ...]]]] = {
-    "program": ("the first program of the README", lambda: ("-c", first_program())),
+    "program": ("the first program of the README", lambda: first_program("README.md")),
+    "tasks": ("... of The tasks", lambda: first_program("docs/tasks.md")),
+    "jmvae": (
+        "... of The JMVAE on your own data: a training",
+        lambda: first_program("docs/jmvae.md"),
+    ),
+    "functions": ("... of Single functions", lambda: first_program("docs/functions.md")),
+    "robot": (
+        "`jaxsense export pretrained:noisy`",
+        lambda: ("-m", "jaxsense", "export", "pretrained:noisy"),
+    ),
     "demo": ("`jaxsense demo`", lambda: ("-m", "jaxsense", "demo", "--no-browser")),
 }
 """Names in the table and words behind `python`, by the names of the option `steps`."""
@@ -37,10 +51,11 @@ STEPS: Mapping[str, tuple[str, Callable[[], tuple[str, ...]]]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Measures what a newcomer waits for: imports, the README's first program and the demo."""
+    """Measures what newcomers wait for: imports, the demo, and the first programs of pages."""
 
     steps: tuple[str, ...] = tuple(STEPS)
-    """Which steps, besides imports: the README's first `program`, and the `demo`."""
+    """Which steps, besides imports: the README's first `program`, the `demo`, and the first steps
+    of the pages for four kinds of user: `tasks`, `robot`, `jmvae` and `functions`."""
     repeats: int = limited(5, at_least=1)
     """How often imports are measured; the medians count."""
     json: Path | None = None

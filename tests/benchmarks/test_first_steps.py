@@ -1,6 +1,7 @@
 """What a newcomer waits for: what runs where, what of it counts, and its table."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -36,13 +37,22 @@ def test_a_step_runs_again_with_the_home_of_its_first_time(ran, tmp_path):
     assert demo == ("-m", "jaxsense", "demo", "--no-browser")
 
 
-def test_the_program_is_the_first_of_the_readme(ran, tmp_path):
-    first_steps.of_step("program", tmp_path / "program")
+@pytest.mark.parametrize(
+    ("step", "path"),
+    [
+        ("program", "README.md"),
+        ("tasks", "docs/tasks.md"),
+        ("jmvae", "docs/jmvae.md"),
+        ("functions", "docs/functions.md"),
+    ],
+)
+def test_the_program_is_the_first_of_its_page(step, path, ran, tmp_path):
+    first_steps.of_step(step, tmp_path / "program")
     (option, program), *_ = ran[0]
-    page = (pipeline.ROOT / "README.md").read_text(encoding="utf-8")
+    page = (pipeline.ROOT / path).read_text(encoding="utf-8")
     before, _, after = page.partition(f"```python\n{program}```")
     assert option == "-c"
-    assert "import jaxsense" in program
+    assert re.search("import jaxsense|from jaxsense import", program)
     assert after
     assert "```python" not in before
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import pictures, results
+from benchmarks import film, pictures, results
 from jaxsense import train
 from jaxsense.config import options
 
@@ -94,3 +94,12 @@ def test_plots_of_stored_results_are_svg(tmp_path, monkeypatch):
     assert plot.draw()
     assert "<svg" in (tmp_path / "figures" / "noisy_curves.svg").read_text(encoding="utf-8")
     assert json.loads((results.RESULTS / "curves.json").read_text(encoding="utf-8"))["policies"]
+
+
+def test_a_film_names_the_policies_that_it_can_play(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        film.main(["pretrained:default", "--policy", "best", "--plot", str(tmp_path / "film.svg")])
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("benchmarks.film: policy = 'best': must be one of latent, greedy,")
+    assert not (tmp_path / "film.svg").exists()
