@@ -3,6 +3,7 @@
 import ast
 import json
 import subprocess
+import symtable
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -163,9 +164,15 @@ def _used_by(function: str, statements: list[ast.stmt]) -> list[ast.stmt]:
 
 
 def _used(node: ast.stmt) -> set[str]:
-    """Names that a statement of a module uses, without arguments of functions."""
-    names = {x.id for x in ast.walk(node) if isinstance(x, ast.Name)}
-    return names - {x.arg for x in ast.walk(node) if isinstance(x, ast.arg)}
+    """Names of the module that a statement uses, not those of its functions' own variables."""
+    return _globals(symtable.symtable(ast.unparse(node), "module", "exec"))
+
+
+def _globals(scope: symtable.SymbolTable) -> set[str]:
+    is_module = scope.get_type() == "module"
+    symbols = [x for x in scope.get_symbols() if x.is_referenced()]
+    own = {x.get_name() for x in symbols if is_module or x.is_global()}
+    return own.union(*map(_globals, scope.get_children()))
 
 
 def _defined(node: ast.stmt) -> set[str]:

@@ -102,7 +102,10 @@ def test_unknown_steps_are_refused(ran, capsys):
     with pytest.raises(SystemExit) as stop:
         first_steps.main(["--steps", "install"])
     assert stop.value.code == 2
-    assert "steps = 'install': must be one of program, tasks, jmvae, functions, robot, demo" in capsys.readouterr().err
+    assert (
+        "steps = 'install': must be one of program, tasks, jmvae, functions, robot, demo"
+        in capsys.readouterr().err
+    )
     assert not ran
 
 

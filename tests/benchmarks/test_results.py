@@ -141,6 +141,10 @@ def other():
         after = module.replace("A: int = 1", text)
         assert (history.program(module, "rate") != history.program(after, "rate")) == differs
     assert history.program(module, "rate") == history.program(module.replace("2", "3"), "rate")
+    # Of two functions, one has an argument of the name and the other uses the module's.
+    both = module.replace("return A", "return (lambda A: A)(other) + A")
+    changed = both.replace("A: int = 1", "A: int = 3")
+    assert history.program(both, "rate") != history.program(changed, "rate")
 
 
 def test_the_code_of_every_row_is_known():
