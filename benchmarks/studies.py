@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jaxsense
 from benchmarks import measure
-from jaxsense import Config, Models, export
+from jaxsense import Config, Models
 from jaxsense.config import ConfigError, parse_json
 from jaxsense.run import cli
 from jaxsense.tasks import registry
+from jaxsense.tasks.pretrained import PREFIX
 
-PRETRAINED = "pretrained:"
 """What precedes the preset of models that travel with the package, in place of a run."""
 _POSITIONAL = ("run", "runs", "commit")  # words without an option
 _FILES = ("json", "plot")  # do not change results
@@ -28,10 +29,9 @@ def load(program: str, run: Path, trust: bool = False) -> tuple[Config, Models]:
       trust: whether to run the code of custom sensors.
     """
     try:
-        config, models, _ = export.load(run, trust)
+        return jaxsense.load(run, trust)
     except ConfigError as error:
         cli.fail(program, str(error))
-    return config, models
 
 
 def name_of(run: Path | str) -> str:
@@ -40,7 +40,7 @@ def name_of(run: Path | str) -> str:
     Args:
       run: see `load`.
     """
-    return Path(run).name.removeprefix(PRETRAINED)
+    return Path(run).name.removeprefix(PREFIX)
 
 
 def command(program: str, arguments: Any) -> str:
@@ -80,8 +80,8 @@ def origin(program: str, arguments: Any, packages: tuple[str, ...] = ()) -> dict
 
 def _made(run: Path) -> dict[str, object]:
     """What made the models of a run."""
-    if (name := str(run)).startswith(PRETRAINED):
-        return dataclasses.asdict(registry.origin(name.removeprefix(PRETRAINED)))
+    if (name := str(run)).startswith(PREFIX):
+        return dataclasses.asdict(registry.origin(name.removeprefix(PREFIX)))
     found: Any = parse_json((cli.find_run(run) / "config.json").read_text(encoding="utf-8"))
     return {name: found.get(name) for name in ("preset", "seed", "commit", "versions")}
 

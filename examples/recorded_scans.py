@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsense
-from jaxsense import export, sim
+from jaxsense import sim
 from jaxsense.run import recordings
 from jaxsense.run.recordings import RecordedLooks
 
@@ -103,15 +103,14 @@ def simulate(config: jaxsense.Config) -> dict[str, np.ndarray]:
 def main(argv: list[str] | None = None) -> None:
     """Runs the program."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("run", type=Path, help="directory of a run, or pretrained:PRESET")
+    parser.add_argument("run", type=Path, help="directory of a run, `latest`, or pretrained:PRESET")
     parser.add_argument("recording", type=Path, help="file of NumPy's format .npz")
     parser.add_argument("--simulate", action="store_true", help="write a new recording, and stop")
     parser.add_argument("--trust", action="store_true", help="import the run's own sensors")
     arguments = parser.parse_args(argv)
     np.set_printoptions(precision=2, suppress=True)
     try:
-        # A directory, or `pretrained:PRESET`.
-        config, models, _ = export.load(arguments.run, arguments.trust)
+        config, models = jaxsense.load(arguments.run, arguments.trust)
         if arguments.simulate:
             found = simulate(config)
             # Opened here, so that NumPy appends no ending; "x": never over another file.

@@ -1,14 +1,14 @@
 """A ROS 2 node by which a robot takes part in a mission, with an exported run and NumPy alone.
 
-    jaxsense export pretrained:default --out robot.zip
+    jaxsense export pretrained:noisy --out robot.zip
     python3 ros2_node.py robot.zip --robot 1 --pois 1.0,0.5 -1.2,0.8 0.3,-1.1
 
 Copy this file, `run_exported.py` and the archive to the robot. `--robot` says which robot of the
 run it is, `--pois` where the points of interest (PoIs) stand in the frame `map`. The node reads
 `scan` (sensor_msgs/LaserScan), or `image` and `camera_info` (sensor_msgs/Image, rectified), and the
 transforms between `map`, `base_link` and the sensor. It publishes from where to look as `goal_pose`
-(geometry_msgs/PoseStamped), to which Nav2 drives, and exchanges looks with the other robots on
-`team` (std_msgs/String, JSON).
+(geometry_msgs/PoseStamped), to which Nav2 drives, exchanges looks with the other robots on `team`,
+and says on `classes` what each PoI probably is (both std_msgs/String, JSON).
 
 The functions and the class `Robot` do the work; they read messages by their fields alone, so that
 they run and are tested where there is no ROS. `main` connects them to topics.
@@ -25,11 +25,16 @@ import math
 import re
 import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from run_exported import Programs, empty, remember, write
+
+try:
+    from run_exported import Programs, empty, remember, write
+except ModuleNotFoundError:
+    sys.exit("needs run_exported.py: copy it next to this file")
 
 VIEW_DISTANCE = 0.9  # m, from the sensor to a PoI
 VIEW_SIDES = 16  # directions around a PoI that are tried
@@ -64,15 +69,23 @@ def scanline(image: Any, info: Any) -> tuple[np.ndarray, np.ndarray]:
 
     Args:
       image: a rectified `sensor_msgs/Image` of a level camera, with 8 bits for each channel.
-      info: its `sensor_msgs/CameraInfo`.
+      info: its `sensor_msgs/CameraInfo`, whose matrix P belongs to rectified images.
 
     Raises:
-      ValueError: if the encoding is another.
+      ValueError: if the encoding is another, the camera is not calibrated, or the calibration is
+        of images of another size.
     """
     if image.encoding not in _ENCODINGS:
         expected = f"must be one of {', '.join(_ENCODINGS)}"
         raise ValueError(f"encoding = {image.encoding!r}: {expected}")
-    focal_length, middle, row = info.k[0], info.k[2], round(info.k[5])
+    focal_length, middle, row = info.p[0], info.p[2], round(info.p[6])
+    if not focal_length > 0:
+        raise ValueError(f"P[0] of camera_info = {focal_length}: must be above 0; calibrate first")
+    if (info.width, info.height) != (image.width, image.height):
+        size = f"{info.width} x {info.height}"
+        raise ValueError(f"camera_info is of {size} pixels: must be {image.width} x {image.height}")
+    if not 0 <= row < image.height:
+        raise ValueError(f"P[6] of camera_info = {row}: must be a row from 0 to {image.height - 1}")
     line = np.frombuffer(bytes(image.data), np.uint8)[row * image.step :][: image.step]
     channels = len(image.encoding.removesuffix("8"))
     pixels = line[: image.width * channels].reshape(-1, channels)[:, _ENCODINGS[image.encoding]]
@@ -146,6 +159,12 @@ def finite(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return found
 
 
+def within(name: str, value: np.ndarray) -> None:
+    """Raises `ValueError` unless all numbers of a report are from 0 to 1."""
+    if not ((value >= 0) & (value <= 1)).all():
+        raise ValueError(f"{name} = {value.tolist()}: must be from 0 to 1")
+
+
 @dataclasses.dataclass(frozen=True)
 class Scan:
     """What a sensor has read.
@@ -174,6 +193,7 @@ class Robot:
       goal: pose from which it does so, in the frame `map`; None if it must choose.
       team: what it knows of all robots and PoIs, as `decide` reads it.
       known: the map.
+      notes: what has happened since somebody last emptied the list, for people to read.
     """
 
     def __init__(
@@ -209,7 +229,8 @@ class Robot:
             )
         expected = contents["programs"]["decide"]["inputs"]["positions"]["shape"][0]
         if expected not in ("pois", pois):
-            raise ValueError(f"{pois} PoIs: the policy of this archive is for {expected}")
+            anyway = "export pretrained:team or many for a policy for any number"
+            raise ValueError(f"{pois} PoIs: the policy of this archive is for {expected}; {anyway}")
         if "merge" in programs:
             raise ValueError("robots have maps of their own: see `tell` in run_exported.py")
         self.contents, self.programs, self.resample = contents, programs, resample
@@ -227,6 +248,7 @@ class Robot:
             "target": np.full(number, pois, np.int32),
         }
         self.known = empty(contents, pois)
+        self.notes: list[str] = []
         self._has_news = True
         self._last_pose, self._last_stamp = np.full(3, np.inf), -np.inf
         self._heard_at = np.full(number, -np.inf)
@@ -257,6 +279,7 @@ class Robot:
             if chosen in (len(self.team["positions"]), -1):
                 self.target, self.goal = None, None
                 self.team["works"][self.robot] = False
+                self.notes.append("done: no further look is worth its cost")
                 break
             # Under way to the same PoI, it keeps its viewpoint.
             if chosen != before or self.goal is None:
@@ -264,7 +287,8 @@ class Robot:
             if self.goal is not None:
                 self.target = chosen
                 break
-            self.team["present"][chosen] = False  # nowhere is left to look from
+            self.team["present"][chosen] = False
+            self.notes.append(f"gives PoI {chosen} up: nowhere is left to look from")
         self.team["target"][self.robot] = self._heading()
 
     def see(self, now: float, scan: Scan) -> dict[str, Any] | None:
@@ -278,8 +302,10 @@ class Robot:
           The look by which it has updated the map, for `report`; None if there was none.
 
         Raises:
-          ValueError: if the beams of a laser scanner are too far apart to be resampled.
+          ValueError: if the scan is too narrow, or the beams of a laser scanner are too far apart
+            to be resampled.
         """
+        self._require_wide(scan.angles)
         if scan.readings.ndim == 1:
             self._require_dense(scan.angles)
         elapsed, moved = scan.stamp - self._last_stamp, np.abs(scan.pose - self._last_pose)
@@ -299,6 +325,7 @@ class Robot:
             readings=self._along_own_rays(scan), bearing=bearing, distance=distance
         )
         if not found["detects"]:
+            self.notes.append(f"nothing detected of PoI {self.target}, {distance:.2f} m away")
             self.fail(scan.pose)
             return None
         look = {
@@ -321,8 +348,17 @@ class Robot:
             return
         self.goal, self._has_news = None, True
         self._failed_at[self.target].append(pose[:2])
-        if len(self._failed_at[self.target]) >= self.contents["mission"]["attempts"]:
+        failures, attempts = len(self._failed_at[self.target]), self.contents["mission"]["attempts"]
+        self.notes.append(f"failure {failures} of {attempts} at PoI {self.target}")
+        if failures >= attempts:
             self.team["present"][self.target] = False
+            self.notes.append(f"gives PoI {self.target} up")
+
+    def classes(self) -> list[dict[str, float]]:
+        """Probability of each class, by PoI."""
+        belief = {name: self.known[name] for name in ("mean", "std")}
+        found = self.programs["classify"](**belief)["probabilities"]
+        return [dict(zip(self.contents["classes"], each.tolist(), strict=True)) for each in found]
 
     def report(self, look: dict[str, Any] | None = None) -> str:
         """What the robot tells the others: its state, and a look that it has taken, once."""
@@ -349,13 +385,14 @@ class Robot:
             state = {
                 "poses": finite("pose", told["pose"], (3,)),
                 "target": index("target", told["target"], pois + 1),
-                "works": bool(told["works"]),
+                "works": {True: True, False: False}[told["works"]],
             }
             if (look := told["look"]) is not None:
                 index("poi", look["poi"], pois)
                 finite("place", look["place"], (2,))
-                finite("weight", look["weight"], ())
-                finite("features", look["features"], (len(look["features"]),))
+                within("weight", finite("weight", look["weight"], ()))
+                labels = self.contents["labels"][self.contents["robots"][robot]]
+                within("features", finite("features", look["features"], (len(labels),)))
                 self._write(robot, look)
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"no report of a robot in the team: {error!r}") from error
@@ -366,6 +403,13 @@ class Robot:
     def _heading(self) -> int:
         """The target, as `decide` reads it."""
         return len(self.team["positions"]) if self.target is None else self.target
+
+    def _require_wide(self, angles: np.ndarray) -> None:
+        """Raises `ValueError` if a scan does not cover what the detector reads around a PoI."""
+        width, window = np.degrees(np.ptp(angles)), self.contents["sensors"][self.name]["window"]
+        if width < np.degrees(window):
+            expected = f"must be at least {np.degrees(window):.1f}"
+            raise ValueError(f"field of view = {width:.1f} degrees: {expected}")
 
     def _require_dense(self, angles: np.ndarray) -> None:
         """Raises `ValueError` if beams are too far apart."""
@@ -438,6 +482,38 @@ def hear(node: Any, robot: Robot, now: float, report: str) -> None:
         node.get_logger().warning(f"ignored a message on `team`: {error}", once=True)
 
 
+def log(node: Any, robot: Robot) -> None:
+    """Logs a robot's notes, and empties them."""
+    for note in robot.notes:
+        node.get_logger().info(note)
+    robot.notes.clear()
+
+
+def join(node: Any, robot: Robot, now: Callable) -> Callable:
+    """Lets a robot hear the others, and tells each second what it does and knows.
+
+    Args:
+      node: of `rclpy`.
+      robot: what it plays.
+      now: returns the time, in seconds.
+
+    Returns:
+      What tells the others of a look.
+    """
+    from std_msgs.msg import String
+
+    team = node.create_publisher(String, "team", 100)
+    classes = node.create_publisher(String, "classes", 1)
+
+    def tell(look: dict[str, Any] | None = None) -> None:
+        team.publish(String(data=robot.report(look)))
+        classes.publish(String(data=json.dumps(robot.classes())))
+
+    node.create_subscription(String, "team", lambda told: hear(node, robot, now(), told.data), 100)
+    node.create_timer(1.0, tell)
+    return tell
+
+
 def connect(node: Any, robot: Robot) -> Any:
     """Connects a robot to topics and transforms.
 
@@ -453,28 +529,28 @@ def connect(node: Any, robot: Robot) -> Any:
     from rclpy.qos import qos_profile_sensor_data
     from rclpy.time import Time
     from sensor_msgs.msg import CameraInfo, Image, LaserScan
-    from std_msgs.msg import String
     from tf2_ros import Buffer, TransformException, TransformListener
 
     buffer = Buffer()
     goals = node.create_publisher(PoseStamped, "goal_pose", 1)
-    team = node.create_publisher(String, "team", 100)
     set_out_at, infos = 0.0, collections.deque(maxlen=1)
 
     def now() -> float:
         return node.get_clock().now().nanoseconds * 1e-9
 
+    tell = join(node, robot, now)
+
     def transform(parent: str, child: str, when: Any) -> Any:
         return buffer.lookup_transform(parent, child, when, Duration(seconds=0.1)).transform
 
     def on_scan(scan: Any) -> None:
-        on_reading(scan.header, *beams(scan), is_optical=False)
+        on_reading(scan.header, lambda: beams(scan), is_optical=False)
 
     def on_image(image: Any) -> None:
         if infos:
-            on_reading(image.header, *scanline(image, infos[0]), is_optical=True)
+            on_reading(image.header, lambda: scanline(image, infos[0]), is_optical=True)
 
-    def on_reading(header: Any, angles: Any, readings: Any, is_optical: bool) -> None:
+    def on_reading(header: Any, read: Callable, is_optical: bool) -> None:
         nonlocal set_out_at
         stamp = Time.from_msg(header.stamp)
         try:
@@ -482,7 +558,7 @@ def connect(node: Any, robot: Robot) -> Any:
             robot.mounting, robot.is_upside_down = pose_of(
                 transform("base_link", header.frame_id, Time()), is_optical
             )
-            look = robot.see(now(), Scan(stamp.nanoseconds * 1e-9, pose, angles, readings))
+            look = robot.see(now(), Scan(stamp.nanoseconds * 1e-9, pose, *read()))
         except TransformException as error:
             node.get_logger().warning(f"no pose for a scan: {error}")
             return
@@ -490,11 +566,13 @@ def connect(node: Any, robot: Robot) -> Any:
             node.get_logger().error(f"ignores the scans: {error}", once=True)
             return
         if look is not None:
-            team.publish(String(data=robot.report(look)))
+            tell(look)
         elif robot.goal is not None and now() - set_out_at > PATIENCE:
+            robot.notes.append(f"has not looked within {PATIENCE:.0f} s")
             robot.fail(pose)
         before = robot.goal
         robot.choose(now(), pose)
+        log(node, robot)
         if robot.goal is not None and robot.goal is not before:
             set_out_at = now()
             goal = PoseStamped()
@@ -502,19 +580,20 @@ def connect(node: Any, robot: Robot) -> Any:
             write_pose(goal.pose, robot.goal)
             goals.publish(goal)
 
-    node.create_subscription(String, "team", lambda told: hear(node, robot, now(), told.data), 100)
     if robot.name == "camera":
         node.create_subscription(CameraInfo, "camera_info", infos.append, qos_profile_sensor_data)
         node.create_subscription(Image, "image", on_image, qos_profile_sensor_data)
     else:
         node.create_subscription(LaserScan, "scan", on_scan, qos_profile_sensor_data)
-    node.create_timer(1.0, lambda: team.publish(String(data=robot.report())))
     return TransformListener(buffer, node, spin_thread=True)
 
 
 def point(text: str) -> list[float]:
     """The numbers of `X,Y`, in metres."""
-    x, y = map(float, text.split(","))
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be X,Y without a space") from None
     return [x, y]
 
 

@@ -31,7 +31,7 @@ from jaxsense.run import cli, files, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import resampling, sensors
 from jaxsense.sim.sensors import Sensor
-from jaxsense.tasks import PRETRAINED, load_pretrained
+from jaxsense.tasks.pretrained import PREFIX
 
 PROGRAM = "jaxsense.export"
 _PLAYERS = (Path(onboard.__file__).with_name(f"robot_{name}.py") for name in ("numpy", "onnx"))
@@ -94,6 +94,11 @@ def _description(config: Config, models: Models) -> dict[str, object]:
         "label_of_class": {name: config.label_of_class(name) for name in config.modalities},
         "class_means": np.asarray(models.fusion.classes.mean).tolist(),
         "num_pois": config.arena.num_pois,
+        "pois": {
+            "radius": float(config.arena.poi_radius),
+            "height": float(config.arena.poi_height),
+            "about": "of the PoIs that the detectors know, in metres; half the side of boxes",
+        },
         "unseen": {name: np.asarray(x).tolist() for name, x in vars(prior).items()},
         "sensors": {sensor.name: _of_sensor(sensor) for sensor in sensors.make(config)},
         "viewpoint": {
@@ -112,6 +117,9 @@ def _description(config: Config, models: Models) -> dict[str, object]:
 
 def _of_sensor(sensor: Sensor) -> dict[str, object]:
     """How a scan is given to `detect`."""
+    rays = min((sensor.window - 1) * sensor.stride, len(sensor.angles) - 1)
+    first = (len(sensor.angles) - 1 - rays) // 2
+    last = first + rays
     return {
         "readings": "distances in metres, infinite or 0 for none"
         if sensor.measures_distance
@@ -120,9 +128,11 @@ def _of_sensor(sensor: Sensor) -> dict[str, object]:
         else "readings",
         "angles": [round(float(angle), 6) for angle in sensor.angles],
         "height": float(sensor.height),
-        "about": "one reading for each ray; `angles` are the rays' directions in the robot's frame "
-        "(x ahead, y left), in radians, positive to the left; `height` is that of the rays above "
-        "the floor, in metres",
+        "window": round(float(abs(sensor.angles[last] - sensor.angles[first])), 6),
+        "about": "one reading for each ray; `angles` are the rays' directions in the sensor's "
+        "frame (x ahead, y left), in radians, positive to the left; `height` is that of the rays "
+        "above the floor, in metres; `window` is how wide a part of the scan the detector reads, "
+        "in radians",
     }
 
 
@@ -158,14 +168,9 @@ def load(run: Path, trust: bool = False) -> tuple[Config, Models, Path]:
     Raises:
       ConfigError: if there is no such run, or no such models.
     """
-    given = str(run)
-    if given in PRETRAINED and not run.exists():
-        reason = f"must be the directory of a finished run, or {cli.PRETRAINED}{given}"
-        raise ConfigError("run", given, reason)
-    if given.startswith(cli.PRETRAINED):
-        preset = given.removeprefix(cli.PRETRAINED)
-        return *load_pretrained(preset), Path(f"{preset}.zip")
-    run = cli.find_run(run)
+    if (given := str(run)).startswith(PREFIX) and not run.exists():
+        return *rundir.load(run), Path(f"{given.removeprefix(PREFIX)}.zip")
+    run = rundir.newest(run)
     return *rundir.load(run, trust), run / "exported.zip"
 
 

@@ -326,6 +326,7 @@ def test_the_latest_run_is_the_newest_finished_one_in_runs(program, tmp_path, mo
     assert older in line
     with pytest.raises(ConfigError, match=older):
         jaxsense.load("latest")
+    assert jaxsense.load("pretrained:noisy")[0] == jaxsense.load_pretrained("noisy")[0]
     # A directory of that name comes first.
     Path("latest").mkdir()
     assert "latest is not a run directory" in error_line(["latest"], capsys, program)

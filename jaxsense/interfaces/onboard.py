@@ -101,7 +101,7 @@ def _detect(config: Config, m: int) -> Function:
         ),
         "bearing": Input(
             (),
-            "of the PoI in the robot's frame (x ahead, y left), in radians, positive to the left",
+            "of the PoI in the sensor's frame (x ahead, y left), in radians, positive to the left",
         ),
         "distance": Input((), "expected from the sensor to the PoI's centre, in metres"),
     }

@@ -12,7 +12,7 @@ import io
 import json
 import sys
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -55,14 +55,14 @@ def checked(
 
     Args:
       program: its name.
-      inputs: describes them by name, see `contents.json`; axes with a name have any size, the same
-        in all inputs.
+      inputs: describes them by name, see `contents.json`; axes with a name have any size but 0, the
+        same in all inputs.
       unnamed: what is given without a name.
       given: by name.
 
     Raises:
       TypeError: if an input is missing, unknown or unnamed.
-      ValueError: if one has another shape.
+      ValueError: if one has another shape, or does not hold numbers of its type.
     """
     wrong = [f"{name} is none of them" for name in given if name not in inputs]
     wrong += [f"{name} is missing" for name in inputs if name not in given and not unnamed]
@@ -71,16 +71,36 @@ def checked(
         raise TypeError("; ".join([f"{needs}, by name" if unnamed else needs, *wrong]))
     arrays, sizes = {}, {}
     for name, each in inputs.items():
-        arrays[name] = array = np.asarray(given[name], each["dtype"])
+        arrays[name] = array = _array(program, name, given[name], each)
         if array.ndim == len(each["shape"]):
             for axis, size in zip(each["shape"], array.shape, strict=True):
-                if isinstance(axis, str):
+                if isinstance(axis, str) and size:
                     sizes.setdefault(axis, size)
         expected = tuple(sizes.get(axis, axis) for axis in each["shape"])
-        if array.shape != expected:
-            must_be = f"must be {expected} ({each['about']})".replace("'", "")
+        if array.shape != expected or 0 in array.shape:
+            must_be = f"must be {_text(expected)} ({each['about']})"
             raise ValueError(f"{program}: {name} has the shape {array.shape}: {must_be}")
     return arrays
+
+
+def _array(program: str, name: str, given: ArrayLike, about: Mapping[str, Any]) -> np.ndarray:
+    """An input as an array of its type; raises `ValueError` if it holds something else."""
+    try:
+        array = np.asarray(given)
+        if array.dtype.kind in "biuf":
+            with np.errstate(invalid="ignore"):
+                found = array.astype(about["dtype"])
+            # A fraction is no index.
+            if about["dtype"] == "float32" or np.array_equal(found, array):
+                return found
+    except ValueError:  # lists of unequal lengths
+        pass
+    must_be = f"must be {about['dtype']} of shape {_text(about['shape'])} ({about['about']})"
+    raise ValueError(f"{program}: {name} = {given!r}: {must_be}")
+
+
+def _text(shape: Iterable[int | str]) -> str:
+    return str(tuple(shape)).replace("'", "")
 
 
 def _program(

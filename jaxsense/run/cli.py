@@ -19,7 +19,6 @@ from jaxsense.tasks import pretrained
 T = TypeVar("T")
 
 CACHE = Path("~/.cache/jaxsense")
-PRETRAINED = "pretrained:"
 """Before the preset of models that come with jaxsense, in place of a run."""
 # Exit statuses, as in shells.
 INTERRUPTED = 130
@@ -147,7 +146,7 @@ def find_run(path: Path) -> Path:
     Raises:
       ConfigError: if there is no finished run, or if the models that come with jaxsense are named.
     """
-    preset = (given := str(path)).removeprefix(PRETRAINED)
+    preset = (given := str(path)).removeprefix(pretrained.PREFIX)
     if (preset != given or preset in pretrained.PRETRAINED) and not path.exists():
         demo = f"{options.command('jaxsense.demo')} --preset {preset}"
         reason = f"must be the directory of a finished run; play pretrained models with {demo}"

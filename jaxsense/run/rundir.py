@@ -17,7 +17,7 @@ from jaxsense.run import devices, files, version
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.settings import Settings, as_json, of_run, resumable
 from jaxsense.summary import Origin
-from jaxsense.tasks.pretrained import PRETRAINED
+from jaxsense.tasks.pretrained import PREFIX, PRETRAINED, load_pretrained
 from jaxsense.training import stages
 from jaxsense.training.agents import learner, tour_stages
 
@@ -266,7 +266,8 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     """Reads the settings and the trained models of a finished run.
 
     Args:
-      path: the run's directory, or `latest` for the newest finished one in `runs/`.
+      path: the run's directory; `latest` for the newest finished one in `runs/`; or
+        `pretrained:PRESET`, see `load_pretrained`.
       trust: whether its `config.json` may name custom sensors, whose code runs.
 
     Returns:
@@ -277,11 +278,13 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
         checkpoint, if the run names custom sensors without trust, or if JAX computes in 64 bits.
     """
     require_32_bits()
-    path = Path(path)
-    preset = str(path).split(":")[-1]  # also of pretrained:PRESET
-    if preset in PRETRAINED and not path.exists():
-        reason = f"must be the directory of a finished run; or call load_pretrained({preset!r})"
-        raise ConfigError("run", str(path), reason)
+    path, given = Path(path), str(path)
+    if given.startswith(PREFIX) and not path.exists():
+        return load_pretrained(given.removeprefix(PREFIX))
+    if given in PRETRAINED and not path.exists():
+        raise ConfigError(
+            "run", given, f"must be the directory of a finished run, or {PREFIX}{given}"
+        )
     path = newest(path)
     settings = of_run(path, trust)
     config = settings.config

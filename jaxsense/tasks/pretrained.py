@@ -14,6 +14,8 @@ DATA = Path(__file__).parent / "data"
 """Where the files are."""
 PRETRAINED = ("default", "noisy", "many", "raw", "team")
 """Presets with trained models, for `load_pretrained`."""
+PREFIX = "pretrained:"
+"""What stands before a preset's name where the directory of a run may stand, too."""
 
 # The others follow from the settings.
 _PARTS = "detectors", "jmvae", "fusion", "novelty", "look_values", "q_networks", "tours"

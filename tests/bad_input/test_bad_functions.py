@@ -97,12 +97,11 @@ FUNCTIONS = {
     "load nul": (lambda w: jaxsense.load("\0"), "run = "),
     "load preset": (
         lambda w: jaxsense.load("noisy"),
-        "run = 'noisy': must be the directory of a finished run; or call load_pretrained('noisy')",
+        "run = 'noisy': must be the directory of a finished run, or pretrained:noisy",
     ),
     "load pretrained": (
-        lambda w: jaxsense.load("pretrained:noisy"),
-        "run = 'pretrained:noisy': must be the directory of a finished run; or call "
-        "load_pretrained('noisy')",
+        lambda w: jaxsense.load("pretrained:loud"),
+        "preset = 'loud': must be one of default, noisy, many, raw, team",
     ),
     "make list": (lambda w: jaxsense.make(["noisy-v0"]), "name = ['noisy-v0']: must be one of map"),
     "about": (lambda w: tasks.about("x"), "name = 'x': must be one of map-v0"),

@@ -47,4 +47,31 @@ def test_axes_of_one_name_have_one_size(player):
 
 def test_both_players_check_alike():
     # Each file is copied to robots alone.
-    assert inspect.getsource(robot_numpy.checked) == inspect.getsource(robot_onnx.checked)
+    for name in ("checked", "_array", "_text"):
+        assert len({inspect.getsource(getattr(x, name)) for x in (robot_numpy, robot_onnx)}) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("lidar", r"robot = 'lidar': must be int32 of shape \(\) \(index of the robot's own"),
+        (1.5, r"robot = 1.5: must be int32 of shape \(\)"),
+        (np.nan, r"robot = nan: must be int32"),
+        (None, "robot = None: must be int32"),
+        ([[0], [1, 2]], r"robot = \[\[0\], \[1, 2\]\]: must be int32"),
+        (1j, r"robot = 1j: must be int32"),
+        ([0, 1], r"robot has the shape \(2,\): must be \(\) \(index of the robot's own"),
+    ],
+)
+def test_values_that_are_no_numbers_of_a_type_are_named(given, expected):
+    inputs = {"robot": {"shape": [], "dtype": "int32", "about": "index of the robot's own"}}
+    assert robot_numpy.checked("decide", inputs, (), {"robot": 1.0})["robot"] == 1
+    with pytest.raises(ValueError, match=f"^decide: {expected}"):
+        robot_numpy.checked("decide", inputs, (), {"robot": given})
+
+
+def test_no_axis_may_be_empty():
+    inputs = {"apart": {"shape": ["looks"], "dtype": "float32", "about": "from earlier looks"}}
+    expected = r"apart has the shape \(0,\): must be \(looks,\) \(from earlier looks\)"
+    with pytest.raises(ValueError, match=expected):
+        robot_numpy.checked("weigh_lidar", inputs, (), {"apart": np.zeros(0)})

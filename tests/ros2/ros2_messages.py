@@ -20,10 +20,16 @@ class Image:
     step: int
     data: bytes
 
+    @property
+    def height(self):
+        return len(self.data) // self.step
+
 
 @dataclass
 class CameraInfo:
-    k: list
+    p: list
+    width: int
+    height: int
 
 
 @dataclass

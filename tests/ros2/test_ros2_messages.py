@@ -24,7 +24,7 @@ def test_the_row_at_the_horizon_is_linear_rgb(ros2, encoding, of_pixel):
     width, padding = 5, 3
     row = bytes(of_pixel) * width + b"\1" * padding
     picture = Image(encoding, width, len(row), b"\0" * len(row) + row + b"\2" * len(row))
-    info = CameraInfo([4.0, 0, 2.0, 0, 4.0, 1.1, 0, 0, 1])
+    info = CameraInfo([4.0, 0, 2.0, 0, 0, 4.0, 1.1, 0, 0, 0, 1, 0], width, 3)
     angles, values = ros2.scanline(picture, info)
     # sRGB: ((188 / 255 + 0.055) / 1.055)^2.4 = 0.503.
     np.testing.assert_allclose(values, [[0, 0.503, 1]] * width, atol=1e-3)
@@ -33,7 +33,23 @@ def test_the_row_at_the_horizon_is_linear_rgb(ros2, encoding, of_pixel):
 
 def test_an_unknown_encoding_is_named(ros2):
     with pytest.raises(ValueError, match=r"encoding = 'mono8': must be one of rgb8, "):
-        ros2.scanline(Image("mono8", 1, 1, b"\0"), CameraInfo([1.0, 0, 0, 0, 1, 0, 0, 0, 1]))
+        ros2.scanline(Image("mono8", 1, 1, b"\0"), CameraInfo([1.0] * 12, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("info", "expected"),
+    [
+        (CameraInfo([0.0] * 12, 2, 2), r"P\[0\] of camera_info = 0.0: must be above 0"),
+        (CameraInfo([4.0, 0, 1, 0, 0, 4, 1, 0], 4, 2), "is of 4 x 2 pixels: must be 2 x 2"),
+        (
+            CameraInfo([4.0, 0, 1, 0, 0, 4, 2.6, 0], 2, 2),
+            r"P\[6\] .* = 3: must be a row from 0",
+        ),
+    ],
+)
+def test_a_calibration_that_does_not_fit_is_named(ros2, info, expected):
+    with pytest.raises(ValueError, match=expected):
+        ros2.scanline(Image("rgb8", 2, 6, b"\0" * 12), info)
 
 
 ROOT = math.sqrt(0.5)

@@ -22,8 +22,9 @@ CONTENTS = {
     "modalities": ["camera", "lidar"],
     "robots": ["camera", "lidar"],
     "classes": ["a", "b"],
+    "labels": {"camera": ["red", "green"], "lidar": ["cylinder", "cube"]},
     "unseen": {"mean": [0.0], "std": [4.5]},
-    "sensors": {"lidar": {"angles": OWN.tolist()}},
+    "sensors": {"lidar": {"angles": OWN.tolist(), "window": math.radians(30.0)}},
     "viewpoint": {"min_distance": 0.3, "max_distance": 1.2, "max_bearing": 0.35},
     "mission": {"attempts": 3},
     "remembered_looks": 2,
@@ -40,7 +41,11 @@ class Stub:
     def programs(self):
         writes = {f"write_{name}": self.write for name in CONTENTS["robots"]}
         weighs = {f"weigh_{name}": self.weigh for name in CONTENTS["robots"]}
-        return {"decide": self.decide, "detect_lidar": self.detect, **writes, **weighs}
+        own = {"decide": self.decide, "detect_lidar": self.detect, "classify": self.classify}
+        return {**own, **writes, **weighs}
+
+    def classify(self, mean, std):
+        return {"probabilities": np.stack([mean[:, 0], 1 - mean[:, 0]], axis=1)}
 
     def decide(self, present, **_):
         return {"action": next(n for n in self.choices if n == 3 or present[n])}
@@ -286,9 +291,15 @@ MALFORMED = {
     json.dumps({**REPORT, "look": {**LOOK, "poi": -1}}): "poi = -1: must be an integer from 0 to 2",
     json.dumps({**REPORT, "look": {**LOOK, "place": [0]}}): "place = [0]: must be finite numbers",
     json.dumps({**REPORT, "look": {**LOOK, "weight": None}}): "weight = None: must be finite",
+    json.dumps({**REPORT, "works": "false"}): "KeyError('false')",
+    json.dumps({**REPORT, "look": {**LOOK, "weight": 7}}): "weight = 7.0: must be from 0 to 1",
     json.dumps(
         {**REPORT, "look": {**LOOK, "features": [math.inf, 0]}}
     ): "features = [inf, 0]: must",
+    json.dumps({**REPORT, "look": {**LOOK, "features": [1, 0, 0]}}): "of shape (2,)",
+    json.dumps(
+        {**REPORT, "look": {**LOOK, "features": [2, -1]}}
+    ): "features = [2.0, -1.0]: must be from 0 to 1",
 }
 
 
@@ -331,6 +342,34 @@ def test_a_coarse_scan_gets_one_line_and_no_goal(ros2, robot, node, monkeypatch)
     (said,) = node.get_logger().error.call_args_list
     assert "ignores the scans: step between beams = 35.00 degrees" in said.args[0]
     assert said.kwargs == {"once": True}
+
+
+def test_a_scan_that_is_too_narrow_for_the_detector_is_refused(ros2, robot, stub):
+    with pytest.raises(ValueError, match=r"field of view = 20.0 degrees: must be at least 30.0"):
+        see(ros2, robot, arrive(robot), np.radians(np.arange(-10, 11, 10.0)))
+    assert stub.asked == []
+
+
+def test_the_node_logs_what_goes_wrong_and_says_what_stands_where(ros2, robot, stub, node):
+    stub.detects, goal = False, arrive(robot)
+    for _ in range(3):
+        assert see(ros2, robot, goal) is None
+        goal = arrive(robot, goal)
+    stub.choices = [3]
+    robot._has_news = True
+    arrive(robot)
+    ros2.log(node, robot)
+    logged = [call.args[0] for call in node.get_logger().info.call_args_list]
+    assert logged[0] == "nothing detected of PoI 0, 0.90 m away"
+    assert logged[1] == "failure 1 of 3 at PoI 0"
+    assert logged[-2:] == ["gives PoI 0 up", "done: no further look is worth its cost"]
+    assert robot.notes == []
+    tell = ros2.join(node, robot, lambda: 1.0)
+    robot.known["mean"][1] = 0.75
+    string = sys.modules["std_msgs.msg"].String
+    tell()
+    (_, classes) = (json.loads(call.kwargs["data"]) for call in string.call_args_list[-2:])
+    assert classes == [{"a": 0.0, "b": 1.0}, {"a": 0.75, "b": 0.25}, {"a": 0.0, "b": 1.0}]
 
 
 def test_a_message_that_is_no_report_does_not_end_the_node(ros2, robot, node):
