@@ -153,6 +153,11 @@ class _WithoutChecks(ast.NodeTransformer):
         is_check = isinstance(module, ast.Name) and module.id in {"checks", "chex"}
         return None if is_check else node
 
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef | None:
+        checks_only = node.name == "__post_init__" and bool(node.body)
+        self.generic_visit(node)
+        return None if checks_only and not node.body else node
+
 
 def _used_by(function: str, statements: list[ast.stmt]) -> list[ast.stmt]:
     """The statements that define a function and what it uses."""

@@ -42,7 +42,14 @@ def of_results(results: Mapping[str, Any]) -> str:
             lines.append(
                 f"| ... over those of {next(iter(models))}, same seed | {' | '.join(cells)} |"
             )
-    return "\n".join([*lines, "", describe(results)])
+    of = results["budget"]
+    number = len(next(iter(models.values())))
+    settings = (
+        f"{number} trainings of each model. Latent size {of['latent_size']}; hidden layers "
+        f"{', '.join(map(str, of['hidden']))}; variance {of['variance']}; alpha {of['alpha']}; "
+        f"batch {of['batch']}; learning rate {of['learning_rate']}, falling along a cosine."
+    )
+    return "\n".join([*lines, "", settings, "", describe(results)])
 
 
 def _median(values: Sequence[float], digits: int) -> str:

@@ -35,7 +35,7 @@ class Arguments:
     def __post_init__(self):
         check_fields(self)
         is_known = set(self.groups) <= set(GROUPS)
-        require(is_known, self, "groups", f"must be of {', '.join(GROUPS)}")
+        require(is_known, self, "groups", f"must be some of {', '.join(GROUPS)}")
 
 
 def finish(group: Group, seed: int, folder: Path) -> bool:

@@ -52,9 +52,9 @@ class Arguments:
         check_fields(self)
         known = [each.name for each in learners.load()]
         are_known = set(self.learners) <= set(known)
-        require(are_known, self, "learners", f"must be of {', '.join(known)}")
+        require(are_known, self, "learners", f"must be some of {', '.join(known)}")
         names = sorted({name for name, _ in STEPS})
-        require(set(self.only) <= set(names), self, "only", f"must be of {', '.join(names)}")
+        require(set(self.only) <= set(names), self, "only", f"must be some of {', '.join(names)}")
         require(not self.quick or self.out is not None, self, "quick", "needs out")
 
     @property

@@ -70,6 +70,7 @@ class LookValues:
           probabilities: `[C]` of the PoI's classes.
           is_seen: `[]` bool, whether anybody has looked at the PoI.
         """
+        checks.require_probabilities("probabilities", probabilities)
         return jnp.where(is_seen, self._read(self.q, probabilities), self.q_unseen)
 
     def _read(self, table: jax.Array, probabilities: jax.Array) -> jax.Array:

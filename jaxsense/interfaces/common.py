@@ -86,7 +86,7 @@ def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> PyTree:
     Raises:
       ValueError: if `number` is not positive.
     """
-    checks.require_number("number", number)
+    checks.require_number("number of starts", number)
     # A start is the same for all sensors.
     played = OneAgent(mdp, 0) if isinstance(mdp, MapMdp) else mdp
     reset = jax.vmap(lambda key, played: played.reset(key)[1], (0, None))

@@ -59,6 +59,9 @@ class _Team:
     def render(self) -> None:
         """Draws nothing: there is no `render_mode`."""
 
+    def close(self) -> None:
+        """Closes nothing."""
+
     def _begin(self, seed: int | None) -> tuple[dict[str, np.ndarray], Infos]:
         """Starts an episode; observations and infos of all robots."""
         if seed is not None or self._key is None:

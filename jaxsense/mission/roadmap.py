@@ -120,6 +120,9 @@ def lengths(
     Returns:
       `[V]` metres; infinite where no path exists.
     """
+    checks.require_shape("position", position, (2,))
+    checks.require_finite("position", position)
+    checks.require_index("poi", poi, len(roadmap.viewpoints))
     goals = roadmap.viewpoints[poi]
     direct, to_node = _first(config, layout, roadmap, position, goals)
     to_last = jnp.min(to_node[:, None] + roadmap.between, axis=0)

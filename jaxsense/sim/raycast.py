@@ -46,6 +46,9 @@ class CrossSection:
     geom: tuple[int, ...] = struct.field(pytree_node=False)
     num_circles: int = struct.field(pytree_node=False)
 
+    def __post_init__(self):
+        checks.require_tuple("geom", self.geom)
+
 
 @pytree
 class Hit:
@@ -130,8 +133,9 @@ def cast(
       The first hit of each ray.
 
     Raises:
-      ValueError: if the origin or an angle is not finite.
+      ValueError: if the origin or an angle is not finite, or the section is none.
     """
+    checks.require_finite("angle", angle)
     return cast_along(section, origin, (jnp.cos(angle), jnp.sin(angle)))
 
 
@@ -141,18 +145,30 @@ def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> H
     Args:
       section: the scene.
       origin: start of the rays, in metres.
-      direction: unit vectors in the world.
+      direction: x and y of unit vectors in the world, two arrays of the same shape.
 
     Returns:
       The first hit of each ray.
 
     Raises:
-      ValueError: if the origin is not finite, or a direction is no unit vector.
+      ValueError: if the origin is not finite, a direction is no unit vector, or the section is
+        none.
     """
     checks.require_shape("origin", origin, (2,))
     checks.require_shape("y of direction", direction[1], jnp.shape(direction[0]))
     checks.require_number("number of outlines", len(section.geom))
     checks.require_index("num_circles", int(section.num_circles), len(section.geom) + 1)
+    checks.require_shape("centre", section.centre, (len(section.geom), 2))
+    checks.require_shape("axis", section.axis, (len(section.geom), 2))
+    checks.require_shape("half", section.half, (len(section.geom), 2))
+    checks.require_finite("centre", section.centre)
+    checks.require(
+        "axis",
+        section.axis,
+        lambda x: np.broadcast_to(np.abs(np.hypot(x[:, :1], x[:, 1:]) - 1) < 1e-3, x.shape),
+        "must hold unit vectors",
+    )
+    checks.require("half", section.half, lambda x: x >= 0, "must be 0 or more")
     checks.require_finite("origin", origin)
     for part in direction:
         checks.require_finite("direction", part)

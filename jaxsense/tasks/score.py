@@ -65,7 +65,9 @@ class Estimate:
     high: float
 
     def __str__(self):
-        return f"{self.value:.3f} ({self.low:.3f} to {self.high:.3f})"
+        # Of a single seed, nothing is known of the others.
+        interval = f" ({self.low:.3f} to {self.high:.3f})" if self.low < self.high else ""
+        return f"{self.value:.3f}{interval}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +111,8 @@ class Score:
         return estimate(self.returns / self.references[self.best])
 
     def __str__(self):
-        lines = [f"{self.task}, {self.agent}: return {self.mean_return}"]
+        seeds = f"{len(self.returns)} seed{'s' * (len(self.returns) > 1)}"
+        lines = [f"{self.task}, {self.agent}, {seeds}: return {self.mean_return}"]
         known = "optimum" if self.has_optimum else f"best rule, {self.best}"
         lines += [f"fraction of the {known}: {self.fraction_of_optimal}"]
         lines += [f"{name}: {estimate(found)}" for name, found in self.references.items()]

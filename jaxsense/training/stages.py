@@ -98,8 +98,11 @@ def learn(
       except its missions.
 
     Raises:
+      TypeError: if `config` is no `Config`.
       ValueError: if no stage has this name.
     """
+    if not isinstance(config, Config):
+        raise TypeError(f'config = {config!r}: must be a Config, such as jaxsense.PRESETS["smoke"]')
     found = stages(config, arena)
     names = [stage.name for stage in found]
     if until is not None and until not in names:

@@ -37,12 +37,13 @@ def log_likelihood(
       In nats.
 
     Raises:
-      ValueError: if no modality is present, `reconstruction_weights` has not one for each, or
-        `samples` is not positive.
+      ValueError: if no modality is present, `reconstruction_weights` has not one above 0 for each,
+        or `samples` is not positive.
     """
     checks.require_number("samples", samples)
     given = tuple(reconstruction_weights)
     checks.require_one_each("reconstruction_weights", given, model.modalities)
+    checks.require_positive("reconstruction_weights", jnp.stack(given))
     posterior = jmvae.posterior(params, model, features)
 
     def log_weight(noise: Float[Array, " D"]) -> Float[Array, ""]:

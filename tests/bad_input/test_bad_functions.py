@@ -517,8 +517,11 @@ FUNCTIONS = {
         lambda w: jaxsense.make_mdp(WINDOWS, w.models),
         "models.detectors of camera: reads windows of 240 numbers; must be of 120, as config's are",
     ),
-    "prepared_starts": (lambda w: common.prepared_starts(w.key, w.mdp, 0), "number = 0"),
-    "prepared_starts real": (lambda w: common.prepared_starts(w.key, w.mdp, 1.5), "number ="),
+    "prepared_starts": (lambda w: common.prepared_starts(w.key, w.mdp, 0), "number of starts = 0"),
+    "prepared_starts real": (
+        lambda w: common.prepared_starts(w.key, w.mdp, 1.5),
+        "number of starts =",
+    ),
     "detections": (lambda w: jaxsense.detections(w.key, SMOKE, w.models, 0), "samples = 0"),
 }
 

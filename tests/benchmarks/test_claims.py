@@ -146,12 +146,16 @@ CLAIMS = {
         > model["log-likelihood"].mean() + half(model["log-likelihood"])
         for model in OTHERS
     ),
-    "With all six views, MVAE, MMVAE and MoPoE are slightly more accurate, within the intervals; "
-    "with a single view, they are less accurate. MMVAE is the most coherent.": lambda: all(
-        0 < model["accuracy all"].mean() - OURS["accuracy all"].mean() < 0.02
-        and single(model) < single(OURS)
-        and model["coherence"].mean() <= DIGITS["MultiVae MMVAE"]["coherence"].mean()
-        for model in OTHERS
+    "With all six views, MVAE, MMVAE and MoPoE are about one percentage point more accurate, MVAE "
+    "beyond chance; with a single view, they are less accurate. MMVAE is the most coherent.": (
+        lambda: all(
+            about(model["accuracy all"].mean() - OURS["accuracy all"].mean(), 0.01, 0.004)
+            and (np.mean(ahead := model["accuracy all"] - OURS["accuracy all"]) > half(ahead))
+            == (name == "MultiVae MVAE")
+            and single(model) < single(OURS)
+            and model["coherence"].mean() <= DIGITS["MultiVae MMVAE"]["coherence"].mean()
+            for name, model in [*DIGITS.items()][2:]
+        )
     ),
     "In `default`, naive exploration takes a fifth longer for the same accuracy.": lambda: (
         about(DEFAULT.time("naive"), 1.2, 0.03)

@@ -183,7 +183,8 @@ def test_the_table_shows_means_and_intervals():
         "theirs": [{"coherence": 0.3, "seconds": 8.0}, {"coherence": 0.3, "seconds": 12.0}],
     }
     origin = machine.origin("python -m x", ("scipy",))
-    lines = table.of_results({**origin, "models": runs}).splitlines()
+    budget = dataclasses.asdict(Budget(steps=7))
+    lines = table.of_results({**origin, "budget": budget, "models": runs}).splitlines()
     # Standard error .1, and t = 12.706 for 1 degree of freedom.
     assert lines[:5] == [
         "| | ours | theirs | ours minus theirs, same seed |",
@@ -192,6 +193,7 @@ def test_the_table_shows_means_and_intervals():
         "| seconds | 2.0 | 10.0 (8.0 to 12.0) |  |",
         "| ... over those of ours, same seed | 1.0 | 5.0 (4.0 to 6.0) |  |",
     ]
+    assert lines[-3].startswith("2 trainings of each model. Latent size 16; hidden layers 64, 64;")
     assert lines[-1].startswith("`python -m x`: cpu with ")
     assert "scipy" in lines[-1]
 
