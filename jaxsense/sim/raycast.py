@@ -156,6 +156,12 @@ def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> H
     """
     checks.require_shape("origin", origin, (2,))
     checks.require_shape("y of direction", direction[1], jnp.shape(direction[0]))
+    checks.require_finite("origin", origin)
+    for part in direction:
+        checks.require_finite("direction", part)
+    if not any(isinstance(part, Tracer) for part in direction):
+        lengths = np.hypot(np.asarray(direction[0]), np.asarray(direction[1]))
+        checks.require("length of direction", lengths, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
     checks.require_number("number of outlines", len(section.geom))
     checks.require_index("num_circles", int(section.num_circles), len(section.geom) + 1)
     checks.require_shape("centre", section.centre, (len(section.geom), 2))
@@ -169,12 +175,6 @@ def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> H
         "must hold unit vectors",
     )
     checks.require("half", section.half, lambda x: x >= 0, "must be 0 or more")
-    checks.require_finite("origin", origin)
-    for part in direction:
-        checks.require_finite("direction", part)
-    if not any(isinstance(part, Tracer) for part in direction):
-        lengths = np.hypot(np.asarray(direction[0]), np.asarray(direction[1]))
-        checks.require("length of direction", lengths, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
     # Not by `platform_dependent`, which takes twice as long to trace and batch.
     on_cpu = jax.default_backend() == "cpu"
     nearest = _nearest_by_two_loops if on_cpu else _nearest_by_one_loop

@@ -315,3 +315,24 @@ def test_a_cross_section_holds_everything_that_is_seen_once(arena):
     walls = [f"wall{w}" for w in range(4)]
     assert sorted(names) == sorted([*pois, *walls, "robot1_body", "robot1_lidar"])
     assert section.num_circles == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("half", np.ones((1, 2)), r"half has the shape \(1, 2\): must be \(2, 2\)"),
+        ("axis", np.ones(2), r"axis has the shape \(2,\): must be \(2, 2\)"),
+        ("centre", [[2.0, 0.0], [0.0, 0.0]], r"centre = .*: must be an array of shape \(2, 2\)"),
+        ("centre", np.full((2, 2), np.nan), "centre = nan: must be finite"),
+        ("half", np.full((2, 2), -0.5), "half = -0.5: must be 0 or more"),
+        ("axis", np.array([[1.0, 0.0], [2.0, 0.0]]), "axis = 2.0: must hold unit vectors"),
+    ],
+)
+def test_what_is_no_scene_is_refused(name, value, expected):
+    axis = np.array([[1.0, 0.0], [1.0, 0.0]])
+    scene = sim.CrossSection(2 * axis, axis, axis / 2, (7, 3), 1)
+    sim.cast(scene, np.zeros(2), 0.0)
+    with pytest.raises(ValueError, match=expected):
+        sim.cast(scene.replace(**{name: value}), np.zeros(2), 0.0)
+    with pytest.raises(ValueError, match=r"geom = .*: must be a tuple"):
+        scene.replace(geom=np.array([7, 3]))
