@@ -19,7 +19,7 @@ _RAYS = (*_BODIES, "sim/raycast.py", "sim/sensors.py")
 _CHOICES = ("dqn/policies.py", "dqn/reference.py", "dqn/rewards.py", "dqn/rules.py")
 _BELIEFS = (
     *(f"vae/{name}.py" for name in ("bayes", "calibration", "detectors", "filter", "fusion")),
-    *(f"vae/{name}.py" for name in ("gate", "gaussian", "novelty", "readout")),
+    *(f"vae/{name}.py" for name in ("gate", "gaussian", "latent", "novelty", "readout")),
     *(f"vae/jmvae.py:{name}" for name in ("posterior", "decode")),
 )
 _STEPS = (*_CHOICES, "core", "looks.py", "mission", "models.py", "sim", *_BELIEFS)

@@ -15,7 +15,6 @@ from jaxsense.run import cli
 from jaxsense.tasks import registry
 from jaxsense.tasks.pretrained import PREFIX
 
-"""What precedes the preset of models that travel with the package, in place of a run."""
 _POSITIONAL = ("run", "runs", "commit")  # words without an option
 _FILES = ("json", "plot")  # do not change results
 

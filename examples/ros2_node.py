@@ -33,7 +33,9 @@ import numpy as np
 
 try:
     from run_exported import Programs, empty, remember, write
-except ModuleNotFoundError:
+except ModuleNotFoundError as error:
+    if error.name != "run_exported":
+        raise
     sys.exit("needs run_exported.py: copy it next to this file")
 
 VIEW_DISTANCE = 0.9  # m, from the sensor to a PoI

@@ -175,7 +175,8 @@ def _write(
         before = summary.read_evaluations(run).get(path.stem)
         blocks = {**(before["mission"] if before else {}), **missions}
         found = _evaluation(config, compare.compared(blocks))
-        found["origin"] = rundir.origin()
+        if not before or _is_alike(before.get("origin"), rundir.origin()):
+            found["origin"] = rundir.origin()
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
         if policies_of(found["mission"]):
@@ -204,6 +205,11 @@ def _evaluation(config: Config, missions: summary.Missions) -> summary.Evaluatio
         "robots": list(config.carried),
         "mission": missions,
     }
+
+
+def _is_alike(origin: summary.Origin | None, other: summary.Origin) -> bool:
+    """Whether figures of both are made alike, be it on other days."""
+    return origin is not None and {**origin, "date": None} == {**other, "date": None}
 
 
 def _place(config: Config) -> str:

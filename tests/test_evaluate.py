@@ -49,6 +49,18 @@ def read(path, name=NAME):
     return json.loads((path / "evaluations" / f"{name}.json").read_text(encoding="utf-8"))
 
 
+def test_origins_are_alike_on_other_days_only():
+    origin = {
+        "versions": {"jax": "0.10.2"},
+        "devices": ["cpu"],
+        "date": "2026-11-28",
+        "commit": "a",
+    }
+    assert evaluate._is_alike({**origin, "date": "2026-11-29"}, origin)
+    assert not evaluate._is_alike({**origin, "commit": "b"}, origin)
+    assert not evaluate._is_alike(None, origin)
+
+
 def test_evaluate_writes_a_file_of_its_own_and_leaves_the_runs_figures(evaluated):
     path, before, _ = evaluated
     assert json.loads((path / "summary.json").read_text()) == before

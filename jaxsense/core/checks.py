@@ -3,6 +3,7 @@
 Traced values are unknown: their checks pass and cost nothing.
 """
 
+import reprlib
 from collections.abc import Callable, Sequence
 from types import EllipsisType
 
@@ -94,10 +95,11 @@ def require_shape(name: str, value: object, shape: Sequence[int | EllipsisType |
       ValueError: names the shape; if only leading axes are too many, also `jax.vmap`.
     """
     if not isinstance(value, _ARRAYS):
-        raise ValueError(f"{name} = {value!r}: must be an array of shape {_text(shape)}")
+        given = reprlib.repr(value)  # which may be long
+        raise ValueError(f"{name} = {given}: must be an array of shape {_text(shape)}")
     if not _has(value, shape):
         is_batch = ... not in shape and _has(value, (..., *shape))
-        advice = ", for one example; use jax.vmap for more" if is_batch else ""
+        advice = "; use jax.vmap for a batch" if is_batch else ""
         raise ValueError(f"{name} has the shape {np.shape(value)}: must be {_text(shape)}{advice}")
 
 

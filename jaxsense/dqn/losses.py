@@ -26,6 +26,7 @@ def td_error(
     Returns:
       `[...]` target minus value.
     """
+    checks.require_shape("a_tm1", a_tm1, (...,))
     checks.require_shape("r_t", r_t, a_tm1.shape)
     checks.require_shape("discount_t", discount_t, a_tm1.shape)
     checks.require_shape("q_tm1", q_tm1, (None, *a_tm1.shape))

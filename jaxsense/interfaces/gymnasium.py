@@ -177,9 +177,9 @@ class MapVectorEnv(VectorEnv):
         checks.require_number("num_envs", num_envs)
         self.num_envs = num_envs
         self._task: Task | None = played if isinstance(played, MapTask | TeamTask) else None
-        modes = ["rgb_array"] if self._task else []
-        self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": modes}
-        self.render_mode = common.checked_mode(render_mode, modes)
+        self.metadata = {**TaskEnv.metadata} if self._task else {"render_modes": []}
+        self.metadata["autoreset_mode"] = AutoresetMode(autoreset_mode)
+        self.render_mode = common.checked_mode(render_mode, self.metadata["render_modes"])
         single = common.environment_spaces(spaces, played)
         self.single_observation_space, self.single_action_space = single
         self.observation_space = batch_space(self.single_observation_space, num_envs)

@@ -10,6 +10,7 @@
 
 import io
 import json
+import reprlib
 import sys
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
@@ -96,7 +97,7 @@ def _array(program: str, name: str, given: ArrayLike, about: Mapping[str, Any]) 
     except ValueError:  # lists of unequal lengths
         pass
     must_be = f"must be {about['dtype']} of shape {_text(about['shape'])} ({about['about']})"
-    raise ValueError(f"{program}: {name} = {given!r}: {must_be}")
+    raise ValueError(f"{program}: {name} = {reprlib.repr(given)}: {must_be}")
 
 
 def _text(shape: Iterable[int | str]) -> str:

@@ -9,6 +9,7 @@ archive with `Ort::Session`, and give and take tensors of the same names, shapes
 """
 
 import json
+import reprlib
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -91,7 +92,7 @@ def _array(program: str, name: str, given: ArrayLike, about: Mapping[str, Any]) 
     except ValueError:  # lists of unequal lengths
         pass
     must_be = f"must be {about['dtype']} of shape {_text(about['shape'])} ({about['about']})"
-    raise ValueError(f"{program}: {name} = {given!r}: {must_be}")
+    raise ValueError(f"{program}: {name} = {reprlib.repr(given)}: {must_be}")
 
 
 def _text(shape: Iterable[int | str]) -> str:

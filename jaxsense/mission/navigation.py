@@ -178,6 +178,7 @@ def drive_to(
       `[2]` wanted command.
     """
     checks.require_shape("waypoint", waypoint, (2,))
+    checks.require_shape("poses", poses, (None, 3))
     checks.require_shape("commands", commands, (len(poses), 2))
     pose, present = poses[robot], commands[robot]
     arcs = _arcs(settings, present[1], seconds)

@@ -19,7 +19,7 @@ from jaxsense.tasks import pretrained
 T = TypeVar("T")
 
 CACHE = Path("~/.cache/jaxsense")
-"""Before the preset of models that come with jaxsense, in place of a run."""
+"""Where compiled programs are kept for later calls."""
 # Exit statuses, as in shells.
 INTERRUPTED = 130
 _CLOSED = 141

@@ -133,7 +133,8 @@ def cast(
       The first hit of each ray.
 
     Raises:
-      ValueError: if the origin or an angle is not finite, or the section is none.
+      ValueError: if the origin or an angle is not finite, or an array of the section does not
+        describe its outlines.
     """
     checks.require_finite("angle", angle)
     return cast_along(section, origin, (jnp.cos(angle), jnp.sin(angle)))
@@ -151,8 +152,8 @@ def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> H
       The first hit of each ray.
 
     Raises:
-      ValueError: if the origin is not finite, a direction is no unit vector, or the section is
-        none.
+      ValueError: if the origin is not finite, a direction is no unit vector, or an array of the
+        section does not describe its outlines.
     """
     checks.require_shape("origin", origin, (2,))
     checks.require_shape("y of direction", direction[1], jnp.shape(direction[0]))

@@ -328,7 +328,7 @@ class Evaluation(TypedDict):
     num_pois: Annotated[int, Metric("PoIs", "Number of points of interest.", 0)]
     side: Annotated[float, Metric("side [m]", "Side of the arena.", 2)]
     robots: Annotated[list[str], Metric("robots", "Modality of each robot.")]
-    # Of the last call that wrote the file; those of earlier versions lack it.
+    # Those of earlier versions, and of several calls that were not made alike, lack it.
     origin: NotRequired[Origin]
     mission: Missions
 

@@ -65,7 +65,7 @@ class Estimate:
     high: float
 
     def __str__(self):
-        # Of a single seed, nothing is known of the others.
+        # Of a single seed, or of equal ones, there is no interval.
         interval = f" ({self.low:.3f} to {self.high:.3f})" if self.low < self.high else ""
         return f"{self.value:.3f}{interval}"
 

@@ -127,6 +127,7 @@ def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Beli
       ValueError: if a belief is not finite, or a standard deviation is not positive.
     """
     for name, each in (("belief", belief), ("posterior", posterior), ("prior", prior)):
+        checks.require_shape(f"{name}.mean", each.mean, (None,))
         checks.require_shape(name, each.std, each.mean.shape)
         checks.require_finite(f"{name}.mean", each.mean)
         checks.require_positive(f"{name}.std", each.std)

@@ -51,6 +51,7 @@ def sample(noise: _Columns, mean: _Columns, log_var: _Columns) -> Float[Array, "
       mean: `[D, ...]`.
       log_var: `[D, ...]` logarithm of the variances.
     """
+    checks.require_shape("mean", mean, (...,))
     checks.require_shape("log_var", log_var, mean.shape)
     checks.require_shape("noise", noise, mean.shape)
     return mean + jnp.exp(0.5 * log_var) * noise

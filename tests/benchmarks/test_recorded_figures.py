@@ -63,6 +63,6 @@ def test_encoders_that_learn_without_labels_are_not_retrained_with_them(monkeypa
 @pytest.mark.slow  # trains a detector of `default`
 def test_default_keeps_its_figures_in_real_scans():
     found = figures_of("default", every=1)
-    assert share(found, "random distance, 7040 looks") <= 0.02
+    assert share(found, "random distance, 7,040 looks") <= 0.02
     assert share(found, "of those that pass") >= 0.97
     assert share(found, "half of the scans", "after") >= 0.985

@@ -119,6 +119,12 @@ def rate(x: Array) -> Array:
     checked = other.replace("return 2", "checks.require_finite('x', x)\n    return 2")
     assert checked != other
     assert history.program(checked, "rate") == history.program(other, "rate")
+    post = "    def __post_init__(self):\n        checks.require_tuple('name', self.name)\n"
+    guarded = before.replace("    name: str\n", f"    name: str\n{post}")
+    assert guarded != before
+    assert history.program(guarded) == history.program(before)
+    made = guarded.replace("self.name)\n", "self.name)\n        self.size = 1\n")
+    assert history.program(made) != history.program(before)
     called = other.replace("return 2", "log.write('x', x)\n    return 2")
     assert history.program(called, "rate") != history.program(other, "rate")
     changed = other.replace("2 * x", "3 * x")

@@ -107,6 +107,7 @@ def test_a_picture_of_gymnasium_shows_what_changes(gymnasium):
 
 def test_vector_environments_draw_each_map(gymnasium):
     envs = gymnasium.make_vec("jaxsense/map-v0", num_envs=2, render_mode="rgb_array")
+    assert envs.metadata["render_fps"] == 2
     with pytest.raises(gymnasium.error.ResetNeeded):
         envs.render()
     envs.reset(seed=3)
@@ -118,7 +119,14 @@ def test_vector_environments_draw_each_map(gymnasium):
     assert envs._actions == [[0], [3]]
     envs.step(np.array([1, 0]))  # and starts anew
     assert envs._actions == [[0, 1], []]
+    envs.reset(options={"reset_mask": np.array([True, False])})
+    assert envs._actions == [[], []]
     assert gymnasium.make_vec("jaxsense/map-v0", num_envs=2).render() is None
+    options = {"render_mode": "rgb_array", "autoreset_mode": "SameStep"}
+    envs = gymnasium.make_vec("jaxsense/map-v0", num_envs=2, **options)
+    envs.reset(seed=3)
+    envs.step(np.array([0, 3]))
+    assert envs._actions == [[0], []]
 
 
 def test_what_cannot_be_in_gymnasium_is_told(gymnasium):
