@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import first_steps, measure, pipeline
+from benchmarks import first_steps, measure, pipeline, results
 from benchmarks.pipeline import Needs
 
 
@@ -115,3 +115,8 @@ def test_a_newcomer_gets_through(capsys):
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[3:6]]
     assert rows[-1][0] == "| the first program of the README"
     assert all(float(row[-1].strip(" |")) > 0 for row in rows)
+
+
+def test_all_steps_are_stored():
+    stored = json.loads((results.RESULTS / "first_steps.json").read_text(encoding="utf-8"))
+    assert [*stored["steps"]] == [*first_steps.STEPS]
