@@ -63,8 +63,9 @@ def read(config: jaxsense.Config, models: jaxsense.Models, looks: RecordedLooks)
             print(f"  {sensor.name}:", ", ".join(f"{label} {share:.2f}" for label, share in told))
             print(f"    alone:   mean {np.asarray(alone.mean)}, sigma {np.asarray(alone.std)}")
             print(f"    in map:  mean {np.asarray(belief.mean)}, sigma {np.asarray(belief.std)}")
-        told = config.arena.classes[fusion.most_likely_class(belief)] if seen.any() else "unseen"
-        print(f"  The map says: {told}")
+        classes = zip(config.arena.classes, fusion.class_probabilities(belief), strict=True)
+        told = ", ".join(f"{name} {share:.2f}" for name, share in classes if share > 0.01)
+        print(f"  The map says: {told if seen.any() else 'unseen'}")
 
 
 def simulate(config: jaxsense.Config) -> dict[str, np.ndarray]:

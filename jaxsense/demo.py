@@ -146,7 +146,8 @@ def _sentence(policy: str, robots: int) -> str:
     naive += "interest) once"
     if policy == _REFERENCE:
         return f"{naive[0].upper()}{naive[1:]}, and what it sees goes into the shared map."
-    chooses = {"latent": "a learned policy takes the look that is worth most on the shared map"}
+    learned = "the learned policy (latent) takes the look that is worth most on the shared map"
+    chooses = {"latent": learned}
     how = chooses.get(policy, f"the policy {policy} chooses each look")
     return f"In the first animation, {how}, and stops when no look pays; {naive}."
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense.config import Config, ConfigError
+from jaxsense.config.checks import require_function
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.core import checks
 from jaxsense.core.types import Key
@@ -22,6 +23,7 @@ from jaxsense.summary import Case, make
 from jaxsense.summary.blocks import MISSIONS
 from jaxsense.summary.compare import REFERENCE, Measured, differences
 
+_IS_POLICY = "must be a function (key, models, known) -> values that JAX can trace"
 AGAINST = (REFERENCE, "auction", "naive", "random")
 """Policies that `score_missions` compares with, unless told otherwise."""
 
@@ -89,8 +91,8 @@ def score_missions(
       The score.
 
     Raises:
-      ConfigError: if an argument is of another type, a policy is unknown or has a name that is
-        taken, or the models are for another number of PoIs.
+      ConfigError: if an argument is of another type, a policy is unknown, has a name that is taken,
+        takes other arguments or cannot be traced, or the models are for another number of PoIs.
       ValueError: if another argument is wrong, or a policy returns values of another shape or
         dtype.
       RuntimeError: if the values of a policy, the models or the beliefs are not finite.
@@ -165,9 +167,13 @@ def _require(
 def _checked(name: str, policy: Values | Policy) -> Policy:
     """The policy, which names itself if its values have another shape or dtype."""
     wrapped = as_policy(policy)
+    require_function(f"policies[{name!r}]", wrapped.values, 3, _IS_POLICY)
 
     def values(key: Key, models: Trained, known: Known) -> jax.Array:
-        found = jnp.asarray(wrapped.values(key, models, known))
+        try:
+            found = jnp.asarray(wrapped.values(key, models, known))
+        except jax.errors.JAXTypeError as error:
+            raise ConfigError(f"policies[{name!r}]", wrapped.values, _IS_POLICY) from error
         number = len(known.looks) + 1
         if found.shape != (number,) or not jnp.issubdtype(found.dtype, jnp.floating):
             expected = f"must return floats of shape [{number}], one for each PoI and NOP's last"

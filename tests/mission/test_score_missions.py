@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -118,3 +119,14 @@ def test_a_policy_without_a_value_for_each_action_is_named(values):
     assert checked.is_unordered
     with pytest.raises(ValueError, match=r"^policies = 'mine': must return floats of shape \[4\]"):
         checked.values(None, None, SimpleNamespace(looks=np.zeros((3, 2))))
+
+
+def test_a_policy_of_a_task_and_one_in_numpy_are_named():
+    expected = r"^policies\['mine'\] = .*: must be a function \(key, models, known\) -> values that"
+    with pytest.raises(ConfigError, match=expected):
+        score._checked("mine", lambda key, observation: 0)
+    in_numpy = score._checked("mine", lambda key, models, known: np.asarray(known.looks[:, 0]))
+    with pytest.raises(ConfigError, match=expected):
+        jax.eval_shape(
+            lambda x: in_numpy.values(None, None, SimpleNamespace(looks=x)), np.zeros((3, 2))
+        )
