@@ -188,7 +188,7 @@ def main(argv: list[str] | None = None) -> None:
     except (ConfigError, ModuleNotFoundError, NotImplementedError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
-        cli.fail(PROGRAM, f"out = {str(path)!r}: cannot be written ({cli.reason(error)})")
+        cli.fail(PROGRAM, f"out = {str(path)!r}: cannot be written ({error.strerror or error})")
     print(f"{path}: {len(content) / 1e3:.0f} kB, for NumPy and ONNX")
 
 

@@ -297,7 +297,7 @@ OTHERS = [
     (export, ["a\nb"], "run = 'a\\nb': must be a path of printable characters"),
     (export, ["RUN", "--out", "full"], "out = 'full': already exists; must be a new file"),
     (export, ["RUN", "--out", "file"], "out = 'file': already exists; must be a new file"),
-    (export, ["RUN", "--out", "file/x"], "out = 'file/x': cannot be written"),
+    (export, ["RUN", "--out", "file/x"], "out = 'file/x': cannot be written (Not a directory)"),
     (export, ["RUN", "--out", ""], "out = '': must be a path"),
     (export, ["RUN", "--out"], "argument --out: expected one argument"),
     (benchmarks, ["x"], "name = 'x': must be one of physics"),
