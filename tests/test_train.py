@@ -43,7 +43,7 @@ def test_run_directory_holds_everything(smoke_run):
 
 def test_summary_keeps_its_contract(smoke_run):
     summary = json.loads((smoke_run / "summary.json").read_text())
-    assert set(summary) == {
+    assert set(summary) - {"commit"} == {  # known in a checkout
         "preset", "seed", "versions", "devices", "cores", "date", "timing", "detectors", "jmvae",
         "belief", "dqn", "mission",
     }  # fmt: skip

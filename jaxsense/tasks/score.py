@@ -65,9 +65,7 @@ class Estimate:
     high: float
 
     def __str__(self):
-        # Of a single seed, or of equal ones, there is no interval.
-        interval = f" ({self.low:.3f} to {self.high:.3f})" if self.low < self.high else ""
-        return f"{self.value:.3f}{interval}"
+        return f"{self.value:.3f} ({self.low:.3f} to {self.high:.3f})"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,11 +109,15 @@ class Score:
         return estimate(self.returns / self.references[self.best])
 
     def __str__(self):
+        def shown(found: Estimate) -> str:
+            # A single seed has no interval.
+            return str(found) if len(self.returns) > 1 else f"{found.value:.3f}"
+
         seeds = f"{len(self.returns)} seed{'s' * (len(self.returns) > 1)}"
-        lines = [f"{self.task}, {self.agent}, {seeds}: return {self.mean_return}"]
+        lines = [f"{self.task}, {self.agent}, {seeds}: return {shown(self.mean_return)}"]
         known = "optimum" if self.has_optimum else f"best rule, {self.best}"
-        lines += [f"fraction of the {known}: {self.fraction_of_optimal}"]
-        lines += [f"{name}: {estimate(found)}" for name, found in self.references.items()]
+        lines += [f"fraction of the {known}: {shown(self.fraction_of_optimal)}"]
+        lines += [f"{name}: {shown(estimate(found))}" for name, found in self.references.items()]
         return "\n  ".join(lines)
 
 

@@ -354,8 +354,8 @@ def test_learners_have_names_of_their_own_and_settings():
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["none"], "learners = ('none',): must be of our DQN"),
-        (["--only", "map-v1"], "only = ('map-v1',): must be of many-v0, map-v0"),
+        (["none"], "learners = ('none',): must be some of our DQN"),
+        (["--only", "map-v1"], "only = ('map-v1',): must be some of many-v0, map-v0"),
         (["--quick"], "quick = True: needs out"),
     ],
 )

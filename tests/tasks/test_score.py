@@ -155,3 +155,18 @@ def test_a_policy_that_cannot_be_traced_is_told_what_to_do(act):
         ValueError, match=r"^policy: must be a function .* wrap others in tasks\.on_host"
     ):
         jaxsense.score(NAME, lambda key, observation: act(observation), episodes=1)
+
+
+def test_a_score_of_one_seed_shows_no_interval():
+    returns = np.array([0.5])
+    references = {"optimal": np.array([1.0]), "naive": np.array([0.25])}
+    one = tasks.Score(NAME, "camera", returns, references, True)
+    assert str(one).splitlines() == [
+        f"{NAME}, camera, 1 seed: return 0.500",
+        "  fraction of the optimum: 0.500",
+        "  optimal: 1.000",
+        "  naive: 0.250",
+    ]
+    two = {name: np.repeat(found, 2) for name, found in references.items()}
+    shown = str(tasks.Score(NAME, "camera", np.repeat(returns, 2), two, True)).splitlines()
+    assert shown[0] == f"{NAME}, camera, 2 seeds: return 0.500 (0.500 to 0.500)"
