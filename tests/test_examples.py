@@ -16,7 +16,7 @@ import pytest
 from smoke import save_models
 
 import jaxsense
-from jaxsense import Belief, evaluate, export, sim, train
+from jaxsense import Belief, evaluate, sim, train
 from jaxsense.config import PRESETS
 from jaxsense.core.types import pytree
 from jaxsense.dqn import policies
@@ -286,14 +286,14 @@ class Latest(InPlace):
 @pytest.mark.slow
 def test_recorded_scans_uses_the_fusion_of_the_run(recorded_scans, tmp_path, monkeypatch, capsys):
     recorded_scans(tmp_path / "recorded.npz", "--simulate")
-    load = export.load
+    load = jaxsense.load
 
     def with_another(run, trust):
-        config, models, place = load(run, trust)
+        config, models = load(run, trust)
         parts = {p.name: getattr(models.fusion, p.name) for p in dataclasses.fields(InPlace)}
-        return config, dataclasses.replace(models, fusion=Latest(**parts)), place
+        return config, dataclasses.replace(models, fusion=Latest(**parts))
 
-    monkeypatch.setattr(export, "load", with_another)
+    monkeypatch.setattr(jaxsense, "load", with_another)
     recorded_scans(tmp_path / "recorded.npz")
     told = re.findall(r"in map: +mean \[(\S+)", capsys.readouterr().out)
     assert told == ["5.5", "6.5"] * 4

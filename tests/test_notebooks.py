@@ -49,7 +49,7 @@ def notebook(name):
 def test_the_tasks(tmp_path, monkeypatch, capsys):
     run(notebook("tasks"), tmp_path, monkeypatch)
     printed = capsys.readouterr().out
-    assert "noisy-v0, lidar: return" in printed
+    assert "noisy-v0, lidar, 10 seeds: return" in printed
 
 
 @pytest.mark.slow  # the same functions run in the examples of pages

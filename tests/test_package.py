@@ -99,22 +99,28 @@ def test_example_of_another_fusion_runs(capsys):
 def test_examples_of_the_tasks_run(capsys):
     page = ROOT / "docs" / "tasks.md"
     assert np.isfinite(run_example(page, 0)["seen"].reward)
-    run_example(page, 1)
-    printed = capsys.readouterr().out
-    assert "noisy-v0, camera: return" in printed
-    on_host = run_example(page, 2)["found"]
+    played = run_example(page, 1)
+    assert played["rewards"].shape == (64, 20)
+    assert np.all(played["is_live"][:, 0])
+    assert np.all(played["is_live"][:, :-1] >= played["is_live"][:, 1:])
+    capsys.readouterr()
+    run_example(page, 2)
+    assert "noisy-v0, camera, 10 seeds: return" in capsys.readouterr().out
+    on_host = run_example(page, 3)["found"]
     assert capsys.readouterr().out.endswith("(10,)\n")
     assert 0 < on_host.fraction_of_optimal.low <= on_host.fraction_of_optimal.value <= 1
-    run_example(page, 3)
-    assert "noisy-v0, camera: return" in capsys.readouterr().out
     run_example(page, 4)
+    assert "noisy-v0, camera, 10 seeds: return" in capsys.readouterr().out
+    run_example(page, 5)
+    assert "mine" in capsys.readouterr().out
+    run_example(page, 6)
     printed = capsys.readouterr().out
     learned, random = (
         float(re.search(rf"{name}:?(?: return)? (-?[\d.]+)", printed)[1])
-        for name in ("map-v0, camera", "random")
+        for name in (r"map-v0, camera, \d+ seeds?", "random")
     )
     assert learned > random
-    assert run_example(page, 5)["models"].tours
+    assert run_example(page, 7)["models"].tours
     assert "--preset team --seed 0" in capsys.readouterr().out
 
 
