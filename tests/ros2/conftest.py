@@ -2,6 +2,9 @@ import importlib
 from pathlib import Path
 
 import pytest
+from ros2_robot import CONTENTS, POSITIONS, Stub
+
+from jaxsense.sim import resampling
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -11,3 +14,13 @@ def ros2():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(EXAMPLES)
         yield importlib.import_module("ros2_node")
+
+
+@pytest.fixture
+def stub():
+    return Stub()
+
+
+@pytest.fixture
+def robot(ros2, stub):
+    return ros2.Robot(CONTENTS, stub.programs(), resampling.resample, 1, POSITIONS)
