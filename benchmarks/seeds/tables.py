@@ -280,11 +280,18 @@ def _evaluated(
 def _origins(
     found: Mapping[str, Any], group: str, num_pois: int, robots: int
 ) -> dict[str, Mapping[str, Any]]:
-    """How `_evaluated` was made; of those that do not say, how the runs were trained."""
-    return {
-        seed: evaluations[-1].get("origin", found[group][seed])
-        for seed, evaluations in _of_size(found[group], num_pois, robots).items()
-    }
+    """How `_evaluated` was made; of those that do not say, how the runs were trained.
+
+    Raises `ValueError` if evaluations of one run were made by several commits.
+    """
+    made = {}
+    for seed, evaluations in _of_size(found[group], num_pois, robots).items():
+        origins = [each.get("origin", found[group][seed]) for each in evaluations]
+        if len(commits := {each["commit"] for each in origins}) > 1:
+            reason = f"evaluated by {' and '.join(sorted(commits))}: must be one commit"
+            raise ValueError(f"run {seed} of {group}: {reason}")
+        made[seed] = origins[-1]
+    return made
 
 
 def _of_size(

@@ -147,6 +147,18 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
     assert "cpu with 2 cores; commit 0123456789 on 2026-11-26" in shown.splitlines()[-1]
 
 
+def test_evaluations_of_one_run_are_by_one_commit(runs):
+    mission = {"latent": CASE}
+    other = {
+        **EVALUATION,
+        "mission": mission,
+        "origin": {**EVALUATION["origin"], "commit": "b" * 16},
+    }
+    found = gather([runs("many", 100, a={**EVALUATION, "mission": mission}, b=other)])
+    with pytest.raises(ValueError, match=r"run 100 of many: evaluated by b+ and fedc.*one commit"):
+        tables.missions(found, "many", 16, 3)
+
+
 def test_teams_of_other_sizes_are_other_columns(runs):
     def evaluation(robots, accuracy):
         mission = {"latent": {**CASE, "accuracy": accuracy}}
