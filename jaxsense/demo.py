@@ -115,9 +115,9 @@ def _page(
         animation.duration_of(scenario.config, each.recording.end) for each in played.values()
     )
 
-    def film(name: str) -> html.Film:
+    def film(name: str) -> str:
         recording, title = played[name].recording, f"{name} policy"
-        drawn = animation.draw(
+        return animation.draw(
             scenario.config,
             recording.records,
             recording.end,
@@ -126,14 +126,13 @@ def _page(
             title,
             lasts,
         )
-        return html.film(name, drawn.encode())
 
     return html.render(
         "demo.html.jinja",
         preset=arguments.preset,
         seed=arguments.seed,
         other=next(name for name in PRETRAINED if name != arguments.preset),
-        films=[[film(name) for name in played]],
+        films=[html.films({name: film(name) for name in played})],
         averages=_AVERAGES,
         table=table,
         sentence=_sentence(arguments.policy, len(scenario.config.carried)),

@@ -1,6 +1,5 @@
 """The report page: what it says, and how a browser shows it."""
 
-import base64
 import dataclasses
 import html
 import inspect
@@ -188,9 +187,10 @@ def test_what_was_run_is_told_and_escaped(run, read):
     assert f"evaluate {shlex.quote(str(run))} --episodes" in text
     assert ("html", {"lang": "en"}) in read.tags
     images = [attributes for tag, attributes in read.tags if tag == "img"]
-    # A half of a film needs no text of its own if it is the second, or stands still.
-    has_text = [True, False, False, False, True, True]
-    assert [len(image["alt"]) > 20 for image in images] == has_text
+    assert len(images) == 2
+    assert all(len(image["alt"]) > 20 for image in images)
+    (frame,) = (attributes for tag, attributes in read.tags if tag == "iframe")
+    assert frame["title"].startswith("Animation mission: robots in the arena")
 
 
 def test_changed_settings_are_named(tmp_path):
@@ -227,44 +227,49 @@ HOSTILE = """<svg xmlns="http://www.w3.org/2000/svg"><title>x</title>tail</svg><
 <script>alert(1)</script><image href="https://x.org/x.png"/>"""
 
 
-def test_of_a_film_the_page_holds_a_data_uri_and_nothing_else(tmp_path):
+def frame_of(text):
+    """The page that is in the only frame of a page."""
+    (document,) = re.findall(r'<iframe sandbox title="[^"]*" srcdoc="([^"]*)"></iframe>', text)
+    return html.unescape(document)
+
+
+def test_a_film_stays_in_a_frame_without_rights(tmp_path):
     run = write_run(tmp_path)
     without = page.render(run, CONFIG, SUMMARY)
     (run / "mission.svg").write_text(HOSTILE, encoding="utf-8")
     text = page.render(run, CONFIG, SUMMARY)
-    data = base64.b64encode(HOSTILE.encode()).decode()
     (figure,) = re.findall('<section id="film">.*?</section>', text, re.DOTALL)
-    # Two halves, which would look the same if it moved.
-    assert figure.count(f'src="data:image/svg+xml;base64,{data}"') == 4
+    assert frame_of(figure).count(HOSTILE) == 2  # halves
     tags = set(re.findall("<(\\w+)", figure))
-    assert tags == {"section", "h2", "figure", "input", "label", "div", "img", "figcaption", "span"}
+    assert tags == {"section", "h2", "figure", "iframe", "figcaption", "span"}
     others = text.replace(figure, "").replace('<a href="#film">Animation</a>', "")
     assert others.split() == without.split()
+    # Frames inherit what the page may load and run: nothing.
+    (policy,) = re.findall('http-equiv="Content-Security-Policy" content="([^"]*)"', text)
+    rules = {rule.split()[0]: rule.split()[1:] for rule in policy.split(";")}
+    assert rules.pop("style-src") == ["'unsafe-inline'"]
+    assert rules.pop("img-src") == ["data:"]
+    assert rules == {key: ["'none'"] for key in ("default-src", "base-uri", "form-action")}
 
 
-def test_a_film_can_be_stopped_without_a_script(run):
-    text = (run / "report.html").read_text()
-    (name,) = re.findall(r'<input type="checkbox" class="stop" id="([\w-]+)">', text)
-    assert f'<label for="{name}">Stop the animation</label>' in text
-    assert ".stop:checked~.film .plays{display:none}" in text
-    plays, stopped = (
-        base64.b64decode(re.findall(rf'class="{kind}" src="data:[^,]*,([^"]*)"', text)[0])
-        for kind in ("plays", "stopped")
-    )
-    assert plays == (run / "mission.svg").read_bytes()
-    assert b"<animate" in plays
-    assert b"<animate" not in stopped
-    assert b"6.0 s" in stopped
+def test_a_film_can_be_paused_without_a_script(run):
+    document = frame_of((run / "report.html").read_text())
+    choices = re.findall(r'<label><input type="radio" name="film" id="(\w+)"', document)
+    assert choices == ["play", "pause", "stop"]
+    assert ":has(#pause:checked) .film *{animation-play-state:paused!important}" in document
+    assert ":has(#stop:checked) .film *{animation:none!important}" in document
+    assert document.count((run / "mission.svg").read_text()) == 2
+    assert "<script" not in document
 
 
 def test_films_of_one_arena_stand_side_by_side(run, tmp_path):
     for name in ("mission", "mission-naive", "mission-naive-7"):
         shutil.copy(run / "mission.svg", tmp_path / f"{name}.svg")
     text = page.render(tmp_path, CONFIG, SUMMARY)
-    pair, alone = re.findall(r'<div class="film( pair)?">(.*?)</figure>', text, re.DOTALL)
-    assert (pair[0], alone[0]) == (" pair", "")
-    assert re.findall(r"Animation ([\w-]+):", pair[1]) == ["mission", "mission-naive"]
-    assert re.findall(r"Animation ([\w-]+):", alone[1]) == ["mission-naive-7"]
+    frames = re.findall(r'--rows:(\d);--tall:[\d.]+">\s*<iframe sandbox title="([^:]*):', text)
+    assert frames == [("2", "Animation mission, mission-naive"), ("1", "Animation mission-naive-7")]
+    documents = map(html.unescape, re.findall('srcdoc="([^"]*)"', text))
+    assert ['<main class="pair">' in document for document in documents] == [True, False]
 
 
 def test_plots_of_an_earlier_version_are_shown(tmp_path):
@@ -288,15 +293,22 @@ def test_columns_are_explained_when_they_are_asked_about(read, run):
 def test_the_name_of_an_animation_is_escaped(run, tmp_path):
     shutil.copy(run / "mission.svg", tmp_path / 'mission"><script>alert(1)<!--.svg')
     text = page.render(tmp_path, CONFIG, SUMMARY)
-    assert "<img" in text
+    assert "<iframe" in text
     assert "<script>" not in text
 
 
+HARM = """</main><script>window.changed = 1</script><details open ontoggle="window.changed = 2">"""
 MEASURE = """
 const frame = document.querySelector("iframe");
 frame.onload = () => setTimeout(() => {
   const page = frame.contentDocument, root = page.documentElement;
-  const [left, right] = page.querySelectorAll(".film div");
+  const film = page.querySelector("iframe").contentDocument;
+  const [left, right] = film.querySelectorAll("main div");
+  const playing = () => [...new Set(film.getAnimations().map(each => each.playState))];
+  const chosen = ["play", "pause", "stop", "play"].map(choice => {
+    film.getElementById(choice).click();
+    return playing();
+  });
   document.title = JSON.stringify({
     width: [root.clientWidth, root.scrollWidth],
     cut: [...page.querySelectorAll("main > *, section > *, h1, p, li, dd, figcaption")]
@@ -309,6 +321,10 @@ frame.onload = () => setTimeout(() => {
       const [image, box] = [half.firstChild, half].map(e => e.getBoundingClientRect());
       return [image.left - box.left, image.width].map(x => x / box.width);
     }),
+    height: [film.documentElement.clientHeight, film.documentElement.scrollHeight],
+    spare: film.documentElement.clientHeight - film.body.getBoundingClientRect().height,
+    chosen: chosen,
+    changed: frame.contentWindow.changed,
     asked: frame.contentWindow.performance.getEntriesByType("resource").map(e => e.name)
       .filter(name => !name.startsWith("data:")),
   });
@@ -320,7 +336,9 @@ frame.onload = () => setTimeout(() => {
 @pytest.mark.parametrize(("width", "is_phone"), [(390, True), (1280, False)])
 def test_a_browser_shows_all_of_it(run, tmp_path, width, is_phone):
     # A window cannot be as narrow as a phone, a frame can.
-    text = html.escape((run / "report.html").read_text(), quote=True)
+    hostile = (run / "report.html").read_text().replace("</main>", HARM)
+    # Only a frame of the same origin can be looked into.
+    text = html.escape(hostile.replace("<iframe sandbox ", "<iframe "), quote=True)
     frame = f'<iframe style="width:{width}px;height:800px;border:0" srcdoc="{text}"></iframe>'
     wrapper = tmp_path / "wrapper.html"
     wrapper.write_text(f'<!doctype html><meta charset="utf-8">{frame}<script>{MEASURE}</script>')
@@ -343,7 +361,11 @@ def test_a_browser_shows_all_of_it(run, tmp_path, width, is_phone):
     assert found["width"] == [width, width]
     assert found["cut"] == []
     assert found["text"] >= 13
-    assert found["images"] == [True] * 6
+    assert found["images"] == [True] * 2
+    assert found["height"][0] == found["height"][1]
+    assert 0 <= found["spare"] < 3
+    assert found["chosen"] == [["running"], ["paused"], [], ["running"]]
+    assert "changed" not in found
     assert found["asked"] == []
     assert found["below"] == is_phone
     # Each half shows its side of a picture that is twice as wide.
@@ -387,9 +409,9 @@ def test_where_motion_is_unwelcome_the_page_does_not_speak_of_playing(run):
     text = (run / "report.html").read_text()
     (moves,) = re.findall('<span class="moves">(.*?)</span>', text, re.DOTALL)
     (stands,) = re.findall('<span\\s+class="stands">(.*?)</span>', text, re.DOTALL)
-    assert "reload the page" in moves
+    assert "choose Stop and then Play" in moves
     assert "reduced motion" in stands
-    hidden = "@media (prefers-reduced-motion:reduce){.stop,.stop+label,.moves{display:none}"
+    hidden = "@media (prefers-reduced-motion:reduce){.moves{display:none}"
     assert hidden + ".stands{display:inline}}" in text
     assert "\n.stands{display:none}\n" in text
 

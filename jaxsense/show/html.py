@@ -2,38 +2,41 @@
 
 import base64
 import dataclasses
+import re
+from collections.abc import Mapping
 
 import jinja2
 
 from jaxsense.config.options import command
-from jaxsense.show import animation
 
 _KINDS = {"svg": "svg+xml", "png": "png"}
+_SIZE = re.compile(r'viewBox="0 0 ([1-9]\d*) ([1-9]\d*)"')
 
 
 @dataclasses.dataclass(frozen=True)
-class Film:
-    """A film on a page.
+class Films:
+    """Films that play together on a page.
 
     Attributes:
-      name: of its file, without a suffix.
-      plays: source of an `img` that plays.
-      stopped: source of an `img` with the last frame.
+      names: of their files, without suffixes.
+      document: page of their own, for a frame without rights.
+      tall: height of a half of a film relative to its width.
     """
 
-    name: str
-    plays: str
-    stopped: str
+    names: tuple[str, ...]
+    document: str
+    tall: float
 
 
-def film(name: str, content: bytes) -> Film:
-    """A film for a page.
+def films(contents: Mapping[str, str]) -> Films:
+    """Films for a page.
 
     Args:
-      name: of its file, without a suffix.
-      content: of its file.
+      contents: of their files, by the names of these without suffixes.
     """
-    return Film(name, picture("svg", content), picture("svg", animation.still(content)))
+    sizes = [_SIZE.search(content) for content in contents.values()]
+    tall = max((int(size[2]) / (int(size[1]) / 2) for size in sizes if size), default=1.0)
+    return Films(tuple(contents), render("films.html.jinja", films=contents), tall)
 
 
 def render(template: str, **values: object) -> str:

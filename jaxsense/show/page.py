@@ -70,15 +70,15 @@ def render(
     )
 
 
-def _films(run: Path) -> list[list[html.Film]]:
+def _films(run: Path) -> list[html.Films]:
     """The films of a run, those of the same arena together, its own first."""
-    stem = operator.attrgetter("stem")
-    found = [
-        html.film(path.stem, path.read_bytes())
-        for path in sorted(run.glob("mission*.svg"), key=stem)
-    ]
-    own = [film for film in found if film.name in OWN_FILMS]
-    return [films for films in (own, *([film] for film in found if film not in own)) if films]
+    found = {
+        path.stem: path.read_text(encoding="utf-8", errors="replace")
+        for path in sorted(run.glob("mission*.svg"), key=operator.attrgetter("stem"))
+    }
+    own = {name: film for name, film in found.items() if name in OWN_FILMS}
+    others = ({name: film} for name, film in found.items() if name not in own)
+    return [html.films(group) for group in (own, *others) if group]
 
 
 def _counted(devices: Sequence[str]) -> str:

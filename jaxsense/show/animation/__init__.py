@@ -2,4 +2,3 @@
 
 from jaxsense.show.animation.film import draw as draw
 from jaxsense.show.animation.film import duration_of as duration_of
-from jaxsense.show.animation.svg import still as still

@@ -19,6 +19,7 @@ WIDTH = 2 * SIZE + 40
 _SPEED = 2.0  # times real time
 _AFTER = 10  # frames shown after the mission's end
 _PAUSE = 2.5  # s that the last one stays
+_TIMES = 3  # that it plays
 _TINY = 1e-3  # s, less than a control period
 _TOP, _LINE = 38, 26
 _ICON = 14  # px, length of a field of view next to the name of a robot
@@ -41,10 +42,10 @@ _STYLE = """
 .film-unknown{fill:#59616e;font-size:12px;text-anchor:middle}.film-start{text-anchor:start}
 .film-on-light{stroke:var(--floor);stroke-width:3px;paint-order:stroke;stroke-linejoin:round}
 .film-on-floor{stroke:var(--floor);stroke-width:9px;paint-order:stroke;stroke-linejoin:round}
-.film-still{display:none}
 @media (prefers-color-scheme:dark){
 .film{--paper:#16181d;--ink:#e6e8ec;--soft:#a3abb8;--floor:#dfe2e8}}
-@media (prefers-reduced-motion:reduce){.film-moving{display:none}.film-still{display:inline}}
+.film:active *{animation-play-state:paused!important}
+@media (prefers-reduced-motion:reduce){.film *{animation:none!important}}
 """
 
 
@@ -85,23 +86,19 @@ def draw(
     height = _TOP + SIZE + _LINE * max(len(config.carried) + 1, len(_NOTES)) + 16
     root = Element("svg", {"xmlns": "http://www.w3.org/2000/svg", "class": "film", "role": "img"})
     root.set("viewBox", f"0 0 {WIDTH} {height}")
-    root.set("aria-labelledby", "title")
+    root.set("style", f"--film:{duration:.2f}s {_TIMES}")
     robots = " and ".join(dict.fromkeys(config.carried))
     text = (
         f"{title}: robots with {robots} look at {config.arena.num_pois} points of interest; bars "
         f"next to each fill with the probabilities of its classes, and the ellipses of the shared "
         f"map shrink. It ends after {seconds:.1f} s."
     )
-    add(root, "title", text, id="title")
-    add(root, "style", _STYLE)
+    add(root, "title", text)
+    timeline = Timeline(shown / duration, add(root, "style", _STYLE))
     clip = add(add(root, "defs"), "clipPath", id="view")
     add(clip, "rect", width=SIZE, height=SIZE, rx=6)
     add(root, "rect", class_="film-paper", width=WIDTH, height=height)
-    # Where motion is unwelcome the last frame is shown alone.
-    for moves in (True, False):
-        timeline = Timeline(shown / duration, duration, moves)
-        part = add(root, "g", class_="film-moving" if moves else "film-still")
-        _draw(part, timeline, config, record, views, (title, seconds))
+    _draw(root, timeline, config, record, views, (title, seconds))
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
@@ -139,7 +136,7 @@ def _draw(
     views: tuple[ArenaView, MapView],
     heading: tuple[str, float],
 ) -> None:
-    """Draws everything that moves, or the last frame."""
+    """Draws both halves."""
     (title, seconds), (arena, latent) = heading, views
     below = _TOP + SIZE + 24
     half = _half(parent, 0, title, timeline, record, arena)
