@@ -145,13 +145,18 @@ def program(source: str, function: str = "") -> str:
 
 
 class _WithoutChecks(ast.NodeTransformer):
-    """Leaves out statements that only call a function of `core.checks` or chex."""
+    """Leaves out statements that only call a function of `core.checks` or chex, or only raise."""
 
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
         called = node.value.func if isinstance(node.value, ast.Call) else None
         module = called.value if isinstance(called, ast.Attribute) else None
         is_check = isinstance(module, ast.Name) and module.id in {"checks", "chex"}
         return None if is_check else node
+
+    def visit_If(self, node: ast.If) -> ast.If | None:
+        self.generic_visit(node)
+        raises_only = all(isinstance(each, ast.Raise) for each in node.body)
+        return None if raises_only and not node.orelse else node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef | None:
         checks_only = node.name == "__post_init__" and bool(node.body)

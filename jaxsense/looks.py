@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsense.config import Config
 from jaxsense.core import checks
-from jaxsense.core.types import Key, Samples, pytree
+from jaxsense.core.types import Fusion, Key, Samples, pytree
 from jaxsense.dqn import rewards
 from jaxsense.dqn.map_mdp import Looks, MapMdp
 from jaxsense.dqn.places import Places
@@ -116,10 +116,12 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapM
         so that every look casts a scan in the environment's own arena.
 
     Raises:
-      ValueError: if the shapes of `models` or `looks` do not match `config`.
+      ValueError: if the shapes of `models` or `looks` do not match `config`, or `models.fusion` is
+        no `Fusion`.
     """
     if not isinstance(models, Models):
         raise ValueError(f"models = {type(models).__name__}: must be Models, as from jaxsense.load")
+    checks.require_members("models.fusion", models.fusion, Fusion)
     expected = len(config.arena.classes), config.jmvae.latent_size
     found = models.fusion.classes.mean.shape
     if found != expected:
@@ -307,6 +309,7 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
     Raises:
       ValueError: if `samples` is not positive.
     """
+    checks.require_key(key)
     checks.require_number("samples", samples)
     num_classes = len(config.arena.classes)
     world = worlds.make_world(config)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsense.config import Config, SearchConfig
+from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
 from jaxsense.dqn import optimum, rewards
@@ -224,6 +225,7 @@ def init(key: Key, config: Config) -> Models:
       key: random key.
       config: all settings.
     """
+    checks.require_key(key)
     detector_key, jmvae_key, dqn_key, filter_key, tours_key = jax.random.split(key, 5)
     model, agent = make_jmvae(config), make_agent(config)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))

@@ -35,7 +35,7 @@ def require(
         return
     values = np.asarray(value)
     if values.dtype.kind in "OSU":
-        raise ValueError(f"{name} = {value!r}: {expected}")
+        raise ValueError(f"{name} = {reprlib.repr(value)}: {expected}")
     wrong = values[~np.asarray(is_right(values))]
     if wrong.size:
         raise ValueError(f"{name} = {wrong.flat[0]}: {expected}")
@@ -116,6 +116,26 @@ def _text(shape: Sequence[object]) -> str:
     return f"({', '.join(words)}{',' * (len(words) == 1)})"
 
 
+def require_key(key: object) -> None:
+    """Checks that a value is one random key, also a traced one.
+
+    Args:
+      key: from `jax.random.key`, or of the older form of `jax.random.PRNGKey`.
+
+    Raises:
+      ValueError: if it is something else, such as a seed or several keys.
+    """
+    expected = "must be one key, as from jax.random.key"
+    if not isinstance(key, jax.Array):
+        raise ValueError(f"key = {reprlib.repr(key)}: {expected}(0)")
+    is_key = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    if not is_key and (key.dtype != jnp.uint32 or key.ndim == 0):
+        raise ValueError(f"key of {key.dtype}{[*key.shape]}: {expected}(0)")
+    number = key.shape if is_key else key.shape[:-1]
+    if number:
+        raise ValueError(f"key holds {number} keys: {expected}; use jax.vmap for a batch")
+
+
 def require_index(name: str, value: object, number: int) -> None:
     """Checks that all numbers are indices of a sequence.
 
@@ -148,7 +168,7 @@ def require_modality(modality: object, modalities: Sequence[str]) -> None:
         require_index("modality", modality, len(modalities))
     except (TypeError, ValueError):
         expected = " or ".join(f"{m} ({name})" for m, name in enumerate(modalities))
-        raise ValueError(f"modality = {modality!r}: must be {expected}") from None
+        raise ValueError(f"modality = {reprlib.repr(modality)}: must be {expected}") from None
 
 
 def require_number(name: str, value: object) -> None:
@@ -162,7 +182,25 @@ def require_number(name: str, value: object) -> None:
       ValueError: if it is something else.
     """
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"{name} = {value!r}: must be a whole number greater than 0")
+        raise ValueError(f"{name} = {reprlib.repr(value)}: must be a whole number greater than 0")
+
+
+def require_members(name: str, value: object, protocol: type) -> None:
+    """Checks that a value has all members of a protocol, whatever they are.
+
+    Args:
+      name: name of the argument.
+      value: the value.
+      protocol: with the members.
+
+    Raises:
+      ValueError: lists those that are missing.
+    """
+    members = [member for member in vars(protocol) if not member.startswith("_")]
+    missing = [member for member in members if not hasattr(value, member)]
+    if missing:
+        kind, expected = type(value).__name__, f"must be a {protocol.__name__}"
+        raise ValueError(f"{name} = {kind}: {expected}; it lacks {', '.join(missing)}")
 
 
 def require_tuple(name: str, value: object) -> None:
@@ -176,7 +214,7 @@ def require_tuple(name: str, value: object) -> None:
       ValueError: if it is something else; JAX cannot hash a list.
     """
     if not isinstance(value, tuple):
-        raise ValueError(f"{name} = {value!r}: must be a tuple")
+        raise ValueError(f"{name} = {reprlib.repr(value)}: must be a tuple")
 
 
 def require_one_each(name: str, values: Sequence[object], modalities: Sequence[str]) -> None:

@@ -183,6 +183,7 @@ def reset(
     Raises:
       ValueError: if a class does not exist.
     """
+    checks.require_key(key)
     return reset_with_looks(key, mdp, classes, seen)[0]
 
 
@@ -275,6 +276,7 @@ def step(
     Raises:
       ValueError: if there is no such modality or action.
     """
+    checks.require_key(key)
     _check_step(mdp, state, action, modality)
     is_nop = action == mdp.num_pois
     poi = jnp.minimum(action, mdp.num_pois - 1)

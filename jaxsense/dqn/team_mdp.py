@@ -251,6 +251,7 @@ def reset(key: Key, mdp: TeamMdp, modality: Int[Array, " R"] | None = None) -> T
     Raises:
       ValueError: if a modality does not exist.
     """
+    checks.require_key(key)
     map_key, place_key, number_key, team_key, alone_key, seen_key = jax.random.split(key, 6)
     config, num_pois = mdp.config, mdp.map.num_pois
     fewest, most = config.num_pois
@@ -332,6 +333,7 @@ def step(
     Raises:
       ValueError: if there is no such action.
     """
+    checks.require_key(key)
     checks.require_shape("action", action, ())
     checks.require_index("action", action, mdp.map.num_pois + 1)
     num_pois, team, travel = mdp.map.num_pois, state.team, mdp.config.travel

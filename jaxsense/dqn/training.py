@@ -141,6 +141,7 @@ def train(
     Returns:
       The last state and the `[epochs]` infos.
     """
+    checks.require_key(key)
     init_key, start_key, chunk_key = jax.random.split(key, 3)
     prepared = starts(start_key, environment, config)
     state = init(init_key, environment, config, prepared)

@@ -42,8 +42,9 @@ def rollout(
       `vmap` of this.
 
     Raises:
-      ValueError: if `steps` is not positive.
+      ValueError: if `steps` is not positive, or `key` is not one key.
     """
+    checks.require_key(key)
     checks.require_number("steps", steps)
     alone = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
     batch = rollout_batch(key[None], mission, models, alone, steps)

@@ -11,14 +11,14 @@ from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import require_function
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.core import checks
-from jaxsense.core.types import Key
+from jaxsense.core.types import Fusion, Key
 from jaxsense.dqn.policies import POLICIES, Known, Policy, Trained, Values, as_policy
 from jaxsense.mission import cases, make_mission
 from jaxsense.models import Models
 from jaxsense.run import batches, devices, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.run.monitor import Monitor
+from jaxsense.run.monitor import Listener, Monitor
 from jaxsense.summary import Case, make
 from jaxsense.summary.blocks import MISSIONS
 from jaxsense.summary.compare import REFERENCE, Measured, differences
@@ -61,6 +61,10 @@ class MissionScore:
         return "\n  ".join(lines)
 
 
+def _ignore(stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
+    """Hears nothing."""
+
+
 def score_missions(
     config: Config,
     models: Models,
@@ -69,6 +73,7 @@ def score_missions(
     against: Sequence[str] = AGAINST,
     episodes: int = 256,
     seed: int = 0,
+    listener: Listener = _ignore,
 ) -> MissionScore:
     """Evaluates policies in missions, next to built-in policies in the same arenas.
 
@@ -86,6 +91,8 @@ def score_missions(
         taken from the first.
       episodes: missions of each policy.
       seed: of the arenas and of all noise, from 0 to 2^32 - 1.
+      listener: called with the stage, how much of it is done, of how much, and metrics, while the
+        missions are compiled and played; `print` shows them.
 
     Returns:
       The score.
@@ -102,7 +109,7 @@ def score_missions(
         name: each if name in POLICIES else _checked(name, each) for name, each in policies.items()
     }
     # As the programs compute on an accelerator.
-    with jax.default_matmul_precision("highest"), Compiler(Monitor()) as compiler:
+    with jax.default_matmul_precision("highest"), Compiler(Monitor(listener)) as compiler:
         scenario = make_mission(config, own)
         known = cases(config, scenario.policies)
         played = {name: known[name] for name in dict.fromkeys((*policies, *against))}
@@ -147,6 +154,7 @@ def _require(
         raise ConfigError("config", type(config), "must be Config, as from load_pretrained")
     if not isinstance(models, Models):
         raise ConfigError("models", type(models), "must be Models, as from load_pretrained")
+    checks.require_members("models.fusion", models.fusion, Fusion)
     if not isinstance(policies, Mapping):
         raise ConfigError("policies", policies, "must be a dictionary from names to policies")
     for name, each in policies.items():

@@ -227,6 +227,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
     Returns:
       The layout, with random yaws.
     """
+    checks.require_key(key)
     checks.require_shape("classes", classes, (config.num_pois,))
     per_side = min(
         int(np.ceil(np.sqrt(2 * config.num_pois))), int(np.floor(config.side / config.poi_pitch))

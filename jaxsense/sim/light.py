@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 
 _NUM_WAVES = 32
@@ -94,6 +95,7 @@ def random_light(key: Key, has_conditions: bool = False) -> Light:
       key: random key.
       has_conditions: whether to draw what changes the light, see `World.reads_conditions`.
     """
+    checks.require_key(key)
     side, height, diffuse, ambient = jax.random.uniform(key, (4,))
     side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)
     flat = jnp.cos(height)

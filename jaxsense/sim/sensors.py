@@ -321,6 +321,7 @@ def scan(
     Raises:
       ValueError: if the sensor reads the light's conditions, and they have not been drawn.
     """
+    checks.require_key(key)
     checks.require_shape("directions", directions, (2, None))
     checks.require_shape("light.direction", light.direction, (3,))
     check_layout(arena.config, layout)

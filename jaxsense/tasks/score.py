@@ -240,26 +240,29 @@ def mean_return(key: Key, task: Task, policy: Policy | Recurrent, episodes: int)
       Mean return of an episode, without discount.
 
     Raises:
-      ConfigError: if the policy is not such a function or returns values of another shape or
-        dtype.
-      ValueError: if its actions do not exist, or if JAX cannot trace it.
+      ConfigError: if the policy is not such a function, returns values of another shape or dtype,
+        or takes actions that do not exist.
+      ValueError: if JAX cannot trace it.
     """
     return _player(policy)(key, task, episodes)
 
 
 def _player(policy: Policy | Recurrent) -> Callable[[Key, Task, int], float]:
     """`mean_return` of a policy, which is compiled once for all keys."""
-    policy = _recurrent(policy)
-    act, memory, play = policy.act, policy.memory, _play_compiled
+    given = _recurrent(policy)
+    act, memory, play = given.act, given.memory, _play_compiled
     if not all(isinstance(leaf, _NUMBERS) for leaf in jax.tree.leaves(act)):
         # A program of its own, which goes when the policy does.
         own = functools.partial(_play, act)
         play, act = jax.jit(lambda _, *rest: own(*rest), static_argnums=4), ()
 
     def checked(key: Key, task: Task, episodes: int) -> float:
-        found = float(play(act, memory, key, task, episodes))
+        last, found = task.num_actions - 1, float(play(act, memory, key, task, episodes))
         if np.isnan(found):
-            raise ValueError(f"action: must be from 0 to {task.num_actions - 1}")
+            by_user: object = given.act
+            if isinstance(by_user, Partial) and by_user.func is _forget:
+                (by_user,) = by_user.args
+            raise ConfigError("policy", by_user, f"must return actions from 0 to {last}")
         return found
 
     return checked

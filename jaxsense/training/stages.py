@@ -8,6 +8,7 @@ reports, saves, and stops if asked to.
 from collections.abc import Mapping
 
 from jaxsense.config import Config
+from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.models import Models, make_agent, make_bayes
 from jaxsense.sim.arena import Arena
@@ -101,6 +102,7 @@ def learn(
       TypeError: if `config` is no `Config`.
       ValueError: if no stage has this name.
     """
+    checks.require_key(key)
     if not isinstance(config, Config):
         raise TypeError(f'config = {config!r}: must be a Config, such as jaxsense.PRESETS["smoke"]')
     found = stages(config, arena)

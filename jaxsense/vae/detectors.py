@@ -258,6 +258,7 @@ def retrain(
       TypeError: if the detector is an encoder of scans, which learns without labels.
       ValueError: if `config.calibration` leaves no window to train with, or none to judge by.
     """
+    checks.require_key(key)
     if not isinstance(detector, Classifier):
         kind = type(detector).__name__
         raise TypeError(f"detector is a {kind}; must be a Classifier, which learns from labels")

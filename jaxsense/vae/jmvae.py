@@ -50,11 +50,7 @@ class Jmvae:
         checks.require_tuple("hidden", self.hidden)
         if not self.modalities:
             raise ValueError("modalities = (): must name one or more modalities")
-        if len(self.feature_sizes) != len(self.modalities):
-            raise ValueError(
-                f"feature_sizes = {self.feature_sizes}: must hold one size for each of "
-                f"{self.modalities}"
-            )
+        checks.require_one_each("feature_sizes", self.feature_sizes, self.modalities)
         if len(set(self.modalities)) < len(self.modalities):
             raise ValueError(f"modalities = {self.modalities}: must name none twice")
         checks.require_number("latent_size", self.latent_size)
@@ -85,6 +81,7 @@ def init(key: Key, model: Jmvae, *, scale: float = 1.0) -> Params:
       model: the shape.
       scale: factor on all weights. With 0.6, features of hundreds of numbers need far fewer steps.
     """
+    checks.require_key(key)
 
     def network(key: Key, inputs: int, outputs: int) -> Params:
         shape = MLP(model.hidden, outputs)
@@ -228,6 +225,7 @@ def loss(
     Raises:
       ValueError: if a modality's features or its weight is missing.
     """
+    checks.require_key(key)
     checks.require_one_each("features", features, model.modalities)
     if any(x is None for x in features):
         raise ValueError(f"features = {features}: must hold every one of {model.modalities}")
@@ -370,6 +368,7 @@ def train(
       ValueError: if a modality has no features, or some of another shape or not finite; the last
         is not checked under `jit`.
     """
+    checks.require_key(key)
     checks.require_bank(bank, model.modalities, model.feature_sizes)
     problem, state = Fitting(config, bank, model), supervised.start(params, config)
     number = min(config.steps, 100)  # whose draws are in memory together

@@ -40,6 +40,7 @@ def log_likelihood(
       ValueError: if no modality is present, `reconstruction_weights` has not one above 0 for each,
         or `samples` is not positive.
     """
+    checks.require_key(key)
     checks.require_number("samples", samples)
     given = tuple(reconstruction_weights)
     checks.require_one_each("reconstruction_weights", given, model.modalities)

@@ -119,6 +119,10 @@ def rate(x: Array) -> Array:
     checked = other.replace("return 2", "checks.require_finite('x', x)\n    return 2")
     assert checked != other
     assert history.program(checked, "rate") == history.program(other, "rate")
+    refused = other.replace("return 2", "if x < 0:\n        raise ValueError(x)\n    return 2")
+    assert history.program(refused, "rate") == history.program(other, "rate")
+    chosen = refused.replace("return 2", "else:\n        x = -x\n    return 2")
+    assert history.program(chosen, "rate") != history.program(other, "rate")
     post = "    def __post_init__(self):\n        checks.require_tuple('name', self.name)\n"
     guarded = before.replace("    name: str\n", f"    name: str\n{post}")
     assert guarded != before

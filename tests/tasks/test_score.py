@@ -108,7 +108,10 @@ def test_a_team_is_measured_against_its_best_rule():
             (NAME, lambda key, seen: seen[0]),
             r"policy = <lambda>: must return an integer of shape \[\]; not float32\[\]",
         ),
-        ((NAME, lambda key, seen: jnp.int32(7)), r"action: must be from 0 to 3"),
+        (
+            (NAME, lambda key, seen: jnp.int32(7)),
+            r"policy = <lambda>: must return actions from 0 to 3",
+        ),
         ((NAME, []), r"policy = '\[\]': must be one policy or several"),
         (("noisy-v1", nop), r"name = 'noisy-v1': must be one of"),
     ],
