@@ -127,8 +127,8 @@ def _view_of(world: World, robot: int, name: str, key: jax.Array, scene: Scene) 
 
 def simulate(
     key: jax.Array, world: World, robot: int, situation: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Readings of one look, and the believed bearing and the expected distance of its PoI.
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Readings of one look, the believed bearing, the expected distance and the class of its PoI.
 
     Args:
       key: random key.
@@ -150,7 +150,7 @@ def simulate(
     )
     has_failed = situation == [*SITUATIONS].index("failed")
     readings = jnp.where(has_failed, world.sensors[robot].blind, readings)
-    return readings, view.bearing, view.distance
+    return readings, view.bearing, view.distance, classes[0]
 
 
 def answered(
@@ -178,7 +178,7 @@ def answered(
         @functools.partial(jax.jit, compiler_options=devices.compiler_options())
         def share(keys: jax.Array, models: jaxsense.Models, situation: jax.Array) -> jax.Array:
             def one(key: jax.Array) -> jax.Array:
-                readings, bearing, distance = simulate(key, world, robot, situation)  # noqa: B023
+                readings, bearing, distance, _ = simulate(key, world, robot, situation)  # noqa: B023
                 return models.detect_in_window(
                     robot,  # noqa: B023
                     made.sensors[robot],  # noqa: B023

@@ -202,7 +202,7 @@ class Robot:
         self,
         contents: dict[str, Any],
         programs: Programs,
-        resample: Any,
+        resampling: Any,
         robot: int,
         positions: np.ndarray,
     ):
@@ -211,7 +211,7 @@ class Robot:
         Args:
           contents: of the archive.
           programs: of the archive.
-          resample: the function of this name in the archive's `resampling.py`.
+          resampling: the archive's module of this name.
           robot: its index in the `robots` of the archive.
           positions: `[N, 2]` of the PoIs in the frame `map`, in metres.
 
@@ -235,7 +235,7 @@ class Robot:
             raise ValueError(f"{pois} PoIs: the policy of this archive is for {expected}; {anyway}")
         if "merge" in programs:
             raise ValueError("robots have maps of their own: see `tell` in run_exported.py")
-        self.contents, self.programs, self.resample = contents, programs, resample
+        self.contents, self.programs, self.resampling = contents, programs, resampling
         self.robot = robot
         self.name = contents["robots"][robot]
         self.mounting, self.is_upside_down = np.zeros(3), False
@@ -422,12 +422,14 @@ class Robot:
             raise ValueError(f"step between beams = {step:.2f} degrees: {expected}")
 
     def _along_own_rays(self, scan: Scan) -> np.ndarray:
-        """The scan along the rays that `detect` reads."""
-        return self.resample(
+        """The scan along the rays that `detect` reads, without the gaps of single lost beams."""
+        measures_distance = scan.readings.ndim == 1
+        close_gaps = self.resampling.close_gaps
+        return self.resampling.resample(
             np.array(self.contents["sensors"][self.name]["angles"]),
             -scan.angles if self.is_upside_down else scan.angles,
-            scan.readings,
-            measures_distance=scan.readings.ndim == 1,
+            close_gaps(scan.readings) if measures_distance else scan.readings,
+            measures_distance=measures_distance,
         )
 
     def _weight(self, poi: int, pose: np.ndarray) -> float:
@@ -472,8 +474,8 @@ def load(archive: Path, robot: int, positions: np.ndarray) -> Robot:
     """
     sys.path.insert(0, str(archive))  # Python imports from an archive as from a folder
     contents, programs = importlib.import_module("robot_numpy").load(archive)
-    resample = importlib.import_module("resampling").resample
-    return Robot(contents, programs, resample, robot, positions)
+    resampling = importlib.import_module("resampling")
+    return Robot(contents, programs, resampling, robot, positions)
 
 
 def hear(node: Any, robot: Robot, now: float, report: str) -> None:

@@ -8,6 +8,8 @@ import numpy as np
 _TURN = 2 * np.pi + 1e-3  # rad; drivers round the last angle
 MAX_STEPS = 3.0
 """A gap between two rays of more than this many median steps was not recorded."""
+MAX_LOST = 5
+"""Beams in a row that may have been lost; where more have no return, nothing is near."""
 SURFACE = 0.1
 """Metres; neighbouring beams that differ by more hit two surfaces."""
 
@@ -58,6 +60,33 @@ def resample(
 def with_returns(ranges: np.ndarray) -> np.ndarray:
     """Distances in metres, infinite instead of 0 where a beam has no return."""
     return np.where(ranges == 0, np.inf, ranges)
+
+
+def close_gaps(ranges: np.ndarray, most: int = MAX_LOST) -> np.ndarray:
+    """Distances in which beams that were lost take those of their neighbours.
+
+    Where up to `most` beams in a row have no return and those on both sides have one, each takes
+    the distance of the nearest that has. Longer gaps stay, as does what is too near (minus
+    infinity).
+
+    Args:
+      ranges: `[A]` distances in metres of beams next to each other; 0, infinite or NaN without a
+        return.
+      most: beams in a gap.
+
+    Returns:
+      `[A]` float32.
+    """
+    ranges = with_returns(np.asarray(ranges, np.float32))
+    is_lost = np.isnan(ranges) | (ranges == np.inf)
+    returned, beam = np.flatnonzero(~is_lost), np.arange(len(ranges))
+    if not len(returned):
+        return ranges
+    behind = np.searchsorted(returned, beam)
+    left, right = (returned[np.clip(i, 0, len(returned) - 1)] for i in (behind - 1, behind))
+    is_short = (left < beam) & (beam < right) & (right - left <= most + 1)
+    nearest = np.where(beam - left <= right - beam, left, right)
+    return np.where(is_lost & is_short, ranges[nearest], ranges)
 
 
 def require_angles(name: str, angles: np.ndarray) -> None:

@@ -6,7 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks import curves, gate, imperfect, place, recorded, results, where
+import jaxsense
+from benchmarks import curves, gate, imperfect, lost_beams, place, recorded, results, where
 from benchmarks.curves import Curves
 
 FIGURES = ("accuracy", "confidence", "looks", "time", "own", "nll", "collisions")
@@ -42,6 +43,7 @@ def _played(monkeypatch):
         (gate, "gate", ["--looks", "3", "--search-position", ".09"]),
         (where, "where", ["pretrained:noisy", "--episodes", "4", "--policies", "latent"]),
         (place, "place", ["pretrained:noisy"]),
+        (lost_beams, "lost_beams", ["pretrained:noisy", "--looks", "8"]),
         (curves, "curves", ["pretrained:noisy", "--episodes", "4"]),
         (imperfect, "imperfect_default", ["pretrained:default", "--search-position", ".09"]),
         (imperfect, "imperfect_messages", ["pretrained:noisy", "--positions", "--headings"]),
@@ -73,3 +75,31 @@ def test_real_scans_go_into_a_file(tmp_path, capsys):
     assert content["noise"]["range_noise"] == pytest.approx(0.0048, abs=1e-4)
     printed = capsys.readouterr().out
     assert all(table(content) in printed for table in results.TABLES[path.name].values())
+
+
+@pytest.mark.parametrize("way", lost_beams.WAYS)
+def test_a_share_of_the_beams_is_lost(way):
+    lost = lost_beams.WAYS[way](np.random.default_rng(0), (400, 50), 0.1)
+    assert lost.shape == (400, 50)
+    assert lost.mean() == pytest.approx(0.1, abs=0.01)
+    pieces = (np.diff(lost.astype(int), axis=1, prepend=0) == 1).sum(axis=1)
+    if way == "together":
+        assert (pieces == 1).all()
+        # In any part of the window.
+        assert lost.any(axis=0).all()
+    else:
+        assert pieces.mean() > 3
+    assert not lost_beams.WAYS[way](np.random.default_rng(0), (400, 50), 0.0).any()
+
+
+def test_detectors_answer_less_where_beams_are_lost_and_gaps_stay():
+    config, models = jaxsense.load_pretrained("default")
+    rows = {(r["lost"], r["closed"]): r for r in lost_beams.answers(config, models, "lidar", 200)}
+    assert set(rows) == {
+        (way, closed) for way in ("scattered", "together") for closed in ("no", "yes")
+    }
+    as_read, closed = (rows["scattered", closed] for closed in ("no", "yes"))
+    assert as_read["answered"][0] == closed["answered"][0] > 0.95
+    assert as_read["right"][0] == closed["right"][0] > 0.99
+    assert as_read["right"][3] < 0.8
+    assert closed["right"][3] > 0.95

@@ -23,4 +23,4 @@ def stub():
 
 @pytest.fixture
 def robot(ros2, stub):
-    return ros2.Robot(CONTENTS, stub.programs(), resampling.resample, 1, POSITIONS)
+    return ros2.Robot(CONTENTS, stub.programs(), resampling, 1, POSITIONS)

@@ -319,3 +319,25 @@ def test_views_show_a_whole_window():
     assert 0.3 <= distances.min() < 0.31
     assert 1.19 < distances.max() <= 1.2
     assert sensor.window == 128
+
+
+def test_short_gaps_between_beams_are_closed():
+    inf, nan = np.inf, np.nan
+    # One lost beam; three in a row, of which the middle one is as near to either side; 0 and NaN
+    # are no returns.
+    ranges = [1.0, inf, 2.0, 0.0, nan, inf, 3.0]
+    np.testing.assert_array_equal(
+        resampling.close_gaps(np.array(ranges)), np.float32([1, 1, 2, 2, 2, 3, 3])
+    )
+    # Ends, what is too near, and longer gaps stay.
+    for same in ([inf, 1.0, 1.0], [1.0, 1.0, inf], [1.0, -inf, 1.0], [inf] * 3, [1.0]):
+        np.testing.assert_array_equal(resampling.close_gaps(np.array(same)), np.float32(same))
+    for lost, is_closed in ((5, True), (6, False)):
+        scan = np.array([1.0, *[inf] * lost, 4.0])
+        found = resampling.close_gaps(scan)
+        assert np.isfinite(found).all() == is_closed
+        assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, np.float32(scan))
+    np.testing.assert_array_equal(
+        resampling.close_gaps(np.array([1.0, inf, inf, 4.0]), 1)[1:3], inf
+    )
