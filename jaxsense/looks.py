@@ -11,12 +11,12 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsense.config import Config
 from jaxsense.core import checks
-from jaxsense.core.types import Fusion, Key, Samples, pytree
+from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.dqn import rewards
 from jaxsense.dqn.map_mdp import Looks, MapMdp
 from jaxsense.dqn.places import Places
 from jaxsense.dqn.team_mdp import TeamMdp
-from jaxsense.models import Models
+from jaxsense.models import Models, require_fitting
 from jaxsense.sim import world as worlds
 from jaxsense.sim.world import Scene, World
 from jaxsense.vae import detectors
@@ -119,16 +119,7 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapM
       ValueError: if the shapes of `models` or `looks` do not match `config`, or `models.fusion` is
         no `Fusion`.
     """
-    if not isinstance(models, Models):
-        raise ValueError(f"models = {type(models).__name__}: must be Models, as from jaxsense.load")
-    checks.require_members("models.fusion", models.fusion, Fusion)
-    expected = len(config.arena.classes), config.jmvae.latent_size
-    found = models.fusion.classes.mean.shape
-    if found != expected:
-        reason = f"{expected[0]} in {expected[1]}, as in config; take both from one run"
-        raise ValueError(
-            f"models.fusion holds {found[0]} classes in {found[1]} dimensions: must be {reason}"
-        )
+    require_fitting(config, models)
     looks = Live(worlds.make_world(config), models.detectors) if looks is None else looks
     _require_fitting(config, looks)
     settings = config.team

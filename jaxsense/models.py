@@ -133,6 +133,31 @@ class Models:
         return latent.plausible_classes(belief, self.fusion.classes.mean)
 
 
+def require_fitting(config: Config, models: Models) -> None:
+    """Checks that models can be those of some settings.
+
+    Args:
+      config: all settings.
+      models: the models.
+
+    Raises:
+      ValueError: if they are for other classes, or their fusion is no `Fusion`.
+    """
+    if not isinstance(models, Models):
+        raise ValueError(f"models = {type(models).__name__}: must be Models, as from jaxsense.load")
+    checks.require_members("models.fusion", models.fusion, Fusion)
+    if jax.tree_util.all_leaves([models.fusion]):
+        kind = type(models.fusion).__name__
+        raise ValueError(f"models.fusion = {kind}: must be a pytree, its class under @pytree")
+    expected = len(config.arena.classes), config.jmvae.latent_size
+    found = models.fusion.classes.mean.shape
+    if found != expected:
+        reason = f"{expected[0]} in {expected[1]}, as in config; take both from one run"
+        raise ValueError(
+            f"models.fusion holds {found[0]} classes in {found[1]} dimensions: must be {reason}"
+        )
+
+
 def make_jmvae(config: Config) -> Jmvae:
     """Makes the shape of the JMVAE of a configuration: modalities and layer sizes."""
     sizes = tuple(len(config.labels(m)) for m in config.modalities)

@@ -4,7 +4,9 @@ Trains with each scale on three quarters of the digits to train with, and prints
 of the rest. The digits that the comparison measures with take no part.
 """
 
+import dataclasses
 import functools
+import sys
 
 import numpy as np
 
@@ -12,14 +14,22 @@ from benchmarks.digits import data, measures
 from benchmarks.digits.data import Digits
 from benchmarks.digits.models import Budget, Ours
 from jaxsense import vae
+from jaxsense.run import cli
 
+PROGRAM = "benchmarks.digits.scale"
 SCALES = 1.0, 0.8, 0.6, 0.4, 0.2
 _SEEDS = range(3)
 _SAMPLES = 50  # of z for the likelihood of each digit
 
 
-def main() -> None:
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Compares scales of initial weights, on three quarters of the digits to train with."""
+
+
+def main(argv: list[str] | None = None) -> None:
     """The program."""
+    cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     digits = data.load()
     inner = data.split(digits.names, digits.train, digits.train_labels)
     print(

@@ -4,14 +4,16 @@ Results go to `benchmarks/results`, the tables and the picture made of them to `
 """
 
 import dataclasses
+import json
 import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
 
 from benchmarks import results
-from benchmarks.tasks import jobs, learners, plot, record
+from benchmarks.tasks import board, jobs, learners, plot, record
 from benchmarks.tasks.jobs import Job
+from benchmarks.tasks.learner import LearnerError
 from jaxsense.config.checks import check_fields, limited, require
 from jaxsense.config.options import Name
 from jaxsense.run import cli
@@ -52,10 +54,14 @@ class Arguments:
         check_fields(self)
         known = [each.name for each in learners.load()]
         are_known = set(self.learners) <= set(known)
-        require(are_known, self, "learners", f"must be some of {', '.join(known)}")
+        expected = f"must be some of {', '.join(map(repr, known))}, from MODULES in learners.py"
+        require(are_known, self, "learners", expected)
         names = sorted({name for name, _ in STEPS})
         require(set(self.only) <= set(names), self, "only", f"must be some of {', '.join(names)}")
-        require(not self.quick or self.out is not None, self, "quick", "needs out")
+        require(not self.quick or self.out is not None, self, "quick", "needs --out FOLDER")
+        trains_nothing = self.out is None and not self.learners
+        expected = "trains nothing and remakes only the repository's pages"
+        require(not self.page or trains_nothing, self, "page", expected)
 
     @property
     def jobs_to_do(self) -> list[Job]:
@@ -75,8 +81,14 @@ def main(argv: list[str] | None = None) -> None:
     arguments = cli.parse(PROGRAM, Arguments, argv)
     if not arguments.page:
         command = shlex.join(["python", "-m", PROGRAM, *argv])
-        jobs.run(arguments.jobs_to_do, arguments.jobs, arguments.out or results.RESULTS, command)
-    if arguments.out is None:
+        folder = arguments.out or results.RESULTS
+        try:
+            jobs.run(arguments.jobs_to_do, arguments.jobs, folder, command)
+        except LearnerError as error:
+            cli.fail(PROGRAM, str(error))
+    if arguments.out is not None:
+        print(board.tables(json.loads((arguments.out / jobs.SCORES).read_text(encoding="utf-8"))))
+    else:
         results.main()
         plot.PICTURE.write_bytes(svg(plot.draw(record.read(results.RESULTS / jobs.CURVES))))
 

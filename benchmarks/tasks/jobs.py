@@ -19,7 +19,7 @@ import jaxsense
 from benchmarks import measure
 from benchmarks.tasks import board, learners, record
 from benchmarks.tasks.board import Row
-from benchmarks.tasks.learner import Learner
+from benchmarks.tasks.learner import Learner, LearnerError
 from benchmarks.tasks.record import Point, Recorder
 from jaxsense import tasks
 
@@ -56,7 +56,13 @@ def do(job: Job, provenance: dict[str, object]) -> tuple[Row, list[Point]]:
     begin = time.perf_counter()
     task, learner = tasks.make(job.task, job.agent), job.learner
     recorder = Recorder(task, learner.name, record.best_return(task))
-    learner.train(task, job.seeds, job.steps, recorder)
+    try:
+        learner.train(task, job.seeds, job.steps, recorder)
+        settings, versions = dataclasses.asdict(learner), measure.versions(learner.packages)  # pyright: ignore[reportArgumentType]
+    except Exception as error:
+        raise LearnerError(f"{learner.name}: {type(error).__name__}: {error}") from error
+    if missing := set(job.seeds) - set(recorder.policies):
+        raise LearnerError(f"{learner.name} has not reported policies of the seeds {missing}")
     found = jaxsense.score(task, [recorder.policies[seed] for seed in job.seeds])
     last = [[p for p in recorder.points if p.seed == seed][-1] for seed in job.seeds]
     row = board.row(
@@ -65,11 +71,11 @@ def do(job: Job, provenance: dict[str, object]) -> tuple[Row, list[Point]]:
         steps=max(point.steps for point in last),
         seconds=sum(point.seconds for point in last) / len(last),
         wall_seconds=time.perf_counter() - begin,
-        settings=dataclasses.asdict(learner),  # pyright: ignore[reportArgumentType]
+        settings=settings,
         about={
             **provenance,
             "device": jax.devices()[0].device_kind,
-            "versions": measure.versions(learner.packages),
+            "versions": versions,
         },
     )
     return row, recorder.points

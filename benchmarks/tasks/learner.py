@@ -50,6 +50,10 @@ class Learner(Protocol):
         ...
 
 
+class LearnerError(RuntimeError):
+    """A learner did not do what it is asked for; names the learner."""
+
+
 def part(steps: int, unit: int) -> int:
     """How many units of steps there are between two points of a learning curve, at least one.
 

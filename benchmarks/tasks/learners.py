@@ -18,5 +18,6 @@ def load() -> tuple[Learner, ...]:
         try:
             found += importlib.import_module(f"benchmarks.tasks.{name}").LEARNERS
         except ImportError as error:
-            print(f"benchmarks.tasks: {name} is left out: {error}", file=sys.stderr)
+            reason = f"{error}; pip install -e '.[rejax,sb3]' brings it"
+            print(f"benchmarks.tasks: {name} is left out: {reason}", file=sys.stderr)
     return tuple(found)

@@ -70,6 +70,12 @@ class Recorder:
 
         Seeds that train side by side share the time.
         """
+        if not isinstance(policies, Mapping) or not policies:
+            raise ValueError(
+                "report must be called with steps and a dictionary of policies by seed"
+            )
+        if steps and not set(policies) <= set(self.policies):
+            raise ValueError("report must be called with 0 steps first, for each seed")
         passed = (time.process_time() - self._since) / len(policies)
         self._seconds = self._seconds + passed if steps else 0.0
         for seed, policy in policies.items():

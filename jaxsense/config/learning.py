@@ -27,7 +27,7 @@ class DetectorConfig(Section, place="detector"):
     """Simulated scans for measuring the accuracy."""
     num_repeats: int = limited(0, at_least=0, at_most=1_000_000)
     """Scenes in which each sensor looks at a PoI several times, to learn how much of a look is new
-    after others nearby, see `vae.novelty`. With 0, every look counts in full."""
+    after others nearby, see `vae.Novelty`. With 0, every look counts in full."""
     steps: int = limited(4000, at_least=1)
     """Gradient steps."""
     batch: int = limited(512, at_least=1)

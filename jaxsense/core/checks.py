@@ -3,7 +3,6 @@
 Traced values are unknown: their checks pass and cost nothing.
 """
 
-import reprlib
 from collections.abc import Callable, Sequence
 from types import EllipsisType
 
@@ -14,6 +13,9 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
+from jaxsense.core.types import Belief
+
+_MOST_SHOWN = 80  # characters of a value
 _ARRAYS = jax.Array | np.ndarray | np.generic | float | int
 
 
@@ -35,10 +37,16 @@ def require(
         return
     values = np.asarray(value)
     if values.dtype.kind in "OSU":
-        raise ValueError(f"{name} = {reprlib.repr(value)}: {expected}")
+        raise ValueError(f"{name} = {_shown(value)}: {expected}")
     wrong = values[~np.asarray(is_right(values))]
     if wrong.size:
         raise ValueError(f"{name} = {wrong.flat[0]}: {expected}")
+
+
+def _shown(value: object) -> str:
+    """A value in one line, which is cut where it is long."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _MOST_SHOWN else f"{text[: _MOST_SHOWN - 3]}..."
 
 
 def require_positive(name: str, value: object) -> None:
@@ -54,17 +62,18 @@ def require_positive(name: str, value: object) -> None:
     require(name, value, lambda x: np.isfinite(x) & (x > 0), "must be greater than 0")
 
 
-def require_finite(name: str, value: object) -> None:
+def require_finite(name: str, value: object, expected: str = "must be finite") -> None:
     """Checks that all numbers are finite.
 
     Args:
       name: name of the argument.
       value: an array.
+      expected: what would be right.
 
     Raises:
       ValueError: names the first wrong number.
     """
-    require(name, value, np.isfinite, "must be finite")
+    require(name, value, np.isfinite, expected)
 
 
 def require_probabilities(name: str, value: object) -> None:
@@ -95,8 +104,7 @@ def require_shape(name: str, value: object, shape: Sequence[int | EllipsisType |
       ValueError: names the shape; if only leading axes are too many, also `jax.vmap`.
     """
     if not isinstance(value, _ARRAYS):
-        given = reprlib.repr(value)  # which may be long
-        raise ValueError(f"{name} = {given}: must be an array of shape {_text(shape)}")
+        raise ValueError(f"{name} = {_shown(value)}: must be an array of shape {_text(shape)}")
     if not _has(value, shape):
         is_batch = ... not in shape and _has(value, (..., *shape))
         advice = "; use jax.vmap for a batch" if is_batch else ""
@@ -127,7 +135,7 @@ def require_key(key: object) -> None:
     """
     expected = "must be one key, as from jax.random.key"
     if not isinstance(key, jax.Array):
-        raise ValueError(f"key = {reprlib.repr(key)}: {expected}(0)")
+        raise ValueError(f"key = {_shown(key)}: {expected}(0)")
     is_key = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     if not is_key and (key.dtype != jnp.uint32 or key.ndim == 0):
         raise ValueError(f"key of {key.dtype}{[*key.shape]}: {expected}(0)")
@@ -168,7 +176,7 @@ def require_modality(modality: object, modalities: Sequence[str]) -> None:
         require_index("modality", modality, len(modalities))
     except (TypeError, ValueError):
         expected = " or ".join(f"{m} ({name})" for m, name in enumerate(modalities))
-        raise ValueError(f"modality = {reprlib.repr(modality)}: must be {expected}") from None
+        raise ValueError(f"modality = {_shown(modality)}: must be {expected}") from None
 
 
 def require_number(name: str, value: object) -> None:
@@ -182,7 +190,42 @@ def require_number(name: str, value: object) -> None:
       ValueError: if it is something else.
     """
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"{name} = {reprlib.repr(value)}: must be a whole number greater than 0")
+        raise ValueError(f"{name} = {_shown(value)}: must be a whole number greater than 0")
+
+
+def require_type(name: str, value: object, kind: type, source: str) -> None:
+    """Checks that a value is of a class.
+
+    Args:
+      name: name of the argument.
+      value: the value.
+      kind: the class.
+      source: where such values come from.
+
+    Raises:
+      ValueError: if it is of another.
+    """
+    if not isinstance(value, kind):
+        expected = f"must be {kind.__name__}, {source}"
+        raise ValueError(f"{name} = {_shown(value)}: {expected}")
+
+
+def require_belief(name: str, belief: Belief, size: int | None = None) -> None:
+    """Checks that a belief is of one PoI, finite and wide.
+
+    Args:
+      name: name of the argument.
+      belief: the belief.
+      size: its number of dimensions, D; any by default.
+
+    Raises:
+      ValueError: if it is no `Belief`, or one of another shape, not finite or of no width.
+    """
+    require_type(name, belief, Belief, "with mean and std")
+    require_shape(f"{name}.mean", belief.mean, (size,))
+    require_shape(f"{name}.std", belief.std, np.shape(belief.mean))
+    require_finite(f"{name}.mean", belief.mean)
+    require_positive(f"{name}.std", belief.std)
 
 
 def require_members(name: str, value: object, protocol: type) -> None:
@@ -196,6 +239,8 @@ def require_members(name: str, value: object, protocol: type) -> None:
     Raises:
       ValueError: lists those that are missing.
     """
+    if isinstance(value, type):
+        raise ValueError(f"{name} = {value.__name__}: must be a {protocol.__name__}, not its class")
     members = [member for member in vars(protocol) if not member.startswith("_")]
     missing = [member for member in members if not hasattr(value, member)]
     if missing:
@@ -214,10 +259,10 @@ def require_tuple(name: str, value: object) -> None:
       ValueError: if it is something else; JAX cannot hash a list.
     """
     if not isinstance(value, tuple):
-        raise ValueError(f"{name} = {reprlib.repr(value)}: must be a tuple")
+        raise ValueError(f"{name} = {_shown(value)}: must be a tuple")
 
 
-def require_one_each(name: str, values: Sequence[object], modalities: Sequence[str]) -> None:
+def require_one_each(name: str, values: object, modalities: Sequence[str]) -> None:
     """Checks that each modality has one value.
 
     Args:
@@ -228,11 +273,33 @@ def require_one_each(name: str, values: Sequence[object], modalities: Sequence[s
     Raises:
       ValueError: if there are more values, or fewer.
     """
+    expected = f"{len(modalities)}, one for each of {tuple(modalities)}"
+    if not isinstance(values, Sequence | jax.Array | np.ndarray) or isinstance(values, str):
+        raise ValueError(f"{name} = {_shown(values)}: must hold {expected}")
     if len(values) != len(modalities):
-        raise ValueError(
-            f"{name} has {len(values)} entries: must be {len(modalities)}, one for each of "
-            f"{tuple(modalities)}"
-        )
+        raise ValueError(f"{name} has {len(values)} entries: must be {expected}")
+
+
+def require_features(
+    features: Sequence[ArrayLike | None], modalities: Sequence[str], sizes: Sequence[int]
+) -> None:
+    """Checks that each modality has finite features or None, and one or more have some.
+
+    Args:
+      features: for each modality `[D_m]`, or None.
+      modalities: names of the modalities.
+      sizes: D_m of each.
+
+    Raises:
+      ValueError: names the first modality with something else.
+    """
+    require_one_each("features", features, modalities)
+    if all(feature is None for feature in features):
+        raise ValueError(f"features = {features}: must hold one modality or more")
+    for name, size, feature in zip(modalities, sizes, features, strict=True):
+        if feature is not None:
+            require_shape(f"features of {name}", feature, (size,))
+            require_finite(f"features of {name}", feature)
 
 
 def require_bank(
@@ -253,7 +320,9 @@ def require_bank(
         of_modality, shape = f"bank of {name}", np.shape(features)
         if features is None:
             raise ValueError(f"{of_modality} = None: must be an array; leave out rows without it")
-        if len(shape) != 3 or shape[-1] != size or 0 in shape:
+        if 0 in shape:
+            raise ValueError(f"{of_modality} has the shape {shape}: must hold one row or more")
+        if len(shape) != 3 or shape[-1] != size:
             expected = f"must be [C, S, {size}]; give [N, {size}] as x[:, None]"
             raise ValueError(f"{of_modality} has the shape {shape}: {expected}")
         classes = np.shape(bank[0])[0]
@@ -261,3 +330,7 @@ def require_bank(
             expected = f"must be {classes}, as many as of {modalities[0]}"
             raise ValueError(f"{of_modality} has {shape[0]} classes or rows: {expected}")
         require_finite(of_modality, features)
+    first = np.shape(bank[0])
+    if first[0] == 1 < first[1]:
+        expected = "must be two or more; give rows [N, D] as x[:, None], not x[None]"
+        raise ValueError(f"bank has one class with {first[1]} looks: {expected}")

@@ -100,7 +100,7 @@ class Fusion(Protocol):
           seen: `[M]` bool, which modalities have looked before.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
-          weight: `[]` share of the look that is new evidence, see `vae.novelty`.
+          weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
         """
         ...
 

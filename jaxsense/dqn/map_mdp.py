@@ -308,6 +308,7 @@ def step(
 
 def _check_step(mdp: MapMdp, state: MapState, action: jax.Array, modality: Index) -> None:
     """Checks the arguments of `step` against the MDP."""
+    checks.require_type("state", state, MapState, "as from reset")
     checks.require_index("modality", modality, mdp.num_modalities)
     checks.require_shape("action", action, ())
     checks.require_index("action", action, mdp.num_pois + 1)

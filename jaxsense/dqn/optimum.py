@@ -211,8 +211,11 @@ def value_iteration(
       above 0, that of no operation.
 
     Raises:
-      ValueError: if a likelihood is not finite or `horizon` is not positive.
+      ValueError: if a likelihood is not finite, `horizon` is not positive, `start` does not hold
+        probabilities, or `reward` or `config` is something else.
     """
+    checks.require_members("reward", reward, Reward)
+    checks.require_type("config", config, MdpConfig, "as config.mdp")
     checks.require_shape("likelihoods", likelihoods, (None, None, None))
     number, num_looks, _ = likelihoods.shape
     checks.require_shape("likelihoods", likelihoods, (number, num_looks, number))
@@ -222,6 +225,8 @@ def value_iteration(
     steps = steps_of_lattice(number, len(points))
     # The unseen PoI is the last row, to which no look leads.
     start = jnp.full(number, 1 / number) if start is None else start
+    checks.require_shape("start", start, (number,))
+    checks.require_probabilities("start", start)
     points = jnp.concatenate([points, start[None]])
 
     def information(probabilities: jax.Array) -> jax.Array:

@@ -35,6 +35,9 @@ def init(state_size: int, rounds: int, blocks: int, width: int) -> Replay:
       width: environments in a block, W. Transitions of one round are independent, so a batch of a
         few dozen blocks is as good as one of single transitions.
     """
+    for name, value in (("rounds", rounds), ("blocks", blocks), ("width", width)):
+        checks.require_number(name, value)
+    checks.require_number("state_size", state_size)
     return Replay(jnp.zeros((rounds, blocks, 2 * state_size + 3, width)), jnp.int32(0))
 
 
@@ -48,6 +51,8 @@ def add(replay: Replay, transitions: Transition) -> Replay:
     rounds, blocks, rows, width = replay.columns.shape
     checks.require_shape("transitions.s_tm1", transitions.s_tm1, ((rows - 3) // 2, blocks * width))
     checks.require_shape("transitions.s_t", transitions.s_t, transitions.s_tm1.shape)
+    for name in ("a_tm1", "r_t", "discount_t"):
+        checks.require_shape(f"transitions.{name}", getattr(transitions, name), (blocks * width,))
     scalars = transitions.a_tm1, transitions.r_t, transitions.discount_t
     columns = jnp.concatenate([transitions.s_tm1, transitions.s_t, jnp.stack(scalars)])
     in_blocks = jnp.moveaxis(columns.reshape(rows, blocks, width), 1, 0)
@@ -70,6 +75,8 @@ def sample(draws: Float[Array, "B 2"], replay: Replay) -> Transition:
       `[S, B * W]` states, and `[B * W]` other fields.
     """
     checks.require_shape("draws", draws, (None, 2))
+    checks.require("draws", draws, lambda x: (x >= 0) & (x < 1), "must be from 0 to below 1")
+    checks.require("rounds in replay", replay.count, lambda x: x > 0, "must be 1 or more; add some")
     rounds, blocks, rows, width = replay.columns.shape
     filled = jnp.minimum(replay.count, rounds)
     size = draws.shape[0]

@@ -119,5 +119,11 @@ def information(std: Float[Array, "... D"]) -> Float[Array, "..."]:
 
 
 def entropy(probabilities: Float[Array, "... C"]) -> Float[Array, "..."]:
-    """Entropy of `[..., C]` probabilities, `[...]` in nats."""
-    return -jnp.sum(jax.scipy.special.xlogy(probabilities, probabilities), axis=-1)
+    """Entropy of `[..., C]` probabilities, `[...]` in nats.
+
+    Its gradient in a probability of 0, which is infinite, counts as 0, so that values of looks have
+    gradients.
+    """
+    is_zero = probabilities == 0
+    logs = jnp.log(jnp.where(is_zero, 1.0, probabilities))
+    return -jnp.sum(jnp.where(is_zero, 0.0, probabilities * logs), axis=-1)

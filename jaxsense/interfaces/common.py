@@ -1,5 +1,6 @@
 """Spaces and starts, shared by the interfaces."""
 
+import enum
 from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar
 
@@ -12,6 +13,7 @@ from jaxsense.core.types import Key
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.tasks.environment import Environment, OneAgent
 
+E = TypeVar("E", bound=enum.Enum)
 B_co = TypeVar("B_co", covariant=True)
 D_co = TypeVar("D_co", covariant=True)
 
@@ -110,6 +112,14 @@ def start(key: Key, played: Environment, starts: PyTree) -> tuple[Float[Array, "
     row = jax.random.randint(key, (), 0, rows)
     state = jax.tree.map(lambda x: x[row], starts)
     return played.observe(state), state
+
+
+def member(name: str, kind: type[E], value: object) -> E:
+    """A member of an enumeration, by its value or as it is; raises `ValueError` if it is none."""
+    known = {each.value: each for each in kind}
+    if value not in (*known, *kind):
+        raise ValueError(f"{name} = {value!r}: must be one of {', '.join(map(str, known))}")
+    return value if isinstance(value, kind) else known[value]
 
 
 def checked_mode(mode: str | None, modes: Sequence[str]) -> str | None:

@@ -178,7 +178,9 @@ class MapVectorEnv(VectorEnv):
         self.num_envs = num_envs
         self._task: Task | None = played if isinstance(played, MapTask | TeamTask) else None
         self.metadata = {**TaskEnv.metadata} if self._task else {"render_modes": []}
-        self.metadata["autoreset_mode"] = AutoresetMode(autoreset_mode)
+        self.metadata["autoreset_mode"] = common.member(
+            "autoreset_mode", AutoresetMode, autoreset_mode
+        )
         self.render_mode = common.checked_mode(render_mode, self.metadata["render_modes"])
         single = common.environment_spaces(spaces, played)
         self.single_observation_space, self.single_action_space = single
@@ -279,7 +281,7 @@ class MapVectorEnv(VectorEnv):
             raise error.ResetNeeded(f"environments {np.flatnonzero(self._ended)} have ended")
         is_whole = np.issubdtype(actions.dtype, np.integer)
         if not (is_whole and self.action_space.contains(actions)):
-            raise ValueError(f"actions = {actions!r}: must be in {self.action_space}")
+            raise ValueError(f"actions = {actions!r}: must be integers in {self.action_space}")
 
     def _restarted(self, mask: np.ndarray) -> np.ndarray:
         """Observations after new starts where the mask is True."""

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxsense.config import Config
+from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import team
@@ -87,6 +88,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
           ValueError: if a robot has no action, or if an action is no integer, or does not exist and
             is not traced.
         """
+        checks.require_type("actions", actions, dict, f"with one of each of {self.agents}")
         if not set(self.agents) <= set(actions):
             raise ValueError(
                 f"actions of {sorted(actions)}: must have one of each of {self.agents}"

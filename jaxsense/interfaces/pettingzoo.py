@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from jaxsense.config import Config
+from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import team
@@ -203,6 +204,7 @@ class TeamParallelEnv(_Team, ParallelEnv):
           ValueError: if there is no such action, or that of the robot whose turn it is is missing.
         """
         turn = self._turn()
+        checks.require_type("actions", actions, dict, f"with one of {turn!r}")
         if turn not in actions:
             raise ValueError(f"actions of {sorted(actions)}: must have one of {turn!r}")
         chosen = {

@@ -93,7 +93,7 @@ class SharedMap:
           poi: index of the PoI.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
-          weight: `[]` share of the look that is new evidence, see `vae.novelty`.
+          weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
         """
         old: Contents = jax.tree.map(lambda x: x[poi], self.contents)
         seen = old.times_seen > 0
@@ -165,7 +165,7 @@ class OwnMap:
           poi: index of the PoI.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
-          weight: `[]` share of the look that is new evidence, see `vae.novelty`.
+          weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
         """
         found = Evidence(
             log_likelihood=log_likelihood(models, features, modality, weight),
@@ -189,7 +189,7 @@ def log_likelihood(
       models: trained models; their fusion must accumulate looks.
       features: `[D_m]` probabilities of the labels.
       modality: index of the sensor; static.
-      weight: `[]` share of the look that is new evidence, see `vae.novelty`.
+      weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
     """
     fusion, nobody = models.fusion, jnp.zeros(len(models.detectors), bool)
     alone = fusion.update(fusion.prior, nobody, features, modality, weight)

@@ -80,7 +80,12 @@ def build(config: Config, layout: Layout) -> Roadmap:
     Args:
       config: all settings.
       layout: the PoIs.
+
+    Raises:
+      ValueError: if the layout is not that of one arena of `config`.
     """
+    checks.require_type("config", config, Config, "all settings")
+    checks.require_shape("layout.position", layout.position, (config.arena.num_pois, 2))
     arena, settings = config.arena, config.navigation
     radius = _radius(config)
     sides = 2 * jnp.pi * jnp.arange(NODES_PER_POI) / NODES_PER_POI
@@ -127,7 +132,8 @@ def lengths(
     direct, to_node = _first(config, layout, roadmap, position, goals)
     to_last = jnp.min(to_node[:, None] + roadmap.between, axis=0)
     around = jnp.min(to_last[None] + roadmap.last(poi, slice(None)), axis=-1)
-    return jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
+    found = jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
+    return jnp.where(jnp.isfinite(found), found, jnp.inf)  # without a gradient
 
 
 @jax.named_scope("mission.reachable")
@@ -237,7 +243,10 @@ def _straight(
     """Lengths of straight lines between positions, infinite where they are not clear."""
     along_x, along_y = end[None, :, 0] - start[:, :1], end[None, :, 1] - start[:, 1:]
     is_clear = _is_clear(start, end, centres, radius)
-    return jnp.where(is_clear, jnp.sqrt(along_x**2 + along_y**2), jnp.inf)
+    squared = along_x**2 + along_y**2
+    is_same = squared == 0  # where a root has no gradient
+    length = jnp.where(is_same, 0.0, jnp.sqrt(jnp.where(is_same, 1.0, squared)))
+    return jnp.where(is_clear, length, jnp.inf)
 
 
 def _is_clear(

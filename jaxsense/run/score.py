@@ -11,10 +11,10 @@ from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import require_function
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.core import checks
-from jaxsense.core.types import Fusion, Key
+from jaxsense.core.types import Key
 from jaxsense.dqn.policies import POLICIES, Known, Policy, Trained, Values, as_policy
 from jaxsense.mission import cases, make_mission
-from jaxsense.models import Models
+from jaxsense.models import Models, require_fitting
 from jaxsense.run import batches, devices, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import ALONE, Workers
@@ -99,9 +99,9 @@ def score_missions(
 
     Raises:
       ConfigError: if an argument is of another type, a policy is unknown, has a name that is taken,
-        takes other arguments or cannot be traced, or the models are for another number of PoIs.
-      ValueError: if another argument is wrong, or a policy returns values of another shape or
-        dtype.
+        takes other arguments, cannot be traced or returns values of another shape or dtype, or the
+        models are for another number of PoIs.
+      ValueError: if another argument is wrong, for example models of another run.
       RuntimeError: if the values of a policy, the models or the beliefs are not finite.
     """
     _require(config, models, policies, against, episodes, seed)
@@ -154,7 +154,6 @@ def _require(
         raise ConfigError("config", type(config), "must be Config, as from load_pretrained")
     if not isinstance(models, Models):
         raise ConfigError("models", type(models), "must be Models, as from load_pretrained")
-    checks.require_members("models.fusion", models.fusion, Fusion)
     if not isinstance(policies, Mapping):
         raise ConfigError("policies", policies, "must be a dictionary from names to policies")
     for name, each in policies.items():
@@ -163,10 +162,12 @@ def _require(
         if not callable(each) and not isinstance(each, Policy):
             raise ConfigError("policies", name, "must be a function or a dqn.Policy")
     names = (*POLICIES, *policies)
-    if not isinstance(against, list | tuple) or not against or any(x not in names for x in against):
-        reason = f"must be one or more of {', '.join(dict.fromkeys(names))}"
+    is_list = isinstance(against, list | tuple)
+    if not is_list or not against or any(x not in names for x in against):
+        reason = f"must be a list of one or more of {', '.join(dict.fromkeys(names))}"
         raise ConfigError("against", against, reason)
     checks.require_one_each("models.detectors", models.detectors, config.modalities)
+    require_fitting(config, models)
     if not models.agent.plays(config.arena.num_pois):
         reason = "must be the number of PoIs that the models were trained with"
         raise ConfigError("arena.num_pois", config.arena.num_pois, reason)
@@ -185,7 +186,8 @@ def _checked(name: str, policy: Values | Policy) -> Policy:
         number = len(known.looks) + 1
         if found.shape != (number,) or not jnp.issubdtype(found.dtype, jnp.floating):
             expected = f"must return floats of shape [{number}], one for each PoI and NOP's last"
-            raise ValueError(f"policies = {name!r}: {expected}; not {found.dtype}{[*found.shape]}")
+            expected = f"{expected}; not {found.dtype}{[*found.shape]}"
+            raise ConfigError(f"policies[{name!r}]", wrapped.values, expected)
         return found
 
     return dataclasses.replace(wrapped, values=values)

@@ -9,7 +9,8 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse, Patch
 
 from jaxsense.core.types import Belief
 from jaxsense.dqn.map_mdp import MapMdp, MapState
@@ -22,7 +23,7 @@ _DPI = 100
 _ARROW = 0.6  # m, from a robot to where it looks
 _MARGIN = 0.8  # m, around places
 _AROUND = 0.75  # of how far classes lie apart
-_TEN = 10
+_OF_CLASSES = [0, 2, 3, 5, 6, 7, 8, 9, 1, 4]
 
 
 def frame(task: Task, state: MapState | TeamState, actions: Sequence[int]) -> np.ndarray:
@@ -55,6 +56,7 @@ def frame(task: Task, state: MapState | TeamState, actions: Sequence[int]) -> np
     nearest = colours[np.argmax(probabilities, axis=1)]
     _draw_beliefs(axes[0], shown, classes, colours, nearest, present)
     _draw_probabilities(axes[1], probabilities, state.map, actions, colours, present)
+    _name_sensors(axes[1], task.modalities)
     for each in state.teams:
         truth = colours[np.asarray(each.map.classes)]
         team = jax.tree.map(np.asarray, each.team)
@@ -85,7 +87,9 @@ def frames(task: Task, states: PyTree, actions: Sequence[Sequence[int]]) -> tupl
 
 def _class_colours(number: int) -> np.ndarray:
     """`[C, 4]` RGBA."""
-    return colormaps["tab10" if number <= _TEN else "tab20"](np.arange(number))
+    # First those that are no sensor's.
+    few = number <= len(_OF_CLASSES)
+    return colormaps["tab10"](_OF_CLASSES[:number]) if few else colormaps["tab20"](range(number))
 
 
 def _draw_beliefs(
@@ -154,6 +158,23 @@ def _draw_probabilities(
     ax.spines["bottom"].set_bounds(0, 1)
 
 
+def _name_sensors(ax: Axes, names: Sequence[str]) -> None:
+    """A legend below the bars: the dot of each sensor, and the square of a class."""
+    dots = [
+        Line2D([], [], color=modality_colour(m), label=name, marker="o", linestyle="")
+        for m, name in enumerate(names)
+    ]
+    ax.legend(
+        handles=[*dots, Patch(color="0.75", label="class, by number")],
+        frameon=False,
+        fontsize="small",
+        columnspacing=1.0,
+        ncols=len(names) + 1,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.08),
+    )
+
+
 def _draw_places(ax: Axes, team: Team, agent: int, nearest: np.ndarray, truth: np.ndarray) -> None:
     """PoIs, in the colour of the most likely class within that of the true one, and robots."""
     for n in np.flatnonzero(team.present).tolist():
@@ -173,4 +194,4 @@ def _draw_places(ax: Axes, team: Team, agent: int, nearest: np.ndarray, truth: n
     places = np.concatenate([team.positions[team.present], team.poses[:, :2]])
     (left, bottom), (right, top) = places.min(axis=0) - _MARGIN, places.max(axis=0) + _MARGIN
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    ax.set_title("places")
+    ax.set_title("places (rim: truth)")

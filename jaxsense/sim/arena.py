@@ -183,6 +183,13 @@ def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
     return f'<body name="{name}" mocap="true">{solid}/>{capsule}</body>'
 
 
+def _check_pois(config: ArenaConfig, name: str, value: jax.Array) -> None:
+    """Raises `ValueError` if an array is not of as many PoIs as the arena has."""
+    number = np.shape(value)[0] if np.ndim(value) else config.num_pois
+    if number != config.num_pois:
+        raise ValueError(f"{name} of {number} PoIs: must be {config.num_pois}, as arena.num_pois")
+
+
 def make_layout(
     config: ArenaConfig,
     position: Float[Array, "N 2"],
@@ -200,6 +207,7 @@ def make_layout(
     Raises:
       ValueError: if a position or a yaw is not finite, or there is no such class.
     """
+    _check_pois(config, "position", position)
     checks.require_shape("position", position, (config.num_pois, 2))
     checks.require_shape("yaw", yaw, (config.num_pois,))
     checks.require_shape("classes", classes, (config.num_pois,))
@@ -228,6 +236,8 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
       The layout, with random yaws.
     """
     checks.require_key(key)
+    checks.require_type("config", config, ArenaConfig, "as config.arena")
+    _check_pois(config, "classes", classes)
     checks.require_shape("classes", classes, (config.num_pois,))
     per_side = min(
         int(np.ceil(np.sqrt(2 * config.num_pois))), int(np.floor(config.side / config.poi_pitch))

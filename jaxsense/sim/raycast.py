@@ -48,6 +48,11 @@ class CrossSection:
 
     def __post_init__(self):
         checks.require_tuple("geom", self.geom)
+        if not all(isinstance(each, int | np.integer) and each >= 0 for each in self.geom):
+            raise ValueError(f"geom = {self.geom}: must hold whole numbers, 0 or more")
+        if not isinstance(self.num_circles, int | np.integer):
+            expected = "must be a whole number, static under jit"
+            raise ValueError(f"num_circles = {self.num_circles}: {expected}")
 
 
 @pytree
@@ -136,8 +141,29 @@ def cast(
       ValueError: if the origin or an angle is not finite, or an array of the section does not
         describe its outlines.
     """
+    checks.require_shape("angle", angle, (...,))
     checks.require_finite("angle", angle)
     return cast_along(section, origin, (jnp.cos(angle), jnp.sin(angle)))
+
+
+def _check_outlines(section: CrossSection) -> None:
+    """Raises `ValueError` unless the arrays of a section describe its outlines."""
+    number = len(section.geom)
+    if np.shape(section.centre)[:1] not in ((), (number,)):
+        expected = f"must be {len(section.centre)}, one for each outline"
+        raise ValueError(f"geom has {number} entries: {expected}")
+    for name in ("centre", "axis", "half"):
+        checks.require_shape(name, getattr(section, name), (number, 2))
+    checks.require_finite("centre", section.centre)
+    checks.require("half", section.half, lambda x: x >= 0, "must be 0 or more")
+    if not isinstance(section.axis, Tracer):
+        lengths = np.hypot(*np.asarray(section.axis).T)
+        expected = "must be 1, also where the outline is a circle"
+        checks.require("length of axis", lengths, lambda x: np.abs(x - 1) < 1e-3, expected)
+    if not isinstance(section.half, Tracer):
+        apart = np.diff(np.asarray(section.half)[: section.num_circles], axis=1)
+        expected = "must be 0, as a circle has its radius twice"
+        checks.require("difference in half of a circle", apart, lambda x: x == 0, expected)
 
 
 def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> Hit:
@@ -155,6 +181,7 @@ def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> H
       ValueError: if the origin is not finite, a direction is no unit vector, or an array of the
         section does not describe its outlines.
     """
+    checks.require_type("section", section, CrossSection, "as from cross_section")
     checks.require_shape("origin", origin, (2,))
     checks.require_shape("y of direction", direction[1], jnp.shape(direction[0]))
     checks.require_finite("origin", origin)
@@ -165,17 +192,7 @@ def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> H
         checks.require("length of direction", lengths, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
     checks.require_number("number of outlines", len(section.geom))
     checks.require_index("num_circles", int(section.num_circles), len(section.geom) + 1)
-    checks.require_shape("centre", section.centre, (len(section.geom), 2))
-    checks.require_shape("axis", section.axis, (len(section.geom), 2))
-    checks.require_shape("half", section.half, (len(section.geom), 2))
-    checks.require_finite("centre", section.centre)
-    checks.require(
-        "axis",
-        section.axis,
-        lambda x: np.broadcast_to(np.abs(np.hypot(x[:, :1], x[:, 1:]) - 1) < 1e-3, x.shape),
-        "must hold unit vectors",
-    )
-    checks.require("half", section.half, lambda x: x >= 0, "must be 0 or more")
+    _check_outlines(section)
     # Not by `platform_dependent`, which takes twice as long to trace and batch.
     on_cpu = jax.default_backend() == "cpu"
     nearest = _nearest_by_two_loops if on_cpu else _nearest_by_one_loop

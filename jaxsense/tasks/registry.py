@@ -24,7 +24,7 @@ from jaxsense.training.mdp import models_of
 TASKS = {
     "map-v0": "the paper's map of three PoIs, with detections that are almost always confident",
     "many-v0": "eight PoIs of sixteen classes; each sensor distinguishes four labels",
-    "noisy-v0": "the same map with uncertain detections, from which beliefs accumulate evidence",
+    "noisy-v0": "map-v0 with uncertain detections, from which beliefs accumulate evidence",
     "team-v0": "robots with a camera and a LiDAR drive among three to eight PoIs; time has a cost",
 }
 """The frozen tasks, and what is special in each."""
@@ -117,9 +117,9 @@ def as_task(task: Task | str, agent: str | None = None) -> Task:
     Raises:
       ConfigError: if there is no such task or agent, or if `task` is something else.
     """
-    if isinstance(task, str):
+    if isinstance(task, str) and task in TASKS:
         return make(task, agent)
-    if isinstance(task, type) or not hasattr(task, "play"):
+    if isinstance(task, type | str) or not hasattr(task, "play"):
         raise ConfigError("task", task, f"must be from make, or one of {', '.join(TASKS)}")
     if agent is not None:
         raise ConfigError("agent", agent, "must be None with a task; pass it to make(name, agent)")
@@ -220,6 +220,7 @@ def _made(
         "scaling": scaling,
         "returns": jnp.asarray(arrays.get(f"returns/{agent}", _NONE)),
         "name": name,
+        "modalities": config.modalities,
     }
     kinds: dict[str, Callable[[], Task]] = {
         "map": lambda: MapTask(**common, modality=config.modalities.index(agent), agent=agent),

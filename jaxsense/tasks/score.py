@@ -153,7 +153,7 @@ def score(
         raise ConfigError("policy", policy, _IS_POLICY)
     policies = [policy] * SEEDS if not isinstance(policy, Sequence) else list(policy)
     if not policies:
-        raise ConfigError("policy", "[]", "must be one policy or several")
+        raise ConfigError("policy", policy, "must be one policy or several")
     seeds = len(policies)
     keys = [key_of_seed(seed) for seed in range(seeds)]
     own = {id(each): _recurrent(each) for each in policies}
@@ -189,7 +189,8 @@ def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
         if actions.shape != observations.shape[:1] or actions.dtype.kind not in "iu":
             expected = f"must return {len(observations)} integers for as many observations"
             raise ConfigError("act", act, f"{expected}; not {actions.dtype}{[*actions.shape]}")
-        return actions.astype(np.int32)
+        # What 32 bits cannot hold is no action, either.
+        return np.where(actions < 2**31, actions, -1).astype(np.int32)
 
     def policy(key: Key, observation: jax.Array) -> jax.Array:
         del key
@@ -203,6 +204,7 @@ def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
 
         return jax.pure_callback(call, shape, observation, vmap_method="broadcast_all")
 
+    policy.__name__ = getattr(act, "__name__", policy.__name__)  # for messages
     return policy
 
 
@@ -225,14 +227,14 @@ def estimate(values: Float[np.ndarray, " seeds"]) -> Estimate:
     return Estimate(value, float(low), float(high))
 
 
-def mean_return(key: Key, task: Task, policy: Policy | Recurrent, episodes: int) -> float:
+def mean_return(key: Key, task: Task | str, policy: Policy | Recurrent, episodes: int) -> float:
     """Computes the mean return of a policy, for example for a learning curve.
 
     Starts and looks differ from those of a score.
 
     Args:
       key: random key; none is that of a score.
-      task: from `make`.
+      task: from `make`, or its name.
       policy: see `score`; compiled anew in each call, unless it is a pytree of numbers.
       episodes: number of episodes.
 
@@ -242,9 +244,11 @@ def mean_return(key: Key, task: Task, policy: Policy | Recurrent, episodes: int)
     Raises:
       ConfigError: if the policy is not such a function, returns values of another shape or dtype,
         or takes actions that do not exist.
-      ValueError: if JAX cannot trace it.
+      ValueError: if JAX cannot trace it, or another argument is wrong.
     """
-    return _player(policy)(key, task, episodes)
+    checks.require_key(key)
+    checks.require_number("episodes", episodes)
+    return _player(policy)(key, as_task(task), episodes)
 
 
 def _player(policy: Policy | Recurrent) -> Callable[[Key, Task, int], float]:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxsense.core import checks
 from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.dqn import environments, episodes, map_agent, policies, team_mdp
 from jaxsense.dqn.environments import Agent
@@ -72,6 +73,11 @@ class Task(Environment, Protocol):
     @property
     def agent(self) -> str:
         """Who acts."""
+        ...
+
+    @property
+    def modalities(self) -> tuple[str, ...]:
+        """Names of the sensors."""
         ...
 
     @property
@@ -142,6 +148,7 @@ class MapTask(OneAgent):
       returns: `[R, seeds]` see `Task`.
       name: with its version.
       agent: name of the agent's sensor.
+      modalities: names of all sensors.
     """
 
     models: Models
@@ -149,6 +156,7 @@ class MapTask(OneAgent):
     returns: jax.Array
     name: str = struct.field(pytree_node=False)
     agent: str = struct.field(pytree_node=False)
+    modalities: tuple[str, ...] = struct.field(pytree_node=False)
 
     def __repr__(self) -> str:
         """See `_as_made`."""
@@ -227,6 +235,7 @@ class TeamTask:
       returns: `[R, seeds]` see `Task`.
       robots: `[R]` int32 index of each robot's sensor.
       name: with its version.
+      modalities: names of all sensors.
     """
 
     mdp: TeamMdp
@@ -235,6 +244,7 @@ class TeamTask:
     returns: jax.Array
     robots: jax.Array
     name: str = struct.field(pytree_node=False)
+    modalities: tuple[str, ...] = struct.field(pytree_node=False)
 
     def __repr__(self) -> str:
         """See `_as_made`."""
@@ -310,6 +320,7 @@ class TeamTask:
         A PoI that is not present counts as NOP. The reward is that of the look, if there was one,
         less the price of the time of all robots.
         """
+        checks.require_type("state", state, TeamState, "as from reset")
         after, outcome = team_mdp.step(key, self.mdp, state, team_mdp.existing(state, action))
         price = self.mdp.time_price(after.team, jnp.asarray(outcome.seconds))
         seen, reward = self.observe(after), outcome.reward - price

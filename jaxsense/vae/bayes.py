@@ -53,7 +53,7 @@ def bayes_update(
       log_weights: `[C]` logarithms of the classes' probabilities before the look.
       features: see `log_likelihoods`.
       label_of_class: see `log_likelihoods`.
-      weight: `[]` share of the look that is new evidence, see `vae.novelty`.
+      weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
 
     Returns:
       `[C]` logarithms after the look, normalised.
@@ -127,10 +127,8 @@ def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Beli
       ValueError: if a belief is not finite, or a standard deviation is not positive.
     """
     for name, each in (("belief", belief), ("posterior", posterior), ("prior", prior)):
-        checks.require_shape(f"{name}.mean", each.mean, (None,))
-        checks.require_shape(name, each.std, each.mean.shape)
-        checks.require_finite(f"{name}.mean", each.mean)
-        checks.require_positive(f"{name}.std", each.std)
+        size = None if each is belief else len(belief.mean)
+        checks.require_belief(name, each, size)
     of_belief, of_posterior, of_prior = (x.std**-2 for x in (belief, posterior, prior))
     precision = jnp.maximum(of_belief + of_posterior - of_prior, _MIN_PRECISION)
     total = of_belief * belief.mean + of_posterior * posterior.mean - of_prior * prior.mean

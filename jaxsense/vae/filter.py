@@ -72,11 +72,11 @@ class Filter:
           seen: not used.
           features: `[D_m]` probabilities of the labels.
           modality: index of the sensor; static.
-          weight: `[]` share of the look that is new evidence, see `vae.novelty`.
+          weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
 
         Raises:
-          ValueError: if there is no such modality, `features` are not probabilities, or the belief
-            is not finite or its width not positive.
+          ValueError: if there is no such modality, `features` are not probabilities, the belief is
+            not finite or its width not positive, or the weight is not from 0 to 1.
         """
         del seen
         model = self.model
@@ -84,14 +84,15 @@ class Filter:
         name = f"features of {model.modalities[modality]}"
         checks.require_shape(name, features, (model.feature_sizes[modality],))
         checks.require_probabilities("features", features)
-        checks.require_shape("belief.mean", belief.mean, (model.latent_size,))
-        checks.require_shape("belief.std", belief.std, (model.latent_size,))
+        checks.require_belief("belief", belief, model.latent_size)
+        checks.require("weight", weight, lambda x: (x >= 0) & (x <= 1), "must be from 0 to 1")
         found = self.log_likelihood(self.networks, features, modality)
         before = jnp.log(self.class_probabilities(belief))
         return readout.mixture(self.classes, jax.nn.softmax(before + weight * found))
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """Belief after looks by several sensors, `[D_m]` features by modality."""
+        checks.require_type("looks", looks, Mapping, "from modalities to features")
         belief, nobody = self.prior, jnp.zeros(len(self.model.modalities), bool)
         for modality, features in looks.items():
             belief = self.update(belief, nobody, features, modality)

@@ -15,6 +15,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from jaxsense.config import JmvaeConfig
+from jaxsense.config.checks import require_32_bits
 from jaxsense.core import checks, networks, supervised
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Features, Key, Samples, pytree
@@ -53,6 +54,8 @@ class Jmvae:
         checks.require_one_each("feature_sizes", self.feature_sizes, self.modalities)
         if len(set(self.modalities)) < len(self.modalities):
             raise ValueError(f"modalities = {self.modalities}: must name none twice")
+        if any("+" in name for name in self.modalities):
+            raise ValueError(f"modalities = {self.modalities}: must have no +, which joins names")
         checks.require_number("latent_size", self.latent_size)
         if self.max_subset is not None:
             checks.require_number("max_subset", self.max_subset)
@@ -82,6 +85,7 @@ def init(key: Key, model: Jmvae, *, scale: float = 1.0) -> Params:
       scale: factor on all weights. With 0.6, features of hundreds of numbers need far fewer steps.
     """
     checks.require_key(key)
+    checks.require_positive("scale", scale)
 
     def network(key: Key, inputs: int, outputs: int) -> Params:
         shape = MLP(model.hidden, outputs)
@@ -123,7 +127,7 @@ def encode(
       ValueError: if `features` has another length than `model.modalities`, all are None, or one is
         not finite.
     """
-    _check_features(model, features)
+    checks.require_features(features, model.modalities, model.feature_sizes)
     subset = tuple(m for m, feature in enumerate(features) if feature is not None)
     if subset in model.subsets:
         return _encode(params, model, subset, features)
@@ -140,21 +144,6 @@ def _encode(
     output = networks.apply(network, params["encoders"][model.encoder_name(subset)], joined)
     mean, log_var = jnp.split(output, 2)
     return mean, log_var
-
-
-def _check_features(model: Jmvae, features: Features) -> None:
-    """Raises an error unless each modality has finite features or None, and one or more have."""
-    if len(features) != len(model.modalities):
-        raise ValueError(
-            f"features has {len(features)} entries: must be {len(model.modalities)}, one for each "
-            f"of {model.modalities}"
-        )
-    if all(feature is None for feature in features):
-        raise ValueError(f"features = {features}: must hold one modality or more")
-    for name, size, feature in zip(model.modalities, model.feature_sizes, features, strict=True):
-        if feature is not None:
-            checks.require_shape(f"features of {name}", feature, (size,))
-            checks.require_finite(f"features of {name}", feature)
 
 
 def decode(params: Params, model: Jmvae, z: Float[Array, " D"]) -> tuple[Float[Array, "_"], ...]:
@@ -226,9 +215,10 @@ def loss(
       ValueError: if a modality's features or its weight is missing.
     """
     checks.require_key(key)
+    checks.require_type("model", model, Jmvae, "as from Jmvae(...)")
     checks.require_one_each("features", features, model.modalities)
-    if any(x is None for x in features):
-        raise ValueError(f"features = {features}: must hold every one of {model.modalities}")
+    for name, size, x in zip(model.modalities, model.feature_sizes, features, strict=True):
+        checks.require_shape(f"features of {name}", x, (size,))
     noise = jax.random.normal(key, (model.latent_size, 1))
     total, parts = losses(
         noise,
@@ -365,10 +355,14 @@ def train(
       The parameters and the `[steps]` losses.
 
     Raises:
-      ValueError: if a modality has no features, or some of another shape or not finite; the last
-        is not checked under `jit`.
+      ValueError: if a modality has no features, or some of another shape or not finite, or if the
+        loss diverges; `jit` checks shapes alone.
+      ConfigError: in JAX's 64-bit mode.
     """
     checks.require_key(key)
+    require_32_bits()
+    checks.require_type("model", model, Jmvae, "as from Jmvae(...)")
+    checks.require_type("config", config, JmvaeConfig, "as config.jmvae")
     checks.require_bank(bank, model.modalities, model.feature_sizes)
     problem, state = Fitting(config, bank, model), supervised.start(params, config)
     number = min(config.steps, 100)  # whose draws are in memory together
@@ -379,7 +373,10 @@ def train(
         return supervised.fit(key, state, problem, number)
 
     state, losses = jax.lax.scan(chunk, state, keys)
-    return state.params, losses.reshape(-1)[: config.steps]
+    losses = losses.reshape(-1)[: config.steps]
+    expected = "must be finite; scale features to a deviation of 1, or lower learning_rate"
+    checks.require_finite("losses", losses, expected)
+    return state.params, losses
 
 
 def annealed_beta(step: Int[Array, ""], config: JmvaeConfig) -> Float[Array, ""]:

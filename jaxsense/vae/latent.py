@@ -71,12 +71,9 @@ def nearest_class(belief: Belief, class_means: Float[Array, "C D"]) -> Int[Array
 
 def _check_belief(belief: Belief, class_means: jax.Array) -> None:
     """Raises an error unless shapes fit and values describe Gaussians."""
-    checks.require_shape("belief.mean", belief.mean, (None,))
-    checks.require_shape("belief.std", belief.std, belief.mean.shape)
+    checks.require_belief("belief", belief)
     checks.require_shape("class_means", class_means, (None, *belief.mean.shape))
-    checks.require_finite("belief.mean", belief.mean)
     checks.require_finite("class_means", class_means)
-    checks.require_positive("belief.std", belief.std)
 
 
 def moment_matching_error(belief: Belief, components: Belief) -> Float[Array, ""]:

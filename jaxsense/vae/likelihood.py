@@ -42,8 +42,8 @@ def log_likelihood(
     """
     checks.require_key(key)
     checks.require_number("samples", samples)
+    checks.require_one_each("reconstruction_weights", reconstruction_weights, model.modalities)
     given = tuple(reconstruction_weights)
-    checks.require_one_each("reconstruction_weights", given, model.modalities)
     checks.require_positive("reconstruction_weights", jnp.stack(given))
     posterior = jmvae.posterior(params, model, features)
 

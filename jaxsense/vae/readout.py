@@ -91,8 +91,7 @@ class Readout:
         Raises:
           ValueError: if the belief is not finite, or a standard deviation is not positive.
         """
-        checks.require_finite("belief.mean", belief.mean)
-        checks.require_positive("belief.std", belief.std)
+        checks.require_belief("belief", belief, len(prior.mean))
         found = jnp.maximum(self._of_maximum_entropy(belief), MIN_PROBABILITY)
         apart = jnp.maximum(jnp.abs(belief.mean - prior.mean), jnp.abs(belief.std - prior.std))
         # Tolerates rounding between compiled programs.

@@ -11,9 +11,11 @@ from refusals import INF, NAN, SMOKE
 from untrained import untrained
 
 import jaxsense
-from jaxsense import Belief, dqn, mission, sim, tasks, vae
+from jaxsense import Belief, Transition, dqn, mission, sim, tasks, vae
 from jaxsense.config import FilterConfig
+from jaxsense.dqn import replay
 from jaxsense.interfaces import common
+from jaxsense.mission import roadmap
 from jaxsense.run import batches
 from jaxsense.vae import filter
 
@@ -49,6 +51,12 @@ class World:
         self.belief, self.means = Belief(jnp.zeros(2), jnp.ones(2)), jnp.zeros((3, 2))
         self.seen, self.x = jnp.zeros(2, bool), jnp.zeros(2)
         self.look = jnp.array([0.75, 0.25])
+
+    def outlines(self, **parts):
+        """A circle and a rectangle."""
+        axis = jnp.array([[1.0, 0.0], [1.0, 0.0]])
+        given = {"centre": 2 * axis, "axis": axis, "half": axis * 0 + 0.5, "geom": (0, 1)}
+        return sim.CrossSection(**{**given, "num_circles": 1, **parts})
 
     def belief_of(self, **parts):
         return dataclasses.replace(self.belief, **parts)
@@ -87,6 +95,27 @@ def of_missions(w, config=SMOKE, models=None, policies=None, **options):
     """A score of missions, of a policy unless others are given."""
     models, policies = models or w.models, policies or {"mine": values}
     return jaxsense.score_missions(config, models, policies, **options)
+
+
+def loss(w, features, weights=(1.0, 1.0)):
+    """A loss of some features."""
+    return vae.loss(
+        w.key,
+        w.params,
+        w.model,
+        features,
+        alpha=0.1,
+        beta=1.0,
+        reconstruction_weights=weights,
+    )
+
+
+def value_iteration(w, **changed):
+    """Values of looks that tell nothing, with some arguments changed."""
+    given = {"likelihoods": jnp.zeros((2, 3, 2)), "reward": dqn.Nats(0.1), "config": SMOKE.mdp}
+    return dqn.value_iteration(
+        mixture=lambda p: w.belief, prior=w.belief, horizon=2, **{**given, **changed}
+    )
 
 
 IS_POLICY = "must be a function (key, observation) -> action, a Recurrent, or a list of them"
@@ -182,8 +211,49 @@ FUNCTIONS = {
         lambda w: of_missions(w, models=SMOKE),
         "models = Config: must be Models, as from load_pretrained",
     ),
-    "missions against": (lambda w: of_missions(w, against=3), "against = 3: must be one or more"),
-    "missions unhashable": (lambda w: of_missions(w, against=[[]]), "against = [[]]: must be one"),
+    "missions against": (lambda w: of_missions(w, against=3), "against = 3: must be a list of one"),
+    "missions unhashable": (lambda w: of_missions(w, against=[[]]), "against = [[]]: must be a l"),
+    "missions name": (lambda w: of_missions(w, against="naive"), "against = 'naive': must be a li"),
+    "missions others": (
+        lambda w: of_missions(w, config=OTHERS),
+        "models.fusion holds 3 classes in 2 dimensions: must be 3 in 3, as in config; take both",
+    ),
+    "missions fusion": (
+        lambda w: of_missions(w, models=dataclasses.replace(w.models, fusion=3)),
+        "models.fusion = int: must be a Fusion; it lacks accumulates, classes, prior, update",
+    ),
+    "score empty": (lambda w: jaxsense.score("map-v0", []), "policy = []: must be one policy or s"),
+    "score preset": (lambda w: jaxsense.score("default", nop), f"task = 'default': {IS_TASK}"),
+    "mean_return episodes": (
+        lambda w: tasks.mean_return(w.key, "map-v0", nop, 0),
+        "episodes = 0: must be a whole number greater than 0",
+    ),
+    "mean_return key": (
+        lambda w: tasks.mean_return(7, "map-v0", nop, 2),
+        "key = 7: must be one key, as from jax.random.key(0)",
+    ),
+    "mean_return task": (
+        lambda w: tasks.mean_return(w.key, "loud-v0", nop, 2),
+        f"task = 'loud-v0': {IS_TASK}",
+    ),
+    **{
+        f"on_host {action}": (
+            lambda w, action=action: on_host(lambda seen: np.full(len(seen), action)),
+            "policy = <lambda>: must return actions from 0 to 3",
+        )
+        for action in (9, -1, 2**31, 2**32, 2**32 + 3)
+    },
+    "task step state": (
+        lambda w: jaxsense.make("map-v0").step(w.key, w.x, 0),
+        "state = Array([0., 0.], dtype=float32): must be MapState, as from reset",
+    ),
+    "task step team": (
+        lambda w: jaxsense.make("team-v0").step(w.key, w.state, 0),
+        ": must be TeamState, as from reset",
+    ),
+    "labels": (lambda w: SMOKE.labels("cam"), "modality = 'cam': must be one of camera, lidar"),
+    "labels index": (lambda w: SMOKE.labels(0), "modality = 0: must be one of camera, lidar"),
+    "labels list": (lambda w: SMOKE.labels([]), "modality = []: must be one of camera, lidar"),
     **{
         f"missions seed {seed!r}": (
             lambda w, seed=seed: of_missions(w, seed=seed),
@@ -232,6 +302,26 @@ FUNCTIONS = {
     "random_layout": (
         lambda w: sim.random_layout(w.key, SMOKE.arena, w.classes - 1),
         "classes = -1",
+    ),
+    "random_layout config": (
+        lambda w: sim.random_layout(w.key, SMOKE, w.classes),
+        ": must be ArenaConfig, as config.arena",
+    ),
+    "random_layout number": (
+        lambda w: sim.random_layout(w.key, SMOKE.arena, w.classes[:2]),
+        "classes of 2 PoIs: must be 3, as arena.num_pois",
+    ),
+    "make_layout number": (
+        lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((5, 2)), jnp.zeros(3), w.classes),
+        "position of 5 PoIs: must be 3, as arena.num_pois",
+    ),
+    "roadmap config": (
+        lambda w: roadmap.build(SMOKE.arena, w.scene.layout),
+        ": must be Config, all settings",
+    ),
+    "roadmap batch": (
+        lambda w: roadmap.build(SMOKE, jax.tree.map(lambda x: x[None], w.scene.layout)),
+        "layout.position has the shape (1, 3, 2): must be (3, 2); use jax.vmap for a batch",
     ),
     "random_scene": (lambda w: sim.random_scene(w.key, w.world, BAD), "classes = 7"),
     "survey": (lambda w: sim.survey(w.key, w.world, BAD), "classes = 7"),
@@ -293,6 +383,74 @@ FUNCTIONS = {
         ),
         "length of direction = ",
     ),
+    "cast list": (lambda w: sim.cast(w.outlines(), w.x, [0.0]), "angle = [0.0]: must be an array"),
+    "cast dict": (
+        lambda w: sim.cast({"geom": ()}, w.x, 0.0),
+        "section = {'geom': ()}: must be CrossSection, as from cross_section",
+    ),
+    "cast geom": (
+        lambda w: sim.cast(w.outlines(geom=(5,)), w.x, 0.0),
+        "geom has 1 entries: must be 2, one for each outline",
+    ),
+    "cast half": (
+        lambda w: sim.cast(w.outlines(half=jnp.array([[0.5, 0.25], [0.5, 0.25]])), w.x, 0.0),
+        "difference in half of a circle = -0.25: must be 0",
+    ),
+    "CrossSection words": (
+        lambda w: w.outlines(geom=("door", "wall")),
+        "geom = ('door', 'wall'): must hold whole numbers, 0 or more",
+    ),
+    "CrossSection negative": (
+        lambda w: w.outlines(geom=(-1, 0)),
+        "geom = (-1, 0): must hold whole",
+    ),
+    "CrossSection circles": (
+        lambda w: w.outlines(num_circles=1.0),
+        "num_circles = 1.0: must be a whole number, static under jit",
+    ),
+    "replay capacity": (lambda w: replay.init(3, 0, 4, 2), "rounds = 0: must be a whole number"),
+    "replay empty": (
+        lambda w: replay.sample(jnp.zeros((1, 2)), replay.init(1, 2, 1, 2)),
+        "rounds in replay = 0: must be 1 or more; add some",
+    ),
+    "replay draws": (
+        lambda w: replay.sample(jnp.ones((1, 2)), replay.init(1, 2, 1, 2)),
+        "draws = 1.0: must be from 0 to below 1",
+    ),
+    "replay rewards": (
+        lambda w: replay.add(
+            replay.init(1, 2, 1, 2), Transition(w.look[None], w.x, w.x[:1], w.x, w.look[None])
+        ),
+        "transitions.r_t has the shape (1,): must be (2,)",
+    ),
+    "value_iteration start": (
+        lambda w: value_iteration(w, start=jnp.array([1.5, -0.5])),
+        "start = 1.5: must be probabilities, within 0 and 1",
+    ),
+    "value_iteration sum": (
+        lambda w: value_iteration(w, start=jnp.array([0.75, 0.5])),
+        "sum of start = 1.25: must be 1",
+    ),
+    "value_iteration wide": (
+        lambda w: value_iteration(w, start=jnp.full(3, 1 / 3)),
+        "start has the shape (3,): must be (2,)",
+    ),
+    "value_iteration reward": (
+        lambda w: value_iteration(w, reward="nats"),
+        "reward = str: must be a Reward; it lacks",
+    ),
+    "value_iteration class": (
+        lambda w: value_iteration(w, reward=dqn.Nats),
+        "reward = Nats: must be a Reward, not its class",
+    ),
+    "value_iteration config": (
+        lambda w: value_iteration(w, config=SMOKE),
+        ": must be MdpConfig, as config.mdp",
+    ),
+    "value_iteration list": (
+        lambda w: value_iteration(w, likelihoods=[[[0.0] * 50] * 50] * 50),
+        "...: must be an array of shape (any, any, any)",
+    ),
     "fan": (lambda w: sim.Fan(0, 90.0), "num_rays = 0: must be a whole number greater than 0"),
     "fan real": (lambda w: sim.Fan(1.5, 90.0), "num_rays = 1.5"),
     "fan bool": (lambda w: sim.Fan(True, 90.0), "num_rays = True"),
@@ -316,10 +474,96 @@ FUNCTIONS = {
     "Sensor height": (lambda w: dataclasses.replace(w.lidar, height=NAN), "height = nan"),
     "Jmvae names": (lambda w: vae.Jmvae((), (), 2, (8,)), "modalities = ()"),
     "Jmvae twice": (lambda w: vae.Jmvae(("a", "a"), (2, 2), 2, (8,)), "must name none twice"),
+    "Jmvae plus": (
+        lambda w: vae.Jmvae(("a", "b", "a+b"), (2, 2, 2), 2, (8,)),
+        "modalities = ('a', 'b', 'a+b'): must have no +, which joins names",
+    ),
     "Jmvae sizes": (lambda w: vae.Jmvae(("a",), (0,), 2, (8,)), "feature_sizes = 0"),
     "Jmvae latent": (lambda w: vae.Jmvae(("a",), (2,), 0.5, (8,)), "latent_size = 0.5"),
     "Jmvae hidden": (lambda w: vae.Jmvae(("a",), (2,), 2, (-8,)), "hidden = -8"),
     "Jmvae subset": (lambda w: vae.Jmvae(("a",), (2,), 2, (8,), 0), "max_subset = 0"),
+    "init scale": (
+        lambda w: vae.init(w.key, w.model, scale=0),
+        "scale = 0: must be greater than 0",
+    ),
+    "train one class": (
+        lambda w: vae.train(w.key, w.params, w.model, tuple(x[:1] for x in w.bank), SMOKE.jmvae),
+        "bank has one class with 4 looks: must be two or more; give rows [N, D] as x[:, None]",
+    ),
+    "train no row": (
+        lambda w: vae.train(w.key, w.params, w.model, tuple(x[:0] for x in w.bank), SMOKE.jmvae),
+        "bank of camera has the shape (0, 4, 2): must hold one row or more",
+    ),
+    "train dict": (
+        lambda w: vae.train(w.key, w.params, w.model, {"camera": w.bank[0]}, SMOKE.jmvae),
+        ": must hold 2, one for each of ('camera', 'lidar')",
+    ),
+    "train config": (
+        lambda w: vae.train(w.key, w.params, w.model, w.bank, SMOKE),
+        ": must be JmvaeConfig, as config.jmvae",
+    ),
+    "train swapped": (
+        lambda w: vae.train(w.key, w.model, w.params, w.bank, SMOKE.jmvae),
+        ": must be Jmvae, as from Jmvae(...)",
+    ),
+    "train diverges": (
+        lambda w: vae.train(
+            w.key, jax.tree.map(lambda x: NAN * x, w.params), w.model, w.bank, SMOKE.jmvae
+        ),
+        "losses = nan: must be finite; scale features to a deviation of 1, or lower learning_rate",
+    ),
+    "loss batch": (
+        lambda w: loss(w, (w.x[None], w.x[None])),
+        "features of camera has the shape (1, 2): must be (2,); use jax.vmap for a batch",
+    ),
+    "loss none": (
+        lambda w: loss(w, (w.x, None)),
+        "features of lidar = None: must be an array of shape (2,)",
+    ),
+    "loss no weights": (
+        lambda w: loss(w, (w.x, w.x), 5.0),
+        "reconstruction_weights = 5.0: must hold 2, one for each of ('camera', 'lidar')",
+    ),
+    "nearest_class array": (
+        lambda w: vae.nearest_class(w.x, w.means),
+        "belief = Array([0., 0.], dtype=float32): must be Belief, with mean and std",
+    ),
+    "posterior dict": (
+        lambda w: vae.posterior(w.params, w.model, {"camera": w.x}),
+        "features = {'camera': Array([0., 0.], dtype=float32)}: must hold 2, one for each of",
+    ),
+    "log_likelihood weights": (
+        lambda w: vae.log_likelihood(w.key, w.params, w.model, (w.x, w.x), 10.0),
+        "reconstruction_weights = 10.0: must hold 2, one for each of ('camera', 'lidar')",
+    ),
+    "class_probabilities array": (
+        lambda w: w.filter.class_probabilities(w.x),
+        "belief = Array([0., 0.], dtype=float32): must be Belief, with mean and std",
+    ),
+    "class_probabilities batch": (
+        lambda w: w.filter.class_probabilities(Belief(jnp.zeros((4, 2)), jnp.ones((4, 2)))),
+        "belief.mean has the shape (4, 2): must be (2,); use jax.vmap for a batch",
+    ),
+    "product_of_experts array": (
+        lambda w: vae.product_of_experts(w.belief, w.x, w.belief),
+        "posterior = Array([0., 0.], dtype=float32): must be Belief, with mean and std",
+    ),
+    "product_of_experts sizes": (
+        lambda w: vae.product_of_experts(w.belief, Belief(w.x[:1], w.x[:1] + 1), w.belief),
+        "posterior.mean has the shape (1,): must be (2,)",
+    ),
+    "update weight": (
+        lambda w: w.filter.update(w.belief, w.seen, w.look, 0, NAN),
+        "weight = nan: must be from 0 to 1",
+    ),
+    "update negative": (
+        lambda w: w.filter.update(w.belief, w.seen, w.look, 0, -1.0),
+        "weight = -1.0: must be from 0 to 1",
+    ),
+    "together": (
+        lambda w: w.filter.together([w.look, w.look]),
+        ": must be Mapping, from modalities to features",
+    ),
     "encode none": (lambda w: vae.encode(w.params, w.model, (None, None)), "must hold one mod"),
     "encode shape": (
         lambda w: vae.encode(w.params, w.model, (jnp.zeros(3), None)),

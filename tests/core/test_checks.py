@@ -119,6 +119,18 @@ def test_what_lacks_members_of_a_protocol():
         jaxsense.make_mdp(config, dataclasses.replace(models, fusion=Half()))
 
 
+def test_a_fusion_that_is_no_pytree_is_refused():
+    config, models = jaxsense.load_pretrained("default")
+
+    class Bare(vae.InPlace):
+        pass
+
+    fusion = object.__new__(Bare)
+    fusion.__dict__.update(vars(models.fusion))
+    with pytest.raises(ValueError, match=r"models\.fusion = Bare: must be a pytree, its class und"):
+        jaxsense.make_mdp(config, dataclasses.replace(models, fusion=fusion))
+
+
 def test_the_shape_of_a_jmvae_is_made_of_tuples():
     given = {"modalities": ("a",), "feature_sizes": (2,), "latent_size": 2, "hidden": (4,)}
     hash(vae.Jmvae(**given))
