@@ -78,7 +78,8 @@ def as_read(readings: np.ndarray) -> np.ndarray:
 
 def closed(readings: np.ndarray) -> np.ndarray:
     """Readings with short gaps closed, see `resampling.close_gaps`."""
-    return np.stack([resampling.close_gaps(each) for each in readings])
+    angles = np.radians(np.arange(readings.shape[1]))  # of a window, less than a circle
+    return np.stack([resampling.close_gaps(angles, each) for each in readings])
 
 
 WAYS = {"scattered": scattered, "together": together}

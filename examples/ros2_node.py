@@ -80,6 +80,10 @@ def scanline(image: Any, info: Any) -> tuple[np.ndarray, np.ndarray]:
     if image.encoding not in _ENCODINGS:
         expected = f"must be one of {', '.join(_ENCODINGS)}"
         raise ValueError(f"encoding = {image.encoding!r}: {expected}")
+    if len(info.p) < 7 or not np.isfinite(info.p).all():
+        raise ValueError(
+            f"P of camera_info = {list(info.p)}: must be finite numbers of a 3 x 4 matrix"
+        )
     focal_length, middle, row = info.p[0], info.p[2], round(info.p[6])
     if not focal_length > 0:
         raise ValueError(f"P[0] of camera_info = {focal_length}: must be above 0; calibrate first")
@@ -88,8 +92,11 @@ def scanline(image: Any, info: Any) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"camera_info is of {size} pixels: must be {image.width} x {image.height}")
     if not 0 <= row < image.height:
         raise ValueError(f"P[6] of camera_info = {row}: must be a row from 0 to {image.height - 1}")
-    line = np.frombuffer(bytes(image.data), np.uint8)[row * image.step :][: image.step]
     channels = len(image.encoding.removesuffix("8"))
+    if image.step < image.width * channels or len(image.data) < image.height * image.step:
+        expected = f"must be {image.height} rows of {image.width * channels} or more"
+        raise ValueError(f"data of {len(image.data)} bytes in rows of {image.step}: {expected}")
+    line = np.frombuffer(bytes(image.data), np.uint8)[row * image.step :][: image.step]
     pixels = line[: image.width * channels].reshape(-1, channels)[:, _ENCODINGS[image.encoding]]
     # The inverse of sRGB's gamma.
     value = pixels / 255
@@ -108,12 +115,18 @@ def pose_of(transform: Any, is_optical: bool = False) -> tuple[np.ndarray, bool]
 
     Returns:
       x and y, in metres, and yaw, in radians; and whether the frame is upside down.
+
+    Raises:
+      ValueError: if the frame looks up or down.
     """
     q, place = transform.rotation, transform.translation
     forward = {
         False: (1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y + q.z * q.w)),
         True: (2 * (q.x * q.z + q.y * q.w), 2 * (q.y * q.z - q.x * q.w)),
     }[is_optical]
+    if math.hypot(*forward) < 0.5:
+        kind = "z ahead, as an optical frame" if is_optical else "x ahead"
+        raise ValueError(f"the frame looks up or down: must have {kind}")
     up = -2 * (q.y * q.z + q.x * q.w) if is_optical else 1 - 2 * (q.x**2 + q.y**2)
     return np.array([place.x, place.y, math.atan2(forward[1], forward[0])]), up < 0
 
@@ -216,8 +229,8 @@ class Robot:
           positions: `[N, 2]` of the PoIs in the frame `map`, in metres.
 
         Raises:
-          ValueError: if there is no such robot, positions are not of PoIs that stand apart, the
-            policy is for another number of PoIs, or robots have maps of their own.
+          ValueError: if there is no such robot, two positions are the same, the policy is for
+            another number of PoIs, or robots have maps of their own.
         """
         positions = np.asarray(positions, np.float32)
         if positions.ndim != 2 or positions.shape[1] != 2 or not np.isfinite(positions).all():
@@ -225,7 +238,7 @@ class Robot:
         if len(np.unique(positions, axis=0)) < len(positions):
             raise ValueError(f"positions = {positions.tolist()}: must differ from each other")
         number, pois, modalities = len(contents["robots"]), len(positions), contents["modalities"]
-        if not 0 <= robot < number:
+        if not isinstance(robot, int) or not 0 <= robot < number:
             raise ValueError(
                 f"robot = {robot}: must be one of {dict(enumerate(contents['robots']))}"
             )
@@ -304,12 +317,11 @@ class Robot:
           The look by which it has updated the map, for `report`; None if there was none.
 
         Raises:
-          ValueError: if the scan is too narrow, or the beams of a laser scanner are too far apart
-            to be resampled.
+          ValueError: if the scan is too narrow, or its beams or pixels are too far apart to be
+            resampled.
         """
         self._require_wide(scan.angles)
-        if scan.readings.ndim == 1:
-            self._require_dense(scan.angles)
+        self._require_dense(scan.angles)
         elapsed, moved = scan.stamp - self._last_stamp, np.abs(scan.pose - self._last_pose)
         self._last_pose, self._last_stamp = np.array(scan.pose), scan.stamp
         # Over a long time, a mean speed says little about that of now.
@@ -408,27 +420,31 @@ class Robot:
 
     def _require_wide(self, angles: np.ndarray) -> None:
         """Raises `ValueError` if a scan does not cover what the detector reads around a PoI."""
+        if len(angles) < 2:
+            raise ValueError(f"scan of {len(angles)} beams: must have two or more")
         width, window = np.degrees(np.ptp(angles)), self.contents["sensors"][self.name]["window"]
         if width < np.degrees(window):
             expected = f"must be at least {np.degrees(window):.1f}"
             raise ValueError(f"field of view = {width:.1f} degrees: {expected}")
 
     def _require_dense(self, angles: np.ndarray) -> None:
-        """Raises `ValueError` if beams are too far apart."""
+        """Raises `ValueError` if beams or pixels are too far apart."""
         own = self.contents["sensors"][self.name]["angles"]
         step, own_step = (np.degrees(np.median(np.abs(np.diff(each)))) for each in (angles, own))
         if step > MAX_STEPS * own_step:
-            expected = f"must be at most {MAX_STEPS * own_step:.2f}; train with the scanner's beams"
+            expected = f"must be at most {MAX_STEPS * own_step:.2f}; train with the sensor's own"
             raise ValueError(f"step between beams = {step:.2f} degrees: {expected}")
 
     def _along_own_rays(self, scan: Scan) -> np.ndarray:
         """The scan along the rays that `detect` reads, without the gaps of single lost beams."""
         measures_distance = scan.readings.ndim == 1
-        close_gaps = self.resampling.close_gaps
+        readings = scan.readings
+        if measures_distance:
+            readings = self.resampling.close_gaps(scan.angles, readings)
         return self.resampling.resample(
             np.array(self.contents["sensors"][self.name]["angles"]),
             -scan.angles if self.is_upside_down else scan.angles,
-            close_gaps(scan.readings) if measures_distance else scan.readings,
+            readings,
             measures_distance=measures_distance,
         )
 
@@ -597,7 +613,8 @@ def point(text: str) -> list[float]:
     try:
         x, y = map(float, text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be X,Y without a space") from None
+        expected = "must be two numbers X,Y in metres, without a space"
+        raise argparse.ArgumentTypeError(f"{text!r}: {expected}") from None
     return [x, y]
 
 

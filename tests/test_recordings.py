@@ -96,7 +96,7 @@ def test_a_distance_of_0_is_no_return(write):
     """As an infinite one, along the run's rays and along others."""
     for angles in (None, HALF_CIRCLE):
         scans = np.full((3, 683 if angles is None else 361), 1.0)
-        scans[:, ::7] = np.inf
+        scans[:, np.arange(scans.shape[1]) % 14 > 6] = np.inf  # wider gaps than are closed
         zeros = np.where(np.isinf(scans), 0.0, scans)
         windows = []
         for values in (scans, zeros):
@@ -105,6 +105,16 @@ def test_a_distance_of_0_is_no_return(write):
             windows.append(np.stack([sim.cut_out(LIDAR, scan, 0.0) for scan in found]))
         np.testing.assert_array_equal(*windows)
         np.testing.assert_allclose(np.unique(windows[1]), [1.0, float(LIDAR.window_limit)])
+
+
+def test_gaps_of_lost_beams_are_closed_as_on_robots(write):
+    for angles in (None, HALF_CIRCLE):
+        scans = np.full((3, 683 if angles is None else 361), 1.0)
+        whole = recordings.read(CONFIG, write(lidar_scans=scans, lidar_angles=angles))
+        for lost in (np.inf, 0.0, np.nan):
+            scans[:, 60:300:40] = lost
+            looks = recordings.read(CONFIG, write(lidar_scans=scans, lidar_angles=angles))
+            np.testing.assert_array_equal(looks.scans["lidar"], whole.scans["lidar"])
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import re
+import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,7 +25,7 @@ def snippets(page):
 
 
 PROGRAM, CLASSES, ATTRIBUTE, SENSOR, SETTINGS, LOOKS, SCORE = snippets("extending.md")
-COMPARED, RETRAINED = snippets("recorded.md")
+COMPARED, RETRAINED, ARCHIVED = snippets("recorded.md")
 
 
 @pytest.fixture
@@ -123,6 +124,12 @@ def test_a_detector_is_retrained_with_labelled_looks(recording, tmp_path, monkey
     )
     labels = np.tile(config.arena.label_of_class("shape"), 4)
     np.save("labels.npy", labels)
-    found = run(RETRAINED)
+    found = run(RETRAINED, ARCHIVED)
     features = jax.vmap(found["detector"].features)(np.stack(found["windows"]))
     np.testing.assert_array_equal(np.argmax(features, axis=1), labels)
+    # The archive answers as the retrained detector does, with NumPy alone.
+    with zipfile.ZipFile("robot.zip") as archive:
+        own = np.load(archive.open("weights.npz"))
+    for name, leaf in (("Dense_0", 1), ("Dense_1", 1)):
+        kept = own[f"detectors/{leaf}/params/params/{name}/kernel"]
+        np.testing.assert_array_equal(kept, found["detector"].params["params"][name]["kernel"])

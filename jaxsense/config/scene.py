@@ -149,7 +149,7 @@ class LidarConfig(Section, place="lidar"):
     min_range: Traced[float] = limited(0.08, above=0)
     """Shortest measured distance, in metres."""
     max_range: Traced[float] = limited(5.0, above=0, at_most=1000)
-    """Longest measured distance, in metres; also the reading of a beam without a return."""
+    """Longest measured distance, in metres; simulated beams without a return read it, too."""
     range_noise: Traced[float] = limited(0.01, at_least=0)
     """Standard deviation of a measured distance, in metres; `range_noise_growth` adds to it."""
     range_noise_growth: float = limited(0.0, at_least=0, at_most=1)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsense.config import Config
-from jaxsense.sim import recorded, sensors
+from jaxsense.sim import recorded, resampling, sensors
 from jaxsense.sim.sensors import Sensor
 
 
@@ -51,7 +51,8 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
         NAME_angles  [A]          their directions in radians, if they are not those of the run
 
     A distance is infinite or 0 for a ray without a return, and any reading NaN for a ray that was
-    not recorded. A sensor may be missing, but not all. Scans along other rays are resampled, see
+    not recorded. Short gaps between rays with a return are closed, see `resampling.close_gaps`. A
+    sensor may be missing, but not all. Scans along other rays are resampled, see
     `sim.recorded.resample`.
 
     Args:
@@ -99,11 +100,21 @@ def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
         others = f"; of other rays, {angles} must hold the angles, in radians"
         _require_shape(found, name, ("C", len(sensor.angles), *channels), others)
         _require_not_negative(found[name], sensor)
-        return found[name]
+        return _closed(sensor, sensor.angles, found[name])
     _require_shape(found, angles, ("A",))
     _require_shape(found, name, ("C", len(found[angles]), *channels))
     _require_not_negative(found[name], sensor)
-    return recorded.resample(sensor, found[angles], found[name])
+    resampling.require_angles(f"angles of {sensor.name}", found[angles])
+    scans = _closed(sensor, found[angles], found[name])
+    return recorded.resample(sensor, found[angles], scans)
+
+
+def _closed(sensor: Sensor, angles: np.ndarray, scans: np.ndarray) -> np.ndarray:
+    """Scans without the gaps of lost beams, as robots read them."""
+    if not sensor.measures_distance:
+        return scans
+    closed = [resampling.close_gaps(angles, scan) for scan in scans]
+    return np.array(closed, np.float32).reshape(scans.shape)
 
 
 def _require_not_negative(scans: np.ndarray, sensor: Sensor) -> None:

@@ -13,6 +13,7 @@ import scipy.special
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config, LidarConfig, Shape
+from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.sim import raycast, resampling
 from jaxsense.sim.sensors import Sensor
@@ -92,6 +93,19 @@ def _longest(is_recorded: Bool[np.ndarray, " B"]) -> Int[np.ndarray, " _"]:
     return np.arange(start, end)
 
 
+def _scans(angles: np.ndarray, ranges: np.ndarray) -> Float[np.ndarray, "S A"]:
+    """Distances, infinite without a return; raises `ValueError` if they are none."""
+    found = resampling.with_returns(ranges)
+    if found.ndim != 2 or found.shape[1] != len(angles):
+        expected = f"must be (S, {len(angles)}), one for each of the angles of each scan"
+        raise ValueError(f"ranges have the shape {found.shape}: {expected}")
+    if (found < 0).any():
+        raise ValueError(
+            f"ranges = {found[found < 0][0]:g}: must be 0 or infinite without a return"
+        )
+    return np.where(np.isnan(found), np.float32(np.inf), found)
+
+
 def wall_residuals(
     angles: Float[np.ndarray, " A"], ranges: Float[np.ndarray, "S A"]
 ) -> tuple[Float[np.ndarray, "R K"], Float[np.ndarray, " R"]]:
@@ -99,7 +113,7 @@ def wall_residuals(
 
     Args:
       angles: directions of the beams, in radians, in order.
-      ranges: `[S, A]` distances in metres, infinite or 0 without a return.
+      ranges: `[S, A]` distances in metres, infinite, NaN or 0 without a return.
 
     Returns:
       `[R, K]` residuals along the beams, in metres, of all pieces of scans that no surface of
@@ -110,7 +124,7 @@ def wall_residuals(
     """
     if len(angles) < _BEAMS:
         raise ValueError(f"number of angles = {len(angles)}: must be at least {_BEAMS}")
-    ranges = resampling.with_returns(ranges)
+    ranges = _scans(angles, ranges)
     residuals, distances = [], []
     for first in range(0, len(angles) - _BEAMS + 1, _BEAMS):
         piece = slice(first, first + _BEAMS)
@@ -150,6 +164,7 @@ def fit_noise(
     Raises:
       ValueError: if the scans show too few straight walls or edges.
     """
+    checks.require_type("config", config, LidarConfig, "as config.lidar")
     residuals, distances = wall_residuals(angles, ranges)
     free = _BEAMS - 2  # a line has two parameters
     unbiased = np.sqrt(scipy.special.chdtri(free, 0.5) / free)
@@ -160,13 +175,13 @@ def fit_noise(
     if len(kept) < 2:
         raise ValueError(
             f"scans show {len(distances)} pieces of walls, {_MIN_PIECES} or more of them in "
-            f"{len(kept)} bins of half a metre: must be in 2 or more bins"
+            f"{len(kept)} bins of half a metre: must be in 2 or more bins (in metres, radians?)"
         )
     within = distances < config.max_range
     middles = [np.median(distances[within][bins == i]) for i in kept]
     medians = [np.median(spread[within][bins == i]) for i in kept]
     growth, noise = np.polyfit(middles, medians, 1, w=np.sqrt(number[kept]))
-    mixed, dropout = _edges(resampling.with_returns(ranges), config.max_range)
+    mixed, dropout = _edges(_scans(angles, ranges), config.max_range)
     found = {"range_noise": noise, "range_noise_growth": growth, "mixed_pixels": mixed}
     rounded = {name: round(max(float(x), 0.0), 5) for name, x in found.items()}
     return dataclasses.replace(config, **rounded, dropout=round(dropout, 5))

@@ -37,13 +37,13 @@ def resample(
       ValueError: if angles are not finite or beyond a turn, or readings are not one for each.
     """
     require_angles("angles", angles)
+    if np.size(angles) < 2:
+        raise ValueError(f"angles of {np.size(angles)} rays: must be of two or more")
     if np.shape(readings)[:1] != np.shape(angles):
         expected = f"must be one for each of {np.size(angles)} angles"
         raise ValueError(f"readings have the shape {np.shape(readings)}: {expected}")
     right, left, share, is_between = _neighbours(targets, angles)
-    readings = np.asarray(readings, np.float32)
-    if measures_distance:
-        readings = with_returns(readings)
+    readings = with_returns(readings) if measures_distance else np.asarray(readings, np.float32)
     first, second = readings[right], readings[left]
     # One number for each ray, next to readings of any shape.
     of_rays = (-1, *[1] * (readings.ndim - 1))
@@ -58,35 +58,54 @@ def resample(
 
 
 def with_returns(ranges: np.ndarray) -> np.ndarray:
-    """Distances in metres, infinite instead of 0 where a beam has no return."""
-    return np.where(ranges == 0, np.inf, ranges)
+    """Distances in metres, float32, infinite instead of 0 where a beam has no return."""
+    ranges = np.asarray(ranges, np.float32)
+    return np.where(ranges == 0, np.float32(np.inf), ranges)
 
 
-def close_gaps(ranges: np.ndarray, most: int = MAX_LOST) -> np.ndarray:
+def close_gaps(angles: np.ndarray, ranges: np.ndarray, most: int = MAX_LOST) -> np.ndarray:
     """Distances in which beams that were lost take those of their neighbours.
 
     Where up to `most` beams in a row have no return and those on both sides have one, each takes
     the distance of the nearest that has. Longer gaps stay, as does what is too near (minus
-    infinity).
+    infinity). The last beam of a full circle has the first as its neighbour.
 
     Args:
-      ranges: `[A]` distances in metres of beams next to each other; 0, infinite or NaN without a
-        return.
+      angles: `[A]` directions of the beams, in radians, in any order.
+      ranges: `[A]` distances in metres; 0, infinite or NaN without a return.
       most: beams in a gap.
 
     Returns:
       `[A]` float32.
+
+    Raises:
+      ValueError: if angles are not finite or beyond a turn, or distances are not one for each.
     """
-    ranges = with_returns(np.asarray(ranges, np.float32))
-    is_lost = np.isnan(ranges) | (ranges == np.inf)
-    returned, beam = np.flatnonzero(~is_lost), np.arange(len(ranges))
+    require_angles("angles", angles)
+    ranges = with_returns(ranges)
+    if ranges.shape != np.shape(angles):
+        expected = f"must be one for each of {np.size(angles)} angles"
+        raise ValueError(f"ranges have the shape {ranges.shape}: {expected}")
+    turned = within_a_turn(angles)
+    order = np.argsort(turned, kind="stable")
+    is_circle = (
+        2 * np.pi - np.ptp(turned) < MAX_STEPS * median_step(angles) if len(turned) else False
+    )
+    # A circle continues past both of its ends.
+    beams = np.tile(order, 3) if is_circle else order
+    is_lost = (np.isnan(ranges) | (ranges == np.inf))[beams]
+    returned, here = np.flatnonzero(~is_lost), np.arange(len(beams))
     if not len(returned):
         return ranges
-    behind = np.searchsorted(returned, beam)
+    behind = np.searchsorted(returned, here)
     left, right = (returned[np.clip(i, 0, len(returned) - 1)] for i in (behind - 1, behind))
-    is_short = (left < beam) & (beam < right) & (right - left <= most + 1)
-    nearest = np.where(beam - left <= right - beam, left, right)
-    return np.where(is_lost & is_short, ranges[nearest], ranges)
+    is_short = (left < here) & (here < right) & (right - left <= most + 1)
+    nearest = np.where(here - left <= right - here, left, right)
+    closed = np.where(is_lost & is_short, ranges[beams[nearest]], ranges[beams])
+    found = ranges.copy()
+    own = slice(len(order), 2 * len(order)) if is_circle else slice(None)
+    found[order] = closed[own]
+    return found
 
 
 def require_angles(name: str, angles: np.ndarray) -> None:

@@ -70,7 +70,7 @@ def cut_out(
     if jnp.issubdtype(dtype, jnp.integer):
         reason = "must be real numbers, in metres or from 0 to 1"
         raise ValueError(f"readings of dtype {dtype}: {reason}")
-    at_least = "must be at least 0"
+    at_least = "must be at least 0; NaN was not recorded: leave the look out"
     checks.require(f"readings of {sensor.name}", readings, lambda x: x >= 0, at_least)
     return as_window(sensor, around(sensor, readings, jnp.asarray(bearing)))
 

@@ -256,14 +256,18 @@ def retrain(
 
     Raises:
       TypeError: if the detector is an encoder of scans, which learns without labels.
-      ValueError: if `config.calibration` leaves no window to train with, or none to judge by.
+      ValueError: if windows are not finite, a label is none of the detector's, or
+        `config.calibration` leaves no window to train with, or none to judge by.
     """
     checks.require_key(key)
     if not isinstance(detector, Classifier):
         kind = type(detector).__name__
         raise TypeError(f"detector is a {kind}; must be a Classifier, which learns from labels")
     windows, labels = jnp.asarray(windows), jnp.asarray(labels)
+    checks.require_shape("windows", windows, (None, len(detector.offset)))
+    checks.require_finite("windows", windows, "must be finite; leave out what was not recorded")
     checks.require_shape("labels", labels, (len(windows),))
+    checks.require_index("labels", labels, detector.num_labels)
     number = config.num_training(len(labels))
     if not 0 < number < len(labels):
         expected = f"must leave some of {len(labels)} windows to train with, and some to judge by"

@@ -17,6 +17,7 @@ from jaxsense.dqn import replay
 from jaxsense.interfaces import common
 from jaxsense.mission import roadmap
 from jaxsense.run import batches
+from jaxsense.sim import recorded
 from jaxsense.vae import filter
 
 # Settings whose models have other shapes.
@@ -108,6 +109,16 @@ def loss(w, features, weights=(1.0, 1.0)):
         beta=1.0,
         reconstruction_weights=weights,
     )
+
+
+def retrain(w, windows=None, labels=None):
+    """A detector that is retrained on eight windows."""
+    (size,) = w.models.detectors[1].offset.shape
+    if windows is not None and windows.shape[1] == 61:
+        windows = np.resize(windows, (8, size))
+    windows = np.zeros((8, size)) if windows is None else windows
+    labels = np.zeros(8, int) if labels is None else labels
+    return vae.retrain(w.key, w.models.detectors[1], windows, labels)
 
 
 def value_iteration(w, **changed):
@@ -450,6 +461,34 @@ FUNCTIONS = {
     "value_iteration list": (
         lambda w: value_iteration(w, likelihoods=[[[0.0] * 50] * 50] * 50),
         "...: must be an array of shape (any, any, any)",
+    ),
+    "fit_noise config": (
+        lambda w: recorded.fit_noise(SMOKE, np.zeros(20), np.ones((2, 20))),
+        ": must be LidarConfig, as config.lidar",
+    ),
+    "fit_noise scan": (
+        lambda w: recorded.fit_noise(SMOKE.lidar, np.zeros(20), np.ones(20)),
+        "ranges have the shape (20,): must be (S, 20), one for each of the angles of each scan",
+    ),
+    "fit_noise negative": (
+        lambda w: recorded.fit_noise(SMOKE.lidar, np.zeros(20), -np.ones((2, 20))),
+        "ranges = -1: must be 0 or infinite without a return",
+    ),
+    "retrain nan": (
+        lambda w: retrain(w, np.full((8, 61), NAN)),
+        "windows = nan: must be finite; leave out what was not recorded",
+    ),
+    "retrain scans": (
+        lambda w: retrain(w, np.zeros((8, 683))),
+        "windows has the shape (8, 683): must be (any, ",
+    ),
+    "retrain label": (
+        lambda w: retrain(w, labels=np.arange(1, 9) % 2 + 1),
+        "labels = 2: must be a whole number from 0 to 1",
+    ),
+    "retrain real": (
+        lambda w: retrain(w, labels=np.zeros(8)),
+        "labels of dtype float32: must be a whole number from 0 to 1",
     ),
     "fan": (lambda w: sim.Fan(0, 90.0), "num_rays = 0: must be a whole number greater than 0"),
     "fan real": (lambda w: sim.Fan(1.5, 90.0), "num_rays = 1.5"),

@@ -40,6 +40,8 @@ def test_an_unknown_encoding_is_named(ros2):
     ("info", "expected"),
     [
         (CameraInfo([0.0] * 12, 2, 2), r"P\[0\] of camera_info = 0.0: must be above 0"),
+        (CameraInfo([], 2, 2), r"P of camera_info = \[\]: must be finite numbers of a 3 x 4"),
+        (CameraInfo([math.nan] * 12, 2, 2), r"P of camera_info = .*: must be finite numbers"),
         (CameraInfo([4.0, 0, 1, 0, 0, 4, 1, 0], 4, 2), "is of 4 x 2 pixels: must be 2 x 2"),
         (
             CameraInfo([4.0, 0, 1, 0, 0, 4, 2.6, 0], 2, 2),
@@ -50,6 +52,17 @@ def test_an_unknown_encoding_is_named(ros2):
 def test_a_calibration_that_does_not_fit_is_named(ros2, info, expected):
     with pytest.raises(ValueError, match=expected):
         ros2.scanline(Image("rgb8", 2, 6, b"\0" * 12), info)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "step", "size"), [("rgb8", 6, 11), ("rgb8", 5, 10), ("rgba8", 6, 12)]
+)
+def test_a_picture_that_is_not_whole_is_refused(ros2, encoding, step, size):
+    info = CameraInfo([4.0, 0, 1, 0, 0, 4, 1, 0], 2, 2)
+    expected = f"data of {size} bytes in rows of {step}: must be 2 rows of"
+    image = SimpleNamespace(encoding=encoding, width=2, height=2, step=step, data=b"\0" * size)
+    with pytest.raises(ValueError, match=expected):
+        ros2.scanline(image, info)
 
 
 ROOT = math.sqrt(0.5)
@@ -70,6 +83,14 @@ def test_poses_of_frames(ros2, rotation, is_optical, yaw, is_upside_down):
     pose, hangs = ros2.pose_of(Transform(at(1, 2), quaternion(*rotation)), is_optical)
     np.testing.assert_allclose(pose, [1, 2, yaw], atol=1e-9)
     assert hangs == is_upside_down
+
+
+@pytest.mark.parametrize(("is_optical", "kind"), [(True, "z ahead, as an opt"), (False, "x ahead")])
+def test_a_frame_that_looks_up_is_refused(ros2, is_optical, kind):
+    # No turn: the x axis lies ahead, and z points up. Pitched by a quarter turn, x points down.
+    rotation = (0, 0, 0, 1) if is_optical else (0, ROOT, 0, ROOT)
+    with pytest.raises(ValueError, match=f"the frame looks up or down: must have {kind}"):
+        ros2.pose_of(Transform(at(0, 0), quaternion(*rotation)), is_optical)
 
 
 @pytest.mark.parametrize("yaw", [-2.5, 0.0, 1.0, 3.1])

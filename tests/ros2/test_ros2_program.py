@@ -36,7 +36,7 @@ def test_the_program_reads_its_command_before_it_needs_ros(ros2, monkeypatch):
 @pytest.mark.parametrize("poi", ["1.0", "1,2,3", "1;2", "-1"])
 def test_the_program_refuses_what_is_no_place(ros2, monkeypatch, capsys, poi):
     assert run_node(ros2, monkeypatch, "robot.zip", "--pois", poi, "0,1") == (2, [])
-    assert f"argument --pois: ' {poi}': must be X,Y" in capsys.readouterr().err.replace(
+    assert f"argument --pois: ' {poi}': must be two numbers X,Y" in capsys.readouterr().err.replace(
         f"'{poi}'", f"' {poi}'"
     )
 

@@ -326,18 +326,48 @@ def test_short_gaps_between_beams_are_closed():
     # One lost beam; three in a row, of which the middle one is as near to either side; 0 and NaN
     # are no returns.
     ranges = [1.0, inf, 2.0, 0.0, nan, inf, 3.0]
-    np.testing.assert_array_equal(
-        resampling.close_gaps(np.array(ranges)), np.float32([1, 1, 2, 2, 2, 3, 3])
-    )
+    np.testing.assert_array_equal(close_gaps(ranges), np.float32([1, 1, 2, 2, 2, 3, 3]))
     # Ends, what is too near, and longer gaps stay.
     for same in ([inf, 1.0, 1.0], [1.0, 1.0, inf], [1.0, -inf, 1.0], [inf] * 3, [1.0]):
-        np.testing.assert_array_equal(resampling.close_gaps(np.array(same)), np.float32(same))
+        np.testing.assert_array_equal(close_gaps(same), np.float32(same))
     for lost, is_closed in ((5, True), (6, False)):
         scan = np.array([1.0, *[inf] * lost, 4.0])
-        found = resampling.close_gaps(scan)
+        found = close_gaps(scan)
         assert np.isfinite(found).all() == is_closed
         assert found.dtype == np.float32
     np.testing.assert_array_equal(found, np.float32(scan))
+    np.testing.assert_array_equal(close_gaps([1.0, inf, inf, 4.0], 1)[1:3], inf)
+
+
+def close_gaps(ranges, *most):
+    """Closes gaps between beams of ten degrees."""
+    return resampling.close_gaps(np.radians(10.0 * np.arange(len(ranges))), ranges, *most)
+
+
+@pytest.mark.parametrize(("first", "turn"), [(0, 1), (-180, 1), (10, 1), (0, -1), (180, -1)])
+def test_gaps_are_closed_across_the_ends_of_a_full_circle(first, turn):
+    # Every ten degrees, from any direction on; three in a row are lost around 0 degrees.
+    angles = np.radians(first + turn * 10.0 * np.arange(36))
+    ahead = np.round(np.degrees(resampling.within_a_turn(angles)))
+    ranges = np.where(ahead < 0, 1.0, 2.0)
+    lost = np.where(np.abs(ahead) <= 10, np.inf, ranges)
+    found = resampling.close_gaps(angles, lost)
+    expected = np.where(ahead == 0, found[ahead == 0], np.where(ahead < 0, 1.0, 2.0))
+    np.testing.assert_array_equal(found, expected)
+    assert found[ahead == 0] in (1, 2)
+    # Half a circle has no neighbours beyond its ends.
+    half = np.abs(ahead - 90) < 91
     np.testing.assert_array_equal(
-        resampling.close_gaps(np.array([1.0, inf, inf, 4.0]), 1)[1:3], inf
+        resampling.close_gaps(angles[half], lost[half])[ahead[half] == 0], np.inf
     )
+
+
+def test_what_is_no_scan_has_no_gaps_to_close():
+    with pytest.raises(
+        ValueError, match=r"ranges have the shape \(2,\): must be one for each of 3"
+    ):
+        resampling.close_gaps(np.arange(3.0), np.ones(2))
+    with pytest.raises(ValueError, match=r"angles = 45: must be from -2 pi to 2 pi"):
+        resampling.close_gaps(np.array([0.0, 45.0]), np.ones(2))
+    assert resampling.close_gaps([0.1], [0.0]) == np.inf
+    assert resampling.close_gaps([], []).shape == (0,)
