@@ -92,7 +92,14 @@ class Models:
           distance: distance at which the PoI's centre is expected, in metres.
           search: largest errors of the robot's pose, within which other bearings and distances are
             tried, too; static. By default none are.
+
+        Raises:
+          ValueError: if there is no such modality, or readings have another shape.
         """
+        checks.require_index("modality", modality, len(self.detectors))
+        channels = () if sensor.channels == 1 else (sensor.channels,)
+        shape = (len(sensor.angles), *channels)
+        checks.require_shape(f"readings of {sensor.name}", readings, shape)
         of_window = windows.around(searching.widened(sensor, search), readings, bearing)
         return self.detect_in_window(modality, sensor, of_window, bearing, distance, search)
 

@@ -62,7 +62,9 @@ def do(job: Job, provenance: dict[str, object]) -> tuple[Row, list[Point]]:
     except Exception as error:
         raise LearnerError(f"{learner.name}: {type(error).__name__}: {error}") from error
     if missing := set(job.seeds) - set(recorder.policies):
-        raise LearnerError(f"{learner.name} has not reported policies of the seeds {missing}")
+        raise LearnerError(
+            f"{learner.name} has not reported policies of the seeds {sorted(missing)}"
+        )
     found = jaxsense.score(task, [recorder.policies[seed] for seed in job.seeds])
     last = [[p for p in recorder.points if p.seed == seed][-1] for seed in job.seeds]
     row = board.row(

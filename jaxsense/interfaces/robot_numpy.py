@@ -35,11 +35,17 @@ def load(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, Program
 
     Returns:
       Its `contents.json`, and its programs by name: from arrays by name to arrays by name.
+
+    Raises:
+      ValueError: if it is no archive.
     """
-    with zipfile.ZipFile(path) as files:
-        contents = json.loads(files.read("contents.json"))
-        graphs = json.loads(files.read("programs.json"))
-        weights = dict(np.load(io.BytesIO(files.read("weights.npz"))))
+    try:
+        with zipfile.ZipFile(path) as files:
+            contents = json.loads(files.read("contents.json"))
+            graphs = json.loads(files.read("programs.json"))
+            weights = dict(np.load(io.BytesIO(files.read("weights.npz"))))
+    except (KeyError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: must be a file of `jaxsense export` ({error})") from error
     described = contents["programs"]
     return contents, {
         name: _program(name, graphs[name], weights, described[name]) for name in graphs

@@ -31,10 +31,16 @@ def load(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, Program
 
     Returns:
       Its `contents.json`, and its programs by name: from arrays by name to arrays by name.
+
+    Raises:
+      ValueError: if it is no archive.
     """
-    with zipfile.ZipFile(path) as files:
-        contents = json.loads(files.read("contents.json"))
-        models = {name: files.read(f"{name}.onnx") for name in contents["programs"]}
+    try:
+        with zipfile.ZipFile(path) as files:
+            contents = json.loads(files.read("contents.json"))
+            models = {name: files.read(f"{name}.onnx") for name in contents["programs"]}
+    except (KeyError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: must be a file of `jaxsense export` ({error})") from error
     described = contents["programs"]
     return contents, {
         name: _program(name, model, described[name]) for name, model in models.items()

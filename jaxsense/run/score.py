@@ -167,10 +167,10 @@ def _require(
         reason = f"must be a list of one or more of {', '.join(dict.fromkeys(names))}"
         raise ConfigError("against", against, reason)
     checks.require_one_each("models.detectors", models.detectors, config.modalities)
-    require_fitting(config, models)
     if not models.agent.plays(config.arena.num_pois):
         reason = "must be the number of PoIs that the models were trained with"
         raise ConfigError("arena.num_pois", config.arena.num_pois, reason)
+    require_fitting(config, models)
 
 
 def _checked(name: str, policy: Values | Policy) -> Policy:

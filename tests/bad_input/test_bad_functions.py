@@ -462,6 +462,18 @@ FUNCTIONS = {
         lambda w: value_iteration(w, likelihoods=[[[0.0] * 50] * 50] * 50),
         "...: must be an array of shape (any, any, any)",
     ),
+    "models.detect length": (
+        lambda w: w.models.detect(1, w.lidar, np.ones(720), 0.0, 1.0),
+        "readings of lidar has the shape (720,): must be (683,)",
+    ),
+    "models.detect list": (
+        lambda w: w.models.detect(1, w.lidar, [1.0], 0.0, 1.0),
+        "readings of lidar = [1.0]: must be an array of shape (683,)",
+    ),
+    "models.detect modality": (
+        lambda w: w.models.detect(2, w.lidar, np.ones(683), 0.0, 1.0),
+        "modality = 2: must be a whole number from 0 to 1",
+    ),
     "fit_noise config": (
         lambda w: recorded.fit_noise(SMOKE, np.zeros(20), np.ones((2, 20))),
         ": must be LidarConfig, as config.lidar",

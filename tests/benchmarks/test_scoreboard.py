@@ -296,6 +296,46 @@ def test_a_row_of_a_job_holds_all_seeds():
     json.dumps(dataclasses.asdict(row), allow_nan=False)
 
 
+@dataclasses.dataclass(frozen=True)
+class Wrong:
+    """A learner that does one thing wrong."""
+
+    how: str
+    name = "wrong"
+
+    @property
+    def packages(self):
+        return ("no-such-package",) if self.how == "package" else ()
+
+    def train(self, task, seeds, steps, report):
+        if self.how == "swapped":
+            report({seeds[0]: nop}, 0)
+        if self.how == "late":
+            report(steps, {seeds[0]: nop})
+        if self.how == "some":
+            report(0, {seeds[0]: nop})
+        if self.how == "package":
+            report(0, dict.fromkeys(seeds, nop))
+
+
+@pytest.mark.parametrize(
+    ("how", "expected"),
+    [
+        ("silent", r"wrong has not reported policies of the seeds \[20, 21\]"),
+        ("some", r"wrong has not reported policies of the seeds \[21\]"),
+        ("swapped", "wrong: ValueError: report must be called with steps and a dictionary of pol"),
+        ("late", "wrong: ValueError: report must be called with 0 steps first, for each seed"),
+        ("package", "wrong: PackageNotFoundError: No package metadata was found for no-such-pack"),
+    ],
+)
+def test_a_learner_that_does_something_wrong_is_named(how, expected, monkeypatch):
+    monkeypatch.setattr(record, "mean_return", lambda *_: 1.0)
+    monkeypatch.setattr(record, "best_return", lambda *_: 2.0)
+    job = jobs.Job("map-v0", "camera", Wrong(how), (20, 21), 64)
+    with pytest.raises(learner.LearnerError, match=expected):
+        jobs.do(job, {})
+
+
 def test_jobs_travel_to_other_processes():
     for each in learners.load():
         sent = jobs.do, jobs.Job("map-v0", "camera", each, (20,), 64)
@@ -338,10 +378,13 @@ def test_results_of_other_learners_stay(tmp_path, monkeypatch):
     assert [p.learner for p in record.read(tmp_path / jobs.CURVES)] == ["mine", "nop", "nop"]
 
 
-def test_the_command_of_a_row_can_be_copied(tmp_path, monkeypatch):
+def test_the_command_of_a_row_can_be_copied(tmp_path, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr(jobs, "run", lambda *arguments: asked.append(arguments[-1]))
+    (tmp_path / jobs.SCORES).write_text("[]")
     program.main(["our DQN", "--seeds", "1", "--out", str(tmp_path)])
+    # With the tables of that folder, for now those of the references.
+    assert "### `map-v0`, `camera`" in capsys.readouterr().out
     assert asked == [f"python -m benchmarks.tasks 'our DQN' --seeds 1 --out {tmp_path}"]
 
 
@@ -354,9 +397,11 @@ def test_learners_have_names_of_their_own_and_settings():
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["none"], "learners = ('none',): must be some of our DQN"),
+        (["none"], "learners = ('none',): must be some of 'our DQN'"),
         (["--only", "map-v1"], "only = ('map-v1',): must be some of many-v0, map-v0"),
-        (["--quick"], "quick = True: needs out"),
+        (["--quick"], "quick = True: needs --out FOLDER"),
+        (["--page", "--out", "x"], "page = True: trains nothing and remakes only the repository's"),
+        (["--page", "our DQN"], "page = True: trains nothing and remakes only the repository's"),
     ],
 )
 def test_wrong_options_are_told_in_one_line(argv, message, capsys):

@@ -390,3 +390,30 @@ def solve_now(likelihoods, horizon):
 def test_what_has_no_values_is_named(likelihoods, horizon, error, expected):
     with pytest.raises(error, match=expected):
         solve_now(likelihoods, horizon)
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 8])
+def test_values_of_looks_have_gradients_in_the_likelihoods(horizon):
+    # The lattice has corners, where the entropy has an infinite slope.
+    belief = Belief(jnp.zeros(1), jnp.ones(1))
+
+    def value(accuracy):
+        right, wrong = jnp.log(accuracy), jnp.log(1 - accuracy)
+        looks = jnp.array([[[1, 0], [1, 0], [0, 1]], [[0, 1], [0, 1], [1, 0]]])
+        looks = jnp.where(looks, right, wrong)
+        found = optimum.value_iteration(
+            looks, rewards.Nats(0.05), lambda p: belief, belief, MdpConfig(), horizon
+        )
+        return found.of_all(jnp.array([0.3, 0.7]), jnp.bool_(True))
+
+    gradient = float(jax.grad(value)(0.8))
+    measured = float(value(0.801) - value(0.799)) / 0.002
+    assert gradient == pytest.approx(measured, rel=0.02)
+    assert gradient > 0.5
+
+
+def test_the_entropy_has_a_finite_gradient_everywhere():
+    found = jax.grad(rewards.entropy)(jnp.array([0.5, 0.5, 0.0]))
+    # -(log p + 1), and 0 for a probability of 0.
+    np.testing.assert_allclose(found, [np.log(2) - 1, np.log(2) - 1, 0], rtol=1e-6)
+    assert float(rewards.entropy(jnp.array([0.5, 0.5, 0.0]))) == pytest.approx(np.log(2))

@@ -1,6 +1,8 @@
 """Inputs that exported programs refuse."""
 
 import inspect
+import re
+import zipfile
 
 import numpy as np
 import pytest
@@ -8,6 +10,18 @@ from exporting import CONFIG
 
 from jaxsense.interfaces import robot_numpy, robot_onnx
 from jaxsense.sim import sensors
+
+
+@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
+def test_what_is_no_archive_is_named(player, tmp_path):
+    text, other = tmp_path / "text.zip", tmp_path / "other.zip"
+    text.write_text("robot")
+    with zipfile.ZipFile(other, "w") as files:
+        files.writestr("readme.txt", "robot")
+    for path in (text, other):
+        expected = re.escape(f"{path}: must be a file of `jaxsense export` (")
+        with pytest.raises(ValueError, match=expected):
+            player.load(path)
 
 
 @pytest.mark.parametrize("player", [robot_numpy, robot_onnx])

@@ -187,12 +187,12 @@ def test_what_cannot_be_is_told(starts):
     mdp = small.small_mdp()
     with pytest.raises(ValueError, match="modality = 2: must be a whole number from 0 to 1"):
         MapVectorEnv(mdp, 2, 2)
-    with pytest.raises(ValueError, match="Sometimes"):
+    with pytest.raises(ValueError, match="autoreset_mode = 'Sometimes': must be one of NextStep, "):
         MapVectorEnv(mdp, 0, 2, autoreset_mode="Sometimes")
     env = MapVectorEnv(mdp, LIDAR, 2, starts)
     with pytest.raises(gymnasium.error.ResetNeeded, match="before reset"):
         env.step(np.zeros(2, int))
     env.reset(seed=0)
     for actions in (np.array([0, 4]), np.array([-1, 0]), np.zeros(3, int)):
-        with pytest.raises(ValueError, match="must be in MultiDiscrete"):
+        with pytest.raises(ValueError, match="must be integers in MultiDiscrete"):
             env.step(actions)

@@ -272,6 +272,8 @@ def test_a_robot_without_an_action_is_named(env):
     first, *_ = AGENTS
     with pytest.raises(ValueError, match=rf"actions of \['{first}'\]: must have one of each of"):
         env.step_env(jax.random.key(4), state, {first: 0})
+    with pytest.raises(ValueError, match=r"actions = \[0, 0\]: must be dict, with one of each of"):
+        env.step_env(jax.random.key(4), state, [0, 0])
 
 
 def test_other_sensors_than_those_of_the_settings_are_named(team_env):

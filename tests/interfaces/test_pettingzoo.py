@@ -203,6 +203,10 @@ def test_what_cannot_be_is_told(env):
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"actions of \['lidar'\]: must have one of 'camera_1'"):
         env.step({"lidar": 0})
+    with pytest.raises(
+        ValueError, match=r"actions = \[0, 0\]: must be dict, with one of 'camera_1'"
+    ):
+        env.step([0, 0])
     for action in (5, -1, 0.5):
         with pytest.raises(
             ValueError, match=rf"actions\['lidar'\] = {action}: must be in Discrete"

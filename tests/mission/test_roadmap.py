@@ -337,3 +337,35 @@ def test_a_wrong_shape_of_the_position_is_named_while_tracing(call):
     jax.eval_shape(lambda place: call(plan, place), jnp.zeros(2))
     with pytest.raises(ValueError, match="position"):
         jax.eval_shape(lambda place: call(plan, place), jnp.zeros(3))
+
+
+def test_lengths_of_paths_have_gradients():
+    # From one side of a PoI to viewpoints of the next, around it.
+    layout = sim.random_layout(jax.random.key(1), CONFIG.arena, jnp.array([0, 1, 2]))
+
+    def shortest(positions, start):
+        moved = layout.replace(position=positions)
+        ways = roadmap.build(CONFIG, moved)
+        return jnp.min(roadmap.lengths(CONFIG, moved, ways, start, 1))
+
+    start, by = jnp.zeros(2), 2e-3
+    found = jax.jit(jax.grad(shortest, (0, 1)))(layout.position, start)
+    for argument, gradient in enumerate(found):
+        arguments = [layout.position, start]
+        measured = np.zeros(gradient.shape)
+        for i in np.ndindex(gradient.shape):
+            ends = []
+            for step in (by, -by):
+                moved = [*arguments]
+                moved[argument] = arguments[argument].at[i].add(step)
+                ends.append(float(shortest(*moved)))
+            measured[i] = (ends[0] - ends[1]) / (2 * by)
+        np.testing.assert_allclose(gradient, measured, atol=2e-3)
+        assert np.abs(measured).max() > 0.5
+    # At a node, where a path of no length begins, and where no path leads.
+    ways = roadmap.build(CONFIG, layout)
+    length = jax.grad(lambda x: roadmap.lengths(CONFIG, layout, ways, x, 1).min())
+    assert np.isfinite(length(ways.nodes[0])).all()
+    nowhere = ways.replace(is_next=ways.is_next & False, is_free=ways.is_free & False)
+    far = jax.grad(lambda x: roadmap.lengths(CONFIG, layout, nowhere, x, 1).min())
+    np.testing.assert_array_equal(far(start), 0)

@@ -95,9 +95,13 @@ def test_differences_are_of_the_same_arenas(play):
         (
             {"mine": last_first},
             {"against": ["best"]},
-            r"^against = \['best'\]: must be one or more",
+            r"^against = \['best'\]: must be a list of one or more",
         ),
-        ({"mine": last_first}, {"against": []}, r"^against = \[\]: must be one or more of latent"),
+        (
+            {"mine": last_first},
+            {"against": []},
+            r"^against = \[\]: must be a list of one or more of latent",
+        ),
         ({"mine": last_first}, {"episodes": 0}, r"^episodes = 0: must be"),
         ({"mine": last_first}, {"seed": -1}, r"^seed = -1: must be a whole number from 0 to"),
     ],
@@ -117,7 +121,9 @@ def test_models_of_another_number_of_pois_are_refused(models):
 def test_a_policy_without_a_value_for_each_action_is_named(values):
     checked = score._checked("mine", Policy(lambda key, models, known: values, is_unordered=True))
     assert checked.is_unordered
-    with pytest.raises(ValueError, match=r"^policies = 'mine': must return floats of shape \[4\]"):
+    with pytest.raises(
+        ValueError, match=r"^policies\['mine'\] = <lambda>: must return floats of shape \[4\]"
+    ):
         checked.values(None, None, SimpleNamespace(looks=np.zeros((3, 2))))
 
 

@@ -112,8 +112,8 @@ def test_a_team_is_measured_against_its_best_rule():
             (NAME, lambda key, seen: jnp.int32(7)),
             r"policy = <lambda>: must return actions from 0 to 3",
         ),
-        ((NAME, []), r"policy = '\[\]': must be one policy or several"),
-        (("noisy-v1", nop), r"name = 'noisy-v1': must be one of"),
+        ((NAME, []), r"policy = \[\]: must be one policy or several"),
+        (("noisy-v1", nop), r"task = 'noisy-v1': must be from make, or one of"),
     ],
 )
 def test_wrong_policies_and_names_are_refused(arguments, message):

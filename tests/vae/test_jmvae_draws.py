@@ -50,7 +50,7 @@ def test_a_pair_is_of_one_class_and_otherwise_independent(drawn):
             (CAMERA[:, 0], LIDAR),
             r"camera has the shape \(4, 1\): .*; give \[N, 1\] as x\[:, None\]",
         ),
-        ((CAMERA, LIDAR[:, :0]), r"lidar has the shape \(4, 0, 2\): must be "),
+        ((CAMERA, LIDAR[:, :0]), r"lidar has the shape \(4, 0, 2\): must hold one row or more"),
         ((CAMERA, None), "lidar = None: must be an array; leave out rows without it"),
     ],
 )
