@@ -130,10 +130,10 @@ def program(source: str, function: str = "") -> str:
       source: its text.
       function: the only one that counts, with what it uses of the module; all by default.
     """
-    tree = ast.parse(source)
+    tree: ast.Module = _WithoutChecks().visit(ast.parse(source))
     if function:
         tree.body = _used_by(function, tree.body)
-    for node in ast.walk(_WithoutChecks().visit(tree)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.arg | ast.AnnAssign):
             node.annotation = None  # pyright: ignore[reportAttributeAccessIssue]
         if isinstance(node, ast.FunctionDef):
@@ -144,21 +144,38 @@ def program(source: str, function: str = "") -> str:
     return ast.dump(tree)
 
 
+_CHECKING = ("_check", "_require", "require_")
+
+
 class _WithoutChecks(ast.NodeTransformer):
-    """Leaves out statements that only call a function of `core.checks` or chex, or only raise."""
+    """Leaves out statements that only check or raise, and functions that do nothing else.
+
+    A check is a call of a function of `core.checks` or chex, or of one that is named as such.
+    """
 
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
-        called = node.value.func if isinstance(node.value, ast.Call) else None
-        module = called.value if isinstance(called, ast.Attribute) else None
-        is_check = isinstance(module, ast.Name) and module.id in {"checks", "chex"}
-        return None if is_check else node
+        match node.value:
+            case ast.Call(func=ast.Attribute(value=ast.Name(id="checks" | "chex"))):
+                return None
+            case ast.Call(func=ast.Name(id=name)) if name.startswith(_CHECKING):
+                return None
+        return node
+
+    def visit_For(self, node: ast.For) -> ast.For | None:
+        self.generic_visit(node)
+        return node if node.body else None
 
     def visit_If(self, node: ast.If) -> ast.If | None:
         self.generic_visit(node)
-        raises_only = all(isinstance(each, ast.Raise) for each in node.body)
-        return None if raises_only and not node.orelse else node
+        # What is left of it; before it raises, it may say why.
+        *words, last = node.body or [ast.Pass()]
+        raises = isinstance(last, ast.Raise | ast.Pass)
+        checks_only = raises and all(isinstance(each, ast.Assign) for each in words)
+        return None if checks_only and not node.orelse else node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef | None:
+        if node.name.startswith(_CHECKING):
+            return None
         checks_only = node.name == "__post_init__" and bool(node.body)
         self.generic_visit(node)
         return None if checks_only and not node.body else node

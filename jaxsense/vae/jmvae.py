@@ -21,6 +21,8 @@ from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Features, Key, Samples, pytree
 from jaxsense.vae import gaussian
 
+_CONVERGES = "must be finite; scale features to a deviation of 1, or lower learning_rate"
+
 Drawn = tuple[jax.Array, tuple[jax.Array, ...]]
 """Noise `[steps, D, B]`, and for each modality features `[steps, D_m, B]`."""
 
@@ -373,10 +375,8 @@ def train(
         return supervised.fit(key, state, problem, number)
 
     state, losses = jax.lax.scan(chunk, state, keys)
-    losses = losses.reshape(-1)[: config.steps]
-    expected = "must be finite; scale features to a deviation of 1, or lower learning_rate"
-    checks.require_finite("losses", losses, expected)
-    return state.params, losses
+    checks.require_finite("losses", losses, _CONVERGES)
+    return state.params, losses.reshape(-1)[: config.steps]
 
 
 def annealed_beta(step: Int[Array, ""], config: JmvaeConfig) -> Float[Array, ""]:

@@ -123,6 +123,12 @@ def rate(x: Array) -> Array:
     assert history.program(refused, "rate") == history.program(other, "rate")
     chosen = refused.replace("return 2", "else:\n        x = -x\n    return 2")
     assert history.program(chosen, "rate") != history.program(other, "rate")
+    told = refused.replace("raise ValueError(x)", "why = 2\n        raise ValueError(why)")
+    assert history.program(told, "rate") == history.program(other, "rate")
+    own = "_check(x)\n    require_one()\n    for each in x:\n        checks.require(each)\n    "
+    helped = other.replace("return 2", f"{own}return 2") + "def _check(x):\n    print(x)\n"
+    assert history.program(helped, "rate") == history.program(other, "rate")
+    assert history.program(helped) == history.program(other)
     post = "    def __post_init__(self):\n        checks.require_tuple('name', self.name)\n"
     guarded = before.replace("    name: str\n", f"    name: str\n{post}")
     assert guarded != before
