@@ -392,7 +392,7 @@ def test_what_has_no_values_is_named(likelihoods, horizon, error, expected):
         solve_now(likelihoods, horizon)
 
 
-@pytest.mark.parametrize("horizon", [1, 2, 8])
+@pytest.mark.parametrize("horizon", [1, 8])
 def test_values_of_looks_have_gradients_in_the_likelihoods(horizon):
     # The lattice has corners, where the entropy has an infinite slope.
     belief = Belief(jnp.zeros(1), jnp.ones(1))
@@ -402,7 +402,7 @@ def test_values_of_looks_have_gradients_in_the_likelihoods(horizon):
         looks = jnp.array([[[1, 0], [1, 0], [0, 1]], [[0, 1], [0, 1], [1, 0]]])
         looks = jnp.where(looks, right, wrong)
         found = optimum.value_iteration(
-            looks, rewards.Nats(0.05), lambda p: belief, belief, MdpConfig(), horizon
+            looks, rewards.Nats(0.05), lambda p: belief, belief, MdpConfig(), horizon, 64
         )
         return found.of_all(jnp.array([0.3, 0.7]), jnp.bool_(True))
 
