@@ -172,6 +172,17 @@ CLAIMS = {
         > model["log-likelihood"].mean() + half(model["log-likelihood"])
         for model in OTHERS
     ),
+    "with one beam in a hundred lost, more answers are wrong, even those of `noisy`": lambda: all(
+        row["right"][1] < row["right"][0] - 0.02
+        for row in read("lost_beams")["rows"]
+        if row["closed"] == "no"
+    ),
+    "and with them the detectors answer as well as without losses": lambda: all(
+        abs(row[key][1] - row[key][0]) < 0.005
+        for row in read("lost_beams")["rows"]
+        for key in ("answered", "right")
+        if row["closed"] == "yes"
+    ),
     "Both JMVAEs are more accurate with one view missing than with none": lambda: all(
         each["accuracy, 1 missing"].mean() > each["accuracy all"].mean() for each in (OURS, THEIRS)
     ),
