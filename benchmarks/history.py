@@ -174,7 +174,8 @@ class _WithoutChecks(ast.NodeTransformer):
         return None if checks_only and not node.orelse else node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef | None:
-        if node.name.startswith(_CHECKING):
+        returns = any(isinstance(x, ast.Return) and x.value for x in ast.walk(node))
+        if node.name.startswith(_CHECKING) and not returns:
             return None
         checks_only = node.name == "__post_init__" and bool(node.body)
         self.generic_visit(node)

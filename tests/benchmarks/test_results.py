@@ -129,6 +129,12 @@ def rate(x: Array) -> Array:
     helped = other.replace("return 2", f"{own}return 2") + "def _check(x):\n    print(x)\n"
     assert history.program(helped, "rate") == history.program(other, "rate")
     assert history.program(helped) == history.program(other)
+    # What returns something is no check, whatever its name.
+    used = (
+        other.replace("return 2 * x", "return 2 * _checked(x)") + "def _checked(x):\n    return x\n"
+    )
+    doubled = used.replace("return x", "return 2 * x")
+    assert history.program(used, "rate") != history.program(doubled, "rate")
     post = "    def __post_init__(self):\n        checks.require_tuple('name', self.name)\n"
     guarded = before.replace("    name: str\n", f"    name: str\n{post}")
     assert guarded != before
