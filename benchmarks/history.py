@@ -148,10 +148,16 @@ _CHECKING = ("_check", "_require", "require_")
 
 
 class _WithoutChecks(ast.NodeTransformer):
-    """Leaves out statements that only check or raise, and functions that do nothing else.
+    """Leaves out statements that only check or raise an error, and functions of nothing else.
 
     A check is a call of a function of `core.checks` or chex, or of one that is named as such.
     """
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        super().generic_visit(node)
+        if getattr(node, "body", None) == []:
+            node.body = [ast.Pass()]  # pyright: ignore[reportAttributeAccessIssue]
+        return node
 
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
         match node.value:
@@ -163,23 +169,35 @@ class _WithoutChecks(ast.NodeTransformer):
 
     def visit_For(self, node: ast.For) -> ast.For | None:
         self.generic_visit(node)
-        return node if node.body else None
+        return node if node.orelse or not _is_empty(node.body) else None
 
     def visit_If(self, node: ast.If) -> ast.If | None:
         self.generic_visit(node)
-        # What is left of it; before it raises, it may say why.
-        *words, last = node.body or [ast.Pass()]
-        raises = isinstance(last, ast.Raise | ast.Pass)
-        checks_only = raises and all(isinstance(each, ast.Assign) for each in words)
-        return None if checks_only and not node.orelse else node
+        names = any(isinstance(each, ast.NamedExpr) for each in ast.walk(node.test))
+        # Before it raises, it may say why.
+        *words, last = node.body
+        refuses = _is_empty([last]) or _is_error(last)
+        checks_only = refuses and all(isinstance(each, ast.Assign) for each in words)
+        return None if checks_only and not node.orelse and not names else node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef | None:
         returns = any(isinstance(x, ast.Return) and x.value for x in ast.walk(node))
         if node.name.startswith(_CHECKING) and not returns:
             return None
-        checks_only = node.name == "__post_init__" and bool(node.body)
         self.generic_visit(node)
-        return None if checks_only and not node.body else node
+        return None if node.name == "__post_init__" and _is_empty(node.body) else node
+
+
+def _is_empty(body: list[ast.stmt]) -> bool:
+    return all(isinstance(each, ast.Pass) for each in body)
+
+
+def _is_error(node: ast.stmt) -> bool:
+    """Whether a statement raises an error, not what ends a loop."""
+    match node:
+        case ast.Raise(exc=ast.Call(func=ast.Name(id=name))):
+            return name.endswith("Error")
+    return False
 
 
 def _used_by(function: str, statements: list[ast.stmt]) -> list[ast.stmt]:
@@ -209,7 +227,8 @@ def _defined(node: ast.stmt) -> set[str]:
         return {node.name}
     targets = [node.target] if isinstance(node, ast.AnnAssign) else []
     targets += node.targets if isinstance(node, ast.Assign) else []
-    return {target.id for target in targets if isinstance(target, ast.Name)}
+    named = (each for target in targets for each in ast.walk(target))
+    return {each.id for each in named if isinstance(each, ast.Name)}
 
 
 def _is_text(node: ast.stmt) -> bool:

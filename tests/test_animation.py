@@ -96,8 +96,8 @@ def duration(picture):
 def test_every_animation_can_be_played(picture):
     found = tracks(picture)
     assert len(found) > 15
-    # 6 s and one more at twice the speed, and 2.5 s of the last frame. What moves beside a text
-    # for more than five seconds must come to an end (WCAG 2.2.2).
+    # 6 s and one more at twice the speed, and 2.5 s of the last frame. Where nothing can pause it,
+    # as in an `img`, it at least comes to an end.
     assert duration(picture) == (pytest.approx(6.0, abs=0.2), 3)
     for track in found:
         assert len(track.times) == len(track.values) > 1

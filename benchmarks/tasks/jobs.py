@@ -61,7 +61,8 @@ def do(job: Job, provenance: dict[str, object]) -> tuple[Row, list[Point]]:
         settings, versions = dataclasses.asdict(learner), measure.versions(learner.packages)  # pyright: ignore[reportArgumentType]
     except Exception as error:
         raise LearnerError(f"{learner.name}: {type(error).__name__}: {error}") from error
-    if missing := set(job.seeds) - set(recorder.policies):
+    trained = {point.seed for point in recorder.points if point.steps}
+    if missing := set(job.seeds) ^ trained:
         raise LearnerError(
             f"{learner.name} has not reported policies of the seeds {sorted(missing)}"
         )

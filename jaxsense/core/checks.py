@@ -134,7 +134,7 @@ def require_key(key: object) -> None:
       ValueError: if it is something else, such as a seed or several keys.
     """
     expected = "must be one key, as from jax.random.key"
-    if not isinstance(key, jax.Array):
+    if not isinstance(key, jax.Array | np.ndarray):
         raise ValueError(f"key = {_shown(key)}: {expected}(0)")
     is_key = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     if not is_key and (key.dtype != jnp.uint32 or key.ndim == 0):
@@ -228,20 +228,21 @@ def require_belief(name: str, belief: Belief, size: int | None = None) -> None:
     require_positive(f"{name}.std", belief.std)
 
 
-def require_members(name: str, value: object, protocol: type) -> None:
-    """Checks that a value has all members of a protocol, whatever they are.
+def require_members(name: str, value: object, protocol: type, needed: Sequence[str] = ()) -> None:
+    """Checks that a value has members of a protocol, whatever they are.
 
     Args:
       name: name of the argument.
       value: the value.
       protocol: with the members.
+      needed: names of those to check; all by default.
 
     Raises:
       ValueError: lists those that are missing.
     """
     if isinstance(value, type):
         raise ValueError(f"{name} = {value.__name__}: must be a {protocol.__name__}, not its class")
-    members = [member for member in vars(protocol) if not member.startswith("_")]
+    members = needed or [member for member in vars(protocol) if not member.startswith("_")]
     missing = [member for member in members if not hasattr(value, member)]
     if missing:
         kind, expected = type(value).__name__, f"must be a {protocol.__name__}"
@@ -331,6 +332,6 @@ def require_bank(
             raise ValueError(f"{of_modality} has {shape[0]} classes or rows: {expected}")
         require_finite(of_modality, features)
     first = np.shape(bank[0])
-    if first[0] == 1 < first[1]:
+    if first[0] == 1 < first[1] and len(modalities) > 1:
         expected = "must be two or more; give rows [N, D] as x[:, None], not x[None]"
         raise ValueError(f"bank has one class with {first[1]} looks: {expected}")

@@ -214,7 +214,7 @@ def value_iteration(
       ValueError: if a likelihood is not finite, `horizon` is not positive, `start` does not hold
         probabilities, or `reward` or `config` is something else.
     """
-    checks.require_members("reward", reward, Reward)
+    checks.require_members("reward", reward, Reward, ("information", "of_gain"))
     checks.require_type("config", config, MdpConfig, "as config.mdp")
     checks.require_shape("likelihoods", likelihoods, (None, None, None))
     number, num_looks, _ = likelihoods.shape

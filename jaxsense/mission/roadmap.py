@@ -133,7 +133,7 @@ def lengths(
     to_last = jnp.min(to_node[:, None] + roadmap.between, axis=0)
     around = jnp.min(to_last[None] + roadmap.last(poi, slice(None)), axis=-1)
     found = jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
-    return jnp.where(jnp.isfinite(found), found, jnp.inf)  # without a gradient
+    return jnp.where(jnp.isposinf(found), jnp.inf, found)  # infinite without a gradient
 
 
 @jax.named_scope("mission.reachable")

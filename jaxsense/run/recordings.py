@@ -114,7 +114,8 @@ def _closed(sensor: Sensor, angles: np.ndarray, scans: np.ndarray) -> np.ndarray
     if not sensor.measures_distance:
         return scans
     closed = [resampling.close_gaps(angles, scan) for scan in scans]
-    return np.array(closed, np.float32).reshape(scans.shape)
+    found = np.array(closed, np.float32).reshape(scans.shape)
+    return np.where(np.isnan(scans), np.float32(np.nan), found)
 
 
 def _require_not_negative(scans: np.ndarray, sensor: Sensor) -> None:

@@ -10,6 +10,7 @@ import jinja2
 from jaxsense.config.options import command
 
 _KINDS = {"svg": "svg+xml", "png": "png"}
+_SMIL = re.compile(r"<animate[^<>]*>")
 _SIZE = re.compile(r'viewBox="0 0 ([1-9]\d*) ([1-9]\d*)"')
 
 
@@ -34,6 +35,8 @@ def films(contents: Mapping[str, str]) -> Films:
     Args:
       contents: of their files, by the names of these without suffixes.
     """
+    # Films of earlier versions (SMIL) cannot be paused: what is left is their last frame.
+    contents = {name: _SMIL.sub("", content) for name, content in contents.items()}
     sizes = [_SIZE.search(content) for content in contents.values()]
     tall = max((int(size[2]) / (int(size[1]) / 2) for size in sizes if size), default=1.0)
     return Films(tuple(contents), render("films.html.jinja", films=contents), tall)

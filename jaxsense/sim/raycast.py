@@ -160,10 +160,6 @@ def _check_outlines(section: CrossSection) -> None:
         lengths = np.hypot(*np.asarray(section.axis).T)
         expected = "must be 1, also where the outline is a circle"
         checks.require("length of axis", lengths, lambda x: np.abs(x - 1) < 1e-3, expected)
-    if not isinstance(section.half, Tracer):
-        apart = np.diff(np.asarray(section.half)[: section.num_circles], axis=1)
-        expected = "must be 0, as a circle has its radius twice"
-        checks.require("difference in half of a circle", apart, lambda x: x == 0, expected)
 
 
 def cast_along(section: CrossSection, origin: Origin, direction: Direction) -> Hit:

@@ -99,10 +99,9 @@ def _scans(angles: np.ndarray, ranges: np.ndarray) -> Float[np.ndarray, "S A"]:
     if found.ndim != 2 or found.shape[1] != len(angles):
         expected = f"must be (S, {len(angles)}), one for each of the angles of each scan"
         raise ValueError(f"ranges have the shape {found.shape}: {expected}")
-    if (found < 0).any():
-        raise ValueError(
-            f"ranges = {found[found < 0][0]:g}: must be 0 or infinite without a return"
-        )
+    wrong = found[(found < 0) & np.isfinite(found)]
+    if wrong.size:
+        raise ValueError(f"ranges = {wrong[0]:g}: must be 0 or infinite without a return")
     return np.where(np.isnan(found), np.float32(np.inf), found)
 
 

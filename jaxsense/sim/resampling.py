@@ -67,8 +67,9 @@ def close_gaps(angles: np.ndarray, ranges: np.ndarray, most: int = MAX_LOST) -> 
     """Distances in which beams that were lost take those of their neighbours.
 
     Where up to `most` beams in a row have no return and those on both sides have one, each takes
-    the distance of the nearest that has. Longer gaps stay, as does what is too near (minus
-    infinity). The last beam of a full circle has the first as its neighbour.
+    the distance of the nearest that has. Longer gaps stay, as do gaps next to something too near
+    (minus infinity) or to directions that were not recorded. The last beam of a full circle has the
+    first as its neighbour.
 
     Args:
       angles: `[A]` directions of the beams, in radians, in any order.
@@ -88,23 +89,24 @@ def close_gaps(angles: np.ndarray, ranges: np.ndarray, most: int = MAX_LOST) -> 
         raise ValueError(f"ranges have the shape {ranges.shape}: {expected}")
     turned = within_a_turn(angles)
     order = np.argsort(turned, kind="stable")
-    is_circle = (
-        2 * np.pi - np.ptp(turned) < MAX_STEPS * median_step(angles) if len(turned) else False
-    )
-    # A circle continues past both of its ends.
-    beams = np.tile(order, 3) if is_circle else order
+    # Beyond both ends of the turn, where a circle, or a scan across its back, continues.
+    beams = np.tile(order, 3)
+    along = turned[beams] + np.repeat([-2 * np.pi, 0.0, 2 * np.pi], len(order))
+    # What was not recorded separates beams.
+    part = np.cumsum(np.diff(along, prepend=along[:1]) >= MAX_STEPS * median_step(angles))
     is_lost = (np.isnan(ranges) | (ranges == np.inf))[beams]
-    returned, here = np.flatnonzero(~is_lost), np.arange(len(beams))
-    if not len(returned):
+    known, here = np.flatnonzero(~is_lost), np.arange(len(beams))
+    if not len(known):
         return ranges
-    behind = np.searchsorted(returned, here)
-    left, right = (returned[np.clip(i, 0, len(returned) - 1)] for i in (behind - 1, behind))
+    behind = np.searchsorted(known, here)
+    left, right = (known[np.clip(i, 0, len(known) - 1)] for i in (behind - 1, behind))
     is_short = (left < here) & (here < right) & (right - left <= most + 1)
+    is_short &= part[left] == part[right]
+    has_both = np.isfinite(ranges[beams[left]]) & np.isfinite(ranges[beams[right]])
     nearest = np.where(here - left <= right - here, left, right)
-    closed = np.where(is_lost & is_short, ranges[beams[nearest]], ranges[beams])
+    closed = np.where(is_lost & is_short & has_both, ranges[beams[nearest]], ranges[beams])
     found = ranges.copy()
-    own = slice(len(order), 2 * len(order)) if is_circle else slice(None)
-    found[order] = closed[own]
+    found[order] = closed[len(order) : 2 * len(order)]
     return found
 
 

@@ -190,7 +190,7 @@ def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
             expected = f"must return {len(observations)} integers for as many observations"
             raise ConfigError("act", act, f"{expected}; not {actions.dtype}{[*actions.shape]}")
         # What 32 bits cannot hold is no action, either.
-        return np.where(actions < 2**31, actions, -1).astype(np.int32)
+        return np.where((actions >= 0) & (actions < 2**31), actions, -1).astype(np.int32)
 
     def policy(key: Key, observation: jax.Array) -> jax.Array:
         del key

@@ -56,7 +56,7 @@ class Jmvae:
         checks.require_one_each("feature_sizes", self.feature_sizes, self.modalities)
         if len(set(self.modalities)) < len(self.modalities):
             raise ValueError(f"modalities = {self.modalities}: must name none twice")
-        if any("+" in name for name in self.modalities):
+        if len(set(map(self.encoder_name, self.subsets))) < len(self.subsets):
             raise ValueError(f"modalities = {self.modalities}: must have no +, which joins names")
         checks.require_number("latent_size", self.latent_size)
         if self.max_subset is not None:

@@ -403,10 +403,6 @@ FUNCTIONS = {
         lambda w: sim.cast(w.outlines(geom=(5,)), w.x, 0.0),
         "geom has 1 entries: must be 2, one for each outline",
     ),
-    "cast half": (
-        lambda w: sim.cast(w.outlines(half=jnp.array([[0.5, 0.25], [0.5, 0.25]])), w.x, 0.0),
-        "difference in half of a circle = -0.25: must be 0",
-    ),
     "CrossSection words": (
         lambda w: w.outlines(geom=("door", "wall")),
         "geom = ('door', 'wall'): must hold whole numbers, 0 or more",
@@ -448,7 +444,7 @@ FUNCTIONS = {
     ),
     "value_iteration reward": (
         lambda w: value_iteration(w, reward="nats"),
-        "reward = str: must be a Reward; it lacks",
+        "reward = str: must be a Reward; it lacks information, of_gain",
     ),
     "value_iteration class": (
         lambda w: value_iteration(w, reward=dqn.Nats),

@@ -172,12 +172,12 @@ CLAIMS = {
         > model["log-likelihood"].mean() + half(model["log-likelihood"])
         for model in OTHERS
     ),
-    "with one beam in a hundred lost, more answers are wrong, even those of `noisy`": lambda: all(
+    "with one beam in a hundred lost, more answers are wrong, even with `noisy`": lambda: all(
         row["right"][1] < row["right"][0] - 0.02
         for row in read("lost_beams")["rows"]
         if row["closed"] == "no"
     ),
-    "and with them the detectors answer as well as without losses": lambda: all(
+    "with one beam in a hundred lost, the detectors answer as well as without losses": lambda: all(
         abs(row[key][1] - row[key][0]) < 0.005
         for row in read("lost_beams")["rows"]
         for key in ("answered", "right")

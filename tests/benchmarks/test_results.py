@@ -129,6 +129,22 @@ def rate(x: Array) -> Array:
     helped = other.replace("return 2", f"{own}return 2") + "def _check(x):\n    print(x)\n"
     assert history.program(helped, "rate") == history.program(other, "rate")
     assert history.program(helped) == history.program(other)
+    for guard in (
+        "try:\n        checks.f(x)\n    finally:\n        pass",
+        "with x:\n        chex.f(x)",
+    ):
+        history.program(other.replace("return 2", f"{guard}\n    return 2"), "rate")
+    branched = other.replace(
+        "return 2", "if x:\n        chex.f(x)\n    else:\n        x = 1\n    return 2"
+    )
+    assert history.program(branched, "rate") != history.program(other, "rate")
+    named = other.replace("return 2", "if (y := f(x)) > 3:\n        raise ValueError\n    return 2")
+    assert history.program(named, "rate") != history.program(named.replace("f(x)", "g(x)"), "rate")
+    stopped = other.replace("return 2", "if x > 3:\n        raise StopIteration\n    return 2")
+    assert history.program(stopped, "rate") != history.program(other, "rate")
+    pair = other.replace("FACTOR = 3", "FACTOR, OTHER = 3, 4")
+    of_four = pair.replace("3, 4", "4, 4")
+    assert history.program(pair, "other") != history.program(of_four, "other")
     # What returns something is no check, whatever its name.
     used = (
         other.replace("return 2 * x", "return 2 * _checked(x)") + "def _checked(x):\n    return x\n"

@@ -314,17 +314,22 @@ class Wrong:
             report(steps, {seeds[0]: nop})
         if self.how == "some":
             report(0, {seeds[0]: nop})
-        if self.how == "package":
+        if self.how in ("package", "untrained"):
             report(0, dict.fromkeys(seeds, nop))
+        if self.how == "others":
+            report(0, {7: nop})
+            report(64, {7: nop})
 
 
 @pytest.mark.parametrize(
     ("how", "expected"),
     [
         ("silent", r"wrong has not reported policies of the seeds \[20, 21\]"),
-        ("some", r"wrong has not reported policies of the seeds \[21\]"),
+        ("some", r"wrong has not reported policies of the seeds \[20, 21\]"),
         ("swapped", "wrong: ValueError: report must be called with steps and a dictionary of pol"),
         ("late", "wrong: ValueError: report must be called with 0 steps first, for each seed"),
+        ("untrained", r"wrong has not reported policies of the seeds \[20, 21\]"),
+        ("others", r"wrong has not reported policies of the seeds \[7, 20, 21\]"),
         ("package", "wrong: PackageNotFoundError: No package metadata was found for no-such-pack"),
     ],
 )

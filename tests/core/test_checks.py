@@ -55,7 +55,7 @@ def test_a_number_has_no_axes_and_a_list_is_no_array():
     [
         (0, "key = 0: must be one key, as from jax.random.key(0)"),
         (None, "key = None: must be one key"),
-        (np.zeros(2, np.uint32), "must be one key"),
+        (np.zeros(2), "key of float64[2]: must be one key"),
         (jnp.zeros(2), "key of float32[2]: must be one key"),
         (jnp.uint32(3), "key of uint32[]: must be one key"),
     ],
@@ -69,6 +69,7 @@ def test_what_is_no_key(wrong, expected):
 @pytest.mark.parametrize("make", [jax.random.key, jax.random.PRNGKey])
 def test_one_key_of_several(make):
     checks.require_key(make(0))
+    checks.require_key(np.asarray(jax.random.PRNGKey(0)))  # as from a file
     keys = jax.random.split(make(0), 3)
     with pytest.raises(ValueError, match=re.escape("key holds (3,) keys: must be one key")):
         checks.require_key(keys)

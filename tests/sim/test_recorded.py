@@ -362,6 +362,28 @@ def test_gaps_are_closed_across_the_ends_of_a_full_circle(first, turn):
     )
 
 
+def test_no_gap_is_closed_across_what_was_not_recorded():
+    inf = np.inf
+    # Half a circle whose last beam, which is lost, lies where a turn ends.
+    half = np.linspace(0, np.pi, 181)
+    ranges = np.where(half > 3.1, inf, 3.0)
+    ranges[0] = 1.0
+    np.testing.assert_array_equal(resampling.close_gaps(half, ranges), np.float32(ranges))
+    # Three quarters of one, across the robot's back, whose first beams are lost.
+    across = np.radians(np.arange(-45.0, 226.0))
+    ranges = np.where(np.arange(271) < 3, inf, 4.0)
+    np.testing.assert_array_equal(resampling.close_gaps(across, ranges), np.float32(ranges))
+    ranges[[134, 135, 136]] = inf  # while gaps at the robot's back are closed
+    found = resampling.close_gaps(across, ranges)
+    np.testing.assert_array_equal(found, np.where(np.arange(271) < 3, inf, np.float32(4.0)))
+    # A sector in the middle that was not recorded, next to lost beams.
+    gapped = np.radians([*range(60), *range(150, 210)])
+    ranges = np.where(np.abs(np.arange(120) - 59.5) < 2, inf, 2.0)
+    np.testing.assert_array_equal(resampling.close_gaps(gapped, ranges), np.float32(ranges))
+    # Something too near is no distance to fill a gap with.
+    np.testing.assert_array_equal(close_gaps([1.0, -inf, inf, 2.0, 2.0])[1:3], [-inf, inf])
+
+
 def test_what_is_no_scan_has_no_gaps_to_close():
     with pytest.raises(
         ValueError, match=r"ranges have the shape \(2,\): must be one for each of 3"
