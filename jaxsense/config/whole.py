@@ -257,8 +257,9 @@ class Config(Section):
 
     def attribute(self, modality: str) -> str:
         """Attribute that a modality reads: `colour`, `shape` or one of `arena.attributes`."""
-        if modality not in self.modalities:
-            raise ConfigError("modality", modality, f"must be one of {', '.join(self.modalities)}")
+        known = [*MODALITIES, *self.sensors]
+        if modality not in known:
+            raise ConfigError("modality", modality, f"must be one of {', '.join(known)}")
         own = self.sensors.get(modality)
         return MODALITIES[modality] if own is None else own.attribute
 
