@@ -36,7 +36,7 @@ nitpicky = True
 # Type variables have no page.
 nitpick_ignore_regex = [
     ("py:.*", r"(?!jaxsense).*"),
-    ("py:(class|obj)", r".*\.([BDMST](_co)?|Row|Result|Annotated)"),
+    ("py:(class|obj)", r".*\.([BDEMST](_co)?|Row|Result|Annotated)"),
 ]
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
