@@ -4,8 +4,9 @@ Robots with different sensors look at points of interest and write what they see
 of latent Gaussians. A policy for each sensor decides which look gains the most information. After
 Korthals, Leitner and Rueckert, "Coordinated Heterogeneous Distributed Perception based on Latent
 Space Representation", 2018. The parts are `sim` (arena, rays, sensors), `vae` (detectors,
-JMVAE, fusion), `dqn` (map MDP, Q-learning), `looks`, `training`, `mission` and `interfaces`. Every
-function is pure, takes its random key first and works on one example: add `vmap` and `jit`.
+JMVAE, fusion), `dqn` (map MDP, Q-learning), `looks`, `training`, `mission` and `interfaces`. All
+functions are pure; those that draw random numbers take their key first, and most work on one
+example: add `vmap` and `jit`.
 """
 
 import lazy_loader

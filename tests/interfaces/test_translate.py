@@ -164,6 +164,14 @@ def test_what_nobody_reads_is_left_out_and_the_same_is_computed_once():
         program(lambda m, x: {"y": jnp.sin(x)}, WEIGHTS, {"x": FLOATS}, Constants({}))
 
 
+def test_a_size_without_translation_is_refused():
+    def halves(models, x):
+        return {"y": jnp.zeros((x.shape[0] // 2, 3)) + x.shape[0]}
+
+    with pytest.raises(NotImplementedError, match="the size .* has no ONNX translation"):
+        program(halves, WEIGHTS, {"x": FLOATS}, Constants({}))
+
+
 def from_the_end(x):
     return jax.lax.scan(lambda total, row: (total + row, total), x[0], x[:2], reverse=True)[1]
 
