@@ -168,7 +168,7 @@ def test_a_size_without_translation_is_refused():
     def halves(models, x):
         return {"y": jnp.zeros((x.shape[0] // 2, 3)) + x.shape[0]}
 
-    with pytest.raises(NotImplementedError, match="the size .* has no ONNX translation"):
+    with pytest.raises(NotImplementedError, match=r"the size .* has no ONNX translation"):
         program(halves, WEIGHTS, {"x": FLOATS}, Constants({}))
 
 
