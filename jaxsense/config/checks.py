@@ -34,6 +34,23 @@ class ConfigError(ValueError):
         return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
+class Unknown:
+    """A traced number: what it is compared with is right, what is computed from it unknown."""
+
+    def _unknown(self, *_: object) -> "Unknown":
+        return self
+
+    __lt__ = __le__ = __gt__ = __ge__ = _unknown
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = _unknown
+    __truediv__ = __rtruediv__ = __mod__ = __neg__ = __abs__ = __round__ = _unknown
+
+    def __format__(self, spec: str) -> str:
+        return "a traced number"
+
+
+UNKNOWN = Unknown()
+
+
 @dataclasses.dataclass(frozen=True)
 class Limits:
     """Limits of each number in a field, and of its number of items; None where there is none."""
@@ -226,7 +243,9 @@ def _converted(value: object, kind: object) -> object:
     elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         if value == 0 or _SMALLEST <= abs(value) <= _LARGEST:
             return float(value)
-    elif isinstance(kind, type) and isinstance(value, kind) and (kind, type(value)) != (int, bool):
+    elif (value is UNKNOWN and origin is None) or (
+        isinstance(kind, type) and isinstance(value, kind) and (kind, type(value)) != (int, bool)
+    ):
         return value
     raise TypeError
 

@@ -5,15 +5,25 @@ shapes a program is structure.
 """
 
 import dataclasses
-from typing import Annotated, ClassVar, NamedTuple, TypeVar, dataclass_transform, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    NamedTuple,
+    TypeVar,
+    dataclass_transform,
+    get_type_hints,
+)
 
 import jax
-import numpy as np
+from jax.core import Tracer
 
-from jaxsense.config.checks import check_fields
+from jaxsense.config.checks import UNKNOWN, check_fields
+from jaxsense.core.types import register
 
 T = TypeVar("T")
 
+_ARRAYS = jax.Array | jax.ShapeDtypeStruct
 _LEAF = "leaf"
 Traced = Annotated[T, _LEAF]
 """A setting that only enters the arithmetic: a number, or a JAX array, traced or not."""
@@ -67,7 +77,7 @@ class Checked:
 class Section(Checked):
     """Base of the sections: a pytree whose leaves are the fields declared `Traced`, and sections.
 
-    Sections that hold arrays or JAX's placeholders are not checked: these have no values yet.
+    A traced value passes its own checks, and relations with other fields.
     """
 
     _LEAVES: ClassVar[tuple[str, ...]] = ()
@@ -77,12 +87,15 @@ class Section(Checked):
         hints = get_type_hints(cls, include_extras=True)
         names = [field.name for field in dataclasses.fields(cls)]
         cls._LEAVES = tuple(name for name in names if _is_leaf(hints[name]))
-        others = [name for name in names if name not in cls._LEAVES]
-        jax.tree_util.register_dataclass(cls, data_fields=cls._LEAVES, meta_fields=others)
+        register(cls, cls._LEAVES, [name for name in names if name not in cls._LEAVES])
 
     def __post_init__(self):
-        if all(map(_is_plain, jax.tree.leaves([getattr(self, name) for name in self._LEAVES]))):
-            super().__post_init__()
+        known = _known(self)
+        check_fields(known)
+        known.check()
+        for name, value in vars(self).items():
+            if not any(isinstance(leaf, _ARRAYS) for leaf in jax.tree.leaves(value)):
+                object.__setattr__(self, name, getattr(known, name))
 
     def arrays(self, sizes: Sizes) -> dict[str, int]:
         """How many numbers each large array holds, by the fields that determine its size."""
@@ -95,7 +108,15 @@ def _is_leaf(kind: object) -> bool:
     return is_section or _LEAF in getattr(kind, "__metadata__", ())
 
 
-def _is_plain(value: object) -> bool:
-    """Whether a value is Python's or NumPy's, not a placeholder of JAX."""
-    is_of_python = type(value).__module__ == "builtins" and type(value) is not object
-    return is_of_python or isinstance(value, np.generic)
+def _known(value: Any) -> Any:
+    """A value of the settings with `UNKNOWN` for what has no value yet."""
+    if isinstance(value, Section):
+        known = object.__new__(type(value))
+        for name, each in vars(value).items():
+            object.__setattr__(known, name, _known(each) if name in value._LEAVES else each)
+        return known
+    if isinstance(value, tuple):
+        return tuple(map(_known, value))
+    if isinstance(value, jax.Array) and not isinstance(value, Tracer) and value.ndim == 0:
+        return value.item()
+    return UNKNOWN if isinstance(value, _ARRAYS) else value

@@ -1,13 +1,14 @@
 """Types that `sim`, `vae`, `dqn` and the modules above them share."""
 
+import dataclasses
 import functools
-from collections.abc import Callable, Mapping
-from typing import Protocol, TypeVar, dataclass_transform
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Protocol, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from flax import serialization, struct
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
 T = TypeVar("T")
@@ -32,9 +33,56 @@ Samples = tuple[Float[Array, "C _ _"], ...]
 def pytree(cls: type[T]) -> type[T]:
     """Class decorator: makes a frozen dataclass that is a pytree.
 
-    Static fields may hold any hashable value.
+    Fields with `flax.struct.field(pytree_node=False)` are static and may hold any hashable value.
     """
-    return struct.dataclass(cls)
+    made: Any = dataclasses.dataclass(frozen=True)(cls)
+    fields = dataclasses.fields(made)
+    leaves = [field.name for field in fields if field.metadata.get("pytree_node", True)]
+    register(made, leaves, [field.name for field in fields if field.name not in leaves])
+
+    def to_state(tree: Any) -> dict[str, Any]:
+        return {name: serialization.to_state_dict(getattr(tree, name)) for name in leaves}
+
+    def from_state(tree: Any, state: dict[str, Any]) -> Any:
+        if state.keys() != set(leaves):
+            raise ValueError(f"fields of {cls.__name__}: {sorted(state)}; must be {leaves}")
+        found = [serialization.from_state_dict(getattr(tree, n), state[n], n) for n in leaves]
+        return dataclasses.replace(tree, **dict(zip(leaves, found, strict=True)))
+
+    serialization.register_serialization_state(made, to_state, from_state, override=True)
+    made.replace = dataclasses.replace
+    return made
+
+
+def register(cls: type, leaves: Sequence[str], static: Sequence[str]) -> None:
+    """Makes a dataclass a pytree: its class is part of the tree definition.
+
+    `jax.tree_util.register_dataclass` would not do: two of its classes with equal fields have equal
+    tree definitions, and jax 0.10 then runs one's compiled program with the other. Values of a
+    pytree are not checked when JAX rebuilds it, because they may be placeholders.
+
+    Args:
+      cls: the dataclass.
+      leaves: names of the fields that hold pytrees.
+      static: names of the other fields; hashable.
+    """
+    keys = [jax.tree_util.GetAttrKey(name) for name in leaves]
+
+    def flatten(tree: object) -> tuple[list, tuple]:
+        values = tree.__dict__
+        return [values[name] for name in leaves], (cls, *[values[name] for name in static])
+
+    def flatten_with_keys(tree: object) -> tuple[list, tuple]:
+        children, aux = flatten(tree)
+        return list(zip(keys, children, strict=True)), aux
+
+    def unflatten(aux: tuple, children: Iterable) -> object:
+        tree = object.__new__(cls)
+        tree.__dict__.update(zip(static, aux[1:], strict=True))
+        tree.__dict__.update(zip(leaves, children, strict=True))
+        return tree
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
 
 
 @pytree

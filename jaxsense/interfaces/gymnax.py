@@ -7,11 +7,10 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, pytree
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.interfaces import common
 from jaxsense.interfaces.extras import extra
@@ -22,7 +21,7 @@ with extra("gymnax"):
     from gymnax.environments import environment, spaces  # pyright: ignore[reportMissingImports]
 
 
-@struct.dataclass
+@pytree
 class MapEnvState(environment.EnvState):
     """State of `MapEnv`.
 
@@ -36,7 +35,7 @@ class MapEnvState(environment.EnvState):
     terminated: jax.Array
 
 
-@struct.dataclass
+@pytree
 class MapEnvParams(environment.EnvParams):
     """Parameters of `MapEnv`: length of episodes, and prepared starts.
 

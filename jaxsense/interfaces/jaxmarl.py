@@ -7,11 +7,10 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 
 from jaxsense.config import Config
 from jaxsense.core import checks
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, pytree
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import team
 from jaxsense.interfaces.extras import extra, quietly
@@ -21,7 +20,7 @@ with extra("jaxmarl"), quietly():
     from jaxmarl.environments import multi_agent_env, spaces  # pyright: ignore[reportMissingImports]
 
 
-@struct.dataclass
+@pytree
 class TeamEnvState(multi_agent_env.State):
     """State of `TeamEnv`.
 
