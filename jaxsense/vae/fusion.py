@@ -125,8 +125,9 @@ def fuse(
         for subset in itertools.combinations(others, size):
             inputs = tuple(generated[m] if m in subset else new for m, new in enumerate(features))
             candidate = jmvae.posterior(params, model, inputs)
-            is_subset = jnp.array([m in subset for m in others], bool)
-            applies = jnp.all(jnp.asarray(seen)[jnp.array(others, int)] == is_subset)
+            applies = jnp.bool_(True)
+            for m in others:
+                applies &= jnp.asarray(seen)[m] == (m in subset)
             fused = jax.tree.map(lambda new, old: jnp.where(applies, new, old), candidate, fused)  # noqa: B023
     for name, new in zip(model.modalities, features, strict=True):
         if new is not None:
