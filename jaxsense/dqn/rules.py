@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxsense.dqn.team_mdp import Team
 
-_USEFUL = 1e3  # s, above the longest travel time
 _TAKEN = 1e2  # s, detour that a robot prefers to a PoI where another is heading
 
 Rule = Callable[[jax.Array, jax.Array, Team, jax.Array], jax.Array]
@@ -31,7 +30,7 @@ def nearest(
       agent: `[]` int32, the robot that chooses.
     """
     cost = times[agent] + _TAKEN * _is_taken(team, agent)
-    return _with_nop(_USEFUL - cost, _is_useful(gains, team)[agent])
+    return _with_nop(1 / (1 + cost), _is_useful(gains, team)[agent])
 
 
 def auction(
@@ -62,7 +61,8 @@ def auction(
     num_robots, num_pois = bids.shape
     nothing = jnp.full(num_robots, num_pois)
     won = jax.lax.fori_loop(0, num_robots, sell, (bids, nothing))[1][agent]
-    return nearest(gains, times, team, agent).at[won].add(jnp.where(won < num_pois, _USEFUL, 0.0))
+    # All other values are at most 1.
+    return nearest(gains, times, team, agent).at[won].add(jnp.where(won < num_pois, 1.0, 0.0))
 
 
 def gain_rate(
@@ -76,8 +76,7 @@ def gain_rate(
       team: see `nearest`.
       agent: see `nearest`.
     """
-    rate = gains[agent] / times[agent]
-    rate /= jnp.where(_is_taken(team, agent), _TAKEN, 1.0)
+    rate = gains[agent] / (times[agent] + _TAKEN * _is_taken(team, agent))
     return _with_nop(rate, _is_useful(gains, team)[agent])
 
 

@@ -45,6 +45,7 @@ ALIKE = np.ones((2, 3))
         ([5, 3, 9], [-1, 1, 0], 1, 1),  # but nothing else is left
         ([90, 3, 99], [1, 1, 1], 1, 0),  # 90 s are less than the 3 + 100 of what is taken
         ([5, 3, 9], [0, -1, -2], 3, 3),  # nothing useful: NOP
+        ([5000, 3000, 9000], [1, 1, 1], 3, 1),  # however far
     ],
 )
 def test_nearest(times, gains, target, expected):
@@ -57,7 +58,7 @@ def test_nearest(times, gains, target, expected):
     [
         ([4, 2, 8], [0.8, 0.3, 0.8], 3, 0),  # .2, .15 and .1 in a second
         ([4, 1, 8], [0.8, 0.3, 0.8], 3, 1),  # .2, .3 and .1
-        ([4, 2, 8], [0.8, 0.3, 0.8], 0, 1),  # PoI 0 is taken: .002
+        ([4, 2, 8], [0.8, 0.3, 0.8], 0, 1),  # PoI 0 is taken: .8 / 104
         ([4, 2, 8], [0.8, -0.3, 0.0], 0, 0),  # but nothing else is left
         ([4, 2, 8], [-0.8, 0.0, -0.8], 3, 3),
     ],
@@ -71,12 +72,13 @@ def test_values_of_rules_as_worked_by_hand():
     gains, times = jnp.array([[0.8, 0.3, -1.0]]), jnp.array([[4.0, 2.0, 1.0]])
     one = team(1)
     found = rules.nearest(gains, times, one, jnp.int32(0))
-    np.testing.assert_allclose(found, [996, 998, -1, 0])
+    # 1 / (1 + seconds)
+    np.testing.assert_allclose(found, [1 / 5, 1 / 3, -1, 0], rtol=1e-6)
     found = rules.gain_rate(gains, times, one, jnp.int32(0))
     np.testing.assert_allclose(found, [0.2, 0.15, -1, 0], rtol=1e-6)
-    # The auction's PoI is worth 1000 more than in `nearest`.
+    # The auction's PoI is worth 1 more than in `nearest`.
     found = rules.auction(gains, times, one, jnp.int32(0))
-    np.testing.assert_allclose(found, [996, 1998, -1, 0])
+    np.testing.assert_allclose(found, [1 / 5, 4 / 3, -1, 0], rtol=1e-6)
 
 
 def test_in_an_auction_the_nearest_poi_goes_to_who_is_nearer():
